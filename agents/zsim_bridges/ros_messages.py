@@ -1,8 +1,8 @@
-"""Messages that ROS 1 and ROS 2 have in common, made from zsim's; each bridge adds its own headers. Pure.
+"""Messages that ROS 1 and ROS 2 have in common, converted from zsim's; each bridge adds its own headers. Pure.
 
 ROS has the same W (east, north, up) and B (forward, left, up) as zsim (REP 103, REP 105), and SI units; its quaternions
-end with w. Covariances are row-major; unknown ones are zero, unless the message's definition has a sign for it.
-The classes are those of ROS 2: rosbags writes a message by the names of its fields, so that they serve ROS 1 as well.
+end with w. Covariances are row-major; unknown ones are zero, unless the message defines a value for this.
+The classes are those of ROS 2; they also serve ROS 1, since rosbags serialises a message by the names of its fields.
 """
 
 import math
@@ -20,7 +20,7 @@ from zsim.math.rotation import Quaternion, Vector
 
 NS_PER_S = 1_000_000_000
 NAVDATA_STATES = {"landed": 2, "taking_off": 6, "hovering": 4, "flying": 3, "landing": 8, "emergency": 0}
-"""States in ardrone_autonomy's Navdata (ctrl_state >> 16 of the aircraft), which shows an emergency as unknown."""
+"""States in ardrone_autonomy's Navdata (ctrl_state >> 16 of the aircraft), in which an emergency is unknown (0)."""
 FIX, NO_FIX, GPS_SERVICE = 0, -1, 1  # sensor_msgs/NavSatStatus
 DIAGONAL_KNOWN = 2  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_DIAGONAL_KNOWN
 DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3: sensor_msgs/distortion_models.h
@@ -47,7 +47,7 @@ def mean_rate(q_WB1: Quaternion, q_WB2: Quaternion, dt_s: float) -> Vector:
 
 
 def diagonal(variance: float) -> Array:
-    """Return a covariance (9,) of three independent axes."""
+    """Return the covariance (9,) of three independent axes with equal variances."""
     return np.diag([variance] * 3).ravel()
 
 
@@ -71,7 +71,7 @@ def transform(head: Any, child: str, position_m: Vector, q: Quaternion) -> Any:
 def odometry(
     head: Any, child: str, pose: Any, twist: Any, of_pose: Array | None = None, of_twist: Array | None = None
 ) -> Any:
-    """Return an Odometry with covariances (36,) of pose and twist; None is unknown, or exact."""
+    """Return an Odometry with covariances (36,) of pose and twist; None: unknown, or exact."""
     nothing = np.zeros(36)
     return ros.nav_msgs__msg__Odometry(
         head,
@@ -82,14 +82,14 @@ def odometry(
 
 
 def imu(head: Any, sample: messages.Imu, q: Quaternion, covariances: tuple[Array, Array, Array]) -> Any:
-    """Return specific force and rate; covariances (9,) of attitude, rate and force."""
+    """Return attitude, rate and specific force in B, with their covariances, each (9,)."""
     of_attitude, of_rate, of_force = covariances
     rate, force = Vector3(*sample.gyro_rad_s), Vector3(*sample.accel_m_s2)
     return ros.sensor_msgs__msg__Imu(head, quaternion(q), of_attitude, rate, of_rate, force, of_force)
 
 
 def fix(head: Any, sample: messages.Gps, has_fix: bool) -> Any:
-    """Return a fix: altitude over the ellipsoid; the covariance is that of a white error, equal on all axes (ENU)."""
+    """Return a fix: altitude above the ellipsoid; the covariance is that of a white error, equal on all axes (ENU)."""
     status: Any = ros.sensor_msgs__msg__NavSatStatus(FIX if has_fix else NO_FIX, GPS_SERVICE)
     return ros.sensor_msgs__msg__NavSatFix(
         head,
@@ -108,11 +108,11 @@ def compressed_image(head: Any, image: CameraImage) -> Any:
 
 
 def camera_info(kind: Any, head: Any, info: CameraInfo) -> Any:
-    """Return what a picture's pixels mean, of a camera that is no part of a stereo pair: R = 1, P = [K 0].
+    """Return the calibration of a single camera, which is not part of a stereo pair: R = 1, P = [K 0].
 
     `kind` is the class of sensor_msgs/CameraInfo, whose fields have other names in ROS 2 (k) than in ROS 1 (K).
     """
     P = np.column_stack([np.reshape(info.K, (3, 3)), np.zeros(3)]).ravel()
-    whole = ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False)
+    full = ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False)
     D, K, R = np.array(info.D), np.array(info.K), np.eye(3).ravel()
-    return kind(head, info.height, info.width, DISTORTION_MODEL, D, K, R, P, 0, 0, whole)
+    return kind(head, info.height, info.width, DISTORTION_MODEL, D, K, R, P, 0, 0, full)

@@ -88,7 +88,7 @@ class GatewayProcess:
 
     def in_run(self) -> "GatewayProcess":
         """Wait until it is in a run."""
-        self.role.line("let into run")
+        self.role.line("may use run")
         return self
 
     @property

@@ -13,6 +13,7 @@ GATES_MAX = 1_000_000  # per `step`: 5.5 hours at 20 ms
 RATE_MAX = 1000.0  # simulated per wall time; faster rates cannot be paced
 PRIORITY_MAX = 100  # programs use 0, operators 10
 SOON_S = 0.5  # wall time
+WAITING_SHOWN = 4  # processes named in a line
 
 
 class Waiting(Struct, frozen=True):
@@ -26,6 +27,11 @@ class Waiting(Struct, frozen=True):
     since_wall_s: Number
     held_by: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        on = f" on {self.host}" if self.host else ""
+        held = f", held by {', '.join(self.held_by)}" if self.held_by else ""
+        return f"{self.name}{on} ({self.since_wall_s:.1f} s{held})"
+
 
 def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
     """Return the awaited processes that block a run whose clock is in `state`; only the causes, if known.
@@ -34,6 +40,13 @@ def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
     """
     late = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
     return [each for each in late if not each.held_by] or late
+
+
+def waiting_text(state: str, waiting: Sequence[Waiting]) -> str:
+    """Return "waiting for" with the processes that hold up a run, empty if none does; see `holding_up`."""
+    late = holding_up(state, waiting)
+    more = [f"{len(late) - WAITING_SHOWN} more"] if len(late) > WAITING_SHOWN else []
+    return f"waiting for {', '.join([*map(str, late[:WAITING_SHOWN]), *more])}" if late else ""
 
 
 @on("clock", writers="world", readers="each", last="world")
@@ -47,11 +60,13 @@ class Clock(Message, frozen=True):
     waiting_for: tuple[Waiting, ...] = ()
 
 
+ADMISSIONS = ("join", "restart", "superseded")  # events of a process that takes part, or does so again
+INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery")  # events of a drone in need of help
 EVENT_KINDS = (
-    "join", "restart", "superseded", "doubled", "no_show", "slow_reader", "silent", "silent_end", "standstill", "leave",
-    "death", "drop", "failure", "overdue", "fingerprint", "commander", "release", "mode", "command", "control",
-    "refused", "outputs_missing", "fault", "fault_end", "fault_clear", "collision", "emergency", "landing", "flip",
-    "impact", "battery", "touchdown", "mission", "diverged", "end",
+    *ADMISSIONS, "doubled", "no_show", "slow_reader", "silent", "silent_end", "standstill", "leave", "death", "drop",
+    "failure", "overdue", "fingerprint", "commander", "release", "mode", "command", "control", "refused",
+    "outputs_missing", "fault", "fault_end", "fault_clear", "collision", *INCIDENTS, "landing", "mission", "diverged",
+    "end",
 )  # fmt: skip
 """All kinds of events, explained in docs/protocol.md."""
 

@@ -35,14 +35,14 @@ from zsim_bridges.console.scene import ChosenRing, draw_ground
 from zsim_bridges.console.view_buffer import ALL, KINDS, EventRow, chosen_rows
 
 PANEL_PX = 350
-ROWS_SHOWN = 60  # events
+ROWS_SHOWN = 60  # number of events
 SWITCHES = {
     "ghosts": "Ghosts: the desired formation",
     "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
     "trails": "Trails",
 }
 MANY = 12  # number of drones; more do not fit on a page, so the worst come first by default
-FILTER_MAX = 80  # characters
+FILTER_MAX = 80  # characters of the filter's text
 SEVERITIES = ("red", "amber", None)
 SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
     "as in the scenario": lambda _: (),

@@ -76,7 +76,7 @@ class _Flight(NamedTuple):
 
     op: str
     shown: str  # the arguments as the page shows them
-    args: dict[str, Any]  # in SI units
+    args: dict[str, Any]  # arguments of the request, in SI units
 
 
 class FormationForm:
@@ -207,7 +207,7 @@ class FormationForm:
             self._send(flight)
             return
         op, shown, args = flight
-        if op == "target" and self._previewed is not None and self._previewed.op == op:  # of sliders moved in turn
+        if op == "target" and self._previewed is not None and self._previewed.op == op:  # extend the preview
             shown = f"{self._previewed.shown}, {shown}"
             args = {**args, "values": {**self._previewed.args["values"], **args["values"]}}
         apart_m = self._cluster.gains.separation_min_m
@@ -293,7 +293,7 @@ class FormationForm:
 
 
 class _HeldValue(NamedTuple):
-    value: float  # to which the slider was moved
+    value: float  # the value to which the slider was moved
     goal: float  # the formation's last goal
     since_s: float  # when that became the goal [s; wall]
 

@@ -40,7 +40,7 @@ COLOURS = ("#868e96", "#1971c2", "#e8590c")  # colours of SERIES
 HEIGHT_PX = 150
 PADDING_PX = (8, 24, 0, 0)  # clockwise from the top, with space for the topmost number; right as viser's
 AXIS_PX = 56  # wide enough for numbers such as -12.5
-CURSOR_COLOUR = "#7048e8"  # of the line at the time that a replay shows
+CURSOR_COLOUR = "#7048e8"  # colour of the line at the time that a replay shows
 BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # data of a plot without points yet
 NONE = "none"
 STEPS_PER_WINDOW = 6  # number of steps of the time axis; chosen: plots are recreated every 30 s at most
@@ -237,8 +237,8 @@ class PlottedVariable(NamedTuple):
     """A variable that can be plotted."""
 
     history: VariableHistory
-    column: int  # in the history
-    label: str  # with its unit
+    column: int  # its index in the history
+    label: str  # its name and unit
     angular: bool
     reference: int  # index in SERIES of the curve to which errors are relative
 
@@ -298,7 +298,7 @@ class VariablePlots:
         windows = {f"{span_s:g} s around" if replayed else f"the last {span_s:g} s": span_s for span_s in WINDOWS_S}
         self._window = gui.add_dropdown("window", list(windows))
         self._windows = windows
-        self._errors = gui.add_checkbox("Errors", False, hint="From the desired values; of a drone, from the true ones")
+        self._errors = gui.add_checkbox("Errors", False, hint="Relative to desired values; for a drone, to true ones")
         self._freeze = gui.add_checkbox(
             "Freeze", False, hint="Drag over a plot to zoom, double-click to reset the zoom"
         )

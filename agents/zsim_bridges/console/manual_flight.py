@@ -40,13 +40,13 @@ SETTLED_S = 1.5  # wall; after which a view shows who has acquired a drone; view
 RATE_MAX = 5.0  # × real time; chosen: above it nobody can fly manually, and the firmware takes pauses for silence
 CLIMB_SHARE = 0.5  # ratio of climb to horizontal speed; chosen: height is harder to see on a page
 YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
-SPEED_M_S = 1.5  # towards a waypoint; chosen: as the paper's formations
+SPEED_M_S = 1.5  # towards a waypoint; chosen: like the paper's formations
 NEAR_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one; chosen
-WAYPOINTS_MAX = 50  # number for one drone; chosen: more are no longer manual flight
+WAYPOINTS_MAX = 50  # number per drone; chosen: more would no longer be manual flight
 BRAKE_S = 1.0  # time in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
 ABOVE_START_M = 0.5  # horizontal distance from a start, near enough to land; chosen: the size of a hull
 OVER_STARTS_M = 0.5  # distance of a formation from the middle of its starts, near enough to land
-OVERRULED_M = 1.0  # increase of the goal's distance, from which a formation counts as sent elsewhere
+OVERRULED_M = 1.0  # increase of its goal's distance from which a formation counts as sent elsewhere
 MIDDLE = ("x_c", "y_c")  # variables of a formation that a return sets
 Point = tuple[float, float]  # x, y [m; W]
 
@@ -58,7 +58,7 @@ class Stick(NamedTuple):
     left: float
     up: float
     turn: float
-    speed_m_s: float  # at full deflection
+    speed_m_s: float  # horizontal speed at full deflection
 
 
 class DronePose(NamedTuple):
@@ -105,7 +105,7 @@ class FlightAnswer(NamedTuple):
     text: str = ""  # why the page does not fly it, or what it is doing
     over: bool = False  # whether the page may take it over from its commander
     commander: str = ""
-    id: str = ""  # of the page's request to take it
+    id: str = ""  # id of the page's request to take it
     goal: Vector | None = None  # its present destination [m; W]
     then: tuple[Vector, ...] = ()  # later destinations
 
@@ -170,7 +170,7 @@ class _Flight:
     modes: int  # number of modes requested of the drone before; a later one ends the flight
     begun_s: float  # when the page requested it
     seen_s: float  # when the page last sent something
-    id: str = ""  # of the page's request
+    id: str = ""  # id of the page's request
     owned_s: float | None = None  # when the world granted it; None before
     sent_s: float = 0.0  # when it was last commanded
     stick: Stick | None = None  # present deflection; None: hover, or fly to `waypoints_W`

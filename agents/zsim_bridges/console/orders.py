@@ -40,7 +40,7 @@ Task = Callable[[], None]
 REPEAT_S = 1.0  # wall; an order without an effect for this long is sent again: the world answers within a gate
 KEPT = 200  # number of settled orders that are remembered: three minutes at one click a second
 SHOWN_S = 20.0  # wall; how long pages show a settled order
-NAME_MAX = 64  # characters
+NAME_MAX = 64  # characters of an id or a name
 REASONS_MAX = 2  # number of targets of an order whose reasons are shown
 STALE_STAMP = "age is "  # start of the world's refusal of a stamp that is too old; the command is then stamped anew
 OrderState = Literal["sent", "confirmed", "refused", "replaced"]
@@ -64,7 +64,7 @@ STATES_DONE = {
     "emergency": frozenset({"emergency"}),
     "reset": frozenset({"landed"}),
 }
-REACHED_M, REACHED_RAD = 0.2, 0.05  # a variable is at its target; chosen: accuracy of the paper's formations
+REACHED_M, REACHED_RAD = 0.2, 0.05  # error of a variable at its target; chosen: about the accuracy in the paper
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
 
 
@@ -386,8 +386,8 @@ class _Order:
     op: Any
     subject: str
     targets: dict[str, _Target]  # by name
-    given_s: float  # wall
-    since_ns: int
+    given_s: float  # when it was given [s; wall]
+    since_ns: int  # when it was given [simulated]
     over_s: float | None = None  # when it was settled [s; wall]
     confirmed_ns: int | None = None
     refusal: str = ""

@@ -20,14 +20,14 @@ from zsim_bridges.console.camera_feed import CameraPicture, field_of_view
 from zsim_bridges.console.page_server import show_jpeg
 from zsim_bridges.console.picture import Array, DronePoses
 
-OFFSET_M = np.array([-2.3, -3.9, 1.7])  # from its target to a page's camera, unless that must be farther away
+OFFSET_M = np.array([-2.3, -3.9, 1.7])  # offset of a page's camera from its target, unless it must be farther away
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
 SLOPE_MIN = 0.05  # half width per distance on the narrowest page considered; a hidden page has no width
 REACH_M = 0.6  # radius of a drone with the name above it; chosen
 FAR_M = 15.0  # distance beyond which a drone is too small to count as in view; chosen: about 15 pixels
 MARGIN = 0.85  # share of half the page; points within it count as in view
 UP_W = np.array([0.0, 0.0, 1.0])
-DIRECTIONS = {  # from the target to the camera; not straight from above, where the up direction is undefined
+DIRECTIONS = {  # directions from the target to the camera; not straight from above, where the up direction is undefined
     "reset": OFFSET_M / DISTANCE_MIN_M,
     "top": np.array([0.0, -0.02, 1.0]),
     "side": np.array([0.0, -1.0, 0.06]),

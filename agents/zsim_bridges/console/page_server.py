@@ -68,7 +68,7 @@ CLIENT_HEADER = "X-Zsim-Client"  # key of a page, which maps to viser's number
 COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has its copies from a console that is exiting
 SECRET_HEADER = "X-Zsim-Console"  # demanded by viser's server
 ALL_ADDRESSES = ("0.0.0.0", "::")
-PAGES_MAX = 50  # open at once, counted separately for operators and viewers, so that viewers do not exclude operators
+PAGES_MAX = 50  # number open at once, counted separately for operators and viewers: viewers must not exclude operators
 HEARTBEAT_S = 20.0  # after which a page whose machine has gone is detected
 CLOSE_S = 0.3  # wall; used twice on exit: for requests in progress, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
@@ -166,13 +166,13 @@ class RunFiles:
 class ViserBackend(NamedTuple):
     """The services behind the HTTP server; sockets are served until they close."""
 
-    port: int  # of viser, on BACKEND_HOST
+    port: int  # viser's port on BACKEND_HOST
     secret: str  # demanded by viser in SECRET_HEADER
-    state: Callable[[], dict[str, Any]]  # what the console shows
-    permits: Callable[[bytes, str], bool]  # whether a message of a page in a role may reach viser
+    state: Callable[[], dict[str, Any]]  # returns what the console shows
+    permits: Callable[[bytes, str], bool]  # returns whether a page's message, in a role, may reach viser
     serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]  # a socket of pictures
     serve_actions: Callable[[web.Request, str], Awaitable[web.StreamResponse]]  # a socket of actions, in a role
-    head: Callable[[], dict[str, Any]]  # what the head of the page shows
+    head: Callable[[], dict[str, Any]]  # returns what the head of the page shows
     command: Callable[[OrderRequest], dict[str, Any]]  # takes an order; returns its progress
     files: RunFiles
     looked: Callable[[str, str, str], None]  # called with key, role and address of a page that is alive
@@ -363,9 +363,9 @@ class PageRequest(NamedTuple):
     """The fields of an HTTP request that identify its sender."""
 
     path: str
-    host: str  # in its Host header
+    host: str  # value of its Host header
     origin: str | None
-    token: str  # in its address; empty for none
+    token: str  # token in its URL; empty for none
     cookies: dict[str, str]
 
 
@@ -400,7 +400,7 @@ class PageTokens:
         role = VIEWER if request.path.startswith(VIEW_PATH) else OPERATOR
         try:
             if request.origin is not None and urlsplit(request.origin).netloc != request.host:
-                return None  # from a page of another server
+                return None  # the request comes from a page of another server
             if self._tokens[OPERATOR] is None:
                 return role if is_loopback_authority(request.host) else None
         except ValueError:

@@ -20,7 +20,7 @@ from zsim_bridges.console.run_monitor import RecordPlayer
 
 ACTION_MAX = 2_000  # bytes of an action
 NAME_MAX = 64  # characters of the name of a drone or camera, or of a page's key
-COORDINATE_MAX_M = 1e5  # on the plan view; the fence is much nearer
+COORDINATE_MAX_M = 1e5  # largest coordinate on the plan view; the fence is much nearer
 SPEED_MAX_M_S = 100.0  # speed of a stick; the drones' own limits are much lower
 PERIOD_S = 0.1  # wall; shortest time between two messages with pictures
 WANTED_MAX = 16  # number of pictures on one page

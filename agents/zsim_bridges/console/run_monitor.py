@@ -45,7 +45,7 @@ LAG_GROWN_MS = 40.0  # increase that is shown: two gates
 LIFE = ("alive", "dead")  # states of a process
 DEATH_AND_RETURN = 3  # number of states: alive, dead, alive
 WIND_GROWN_M_S = 0.3  # increase that is shown; chosen: above the rounding of the display
-BATTERY_S = 20.0  # simulated, for which a battery must have been seen before its remaining time is shown
+BATTERY_S = 20.0  # simulated; how long a battery must have been observed before its remaining time is shown
 BATTERY_POINTS_MAX = 120
 BATTERY_SPACING_S = 1.0  # simulated
 POLL_S = 0.25  # wall; clock messages of every gate would cost the world time
@@ -173,8 +173,8 @@ class FlightFigures(NamedTuple):
     roll_deg: float
     pitch_deg: float
     heading_deg: float  # 0 to 360
-    battery_left_s: float | None  # at the present drain; None while unknown
-    obstacle_m: float | None = None  # from its centre to the nearest obstacle or surface; None without any
+    battery_left_s: float | None  # time left at the present drain; None while unknown
+    obstacle_m: float | None = None  # distance from its centre to the nearest obstacle or surface; None without any
 
 
 class FlightMeter:
@@ -425,7 +425,7 @@ class TimeMonitor:
         """Return simulated time for a stamp, after a poll if it may be too old; takes at most 2 ANSWER_TIMEOUT_S."""
 
         def is_old() -> bool:
-            rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: 0 at the beginning of a run
+            rate = max(1.0, self.clock.rate) if self.clock else 1.0  # the measured rate is 0 at the beginning of a run
             return (self._wall_s() - self._known_s) * rate > self._stamp_age_s
 
         if is_old():

@@ -68,7 +68,7 @@ WIND_ABOVE_M = 1.5  # height of the arrow above the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; position of a name relative to its drone
 MIDDLE = "center-center"  # anchor of a label
 LABELS_MAX = 3  # figures of a formation: p, q and beta
-LUMINANCE_MIN = 0.12  # of a trail: contrast of 2.5 with the ground of the dark theme (WCAG 2.2)
+LUMINANCE_MIN = 0.12  # of a trail's colour: a contrast of 2.5 with the ground of the dark theme (WCAG 2.2)
 HIDDEN = (0.0, 0.0, -1000.0)  # m; position of hidden instances: viser cannot hide them one by one
 HALF_M = 150.0  # half a side of the ground
 FIELD_BELOW_M = 0.15  # depth of the field below the grid; a depth buffer cannot order closer surfaces
@@ -76,7 +76,7 @@ THICK_M = 0.02  # thickness of the field
 LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # colours of the field, the grid's cells and its sections
 DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
 CHOSEN = (25, 113, 194)
-ARM_M = 0.1785  # from the centre to a rotor's axis
+ARM_M = 0.1785  # distance from the centre to a rotor's axis
 ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
 RING = 1.31  # rotor radii, outer radius of a hull ring: half of the 0.515 m of the hull, less 0.126 m to its centre
 ROTOR_Z_M = 0.030  # height of the rotors above the centre of mass, as drawn
@@ -525,10 +525,10 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
         cross.append(_moved(beam, (x / 2, y / 2, 0.004), math.atan2(y, x)))
         cross += [_moved(motor, (x, y, ROTOR_Z_M / 2)), _moved(foot, (0.92 * x, 0.92 * y, -0.029))]
     ahead = trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0))
-    lens = cylinder(0.013, 0.03, sections=14)  # of the front camera
+    lens = cylinder(0.013, 0.03, sections=14)  # lens of the front camera
     lens.apply_transform(ahead)
     rings = [annulus(radius - 0.016, radius, 0.042, sections=28) for _ in hubs]  # foam of the indoor hull
-    body = capsule(height=0.19, radius=0.045, count=[14, 14])  # with the battery, from nose to tail
+    body = capsule(height=0.19, radius=0.045, count=[14, 14])  # body with the battery, from nose to tail
     body.apply_transform(ahead)
     body.apply_scale((1.0, 1.0, 0.72))
     nose = icosphere(subdivisions=2, radius=0.042)
@@ -543,7 +543,7 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
     }
     for solid in (solid for of_one in solids.values() for solid in of_one):
         solid.apply_scale(shape.size)
-    hats = Hats()  # by which drones detect each other, in the size that the cameras assume
+    hats = Hats()  # drones detect each other by their hats, whose size cameras assume
     return {**solids, "hat": [_moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)]}
 
 

@@ -1,1 +1,1 @@
-"""FMUs as agents: controllers, estimators and formations from Simulink, Modelica and others, by FMPy; docs/fmu.md."""
+"""FMUs as agents: controllers of drones and formations, and estimators, from Simulink, Modelica and others, by FMPy."""

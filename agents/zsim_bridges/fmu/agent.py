@@ -1,7 +1,7 @@
 """An FMU as an agent: inputs from the messages of a gate, one communication step, outputs as commands or an estimate.
 
-At a gate t the FMU receives the newest values of its inputs, steps from t to t + period, and its outputs are then
-published with the stamp t, as the answer of any agent to that gate.
+At gate t the FMU receives the newest values of its inputs and steps from t to t + period; its outputs are then
+published with the stamp t, like any agent's answer to that gate.
 """
 
 import math
@@ -27,7 +27,7 @@ from zsim_bridges.fmu.model import FmuInstance, FmuModel, Inputs, Variable
 Frame = Literal["heading", "world"]
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 COVARIANCE = tuple(float(i == j) for i in range(6) for j in range(6))
-# Fields that an FMU need not give, by message. What it gives of a vector may be some of its numbers: the others are 0.
+# Defaults of fields that an FMU may omit, by message. If it provides only some elements of a vector, the others are 0.
 DEFAULTS: dict[str, dict[str, Any]] = {
     "velocity": {"velocity_m_s": (0.0, 0.0, 0.0), "yaw_rate_rad_s": 0.0},
     "attitude": {"orientation_wxyz": LEVEL, "yaw_rate_rad_s": 0.0},
@@ -48,14 +48,14 @@ class Fmu:
     """An FMU for a flight: `zsim.run("step.yaml", agents=[zsim.Fmu("controller.fmu", "drone1", {...})])`.
 
     Args:
-        path: of the file, FMI 2 or 3 for co-simulation.
-        drone: whose places need no name before them; None where all name theirs.
+        path: path of the file, FMI 2 or 3 for co-simulation.
+        drone: drone to which places without a name refer; None if all places have names.
         map: places by variable, `{"vx": "velocity_m_s.0"}`, or texts `vx=velocity_m_s.0`; see docs/fmu.md.
-        name: of the process (default `fmu.` and the drone, or `fmu.main`); that of a stock agent takes its place.
-        period_s: communication step [s], a multiple of the gate; default what the FMU suggests, or the gate.
+        name: name of the process (default `fmu.` and the drone, or `fmu.main`); that of a stock agent replaces it.
+        period_s: communication step [s], a multiple of the gate; default: the one that the FMU suggests, or the gate.
         param: start values of parameters and inputs, by variable.
-        takeoff_s: when the drones that it commands take off [s]; None if others command that.
-        frame: of velocity commands.
+        takeoff_s: simulated time at which the drones that it commands take off [s]; None if others command this.
+        frame: frame of velocity commands.
         log: whether to print the whole log of the FMU, not only warnings and errors.
         say: receives lines about the FMU; by default they go to standard error.
     """
@@ -110,7 +110,7 @@ class FmuAgent(Agent):
         mapping = mapping_of(model, of.map, info, of.drone, lambda cluster: formation(cluster).names)
         if not mapping.outputs:
             known = ", ".join(each.name for each in model.variables.values() if each.causality == "output") or "none"
-            raise RunError(f"{of.path}: none of its outputs is mapped; must map one of {known}")
+            raise RunError(f"{of.path}: maps no output; must map at least one of {known}")
         self._inputs = mapping.inputs
         self._formations = {
             key: formation(keys.thing(key))
@@ -122,14 +122,14 @@ class FmuAgent(Agent):
         self._commanded = sorted({drone for writer in self._writers for drone in writer.commanded})
         self._takeoff_ns = None if of.takeoff_s is None else round(of.takeoff_s * 1e9)
         self._latest: dict[str, Any] = {}
-        self._states: dict[str, Any] = {}  # of the drones that it commands
-        self._raised: set[str] = set()  # flags of modes that were up at the last step
+        self._states: dict[str, Any] = {}  # states of firmwares, by drone
+        self._raised: set[str] = set()  # modes whose outputs were true at the last step
         self._has_started = False
         self._declare_keys(info)
         for line in mapping.notes:
             self._say(f"{self.name}: {of.path.name}: {line}")
         if not model.restores:
-            self._say(f"{self.name}: {of.path.name} cannot give its state: started again, it begins afresh")
+            self._say(f"{self.name}: {of.path.name} cannot save its state; a restart begins anew")
         self._unit = FmuInstance(model, self.name, lambda line: self._say(f"{self.name}: {line}"), of.log)
         self._unit.write([_parameter(model, name, value) for name, value in of.param.items()])
 
@@ -179,7 +179,7 @@ class FmuAgent(Agent):
         return outputs
 
     def _values(self) -> Inputs:
-        """Return the inputs of which there has been a message; the others keep their start values."""
+        """Return the inputs whose messages have arrived; the others keep their start values."""
         values = []
         for link in self._inputs:
             place = link.place
@@ -202,7 +202,7 @@ class FmuAgent(Agent):
         return Output(key, Mode(t_ns, self.next_seq(key), self.source, mode))
 
     def motion(self, t_ns: int, formation: Formation, c_dot: Sequence[float]) -> list[Output]:
-        """Return the velocity commands of the drones of a formation that are in the air."""
+        """Return velocity commands, for rates c_dot (4n,), to those drones of a formation that accept setpoints."""
         outputs = []
         for drone, command in zip(formation.drones, formation.velocities(self._latest, c_dot), strict=False):
             if self.takes_setpoints(drone):
@@ -213,11 +213,11 @@ class FmuAgent(Agent):
     def takes_setpoints(self, drone: str) -> bool:
         return state_refusal(drone, self._states.get(drone, "landed"), "setpoint") is None
 
-    def rises(self, flag: str, is_up: bool) -> bool:
-        """Tell whether a flag has gone up since the last step."""
-        was_up = flag in self._raised
-        (self._raised.add if is_up else self._raised.discard)(flag)
-        return is_up and not was_up
+    def rises(self, flag: str, is_set: bool) -> bool:
+        """Return whether a flag has become true since the last step."""
+        was_set = flag in self._raised
+        (self._raised.add if is_set else self._raised.discard)(flag)
+        return is_set and not was_set
 
     def snapshot(self) -> State | None:
         if not self._model.restores or not self._has_started:
@@ -239,7 +239,7 @@ class FmuAgent(Agent):
 
 
 class _Writer:
-    """Makes the messages of one key from outputs of the FMU."""
+    """Builds the messages of one key from outputs of the FMU."""
 
     def __init__(self, key: str, links: Sequence[MappedVariable], frame: Frame) -> None:
         self.key, self.links = key, links
@@ -251,7 +251,7 @@ class _Writer:
         self._fields = {**DEFAULTS.get(leaf, {}), **fields}
         self._is_mode = self._kind is Mode
         mapped = {link.place.field for link in links}
-        self._yaw_from, self._level_from = "orientation_wxyz" in mapped, "yaw_rad" in mapped
+        self._has_attitude, self._has_yaw = "orientation_wxyz" in mapped, "yaw_rad" in mapped
         if not self._is_mode:
             self._check_complete(leaf)
 
@@ -275,34 +275,34 @@ class _Writer:
         fields: dict[str, Any] = dict(self._fields)
         for link, own in zip(self.links, values, strict=True):
             place, given = link.place, link.converted(list(own))
-            if place.kind == "flag":
+            if place.kind == "boolean":
                 given = [value > 0 for value in given]
             elif place.kind == "number":
                 given = [float(value) for value in given]
             if place.indices is None:
                 fields[place.field] = given[0]
                 continue
-            held = list(fields.get(place.field, ()))
-            held += [0.0] * (max(place.indices) + 1 - len(held))
+            elements = list(fields.get(place.field, ()))
+            elements += [0.0] * (max(place.indices) + 1 - len(elements))
             for index, value in zip(place.indices, given, strict=True):
-                held[index] = value
-            fields[place.field] = tuple(held)
+                elements[index] = value
+            fields[place.field] = tuple(elements)
         if self._kind is Estimate:
             self._complete_attitude(fields)
         return [Output(self.key, self._kind(t_ns=t_ns, seq=agent.next_seq(self.key), source=agent.source, **fields))]
 
     def _complete_attitude(self, fields: dict[str, Any]) -> None:
-        """Set the heading of an estimate where the FMU gives the attitude only, or the attitude by the heading."""
-        if self._level_from and not self._yaw_from:
+        """Derive the heading from the attitude, or a level attitude from the heading, if only one is mapped."""
+        if self._has_yaw and not self._has_attitude:
             half = fields["yaw_rad"] / 2
             fields["orientation_wxyz"] = (el.cos(half), 0.0, 0.0, el.sin(half))
-        elif self._yaw_from and not self._level_from:
+        elif self._has_attitude and not self._has_yaw:
             w, x, y, z = fields["orientation_wxyz"]
             fields["yaw_rad"] = el.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 class _FormationWriter:
-    """Makes the velocity commands of a formation of what the FMU gives of c_dot; what it does not give is 0."""
+    """Builds the velocity commands of a formation from c_dot; elements that the FMU does not provide are 0."""
 
     def __init__(self, key: str, links: Sequence[MappedVariable], formation: Formation) -> None:
         self.key, self.links, self.commanded = key, links, formation.drones
@@ -329,11 +329,11 @@ def _writers(
 
 
 def _period_ns(model: FmuModel, period_s: float | None, info: Info) -> int:
-    """Return the communication step [ns]; RunError if it is no multiple of the gate, or not what the FMU takes."""
+    """Return the communication step [ns]; raise a RunError if the FMU refuses it, or it is no multiple of the gate."""
     gate_s = info.gate_ns / 1e9
     wanted_s = period_s if period_s is not None else model.step_s
     if model.is_step_fixed and period_s is not None and not math.isclose(period_s, model.step_s or 0.0):
-        raise RunError(f"--period is {period_s:g} s; {model.path} takes {model.step_s:g} s only, by its description")
+        raise RunError(f"--period is {period_s:g} s; {model.path} accepts only {model.step_s:g} s, by its description")
     if wanted_s is None:
         return info.gate_ns
     gates = round(wanted_s / gate_s)
@@ -358,17 +358,17 @@ def _parameter(model: FmuModel, name: str, value: Any) -> tuple[Variable, list[A
     try:
         return variable, [_typed(each, variable) for each in values]
     except ValueError:
-        raise RunError(f"--param {name} is {value!r}; must be a {variable.kind}, as {variable.type} is") from None
+        raise RunError(f"--param {name} is {value!r}; must be a value of {variable.type} ({variable.kind})") from None
 
 
 def _typed(value: Any, variable: Variable) -> Any:
     if variable.kind == "text":
         return str(value)
-    if variable.kind == "flag":
+    if variable.kind == "boolean":
         if str(value).lower() not in ("true", "false", "1", "0"):
             raise ValueError
         return str(value).lower() in ("true", "1")
-    return int(value) if variable.kind == "whole" else float(value)
+    return int(value) if variable.kind == "integer" else float(value)
 
 
 def _print(line: str) -> None:

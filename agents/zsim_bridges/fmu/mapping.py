@@ -1,11 +1,11 @@
-"""Which variable of an FMU stands for which field of a message: `vx=velocity_m_s.0`, read and checked.
+"""The mapping between variables of an FMU and fields of messages: texts such as `vx=velocity_m_s.0`, parsed, checked.
 
     NAME = [WHOSE/] [MESSAGE.] FIELD [.INDEX]
 
-WHOSE is a drone or a cluster (by default the drone that the FMU is for), or a key up to its last `/`. MESSAGE is the
-last part of a key: `estimate`, `truth`, a sensor, `state` of a cluster; for what the FMU gives `velocity`, `attitude`,
-`rotors`, `ardrone`, `mode`, `estimate`. Without it, an input is of the drone's estimate, and an output of its velocity
-command. `main/c` is c of the cluster `main` by the estimates, and `main/c_dot` the rates at which it is to move.
+WHOSE is a drone or a cluster (by default the FMU's drone), or a key up to its last `/`. MESSAGE is the last part of a
+key: for inputs `estimate`, `truth`, a sensor, or `state` of a cluster; for outputs `velocity`, `attitude`, `rotors`,
+`ardrone`, `mode`, `estimate`. Without it, an input belongs to the drone's estimate, an output to its velocity command.
+`main/c` is the estimated c of the cluster `main`, and `main/c_dot` its commanded rates.
 """
 
 import math
@@ -27,10 +27,10 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.fmu.model import FmuModel, Kind, Unit, Variable
 
 MODES = ("takeoff", "land", "emergency", "reset")
-NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster's state, one number for each of its variables
-FORMATION = {"c": False, "c_dot": True}  # of a cluster, and no messages; whether an FMU gives them
-OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # that no FMU gives: the process fills them in
-# What a field is in, by the end of its name: unit, exponents as BASE_UNITS, and what one is in SI units
+NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster's state with one number for each of its variables
+FORMATION = {"c": False, "c_dot": True}  # quantities of a cluster without a message; True for outputs of an FMU
+OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # fields that the process fills in
+# Units of fields by the suffixes of their names: name, exponents of BASE_UNITS, factor to SI units
 RAD, PER_S = (0, 0, 0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0, 0, 1)
 UNITS = {
     "_rad_s": Unit("rad/s", PER_S),
@@ -44,22 +44,22 @@ UNITS = {
     "_ut": Unit("uT", (1, 0, -2, -1, 0, 0, 0, 0), 1e-6),
     "_ns": Unit("ns", (0, 0, 1, 0, 0, 0, 0, 0), 1e-9),
 }
-# What an FMU's variables of a kind may stand for
+# Kinds of values that a receiver of each kind accepts
 TAKES: dict[Kind, tuple[Kind, ...]] = {
-    "number": ("number", "whole", "flag"),
-    "whole": ("whole", "flag"),
-    "flag": ("flag",),
+    "number": ("number", "integer", "boolean"),
+    "integer": ("integer", "boolean"),
+    "boolean": ("boolean",),
     "text": ("text",),
 }
 
 
 class Place(NamedTuple):
-    """A field of the messages on a key, or some of its numbers."""
+    """A field of the messages on a key, or some of its elements."""
 
     text: str  # as the user wrote it
     key: str
     field: str
-    indices: tuple[int, ...] | None  # None for a field that is one value
+    indices: tuple[int, ...] | None  # indices of its elements; None for a field with a single value
     kind: Kind
 
     @property
@@ -71,7 +71,7 @@ class Place(NamedTuple):
         return next((unit for end, unit in UNITS.items() if self.field.endswith(end)), None)
 
     def read(self, message: Any) -> list[Any] | None:
-        """Return its values in a message, None where the message leaves them out."""
+        """Return its values in a message, None if the message omits them."""
         value = getattr(message, self.field)
         if value is None:
             return None
@@ -79,21 +79,21 @@ class Place(NamedTuple):
 
 
 class MappedVariable(NamedTuple):
-    """A variable and its place; `to_unit` converts what the sender gives to the receiver's unit, None for no change."""
+    """A variable and its place; `to_unit` converts from the sender's to the receiver's unit, None: no conversion."""
 
     variable: Variable
     place: Place
     to_unit: Callable[[float], float] | None
 
     def converted(self, values: list[Any]) -> list[Any]:
-        """Return values in the receiver's unit and type: numbers for a number."""
+        """Return values in the receiver's unit."""
         if self.to_unit is not None:
             return [self.to_unit(value) for value in values]
         return values
 
 
 class FmuMapping(NamedTuple):
-    """The inputs and outputs of an FMU, and lines about differing units."""
+    """The mapped inputs and outputs of an FMU, and lines about differing units."""
 
     inputs: list[MappedVariable]
     outputs: list[MappedVariable]
@@ -103,14 +103,14 @@ class FmuMapping(NamedTuple):
 def mapping_of(
     model: FmuModel, texts: Sequence[str], info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]
 ) -> FmuMapping:
-    """Return what texts `NAME=PLACE` mean.
+    """Return the mapping that texts `NAME=PLACE` describe.
 
     Args:
-        drone: whose places need no WHOSE; None for none.
-        cluster_names: returns the variables of a cluster.
+        drone: drone to which places without WHOSE refer; None: all places need it.
+        cluster_names: returns the names of a cluster's variables.
 
     Raises:
-        RunError: with the text that cannot be used, what was found, and what is allowed.
+        RunError: a text is invalid; the error has the text, what was found, and what is allowed.
     """
     found = FmuMapping([], [], [])
     places = _Places(info, drone, cluster_names)
@@ -120,16 +120,16 @@ def mapping_of(
             raise RunError(f"--map is {text!r}; must be NAME=PLACE, such as vx=velocity_m_s.0")
         variable = model.variable(name)
         if variable.causality not in ("input", "output"):
-            hint = "; give a value of its own with --param" if variable.causality == "parameter" else ""
+            hint = "; set it with --param" if variable.causality == "parameter" else ""
             raise RunError(f"--map {text}: {name} is a {variable.causality}; must be an input or an output{hint}")
         is_output = variable.causality == "output"
         place = places.parse(where, is_output, f"--map {text}")
         if place.size != variable.size:
-            raise RunError(f"--map {text}: {name} has {variable.size} values and {where} {place.size}; must be as many")
+            raise RunError(f"--map {text}: {name} has {variable.size} values, {where} has {place.size}; must be equal")
         gives, takes = (variable.kind, place.kind) if is_output else (place.kind, variable.kind)
-        if gives not in TAKES[takes] and not (is_output and takes == "flag" and gives != "text"):
+        if gives not in TAKES[takes] and not (is_output and takes == "boolean" and gives != "text"):
             raise RunError(
-                f"--map {text}: {name} is {variable.type} and {where} a {place.kind}; a {gives} is no {takes}"
+                f"--map {text}: {name} is {variable.type}, {where} is {place.kind}; {gives} cannot become {takes}"
             )
         convert, note = _conversion(variable, place, is_output)
         if note:
@@ -140,21 +140,25 @@ def mapping_of(
 
 
 def _check_once(found: FmuMapping) -> None:
-    taken: dict[tuple[str, str, int | None], str] = {}
+    mapped: dict[tuple[str, str, int | None], str] = {}
     for variable, place, _ in found.outputs:
         for index in place.indices or (None,):
-            spot = (place.key, place.field, index)
-            if spot in taken:
-                raise RunError(f"--map {variable.name}={place.text}: {taken[spot]} gives that already; must be one")
-            taken[spot] = variable.name
-    fed: set[str] = set()
+            target = (place.key, place.field, index)
+            if target in mapped:
+                raise RunError(
+                    f"--map {variable.name}={place.text}: {mapped[target]} is mapped there already; must be one"
+                )
+            mapped[target] = variable.name
+    inputs: set[str] = set()
     for variable, place, _ in found.inputs:
-        if variable.name in fed:
-            raise RunError(f"--map {variable.name}={place.text}: {variable.name} is fed twice; must be fed once")
-        fed.add(variable.name)
+        if variable.name in inputs:
+            raise RunError(f"--map {variable.name}={place.text}: {variable.name} is mapped twice; must be mapped once")
+        inputs.add(variable.name)
 
 
 class _Places:
+    """Parses places in a run."""
+
     def __init__(self, info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]) -> None:
         self._drones = {each.name: each for each in info.drones}
         self._clusters = {each.name: each for each in info.clusters}
@@ -173,7 +177,7 @@ class _Places:
             drone = whose or self._drone
             if drone is None:
                 known = ", ".join([*self._drones, *self._clusters])
-                raise RunError(f"{where}: names no drone, and there is no --drone; must begin with one of {known}")
+                raise RunError(f"{where}: names no drone, and --drone is not given; must begin with one of {known}")
             found = self._drone_key(drone, first, is_output)
             if found is None:
                 path.insert(0, first)
@@ -199,8 +203,8 @@ class _Places:
         name, *rest = path or [""]
         if kind is flight_messages.Mode and is_output:
             if name not in MODES or rest:
-                raise RunError(f"{where}: mode is {name!r}; must be one of {', '.join(MODES)}, which a flag asks for")
-            return Place(text, key, name, None, "flag")
+                raise RunError(f"{where}: mode is {name!r}; must be one of {', '.join(MODES)}")
+            return Place(text, key, name, None, "boolean")
         kinds = {each.name: each.type for each in _fields(kind) if not is_output or each.name not in OWN_FIELDS}
         if name not in kinds:
             hint = suggestion(name, kinds)
@@ -212,25 +216,25 @@ class _Places:
         value = _kind(described)
         if value is not None:
             if rest:
-                raise RunError(f"{where}: {name} is one value; has no {'.'.join(rest)}")
+                raise RunError(f"{where}: {name} is a single value; has no element {'.'.join(rest)}")
             return Place(text, key, name, None, value)
         element, names = self._elements(key, name, described)
         if element is None:
-            raise RunError(f"{where}: {name} of {key} holds neither numbers nor flags nor texts; map another field")
+            raise RunError(f"{where}: {name} of {key} has no fixed set of values; map another field")
         return self._elements_at(text, key, name, rest, element, names, where)
 
     def _elements_at(
         self, text: str, key: str, field: str, rest: list[str], kind: Kind, names: Sequence[str], where: str
     ) -> Place:
-        """Return the place of all elements of a field, or of the one that is named or numbered."""
+        """Return the place of all elements of a field, or of the one with this name or number."""
         if not rest:
             return Place(text, key, field, tuple(range(len(names))), kind)
-        wanted = ".".join(rest)  # variables of a group have a dot in their names
+        wanted = ".".join(rest)  # names of variables of a group contain a dot
         index = next((i for i, each in enumerate(names) if wanted in (each, str(i))), None)
         if index is None:
             hint = suggestion(wanted, names) if names[0] != "0" else ""
             allowed = f"0 to {len(names) - 1}" if names[0] == "0" else f"one of {', '.join(names)}"
-            raise RunError(f"{where}: {wanted!r} is no part of {field}; {hint}must be {allowed}")
+            raise RunError(f"{where}: {wanted!r} is not an element of {field}; {hint}must be {allowed}")
         return Place(text, key, field, (index,), kind)
 
     def _message(self, key: str, is_output: bool, where: str) -> type[Struct]:
@@ -242,14 +246,14 @@ class _Places:
                 raise RunError(f"{where}: {error}") from error
             if kind not in (*messages.COMMANDS, flight_messages.Estimate):
                 allowed = ", ".join([*map(keys.leaf, messages.COMMANDS.values()), "estimate"])
-                raise RunError(f"{where}: an FMU gives no {kind.__name__}; must be one of {allowed}")
+                raise RunError(f"{where}: {kind.__name__} cannot be an output of an FMU; must be one of {allowed}")
         if kind is None:
-            hint = "an input is of an estimate, truth, a sensor, or the state of a cluster"
-            raise RunError(f"{where}: {key} is no key of the contract; {hint}; see docs/protocol.md")
+            hint = "must be an estimate, truth, a sensor, or the state of a cluster"
+            raise RunError(f"{where}: {key} is not a key of the contract; {hint}; see docs/protocol.md")
         return kind
 
     def _elements(self, key: str, field: str, described: Any) -> tuple[Kind | None, Sequence[str]]:
-        """Return the kind of the elements of a field, and by which names they are known."""
+        """Return the kind of a field's elements and their names; None if it has no fixed number of such elements."""
         _, thing, _ = keys.parts(key)
         if isinstance(described, msgspec.inspect.TupleType):
             kinds: set[Kind | None] = {_kind(each) for each in described.item_types}
@@ -280,25 +284,25 @@ def _kind(described: Any) -> Kind | None:
     if isinstance(described, msgspec.inspect.FloatType):
         return "number"
     if isinstance(described, msgspec.inspect.IntType):
-        return "whole"
+        return "integer"
     if isinstance(described, msgspec.inspect.BoolType):
-        return "flag"
+        return "boolean"
     if isinstance(described, msgspec.inspect.StrType | msgspec.inspect.LiteralType):
         return "text"
     return None
 
 
 def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Callable[[float], float] | None, str]:
-    """Return what converts values on their way, None for none; and a line where units differ or cannot be compared."""
+    """Return the conversion of values (None: none), and a line if units differ or cannot be compared (or empty)."""
     theirs, ours = variable.unit, place.unit
     if theirs is None or ours is None or theirs.name == ours.name or place.kind != "number":
         return None, ""
     found = f"{variable.name} is in {theirs.name}, {place.field} in {ours.name}"
     if theirs.exponents is None:
-        return None, f"{found}, which is not compared: the FMU does not say what its unit is; values are as they are"
+        return None, f"{found}, not compared, since the FMU does not define its unit; values are passed unchanged"
     assert ours.exponents is not None
-    if theirs.exponents[:-1] != ours.exponents[:-1]:  # many tools leave out rad
-        return None, f"{found}, which is another quantity; values are as they are"
+    if theirs.exponents[:-1] != ours.exponents[:-1]:  # many tools omit rad
+        return None, f"{found}, a different quantity; values are passed unchanged"
     if (theirs.factor, theirs.offset) == (ours.factor, ours.offset):
         return None, ""
     own, factor, offset = ours.factor, theirs.factor, theirs.offset
@@ -308,13 +312,13 @@ def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Call
 
 
 class Formation:
-    """A formation as an FMU sees it: cluster variables of the estimates, and velocities for rates of these variables.
+    """A formation for an FMU: cluster variables from the estimates, and velocities from rates of these variables.
 
-    So an FMU may be a cluster space controller that knows nothing of kinematics: c in, c_dot out.
+    An FMU can thus be a cluster space controller without kinematics: c in, c_dot out.
 
     Attributes:
-        drones: in the order of its robots.
-        names: of its variables, in the order of c.
+        drones: its drones, in the order of its robots.
+        names: names of its variables, in the order of c.
     """
 
     def __init__(self, scenario: Scenario, cluster: str) -> None:
@@ -328,7 +332,7 @@ class Formation:
         self._estimates = [keys.estimate(drone) for drone in self.drones]
 
     def c(self, latest: Mapping[str, Any]) -> list[float] | None:
-        """Return c (4n,) of the newest messages; None before there are all estimates, or where it is singular."""
+        """Return c (4n,) from the newest estimates; None if one is missing, or the formation is singular."""
         estimates = [latest.get(key) for key in self._estimates]
         if None in estimates:
             return None
@@ -340,10 +344,10 @@ class Formation:
             return None
 
     def velocities(self, latest: Mapping[str, Any], c_dot: Sequence[float]) -> list[Velocity]:
-        """Return the commands of the drones in W [m/s, rad/s] for rates c_dot (4n,); none before there is a c.
+        """Return the drones' velocity commands in W [m/s, rad/s] for rates c_dot (4n,); empty if c is None.
 
         Raises:
-            UserCodeError: the formation has no such motion.
+            UserCodeError: the formation is singular for this motion.
         """
         c = self.c(latest)
         if c is None:

@@ -20,12 +20,16 @@ from zsim.errors import DecodeError, ZsimError
 from zsim.runtime.rate_limit import RateLimit
 from zsim.transport.session import RawSample
 
-COUNTED_KEYS = (keys.command("*", "*"), keys.estimate("*"), keys.cluster_state("*"))  # contract: `sent` of a done
+COUNTED_KEYS = (
+    keys.command("*", "*"),
+    keys.estimate("*"),
+    keys.cluster_state("*"),
+)  # contract: counted in `sent` of a done
 CAMERA_KEYS = (keys.camera("*", "*"), keys.camera_info("*", "*"), keys.detections("*"))
 """Keys of clients' own cameras, renderers and detectors."""
 CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"), *CAMERA_KEYS)
 """Keys of the contract on which clients publish."""
-CONTROL_KEYS = (keys.CONTROL, keys.cluster_control("*"), keys.drone_control("*"))  # requests go there
+CONTROL_KEYS = (keys.CONTROL, keys.cluster_control("*"), keys.drone_control("*"))  # keys that accept requests
 RESERVED_KEYS = (
     "world/**",
     keys.CLOCK,
@@ -41,11 +45,11 @@ RESERVED_KEYS = (
     keys.drone_request("*"),
     keys.reference("*"),
 )
-"""Keys on which only the world, or a process in its own name, publishes: a client's message would impersonate them.
+"""Keys on which only the world, or a process in its own name, publishes; a client's message would impersonate it.
 
-A driver is armed by operators on Zenoh only.
+Drivers can be armed only over Zenoh, by operators.
 """
-CACHED_VALUES = 256  # values; a value sent to many clients is encoded once
+CACHED_VALUES = 256  # number of values; one that is sent to many clients is encoded once
 INTEGER_MAX = 2.0**63  # a double of this size or more does not fit a 64-bit integer
 JSON = ("application/json", "text/json", "text/json5")
 TEXT = ("text/plain", "zenoh/string")
@@ -80,14 +84,14 @@ def count_request(limit: RateLimit, address: str = "") -> None:
 
 
 class ClientLimit:
-    """Bounds the number of clients at a time."""
+    """Bounds the number of concurrent clients."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._count = 0
 
     def enter(self) -> None:
-        """Count one more, or raise a TooManyError."""
+        """Count one more client, or raise a TooManyError."""
         if self._count >= self._limit:
             raise TooManyError(f"there are {self._limit} clients already; try again later")
         self._count += 1
@@ -105,12 +109,12 @@ def is_counted_key(key: str) -> bool:
 
 
 def is_client_key(key: str) -> bool:
-    """Return whether a key is one of the contract's on which clients publish."""
+    """Return whether a key of the contract is one on which clients publish."""
     return _matches_any(CLIENT_KEYS, key)
 
 
 def is_control_key(key: str) -> bool:
-    """Return whether requests go to a key."""
+    """Return whether a key accepts requests."""
     return _matches_any(CONTROL_KEYS, key)
 
 
@@ -129,7 +133,7 @@ def check_not_reserved(key: str) -> None:
         raise DecodeError(f"{key[:80]!r}: is not a key; must be names separated by /")
     if is_reserved(key):
         raise ForbiddenError(
-            f"{key[:80]}: only the process that this is about writes here; a client may write on "
+            f"{key[:80]}: only the world or the process of that name writes here; a client may write on "
             f"{', '.join(CLIENT_KEYS).replace('*', '…')} and keys of its own"
         )
 
@@ -142,7 +146,7 @@ class MessageDefaults:
         self._next_seq: Counter[str] = Counter()
 
     def fill(self, key: str, value: Any, now_ns: int) -> Any:
-        """Return plain data with `t_ns` (of the newest gate), `seq` and `source` added where its message has them."""
+        """Return plain data with `t_ns` (of the newest gate), `seq` and `source` added if its message has them."""
         kind = messages.type_of(key)
         if kind is None or not isinstance(value, dict):
             return value
@@ -167,7 +171,7 @@ class MessageDefaults:
 
 
 def is_sound(key: str, payload: bytes) -> bool:
-    """Return whether a payload is the message that the contract defines for its key; on other keys any payload is."""
+    """Return whether a payload is the message of the contract for its key; any payload is valid on other keys."""
     try:
         return messages.type_of(key) is None or messages.decode(key, payload) is not None
     except DecodeError:
@@ -177,11 +181,11 @@ def is_sound(key: str, payload: bytes) -> bool:
 def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
     """Return a payload as JSON.
 
-    A message of the contract has all of its fields; JSON, text and msgpack on other keys give their value, bytes
-    within as base64; anything else as base64 of the whole. `encoding` is Zenoh's, where it is known.
+    A message of the contract has all of its fields. On other keys, JSON, text and msgpack are converted to values, in
+    which bytes become base64; any other payload becomes base64. `encoding` is Zenoh's, if known.
 
     Raises:
-        DecodeError: it is not the message that the contract defines for its key.
+        DecodeError: the payload is not the message of the contract for its key.
     """
     if messages.type_of(key) is not None:
         return _to_json(messages.decode(key, payload))
@@ -214,7 +218,7 @@ def json_to_payload(key: str, value: Any) -> bytes:
     An integer field also accepts 20000000.0, as written by languages that have only doubles.
 
     Raises:
-        DecodeError: with key, field, value and what is allowed; a key outside the contract accepts anything.
+        DecodeError: it is not the message of the key; a key outside the contract accepts anything.
     """
     if messages.type_of(key) is None:
         return _pack(key, value)
@@ -238,7 +242,7 @@ def _pack(key: str, value: Any) -> bytes:
     try:
         return msgspec.msgpack.encode(value)
     except REFUSALS as error:
-        raise DecodeError(f"{key:.80}: {error}; must be JSON of numbers of 64 bits") from error
+        raise DecodeError(f"{key:.80}: {error}; must be JSON with numbers of 64 bits") from error
 
 
 def _with_integers(value: Any) -> Any:
@@ -277,7 +281,7 @@ class StreamRequest(Struct, tag_field="op", forbid_unknown_fields=True, kw_only=
 
 
 class HelloRequest(StreamRequest, tag="hello"):
-    """The client's name, and the token where one is needed. The answer describes the run."""
+    """The client's name, and the token if one is needed. The answer describes the run."""
 
     name: str = ""
     token: str = ""
@@ -321,8 +325,8 @@ class AskRequest(StreamRequest, tag="ask"):
 class JoinRequest(StreamRequest, tag="join"):
     """Take part in the lockstep: a `gate` is sent every `period_s`, and time waits for its `done`.
 
-    `reads` are the key expressions whose messages are sent with each gate; `gates` the keys that close one, of which a
-    message arrives at every gate; by default the status of the drones that are read.
+    `reads` are the key expressions whose messages are sent with each gate. `gates` are the keys whose messages complete
+    a gate, one each; by default those keys with a message at every gate that `reads` match.
     """
 
     name: str
@@ -356,7 +360,7 @@ _REQUESTS = (
     LeaveRequest,
 )  # fmt: skip
 _OPS = ", ".join(str(kind.__struct_config__.tag) for kind in _REQUESTS)
-_decode = msgspec.json.Decoder(Union[_REQUESTS]).decode  # noqa: UP007 -- of a tuple
+_decode = msgspec.json.Decoder(Union[_REQUESTS]).decode  # noqa: UP007 -- a union of a tuple
 
 
 def decode_request(line: bytes) -> StreamRequest:

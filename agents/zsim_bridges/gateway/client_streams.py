@@ -21,11 +21,11 @@ from zsim_bridges.gateway.run_access import SharedSubscriptions
 
 OUTBOX_BYTES_MAX = 4_000_000  # about 20 s of a drone's sensors as JSON
 FLUSH_S = 2.0  # time limit for sending the rest to a client that closes its connection
-LINES_PER_TURN = 100  # consecutive lines of one client before other tasks of the loop run
+LINES_PER_TURN = 100  # number of consecutive lines of one client before other tasks of the loop run
 LINE_MAX = 1_000_000  # bytes of a request
-HEARTBEAT_S = 20.0  # wall time after which a WebSocket without a client is detected
-ALIVE_S = 10.0  # wall time after which an idle stream sends a sign of life, to detect a client that is gone
-LINGER_S = 10.0  # wall time that a camera's subscription outlives its last client, since some request single pictures
+HEARTBEAT_S = 20.0  # wall; after which a WebSocket whose client is gone is detected
+ALIVE_S = 10.0  # wall; after which an idle stream sends a sign of life, to detect a client that is gone
+LINGER_S = 10.0  # wall; how long a camera's subscription outlives its last client, since some request single pictures
 BOUNDARY = "zsim-picture"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "Access-Control-Allow-Origin": "*"}
 _SOCKET_OPTIONS = (
@@ -113,7 +113,7 @@ async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], c
         reading: ends with the client's last request.
         sending: ends when nothing remains to be sent.
         finish: ends the client, so that sending ends.
-        cut: ends the connection at once, for a client that does not receive the rest.
+        cut: ends the connection at once if the client does not receive the rest.
     """
     reader, sender = asyncio.create_task(reading), asyncio.create_task(sending)
     try:
@@ -139,7 +139,7 @@ def _lost_line(lost: int) -> bytes:
 async def serve_lines(
     new_client: ClientFactory, authenticated: bool, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
 ) -> None:
-    """Serve a connection of lines until it ends; `authenticated`: no token is needed."""
+    """Serve a connection of lines until it ends; `authenticated`: the client needs no token."""
     cut = writer.transport.abort
     outbox = Outbox(cut, _lost_line)
     raw = writer.get_extra_info("socket")
@@ -154,7 +154,7 @@ async def serve_lines(
                 writer.write(b"".join(lines))
                 await writer.drain()
 
-    with suppress(asyncio.CancelledError):  # the gateway ends
+    with suppress(asyncio.CancelledError):  # the gateway exits
         await run_duplex(_read_lines(client, reader), send(), client.close, cut)
     writer.close()
 
@@ -274,7 +274,7 @@ class PictureFeed:
         self._arrived = asyncio.Event()
         self._count = 0
         self.newest: NumberedPicture | None = None
-        self.watchers = 0  # clients
+        self.watchers = 0  # number of clients
         self.stop: Callable[[], None] = lambda: None
 
     def take(self, sample: RawSample) -> None:
@@ -299,7 +299,7 @@ class PictureFeed:
 
 
 class PictureFeeds:
-    """The feeds of cameras with clients, now or within LINGER_S; what `subscribe` returns ends a subscription."""
+    """The feeds of cameras that have, or recently had, clients; `subscribe` returns the end of a subscription."""
 
     def __init__(
         self,
@@ -333,7 +333,7 @@ class PictureFeeds:
             feed.stop()
 
     def forget(self) -> None:
-        """Drop the newest pictures: another run begins."""
+        """Drop the newest pictures, since another run begins."""
         for feed in self._feeds.values():
             feed.newest = None
 
@@ -347,7 +347,7 @@ async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.Stream
         await response.write(b"--%b\r\n" % BOUNDARY.encode())
         number = -1
         while request.transport is not None and not request.transport.is_closing():
-            picture = await feed.after(number, ALIVE_S) or feed.newest  # again: in a paused run the client may be gone
+            picture = await feed.after(number, ALIVE_S) or feed.newest  # repeated, to detect a client that is gone
             if picture is not None:
                 number = picture.number
                 await response.write(picture_part(picture.image))

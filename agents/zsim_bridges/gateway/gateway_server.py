@@ -43,20 +43,20 @@ from zsim_bridges.web.web_server import (
     url_host,
 )
 
-CLIENTS_MAX = 500  # streams at once
-UNAUTHENTICATED_MAX = 100  # unauthenticated connections at once
+CLIENTS_MAX = 500  # number of concurrent streams
+UNAUTHENTICATED_MAX = 100  # number of concurrent unauthenticated connections
 HELLO_TIMEOUT_S = 5.0  # time limit for a client to present its token
 DRAIN_S = 2.0  # after the end of a run, how long agents may still answer their last gates
-FAULTS_REPORTED_MAX = 100
-PICTURES_WAITING_MAX = 4  # waiting messages of a camera; each may have megabytes
+FAULTS_REPORTED_MAX = 100  # number of different errors that are printed
+PICTURES_WAITING_MAX = 4  # number of waiting messages of a camera; each may have megabytes
 RELEASE_TIMEOUT_S = 1.0  # the world answers within milliseconds
 STREAM_RATE_HZ = 5_000.0  # requests per wall second of one stream; a loop at the speed of the fastest run makes 2 500
 STREAM_BURST = 10_000.0
 BYE_TIMEOUT_S = 2.0  # how long shutdown waits for the agents to leave
-SUBSCRIPTIONS_MAX = 100  # of one client; `drone/*/truth` is one
+SUBSCRIPTIONS_MAX = 100  # number for one client; `drone/*/truth` is one
 ANSWER_MAX = OUTBOX_BYTES_MAX  # bytes of an answer
-PENDING_MAX = 8  # unanswered requests of one client
-ROLE = "client"  # of a name without a role
+PENDING_MAX = 8  # number of unanswered requests of one client
+ROLE = "client"  # role added to a name without one
 _encode = msgspec.json.Encoder().encode
 
 
@@ -72,7 +72,7 @@ class Gateway:
     """One gateway.
 
     Args:
-        token: of clients; None if only this machine can connect.
+        token: the clients' token; None if only this machine can connect.
         dial: opens a session to the world for a named process.
         say: prints a line.
         secured: whether access control restricts where it may publish.
@@ -110,7 +110,7 @@ class Gateway:
         self._link_lost = False
         self._reported_faults: set[str] = set()
         self._clients: set[Client] = set()
-        self._unauthenticated: dict[Client, None] = {}  # the unauthenticated ones among them, in order
+        self._unauthenticated: dict[Client, None] = {}  # unauthenticated clients, in order of connection
         self._lockstep_threads: set[threading.Thread] = set()
 
     # For clients
@@ -137,7 +137,7 @@ class Gateway:
                 reason = Runner(link, info, session, left, self._say, lost).run()
         except ZsimError as error:
             reason = str(error)
-        except Exception as error:  # an internal error: the client must not wait for ever
+        except Exception as error:  # an internal error: the client must not wait forever
             self.report(f"{session.name}: {error!r}")
         finally:
             self._say(f"{session.name}: left, {'its client is gone' if session.connection_lost else reason}")
@@ -188,11 +188,11 @@ class Gateway:
         run.open()
         self._call_on_loop(self._begin, run)
         self._observe_link(run)
-        say(f"{self.name}: clients are let into run {info.run_id}")
+        say(f"{self.name}: clients may use run {info.run_id}")
         try:
             run.receive_until_end(stopped)
         finally:
-            if not observer.end_reason:  # the gateway exits while the run goes on
+            if not observer.end_reason:  # the gateway exits while the run continues
                 for client in list(self._clients):
                     _release_drones(link, client.commanded)
             self._call_on_loop(self._end, run, observer.end_reason == ANOTHER_RUN)
@@ -213,7 +213,7 @@ class Gateway:
         self._notify_clients("begun", run)
 
     def _end(self, run: RunAccess, another: bool = False) -> None:
-        """End a run for the clients; if the world has begun another one, the link is back."""
+        """End a run for the clients; `another`: the world has begun another one, so the link is restored."""
 
         def end_lockstep_sessions() -> None:
             for client in self._clients:
@@ -234,21 +234,21 @@ class Gateway:
 
     def _observe_link(self, run: RunAccess) -> None:
         def on_link(up: bool) -> None:
-            with suppress(RuntimeError):  # in a thread of Zenoh's; the gateway has ended
+            with suppress(RuntimeError):  # called in a Zenoh thread; the gateway has ended
                 self.loop.call_soon_threadsafe(self._notify_link, run, up)
 
         run.link.on_link(on_link)
-        if not run.link.links():  # lost before anything was observed, so no event follows
+        if not run.link.links():  # lost before it was observed, so no event follows
             on_link(False)
 
     def _notify_link(self, run: RunAccess, up: bool) -> None:
-        """Notify clients of a link that is lost or back, but not when the world exits after the end of its run."""
+        """Notify clients that the link is lost or restored, but not if the world exits after the end of its run."""
         if run is self._run and up == self._link_lost:
             self._link_lost = not up
             self._notify_clients("back" if up else "lost", run)
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Print an error that no client receives, each text once: a flood of connections causes a flood of these."""
+        """Print an error that no client receives, each text once: a flood of connections causes a flood of errors."""
         self._report_once(f"{context.get('message')}: {context.get('exception')!r}")
 
     def _refuse_picture(self, reason: str) -> None:
@@ -323,7 +323,7 @@ class Gateway:
 
 
 def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None:
-    """Release drones in the name of the source that commanded each; the world knows whether it still holds them."""
+    """Release drones in the name of the source that commanded each; the world knows whether it still commands them."""
     with suppress(ZsimError):
         for source, drone in commanded:
             link.request(keys.CONTROL, "release", source, {"drone": drone}, RELEASE_TIMEOUT_S)
@@ -366,7 +366,7 @@ class Client:
             getattr(self, f"_{request.__struct_config__.tag}")(request)  # the method named after the op
         except ZsimError as error:
             self.refuse_line(str(error), request)
-        except Exception as error:  # an internal error: the gateway goes on
+        except Exception as error:  # an internal error: the gateway continues
             self._gateway.report(f"{self.source}: {line[:80]!r}: {error!r}")
             self.refuse_line(f"the gateway failed ({type(error).__name__}); its terminal says more", request)
 
@@ -420,7 +420,7 @@ class Client:
         self.send(answer, request)
 
     def _process_name(self, name: str) -> str:
-        """Return the process name of a client, a name without a role with ROLE, or raise a DecodeError."""
+        """Return the process name of a client, to which ROLE is added if it has no role, or raise a DecodeError."""
         process = name if "." in name else f"{ROLE}.{name}"
         if not keys.PROCESS_NAME.fullmatch(process) or "." not in process.strip(".") or process == self._gateway.name:
             raise DecodeError(
@@ -450,7 +450,7 @@ class Client:
         task.add_done_callback(self._pending.discard)
 
     async def _send_answer(self, request: client_messages.AskRequest, run: RunAccess) -> None:
-        """Wait for an answer while other requests are executed: it may depend on the client's next done."""
+        """Wait for an answer while other requests are executed, since it may depend on the client's next done."""
         try:
             answer = await run.request(request.key, request.request, request.args, self.source, request.timeout_s)
         except ZsimError as error:
@@ -525,7 +525,7 @@ class Client:
     # Runs, and the end of the connection
 
     def notify_run(self, state: str, run_id: str) -> None:
-        """Notify the client that a run has begun or ended, or that the link to its world is lost or back."""
+        """Notify the client that a run has begun or ended, or that the link to its world is lost or restored."""
         if state == "begun":
             self._defaults = MessageDefaults(self.source)
             self.commanded.clear()

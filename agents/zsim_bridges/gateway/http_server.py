@@ -1,16 +1,16 @@
-"""The gateway's HTTP server: access, and the keys as trees.
+"""The gateway's HTTP server: access checks, and trees of keys.
 
-Full keys, the tree of the Zenoh REST plugin, with payloads as they are. GET and POST query, PUT and PATCH publish,
+Full keys form the tree of the Zenoh REST plugin, with unchanged payloads. GET and POST query, PUT and PATCH publish,
 DELETE deletes; `Accept: text/event-stream` subscribes; `?_raw` returns the first payload alone. Source: zenoh,
 plugins/zenoh-plugin-rest.
 
-/json/KEY without the federation's name, JSON by the schema of each message.
-GET    /json/drone/drone1/sensor/imu      the last value; of an expression, a list of {key, value}
+/json/KEY, without the federation's name, has JSON by the schema of each message.
+GET    /json/drone/drone1/sensor/imu      the last value; for an expression, a list of {key, value}
 GET    … with Accept: text/event-stream   every value from now on
 PUT    /json/drone/drone1/cmd/velocity    {"velocity_m_s": [1, 0, 0]}; t_ns, seq and source are filled in
 POST   /json/world/control                {"op": "pause", "args": {}}
 
-/camera/DRONE/CAMERA, a stream of pictures; /camera/DRONE/CAMERA.jpg, the newest one.
+/camera/DRONE/CAMERA is a stream of pictures, /camera/DRONE/CAMERA.jpg the newest one.
 """
 
 import base64
@@ -68,8 +68,8 @@ HTTP_BURST = 10_000.0
 METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"
-BYTES = "zenoh/bytes"  # encoding that the plugin gives a body without Content-Type
-PICTURE_S = 2.0  # wall time to wait for the first picture; twice the period of a slow camera
+BYTES = "zenoh/bytes"  # the plugin's encoding of a body without Content-Type
+PICTURE_S = 2.0  # wall; time to wait for the first picture: twice the period of a slow camera
 NO_PICTURE = "no picture yet; is a camera process publishing there, and is time running?"
 NO_VALUE = "no value yet; is the key right, and does a process publish it?"
 STREAM, DESCRIPTION, CAMERA = "/stream", "/openapi.json", "/camera/{drone}/{camera}"
@@ -77,11 +77,11 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _encode = msgspec.json.Encoder().encode
 _control_request = msgspec.json.Decoder(ControlRequest).decode
 JSON_PREFIX = "/json/"
-ONE_PICTURE = ".jpg"  # end of the path of a single picture
+ONE_PICTURE = ".jpg"  # suffix of the path of a single picture
 DEFAULTED = ("t_ns", "seq", "source")  # fields that a client may leave out
 CONTROL_PATHS = ("world/control", "cluster/{cluster}/control", "drone/{drone}/control")
 _REF = "#/components/schemas/{name}"
-_OWN_KEY = {"type": "string", "pattern": "^[A-Za-z0-9_.-]{1,64}$"}  # of a client's own key; Zenoh accepts more
+_OWN_KEY = {"type": "string", "pattern": "^[A-Za-z0-9_.-]{1,64}$"}  # schema of a client's own key; Zenoh accepts more
 _ERRORS = {
     400: "an invalid key or value",
     401: "no token, or a wrong one",
@@ -113,7 +113,7 @@ STATUS: tuple[tuple[type[ZsimError], int], ...] = (
 
 
 def application(access_check: "AccessCheck", trees: "KeyTrees", new_client: ClientFactory) -> web.Application:
-    """Return the web application of a gateway; `new_client` makes the client of a WebSocket."""
+    """Return the web application of a gateway; `new_client` creates the client of a WebSocket."""
 
     async def index(request: web.Request) -> web.Response:
         cameras = {"camera": "/camera/DRONE/CAMERA", "picture": f"/camera/DRONE/CAMERA{ONE_PICTURE}"}
@@ -152,10 +152,10 @@ def application(access_check: "AccessCheck", trees: "KeyTrees", new_client: Clie
 
 
 class AccessCheck:
-    """Passes on or refuses requests.
+    """Forwards or refuses requests.
 
     Args:
-        token: that every request must have; None where only this machine can connect.
+        token: token that every request must have; None if only this machine can connect.
         report: prints an internal error of the gateway.
     """
 
@@ -169,7 +169,7 @@ class AccessCheck:
 
     @web.middleware
     async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests without the token, from other sites' pages, or too many; answer errors."""
+        """Refuse requests without the token, from other sites' pages, or above the limit; answer errors."""
         response = await self._answer(request, handler)
         if not response.prepared:
             response.headers.setdefault("Access-Control-Allow-Origin", "*")
@@ -196,7 +196,7 @@ class AccessCheck:
             return error_response(error.status, f"{request.method} {request.path[:80]}: {text}", sorted(allowed))
         except ConnectionError:
             raise
-        except Exception as error:  # an internal error: the gateway goes on
+        except Exception as error:  # an internal error: the gateway continues
             if isinstance(error, RuntimeError) and request.transport is None:  # raised by aiohttp for a truncated body
                 raise ConnectionResetError("the client is gone") from error
             self._report(f"{request.method} {request.path[:80]}: {error!r}")
@@ -204,7 +204,7 @@ class AccessCheck:
 
 
 def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:
-    """Return a response with an error, and with the methods of the key."""
+    """Return a response with an error and the methods that the key allows."""
     headers = {"Allow": ", ".join(allowed)} if allowed else None
     return web.Response(status=status, body=_encode({"error": text}), content_type="application/json", headers=headers)
 
@@ -212,10 +212,10 @@ def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.R
 def _is_from_this_machine(request: web.Request) -> bool:
     """Return whether a request is from a program of this machine and not from a page of another server (by its origin).
 
-    A server on another port of this machine is another one, whose pages are not trusted. The Host header counts too:
-    another site can make its own name resolve to this machine.
+    A server on another port of this machine is another server, whose pages are not trusted. The Host header must be
+    checked, too: another site can make its own name resolve to this machine.
     """
-    origin = request.headers.get("Origin")  # "null" for a sandboxed frame: any page can make one
+    origin = request.headers.get("Origin")  # "null" for a sandboxed frame, which any page can create
     try:
         is_own = origin is None or urlsplit(origin).netloc == request.host
         return is_own and is_loopback_authority(request.host)
@@ -227,17 +227,17 @@ def _is_from_this_machine(request: web.Request) -> bool:
 class KeyTrees:
     """Handlers of the trees of full keys, of JSON, and of the pictures of cameras."""
 
-    run: Callable[[], RunAccess]  # the current one
+    run: Callable[[], RunAccess]  # returns the current run
     full_subscriptions: SharedSubscriptions  # subscriptions to full keys
     subscriptions: SharedSubscriptions  # subscriptions to keys without the federation's name
     feeds: PictureFeeds
-    limit: ClientLimit  # in which streams of pictures count
-    source: str  # of control requests that name none
+    limit: ClientLimit  # bounds the number of clients, including streams of pictures
+    source: str  # source of control requests that name none
 
     async def get_full(self, request: web.Request) -> web.StreamResponse:
         """Answer a GET or a POST of a full key."""
         expression, accepted = _key_of(request, "/"), _first_accepted(request)
-        if any(part.startswith("@") for part in expression.split("/")):  # wildcards do not match these
+        if any(part.startswith("@") for part in expression.split("/")):  # wildcards match no such parts
             raise ForbiddenError(
                 f"{expression[:80]}: Zenoh's own keys are not shown; must be keys without @, as zsim/**"
             )
@@ -324,7 +324,7 @@ class KeyTrees:
 
 
 def methods_of(key: str) -> tuple[str, ...]:
-    """Return the HTTP methods of a key: control keys accept requests, reserved keys reads, clients' own keys all."""
+    """Return the HTTP methods of a key: POST for control keys, GET for reserved keys, all for clients' own keys."""
     if is_control_key(key):
         return ("POST",)
     if is_reserved(key):
@@ -347,7 +347,7 @@ def _key_of(request: web.Request, prefix: str) -> str:
 
 
 def _checked_key(request: web.Request) -> str:
-    """Return the key of a request, or raise a MethodError where the key has other methods."""
+    """Return the key of a request, or raise a MethodError if the key does not have its method."""
     key = _key_of(request, JSON_PREFIX)
     check_expression(key)
     allowed = methods_of(key)
@@ -367,7 +367,7 @@ def _encoding_of(request: web.Request) -> str:
 
 
 def _first_accepted(request: web.Request) -> str:
-    """Return the first accepted media type: the plugin ignores the others."""
+    """Return the first accepted media type; like the plugin, ignore the others."""
     return request.headers.get("Accept", "application/json").split(",")[0].split(";")[0].strip()
 
 
@@ -377,7 +377,7 @@ def _first_accepted(request: web.Request) -> str:
 def described_sample(sample: RawSample) -> dict[str, Any]:
     """Return an answer or a publication in the plugin's JSON format."""
     kind, payload = sample.encoding.partition(";")[0], sample.payload
-    value: Any = base64.b64encode(payload).decode() if payload else None  # not valid in its encoding: as bytes
+    value: Any = base64.b64encode(payload).decode() if payload else None  # if it is invalid in its encoding
     try:
         if payload and kind in JSON:
             value = json.loads(payload)
@@ -415,7 +415,7 @@ def _as_json(value: Any) -> web.Response:
 
 @cache
 def description() -> dict[str, Any]:
-    """Return the OpenAPI 3.1 description of this server, made from the messages' schemas."""
+    """Return the OpenAPI 3.1 description of this server, derived from the messages' schemas."""
     shapes = messages.types_by_shape()
     kinds = dict.fromkeys([*shapes.values(), ControlRequest, ControlAnswer])
     _, components = msgspec.json.schema_components(list(kinds), ref_template=_REF)
@@ -480,7 +480,7 @@ def _other_paths() -> dict[str, Any]:
             "post": post,
         }
 
-    anything = {"description": "a value, or of an expression a list of key and value"}
+    anything = {"description": "a value, or for an expression a list of keys and values"}
     paths[f"{JSON_PREFIX}{{key}}"] = {
         "parameters": [_parameter("key", _OWN_KEY)],
         "get": {"summary": "The last value", "responses": _responses(_json(anything))},
@@ -529,7 +529,7 @@ def _parameter(name: str, schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def _named(kind: str) -> dict[str, Any]:
-    """Return the parameter of the name of a process, a drone, a cluster."""
+    """Return the path parameter with the name of a process, a drone or a cluster."""
     length_max = 48 if kind in ("process", "estimates") else 32
     return _parameter(kind, {"type": "string", "pattern": f"^[a-z0-9_.-]{{1,{length_max}}}$"})
 

@@ -44,17 +44,17 @@ from zsim_bridges.gateway.client_messages import (
 
 TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
 REQUESTS_MAX = 64  # concurrent requests; each has a thread that waits for Zenoh
-ECHOES_MAX = 256  # of a key; a paused world returns none, and clients may go on
+ECHOES_MAX = 256  # number of expected echoes per key; a paused world returns none while clients may continue
 DELETED = None
-OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
-KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
+OWN_BYTES_MAX = 64_000_000  # total size of the values on clients' own keys
+KEYS_MAX = 200_000  # number of keys with a last value; 1000 drones have about 12 000
 WAITING_MAX = 50_000  # default limit of an expression's messages that wait for the loop
 DELIVER_MAX = 500  # messages delivered before other tasks of the loop run
-EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
+EXPRESSIONS_MAX = 2_000  # number for all clients together; the world's session checks each subscription
 
 Subscriber = Callable[[RawSample], None]
 ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
-LATE_PERIODS = 2  # in realtime, a gate older by this many is sent together with a newer one
+LATE_PERIODS = 2  # in realtime, a gate late by this many is skipped: its inputs are sent with a newer one
 NO_GATE_NS = -1  # no gate waits for an answer
 _encode = msgspec.json.Encoder().encode
 
@@ -64,13 +64,13 @@ class RunAccess:
 
     Args:
         link: an open session.
-        info: of the run.
-        observer: of the gateway in it.
-        secured: whether access control restricts what it may do.
+        info: description of the run.
+        observer: the gateway's participant in the run.
+        secured: whether access control restricts where the gateway may publish.
 
     Attributes:
-        values: last ones.
-        defaults: of messages in the gateway's own name.
+        values: last values of keys.
+        defaults: defaults for messages in the gateway's own name.
         required_processes: (process, drone or cluster served) of all processes that the run needs to start.
     """
 
@@ -95,19 +95,19 @@ class RunAccess:
         """Simulated time of the newest gate."""
         return self._observer.now_ns
 
-    # Messages that pass the world
+    # Messages that pass through the world
 
     def open(self) -> None:
-        """Subscribe to the messages that pass the world, and read the earlier last values."""
+        """Subscribe to the messages that pass through the world, and read the present last values."""
         self._traffic = Traffic(self.link, run_key_table(self.info), self.count_refused)
-        # Views do not pass the world.
+        # Views do not pass through the world.
         self.link.declare_subscriber("view/**", lambda sample: self._keep(self.values.add, sample))
         for expression in roles.LAST_VALUES:
             for sample in self.link.get(expression):
                 self._keep(self.values.add, sample)
 
     def receive_until_end(self, stopped: Callable[[], bool]) -> None:
-        """Store the messages that pass the world until the run is over or `stopped` returns true."""
+        """Store the messages that pass through the world until the run is over or `stopped` returns true."""
         traffic, over = self._traffic, threading.Event()
         assert traffic is not None
 
@@ -154,16 +154,16 @@ class RunAccess:
         self.publish(key, payload)
 
     def publish(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Publish a checked payload, with the given encoding or else that of its key."""
+        """Publish a checked payload, with the given encoding, or else the default of its key."""
         self.link.put_sample(key, payload, encoding or messages.encoding(key))
-        if not keys.is_picture(key):  # not kept as last values: they are large, and the world keeps none either
+        if not keys.is_picture(key):  # too large for last values; the world keeps none either
             self.values.add_own(key, payload, encoding)
 
     def encode(self, key: str, value: Any) -> bytes:
         """Return plain data as the payload of a key on which clients may publish.
 
         Raises:
-            DecodeError: with key, field, value and what is allowed.
+            DecodeError: it is not a message of the key; the error has key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
             UnknownError: the run has no such drone or cluster.
             SessionError: the key is invalid.
@@ -215,7 +215,7 @@ class RunAccess:
         self.check_known(key)
         return await self._in_thread(self.link.request, key, op, source, args, timeout_s)
 
-    # By full keys, with the federation's name; keys of other federations too
+    # By full keys, with the federation's name; also keys of other federations
 
     def last_samples(self, expression: str) -> list[RawSample]:
         return [
@@ -282,7 +282,7 @@ class EchoFilter:
         self._waiting: dict[str, deque[int | None]] = {}
 
     def add(self, key: str, payload: bytes) -> None:
-        """Expect the echo of a payload that is on its way to the world."""
+        """Expect the echo of a payload that was sent to the world."""
         if key in self._waiting or len(self._waiting) < self._keys_max:
             self._waiting.setdefault(key, deque(maxlen=ECHOES_MAX)).append(hash(payload))
 
@@ -304,7 +304,7 @@ class EchoFilter:
 
 
 class LastValues:
-    """The last value of every key that has passed the world or was published by clients here.
+    """The last value of every key that passed through the world or was published by this gateway's clients.
 
     Args:
         table: keys of the world's messages about the drones of the run, see `run_key_table`.
@@ -315,7 +315,7 @@ class LastValues:
         self._indices = {key: index for index, key in enumerate(self._table)}
         self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0
-        self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
+        self._lock = threading.Lock()  # values are added in the clients' thread and in the world's
         self._encodings: dict[str, tuple[bytes, str]] = {}
         self._echoes = EchoFilter(KEYS_MAX)
         self._of_gates: dict[int, tuple[GateMessages, int]] = {}
@@ -331,7 +331,7 @@ class LastValues:
             self._add(key, payload, encoding)
 
     def add_passed(self, key: str, payload: bytes) -> None:
-        """Store one message that has passed the world."""
+        """Store a message that has passed through the world."""
         with self._lock:
             if not self._echoes.is_stale(key, payload):
                 self._add(key, payload)
@@ -341,7 +341,7 @@ class LastValues:
         if messages.type_of(key) is None:
             more = len(payload) - len(self._payloads.get(key, b""))
             if not has_room or self._own_bytes + more > OWN_BYTES_MAX:
-                self._drop(key)  # better no value than an outdated one
+                self._drop(key)  # no value is better than an outdated one
                 return
             self._own_bytes += more
         if has_room:
@@ -350,7 +350,7 @@ class LastValues:
                 self._encodings[key] = (payload, encoding)
 
     def drop(self, key: str) -> None:
-        """Remove the value of a key that a client here deletes."""
+        """Remove the value of a key that a client of this gateway deletes."""
         with self._lock:
             self._echoes.add_deletion(key)
             self._drop(key)
@@ -368,20 +368,20 @@ class LastValues:
 
     def add_gate(self, gate: GateMessages) -> None:
         """Store the world's messages of a gate, whose columns have been checked."""
-        for m, place in enumerate(gate.which.tolist()):
-            self._of_gates[place] = (gate, m)
+        for m, index in enumerate(gate.which.tolist()):
+            self._of_gates[index] = (gate, m)
 
     def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
         """Return keys and payloads that an expression matches, in order of the keys.
 
         Args:
-            expression: of keys with the prefix.
+            expression: key expression with the prefix.
             prefix: prepended to each key for the comparison; returned keys are without it.
         """
         if "*" not in expression:
             matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
         else:
-            known = {*self._payloads, *(self._table[place] for place in list(self._of_gates))}  # another adds
+            known = {*self._payloads, *(self._table[index] for index in list(self._of_gates))}  # a copy
             matching = sorted(key for key in known if keys.matches(expression, prefix + key))
         return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 
@@ -395,8 +395,8 @@ class SharedSubscriptions:
 
     Args:
         loop: on which everything but Zenoh's callbacks is called.
-        limit: of clients; a stream that is only one subscription counts as one.
-        waiting_max: messages of an expression that wait for the loop; beyond it the oldest are dropped.
+        limit: bounds the number of clients; a connection with a single subscription counts as one.
+        waiting_max: number of an expression's messages that wait for the loop; the oldest of more are dropped.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, limit: ClientLimit, waiting_max: int = WAITING_MAX) -> None:
@@ -409,7 +409,7 @@ class SharedSubscriptions:
     def attach(self, link: Session) -> None:
         self._link = link
         for expression, shared in self._by_expression.items():
-            with suppress(SessionError):  # no right to read it: nothing arrives, as from keys without publishers
+            with suppress(SessionError):  # without the right to read it, nothing arrives, as on keys without publishers
                 shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
 
     def detach(self) -> None:
@@ -422,7 +422,7 @@ class SharedSubscriptions:
         """Call a subscriber with every publication on an expression until the returned function is called.
 
         Raises:
-            SessionError: it is not a key expression.
+            SessionError: the expression is invalid.
             TooManyError: there are EXPRESSIONS_MAX others.
         """
         shared = self._by_expression.get(expression)
@@ -451,7 +451,7 @@ class SharedSubscriptions:
         """Subscribe for a connection with a single subscription, and count it among the clients.
 
         Raises:
-            SessionError: it is not a key expression.
+            SessionError: the expression is invalid.
             TooManyError: the limit of clients or of expressions is reached.
         """
         self._limit.enter()
@@ -504,7 +504,7 @@ class LockstepSession(Agent):
 
     Args:
         name: process name of the participant, role.thing.
-        loop: of the client.
+        loop: event loop of the client.
         send: sends the line of a gate; called on the loop.
 
     Attributes:
@@ -534,9 +534,7 @@ class LockstepSession(Agent):
             must = f"must be a multiple of {info.gate_ns / 1e9:g}"
             raise DecodeError(f"join: period_s is {self.period_ns / 1e9:g}; {must}")
         if any("*" in key for key in gates):
-            raise DecodeError(
-                "join: gates has a wildcard; must be keys, of each of which a message comes at every gate"
-            )
+            raise DecodeError("join: gates has a wildcard; must be keys, each with a message at every gate")
         for key in gates:
             run.check_known(key)
         self.gate_keys = tuple(gates) or gate_keys_of(info, reads, name, run.required_processes)
@@ -586,8 +584,8 @@ class LockstepSession(Agent):
         if self._gate_ns == NO_GATE_NS:
             raise DecodeError("done: there is no gate to answer; wait for the next")
         if request.t_ns != self._gate_ns:
-            raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the gate that came last")
-        counted: list[Output] = []  # counted by a done: the runner publishes these, the gateway the rest
+            raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the last gate sent")
+        counted: list[Output] = []  # those that a done counts: the runner publishes these, the gateway the others
         others: list[tuple[str, bytes]] = []
         with self.defaults.transaction():
             for key, value in ((output.key, output.value) for output in request.outputs):
@@ -605,13 +603,13 @@ class LockstepSession(Agent):
         self._answers.put(counted)
 
     def leave(self, connection_lost: bool = False) -> None:
-        """End a waiting step: the client is gone."""
+        """End the session, and a step that waits for an answer."""
         self.has_left, self.connection_lost = True, connection_lost
         self._answers.put([])
 
 
 def gate_keys_of(info: Info, reads: Sequence[str], name: str, required: Collection[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the keys with a message at every gate that match some expression; `clock` if there are none.
+    """Return the keys with a message at every gate that match an expression of `reads`; `clock` if there are none.
 
     A drone's status and truth come from the world. Its estimate and the state of a cluster arrive at every gate if the
     run does not start without a process for it, other than the one that joins.

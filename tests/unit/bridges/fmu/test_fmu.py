@@ -212,7 +212,7 @@ REFUSALS: list[tuple[Any, dict[str, Any], tuple[str, ...]]] = [
     ({"x": "drone/drone7/estimate.yaw_rad"}, {}, ("'drone7'", "drone1?")),
     ({"x": "estimate.sensors"}, {}, ("x=estimate.sensors", "sensors")),
     ({"x": "status.state"}, {}, ("x=status.state", "text", "number")),
-    ({"crash": "estimate.yaw_rad"}, {}, ("crash=estimate.yaw_rad", "number", "flag")),
+    ({"crash": "estimate.yaw_rad"}, {}, ("crash=estimate.yaw_rad", "number", "boolean")),
     ({"state": "estimate.yaw_rad"}, {}, ("state=estimate.yaw_rad", "number", "text")),
     ({"x": "estimate.yaw_rad"}, {}, ("vx", "yaw_rate", "up", "count")),
     (["vx"], {}, ("--map", "'vx'", "NAME=PLACE")),
