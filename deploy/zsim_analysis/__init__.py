@@ -1,4 +1,4 @@
-"""Judging of records, and many runs in one process: report, sweep, export, rerun. Imports zsim, world and agents.
+"""Evaluation of records, and many runs in one process: report, sweep, export, rerun. Imports zsim, world and agents.
 
-`reading` has a record as arrays and messages, and the verdict on its flight; `in_process` flies.
+`reading` reads a record as arrays and messages, and judges its flight; `in_process` flies.
 """

@@ -26,7 +26,7 @@ from zsim.schema.checker import show
 from zsim_agents.hosting import hosted, own_agent, with_own_agents
 from zsim_world.run.world import World
 
-CALLER = "python.main"  # process name of whoever steps a flight
+CALLER = "python.main"  # process name of the participant that steps a flight
 OwnAgent = Agent | Callable[..., Agent]
 
 
@@ -42,22 +42,23 @@ def fly(
     """Fly a resolved scenario and record it; return why it ended.
 
     Args:
-        record: path of the record, None for no record.
+        scenario: the resolved scenario.
+        record: path of the record; None: no record.
         stop_reason: called at every gate; a text ends the run.
         screen: shows progress.
         run_id: set only by tests that compare records.
-        changed: as of `World`.
-        own: as of `InProcessFlight`.
+        changed: as in `World`.
+        own: as in `InProcessFlight`.
 
     Raises:
-        RunError: a failure has ended the run, of a user's class, or because the state of a drone was no longer finite;
-            the record is complete to its end.
+        RunError: a user's class failed, or the state of a drone was no longer finite, which ended the run; the record
+            is complete up to there.
     """
     progress = _Progress(scenario, screen) if screen else None
     writer = None
     try:
         flight = InProcessFlight(scenario, run_id, changed, own)
-        writer = RecordWriter(record) if record else None  # after it: a refused scenario leaves no record in the way
+        writer = RecordWriter(record) if record else None  # last, so that a refused scenario leaves no record
         flight.run([each for each in (writer, progress) if each], stop_reason)
     finally:
         for each in (progress, writer):
@@ -69,28 +70,28 @@ def fly(
 
 
 def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, list[Agent]]:
-    """Return a resolved scenario that waits for agents of a user's, and ends where one fails; and the agents.
+    """Return a resolved scenario that waits for a user's agents, and ends if one fails; and these agents.
 
     Raises:
-        RunError: they are not in a sequence, or one is no agent.
-        UserCodeError: the class of one raised.
+        RunError: `own` is not a sequence, or one of its elements is not an agent.
+        UserCodeError: the class of an agent raised.
     """
     if not sequence_of_agents(own):
         return scenario, []
     info = World(scenario).info()
-    made = [own_agent(each, info, scenario) for each in own]
-    return with_own_agents(scenario, [agent.name for agent in made]), made
+    agents = [own_agent(each, info, scenario) for each in own]
+    return with_own_agents(scenario, [agent.name for agent in agents]), agents
 
 
 def sequence_of_agents(given: Any, others: str = "") -> Sequence[Any]:
-    """Return what is given for agents; RunError if it is none of `others` nor a sequence, but, say, one agent."""
+    """Return the given agents; RunError, which lists `others` as allowed, if they are not a sequence."""
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise RunError(f"agents is {show(given)}; must be {others}a sequence of agents")
     return given
 
 
 class FlightObserver(Protocol):
-    """Receives messages of a flight, as a record writer does."""
+    """Receives the messages of a flight, like a record writer."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None: ...
 
@@ -98,14 +99,14 @@ class FlightObserver(Protocol):
 
 
 class InProcessFlight:
-    """A world with its agents on a bus, to be flown to its end (`run`) or in turns (`start`, `turn`, `end`).
+    """A world with its agents on a bus, which is flown to its end (`run`) or in turns (`start`, `turn`, `end`).
 
     Args:
-        scenario: resolved.
-        run_id, changed: as of `fly`.
-        own: agents of a user's, beside those of the scenario: objects, or what `own_agent` makes them of.
+        scenario: the resolved scenario.
+        run_id, changed: as in `fly`.
+        own: a user's agents, beside those of the scenario: objects, or whatever `own_agent` accepts.
         stock: whether the estimators and controllers of the scenario fly.
-        steered: whether `send` is used: the caller takes part as `python.main`.
+        steered: whether `send` is used, so that the caller takes part as `python.main`.
 
     Raises:
         ScenarioError, RunError: the scenario cannot be flown.
@@ -141,7 +142,7 @@ class InProcessFlight:
             self.agents.append(self._caller)
 
     def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:
-        """Fly to the end; observers receive every message; `world.ended` and `world.failure` then have the reason."""
+        """Fly to the end; observers receive every message; `world.ended` or `world.failure` then gives the reason."""
         self.start(observers)
         try:
             with rare_collections():
@@ -150,7 +151,7 @@ class InProcessFlight:
                         self.world.clock.stop(reason)
                 self.end()
         except UserCodeError:
-            if self.world.failure:  # otherwise the run goes on without the failed agent, as the scenario says
+            if self.world.failure:  # otherwise the scenario lets the run go on without the failed agent
                 raise
 
     def start(self, observers: Sequence[FlightObserver]) -> None:
@@ -174,9 +175,9 @@ class InProcessFlight:
         self.bus.join()
 
     def send(self, commands: Sequence[tuple[str, Struct]]) -> None:
-        """Publish the caller's commands of the newest gate by drone; without it the world does not go beyond that gate.
+        """Publish the caller's commands for the newest gate, as pairs of drone and command; the world waits for them.
 
-        RunError, before anything is sent, if one is no command.
+        Raises RunError, before anything is sent, if one of them is not a command.
         """
         caller, t_ns = self._caller, self.world.now_ns
         assert caller is not None
@@ -192,18 +193,18 @@ class InProcessFlight:
             if key in agent.control_keys():
                 return agent.control(key, request)
         known = [keys.CONTROL, *(each for agent in self.agents for each in agent.control_keys())]
-        return ControlAnswer(False, f"{key}: nobody answers there; must be one of {', '.join(known)}")
+        return ControlAnswer(False, f"{key}: no process answers on it; must be one of {', '.join(known)}")
 
     def snapshot(self) -> tuple[Any, ...]:
-        """Return all from which `restore` continues to the same bits.
+        """Return the state from which `restore` continues bit-identically.
 
         Raises:
-            RunError: an agent of a user's has no `snapshot`.
+            RunError: a user's agent has no `snapshot`.
         """
         states = [agent.checkpoint() for agent in self.agents]
         for agent, state in zip(self.agents, states, strict=True):
             if state is None:
-                raise RunError(f"{agent.name} has no snapshot(); must return its state there, {{}} if it has none")
+                raise RunError(f"{agent.name} has no snapshot(); must return its state, or {{}} if it has none")
         world, agents = pack(self.world.checkpoint()), [pack(state) for state in states if state is not None]
         return world, agents, self.bus.snapshot(), self.world.truth_hash.snapshot()
 
@@ -211,7 +212,7 @@ class InProcessFlight:
         """Continue from a snapshot of this flight, or of another one of the same scenario."""
         world, agents, inboxes, truth_hash = snapshot
         restore(self.world, unpack(world))
-        clock = self.world.clock  # the snapshot is of a flight that goes on
+        clock = self.world.clock  # the snapshot is of a flight that was not over
         clock.ended, clock.is_complete, self.world.failure = None, False, None
         self.world.truth_hash.restore(truth_hash)
         for agent, state in zip(self.agents, agents, strict=True):
@@ -220,7 +221,7 @@ class InProcessFlight:
 
 
 class Caller(Agent):
-    """Takes part for whoever steps a flight: its commands are published by `InProcessFlight.send`."""
+    """Takes part on behalf of the caller that steps a flight, whose commands `InProcessFlight.send` publishes."""
 
     name, reads, gate_keys = CALLER, (), ()
 
@@ -229,7 +230,7 @@ class Caller(Agent):
         self.period_ns = info.gate_ns
 
     def receive(self, key: str, message: Any) -> None:
-        """Take nothing."""
+        """Ignore messages; the caller reads the flight's state itself."""
 
     def step(self, t_ns: int) -> list[Output]:
         return []
@@ -248,7 +249,7 @@ class _Progress:
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
-        self._clock: run_messages.Clock | None = None  # the newest one, if it is not shown
+        self._clock: run_messages.Clock | None = None  # the newest one, unless it is shown
         self._start = SlowStart(screen.say)
 
     def close(self) -> None:
@@ -256,7 +257,7 @@ class _Progress:
         self._show_clock()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Show nothing: it holds truth, status and sensors only."""
+        """Show nothing, since a gate has only truth, status and sensors."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         if key not in self._watched:

@@ -1,7 +1,7 @@
-"""`zsim rerun`: the run of a record flown again from its own inputs, and compared with the truth on record.
+"""`zsim rerun`: flies a recorded run again from its own inputs, and compares it with the truth on record.
 
-First its world and its agents are flown, with the inputs of others (operators, users' programs) from the record. If
-truth differs, or the agents cannot be run again, then the world alone, with all commands from the record: if that
+First, world and agents are run again, with the inputs of others (operators, users' programs) from the record. If the
+truth differs, or the agents cannot be run again, the world is run alone, with all commands from the record: if that
 reproduces the recorded truth, the difference came from the agents.
 """
 
@@ -17,7 +17,7 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.fingerprint import fingerprint
 from zsim.contract.flight_messages import Sightings
 from zsim.contract.framing import GateMessages
-from zsim.contract.run_messages import ControlRequest
+from zsim.contract.run_messages import ADMISSIONS, ControlRequest
 from zsim.errors import RecordError, RunError, RunFailedError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Agent, AgentGroup, Output
@@ -37,32 +37,32 @@ from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 
 Say = Callable[[str], None]
-COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
-JOINED = ("join", "restart", "superseded")  # events of admitted joins
+COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # fields in truth_sha256
 
 
 class RerunResult(NamedTuple):
     """The result of flying a run again."""
 
-    compared: "TruthComparison"  # with the truth on record
-    sha256: str  # of the truth
-    until: str  # why the comparison ended before the record, empty if it did not
-    refused: list[str]  # requests that were carried out on record and are refused now
+    compared: "TruthComparison"  # comparison with the truth on record
+    sha256: str  # hash of the truth
+    until: str  # why the comparison ended before the record; empty if it did not
+    refused: list[str]  # requests that were carried out in the recorded run but are refused now
     first_output: str  # the first output of an agent that differs, with its field; empty if none does
-    outputs: dict[str, str]  # SHA-256 of the agents' by key, as OutputHashes
-    failure: str  # of a user's code, empty if none failed
+    outputs: dict[str, str]  # SHA-256 of the agents' outputs by key, as in OutputHashes
+    failure: str  # failure of a user's code; empty if there was none
 
 
 def rerun_record(
     place: Path, commands_only: bool, say: Say, note: Say, outputs: Mapping[str, str] | None = None
 ) -> str:
-    """Fly the run of a record again; return how truth differs from the record, empty if it is the same to the bit.
+    """Fly a recorded run again; return how the truth differs from the record, empty if it is identical to the bit.
 
-    With `commands_only` no agents are run. `say` receives each line of the results, `note` each warning. `outputs` has
-    the SHA-256 of the agents' outputs by key, as OutputHashes, where they must be the same, too.
+    With `commands_only`, no agents are run. `say` is called with each line of the results, `note` with each warning. If
+    the agents' outputs must be the same too, `outputs` has their SHA-256 by key, as in OutputHashes.
 
     Raises:
-        RunError, RecordError: there is no record, or it is not one from the start of a flight.
+        RunError, RecordError: there is no record, it does not begin with the start of a flight, or the run cannot be
+            flown again.
     """
     with recorded_run.open_run(place) as record:
         if record.info.replay_of:
@@ -74,7 +74,7 @@ def rerun_record(
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
             raise RunError(f"{place}: {reason}")
         agents = recorded_run.recorded_agents(record.reader, record.info, record.scenario)
-        nobody = agents._replace(processes=(), requests=(), failure="")
+        no_agents = agents._replace(processes=(), requests=(), failure="")
         here, recorded_by = fingerprint(), record.info.version
         if others := {record.info.fingerprint, *agents.fingerprints} - {here}:
             of = f"{', '.join(sorted(others))}; here {here}"
@@ -84,7 +84,7 @@ def rerun_record(
         if commands_only or agents.why_not:
             why = "as asked" if commands_only else agents.why_not
             say(f"agents are not run again: {why}; the world alone, with all recorded commands")
-            return _judge(record.reader, agents.truth_sha256, _fly(record, nobody), say)
+            return _judge(record.reader, agents.truth_sha256, _fly(record, no_agents), say)
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
         again = _fly(record, agents)
         fault = _judge(record.reader, agents.truth_sha256, again, say)
@@ -97,7 +97,7 @@ def rerun_record(
             fault = _compare_outputs(outputs, again, say)
         if again.compared.first is None:
             return fault
-        alone = _fly(record, nobody)
+        alone = _fly(record, no_agents)
         if alone.compared.first is not None:
             say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
         else:
@@ -108,7 +108,7 @@ def rerun_record(
 
 
 def _compare_outputs(expected: Mapping[str, str], again: RerunResult, say: Say) -> str:
-    """Print how the agents' outputs compare; return how they differ, empty if they do not."""
+    """Report how the agents' outputs compare; return how they differ, empty if they do not."""
     keys_of_both = sorted({*expected, *again.outputs})
     differing = [key for key in keys_of_both if expected.get(key) != again.outputs.get(key)]
     if not differing:
@@ -119,7 +119,7 @@ def _compare_outputs(expected: Mapping[str, str], again: RerunResult, say: Say) 
 
 
 def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) -> RerunResult:
-    """Fly from gate to gate of a record, as far as it is whole."""
+    """Fly through the gates of a record, up to the first gate with missing truth."""
     reader, info, scenario = record
     world = World(scenario, info.mode, 0.0, time.monotonic_ns, info.run_id)
     bus = RerunBus(world, agents, info, scenario, OutputHashes(recorded_run.answered_until_ns(reader, info)))
@@ -149,21 +149,21 @@ def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) 
 
 
 def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say: Say) -> str:
-    """Print how truth compares; return how it differs, empty if it is the same at all instants of a sound record."""
+    """Report how the truth compares; return how it differs, empty if it is the same in all of an intact record."""
     compared, until = result.compared, result.until
     for refusal in result.refused:
-        say(f"was done on record, and is refused now: {refusal}")
+        say(f"was carried out on record, but is refused now: {refusal}")
     if compared.first is not None:
         say(f"truth differs: first {compared.first}")
         say(f"               last  {compared.last}; {compared.instants} instants compared")
         if reader.damaged:
-            say("the record is damaged: what it lacks may be the difference")
+            say("the record is damaged: missing messages may cause the difference")
         return f"truth differs, first {compared.first}"
     if recorded == result.sha256 and not until:
         say(f"truth_sha256 is the same: {result.sha256}")
         return ""
     condition = "is damaged" if reader.damaged else "does not hold the whole run" if reader.complete else "was cut"
-    lacks = f"{recorded} cannot be shown" if recorded else "has no truth_sha256"
+    lacks = f"{recorded} cannot be verified" if recorded else "has no truth_sha256"
     reason = f"{until}, for it {condition}" if until else f"the record {condition} and {lacks}"
     say(f"{reason}; truth is the same at all {compared.instants} instants before, to the bit")
     return "" if recorded is None and not until and not reader.damaged else reason
@@ -173,7 +173,7 @@ def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say:
 
 
 class Difference(NamedTuple):
-    """The difference of two flights: when, of which drone, and how large [m, m/s, rad, rad/s]."""
+    """A difference between two flights: when, of which drone, and how large [m, m/s, rad, rad/s]."""
 
     t_ns: int
     drone: str
@@ -181,7 +181,7 @@ class Difference(NamedTuple):
     velocity_m_s: float
     angle_rad: float
     rate_rad_s: float
-    field: str = ""  # the first that differs, with both values
+    field: str = ""  # the first field that differs, with both values
 
     def __str__(self) -> str:
         angle_deg, rate_deg_s = math.degrees(self.angle_rad), math.degrees(self.rate_rad_s)
@@ -191,10 +191,10 @@ class Difference(NamedTuple):
 
 
 def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Difference | None:
-    """Return the difference of two true states; None if the COUNTED fields are the same to the bit.
+    """Return the difference between two true states; None if the COUNTED fields are identical to the bit.
 
     Raises:
-        DecodeError: one of them is no truth.
+        DecodeError: one of them is not a truth message.
     """
     key = keys.truth(drone)
     a, b = messages.decode(key, recorded), messages.decode(key, flown)
@@ -213,7 +213,7 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
 
 
 def differing_field(recorded: Any, flown: Any, fields: Sequence[str]) -> str:
-    """Return the first of some fields, and which number of it, that differs in two messages, with both values."""
+    """Return the first of some fields that differs between two messages, with its index and both values; or empty."""
     for name in fields:
         a, b = getattr(recorded, name), getattr(flown, name)
         if a == b:
@@ -230,12 +230,12 @@ class TruthComparison:
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._drones = tuple(drones)
-        self.instants = 0  # compared so far
+        self.instants = 0  # number of gates compared so far
         self.first: Difference | None = None
         self.last: Difference | None = None
 
     def add(self, t_ns: int, recorded: Mapping[str, bytes], flown: Mapping[str, bytes]) -> None:
-        """Compare the truth of a gate of both, by drone."""
+        """Compare the truth of a gate of both flights, given as payloads by drone."""
         self.instants += 1
         for drone in self._drones:
             if recorded[drone] != flown[drone] and (
@@ -246,25 +246,24 @@ class TruthComparison:
 
 
 class OutputComparison:
-    """Compares the outputs of agents with those on record; either may come first, within `match_within_ns`."""
+    """Compares the outputs of agents with those on record; either may come first, by up to `match_within_ns`."""
 
     def __init__(self, match_within_ns: int) -> None:
         self._match_within_ns = match_within_ns
         self._unmatched: dict[tuple[str, int, int], Message] = {}
-        self._first: tuple[int, bool, str, str] | None = (
-            None  # of one instant estimates come first, the cause of others
-        )
+        # of outputs with the same time, estimates sort first, since they cause the others
+        self._first: tuple[int, bool, str, str] | None = None
 
     @property
     def first(self) -> str:
-        """The first output that differs, or that only one of the two has, when, and in which field; empty if none."""
+        """Key, time and field of the first output that differs or that only one side has; empty if there is none."""
         if not self._first:
             return ""
         t_ns, _, key, field = self._first
         return f"{key} at {t_ns / 1e9:.2f} s" + (f": {field}" if field else "")
 
     def add(self, key: str, output: Any, recorded: bool = False) -> None:
-        """Add an output of either."""
+        """Add an output of either side."""
         identity = (key, output.seq, output.t_ns)
         other = self._unmatched.pop(identity, None)
         if other is None:
@@ -274,7 +273,7 @@ class OutputComparison:
             self._note(output.t_ns, key, differing_field(*pair, output.__struct_fields__))
 
     def expire(self, t_ns: int) -> None:
-        """Count outputs as different whose counterpart has not come in time before t_ns."""
+        """Count as different all outputs without a counterpart `match_within_ns` before t_ns."""
         for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._match_within_ns]:
             del self._unmatched[identity]
             self._note(identity[2], identity[0])
@@ -291,7 +290,7 @@ Requests = dict[int, list[tuple[str, ControlRequest]]]  # control key and reques
 
 
 class AgentsWithRequests(AgentGroup):
-    """Agents of one process that receive the recorded requests again."""
+    """The agents of one process, which receive the recorded requests again."""
 
     def __init__(self, agents: Agent, requests: Requests, hold_ns: int) -> None:
         super().__init__([agents], hold_ns)
@@ -336,11 +335,11 @@ class RerunBus(Bus):
 
         super().__init__(world, groups, lambda: 0, compare_output, keep_truth)
         self._world = world
-        self.hashes = hashes or OutputHashes(-1)  # of the agents that are run again
+        self.hashes = hashes or OutputHashes(-1)  # hashes of the outputs of agents that are run again
         self._rerun = agents.names
         self.truth: dict[str, bytes] = {}  # payloads at the newest gate, by drone
-        self.refused: list[str] = []  # requests that were carried out on record and are refused now
-        self._admitted: set[_Joined] | None = None  # in this gate; None before the start, when it does not matter
+        self.refused: list[str] = []  # requests that were carried out in the recorded run but are refused now
+        self._admitted: set[_Joined] | None = None  # in this gate; None before the start, when all joins are admitted
         self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
@@ -348,8 +347,8 @@ class RerunBus(Bus):
         """Receive the inputs of a gate, let the agents answer, and advance to that gate.
 
         Raises:
-            RunError: an agent does not answer, since what it waits for is not on record.
-            RunFailedError: or since a user's code fails, which it did not at this gate on record.
+            RunError: an agent does not answer, since what it waits for is not on record; or the run ends differently.
+            RunFailedError: a user's code fails, which it did not at this gate on record.
         """
         self._admitted = _admitted(gate.inputs) if gate.t_ns else None
         for recorded in gate.inputs:
@@ -372,22 +371,22 @@ class RerunBus(Bus):
 
     @property
     def failure(self) -> str:
-        """The first failure of a user's code, empty if there was none."""
+        """The first failure of a user's code; empty if there was none."""
         return next((str(failure) for failure in self._failures.values()), "")
 
     def answer_all(self) -> None:
-        """Let the agents answer all that they have received."""
+        """Let the agents respond to everything that they have received."""
         while self._round():
             pass
 
     def _update_faults(self, faults: run_messages.Faults) -> None:
-        if self._rerun:  # alone, the world receives the commands that resulted from them
+        if self._rerun:  # without agents, the recorded commands already contain their effect
             super()._update_faults(faults)
 
     def _feed(self, recorded: Recorded) -> None:
-        """Repeat what another process published; that of agents that are run again is compared."""
+        """Repeat what another process published; compare what agents that are run again published."""
         key, message = recorded.key, recorded_run.decode_or_none(recorded)
-        if message is None:  # the world refused it too
+        if message is None:  # the recorded world refused it too
             return
         if key == keys.EVENT:
             self._feed_event(message)
@@ -397,14 +396,14 @@ class RerunBus(Bus):
                 self.outputs.add(key, message, recorded=True)
             else:
                 self._hand_over(key, message, source)
-        elif isinstance(message, Sightings):  # no detector is run again: it would need the pictures
+        elif isinstance(message, Sightings):  # detectors are not run again, since they would need the pictures
             self._hand_over(key, message, message.source)
         elif isinstance(message, flight_messages.Command):
             if message.source in self._rerun:
                 self.outputs.add(key, message, recorded=True)
             else:
                 self._world.handle(key, message, 0)
-        elif keys.thing(key) not in self._rerun:  # a join, done or bye; a join when it was admitted, as its event says
+        elif keys.thing(key) not in self._rerun:  # a done, a bye, or a join, which is repeated when its event says so
             joined = (keys.thing(key), message.incarnation) if isinstance(message, run_messages.Join) else None
             if joined is None or self._admitted is None or joined in self._admitted:
                 self._world.handle(key, message, 0)
@@ -418,8 +417,8 @@ class RerunBus(Bus):
         self._world.count_output(source)
 
     def _feed_event(self, event: run_messages.Event) -> None:
-        """Repeat what reached the world other than as a message: deaths, requests, and joins that were withheld."""
-        if event.kind in JOINED and event.source not in self._rerun:
+        """Repeat what reached the world in other ways than as a message: deaths, requests, and withheld joins."""
+        if event.kind in ADMISSIONS and event.source not in self._rerun:
             joined = _joined(event)
             if (join := self._withheld.pop(joined, None)) is not None:
                 self._world.handle(keys.process(joined[0], "join"), join, 0)
@@ -437,14 +436,14 @@ class RerunBus(Bus):
 
 
 def _joined(event: run_messages.Event) -> _Joined:
-    """Return name and incarnation of the process that an event says has joined."""
+    """Return name and incarnation of the process whose join an event reports."""
     return event.subject, event.data.get("incarnation", -1)
 
 
 def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
-    """Return the processes that were admitted before a gate and whose joins were published in that gate, too.
+    """Return the processes that were admitted in a gate, by the events among its inputs.
 
     Their joins are repeated in place. A join that was withheld for longer has its event in a later gate.
     """
     events = (recorded_run.decode_or_none(recorded) for recorded in inputs if recorded.key == keys.EVENT)
-    return {_joined(event) for event in events if event is not None and event.kind in JOINED}
+    return {_joined(event) for event in events if event is not None and event.kind in ADMISSIONS}

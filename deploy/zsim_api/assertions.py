@@ -1,4 +1,4 @@
-"""What tests assert of a run: its errors, that nothing collided, that it is the same to the bit as another."""
+"""Assertions about a run for tests: its errors, no collisions, and bit-identity with another run."""
 
 from abc import ABC, abstractmethod
 from itertools import zip_longest
@@ -18,15 +18,15 @@ from zsim_analysis.rerun import TruthComparison
 if TYPE_CHECKING:
     from zsim_api.recorded import Run
 
-NAMED_MAX = 3  # collisions
+NAMED_MAX = 3  # most collisions listed
 
 
 class Assertions(ABC):
-    """What a test asserts of a run; each lets it fly to its end first."""
+    """Assertions about a run, each of which first lets it fly to its end."""
 
     @abstractmethod
     def run(self) -> "Run":
-        """Return the run on record."""
+        """Return the recorded run."""
 
     def assert_errors(
         self, window: tuple[float, float] | None = None, cluster: str | None = None, **rms: float
@@ -34,15 +34,15 @@ class Assertions(ABC):
         """Assert the true errors of a formation: the RMS of truth − desired while it is engaged.
 
         Args:
-            window: from and to [s]; None: that of the report.
+            window: start and end [s]; None: that of the report.
             cluster: name; None: the first.
             rms: the largest RMS allowed by cluster variable [m, rad], such as p=0.3.
 
         Raises:
-            AssertionError: an RMS is larger or not known, a line each, with the largest error and when it was; or the
-                formation was not engaged all the time.
+            AssertionError: with a line for each RMS that is larger or unknown, with the largest error and its time; or
+                the formation was not engaged throughout the window.
         """
-        __tracebackhide__ = True  # pytest shows the test's line, not these
+        __tracebackhide__ = True  # pytest then shows the line of the test, not this function
         run = self.run()
         formation = run.judged_formation(cluster)
         window = window or run.summary.window_s
@@ -71,7 +71,7 @@ class Assertions(ABC):
             raise AssertionError("\n".join([*faults, f"the record is {run.record}"]))
 
     def assert_no_collision(self) -> None:
-        """Assert that no drone collided with another, or ran into an obstacle; AssertionError says which, and when."""
+        """Assert that no drone collided with another one or an obstacle; AssertionError says which did, and when."""
         __tracebackhide__ = True
         run = self.run()
         with RecordReader(run.record) as reader:
@@ -83,13 +83,13 @@ class Assertions(ABC):
             raise AssertionError("\n".join([*lines, *more, f"the record is {run.record}"]))
 
     def assert_same_bits(self, other: "Assertions | Run | str | Path") -> None:
-        """Assert that the truth of another run is the same to the bit.
+        """Assert that the truth of another run is identical to the bit.
 
         Args:
-            other: another federation, a run, or where one is.
+            other: another federation, a run, or the path of one.
 
         Raises:
-            AssertionError: with the first difference: drone, time, and how large.
+            AssertionError: with drone, time and size of the first difference.
         """
         __tracebackhide__ = True
         from zsim_api.recorded import Run

@@ -1,8 +1,7 @@
-"""What drones are told from Python: commands, and requests to the pilot of a drone that flies by a reference.
+"""Control of drones from Python: commands, and requests to the pilot of a drone that flies a reference.
 
-Commands are for `Simulation.step` and for agents: messages of the contract by their SI numbers, whose stamp, number and
-source are filled in by whoever publishes them. Requests are for a drone that flies by itself:
-`sim.drone("drone1").goto((1, 2, 3))`.
+Commands are for `Simulation.step` and for agents: messages of the contract in SI units, in which the publisher fills in
+stamp, number and source. Requests are for a drone that flies on its own: `sim.drone("drone1").goto((1, 2, 3))`.
 """
 
 import math
@@ -16,10 +15,10 @@ from zsim.contract.flight_messages import Ardrone, Attitude, Mode, RotorSpeeds, 
 from zsim.errors import RunError
 
 Command = Velocity | Attitude | RotorSpeeds | Ardrone | Mode
-"""What a drone can be told: what the functions of this module return."""
+"""A command to a drone, as the functions of this module return it."""
 _UNSTAMPED = (0, 0, "")  # t_ns, seq, source
 Ask = Callable[..., dict[str, Any]]
-"""`ask` of a `Simulation` or a `Federation`: key, op and arguments; RequestRefusedError with the reason."""
+"""`ask` of a `Simulation` or a `Federation`, with key, op and arguments; raises RequestRefusedError."""
 
 
 def velocity(
@@ -29,7 +28,7 @@ def velocity(
     yaw_rate_rad_s: float = 0.0,
     frame: Literal["heading", "world"] = "heading",
 ) -> Velocity:
-    """Return a command to fly a velocity: x forward, y left, z up; in the frame "world" east, north, up.
+    """Return a command to fly a velocity [m/s]: x forward, y left, z up; in the frame "world" east, north, up.
 
     Raises:
         RunError: a number is not finite, or the frame is unknown.
@@ -41,10 +40,10 @@ def velocity(
 
 
 def attitude(orientation_wxyz: Sequence[float] | np.ndarray, thrust_n: float, yaw_rate_rad_s: float = 0.0) -> Attitude:
-    """Return a command to fly a tilt: B to W, w first, its heading being ignored; with a thrust [N] and a yaw rate.
+    """Return a command to fly a tilt (B to W, w first, heading ignored), with a thrust [N] and a yaw rate [rad/s].
 
     Raises:
-        RunError: a number is not finite, or the orientation does not have four.
+        RunError: a number is not finite, or the orientation does not have four numbers.
     """
     *q, thrust, yaw_rate = _finite("attitude", (*orientation_wxyz, thrust_n, yaw_rate_rad_s))
     if len(q) != 4:
@@ -53,17 +52,17 @@ def attitude(orientation_wxyz: Sequence[float] | np.ndarray, thrust_n: float, ya
 
 
 def rotors(speed_rad_s: Sequence[float] | np.ndarray) -> RotorSpeeds:
-    """Return a command to turn the rotors at speeds (R,) [rad/s], in the order of `world/info`."""
+    """Return a command of rotor speeds (R,) [rad/s], in the order of `world/info`."""
     return RotorSpeeds(*_UNSTAMPED, _finite("rotors", speed_rad_s))
 
 
 def ardrone(forward: float, left: float, up: float, yaw_left: float, hover: bool = False) -> Ardrone:
-    """Return a command in the AR.Drone's terms: tilts, climb and yaw rate in [-1, 1] of their limits, or hovering."""
+    """Return a command in the AR.Drone's terms: tilts, climb and yaw rate in [-1, 1] of their limits, or hover."""
     return Ardrone(*_UNSTAMPED, *_finite("ardrone", (forward, left, up, yaw_left)), hover=hover)
 
 
 def takeoff() -> Mode:
-    """Return a command to take off, and to hover then."""
+    """Return a command to take off, then hover."""
     return Mode(*_UNSTAMPED, "takeoff")
 
 
@@ -87,11 +86,11 @@ def _finite(what: str, numbers: Sequence[float] | np.ndarray) -> tuple[float, ..
 class PilotedDrone:
     """The requests to the pilot of one drone; see docs/references.md.
 
-    Each acts from the next gate on, and raises RequestRefusedError with the reason: the drone has no `reference` in the
-    scenario, is not in the air, or cannot fly what is asked.
+    Each request acts from the next gate on. It raises RequestRefusedError if, for example, the drone has no `reference`
+    in the scenario, is not in the air, or cannot fly the requested path.
 
     Attributes:
-        name: of the drone.
+        name: name of the drone.
     """
 
     def __init__(self, name: str, ask: Ask) -> None:
@@ -107,15 +106,16 @@ class PilotedDrone:
         speed_m_s: float | None = None,
         radius_m: float | None = None,
     ) -> float:
-        """Fly to a place in W, or through several, to rest at the last one; return the simulated time [s] of arrival.
+        """Fly to a position in W, or through several, and rest at the last; return the simulated time of arrival [s].
 
         Args:
-            position_m: (3,), or (n, 3) of places one after the other.
-            yaw_deg: heading there; None for the present one.
-            over_s: how long, to one place; less than the drone's limits need is lengthened. With the same one, all
-                drones fly by one function of time.
-            speed_m_s: cruise speed; None, or more than the drone's limits allow, for as fast as these let it.
-            radius_m: from within which of a place it turns towards the next one; None or 0: it rests at each.
+            position_m: (3,), or (n, 3) for successive positions.
+            yaw_deg: heading there; None: the present heading.
+            over_s: duration of a flight to one position, which is lengthened if the drone's limits require it. With the
+                same duration, all drones follow the same function of time.
+            speed_m_s: cruise speed; None, or more than the drone's limits allow: as fast as these allow.
+            radius_m: distance from a position within which the drone turns towards the next one; None or 0: it rests at
+                each position.
         """
         places = np.asarray(position_m, float)
         where = "places_m" if places.ndim == 2 else "position_m"
@@ -124,10 +124,10 @@ class PilotedDrone:
         return float(self._ask(self._key, "goto", **asked)["until_s"])
 
     def follow(self, **path: Any) -> float | None:
-        """Fly to the beginning of a path, then the path; return the simulated time [s] of its end, None if it has none.
+        """Fly to the start of a path, then along it; return the simulated time of its end [s], None if it has no end.
 
         Args:
-            path: fields of a reference as in a scenario, but for its times, gains and file:
+            path: fields of a reference as in a scenario, except its times, gains and file:
                 `minimum_snap=[{"at_s": 0, "position_m": [0, 0, 2]}, …]`,
                 `circle={"radius_m": 2, "period_s": 10}`, `fit=True`, `origin_m=…`.
         """
@@ -138,7 +138,7 @@ class PilotedDrone:
         self._ask(self._key, "hold")
 
     def land(self) -> None:
-        """Land where it is."""
+        """Land at the current position."""
         self._ask(self._key, "land")
 
     def takeoff(self) -> None:

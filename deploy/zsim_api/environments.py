@@ -1,10 +1,10 @@
-"""Environments for learning over any scenario: PettingZoo's ParallelEnv, and Gymnasium's Env and VectorEnv.
+"""Environments for reinforcement learning in any scenario: PettingZoo's ParallelEnv, Gymnasium's Env and VectorEnv.
 
     env = zsim.parallel_env("step.yaml", reward=near_start, terminated=zsim.flipped, observe="estimate", step_s=0.1)
     observations, infos = env.reset(seed=3)
 
-An episode begins when all drones are in the air, and ends with the scenario's duration. What an action does is seen
-after the command's delay (`infos[agent]["command_delay_s"]`), as everywhere in zsim: see docs/python.md.
+An episode begins when all drones are in the air, and ends with the scenario's duration. The effect of an action becomes
+visible after the command's delay (`infos[agent]["command_delay_s"]`), as everywhere in zsim: see docs/python.md.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,32 +25,32 @@ from zsim_api.policy import FARTHEST, Action, Floats, Interface, Observe
 from zsim_api.scenarios import AnyScenario, Scenario, scenario_of
 from zsim_api.simulation import Simulation
 
-Reward = Callable[[Simulation, str], float]  # of the flight and an agent, after a step
+Reward = Callable[[Simulation, str], float]  # reward of an agent after a step
 Ended = Callable[[Simulation, str], bool]
-Randomise = Callable[[np.random.Generator], Mapping[str, Any]]  # fields of an episode's scenario, by path
+Randomise = Callable[[np.random.Generator], Mapping[str, Any]]  # returns fields of an episode's scenario by path
 SEEDS = 2**31
 
 
 def never(sim: Simulation, agent: str) -> bool:
-    """End no episode before its time."""
+    """Let every episode last until the scenario's end."""
     return False
 
 
 def collided(sim: Simulation, agent: str) -> bool:
-    """End the episode of a drone, or of a cluster, that hits another drone, an obstacle, or the ground."""
+    """End the episode of a drone that hits a drone, an obstacle or the ground, or of a cluster with such a drone."""
     own = _drones(sim, agent)
     hits = (event for event in sim.events if event.kind in ("collision", "impact"))
     return any(event.subject in own or event.data.get("other") in own for event in hits)
 
 
 def flipped(sim: Simulation, agent: str) -> bool:
-    """End the episode of a drone whose z axis points below the horizon; of a cluster with such a drone."""
+    """End the episode of a drone whose z axis points below the horizon, or of a cluster with such a drone."""
     _, x, y, _ = sim.truth.orientation_wxyz[[sim.names.index(drone) for drone in _drones(sim, agent)]].T
     return bool((1 - 2 * (x * x + y * y) < 0).any())
 
 
 def far_away(distance_m: float) -> Ended:
-    """Return a condition that ends the episode of a drone farther than this from where it stood at the start [m]."""
+    """Return a condition that ends the episode of a drone farther than this from its initial position [m]."""
 
     def is_far(sim: Simulation, agent: str) -> bool:
         places = [sim.names.index(drone) for drone in _drones(sim, agent)]
@@ -61,7 +61,7 @@ def far_away(distance_m: float) -> Ended:
 
 
 def any_of(*conditions: Ended) -> Ended:
-    """Return a condition that holds where one of several does."""
+    """Return a condition that holds if any of these does."""
     return lambda sim, agent: any(each(sim, agent) for each in conditions)
 
 
@@ -71,7 +71,7 @@ def _drones(sim: Simulation, agent: str) -> Sequence[str]:
 
 
 class _Episodes:
-    """Episodes of a scenario, which all kinds of environments step; arguments as of `parallel_env`."""
+    """Episodes of a scenario, which all kinds of environments step; arguments as in `parallel_env`."""
 
     def __init__(
         self,
@@ -86,11 +86,11 @@ class _Episodes:
         duration_s: float | None = None,
         set: Mapping[str, Any] | None = None,
     ) -> None:
-        whole = scenario_of(scenario).changed(duration_s=duration_s, set=set)
-        self.interface = Interface(whole.resolved, observe, action, step_s)
-        estimators = [name for name in agent_names(whole.resolved) if name.startswith("estimator.")]
+        source = scenario_of(scenario).changed(duration_s=duration_s, set=set)
+        self.interface = Interface(source.resolved, observe, action, step_s)
+        estimators = [name for name in agent_names(source.resolved) if name.startswith("estimator.")]
         expect = estimators if observe == "estimate" else []
-        self.scenario: Scenario = whole.with_({"processes.expect": expect})
+        self.scenario: Scenario = source.with_({"processes.expect": expect})
         self._reward, self._terminated, self._randomise = reward, terminated, randomise
         self.sim = Simulation(self.scenario)
         self.action_spaces: dict[str, Box] = {}
@@ -104,7 +104,7 @@ class _Episodes:
         """Fly until all drones are in the air; return the observations.
 
         Raises:
-            RunError: they are not before the scenario ends.
+            RunError: the scenario ends before they are.
         """
         drawn = self._randomise(rng) if self._randomise else {}
         self.sim.source = self.scenario.changed(seed=int(rng.integers(SEEDS)), set=drawn)
@@ -112,7 +112,7 @@ class _Episodes:
         while (commands := self.interface.begin(self.sim)) is not None:
             if self.sim.ended is not None:
                 states = ", ".join(f"{name} {self.sim.state(name)}" for name in self.sim.names)
-                raise RunError(f"{self.scenario.source}: at its end its drones are not all in the air: {states}")
+                raise RunError(f"{self.scenario.source}: ended before all drones were in the air: {states}")
             self._fly(commands)
         return self.interface.observations(self.sim)
 
@@ -141,7 +141,7 @@ class _Episodes:
 
 
 class FormationEnv(ParallelEnv[str, Floats, Floats]):
-    """PettingZoo's environment over a scenario: an agent per drone, or per cluster; see `parallel_env`."""
+    """PettingZoo's environment for a scenario: an agent per drone, or per cluster; see `parallel_env`."""
 
     metadata = {"name": "zsim_formation_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012
     render_mode = None
@@ -167,7 +167,7 @@ class FormationEnv(ParallelEnv[str, Floats, Floats]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Floats], dict[str, dict[str, Any]]]:
-        """Begin an episode; the same seed gives the same bits."""
+        """Begin an episode; the same seed gives a bit-identical one."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
@@ -185,7 +185,7 @@ class FormationEnv(ParallelEnv[str, Floats, Floats]):
         return observations, rewards, terminations, dict.fromkeys(acting, is_over), infos
 
     def render(self) -> None:
-        """Draw nothing: record a flight and look at its report."""
+        """Draw nothing; to see a flight, record it and view its report."""
 
     def close(self) -> None:
         """End the flight."""
@@ -193,7 +193,7 @@ class FormationEnv(ParallelEnv[str, Floats, Floats]):
 
 
 class FlightEnv(gymnasium.Env[Floats, Floats]):
-    """Gymnasium's environment over a scenario: all agents as one; see `gym_env`."""
+    """Gymnasium's environment for a scenario, with all agents as one; see `gym_env`."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
@@ -208,70 +208,73 @@ class FlightEnv(gymnasium.Env[Floats, Floats]):
         self.observation_space = Box(-FARTHEST, FARTHEST, (size,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode; the same seed gives the same bits."""
+        """Begin an episode; the same seed gives a bit-identical one."""
         super().reset(seed=seed)
-        return self._whole(self._episodes.begin(self.np_random)), self._episodes.info()
+        return self._joined(self._episodes.begin(self.np_random)), self._episodes.info()
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Fly one step; the reward is the mean of the agents', and one that terminates ends the episode."""
+        """Fly one step; the reward is the mean over agents, and any agent that terminates ends the episode."""
         parts = np.split(np.asarray(action), self._cuts)
         seen = self._episodes.step(dict(zip(self._agents, parts, strict=True)))
         reward = sum(map(self._episodes.reward, self._agents)) / len(self._agents)
         is_terminated = any(self._episodes.terminated(agent) for agent in self._agents)
-        return self._whole(seen), reward, is_terminated, self.sim.ended is not None, self._episodes.info()
+        return self._joined(seen), reward, is_terminated, self.sim.ended is not None, self._episodes.info()
 
     def close(self) -> None:
         """End the flight."""
         self.sim.close()
 
-    def _whole(self, seen: Mapping[str, NDArray[np.float32]]) -> Floats:
+    def _joined(self, seen: Mapping[str, NDArray[np.float32]]) -> Floats:
         return np.concatenate([seen[agent] for agent in self._agents])
 
 
 def parallel_env(scenario: AnyScenario, **settings: Any) -> FormationEnv:
-    """Return a PettingZoo environment over a scenario.
+    """Return a PettingZoo environment for a scenario.
 
-    The scenario's controllers do not fly in it; its estimators do where estimates are observed. `env.scenario` is what
-    flies: `zsim.run(env.scenario, agents=[MyPolicy])` flies a `zsim.PolicyAgent` to the same bits, anywhere.
+    The scenario's controllers do not take part; its estimators do if estimates are observed. `env.scenario` is the
+    scenario that flies: `zsim.run(env.scenario, agents=[MyPolicy])` flies a `zsim.PolicyAgent` bit-identically,
+    anywhere.
 
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
-        settings: `reward(sim, agent)`, required, and `terminated(sim, agent)`, of the `zsim.Simulation` after a step
-            and an agent's name, for instance `zsim.flipped`; `randomise(rng)`, fields of an episode's scenario by path,
-            drawn from a numpy Generator; `observe`: "truth", "estimate" or "sensors"; `action`: "velocity", "attitude",
-            "rotors", or "cluster", whose agents are clusters; `step_s`: time between two actions, one gate if left out;
-            `duration_s` and `set`, as of `zsim.run`. Both spaces: see `zsim.Interface`.
+        settings: `reward(sim, agent)`, which is required, and `terminated(sim, agent)`, functions of the
+            `zsim.Simulation` after a step and an agent's name, for example `zsim.flipped`; `randomise(rng)`, which
+            returns fields of an episode's scenario by path, drawn from a numpy Generator; `observe`: "truth",
+            "estimate" or "sensors"; `action`: "velocity", "attitude", "rotors", or "cluster", for which the agents are
+            clusters; `step_s`: time between two actions, one gate by default; `duration_s` and `set` as in `zsim.run`.
+            For both spaces, see `zsim.Interface`.
 
     Raises:
-        ScenarioError: with every fault of the scenario, a line each.
+        ScenarioError: with one line for every fault of the scenario.
         RunError: the settings do not fit each other or the scenario.
     """
     return FormationEnv(scenario, **_checked(settings))
 
 
 def gym_env(scenario: AnyScenario, **settings: Any) -> FlightEnv:
-    """Return a Gymnasium environment over a scenario, of which all agents are one; arguments as of `parallel_env`."""
+    """Return a Gymnasium environment for a scenario, with all agents as one; arguments as in `parallel_env`."""
     return FlightEnv(scenario, **_checked(settings))
 
 
 def vector_env(
     scenario: AnyScenario, num_envs: int, processes: bool = False, **settings: Any
 ) -> VectorEnv[Any, Any, Any]:
-    """Return several Gymnasium environments as one, which begin the next episode with the step after the last one.
+    """Return several Gymnasium environments as one; each begins its next episode with the step after the last one.
 
     Args:
-        num_envs: their number.
-        processes: each in a process of its own.
-        settings: as of `parallel_env`.
+        scenario: as in `parallel_env`.
+        num_envs: number of environments.
+        processes: whether each has its own process.
+        settings: as in `parallel_env`.
     """
     make = partial(gym_env, scenario, **_checked(settings))
     return (AsyncVectorEnv if processes else SyncVectorEnv)([make] * num_envs)
 
 
 def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
-    known = [*signature(_Episodes).parameters][1:]  # after the scenario
+    known = [*signature(_Episodes).parameters][1:]  # without the scenario
     if unknown := [name for name in settings if name not in known]:
-        raise RunError(f"settings: {', '.join(unknown)} is not known; must be of {', '.join(known)}")
+        raise RunError(f"settings: unknown {', '.join(unknown)}; must be of {', '.join(known)}")
     if "reward" not in settings:
         raise RunError("settings: reward is missing; must be a function of the zsim.Simulation and an agent's name")
     return dict(settings)

@@ -1,4 +1,4 @@
-"""A flight under test: real processes and a user's own programs, which a test observes and intervenes in.
+"""A flight under test: real processes and the user's own programs, in which a test observes and intervenes.
 
     with zsim.Federation("step.yaml", duration=40, programs=["python my_controller.py --connect {endpoint}"]) as flight:
         flight.wait_until("engaged")
@@ -7,7 +7,7 @@
         flight.assert_errors(p=0.3, window=(20, 40))
 
 The test takes part in the lockstep as `test.federation`: simulated time stands still unless the test waits for
-something, so its actions take effect at the same gate each time. The fixture `federation` of the pytest plugin makes
+something, so its actions take effect at the same gate each time. The fixture `federation` of the pytest plugin creates
 these objects.
 """
 
@@ -53,7 +53,7 @@ PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to 
 PROGRAM_END_S = 5.0  # wall time for programs to notice the end of the run
 KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no SIGKILL
 HARMLESS = {getattr(signal, name, None) for name in ("SIGSTOP", "SIGCONT")}  # signals that do not end a process
-LAST_LINES = 40  # shown of a log with a failure
+LAST_LINES = 40  # last lines shown of a log with a failure
 ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # in the launcher's log
 
 
@@ -62,8 +62,8 @@ class Moment(NamedTuple):
 
     Attributes:
         t_s: simulated time.
-        states: the received states of the clusters by name: two gates old.
-        truth: the true motion of the drones by name; without external ones.
+        states: the newest received states of the clusters by name, which are two gates old.
+        truth: the true motion of the drones by name, except external ones.
         events: those since the last `wait_until`.
     """
 
@@ -77,26 +77,26 @@ Condition = Callable[[Moment], Any]
 
 
 class Federation(Assertions):
-    """A flight as processes: `zsim run`, on a free port and in a federation of its own, and programs.
+    """A flight as processes: `zsim run` on a free port, in a federation of its own, together with the user's programs.
 
     Args:
         scenario: path, `zsim.Scenario`, or a mapping as in YAML.
         duration: simulated time of the flight [s]; None: that of the scenario.
         seed, set, law, estimator, out: as in `zsim.run`; an earlier run in `out` is replaced.
-        agents: your own, as in `zsim.run`, or as words of `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
-        programs: command lines of your own programs, in any language, as text or as words. `{endpoint}`,
-            `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION. Time
-            does not begin before a named program has joined, as in "ground.main=python ground.py". A program that ends
-            with a code other than 0 fails the flight.
-        options: of `zsim run`, such as "--hosted", or "--rate" and "1".
+        agents: your own, as in `zsim.run`, or as texts for `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
+        programs: command lines of your own programs, in any language, each a text or a list of words. `{endpoint}`,
+            `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION.
+            Simulated time does not start before every named program has joined, as in "ground.main=python ground.py".
+            A program that ends with a code other than 0 fails the flight.
+        options: further options of `zsim run`, such as "--hosted", or "--rate" and "1".
         modules: further folders with the modules of named classes, beside those of the scenario.
 
     Attributes:
-        endpoint, name: the endpoint of its world; the name of the federation.
-        folder: of the run, with the record and the logs.
+        endpoint, name: the endpoint of the world; the name of the federation.
+        folder: the run's folder, with the record and the logs.
 
     Raises:
-        ScenarioError, RunError: it cannot be flown; nothing was started.
+        ScenarioError, RunError: the flight is not possible; nothing was started.
     """
 
     def __init__(
@@ -126,12 +126,12 @@ class Federation(Assertions):
             )
             own = [each for each in sequence_of_agents(agents) if not isinstance(each, str)]
             named = [each for each in agents if isinstance(each, str)]
-            flown, made = calling(lambda: with_agents(source.resolved, own))
-            expected = [*expected_processes(flown), *(name for name, _ in started if name), PROCESS]
+            resolved, own_agents = calling(lambda: with_agents(source.resolved, own))
+            expected = [*expected_processes(resolved), *(name for name, _ in started if name), PROCESS]
             changed: dict[str, Any] = {"federation": self.name, "processes.expect": expected}
-            changed["processes.on_death"] = {**flown.processes.on_death, PROCESS: "drop"}
+            changed["processes.on_death"] = {**resolved.processes.on_death, PROCESS: "drop"}
             source = source.with_(changed)
-            self.folder = run_folder.make_directory(Path(out) if out is not None else None, flown, force=True)
+            self.folder = run_folder.make_directory(Path(out) if out is not None else None, resolved, force=True)
             source.keep_modules(self.folder)
             logs = self.folder / run_folder.LOGS
             logs.mkdir(exist_ok=True)
@@ -140,7 +140,7 @@ class Federation(Assertions):
             raise
         self._watch = _Watch()
         self._known = {*expected, WORLD, RECORDER}
-        self._has_others = bool(named or options) or any(not name for name, _ in started)  # with unknown names
+        self._has_others = bool(named or options) or any(not name for name, _ in started)  # whose names are unknown
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
@@ -149,7 +149,7 @@ class Federation(Assertions):
         self._run: Run | None = None
         words = [word for each in named for word in ("--agent", each)]
         launched = ["--listen", self.endpoint, *words, *options]
-        command, environment = command_of(source, own, [agent.name for agent in made], launched, self.folder)
+        command, environment = command_of(source, own, [agent.name for agent in own_agents], launched, self.folder)
         environment["PYTHONPATH"] = search_path([*modules, environment["PYTHONPATH"]])
         self._launcher = Program(command, environment, logs / f"{LAUNCHER}.log")
         self._environment = environment | environment_of(self.endpoint, self.name)
@@ -183,17 +183,17 @@ class Federation(Assertions):
         """Let time pass until a condition is met, and stop it there; in realtime it continues.
 
         Args:
-            what: a phase that every cluster must be in, such as "engaged" (met at once if it is already so, even just
+            what: a phase that every cluster must be in, such as "engaged" (met at once if all already are, even just
                 after a `kill`); a kind of event, such as "collision" or "restart", since the last call; a simulated
                 time [s]; or a function of a `Moment`.
-            within_s: wall time.
+            within_s: limit in wall time.
 
         Returns:
-            The moment.
+            The moment at which the condition was met.
 
         Raises:
             RunError: there is no such phase or kind of event.
-            RunFailedError: the run ended before, or a program failed, or it takes longer.
+            RunFailedError: the run ended first, a program failed, or `within_s` has passed.
             Exception: raised by the function.
         """
         __tracebackhide__ = True
@@ -209,19 +209,19 @@ class Federation(Assertions):
                 raise watch.raised
             if not waited and watch.moment is not None:
                 return watch.moment
-        if self._watch.left:  # the launcher's log tells why
+        if self._watch.left:  # the launcher's log says why
             self._launcher.wait(max(0.0, until_s - time.monotonic()))
         fault = self._fault or f"not reached within {within_s:g} s of wall time"
         raise RunFailedError(f"{self.folder.name}: waiting for {text} from {self.t_s:.2f} s on: {fault}")
 
     def run(self, within_s: float = PATIENCE_S) -> "Run":
-        """Let time pass until the end of the run; return the run on record, `zsim.load` of its folder.
+        """Let time pass until the end of the run; return the recorded run, as `zsim.load` does.
 
         Args:
-            within_s: wall time.
+            within_s: limit in wall time.
 
         Raises:
-            RunFailedError: a failure ended the run, or a program ended with a code other than 0, or it takes longer.
+            RunFailedError: a failure ended the run, a program ended with a code other than 0, or `within_s` has passed.
         """
         if self._run is None:
             self._watch.finish()
@@ -248,11 +248,11 @@ class Federation(Assertions):
 
         Args:
             key: `world/control` or `cluster/NAME/control`.
-            op, args: docs/protocol.md has them.
+            op, args: the request, as in docs/protocol.md.
             within_s: wall time to wait for the world.
 
         Raises:
-            RequestRefusedError: with the reason.
+            RequestRefusedError: the request was refused, for the reason given.
             RunError: no answer came.
         """
         return result_of(self._session(within_s).request(key, op, PROCESS, args))
@@ -264,30 +264,30 @@ class Federation(Assertions):
     def inject(self, fault: Mapping[str, Any]) -> Any:
         """Inject a fault, as in a scenario's `faults`; see docs/faults.md.
 
-        In lockstep, a fault without `at_s` acts from the first gate that the world cannot have computed yet, the same
-        in each run: one more than `time.command_delay_gates` after `t_s`.
+        In lockstep, a fault without `at_s` acts from the first gate that the world cannot have computed yet, which is
+        the same in each run: `time.command_delay_gates` + 1 gates after `t_s`.
 
         Returns:
-            `id`, `from_ns` and `until_ns`.
+            `id`, `from_ns` and `until_ns` of the fault.
 
         Raises:
-            RequestRefusedError: with the reason.
+            RequestRefusedError: the fault was refused, for the reason given.
         """
         self._session(PATIENCE_S)
         at = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
         return self.ask(keys.CONTROL, "fault_add", **{**at, **fault})
 
     def kill(self, process: str, number: int = KILL, within_s: float = PATIENCE_S) -> int:
-        """Send a process of the run a signal, kill -9 by default; return its process id.
+        """Send a signal to a process of the run, SIGKILL by default; return its process id.
 
         Args:
             process: name, such as "estimator.drone2", "world", or that of a program of yours, "ground.main".
-            number: of the signal, such as SIGSTOP, which stops it until SIGCONT.
-            within_s: wall time to wait until it has joined.
+            number: the signal, such as SIGSTOP, which stops the process until SIGCONT.
+            within_s: wall time to wait until the process has joined.
 
         Raises:
             RunError: no process of the run has that name.
-            RunFailedError: it has not joined.
+            RunFailedError: the process has not joined in time.
         """
         until_s = time.monotonic() + within_s
         self._check_name(process, within_s)
@@ -305,15 +305,15 @@ class Federation(Assertions):
         return pid
 
     def start(self, program: str) -> None:
-        """Restart a program of yours that has ended or was killed, by its name.
+        """Restart one of your programs that has ended or was killed.
 
         Raises:
-            RunError: there is no such program, or it is still running.
+            RunError: no program has this name, or it is still running.
         """
         former = self._programs.get(program)
         if former is None:
-            known = ", ".join(self._programs) or "there are none"
-            raise RunError(f"start: program is {program!r}; must be one of {known}")
+            known = f"must be one of {', '.join(self._programs)}" if self._programs else "the flight has no programs"
+            raise RunError(f"start: program is {program!r}; {known}")
         if former.wait(PROGRAM_END_S if former.asked else 0.0) is None:
             raise RunError(f"start: {program} is running; must have ended")
         former.close()
@@ -325,10 +325,10 @@ class Federation(Assertions):
             return
         watch = self._watch
         with watch.news:
-            if self._has_others:  # all expected processes have joined by the first gate
+            if self._has_others:  # at the first gate all expected processes have joined
                 watch.news.wait_for(lambda: watch.moment is not None or self._fault is not None, within_s)
             link = self._link
-        for sample in link.get(keys.process("*", "join")) if link else ():  # joined before this test
+        for sample in link.get(keys.process("*", "join")) if link else ():  # those that joined before this test
             self._take_process(sample)
         allowed = sorted({*self._known, *self._pids} - {PROCESS})
         if process not in allowed:
@@ -343,15 +343,15 @@ class Federation(Assertions):
             return self._link
 
     def _await(self, is_met: Callable[[], bool], until_s: float, failure: str) -> None:
-        """Wait for news by which a condition is met; RunFailedError if the run is over, or it takes longer."""
+        """Wait for news until a condition is met; RunFailedError once the run is over or the time has passed."""
         while not is_met():
             if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
                 raise RunFailedError(f"{self.folder.name}: {self._fault or failure}")
 
-    # Its end
+    # End
 
     def close(self) -> None:
-        """End all its processes; the record contains everything up to then."""
+        """End all processes of the flight; the record contains everything up to then."""
         self._over = True
         self._watch.finish()
         self._launcher.close()
@@ -368,37 +368,33 @@ class Federation(Assertions):
         self.close()
 
     def diagnosis(self) -> str:
-        """Describe the progress of the run, the processes that are waited for, and the last lines of the logs.
+        """Describe the progress of the run, the processes that it waits for, and the last lines of the logs.
 
         The logs of failed and awaited processes come first, then the launcher's; then one line of each other log.
         """
         clock = self._newest_clock()
         waiting = [each for each in clock.waiting_for if each.name != PROCESS] if clock else []
-        parts = [self._standing(clock, waiting)]
+        parts = [self._progress(clock, waiting)]
         if fault := self._program_fault():
             parts.append(fault)
         logs = {log.stem: log.read_text(errors="replace") for log in (self.folder / run_folder.LOGS).glob("*.log")}
         failed = [name for name, program in self._programs.items() if program.code and not program.asked]
         failed += ENDED.findall(logs.get(LAUNCHER, ""))
-        whole = [*dict.fromkeys((*failed, *(each.name for each in waiting), LAUNCHER))]
-        for name in (*whole, *sorted(logs.keys() - {*whole})):
+        detailed = [*dict.fromkeys((*failed, *(each.name for each in waiting), LAUNCHER))]
+        for name in (*detailed, *sorted(logs.keys() - {*detailed})):
             lines = logs.get(name, "").splitlines()
-            shown = lines[-LAST_LINES:] if name in whole else lines[-1:]
-            if shown and name in whole:
+            shown = lines[-LAST_LINES:] if name in detailed else lines[-1:]
+            if shown and name in detailed:
                 before = f" (last {len(shown)} of {len(lines)} lines)" if len(shown) < len(lines) else ""
                 parts.append("\n".join([f"--- {name}.log{before}", *shown]))
             elif shown:
                 parts.append(f"--- {name}.log, the last of {len(lines)}: {shown[0]}")
         return "\n".join(parts)
 
-    def _standing(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
+    def _progress(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
             return "no clock of a world was received"
-        lines = []
-        for each in holding_up(clock.state, waiting) or waiting:
-            on = f" on {each.host}" if each.host else ""
-            held = f", held by {', '.join(each.held_by)}" if each.held_by else ""
-            lines.append(f"  {each.name}{on} since {each.since_wall_s:.1f} s{held}")
+        lines = [f"  {each}" for each in holding_up(clock.state, waiting) or waiting]
         if not self._watch.left and self._watch.wanted is None:
             lines.append(f"  {PROCESS}, this test, which is not waiting for anything at the moment")
         lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' none'}")
@@ -415,7 +411,7 @@ class Federation(Assertions):
 
     @property
     def _fault(self) -> str | None:
-        """Why the run is over, None while it continues."""
+        """Why the run is over; None while it continues."""
         if fault := self._program_fault():
             return fault
         if (code := self._launcher.code) is not None:
@@ -439,7 +435,7 @@ class Federation(Assertions):
             self._watch.news.notify_all()
 
     def _take_part(self) -> None:
-        """Observe the run from its start to its end; the world waits for this."""
+        """Take part in the run from its start to its end; the world waits for this participant."""
 
         def is_over() -> bool:
             return self._over or self._launcher.code is not None
@@ -477,19 +473,19 @@ class Federation(Assertions):
 
 
 class _Watch(Agent):
-    """The test's participant in the lockstep: it is done with a gate once the test lets time pass.
+    """The test's participant in the lockstep, which completes a gate only once the test lets time pass.
 
     Attributes:
         news: guards the other attributes, and signals changes.
-        wanted: the condition that the test waits for; None while time stands still.
+        wanted: the condition that the test waits for; None while simulated time stands still.
         moment: the newest gate; None before the first.
-        raised: by the condition.
-        left: whether it has left the run.
+        raised: the exception that the condition raised.
+        left: whether the participant has left the run.
         ahead_s: time after the newest gate that the world cannot have computed yet [s]; None in realtime.
     """
 
     name = PROCESS
-    uncounted = (keys.EVENT,)  # the end of a process is stamped with a gate that has already been received
+    uncounted = (keys.EVENT,)  # the event of a process's end carries the stamp of a gate that has already been received
 
     def __init__(self) -> None:
         super().__init__()
@@ -506,7 +502,7 @@ class _Watch(Agent):
         self._events: list[Event] = []
 
     def watch(self, info: Info) -> None:
-        """Prepare for the run of `world/info`; in realtime, time does not wait."""
+        """Prepare for the run that `world/info` describes; in realtime, time does not wait for the test."""
         simulated = [drone.name for drone in info.drones if drone.body is UNSET]
         truth = [keys.truth(drone) for drone in simulated]
         self.gate_keys = (*(keys.status(drone.name) for drone in info.drones), *truth)
@@ -523,7 +519,7 @@ class _Watch(Agent):
         self.news.notify_all()
 
     def finish(self) -> None:
-        """Let time pass to the end."""
+        """Let time pass until the end of the run."""
         with self.news:
             self.begin(lambda _: False)
 
@@ -538,7 +534,8 @@ class _Watch(Agent):
     def step(self, t_ns: int) -> Sequence[Output]:
         with self.news:
             self._now_ns = t_ns
-            events = tuple(event for event in self._events if event.t_ns < t_ns)  # those of this gate may be incomplete
+            # the events of this gate may be incomplete
+            events = tuple(event for event in self._events if event.t_ns < t_ns)
             self.moment = Moment(t_ns / 1e9, dict(self._states), dict(self._truth), events)
             while True:
                 wanted = self.wanted
@@ -578,7 +575,7 @@ def _condition(what: str | float | Condition) -> tuple[Condition, str]:
 
 
 def _named(program: str | Sequence[str]) -> tuple[str, list[str]]:
-    """Return the process name of a program, empty if it has none, and its words."""
+    """Return the process name of a program (empty if it has none) and the words of its command line."""
     words = shlex.split(program) if isinstance(program, str) else list(program)
     if not words:
         raise RunError("programs: a command line is empty; must be words such as 'python my_controller.py'")
@@ -589,8 +586,8 @@ def _named(program: str | Sequence[str]) -> tuple[str, list[str]]:
 
 
 def _reserved_port() -> socket.socket:
-    """Return a socket that reserves a free port, on which a world can listen nevertheless."""
+    """Return a socket that reserves a free port but still lets a world listen on it."""
     kept = socket.socket()
     kept.bind(("127.0.0.1", 0))
-    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after bind, so that the port is not given to others
+    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after bind, so that no other socket gets the port
     return kept

@@ -1,4 +1,4 @@
-"""`zsim.run`: a whole flight, in this process or as processes of its own, recorded and given back as a `Run`."""
+"""`zsim.run`: a complete flight, in this process or as separate processes, recorded and returned as a `Run`."""
 
 import os
 import signal
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 COMMAND = (sys.executable, "-P", "-m", "zsim_deploy")
-LAUNCHER = "zsim-run"  # its output, where it is not shown, beside the logs of the processes
+LAUNCHER = "zsim-run"  # log of the launcher's output if that is not shown, beside the logs of the processes
 INTERRUPTED = 130  # exit code of `zsim run` after Ctrl-C
 
 
@@ -54,26 +54,28 @@ def run(
 
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
-        seed, duration_s, set: replace those of the scenario; `set` by paths, `{"environment.wind.gust_m_s": 1.0}`.
-        agents: of your own, beside the estimators and controllers of the scenario: subclasses of `zsim.Agent`, or
-            objects of them, which keep their state after the run, except as processes. The run waits for them, and
-            ends where one fails.
+        seed, duration_s: replace those of the scenario.
+        set: replaces fields of the scenario by path, as in `{"environment.wind.gust_m_s": 1.0}`.
+        agents: your own agents, beside the estimators and controllers of the scenario: subclasses of `zsim.Agent`, or
+            their instances, which keep their state after the run, except as processes. The run waits for them, and
+            ends if one fails.
         law, estimator: classes that replace those of all clusters and drones; see docs/extending.md.
-        processes: fly it as real processes on this machine, as `zsim run` does, to the same bits. It takes longer.
-        options: of `zsim run`, for processes: `["--hosted"]`, `["--realtime", "--console"]`.
+        processes: fly it as real processes on this machine, as `zsim run` does; bit-identical, but slower.
+        options: options of `zsim run`, for processes: `["--hosted"]`, `["--realtime", "--console"]`.
         out: folder of the run; None: `runs/NAME-TIME`.
         force: replace an earlier run in that folder.
         progress: show a bar and the events.
 
     Raises:
-        ScenarioError: with every fault of the scenario, a line each; nothing has been flown.
-        RunFailedError: a failure ended the run; its record holds all until then.
-        KeyboardInterrupt: it was interrupted; its record holds all until then. A second Ctrl-C ends it at once.
-        Exception: what a class of yours raised, after a line on stderr that says where, with its own traceback.
+        ScenarioError: with one line for every fault of the scenario; nothing was flown.
+        RunFailedError: a failure ended the run; its record holds everything up to then.
+        KeyboardInterrupt: the run was interrupted; its record holds everything up to then. A second Ctrl-C ends it at
+            once.
+        Exception: raised by one of your classes, with its own traceback, after a line on stderr that says where.
     """
     source = scenario_of(scenario).changed(seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator)
     if options and not processes:
-        raise RunError(f"options is {list(options)}; must be empty without processes=True, which they are for")
+        raise RunError(f"options is {list(options)}; must be empty without processes=True")
     flown, made = calling(lambda: with_agents(source.resolved, agents))
     place = Path(out) if out is not None else None
     screen = screen_for(flown.duration_s) if progress else None
@@ -103,7 +105,7 @@ def fly_here(
     stop_reason: Callable[[], str | None],
     continued: bool = False,
 ) -> str:
-    """Fly a resolved scenario in this process into a run's folder; return why it ended; errors as of `fly`."""
+    """Fly a resolved scenario in this process into a run's folder; return why it ended; errors as in `fly`."""
     with nullcontext() if continued else run_folder.left_only_if_flown(folder):
         run_folder.prepare(folder, scenario, launch, screen.say if screen else lambda _: None, continued)
         ended = fly(scenario, folder / RECORD, stop_reason, screen, None, launch.changed, own)
@@ -112,7 +114,7 @@ def fly_here(
     return ended
 
 
-# Of processes
+# As processes
 
 
 def _fly_as_processes(
@@ -123,7 +125,7 @@ def _fly_as_processes(
     folder: Path,
     screen: Screen | None,
 ) -> None:
-    """Fly as `zsim run`, which draws on a terminal itself; in a notebook, it is drawn here."""
+    """Fly by `zsim run`, which shows its own progress on a terminal; in a notebook, it is shown here."""
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     log.parent.mkdir(exist_ok=True)
     drawn_here = isinstance(screen, NotebookScreen)
@@ -149,7 +151,7 @@ def _fly_as_processes(
 
 
 def _show(line: str, screen: Screen | None, log: Path) -> None:
-    """Show a line of progress, and keep what else `zsim run` prints: how the run ended is told by the caller."""
+    """Show a line of progress, or log whatever else `zsim run` prints; the caller reports how the run ended."""
     kind, content = JsonProgress.read(line)
     if kind:
         getattr(screen, kind)(content)
@@ -161,9 +163,9 @@ def _show(line: str, screen: Screen | None, log: Path) -> None:
 def command_of(
     source: Scenario, agents: Sequence[OwnAgent], names: Sequence[str], options: Sequence[str], folder: Path
 ) -> tuple[list[str], dict[str, str]]:
-    """Return the `zsim run` that flies a scenario as processes, and its environment.
+    """Return the command line of the `zsim run` that flies a scenario as processes, and its environment.
 
-    A launcher of its own has its signals and its children for itself.
+    A separate launcher has signals and children of its own.
     """
     command = [*COMMAND, "run", str(_file_of(source, folder)), "--out", str(folder), "--force", "--no-report"]
     command += [word for change in source.changes or () for word in ("--set", change)]
@@ -179,7 +181,7 @@ def command_of(
 
 
 def _file_of(source: Scenario, folder: Path) -> Path:
-    """Return a scenario's file; one that was made in Python is written into the run's folder."""
+    """Return the file of a scenario; one created in Python is written into the run's folder."""
     if source.changes is not None:
         return source.folders[0] / source.source
     file = folder / run_folder.SCENARIO
@@ -188,16 +190,14 @@ def _file_of(source: Scenario, folder: Path) -> Path:
 
 
 def raise_failure(folder: Path, code: int) -> None:
-    """Raise what ended the processes of a run; nothing where all of it was flown, though not as planned."""
+    """Raise RunFailedError with what ended a run's processes, unless it was flown to its end, though not as planned."""
     record = folder / RECORD
     if not record.exists():
         raise RunFailedError(f"{folder}: nothing was recorded: {_last_line(folder, code)}")
     failures = [each.text for each in verdict(record).shortfalls if each.kind == "process" and each.fails]
     flight = read_flight(record, motion=False)
     flew = any(len(track.t_ns) for track in flight.tracks)
-    if not failures and (
-        not flew or (folder / run_folder.JOURNAL).exists()
-    ):  # it is kept of what ended before its time
+    if not failures and (not flew or (folder / run_folder.JOURNAL).exists()):  # an early end leaves the journal
         failures = [str((flight.end or {}).get("reason", _last_line(folder, code)))]
     if failures:
         raise RunFailedError(f"{failures[0]}; the record is {record}, the logs are in {folder / run_folder.LOGS}")
@@ -206,20 +206,20 @@ def raise_failure(folder: Path, code: int) -> None:
 def _last_line(folder: Path, code: int | None) -> str:
     """Return the last line that `zsim run` printed into its log."""
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
-    said = log.read_text(errors="replace").split("\n") if log.exists() else []
-    return next((line for line in reversed(said) if line.strip()), f"`zsim run` ended with code {code}")
+    lines = log.read_text(errors="replace").split("\n") if log.exists() else []
+    return next((line for line in reversed(lines) if line.strip()), f"`zsim run` ended with code {code}")
 
 
 # In this process
 
 
 def calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
-    """Call what calls classes of a user's; what one raises is raised as it is, after a line with where that was."""
+    """Call a function that calls users' classes; re-raise their exceptions, after a line that says where they arose."""
     try:
         return call()
     except UserCodeError as error:
         failure, raised = error, plugin.raised_by_user(error)
-    if raised is None:  # it returned what cannot be used
+    if raised is None:  # the user's code returned something unusable
         raise failure.with_traceback(None) from None
     kept = f"; zsim.load({str(folder)!r}) reads the record so far" if folder and (folder / RECORD).exists() else ""
     print(printable(f"{failure}{kept}"), file=sys.stderr, flush=True)
@@ -237,7 +237,7 @@ class _StopRequest:
 
 @contextmanager
 def _ctrl_c() -> Iterator[_StopRequest]:
-    """Let Ctrl-C end a flight at its next gate, with its record complete; the second one interrupts at once."""
+    """Let Ctrl-C end a flight at its next gate, with a complete record; a second one interrupts at once."""
     request = _StopRequest()
     former = signal.getsignal(signal.SIGINT)
     if former is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
@@ -256,16 +256,16 @@ def _ctrl_c() -> Iterator[_StopRequest]:
 
 
 def screen_for(duration_s: float) -> Screen:
-    """Return what shows the progress of a run: on a terminal, or below a notebook's cell."""
+    """Return the display of a run's progress: on a terminal, or below a notebook's cell."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return NotebookScreen(duration_s) if type(shell).__name__ == "ZMQInteractiveShell" else Screen(duration_s)
 
 
 class NotebookScreen(Screen):
-    """Shows the live line below a notebook's cell; events on its standard output."""
+    """Shows the live line below a notebook's cell, and events on the cell's standard output."""
 
     def __init__(self, duration_s: float) -> None:
-        # a kernel sets FORCE_COLOR, which rich takes for a terminal
+        # a kernel sets FORCE_COLOR, from which rich infers a terminal
         super().__init__(duration_s, Console(file=sys.stdout, force_jupyter=False, force_terminal=False))
         self._line = NotebookLine()
 
@@ -274,10 +274,10 @@ class NotebookScreen(Screen):
 
 
 def fly_as_processes(scenario: Resolved, folder: Path) -> None:
-    """Fly a resolved scenario as processes of this machine, into a new folder of a run.
+    """Fly a resolved scenario as processes on this machine, into the new folder of a run.
 
     Raises:
-        RunError: nothing was recorded; with the last line that `zsim run` printed.
+        RunError: nothing was recorded; the error has the last line that `zsim run` printed.
     """
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     log.parent.mkdir(parents=True)

@@ -36,7 +36,7 @@ from zsim_api.simulation import Estimates, Samples, Truth, estimates_of
 Observe = Literal["truth", "estimate", "sensors"]
 Action = Literal["velocity", "attitude", "rotors", "cluster"]
 Floats = NDArray[np.float32]
-FARTHEST = 1e6  # bound of an observation, in its unit: beyond any flight
+FARTHEST = 1e6  # bound of observations in their units; beyond any flight
 AIRBORNE = ("hovering", "flying")
 
 
@@ -55,28 +55,30 @@ class Flown(Protocol):
 
 
 class Interface:
-    """Observations and commands of the agents of an environment: drones, or clusters where these are acted on.
+    """Observations and commands of the agents of an environment: drones, or clusters if actions are of clusters.
 
-    An observation (K,) of "truth" or "estimate" has for each drone of the agent position [m] and velocity [m/s] in W
-    and orientation (w, x, y, z, B to W), of the truth the angular velocity in B [rad/s] too; then, for each other
-    drone, position and velocity relative to the agent's first drone, in W. Of "sensors" it has the newest sample of
-    every sensor, in the order of the contract; 0 before the first one.
+    An observation (K,) of "truth" or "estimate" has, for each drone of the agent, position [m] and velocity [m/s] in W
+    and orientation (w, x, y, z, B to W), for "truth" also the angular velocity in B [rad/s]; then, for each other
+    drone, position and velocity relative to the agent's first drone, in W. An observation of "sensors" has the newest
+    sample of every sensor, in the order of the contract; 0 before the first one.
 
-    An action (A,) is of -1 to 1, the limits of the drone's firmware and rotors, see `bounds`. For each drone of the
-    agent it has, "velocity": forward, left, up [m/s], yaw rate [rad/s]; "attitude": roll and pitch [rad], thrust [N],
-    yaw rate [rad/s]; "rotors": their speeds [rad/s]. "cluster": the rates of all variables of the cluster's space
-    [m/s, rad/s].
+    An action (A,) has values from -1 to 1, scaled to the limits of the drone's firmware and rotors, see `bounds`. For
+    each drone of the agent, it has, for "velocity": forward, left, up [m/s], yaw rate [rad/s]; for "attitude": roll and
+    pitch [rad], thrust [N], yaw rate [rad/s]; for "rotors": their speeds [rad/s]. For "cluster", it has the rates of
+    all variables of the cluster's space [m/s, rad/s].
 
     Args:
-        scenario: resolved.
-        step_s: time between two actions [s], a whole number of gates.
+        scenario: the resolved scenario.
+        observe: "truth", "estimate" or "sensors".
+        action: "velocity", "attitude", "rotors" or "cluster".
+        step_s: time between two actions [s], a multiple of the gate; None: one gate.
 
     Raises:
         RunError: the arguments do not fit each other or the scenario.
 
     Attributes:
         agents: names of the drones, or of the clusters.
-        gates: between two actions.
+        gates: number of gates between two actions.
     """
 
     def __init__(self, scenario: Scenario, observe: Observe, action: Action, step_s: float | None = None) -> None:
@@ -88,9 +90,9 @@ class Interface:
         if self.gates < 1 or abs(self.gates * gate_s - (step_s or gate_s)) > 1e-9:
             raise RunError(f"step_s is {step_s:g}; must be a multiple of the scenario's gate, {gate_s:g} s")
         if action == "cluster" and observe == "sensors":
-            raise RunError("observe is 'sensors' where the action is of a cluster; must be 'truth' or 'estimate'")
+            raise RunError("observe is 'sensors' with action 'cluster'; must be 'truth' or 'estimate'")
         if action == "cluster" and not scenario.clusters:
-            raise RunError(f"action is 'cluster', and scenario {scenario.name!r} has none")
+            raise RunError(f"action is 'cluster', but scenario {scenario.name!r} has no cluster")
         self.observe, self.action = observe, action
         self._drones = {drone.name: drone for drone in scenario.drones}
         self.names = list(self._drones)
@@ -109,7 +111,7 @@ class Interface:
         return own * (13 if self.observe == "truth" else 10) + 6 * others
 
     def bounds(self, agent: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the commands (A,) of an action of -1 and of 1, in the units above."""
+        """Return the commands (A,) that correspond to actions of -1 and of 1, in the units of the class's docstring."""
         low: list[float] = []
         high: list[float] = []
         for drone in (self._drones[name] for name in self._members[agent]):
@@ -142,16 +144,16 @@ class Interface:
         of = flown.truth if self.observe == "truth" else flown.estimates
         parts = [of.position_m, of.velocity_m_s, of.orientation_wxyz]
         parts += [of.angular_velocity_rad_s] if isinstance(of, Truth) else []
-        whole = np.concatenate(parts, axis=1).ravel()
+        flat = np.concatenate(parts, axis=1).ravel()
         picked, origins, ends = self._layout
-        seen = whole[picked]
-        seen -= np.append(whole, 0.0)[origins]
+        seen = flat[picked]
+        seen -= np.append(flat, 0.0)[origins]
         return dict(zip(self.agents, np.split(_bounded(seen), ends), strict=True))
 
     @cached_property
     def _layout(self) -> tuple[NDArray[np.intp], NDArray[np.intp], list[int]]:
-        """Return the layout of all observations in a row: indices into the drones' flattened rows, indices of the
-        values that are subtracted (-1 for none), and the ends of the agents' observations.
+        """The layout of all observations in sequence: indices into the drones' flattened rows, indices of the values to
+        subtract (-1 for none), and the ends of the agents' observations.
         """
         width = 13 if self.observe == "truth" else 10
         picked: list[int] = []
@@ -166,17 +168,17 @@ class Interface:
         return np.array(picked), np.array(origins), ends[:-1]
 
     def begin(self, flown: Flown) -> dict[str, Command] | None:
-        """Return the commands that take the drones off; None once all are in the air and a policy may begin."""
+        """Return the commands for take-off; None once all drones are in the air and a policy may begin."""
         states = {name: flown.state(name) for name in self.names}
         if all(state in AIRBORNE for state in states.values()):
             return None
         return {name: takeoff() for name, state in states.items() if state == "landed"}
 
     def commands(self, flown: Flown, actions: Mapping[str, ArrayLike], by: str = "step") -> dict[str, Command]:
-        """Return the commands to the drones for the actions of agents; an agent without an action sends none.
+        """Return the commands by drone for the actions of agents; an agent without an action sends none.
 
         Raises:
-            UserCodeError: an action has the wrong shape, or is not finite; `by` names its source.
+            UserCodeError: an action has an unknown agent or the wrong shape, or is not finite; `by` names its source.
         """
         commands: dict[str, Command] = {}
         for agent, given in actions.items():
@@ -206,10 +208,10 @@ class Interface:
             return velocity(*action.tolist())
         roll, pitch, thrust_n, yaw_rate = action.tolist()
         (sr, sp), (cr, cp) = np.sin([roll / 2, pitch / 2]), np.cos([roll / 2, pitch / 2])
-        return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # pitch, then roll
+        return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # pitch and roll
 
     def _of_cluster(self, cluster: str, flown: Flown, c_dot: NDArray[np.float64]) -> dict[str, Command]:
-        """Return velocities of the drones of a cluster; zero if its shape is singular."""
+        """Return the velocities of the drones of a cluster; zero if its shape is singular."""
         of = flown.truth if self.observe == "truth" else flown.estimates
         places, space = self._places[cluster], self._spaces[cluster]
         w, x, y, z = of.orientation_wxyz[places].T
@@ -232,7 +234,7 @@ class Interface:
 
 
 def _readings(drone: Drone) -> list[tuple[str, str, int]]:
-    """Return the numbers that a drone's sensors measure: sensor, field, and how many."""
+    """Return sensor, field and width of all numeric fields that a drone's sensors measure."""
     found = []
     for name, kind, settings in drone.sensors.sections():
         if getattr(settings, "rate_hz", 1.0) == 0:
@@ -249,17 +251,17 @@ def _readings(drone: Drone) -> list[tuple[str, str, int]]:
 
 
 def _bounded(numbers: NDArray[np.float64]) -> Floats:
-    """Clip numbers to the bounds of an observation; unknown ones become 0."""
+    """Clip numbers to the bounds of an observation; NaN becomes 0."""
     within = np.minimum(np.maximum(numbers, -FARTHEST), FARTHEST)
     within[np.isnan(within)] = 0.0
     return within.astype(np.float32)
 
 
 class PolicyAgent(Agent):
-    """A policy as an agent of a flight; it takes the drones off, and acts once all are in the air.
+    """A policy as an agent of a flight, which lets the drones take off, and acts once all are in the air.
 
     Attributes:
-        observe, action, step_s: as of the environment in which it was trained.
+        observe, action, step_s: those of the environment in which the policy was trained.
     """
 
     observe: Observe = "truth"
@@ -305,7 +307,7 @@ class PolicyAgent(Agent):
 
 
 class _Received:
-    """A flight as known from the messages that an agent has received."""
+    """The state of a flight according to the messages that an agent has received."""
 
     def __init__(self, names: Sequence[str], rotors_max: int) -> None:
         self.names = names

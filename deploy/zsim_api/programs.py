@@ -1,14 +1,15 @@
-"""Child programs that never outlive this process: `zsim run`, and a user's own.
+"""Child programs that never outlive this process: `zsim run`, and the user's own.
 
-Each is run by a keeper in a session of its own, which ends it with its descendants when this process is gone, even by
-kill -9. So Ctrl-C in a terminal reaches a program only through this process. The keeper is this file, run by its path:
+Each is run by a keeper in a session of its own, which ends it and its descendants once this process is gone, even by
+kill -9. Ctrl-C in a terminal therefore reaches a program only through this process. The keeper is this file, run by
+path:
 
     python -I -S programs.py GRACE_S WORD...
 
 Standard input of the keeper is a pipe from its caller, which closes when the caller ends: then the program receives
 SIGTERM, and is killed if it has not ended within the grace period. Signals are forwarded to its process group; SIGUSR1
 kills it and its descendants. Descendants that outlive the program are killed after the same grace period. The exit code
-is the program's; 128 + N for a signal, as in shells, and 127 if it cannot be started.
+is the program's, 128 + N for a signal, as in shells, or 127 if it cannot be started.
 
 Only the standard library is imported here, so that a keeper starts within milliseconds.
 """
@@ -29,17 +30,17 @@ GRACE_S = 10.0  # wall time for a program to end after SIGTERM; `zsim run` ends 
 KEEPER = (sys.executable, "-I", "-S", __file__)
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 NOT_STARTED = 127
-AGAIN_S = 0.02  # between two rounds of killing
+AGAIN_S = 0.02  # interval between rounds of killing
 
 
 class Program:
     """A running program.
 
     Args:
-        words: its command line.
+        words: command line.
         environment: variables in addition to those of this process.
-        output: file for its output; None: that of this process; PIPE for `lines`.
-        folder: its working folder; None: the current one.
+        output: file for the output; None: the output of this process; PIPE for `lines`.
+        folder: working folder; None: the current one.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Program:
         folder: Path | None = None,
     ) -> None:
         self.words = tuple(words)
-        self.asked = False  # whether this process has asked it to end
+        self.asked = False  # whether this process has requested its end
         self._lock = threading.Lock()
         environment = {**os.environ, **(environment or {})}
         if output is not None:
@@ -69,36 +70,36 @@ class Program:
 
     @property
     def code(self) -> int | None:
-        """Its exit code, None while it runs; 128 + N for a signal, 127 if it could not be started."""
+        """The exit code; 128 + N for a signal, 127 if the program could not be started; None while it runs."""
         return self._keeper.poll()
 
     def lines(self) -> Iterator[str]:
-        """Yield the lines of its output to the end; may be called again after an interrupt."""
+        """Yield the lines of the program's output to the end; may be called again after an interrupt."""
         assert self._keeper.stdout is not None
         for line in self._keeper.stdout:
             yield line.decode(errors="replace")
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait until it and its descendants have ended; return its exit code, None if it is still running."""
+        """Wait until the program and its descendants have ended; return its exit code, None if it is still running."""
         with suppress(subprocess.TimeoutExpired):
             return self._keeper.wait(timeout_s)
         return None
 
     def interrupt(self) -> None:
-        """Send it SIGINT, as Ctrl-C does."""
+        """Send SIGINT, as Ctrl-C does."""
         self._keeper.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """Kill it and its descendants at once."""
+        """Kill the program and its descendants at once."""
         self._keeper.send_signal(signal.SIGUSR1)
 
     @property
     def pid(self) -> int:
-        """Process id of the keeper, which lives as long as the program."""
+        """The process id of the keeper, which lives as long as the program."""
         return self._keeper.pid
 
     def close(self) -> int:
-        """Ask it to end, kill it if it has not within GRACE_S, and return its exit code."""
+        """Send SIGTERM, kill the program if it has not ended within GRACE_S, and return its exit code."""
         with self._lock:
             self.asked = self.asked or self.code is None
             assert self._keeper.stdin is not None
@@ -108,14 +109,14 @@ class Program:
 
 
 def filled(words: Sequence[str], values: Mapping[str, str]) -> list[str]:
-    """Replace `{endpoint}` and so on in a command line by their values."""
+    """Replace `{endpoint}` and the like in a command line by their values."""
     for name, value in values.items():
         words = [word.replace(f"{{{name}}}", value) for word in words]
     return [*words]
 
 
 def environment_of(endpoint: str, federation: str) -> dict[str, str]:
-    """Return the environment variables for programs of a run; `python` and `zsim` are those of this process."""
+    """Return the environment variables for programs of a run, whose `python` and `zsim` are those of this process."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     return {"ZSIM_CONNECT": endpoint, "ZSIM_FEDERATION": federation, "PATH": path}
 
@@ -130,7 +131,7 @@ def search_path(folders: Sequence[str | Path]) -> str:
 
 
 def keep(grace_s: float, words: list[str]) -> int:
-    """Run a program to its end, as a keeper; return the exit code."""
+    """Run a program to its end as its keeper; return the exit code."""
     early: list[int] = []
     program: subprocess.Popen[bytes] | None = None
 
@@ -166,14 +167,14 @@ def keep(grace_s: float, words: list[str]) -> int:
     killer = threading.Timer(grace_s, _kill_children)
     killer.daemon = True
     killer.start()
-    with suppress(ChildProcessError):  # none is left
+    with suppress(ChildProcessError):  # no child is left
         while True:
             os.waitpid(-1, 0)
     return code if code >= 0 else 128 - code
 
 
 def _kill_children() -> None:
-    """Kill all children (known on Linux only), and theirs, which become children of this process in turn."""
+    """Kill all children (known only on Linux), and then theirs, which in turn become children of this process."""
     while children := [pid for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]:
         for pid in children:
             with suppress(ProcessLookupError):

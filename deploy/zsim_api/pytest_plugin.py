@@ -1,6 +1,6 @@
-"""The pytest plugin of zsim: the fixture `federation`, and in reports of failed tests who waited for whom.
+"""The pytest plugin of zsim: the fixture `federation`, and in reports of failed tests, which processes were awaited.
 
-It is loaded with every pytest of an environment that has zsim, so it imports nothing else before a test flies.
+Every pytest run in an environment with zsim loads it, so it imports nothing else before a test flies.
 """
 
 import re
@@ -18,7 +18,7 @@ FAILED_RUNS = "zsim_failed_runs"  # option of pytest's configuration
 
 
 class Federations:
-    """Starts federations for one test, each into a folder of its own."""
+    """Starts the federations of one test, each with its own folder."""
 
     def __init__(self, folder: Path, kept: Path, modules: tuple[Path, ...]) -> None:
         self.made: list[Federation] = []
@@ -26,7 +26,7 @@ class Federations:
         self._folder, self._kept, self._modules = folder, kept, modules
 
     def __call__(self, scenario: Any, duration: float | None = None, **options: Any) -> "Federation":
-        """Start a federation; arguments as of `zsim.Federation`."""
+        """Start a federation; arguments as in `zsim.Federation`."""
         from zsim_api.federation import Federation
 
         options = {"out": self._folder / f"run{len(self.made) + 1}", "modules": self._modules, **options}
@@ -34,7 +34,7 @@ class Federations:
         return self.made[-1]
 
     def kept(self, made: "Federation") -> Path:
-        """Return where the folder of a run is kept if the test has failed."""
+        """Return the path at which a run's folder is kept if the test has failed."""
         return self._kept / made.folder.name
 
     def close(self) -> None:
@@ -57,11 +57,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def federation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Federations]:
     """Start flights as real processes, with programs of your own: `federation("step.yaml", duration=40)`.
 
-    It takes what `zsim.Federation` takes, and gives one: `wait_until`, `inject`, `kill`, `ask`, `run`,
-    `assert_errors`, `assert_no_collision`, `assert_same_bits`. Each has a free port and a federation's name of its own,
-    so that tests run side by side (pytest-xdist). Nothing of it outlives the test. If the test fails, the report shows
-    who waited for whom and the last lines of the logs, first of processes that failed or were waited for, and records
-    and logs are kept in `runs/failed` (`zsim_failed_runs`).
+    It takes the arguments of `zsim.Federation`, and returns one: `wait_until`, `inject`, `kill`, `ask`, `run`,
+    `assert_errors`, `assert_no_collision`, `assert_same_bits`. Each federation has its own free port and name, so tests
+    can run in parallel (pytest-xdist). No process outlives the test. If the test fails, the report shows which
+    processes were awaited, and the last lines of the logs, beginning with failed and awaited processes; records and
+    logs are kept in `runs/failed` (`zsim_failed_runs`).
     """
     test = re.sub(r"[^\w.-]+", "-", request.node.nodeid.rpartition("/")[2]).strip("-")
     kept = request.config.rootpath / request.config.getini(FAILED_RUNS) / test
@@ -74,7 +74,7 @@ def federation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Feder
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Any:
-    """Show how the federations of a failed test stood."""
+    """Add the diagnoses of the federations to the report of a failed test."""
     report: pytest.TestReport = yield
     started = item.stash.get(MADE, None)
     if started is not None and report.failed and report.when != "teardown":

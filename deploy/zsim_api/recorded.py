@@ -5,8 +5,8 @@
     run.errors(window=(20, 40))
     run.figure("shape")
 
-Each key is read on first use, once, and kept. Records of runs in one process, of processes on any hosts, of interrupted
-runs and of replays are all treated the same.
+Each key is read once, on first use, and cached. Records of runs in one process or as processes on any hosts, of
+interrupted runs and of replays are all treated the same.
 """
 
 import html
@@ -64,13 +64,13 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-Table = dict[str, NDArray[Any]]  # columns of equal length (K,), in order of simulated time
+Table = dict[str, NDArray[Any]]  # columns of equal length (K,), ordered by simulated time
 INDEX = "t_s"
 STAMPS = ("t_ns", "seq", "wall_ns")  # metadata columns of a message
-SHOWN = 12  # names in an error
-ROWS_MAX = 200_000  # of several drones, read at once; estimates of that size take 100 MB
-NOTES = 3  # shortfalls in a notebook's display of a run
-ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # as those of estimates
+SHOWN = 12  # most names listed in an error
+ROWS_MAX = 200_000  # most rows of several drones read at once; as many estimates take 100 MB
+NOTES = 3  # most shortfalls in a notebook's display of a run
+ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # named as in tables of estimates
 Window = tuple[float, float]
 
 
@@ -94,10 +94,10 @@ class Run:
 
     Tables are pandas frames with simulated time in seconds as index, `t_s`, and units in the names of their columns,
     which are those of `zsim export`; docs/records.md lists them. Without pandas they are dicts of numpy arrays by
-    column. Runs with the same bits have equal tables, except for `source`, which names processes.
+    column. Bit-identical runs have equal tables, except for `source`, which names processes.
 
     Attributes:
-        record: the file.
+        record: path of the file.
         keys: number of messages on record by key.
         drones, clusters: names, in the order of the scenario.
     """
@@ -122,7 +122,7 @@ class Run:
     # Tables
 
     def truth(self, drone: str) -> "DataFrame":
-        """Return the true motion of a drone at every gate, W and B as in docs/conventions.md; RunError if unknown."""
+        """Return the true motion of a drone at every gate, in W and B of docs/conventions.md; RunError without any."""
         return self._of("drone", drone, "truth")
 
     def estimate(self, drone: str) -> "DataFrame":
@@ -132,12 +132,12 @@ class Run:
     def sensor(self, drone: str, sensor: str) -> "DataFrame":
         """Return the samples of a sensor: imu, gps, mag, baro, sonar, flow, or your own; RunError without any.
 
-        `t_sample_ns` is when a sample was taken, the index when it was delivered.
+        `t_sample_ns` is the time at which a sample was taken; the index is the time of its delivery.
         """
         return self._of("drone", drone, f"sensor/{sensor}")
 
     def status(self, drone: str) -> "DataFrame":
-        """Return the state of a drone's firmware and battery, at every gate; RunError if unknown."""
+        """Return the state of a drone's firmware and battery, at every gate; RunError without any."""
         return self._of("drone", drone, "sensor/status")
 
     def commands(self, drone: str, kind: str = "velocity") -> "DataFrame":
@@ -161,7 +161,7 @@ class Run:
         return self._of("cluster", self._cluster(cluster), "state")
 
     def messages(self, key: str) -> "DataFrame":
-        """Return all messages of a key, with `t_ns`, `seq`, and `wall_ns`, when each was recorded [ns since 1970].
+        """Return all messages of a key, with `t_ns`, `seq`, and `wall_ns`, the time of recording [ns since 1970].
 
         Messages of a program of your own have a column for each field.
 
@@ -169,7 +169,7 @@ class Run:
             key: without the federation's name, and without wildcards; `run.keys` has those on record.
 
         Raises:
-            RunError: there are none.
+            RunError: the record has no message of this key.
         """
         return frame(self._table(key))
 
@@ -181,11 +181,11 @@ class Run:
     # Errors
 
     def formation(self, cluster: str | None = None) -> "DataFrame":
-        """Return the variables of a formation over time, its `phase`, and errors, angles within ±π.
+        """Return the variables of a formation over time, its `phase`, and its errors (angles within ±π).
 
         For a variable p: `desired_p_m`, `estimate_p_m`, `truth_p_m`; `estimate_error_p_m` is estimate − desired, as the
-        controller saw it; `truth_error_p_m` is truth − desired, as the drones flew. NaN where unknown. Before the phase
-        is engaged, the desired value is the estimate.
+        controller saw it; `truth_error_p_m` is truth − desired. NaN where unknown. Until the phase is engaged, the
+        desired value is the estimate.
 
         Args:
             cluster: name; None: the first.
@@ -227,13 +227,13 @@ class Run:
     ) -> "DataFrame":
         """Return statistics of errors, a row for each variable with its unit; the report's table.
 
-        For formations, by cluster and variable, over the instants of the window at which it was engaged: `est_…` is
-        estimate − desired, as the controller saw it, `true_…` truth − desired, as the drones flew. For estimates, by
-        drone and variable: `std`, `rms` and `mean` of estimate − truth, and `inside`, the share of errors within two
-        stated standard deviations. NaN without such instants.
+        For formations, by cluster and variable, over the part of the window in which it was engaged: `est_…` is
+        estimate − desired, as the controller saw it, `true_…` is truth − desired. For estimates, by drone and variable:
+        `std`, `rms` and `mean` of estimate − truth, and `inside`, the share of errors within two stated standard
+        deviations. NaN where the window has no such samples.
 
         Args:
-            window: from and to [s]; None: the report's, `run.summary.window_s`.
+            window: start and end [s]; None: the report's, `run.summary.window_s`.
             of: formations, or estimates.
 
         Raises:
@@ -266,7 +266,7 @@ class Run:
             if known:
                 self._read([key for drone in known if (key := f"drone/{drone}/{what}") not in self._tables])
                 tables = {drone: read(drone).select_dtypes("number").add_prefix(f"{what}_") for drone in known}
-                # a world that was restarted may have published a gate again
+                # a restarted world may have published a gate again
                 once = {drone: table[~table.index.duplicated()] for drone, table in tables.items()}
                 parts.append(pandas.concat(once, names=["drone"]).to_xarray().reindex(drone=known))
         return xarray.merge(parts, join="outer", compat="no_conflicts")
@@ -275,39 +275,37 @@ class Run:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario with all defaults and changes; it can be flown again.
+        """The scenario with all defaults and overrides; it can be flown again.
 
-        RunError without `world/info` on record.
+        Raises RunError if `world/info` is not on record.
         """
         if self._info is None:
-            raise RunError(f"{self.record}: has no world/info, so that its scenario is unknown")
-        made = Scenario(**yaml_file.value(self._info.scenario))
+            raise RunError(f"{self.record}: has no world/info, so its scenario is unknown")
+        scenario = Scenario(**yaml_file.value(self._info.scenario))
         modules = () if self._info.module_folders is UNSET else self._info.module_folders
-        made.source, made.folders = (
-            str(self.record),
-            (*(self.folder / each for each in modules), self.folder, Path.cwd()),
-        )
-        return made
+        scenario.source = str(self.record)
+        scenario.folders = (*(self.folder / each for each in modules), self.folder, Path.cwd())
+        return scenario
 
     @property
     def summary(self) -> RunSummary:
-        """The content of summary.json; RecordError if there is no truth on record."""
+        """The content of summary.json; RecordError if no truth is on record."""
         return self._judged[2]
 
     @property
     def duration_s(self) -> float:
-        """Simulated time that was flown [s]."""
+        """Simulated duration of the flight [s]."""
         sim_s = self._end.get("sim_s")
         return self.summary.sim_s if sim_s is None else float(sim_s)
 
     @property
     def ended(self) -> str:
-        """Why it ended."""
+        """Why the run ended."""
         return str(self._end["reason"]) if "reason" in self._end else self.summary.ended
 
     @property
     def truth_sha256(self) -> str:
-        """The hash of all truth: equal for flights that are equal to the bit."""
+        """The SHA-256 of all truth messages: equal for bit-identical flights."""
         return str(self._end.get("truth_sha256") or self.summary.truth_sha256)
 
     @property
@@ -315,17 +313,17 @@ class Run:
         """Whether every message of the world and the end are on record; `summary.record.state` says what is missing."""
         try:
             return self.summary.record.complete
-        except RecordError:  # it contains no truth
+        except RecordError:  # the record contains no truth
             return False
 
     @property
     def as_planned(self) -> bool:
-        """Whether the flight followed its plan; `shortfalls` has the deviations."""
+        """Whether the flight followed its plan; `shortfalls` lists the deviations."""
         return self.summary.as_planned
 
     @property
     def shortfalls(self) -> list[Shortfall]:
-        """The deviations from its plan, as in the report."""
+        """The deviations of the flight from its plan, as in the report."""
         return self.summary.shortfalls
 
     # Display
@@ -351,10 +349,10 @@ class Run:
                 known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
                 if name in (known[-1], stem):
                     drawing = marked(each, summary).drawing
-                    # a notebook displays a figure without pyplot only if it has this
+                    # without pyplot, a notebook displays a figure only if it has this method
                     setattr(drawing, "_repr_png_", _png_of(drawing))  # noqa: B010
                     return drawing
-        raise RunError(f"{self.record}: has no figure {name!r}; {_there(name, known)}")
+        raise RunError(f"{self.record}: has no figure {name!r}; {_choices(name, known)}")
 
     def report(self, formats: Sequence[str] = ()) -> Path:
         """Write the report into the run's folder, as `zsim report` does; return its page.
@@ -417,24 +415,24 @@ class Run:
 
     def _table(self, key: str) -> Table:
         if key not in self.keys:
-            raise RunError(f"{self.record}: has no messages of {key!r}; {_there(key, self.keys)}")
+            raise RunError(f"{self.record}: has no messages of {key!r}; {_choices(key, self.keys)}")
         if key not in self._tables:
             fleet = self._of_all_drones(key)
             missing = [each for each in fleet if each not in self._tables]
-            # a second drone is usually followed by all, and a pass over the record takes longer than decoding one key
+            # whoever reads a second drone usually reads all, and a pass over the record costs more than decoding a key
             is_second = len(fleet) - len(missing) > 0
             at_once = is_second and sum(self.keys[each] for each in missing) <= ROWS_MAX
             self._read(missing if at_once else [key])
         return self._tables[key]
 
     def _of_all_drones(self, key: str) -> list[str]:
-        """Return the same key of all drones; any other key alone."""
+        """Return the keys that match a drone's key, of all drones; for any other key, that key alone."""
         kind, _, what = keys.parts(key)
         alike = [f"drone/{drone}/{what}" for drone in self.drones] if kind == "drone" else [key]
         return [each for each in alike if each in self.keys]
 
     def _read(self, wanted: Sequence[str]) -> None:
-        """Read keys in one pass."""
+        """Read the tables of some keys in one pass over the record."""
         if not wanted:
             return
         with plugin.names_only(not self._trust, looked_up=False):
@@ -453,14 +451,14 @@ class Run:
         if key not in self.keys:
             group, _, last = what.rpartition("/")  # "sensor", "gps"
             head = f"{kind}/{name}/{group}/" if group else f"{kind}/{name}/"
-            there = [each.removeprefix(head) for each in self.keys if each.startswith(head)]
-            said = f"{group} {last!r}" if group else what
-            raise RunError(f"{self.record}: has no {said} of {name}; {_there(last, there)}")
+            available = [each.removeprefix(head) for each in self.keys if each.startswith(head)]
+            missing = f"{group} {last!r}" if group else what
+            raise RunError(f"{self.record}: has no {missing} of {name}; {_choices(last, available)}")
         return self._plain(key)
 
     def _known(self, kind: str, name: str, names: Sequence[str]) -> str:
         if name not in names:
-            raise RunError(f"{self.record}: has no {kind} {name!r}; {_there(name, names)}")
+            raise RunError(f"{self.record}: has no {kind} {name!r}; {_choices(name, names)}")
         return name
 
     def _named(self, kind: str) -> list[str]:
@@ -480,7 +478,7 @@ class Run:
         return f"; its space {names[0]} is imported only by zsim.load(…, trust=True)" if names else ""
 
     def judged_formation(self, cluster: str | None = None) -> Formation:
-        """Return the content of `formation` as arrays; errors as there."""
+        """Return the content of `formation` as arrays; raises the same errors."""
         name = self._cluster(cluster)
         found = next((each for each in self._judged[1] if each.name == name), None)
         if found is None:
@@ -495,7 +493,7 @@ def _checked(window: Window) -> Window:
             return start_s, end_s
     except (TypeError, ValueError):
         pass
-    raise RunError(f"window is {window!r}; must be from and to [s], as (20, 40)")
+    raise RunError(f"window is {window!r}; must be start and end [s], as (20, 40)")
 
 
 def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:
@@ -525,8 +523,8 @@ def _statistics(
     )
 
 
-def _there(given: str, names: Iterable[str]) -> str:
-    """Return a hint at the most similar name, and the names that there are."""
+def _choices(given: str, names: Iterable[str]) -> str:
+    """Return a hint at the most similar name, and the available names."""
     names = list(names)
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{suggestion(given, names)}there are {', '.join(names[:SHOWN])}{more}" if names else "there are none"
@@ -557,8 +555,8 @@ def read_tables(record: Path, wanted: Collection[str]) -> dict[str, Table]:
     contract, and pictures, have a column for each field, or for each element of a field that is a list of numbers.
 
     Args:
-        record: file.
-        wanted: one key, or the same one of several drones.
+        record: path of the file.
+        wanted: one key, or the same key of several drones.
     """
     with RecordReader(record) as reader:
         selection = MessageSelection(tuple(wanted))
@@ -623,6 +621,6 @@ def _kind(values: Sequence[Any]) -> Kind:
     if values and all(isinstance(value, bool) for value in values):
         return "flag"
     if values and all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-        whole = all(isinstance(value, int) and abs(value) < 2**63 for value in values)
-        return "whole" if whole else "number"
+        is_int64 = all(isinstance(value, int) and abs(value) < 2**63 for value in values)
+        return "whole" if is_int64 else "number"
     return "text"

@@ -1,6 +1,6 @@
-"""The folder of a run: made new, or one that holds nothing which a run would hide or be mixed up with.
+"""The folder of a run: a new one, or one without files that a run would replace or be confused with.
 
-How the run was launched is kept in it, beside the journal of its world, so that an interrupted run can go on.
+It records how the run was launched, beside the journal of its world, so that an interrupted run can be continued.
 """
 
 import json
@@ -27,10 +27,10 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 
 LOGS, SCENARIO, FIGURES = "logs", "scenario.yaml", "figures"
-JOURNAL = "journal"  # what the world hands itself is there
-LAUNCH = "launch.json"  # in it
-LEFT = (SCENARIO, "run.log", "up.log")  # beside empty logs and an empty journal: all that a run leaves that never flew
-WRITTEN = (RECORD, "summary.json", "report.html", *LEFT)  # of a run that is replaced
+JOURNAL = "journal"  # folder of the world's journal
+LAUNCH = "launch.json"  # in the journal's folder
+LEFT = (SCENARIO, "run.log", "up.log")  # left by a run that never flew, beside empty logs and journal
+WRITTEN = (RECORD, "summary.json", "report.html", *LEFT)  # files removed when a run is replaced
 WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes of a run's files, by folder
 
 
@@ -38,9 +38,11 @@ WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes 
 def run_directory(out: Path | None, scenario: Scenario, force: bool = False) -> Iterator[Path]:
     """Yield the run's folder, locked against other runs: `out`, or a new one named after scenario and time.
 
-    With `force`, one that holds other files, too, which stay as they are; an earlier run of zsim's is removed.
-    RunError if a run is under way in it, if it holds a run, or other files, or cannot be made; with `force`, if its
-    record is not zsim's.
+    With `force`, an earlier run of zsim is removed from it, and other files stay as they are.
+
+    Raises:
+        RunError: a run is in progress in the folder; it contains a run or other files; it cannot be created; or, with
+            `force`, its record is not zsim's.
     """
     if out is None:
         out = _new_directory(f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}")
@@ -61,10 +63,10 @@ def make_directory(out: Path | None, scenario: Scenario, force: bool = False) ->
 
 @contextmanager
 def locked(folder: Path) -> Iterator[Path]:
-    """Yield a run's folder, locked until the block is left, so that no other run is flown into it, of this process too.
+    """Yield a run's folder, locked until the block is left, so that no other run, even of this process, flies into it.
 
-    A run has no file from its first moment on, so the folder itself is locked. NFS locks no folders: there the locks of
-    record and journal must do.
+    A run has no file that exists from the beginning, so the folder itself is locked. NFS cannot lock folders; there,
+    the locks of record and journal must suffice.
     """
     with file_fault(folder, "cannot be opened", OTHER_OUT):
         opened = None if os.name == "nt" else os.open(folder, os.O_RDONLY)
@@ -78,7 +80,7 @@ def locked(folder: Path) -> Iterator[Path]:
 
 
 def _new_directory(name: str) -> Path:
-    """Make a folder in `runs` that no other run has made: several may start within one second."""
+    """Create a folder in `runs` that no other run uses, since several may start within one second."""
     folder = first = Path("runs") / name
     with file_fault(first, "cannot be made", OTHER_OUT):
         for number in count(2):
@@ -92,40 +94,40 @@ def _new_directory(name: str) -> Path:
 
 
 def _make_room(out: Path, force: bool) -> None:
-    """Refuse a folder that holds a run, or other files; with `force`, remove the run."""
+    """Raise RunError for a folder with a run or other files; with `force`, remove the run."""
     with file_fault(out, "cannot be made", OTHER_OUT):
         if force:
             _remove_run(out)
         elif any((out / JOURNAL).glob("*.entries")):
-            way = f"`zsim run --continue {out}` goes on with it, --force replaces it, or give --out another folder"
-            raise RunError(f"{out}: holds a run that was interrupted; {way}")
+            options = f"`zsim run --continue {out}` continues it, --force replaces it, or give --out another folder"
+            raise RunError(f"{out}: holds a run that was interrupted; {options}")
         elif (out / RECORD).exists() or any(not log.is_file() or log.stat().st_size for log in (out / LOGS).glob("*")):
             raise RunError(f"{out}: holds a run already; --force replaces it, or give --out another folder")
         refuse_others(out, (*LEFT, LOGS, JOURNAL), force, "fly into")
 
 
-_MADE: set[Path] = set()  # folders that were not there before
+_MADE: set[Path] = set()  # folders that this process has created
 
 
 def _remove_run(folder: Path) -> None:
-    """Remove what a run of zsim's has written, and its report; whatever else is there stays, exports too."""
+    """Remove the files of a run of zsim and its report; all other files, including exports, stay."""
     record, journal = folder / RECORD, folder / JOURNAL
     if record.exists():
         with record.open("rb") as file:
             opening = file.read(LIBRARY + len(OURS))
-        if opening and not is_ours(opening):  # an empty one was killed before it had begun
-            raise RunError(f"{record}: is no record of zsim's and is not removed; give --out another folder")
+        if opening and not is_ours(opening):  # an empty record is of a run that was killed at its start
+            raise RunError(f"{record}: is not a record of zsim and is not removed; give --out another folder")
     journaled = (journal / LAUNCH).exists() or any(journal.glob("*.entries"))
     failed = (folder / SCENARIO).exists() and (folder / LOGS / "world.log").exists()
     if not (record.exists() or journaled or failed):
-        return  # `logs`, `figures` and `journal` are not of a run
+        return  # `logs`, `figures` and `journal` do not belong to a run
     if is_being_written(record):
         raise RunError(f"{folder}: a run is flown into it now; end that one, or give --out another folder")
     for name, suffixes in WRITTEN_INTO.items():
         for path in (folder / name).glob("*"):
             if path.suffix in suffixes and path.is_file():
                 path.unlink()
-        with suppress(OSError):  # not there, or it holds other files
+        with suppress(OSError):  # it does not exist, or contains other files
             (folder / name).rmdir()
     if journaled:
         shutil.rmtree(journal)
@@ -134,7 +136,7 @@ def _remove_run(folder: Path) -> None:
 
 
 def _modules(folder: Path) -> Iterator[Path]:
-    """Yield the modules that were made for a run's classes of a notebook or a script."""
+    """Yield the modules that were generated for a run's classes from a notebook or a script."""
     return folder.glob(f"{plugin.MADE}*.py")
 
 
@@ -148,22 +150,23 @@ class Launch(msgspec.Struct, frozen=True):
     hosted: bool = False
     insecure: bool = False
     listen: str | None = None
-    modules: tuple[str, ...] = ()  # folders in which those that its scenario names were looked for
-    agents: tuple[tuple[str, ...], ...] = ()  # of the user's own, as words of `AgentSpec`
-    changed: tuple[str, ...] = ()  # texts `a.b.c=value` by which the scenario was changed against its file
+    modules: tuple[str, ...] = ()  # folders searched for modules that the scenario names
+    agents: tuple[tuple[str, ...], ...] = ()  # the user's agents, as words of `AgentSpec`
+    changed: tuple[str, ...] = ()  # overrides `a.b.c=value` of the scenario's file
 
 
 def new_launch(**how: Any) -> Launch:
-    """Return a launch of a new run, with the modules that its scenario has been loaded with."""
+    """Return the launch of a new run, with the folders in which its scenario's modules were found."""
     return Launch(uuid.uuid4().hex[:12], modules=tuple(map(str, plugin.folders())), **how)
 
 
 def prepare(
     folder: Path, scenario: Scenario, launch: Launch, say: Callable[[str], None], continued: bool = False
 ) -> None:
-    """Put what is to be flown, and how, into the run's folder, if that is not `continued`; and say it.
+    """Write scenario and launch into the run's folder, unless the run is `continued`; and announce the run.
 
-    RunError if it cannot be written.
+    Raises:
+        RunError: the folder cannot be written.
     """
     if not continued:
         with file_fault(folder, "cannot be written", OTHER_OUT):
@@ -171,7 +174,7 @@ def prepare(
                 (folder / LOGS).mkdir(exist_ok=True)
             (folder / SCENARIO).write_text(scenario_file.to_text(scenario))
             (folder / JOURNAL).mkdir(exist_ok=True)
-            content = json.dumps(msgspec.to_builtins(launch))  # not msgspec's: a path may hold no UTF-8
+            content = json.dumps(msgspec.to_builtins(launch))  # unlike msgspec, json allows paths not in UTF-8
             (folder / JOURNAL / LAUNCH).write_text(content, "utf-8")
     say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {folder}")
     for line in (*unflown_plans(scenario), no_locks(folder)):
@@ -180,7 +183,7 @@ def prepare(
 
 
 def forget_launch(folder: Path) -> None:
-    """Remove the note: nothing flew, or all of it."""
+    """Remove the launch of a run that did not fly at all, or flew to its end."""
     with suppress(OSError):
         (folder / JOURNAL / LAUNCH).unlink(missing_ok=True)
         (folder / JOURNAL).rmdir()
@@ -188,7 +191,7 @@ def forget_launch(folder: Path) -> None:
 
 @contextmanager
 def left_only_if_flown(folder: Path) -> Iterator[None]:
-    """Remove what is prepared for a flight that fails before anything is recorded, and the folder if it was made."""
+    """If a flight fails before anything is recorded, remove what was prepared, and the folder if it was created."""
     try:
         yield
     except BaseException:
@@ -197,26 +200,26 @@ def left_only_if_flown(folder: Path) -> Iterator[None]:
             for path in (folder / SCENARIO, *_modules(folder)):
                 with suppress(OSError):
                     path.unlink()
-            with suppress(OSError):  # it holds something else
+            with suppress(OSError):  # it contains other files
                 if folder.resolve() in _MADE:
                     folder.rmdir()
         raise
 
 
 def launch_of(folder: Path) -> Launch:
-    """Return how a run was launched that is to go on; RunError if nothing is left of it to do, or it is no run."""
+    """Return the launch of an interrupted run; RunError if the run is over, or the folder has none."""
     place = folder / JOURNAL / LAUNCH
     try:
         return msgspec.convert(json.loads(place.read_bytes()), Launch)
     except FileNotFoundError as error:
-        state = "is over" if (folder / RECORD).exists() else "is not there"
+        state = "is over" if (folder / RECORD).exists() else "does not exist"
         raise RunError(f"{folder}: the run {state}; must be the folder of one that was interrupted") from error
     except (OSError, ValueError, msgspec.MsgspecError) as error:
-        raise RunError(f"{place}: cannot be read ({error}); must be as zsim run has left it") from error
+        raise RunError(f"{place}: cannot be read ({error}); must be as `zsim run` wrote it") from error
 
 
 def reopen_record(folder: Path) -> None:
-    """Take the end of the interrupted run off its record; RecordError if another process writes it."""
+    """Remove the end of an interrupted run from its record; RecordError if another process is writing it."""
 
     def is_end(payload: bytes) -> bool:
         try:

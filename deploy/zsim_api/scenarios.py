@@ -1,4 +1,4 @@
-"""A scenario in Python: the same document as in YAML, changed by paths and by classes, checked by the same rules."""
+"""A scenario in Python: the same document as in YAML, changed by path or with classes, checked by the same rules."""
 
 import copy
 import json
@@ -21,7 +21,7 @@ from zsim_agents.hosting import check_classes, check_plans
 
 
 class Scenario:
-    """A scenario that is not changed in place.
+    """An immutable scenario.
 
         zsim.Scenario.load("step.yaml").with_({"environment.wind.gust_m_s": 1.0}, seed=3)
         zsim.Scenario(name="pair", duration_s=20, drones=[{"name": "drone1", "position_m": [0, 0, 0]}])
@@ -34,9 +34,9 @@ class Scenario:
 
     def __init__(self, **fields: Any) -> None:
         self._document: dict[str, Any] = copy.deepcopy(fields)
-        self.source = "scenario"  # named in faults
-        self.folders: tuple[Path, ...] = (Path.cwd(),)  # where modules that it names are searched
-        self.changes: tuple[str, ...] | None = None  # texts `a.b.c=value` against its file
+        self.source = "scenario"  # where it is from, for messages about faults
+        self.folders: tuple[Path, ...] = (Path.cwd(),)  # folders searched for modules that it names
+        self.changes: tuple[str, ...] | None = None  # overrides `a.b.c=value` of its file
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -50,11 +50,11 @@ class Scenario:
         """Return the scenario with other values.
 
         Args:
-            set: values by path, `{"drones.drone2.mass_kg": 0.5}`; a value may be a class, where one is named.
+            set: values by path, `{"drones.drone2.mass_kg": 0.5}`; where a class is named, the value may be the class.
             fields: top-level fields.
 
         Raises:
-            ScenarioError: a path leads nowhere; a line for each.
+            ScenarioError: with a line for each path that does not exist.
         """
         made = copy.copy(self)
         made.__dict__.pop("resolved", None)
@@ -78,7 +78,7 @@ class Scenario:
         law: type | None = None,
         estimator: type | None = None,
     ) -> Self:
-        """Return it as the arguments of `zsim.run` say."""
+        """Return the scenario with the changes of `zsim.run`'s arguments."""
         values = dict(set or {})
         values |= {k: v for k, v in (("seed", seed), ("duration_s", duration_s)) if v is not None}
         if estimator is not None:
@@ -89,7 +89,7 @@ class Scenario:
 
     @cached_property
     def resolved(self) -> Resolved:
-        """The scenario with all defaults, as it is flown; ScenarioError with every fault, a line each."""
+        """The scenario with all defaults, as it is flown; ScenarioError with a line for every fault."""
         self.search()
         scenario = scenario_file.resolve(self._document, self.source)
         check_classes(scenario, self.source)
@@ -97,11 +97,11 @@ class Scenario:
         return scenario
 
     def search(self) -> None:
-        """Let modules that it names be found, in this process and in those started from here."""
+        """Let modules that the scenario names be found, in this process and in those that it starts."""
         plugin.search(*self.folders)
 
     def keep_modules(self, folder: Path) -> None:
-        """Copy the modules of notebook classes that it names into a run's folder, where `zsim rerun` finds them."""
+        """Copy modules of notebook classes that the scenario names to a run's folder, where `zsim rerun` finds them."""
         for name in self.resolved.own_code():
             file = scratch_folder() / f"{name.partition(':')[0]}.py"
             if file.exists():
@@ -111,7 +111,7 @@ class Scenario:
         """Return the value at a path as it is flown, in maps and lists as in YAML: `s["environment.wind.gust_m_s"]`.
 
         Raises:
-            ScenarioError: a path leads nowhere, or the scenario has faults.
+            ScenarioError: the path does not exist, or the scenario has faults.
         """
         values = _by_path(self._whole)
         if path not in values:
@@ -121,7 +121,7 @@ class Scenario:
         return copy.deepcopy(values[path])
 
     def _ipython_key_completions_(self) -> list[str]:
-        """Return all paths, with which notebooks complete `scenario["…`."""
+        """Return all paths, by which notebooks complete `scenario["…`."""
         return [*_by_path(self._whole)]
 
     @property
@@ -151,7 +151,7 @@ class Scenario:
         return f"<Scenario {self._document.get('name')!r} of {self.source}, {count} drones>"
 
     def named(self, value: Any) -> Any:
-        """Return a value with the names of classes and functions in place of them, and search where these are."""
+        """Return a value with names in place of classes and functions, and let these be found."""
         if callable(value):
             from zsim_api.own_code import module_folders, name_of
 
@@ -166,7 +166,7 @@ class Scenario:
 
 
 def _by_path(values: Any, path: str = "") -> dict[str, Any]:
-    """Return values by path, those of named entries of a list by their name."""
+    """Return values by path, in which named entries of a list have their names."""
     found = {path: values} if path else {}
     parts: dict[str, Any] = values if isinstance(values, dict) else {}
     if isinstance(values, list):
@@ -176,7 +176,7 @@ def _by_path(values: Any, path: str = "") -> dict[str, Any]:
     return found
 
 
-# Editors complete the fields; the types are those of the declaration, as far as Python has them.
+# Lets editors complete the fields, with the declared types as far as Python has them.
 _OWN = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind) for name, kind in get_type_hints(Resolved).items()]
 setattr(Scenario, "__signature__", Signature(_OWN))  # noqa: B010
 _SELF = [Parameter("self", Parameter.POSITIONAL_ONLY), Parameter("set", Parameter.POSITIONAL_ONLY, default={})]
@@ -186,7 +186,7 @@ AnyScenario = str | Path | Mapping[str, Any] | Scenario | Resolved
 
 
 def scenario_of(given: AnyScenario) -> Scenario:
-    """Return a scenario as it may be given: a path, a mapping as in YAML, a Scenario, or a resolved one."""
+    """Return a Scenario, given a path, a mapping as in YAML, a Scenario, or a resolved scenario."""
     if isinstance(given, Scenario):
         return given
     if isinstance(given, Resolved):
@@ -198,5 +198,5 @@ def scenario_of(given: AnyScenario) -> Scenario:
 
 @cache
 def scratch_folder() -> Path:
-    """Return the folder, until this process ends, of the modules of notebook classes that no run's folder has yet."""
+    """Return this process's temporary folder for modules of notebook classes that are not yet in a run's folder."""
     return temporary_folder("modules-")

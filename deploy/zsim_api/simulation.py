@@ -6,7 +6,7 @@
         sim.step({"drone1": zsim.velocity(0.5, 0, 0)})
     print(sim.truth.position_m[0])
 
-It is the flight of `zsim run --in-process`, to the same bits, with the caller as one more participant.
+The flight is bit-identical to that of `zsim run --in-process`, with the caller as one more participant.
 """
 
 import copy
@@ -41,14 +41,14 @@ GATES_HELD = 64  # gates of sensor messages that are kept undecoded; chosen: 0.3
 
 
 class Truth(NamedTuple):
-    """The true state of N drones, in the order of `Simulation.names`: views, read-only, that change with every step."""
+    """The true state of N drones, in the order of `Simulation.names`: read-only views, which change with every step."""
 
     position_m: Array  # (N, 3), W
     velocity_m_s: Array  # (N, 3), W
     orientation_wxyz: Array  # (N, 4), B to W
     angular_velocity_rad_s: Array  # (N, 3), B
     accel_m_s2: Array  # (N, 3), W
-    rotor_rad_s: Array  # (N, R), 0 where a drone has fewer
+    rotor_rad_s: Array  # (N, R), 0 for rotors that a drone does not have
 
 
 class Estimates(NamedTuple):
@@ -63,7 +63,7 @@ class Estimates(NamedTuple):
 
 
 def estimates_of(names: Sequence[str], by_drone: Mapping[str, Estimate]) -> Estimates:
-    """Return the estimates of drones, in the order of their names."""
+    """Return the estimates of drones, in the order of `names`."""
     shapes = {"position_m": (3,), "velocity_m_s": (3,), "orientation_wxyz": (4,), "covariance": (6, 6)}
     columns = [np.full((len(names), *shapes.get(field, ())), np.nan) for field in Estimates._fields]
     for i, estimate in enumerate(map(by_drone.get, names)):
@@ -76,27 +76,28 @@ def estimates_of(names: Sequence[str], by_drone: Mapping[str, Estimate]) -> Esti
 class Simulation:
     """World and agents of a scenario, stepped gate by gate.
 
-    Timing: the commands of a `step` carry the stamp of the gate that the caller has just seen, at `t_s`, as those of an
-    agent do. They act from `t_s + command_delay_s` on. With the usual delay of one gate, their effect is not visible in
-    the state after this step, but after the next one.
+    Timing: the commands of a `step` carry the stamp of the gate that the caller has just seen, at `t_s`, like those of
+    an agent. They act from `t_s + command_delay_s` on. With the usual delay of one gate, their effect is visible not in
+    the state after this step, but in the one after the next step.
 
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
-        seed, duration_s, set: replace those of the scenario; `set` by paths, `{"environment.wind.gust_m_s": 1.0}`.
+        seed, duration_s: replace those of the scenario.
+        set: replaces fields of the scenario by path, as in `{"environment.wind.gust_m_s": 1.0}`.
         agents: "stock": the scenario's estimators and controllers; None: none; or a sequence of your own agents,
             classes or objects, which fly beside the stock ones, or alone with `stock=False`.
         law, estimator: classes that replace those of all clusters and drones.
-        record: folder for the record, which `zsim.load` reads; None for none.
+        record: folder for the record, which `zsim.load` reads; None: no record.
 
     Raises:
         ScenarioError: with one line for every fault of the scenario.
-        RunError: it cannot be flown in one process, or the folder of the record is not empty.
+        RunError: the scenario cannot be flown in one process, or the folder of the record is not empty.
 
     Attributes:
-        names: of the drones; all arrays have them in this order.
+        names: names of the drones, in the order of all arrays.
         truth, sensors, estimates: see `Truth`, `Sensors`, `Estimates`.
         clusters: newest state of each cluster's controller, by cluster.
-        events: of the last step.
+        events: events of the last step.
     """
 
     def __init__(
@@ -124,18 +125,18 @@ class Simulation:
         self.reset()
 
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
-        """Begin a new flight.
+        """Start a new flight; return its initial state.
 
-        Agents given as objects begin with the attributes that they had initially.
+        Agents given as objects start with the attributes that they had initially.
 
         Args:
-            seed: of this flight and those after it; None: as before.
-            set: fields of the scenario that change for this flight and those after it.
+            seed: for this and later flights; None: as before.
+            set: fields of the scenario that change for this and later flights.
         """
         if seed is not None or set:
             self.source = self.source.changed(seed=seed, set=set)
         if self._writer is not None:
-            raise RunError("reset: this simulation is recorded, and a record holds one flight; make another Simulation")
+            raise RunError("reset: this simulation is recorded, and a record holds one flight; use a new Simulation")
         for i, attributes in self._pristine.items():
             own = vars(self._own[i])
             own.clear()
@@ -176,12 +177,12 @@ class Simulation:
 
     @property
     def ended(self) -> str | None:
-        """Why the flight is over, None while it continues."""
+        """Why the flight is over; None while it continues."""
         return self._flight.world.ended
 
     @property
     def truth_sha256(self) -> str:
-        """The hash of the truth of all gates so far, as in `zsim report`."""
+        """The SHA-256 of the truth of all gates so far, as in `zsim report`."""
         return self._flight.world.truth_hash.hexdigest()
 
     @property
@@ -199,12 +200,12 @@ class Simulation:
         """Fly one gate.
 
         Args:
-            commands: by drone, one or several, made by `zsim.velocity` and so on; see above for their timing. A drone
-                without a command keeps its last one for `silence.hover_s`, then it hovers.
+            commands: one or several by drone, created by `zsim.velocity` and the like; see the class for their timing.
+                A drone without a command keeps its last one for `silence.hover_s`, then it hovers.
 
         Raises:
-            RunError: the flight is over, or no drone has that name; nothing was sent.
-            Exception: raised by a class of yours, after a line on stderr that says where; the flight is over.
+            RunError: the flight is over, or there is no drone of that name; nothing was sent.
+            Exception: raised by one of your classes, after a line on stderr that says where; the flight is over.
         """
         world = self._flight.world
         if world.ended is not None:
@@ -220,7 +221,7 @@ class Simulation:
         return self.truth
 
     def run(self, until_s: float | None = None) -> str | None:
-        """Continue without commands until a simulated time [s], or to the end; return `ended`."""
+        """Continue without commands until a simulated time [s], or the end of the flight; return `ended`."""
         until_ns = np.inf if until_s is None else round(until_s * 1e9)
         while self.ended is None and self._flight.world.now_ns < until_ns:
             self.step()
@@ -232,7 +233,7 @@ class Simulation:
         It takes effect between this gate and the next.
 
         Raises:
-            RequestRefusedError: with the reason.
+            RequestRefusedError: the request was refused, for the reason given.
         """
         answer = self._flight.control(key, ControlRequest(op, args, CALLER))
         if not answer.ok:
@@ -253,22 +254,20 @@ class Simulation:
         return self.ask(keys.CONTROL, "fault_add", **fault)
 
     def snapshot(self) -> Any:
-        """Return the whole state of the flight, for `restore`.
+        """Return the complete state of the flight, for `restore`.
 
         Raises:
-            RunError: an agent of yours has no `snapshot`, or the flight is over.
+            RunError: one of your agents has no `snapshot`, or the flight is over.
         """
         if self.ended is not None:
             raise RunError(f"snapshot: the flight is over ({self.ended}); must be taken before its end")
         return (self.source, self._flight.snapshot(), dict(self._last_estimates), dict(self.clusters))
 
     def restore(self, snapshot: Any) -> Truth:
-        """Continue from a snapshot, to the same bits. A recorded flight cannot go back."""
+        """Continue from a snapshot, bit-identically; RunError if the flight is recorded."""
         source, flight, estimates, clusters = snapshot
         if self._writer is not None:
-            raise RunError(
-                "restore: this simulation is recorded, and a record does not go back; make another Simulation"
-            )
+            raise RunError("restore: this simulation is recorded, and a record cannot go back; use a new Simulation")
         if source != self.source:
             self.source = source
             self.reset()
@@ -320,7 +319,7 @@ class Simulation:
     # Observer of the flight
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take a message; called by the flight."""
+        """Receive a message; called by the flight."""
         kind = type(message)
         if kind is Estimate:
             self._last_estimates[keys.thing(key)] = message
@@ -330,7 +329,7 @@ class Simulation:
             self.events.append(message)
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Take the world's messages of a gate; called by the flight."""
+        """Receive the world's messages of a gate; called by the flight."""
         self.sensors.add(gate)
 
 
@@ -340,7 +339,7 @@ class Sensors(Mapping[str, "Samples"]):
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
         self._gates: list[GateMessages] = []
-        self._newest: dict[str, tuple[GateMessages, int]] = {}  # by key, not decoded yet
+        self._newest: dict[str, tuple[GateMessages, int]] = {}  # by key, not yet decoded
         self._samples: dict[str, Samples] = {}
 
     def add(self, gate: GateMessages) -> None:
@@ -403,10 +402,10 @@ class Samples:
     def put(self, place: int, message: Struct) -> None:
         for name, value in structs.asdict(message).items():
             if name not in self._columns:
-                whole = isinstance(value, int) and not isinstance(value, bool)
+                is_integer = isinstance(value, int) and not isinstance(value, bool)
                 shape = np.shape(value) if not isinstance(value, str) else ()
-                kind = np.int64 if whole else object if isinstance(value, str) else np.float64
-                self._columns[name] = np.full((self._count, *shape), -1 if whole else np.nan, dtype=kind)
+                kind = np.int64 if is_integer else object if isinstance(value, str) else np.float64
+                self._columns[name] = np.full((self._count, *shape), -1 if is_integer else np.nan, dtype=kind)
             self._columns[name][place] = value
 
     def __getattr__(self, name: str) -> NDArray[Any]:
@@ -427,6 +426,4 @@ def _copied(agent: Agent) -> dict[str, Any]:
     try:
         return copy.deepcopy(vars(agent))
     except Exception as error:
-        raise RunError(
-            f"{type(agent).__qualname__} cannot be copied ({error}), as reset() needs; give the class"
-        ) from error
+        raise RunError(f"{type(agent).__qualname__} cannot be copied for reset() ({error}); give the class") from error

@@ -1,4 +1,4 @@
-"""Flies a scenario many times, with other seeds and other values of its fields: `zsim.sweep` and `zsim sweep`."""
+"""Flies a scenario many times with different seeds and values of its fields: `zsim.sweep` and `zsim sweep`."""
 
 import json
 import re
@@ -55,7 +55,7 @@ def sweep(
     keep_records: bool = False,
     progress: bool = True,
 ) -> "pd.DataFrame":
-    """Fly every combination of some values, on all cores; return a frame with a row for each run.
+    """Fly every combination of values, on all cores; return a frame with a row for each run.
 
         frame = zsim.sweep(
             "step.yaml",
@@ -64,35 +64,35 @@ def sweep(
         )
         frame.groupby("estimation.algorithm")["metrics.settling_time"].mean()
 
-    Each run has the bits of `zsim.run` with the same values, wherever it is flown. Ctrl-C ends the workers and raises
-    KeyboardInterrupt; what is finished is in the folder, where the same call with `out` goes on.
+    Each run is bit-identical to `zsim.run` with the same values, wherever it is flown. Ctrl-C ends the workers and
+    raises KeyboardInterrupt; finished runs are kept in the folder, where the same call with `out` continues.
 
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
-        vary: values by path, in a sequence, of which every combination is flown; classes where one is named; or a text
-            as `--vary` takes it: `{"seed": "paired", "wind.gust_m_s": "uniform(0, 2)"}`, with `runs`.
+        vary: sequences of values by path, of which every combination is flown; for fields that name a class, values may
+            be classes; or texts as for `--vary`, with `runs`: `{"seed": "paired", "wind.gust_m_s": "uniform(0, 2)"}`.
         metrics: functions of the run (`zsim.Run`), or their names `module:function`, that return a number or a mapping
-            of numbers by name: columns `metrics.NAME`. One whose argument is named `flight` is given the arrays of a
-            `RecordedFlight` instead, for which nothing is recorded: that is faster.
-        runs: their number; None: one for each combination.
-        seed, duration_s, set, law, estimator: for all runs, as of `zsim.run`.
-        workers: processes; None: one per core.
+            of numbers by name: columns `metrics.NAME`. A function whose argument is named `flight` is given the arrays
+            of a `RecordedFlight` instead; this is faster, because nothing is recorded.
+        runs: number of runs; None: one for each combination.
+        seed, duration_s, set, law, estimator: for all runs, as in `zsim.run`.
+        workers: number of processes; None: one per core.
         client: a `distributed.Client`, whose workers are used instead.
-        out: folder of the sweep, which `zsim report` reads; an unfinished one is continued. None: a folder
-            that is removed when this process ends.
+        out: folder of the sweep, which `zsim report` reads; an unfinished sweep is continued. None: a folder that is
+            removed when this process ends.
         keep_records: whether the record of every run is kept, in `runs/` of the folder.
         progress: whether progress is shown.
 
     Returns:
-        frame by number of the run: `seed`, the values by path, `failure` (why the run did not end well, else NaN),
-        `metrics.NAME`, errors, and the other columns of docs/sweep.md. Texts and numbers that are missing are NaN,
-        flags NA. A class is there by its name, a further one of the same name as `Law-2`. `attrs["folder"]` is the
-        folder of the sweep, `attrs["summary"]` what `zsim report` writes as summary.json: means and intervals of each
+        A frame by number of the run: `seed`, the values by path, `failure` (why the run did not end well, NaN if it
+        did), `metrics.NAME`, errors, and the other columns of docs/sweep.md. Missing texts and numbers are NaN, missing
+        flags NA. A class appears by its name, a second one of the same name as `Law-2`. `attrs["folder"]` is the folder
+        of the sweep, `attrs["summary"]` the content of summary.json of `zsim report`: means and intervals of each
         combination.
 
     Raises:
-        ScenarioError: with every fault of the values and of the scenarios, a line each.
-        RunError: the folder holds something else; workers cannot start; pandas is not installed.
+        ScenarioError: with one line for every fault of the values and of the scenarios.
+        RunError: the folder holds something else, workers cannot start, or pandas is not installed.
     """
     with what_is_missing():
         import_module("pandas")  # before anything is flown
@@ -115,7 +115,7 @@ def sweep(
     except KeyboardInterrupt:
         finished = len(SweepFolder(folder, plan).rows())
         kept = folder if out is not None else folder.replace(tempfile.mkdtemp(prefix="zsim-sweep-"))
-        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(kept)!r} goes on"
+        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(kept)!r} continues"
         console.print(cell(text), soft_wrap=True)
         raise
     except RunError as error:
@@ -140,7 +140,7 @@ def planned(
     console: Console,
     faults: Sequence[str] = (),
 ) -> SweepPlan:
-    """Return the plan of a sweep, as `make_plan`, showing which combination is checked."""
+    """Return the plan of a sweep as by `make_plan`, showing which combination is being checked."""
     status = console.status("checking every combination …") if console.is_terminal else None
     with status or nullcontext():
 
@@ -154,12 +154,12 @@ def planned(
 def flown(
     plan: SweepPlan, folder: Path, workers: int | None = None, dask: Any = None, force: bool = False, **more: Any
 ) -> list[Row]:
-    """Fly a plan into a folder; return its rows. Arguments and errors as of `SweepRequest`, and of its `sweep`."""
+    """Fly a plan into a folder; return its rows. Arguments as in `SweepRequest`, errors as in `sweep`."""
     return swept(SweepRequest(plan, folder, workers, dask, force, open_run=partial(load, trust=True), **more))
 
 
 def _text(path: str, values: Any, scenario: Scenario) -> str:
-    """Return what varies as a text of `--vary`."""
+    """Return an entry of `vary` as a text for `--vary`."""
     if isinstance(values, str):
         return f"{path}={values}"
     values = values.tolist() if isinstance(values, np.ndarray) else values
@@ -176,20 +176,20 @@ _DTYPES: dict[Any, Any] = {str: str, str | None: str, bool | None: "boolean", in
 
 
 def _frame(rows: Sequence[Row], varied: Collection[str]) -> "pd.DataFrame":
-    """Return a frame of rows by their number; a text or a number that is missing is NaN, a flag NA."""
+    """Return rows as a frame by number of the run; missing texts and numbers are NaN, missing flags NA."""
     import pandas as pd
 
     columns: dict[str, pd.Series] = {}
     for name in rows[0]:
         dtype = None if name in varied else _DTYPES.get(FIXED.get(name, float | None))
         values = [row[name] for row in rows]
-        # of None, some versions of pandas make a text
+        # some versions of pandas turn None into a text
         columns[name] = pd.Series([np.nan if v is None else v for v in values] if dtype is str else values, dtype=dtype)
     return pd.DataFrame(columns).set_index("run")
 
 
 def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
-    """Return the names of classes and functions among values, by those that the scenario has for them."""
+    """Return the names of the classes and functions among values, by their names in the scenario."""
     given = [] if isinstance(values, str) else [*values]
     texts = [text_of(scenario.named(value)) for value in given]
     made = {place: value.__name__ for place, value in enumerate(given) if hasattr(value, "__name__")}
@@ -198,5 +198,5 @@ def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
 
 
 def _in_python(line: str) -> str:
-    """Return a line about a sweep with its arguments as Python has them."""
+    """Return a line about a sweep with the names of its arguments in Python."""
     return re.sub(r"--(?=(vary|runs|out|set)\b)", "", line)

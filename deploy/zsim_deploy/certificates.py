@@ -1,12 +1,12 @@
-"""A federation's certificate authority: certificates for each process and host, and their access rights.
+"""The certificate authority of a federation: certificates of its processes on its hosts, and their access rights.
 
-certs/ca.pem, certs/ca.key                                 the authority; the key stays on the machine that made it
-certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem        of one process on one host, the folder of --tls
-certs/HOST/PROCESS.access.json                             access control of a listening process
+certs/ca.pem, certs/ca.key                             the authority; the key stays on the machine where it was made
+certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem    those of one process on one host; folder for --tls
+certs/HOST/PROCESS.access.json                         access control of a listening process
 
-Zenoh enforces access control at the listening process (the world, a router), by the common name in the peer's
-certificate, in both directions. A key expression is allowed if it is included in that of a rule.
-docs.rs/zenoh-config, AclConfig.
+Zenoh enforces access control at the listening process (the world or a router), by the common name in the peer's
+certificate, in both directions. A key expression is allowed if that of a rule includes it.
+Source: docs.rs/zenoh-config, AclConfig.
 """
 
 import ipaddress
@@ -34,13 +34,13 @@ from zsim.transport.tls import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
 from zsim_deploy import inventory as inv
 from zsim_deploy.inventory import InventoryFile
 
-AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
+AUTHORITY_DAYS = 1825  # lifetime, 5 years; the key never leaves the machine where it was made
 AUTHORITY_KEY = "ca.key"
-BACK = timedelta(days=1)  # back-dating, because clocks of hosts in the field are hours off
-EXPIRED = "expired on"  # followed by a date
-OPERATORS = "operators"  # folder of the operators without a host in the inventory
+BACK = timedelta(days=1)  # certificates are back-dated by this, because clocks of hosts in the field are hours off
+EXPIRED = "expired on"  # begins a fault; a date follows
+OPERATORS = "operators"  # folder, in place of HOST, for operators without a host in the inventory
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-SHOWN_MAX = 4  # names in a line; usually all are missing at once
+SHOWN_MAX = 4  # number of names in a fault; usually all certificates are missing at once
 READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH
 
 Root = x509.Certificate
@@ -50,9 +50,9 @@ Root = x509.Certificate
 class CertificateRequest(NamedTuple):
     """A required certificate."""
 
-    host: str  # name in the inventory; a folder
-    process: str  # its name; the common name
-    addresses: tuple[str, ...] = ()  # of the host, IP or DNS
+    host: str  # name in the inventory, and of the folder
+    process: str  # name of the process, which is the common name
+    addresses: tuple[str, ...] = ()  # of the host, IP addresses or DNS names
 
 
 class CertificateStatus(NamedTuple):
@@ -73,25 +73,27 @@ def folder_of(placed: InventoryFile) -> Path:
 
 
 def init_command(placed: InventoryFile, renew: bool = False) -> str:
-    """Return the command that makes an inventory's certificates."""
+    """Return the command that makes the certificates of an inventory."""
     return f"zsim certs init {placed.word} --scenario FILE{' --renew' if renew else ''}"
 
 
 def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
-    """Return the authority in a folder, which is made if there is none.
+    """Return the authority in a folder, created if the folder has none.
 
-    `force` makes a new one, which invalidates all earlier certificates. RunError if it is incomplete, has expired, or
-    cannot be read or written.
+    `force`: create a new one, which invalidates all earlier certificates. RunError if the authority is incomplete, has
+    expired, or cannot be read or written.
     """
     place, key_place = folder / AUTHORITY, folder / AUTHORITY_KEY
-    there = [path for path in (place, key_place) if path.exists()]
-    if force or not there:
+    existing = [path for path in (place, key_place) if path.exists()]
+    if force or not existing:
         return _make_authority(folder, now)
-    if len(there) == 1:
-        missing = key_place if there == [place] else place
-        raise RunError(f"{missing}: is missing beside {there[0].name}; bring it here, or --force makes a new authority")
+    if len(existing) == 1:
+        missing = key_place if existing == [place] else place
+        raise RunError(
+            f"{missing}: is missing beside {existing[0].name}; copy it here, or --force makes a new authority"
+        )
     try:
-        with file_fault(key_place, "cannot be read", "it belongs to the user who made it"):
+        with file_fault(key_place, "cannot be read", "run this as the user who made it"):
             key = serialization.load_pem_private_key(key_place.read_bytes(), password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise RunError(f"{key_place}: is not a private key; --force makes a new authority") from error
@@ -123,8 +125,8 @@ def _make_authority(folder: Path, now: datetime) -> Authority:
 
 
 def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
-    """Make key and certificate of a process on a host; return their folder."""
-    purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # routers are both
+    """Make the key and certificate of a process on a host; return their folder."""
+    purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # a router is both
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key())
     key, builder = _key_and_builder(_name(wanted.process), signer.certificate.subject, now, days)
     certificate = (
@@ -182,7 +184,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def root(folder: Path) -> Root:
-    """Return the certificate of the authority in a folder; its key is not needed."""
+    """Return the certificate of the authority in a folder; RunError if it cannot be read."""
     return _load(folder / AUTHORITY)
 
 
@@ -196,7 +198,7 @@ def show(folder: Path, now: datetime) -> list[CertificateStatus]:
 
 
 def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
-    """Yield the operators who have a certificate in a folder, as NAME or, at one of the hosts, NAME@HOST."""
+    """Yield the operators who have a certificate in a folder, as NAME or, if at one of the hosts, as NAME@HOST."""
     for host in (OPERATORS, *hosts):
         for path in sorted((folder / host).glob(f"{OPERATOR}.*/{CERTIFICATE}")):
             name = path.parent.name.removeprefix(f"{OPERATOR}.")
@@ -204,7 +206,7 @@ def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
 
 
 def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
-    """Return why a certificate must be made, None if a valid one exists with its key."""
+    """Return why a certificate must be made; None if a valid one exists, with its key."""
     place = folder / wanted.host / wanted.process
     if not all((place / name).exists() for name in CERTIFICATES):
         return "new"
@@ -219,9 +221,9 @@ def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: 
 
 
 def _fault(place: Path, certificate: x509.Certificate, signer: Root, now: datetime) -> str | None:
-    """Return the fault of a certificate or its accompanying files, for instance of an interrupted `certs init`."""
+    """Return the fault of a certificate or of the files beside it, for instance after an interrupted `certs init`."""
     try:
-        authority_there, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
+        authority_pem, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
         public = serialization.load_pem_private_key(key, password=None).public_key()
     except (OSError, ValueError, TypeError, UnsupportedAlgorithm):
         return "cannot be read"
@@ -229,7 +231,7 @@ def _fault(place: Path, certificate: x509.Certificate, signer: Root, now: dateti
         certificate.verify_directly_issued_by(signer)
     except (InvalidSignature, ValueError, TypeError):
         return "of another authority"
-    if authority_there != _pem(signer):
+    if authority_pem != _pem(signer):
         return "of another authority"
     if public != certificate.public_key():
         return "without its key"
@@ -255,7 +257,7 @@ def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
 def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
     """Return a line for each fault of a run's certificates and access control.
 
-    `places`: host of each process to be started, with or without routers; None: only the world.
+    `places`: host of each process to start, with or without routers; None: check only the world and the routers.
     """
     if placed.inventory.security.insecure:
         return []
@@ -276,7 +278,7 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
             if why == "new":
                 fault = "certificate missing"
             elif why == "other addresses":
-                fault = "certificate for other addresses" if listens else None  # that of a client is not checked
+                fault = "certificate for other addresses" if listens else None  # a client's addresses are not checked
             elif why:
                 fault = f"certificate {why}"
             elif listens and not (folder / host / f"{name}.access.json").exists():
@@ -286,7 +288,7 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
     except RunError as error:
         return [str(error)]
     except OSError as error:
-        return [f"{folder}: cannot be read ({error.strerror}); it belongs to the user who made it"]
+        return [f"{folder}: cannot be read ({error.strerror}); run this as the user who made it"]
     lines = []
     for fault, who in names.items():
         more = f" and {len(who) - SHOWN_MAX} more" if len(who) > SHOWN_MAX else ""
@@ -296,7 +298,7 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
 
 
 def exposed_keys(placed: InventoryFile) -> str | None:
-    """Return a warning about private keys that other users can read; None if there are none."""
+    """Return a warning about private keys that other users can read; None without such keys."""
     if placed.inventory.security.insecure:
         return None
     folder = folder_of(placed)
@@ -307,34 +309,34 @@ def exposed_keys(placed: InventoryFile) -> str | None:
     if not exposed:
         return None
     more = f" and {len(exposed) - 1} more private keys" if len(exposed) > 1 else ""
-    return f"{min(exposed)}{more} can be read by others on this machine; chmod -R go= {shlex.quote(str(folder))}"
+    return f"{min(exposed)}{more} can be read by other users of this machine; chmod -R go= {shlex.quote(str(folder))}"
 
 
 def enrolment(
     placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()
 ) -> tuple[list[CertificateRequest], list[tuple[str, str, dict[str, Any]]]]:
-    """Return the required certificates, and host, process and access control of every listening process.
+    """Return the required certificates, and the (host, process, access control) of every listening process.
 
-    A role has a certificate for every host, so that it can be moved there during a run.
+    A role gets a certificate for every host, so that it can be moved there during a run.
 
     Args:
-        operators: people and programs that observe and command, each NAME or NAME@HOST; at a host they connect as its
-            roles do, through its router if it has one, otherwise to the world. One may be at several hosts.
+        operators: people and programs that observe and command, each as NAME or NAME@HOST; at a host they connect as
+            its roles do: through its router if it has one, otherwise to the world. One may be at several hosts.
 
     Raises:
-        InventoryError: a process has no place, or the host of an operator is unknown.
+        InventoryError: a process has no host, or the host of an operator is unknown.
         BadNameError: a name is not allowed by the contract.
     """
     hosts, routers = placed.inventory.hosts, placed.inventory.routers
     places = inv.placement(placed, scenario)
-    people: dict[tuple[str, str | None], None] = {}  # names of operators, each with its host
+    people: dict[tuple[str, str | None], None] = {}  # (name, host) of the operators, in order
     for name, at, host in (text.partition("@") for text in operators):
         name = keys.name(name.removeprefix(f"{OPERATOR}."), OPERATOR)
         if at and host not in hosts:
             known = f"must be one of hosts: {', '.join(hosts)}"
             raise InventoryError([f"{placed.source}: operator {name!r} is at {host!r}; {known}"])
         people[f"{OPERATOR}.{name}", host or None] = None
-    # Any host may run these: the processes of the scenario, and drivers, even if it does not expect them.
+    # Any host may run the processes of the scenario, and drivers, even those that it does not expect.
     movable = [name for name in places if name != WORLD]
     movable += [name for name in drivers_of(scenario) if name not in places]
     wanted = [(places[WORLD], WORLD), *((router.host, f"{ROUTER}.{name}") for name, router in routers.items())]
@@ -346,7 +348,7 @@ def enrolment(
         return list(dict.fromkeys(who for who, at in people if (hosts[at].router if at else None) == router))
 
     def clients_of(router: str) -> list[str]:
-        """Return the processes that may connect to a router: every role, since any may be moved to its hosts."""
+        """Return the processes that may connect to a router: every role if it has hosts, to which any can be moved."""
         has_hosts = any(host.router == router for host in hosts.values())
         return [*(movable if has_hosts else []), *operators_at(router)]
 
@@ -357,7 +359,7 @@ def enrolment(
         return [*clients_of(router), *(process for name in lower(router) for process in behind(name))]
 
     def below(router: str | None) -> dict[str, list[str]]:
-        """Return the routers that connect to a router, or to the world, with all processes behind each."""
+        """Return the routers that connect to a router, or to the world (None), with the processes behind each."""
         return {f"{ROUTER}.{name}": processes for name in lower(router) if (processes := behind(name))}
 
     rules = access_control(scenario, [*movable, *operators_at(None)], below(None))
@@ -369,7 +371,7 @@ def enrolment(
     return requests, access
 
 
-# rights on the wire, as seen from the listening process: (flow, messages, field of Rights with the keys)
+# Rights as Zenoh's rules, from the view of the listening process: (flow, messages, field of Rights with the keys)
 _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("declare_subscriber",), "reads"),
     ("egress", ("put",), "reads"),
@@ -382,34 +384,34 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("liveliness_query", "declare_liveliness_subscriber"), "watches"),
     ("egress", ("liveliness_token",), "watches"),
 )
-# Declarations are allowed for all, because nothing is sent without them; they have no payload.
+# Declarations are allowed to all, because nothing is sent without them; they have no payload.
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
-ANYONE = "anyone"  # with a certificate of the authority; a subject without conditions matches all peers
-# Anyone may ask for its own rights: zsim.transport.tls.
-_ASKS_ACCESS = (("ingress", "query"), ("egress", "reply"))
+ANYONE = "anyone"  # any peer with a certificate of the authority: a subject without conditions matches all
+# Anyone may query its own rights; see zsim.transport.tls.
+_ACCESS_QUERY = (("ingress", "query"), ("egress", "reply"))
 
 
 def access_control(
     scenario: Scenario, clients: Iterable[str], routers: Mapping[str, Iterable[str]], above: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Return the `access_control` of a listening process for Zenoh's configuration.
+    """Return the `access_control` section of Zenoh's configuration for a listening process.
 
-    Everything else is denied. A process that is not named may only ask for its own rights.
+    Everything else is denied; a process that is not named may only query its own rights.
 
     Args:
         clients: names of the processes that connect to it.
         routers: names of the routers that connect to it, with the processes behind each.
-        above: names of the world or the router that it connects to itself.
+        above: names of the world or the router to which it connects itself.
     """
     granted = {name: rights.rights_for(name, scenario) for name in clients}
     for name, behind in routers.items():
         granted[name] = rights.combined(rights.rights_for(process, scenario) for process in behind)
     granted |= dict.fromkeys(above, rights.ALL_RIGHTS)
     entries = [(name, _rules(name, right, scenario.federation)) for name, right in granted.items()]
-    asking = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ASKS_ACCESS]
+    queries = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ACCESS_QUERY]
     subjects = [{"id": name, "cert_common_names": [name]} for name, _ in entries]
-    entries.append((ANYONE, asking))
+    entries.append((ANYONE, queries))
     return {
         "enabled": True,
         "default_permission": "deny",

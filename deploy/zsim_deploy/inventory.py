@@ -1,6 +1,6 @@
-"""An inventory: the hosts, how to reach them, which role runs where, and the command lines of processes.
+"""Inventories: the hosts, how to reach them, which role runs where; and the command lines of processes.
 
-Pure: reads a file, and opens no connection. docs/deployment.md explains the fields.
+Pure apart from reading the file. docs/deployment.md explains the fields.
 """
 
 import fnmatch
@@ -33,18 +33,18 @@ from zsim_api.programs import filled
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME
 
-EXAMPLE = "examples/hosts.yaml"  # suggested if no inventory is given
-ZENOH_PORT = 7447  # Zenoh's default
+EXAMPLE = "examples/hosts.yaml"  # suggested if the inventory does not exist
+ZENOH_PORT = 7447  # default port of Zenoh
 SSH_PORT = 22  # IANA
-HOSTS_MAX = DRONES_MAX  # with more, some would have no drone
-ROLES_MAX = PROCESSES_MAX  # each entry is at least one process
-ROUTER_PORT = 7448  # differs from that of a world on the same host
+HOSTS_MAX = DRONES_MAX  # with more hosts, some would have no drone
+ROLES_MAX = PROCESSES_MAX  # each entry stands for at least one process
+ROUTER_PORT = 7448  # differs from ZENOH_PORT, for a world on the same host
 MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # arguments of the interpreter
-NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # one of each; in the order of placement
+NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # extras by process name, in the order of placement
 OF_CAMERAS = ("camera", "detector")  # roles that a run waits for only if the scenario names them
-COMMANDS = {RECORDER: "record", "detector": "detect"}  # of roles whose command has another name
-KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # by prefix of the process name
-MODULES = {  # imported as a check of an extra, and of the installation without extras first
+COMMANDS = {RECORDER: "record", "detector": "detect"}  # commands of roles, where the names differ
+KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # extras by prefix of the process name
+MODULES = {  # module that is imported to check an extra; "": the installation without extras
     "": "zsim.transport.session",
     "agents": "zsim_agents.estimation.estimator",
     "record": "zsim_agents.recorder",
@@ -58,22 +58,22 @@ Text = Annotated[str, Meta(min_length=1, max_length=4096)]
 
 
 class Host(Spec, frozen=True, kw_only=True):
-    """A computer."""
+    """A computer on which roles run."""
 
     address: Address
-    """How the other hosts reach it."""
+    """Address at which the other hosts reach it."""
     ssh: Address | None = None
-    """How the launcher reaches it, if that differs."""
+    """Address at which the launcher reaches it, if that differs."""
     port: Port = SSH_PORT
     user: Text | None = None
     key: Text | None = None
-    """Private key file; None: those of the agent and ~/.ssh."""
+    """Private key file; None: the keys of the ssh agent and of ~/.ssh."""
     known_hosts: Text | None = None
     """File with its host key; None: ~/.ssh/known_hosts."""
     folder: Text = ".zsim"
-    """Folder of zsim's installation and files; relative to the home."""
+    """Folder for zsim's installation and files; a relative path starts at the home folder."""
     python: Text | None = None
-    """Absolute path of an interpreter with zsim; None: the environment that `zsim push` makes."""
+    """Absolute path of an interpreter that has zsim; None: that of `zsim push`."""
     router: Name | None = None
     """Router through which its roles reach the world; None: they connect to the world directly."""
 
@@ -84,22 +84,22 @@ class Router(Spec, frozen=True, kw_only=True):
     host: Name
     port: Port = ROUTER_PORT
     upstream: Name | None = None
-    """Router that it connects to; None: the world."""
+    """Router to which it connects; None: the world."""
 
 
 class Security(Spec, frozen=True, kw_only=True):
-    """TLS and access control."""
+    """Settings of TLS and access control."""
 
     certificates: Text = "certs"
     """Folder of `zsim certs init`, relative to the inventory."""
     insecure: bool = False
-    """No TLS and no access control, for a network of your own."""
+    """Whether to do without TLS and access control, on a network of your own."""
 
 
 class Inventory(Spec, frozen=True, kw_only=True):
     hosts: Annotated[dict[Name, Host], Meta(max_length=HOSTS_MAX)]
     roles: Annotated[dict[Text, Name | Annotated[list[Name], Meta(max_length=HOSTS_MAX)]], Meta(max_length=ROLES_MAX)]
-    """Process name or pattern to a host, or to several over which the matching processes are spread in order."""
+    """Host of each process, by name or pattern; a list of hosts is used in turn for the processes that match."""
     routers: Annotated[dict[Name, Router], Meta(max_length=HOSTS_MAX)] = msgspec.field(default_factory=dict)
     port: Port = ZENOH_PORT
     """Port of the world."""
@@ -115,7 +115,7 @@ class InventoryFile(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Return its path as a word of a command."""
+        """Return the path of the file, quoted as a word for a shell."""
         return shlex.quote(str(self.folder / self.source))
 
 
@@ -136,7 +136,7 @@ def insecure(placed: InventoryFile) -> InventoryFile:
 
 
 def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
-    """Yield the faults between fields: unknown names of hosts and routers, and cycles of routers."""
+    """Yield the faults that concern several fields: unknown hosts and routers, and cycles of routers."""
 
     def entries(name: str) -> list[tuple[Any, Any]]:
         """Return the entries of a field; empty if it is not a map, or has too many entries to compare."""
@@ -145,7 +145,7 @@ def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
 
     def unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
         if isinstance(name, str) and name not in known:
-            yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'there are none'}"
+            yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'none defined'}"
 
     hosts, routers = ([key for key, _ in entries(name)] for name in ("hosts", "routers"))
     for key, wanted in entries("roles"):
@@ -182,15 +182,16 @@ def roles(scenario: Scenario) -> list[str]:
 
 
 def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
-    """Return the host of every process, by `spread`; InventoryError if one has none, or a pattern matches nothing.
+    """Return the host of every process, by `spread`.
 
-    A program of the scenario may have none: then `zsim up` starts it on the launcher's machine.
+    A program of the scenario may have none: then `zsim up` starts it on the launcher's machine. InventoryError if
+    another process has no host, an entry matches no process, or two processes listen on the same port.
     """
     names, inventory = roles(scenario), placed.inventory
     entries = inventory.roles
     places = spread(entries, names)
     lines = [
-        f"roles has no place for {name}; add {name!r}"
+        f"roles has no host for {name}; add {name!r}"
         for name in names
         if name not in {**places, **scenario.own_programs}
     ]
@@ -202,17 +203,17 @@ def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
             other = first.setdefault((router.host, router.port), f"{ROUTER}.{name}")
             if other != f"{ROUTER}.{name}":
                 taken = f"on which {other} listens on {router.host}"
-                lines.append(f"routers.{name}.port is {router.port}, {taken}; give another")
+                lines.append(f"routers.{name}.port is {router.port}, {taken}; give another port")
     if lines:
         raise InventoryError([f"{placed.source}: {line}" for line in lines])
     return places
 
 
 def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
-    """Return the hosts of processes, without those that have no place; an entry's hosts are used in turn.
+    """Return the hosts of processes by name, where they have one; the hosts of an entry are used in turn.
 
-    A name takes precedence over a pattern, a longer pattern over a shorter one. The default host of the recorder is the
-    world's.
+    A name takes precedence over a pattern, and a longer pattern over a shorter one. The recorder's default host is that
+    of the world.
     """
     places: dict[str, str] = {}
     turns: Counter[str] = Counter()
@@ -230,24 +231,24 @@ def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict
 
 
 def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
-    """Return the endpoint to which the roles of a host connect: that of their router, or the world."""
+    """Return the endpoint to which the roles on a host connect: that of their router, or of the world."""
     return listening(placed, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
 
 
 def listening(placed: InventoryFile, host: str, port: int) -> str:
-    """Return the endpoint on which a process of a host listens, with the address that other hosts use."""
+    """Return the endpoint of a process that listens on a host, with the address that other hosts use."""
     address = placed.inventory.hosts[host].address
     shown = f"[{address}]" if ":" in address else address
     return f"{'tcp' if placed.inventory.security.insecure else 'tls'}/{shown}:{port}"
 
 
 def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
-    """Return host and port of each listening process, with the other hosts whose roles and routers connect to it."""
+    """Return, for host and port of each listening process, the other hosts whose roles and routers connect to it."""
     inventory = placed.inventory
-    ways = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
-    ways += [(router.host, router.upstream) for router in inventory.routers.values()]
+    links = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
+    links += [(router.host, router.upstream) for router in inventory.routers.values()]
     sources: dict[tuple[str, int], set[str]] = {}
-    for source, above in ways:
+    for source, above in links:
         target = _listener(inventory, places, above)
         if target[0] != source:
             sources.setdefault(target, set()).add(source)
@@ -265,7 +266,7 @@ def below_home(path: str) -> str:
 
 
 def python(host: Host) -> str:
-    """Return the interpreter of a host that has zsim: as given, or that of `zsim push`."""
+    """Return the path of the interpreter on a host that has zsim: as given, or that of `zsim push`."""
     return host.python or f"{below_home(host.folder)}/venv/bin/python"
 
 
@@ -277,15 +278,15 @@ class PlannedProcess(NamedTuple):
 
     name: str  # `role.thing`
     host: str
-    words: tuple[str, ...]  # of the command, without file paths and `thing`
-    thing: str | None  # argument: name of a drone, a cluster or a router; None: no argument
-    port: int | None
-    secure: bool
+    words: tuple[str, ...]  # words of the command, without file paths and `thing`
+    thing: str | None  # argument of the command: name of a drone, a cluster or a router; None: no argument
+    port: int | None  # port on which it listens; None: it does not listen
+    secure: bool  # uses TLS
     on_death: OnDeath
 
     @property
     def is_restarted(self) -> bool:
-        """Whether its service restarts it; never for a world, which has no journal there."""
+        """Whether its service restarts it; never for a world, which has no journal as a service."""
         return self.on_death == "restart" and self.name != WORLD
 
     @property
@@ -298,18 +299,18 @@ class PlannedProcess(NamedTuple):
 
 
 class ProcessFiles(NamedTuple):
-    """Paths of the files of a process, as in its command line."""
+    """Paths of the files of a process, as given in its command line."""
 
     scenario: str
     identity: str  # folder with ca.pem, certificate.pem and key.pem
-    access: str
-    out: str
+    access: str  # file with the access control of a listening process
+    out: str  # folder of the record
 
 
 def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
     """Return the processes that zsim can start: the world, the recorder, agents, cameras, then routers.
 
-    `pace`: options of the world. InventoryError as of `placement`.
+    `pace`: command line options of the world. InventoryError as for `placement`.
     """
     inventory, places = placed.inventory, placement(placed, scenario)
 
@@ -328,7 +329,7 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
             return planned(name, host, ("agent", *reach), name, None)
         if role in OF_CAMERAS:
             words = (*words, "--name", name)
-            thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # none: of all with cameras
+            thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # empty: all with cameras
         return planned(name, host, words, thing or None, None)
 
     def router(name: str) -> PlannedProcess:
@@ -348,7 +349,10 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
 
 
 def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
-    """Return a remark on each program of the user's own, with its command: those placed on one host, or all."""
+    """Return a line on each program of the user's own, with its command.
+
+    `host`: only programs placed on that host; None: all, including those without a host.
+    """
     places = placement(placed, scenario)
     own = [(name, at, f" on {at}") for name, at in places.items() if not _is_known(name, scenario)]
     own += [(name, places[WORLD], "") for name in (programs_here(placed, scenario) if host is None else ())]
@@ -356,19 +360,19 @@ def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = N
     for name, at, where in own:
         if host in (None, at):
             reach = endpoint(placed, places, at)
-            what = f"{name}{where} is a program of your own: start it yourself, it connects to {reach}"
+            what = f"{name}{where} is a program of your own: start it yourself; it connects to {reach}"
             remarks.append(what + _command_text(name, scenario, reach))
     return remarks
 
 
 def programs_here(placed: InventoryFile, scenario: Scenario) -> list[str]:
-    """Return the programs of a scenario that have no place: `zsim up` starts them on this machine."""
+    """Return the programs of a scenario that have no host; `zsim up` starts them on this machine."""
     places = placement(placed, scenario)
     return [name for name in programs(scenario) if name not in places]
 
 
 def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
-    """Return the command line of a program of the scenario; `{folder}` of the run is left for the user to choose."""
+    """Return the command line of a program of the scenario; the user fills in `{folder}`, that of the run."""
     if name not in scenario.own_programs:
         return ""
     values = {"endpoint": endpoint, "federation": scenario.federation, "name": name, "folder": "{folder}"}
@@ -387,11 +391,11 @@ def command(process: PlannedProcess, files: ProcessFiles) -> list[str]:
     if process.secure and process.port is not None:
         words += ["--access", files.access]
     argument = files.scenario if process.name == WORLD else process.thing
-    return [*words, "--", argument] if argument is not None else words  # a name may begin with a dash
+    return [*words, "--", argument] if argument is not None else words  # the name may begin with a dash
 
 
 def access_file(process: PlannedProcess) -> str:
-    """Return the file with a listening process's access control, in the certificates folder of its host."""
+    """Return the name of the file with the access control of a listening process, in its host's certificate folder."""
     return f"{process.name}.access.json"
 
 
@@ -409,10 +413,10 @@ def extras(names: Sequence[str]) -> list[str]:
 
 
 def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:
-    """Return the extras of every host, with those of `more`.
+    """Return the extras that every host needs, and those of `more`.
 
-    A pattern counts for everything that it can match, since the scenario is not known here. Routers and programs of the
-    user's own need no extra.
+    A pattern counts for every role that it can match, because the scenario is unknown here. Routers and the user's own
+    programs need no extra.
     """
     extras_by_host: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
     for process, host in spread(inventory.roles, NAMED).items():
@@ -424,8 +428,8 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
 
 
 def _can_match(pattern: str, kind: str) -> bool:
-    """Return whether a pattern can match a name with the prefix `kind`."""
+    """Whether a pattern can match a name with the prefix `kind`."""
     if kind.removesuffix(".") in OF_CAMERAS:
-        return pattern.startswith(kind)  # these roles exist only if they are named
+        return pattern.startswith(kind)  # these roles exist only where they are named
     literal = pattern[: min((pattern.find(sign) for sign in "*?[" if sign in pattern), default=len(pattern))]
     return literal.startswith(kind) or (literal != pattern and kind.startswith(literal))

@@ -1,10 +1,10 @@
 """`zsim render`: the processes of an inventory and a scenario as systemd units, compose files or Kubernetes manifests.
 
-Templates are in templates/, with `$name` for values. YAML templates are filled as data and dumped again, so that every
-value is quoted correctly. Restart limits and exit codes are those of the supervisor: a role is restarted in the same
-cases as by `zsim run`.
+Templates are in templates/, with `$name` for values. YAML templates are filled in as data and dumped again, so that
+every value is quoted correctly. Restart limits and exit codes are those of the supervisor, so that a role is restarted
+in the same cases as by `zsim run`.
 
-Zenoh's endpoints and the certificates name the hosts of the inventory, so containers and Pods use the host's network.
+Zenoh's endpoints and the certificates name the hosts of the inventory, so containers and Pods use their host's network.
 """
 
 import contextlib
@@ -31,37 +31,37 @@ from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED
 
 Rendered = dict[str, str]
-"""Path inside the output folder to text."""
+"""Text of each file, by path in the output folder."""
 TEMPLATES = Path(__file__).with_name("templates")
 
-STATE = "/var/lib/zsim"  # StateDirectory=zsim
-CACHE = "/var/cache/zsim"  # CacheDirectory=zsim
-PATH_MAX = 4000  # bytes; Linux allows 4095, including the names of the files in the folder
-STOP_S = 15  # a stopped world waits 5 s for byes, and a recorder may wait for its disk
-BASE = "python:3.11-slim"  # the oldest Python that zsim runs on
+STATE = "/var/lib/zsim"  # folder that StateDirectory=zsim stands for
+CACHE = "/var/cache/zsim"  # folder that CacheDirectory=zsim stands for
+PATH_MAX = 4000  # length of a folder's path, bytes; Linux allows 4095, including the names of the files in it
+STOP_S = 15  # time to stop before SIGKILL; a world waits 5 s for byes, and a recorder may wait for its disk
+BASE = "python:3.11-slim"  # base image, with the oldest Python that zsim runs on
 WHEEL = f"zsim-{RELEASE}-py3-none-any.whl"
 IMAGE = f"zsim:{RELEASE}"
-USER = 1000  # first ordinary user of Debian
+USER = 1000  # user and group id in images, those of Debian's first ordinary user
 CERTIFICATES, ACCESS, SCENARIO, RUNS = "/certs", "/access/access.json", "/scenario/scenario.yaml", "/runs"
 ENVIRONMENT = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
 IN_A_CONTAINER = {
     "cache": CACHE, "scenario": SCENARIO, "runs": RUNS, "certificates": CERTIFICATES, "access": ACCESS, "user": USER,
     "stop_s": STOP_S,
 }  # fmt: skip
-NAME_MAX = 63  # RFC 1123 label
-CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
-FINAL_CODES = [USER_FAULT, SUPERSEDED]  # a restart helps neither with a wrong call nor with a name taken by another
+NAME_MAX = 63  # length of a label; RFC 1123
+CONFIG_BYTES_MAX = 1_048_576  # size of a ConfigMap; Kubernetes documentation, "ConfigMaps"
+FINAL_CODES = [USER_FAULT, SUPERSEDED]  # exit codes after which no restart helps: a user's mistake, a name taken over
 
 
-# systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops them together
+# systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops the units together
 
 
 def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
-    """Return `HOST/zsim-PROCESS.service`, `HOST/zsim.target`, and the scenario for the world's host.
+    """Return `HOST/zsim-PROCESS.service` and `HOST/zsim.target`, and the scenario for the world's host.
 
-    The options are those of systemd.exec(5) and systemd.service(5). Omitted are MemoryDenyWriteExecute (numba
-    compiles) and ProcSubset (libraries read /proc/cpuinfo). `pace`: options of the world. InventoryError if a
-    process has no place, or a host has no user or a relative path to its interpreter.
+    The options are those of systemd.exec(5) and systemd.service(5), without MemoryDenyWriteExecute (numba compiles) and
+    ProcSubset (libraries read /proc/cpuinfo). `pace`: command line options of the world. InventoryError if a process
+    has no host, or if a host has no user, or a relative path to its interpreter.
     """
     planned, hosts = inv.processes(placed, scenario, pace), placed.inventory.hosts
     _refuse(placed, [f"hosts.{name}.{text}" for name in inv.used_hosts(planned) for text in _lacks(hosts[name])])
@@ -78,7 +78,7 @@ def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ())
 
 def _lacks(host: Host) -> Iterator[str]:
     if host.user is None:
-        yield "user is missing; a unit needs the user under which it runs; add it"
+        yield "user is missing; must be the user that the units run as; add it"
     elif not _home(host.user):
         yield f"user is {show(host.user)}; must be letters, digits, `_`, `-` and `.`, at most 31"
     for name, path in (("folder", host.folder), ("python", host.python or "/")):
@@ -91,7 +91,7 @@ def _lacks(host: Host) -> Iterator[str]:
 
 
 def _home(user: str | None) -> str | None:
-    """Return the usual home of a user; None for an invalid name (systemd: "User/Group Name Syntax", relaxed)."""
+    """Return the usual home of a user; None for an invalid name (systemd, "User/Group Name Syntax", relaxed mode)."""
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,30}", user or ""):
         return None
     return "/root" if user == "root" else f"/home/{user}"
@@ -102,7 +102,7 @@ def _absolute(host: Host, path: str) -> str:
 
 
 def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequence[PlannedProcess]) -> str:
-    """Return the unit of a process. Units stop in reverse order: the world ends the run, and routers stop last."""
+    """Return the unit of a process; units stop in reverse order: first the world, which ends the run, last routers."""
     rank = {ROUTER: 0, WORLD: 2}
     earlier = [each.unit for each in here if rank.get(each.role, 1) < rank.get(process.role, 1)]
     folder = _absolute(host, host.folder)
@@ -112,13 +112,13 @@ def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequ
         access=f"{folder}/certs/{inv.access_file(process)}",
         out=f"{STATE}/runs/{scenario.name}-{RUN_ID}",
     )
-    # ":" disables variable substitution; "$$" would remain doubled in the path of the program
+    # ":" disables variable substitution; doubling "$" would not help, since it stays doubled in the program's path.
     words = (f":{_absolute(host, inv.python(host))}", *inv.command(process, files))
     remarks = []
     if not host.folder.startswith("/"):
-        remarks.append(f"folder {host.folder} is assumed to be in {_home(host.user)}; else give an absolute folder")
+        remarks.append(f"folder {host.folder} is assumed to be in {_home(host.user)}; otherwise give an absolute path")
     if process.on_death == "wait":
-        remarks.append("on_death is wait: systemd does not restart it; time stands still until it is started by hand")
+        remarks.append("on_death is wait: systemd does not restart it; time stops until it is started by hand")
     values = {
         "process": process.name,
         "scenario": scenario.name,
@@ -137,7 +137,7 @@ def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequ
 
 
 def _systemd_word(text: str) -> str:
-    """Quote a word for ExecStart=."""
+    """Quote a word for ExecStart=; systemd.service(5)."""
     text = text.replace("%", "%%")
     if re.fullmatch(r"[^\s\"'\\;]+", text):
         return text
@@ -148,7 +148,10 @@ def _systemd_word(text: str) -> str:
 
 
 def compose(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
-    """Return `HOST/compose.yaml`, `HOST/Dockerfile`, and the scenario for the world's host."""
+    """Return `HOST/compose.yaml` and `HOST/Dockerfile`, and the scenario for the world's host.
+
+    `pace`: command line options of the world. InventoryError if a process has no host.
+    """
     planned = inv.processes(placed, scenario, pace)
     head, (project,) = _yaml_template("compose.yaml")
     service = project["services"]["process"]
@@ -174,7 +177,7 @@ def _compose_service(template: Any, scenario: Scenario, process: PlannedProcess)
         **IN_A_CONTAINER,
         "release": RELEASE,
         "host": process.host,
-        "words": [word if word == out else word.replace("$", "$$") for word in words],  # for Compose to leave alone
+        "words": [word if word == out else word.replace("$", "$$") for word in words],  # Compose reads $$ as $
         "environment": ENVIRONMENT,
         "process": process.name,
         "access_file": inv.access_file(process),
@@ -203,24 +206,25 @@ def _unused(placed: InventoryFile, host: str) -> list[str]:
     described = placed.inventory.hosts[host]
     defaults = Host(address=described.address)
     names = [name for name in ("folder", "python") if getattr(described, name) != getattr(defaults, name)]
-    return [f"# hosts.{host}: {', '.join(names)} not used, the image has its own"] if names else []
+    return [f"# hosts.{host}: {', '.join(names)} not used; the image has its own"] if names else []
 
 
 def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
-    """Return the Dockerfile of an image with the extras of some processes; it expects the wheel beside it."""
+    """Return the Dockerfile of an image with the extras of processes; it expects zsim's wheel beside it."""
     extras = inv.extras([process.name for process in planned])
     wanted = f"[{','.join(extras)}]" if extras else ""
     return _text("Dockerfile", {**IN_A_CONTAINER, "wheel": WHEEL, "base": BASE, "extras": wanted})
 
 
-# Kubernetes: a run ends, so its roles are Jobs; a router does not, so it is a Deployment
+# Kubernetes: roles end with the run, so they are Jobs; a router does not, so it is a Deployment
 
 
 def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
-    """Return `namespace.yaml`, `secrets.sh`, `zsim.yaml`, `records.yaml` and a Dockerfile.
+    """Return `namespace.yaml`, `zsim.yaml`, `records.yaml`, a Dockerfile, and with TLS also `secrets.sh`.
 
-    The names of the hosts must be those of the nodes, which must find the Dockerfile's image as `image`. InventoryError
-    if a process has no place, a name is not allowed by Kubernetes, or the scenario is too large.
+    The hosts must be named like the nodes, which must find the Dockerfile's image as `image`. `pace`: command line
+    options of the world. InventoryError if a process has no host, Kubernetes does not allow a name, or the scenario is
+    too large.
     """
     planned, text = inv.processes(placed, scenario, pace), scenario_file.to_text(scenario)
     _refuse(placed, _kubernetes_faults(planned, text))
@@ -234,7 +238,7 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
         *(_role_manifest(by_kind, shared, process) for process in planned),
     ]
     address = placed.inventory.hosts[world.host].address
-    certified = f"# The world's certificate is for {address}: over TLS use this name, not that of the Service."
+    certified = f"# The world's certificate is for {address}: over TLS use that address, not the name of the Service."
     remarks = [*head, *([certified] if world.secure else [])]
     remarks += [line for host in inv.used_hosts(planned) for line in _unused(placed, host)]
     remarks += [f"# {line}" for line in inv.own_programs(placed, scenario)]
@@ -256,7 +260,7 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
 
 def _kubernetes_faults(planned: Sequence[PlannedProcess], text: str) -> list[str]:
     lines = [
-        f"hosts.{host} is not the name of a node; must be letters, digits, - and ., as `kubectl get nodes` lists them"
+        f"hosts.{host} is not a name of a node; must be of a-z, 0-9, - and ., as `kubectl get nodes` lists it"
         for host in inv.used_hosts(planned)
         if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
     ]
@@ -313,7 +317,7 @@ def _refuse(placed: InventoryFile, lines: Sequence[str]) -> None:
 
 
 def _template(name: str) -> tuple[list[str], str]:
-    """Return the comment lines at the top of a template, and its body."""
+    """Return the comment lines at the top of a template, and the rest of it."""
     lines = (TEMPLATES / name).read_text(encoding="utf-8").splitlines(keepends=True)
     count = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     return [line.rstrip("\n") for line in lines[:count]], "".join(lines[count:])
@@ -331,7 +335,7 @@ def _yaml_template(name: str) -> tuple[list[str], list[Any]]:
 
 
 def _filled(node: Any, values: Mapping[str, Any]) -> Any:
-    """Fill in the values of a part of a template; a text that is just `$name` becomes the value itself."""
+    """Return a part of a template with its values; a text that is just `$name` becomes the value itself."""
     if isinstance(node, dict):
         return {key: _filled(value, values) for key, value in node.items()}
     if isinstance(node, list):
@@ -342,7 +346,7 @@ def _filled(node: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _dump(remarks: Sequence[str], documents: Sequence[Any]) -> str:
-    """Return YAML documents as one text with remarks at the top; deterministic."""
+    """Return YAML documents as one text, with remarks at the top; the same text for the same input."""
     options: dict[str, Any] = {"sort_keys": False, "default_flow_style": False, "width": 1000}
     texts = [yaml.dump(plain, Dumper=_Dumper, **options) for plain in documents]
     return "".join(f"{line}\n" for line in remarks) + "---\n".join(texts)
@@ -365,11 +369,11 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 
 
 def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False) -> list[str]:
-    """Write the texts into a folder; return the files of an earlier rendering for this target that were removed.
+    """Write texts into a folder; return the files of an earlier rendering for this target that were removed.
 
-    A list beside the files has their digests, in the format of `sha256sum`: a later rendering removes the files of an
-    earlier one for its target, but never other files or changed ones; `force` overwrites those. RunError if a file
-    cannot be written, a path leads out of the folder, or an existing file was not rendered.
+    A list beside the files has their digests, in the format of `sha256sum`. By it a later rendering for the same target
+    removes the files of an earlier one. RunError if a file cannot be written, a path leads out of the folder, a file to
+    remove was changed since, or, without `force`, a file to replace was not rendered or was changed since.
     """
     root, record = out.resolve(), out / f".zsim-render-{target}.sha256"
 
@@ -397,12 +401,12 @@ def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False)
         for name, text in texts.items():
             path, known = root / name, (former.get(name, ""), digest(text.encode()))
             if path.exists() and not has_digest(path, known):
-                why = "it was not rendered, or was changed since"
+                why = "was not rendered, or was changed since"
                 raise RunError(f"{path}: {why}; give --out another folder, or --force to replace it")
     stale = [name for name in former if name not in texts and is_inside(name) and (root / name).is_file()]
     for name in stale:
         if not has_digest(root / name, (former[name],)):
-            why = "it was rendered earlier and changed since"
+            why = "was rendered earlier, and changed since"
             raise RunError(f"{root / name}: {why}; remove it, or give --out another folder")
     for path in (root / name for name in stale):
         with file_fault(path, "cannot be removed", OTHER_OUT):

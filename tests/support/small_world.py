@@ -4,6 +4,7 @@ from typing import Any
 
 from zsim.contract.run_messages import Event
 from zsim.scenario.scenario_file import resolve
+from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
@@ -20,7 +21,7 @@ def small_world(mode: str = "lockstep", drones: int = 1, processes: Any = None, 
     )
 
 
-def events_of(world: World, *kinds: str) -> list[Event]:
+def events_of(world: Coordinator, *kinds: str) -> list[Event]:
     """Take the outbox; return its events, of some kinds or all."""
     events = [message for _, message in world.take_outbox() if isinstance(message, Event)]
     return [event for event in events if not kinds or event.kind in kinds]

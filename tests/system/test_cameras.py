@@ -64,7 +64,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
             seen.until(lambda m: m["t_ns"] >= AIRBORNE_NS and m["seen"])
         publish_garbage(client)
         health.until(lambda m: m["refused"] >= 1 or publish_garbage(client))  # a detector that lags skips pictures
+        infos = client.subscribe(INFO)
         federation.kill("camera")
+        infos.until(lambda m: m["source"] == "camera.main")
         died_ns = events.until(lambda m: m["kind"] in SEEN_DEAD and m["subject"] == "camera.main").message["t_ns"]
         pictures.until(lambda m: m["source"] == "camera.main" and m["t_ns"] > died_ns + 300_000_000)
         assert client.request("world/control", "stop")["ok"]

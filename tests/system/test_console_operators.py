@@ -113,7 +113,7 @@ def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost
     # a page that is gone releases; who has asked has it
     button(first, "Ask for main").click()
     second.page.close()
-    see(first, re.compile("operator 2 is gone"))
+    see(first, re.compile("operator 2 has left"))
     see(first, "alone here")
     type_into(first, X_C, "8")
     wait_until(first, lambda: len(requests(run, "target")) == 3)

@@ -19,4 +19,4 @@ def test_a_gate_is_defined_where_it_is_first_read(page: str) -> None:
 
 def test_a_run_that_counts_gates_says_what_one_is(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_commands._fault_of(True, "complete: 10 gates", []) == ""
-    assert "gate: an instant" in capsys.readouterr().out
+    assert "gate: a time step" in capsys.readouterr().out

@@ -1,6 +1,6 @@
 """Reproducibility: the fingerprint of a process's code, stated in its join, and the hash of a flight.
 
-A flight is computed with zsim.math.elementary, distributions and linear, which give the same bits on every processor
+A flight is computed with zsim.math.elementary, randomness and linear, which give the same bits on every processor
 and with every version of Python and the numeric packages. So a fingerprint covers only code and contract. Other
 differences between machines are in `machine`, for diagnosis: only users' classes and camera pictures may depend on it.
 """
@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from zsim import CONTRACT, __version__
 
-PACKAGES = ("numpy", "scipy", "numba", "llvmlite")  # with which is computed
-CODE = ("zsim", "zsim_world", "zsim_agents")  # packages whose sources decide about a flight
+PACKAGES = ("numpy", "scipy", "numba", "llvmlite")  # numeric packages
+CODE = ("zsim", "zsim_world", "zsim_agents")  # packages whose sources determine a flight
 COLUMNS = 13  # position, velocity, orientation, angular velocity of a drone
-HELD_BYTES = 16_384  # hashed in one go, which takes as long as a few instants
+HELD_BYTES = 16_384  # hashed at once, which takes as long as a few small updates
 
 
 @cache
@@ -34,14 +34,14 @@ def parts() -> dict[str, str]:
 
 @cache
 def fingerprint() -> str:
-    """Return 16 hex digits: equal fingerprints promise equal bits."""
+    """Return 16 hex digits; equal fingerprints guarantee bit-identical flights."""
     text = ";".join(f"{name}={value}" for name, value in sorted(parts().items()) if name != "zsim")
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @cache
 def machine() -> dict[str, str]:
-    """Return the properties that may differ between machines with equal results: processor, libraries, versions."""
+    """Return properties that may differ between machines with equal results: processor, libraries, versions."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "python": platform.python_version(),
@@ -98,7 +98,7 @@ def _blas() -> str:
     found = set()
     for each in threadpoolctl.threadpool_info():
         folder = Path(each["filepath"]).parent
-        package = None  # whose wheel contains it
+        package = None  # package whose wheel contains it
         if folder.suffix == ".libs":  # as auditwheel and delvewheel name it
             package = folder.stem
         elif folder.name == ".dylibs":  # as delocate does
@@ -109,13 +109,13 @@ def _blas() -> str:
 
 
 class TruthHash:
-    """SHA-256 over all truth instants of a flight (contract, "Same bits").
+    """SHA-256 over all truth messages of a flight (docs/protocol.md, "Bit-identical results").
 
-    Of each t_ns (int64), then position, velocity, orientation and angular velocity (float64); little-endian, drone by
-    drone in scenario order, instants in time order.
+    Each row is t_ns (int64), then position, velocity, orientation and angular velocity (float64); little-endian, in
+    order of time, at equal times drone by drone in scenario order.
 
     Args:
-        rows: of each `add`: the drones of an instant, or all rows of a flight at once.
+        rows: number of rows per `add`: the drones at one time, or all rows of a flight.
     """
 
     def __init__(self, rows: int) -> None:
@@ -145,7 +145,7 @@ class TruthHash:
         """Add rows.
 
         Args:
-            t_ns: of all, or of each (rows,).
+            t_ns: of all rows, or of each (rows,) [ns].
             state: (rows, 13 or more): position, velocity, orientation, angular velocity.
         """
         self._t[self._held] = t_ns
@@ -155,7 +155,7 @@ class TruthHash:
             self.flush()
 
     def flush(self) -> None:
-        if not self._held or not self._rows.size:  # of a run whose drones are all external there is nothing
+        if not self._held or not self._rows.size:  # empty if all drones are external
             self._held = 0
             return
         self._hash.update(data := self._rows[: self._held].data)

@@ -1,7 +1,7 @@
 """Messages of a flight, contract version 1: drones, commands, estimates, formations, cameras, and views for displays.
 
-SI units and radians, the unit in the name. W is the world frame (ENU), B the body's (FLU); quaternions are w first and
-turn B to W.
+In SI units and radians, with the unit in the name. W is the world frame (ENU), B the body frame (FLU); quaternions are
+w first and rotate B to W.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ Quaternion = tuple[Number, Number, Number, Number]
 Rotors = Annotated[tuple[Number, ...], Meta(min_length=4, max_length=8)]
 Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
 DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
-AIRBORNE: frozenset[DroneState] = frozenset({"hovering", "flying"})  # states of a drone that takes setpoints
+AIRBORNE: frozenset[DroneState] = frozenset({"hovering", "flying"})  # states in which a drone accepts setpoints
 Connection = Literal["waiting", "connected", "armed", "lost"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
 ReferencePhase = Literal["waiting", "approaching", "path", "holding", "over"]
-PICTURE_MAX = 4_000_000  # bytes; a JPEG of 1920 x 1080 at full quality is below it
-SEEN_MAX = 1000  # of one picture
+PICTURE_MAX = 4_000_000  # bytes; larger than a JPEG of 1920 x 1080 at full quality
+SEEN_MAX = 1000  # hats seen in one picture
 JPEG_BEGINS = b"\xff\xd8\xff"  # SOI, then the next marker: ISO/IEC 10918-1, B.1
 
 SidePx = Annotated[int, Meta(ge=1, le=16_384)]
@@ -34,10 +34,10 @@ SidePx = Annotated[int, Meta(ge=1, le=16_384)]
 
 @on("drone/*/sensor/status", writers="world driver", readers="estimator controller reference", last="world")
 class Status(Message, frozen=True):
-    """The state of a drone, last in every gate.
+    """The state of a drone, its last message in every gate.
 
-    `commander` is the source that commands it; `count` is the number of messages on its `sensor/*` since the last
-    status, including this one.
+    `commander` is the source whose commands it accepts; `count` is the number of messages on its `sensor/*` since the
+    last status, including this one.
     """
 
     state: DroneState
@@ -70,9 +70,9 @@ class Command(Message, frozen=True):
 @on("drone/*/cmd/velocity", is_output=True)
 @on("drone/*/accepted/velocity")
 class Velocity(Command, frozen=True):
-    """Fly a velocity [m/s] and turn at a rate [rad/s], counter-clockwise from above.
+    """Fly with a velocity [m/s] and turn at a rate [rad/s], counter-clockwise seen from above.
 
-    `frame`: "heading", x forward and y left by the sender's idea of the yaw; "world", W by the firmware's own.
+    `frame`: "heading", x forward and y left by the sender's estimate of the yaw; "world", W by the firmware's estimate.
     """
 
     velocity_m_s: Vector3
@@ -83,7 +83,7 @@ class Velocity(Command, frozen=True):
 @on("drone/*/cmd/ardrone", is_output=True)
 @on("drone/*/accepted/ardrone")
 class Ardrone(Command, frozen=True):
-    """Fly as the aircraft's own commands do: tilt forward and left, climb, yaw rate, each in [-1, 1] of its limit."""
+    """The AR.Drone's own command: tilt forward and left, climb, yaw rate, each in [-1, 1] of its limit."""
 
     forward: Number
     left: Number
@@ -95,7 +95,7 @@ class Ardrone(Command, frozen=True):
 @on("drone/*/cmd/attitude", is_output=True)
 @on("drone/*/accepted/attitude")
 class Attitude(Command, frozen=True):
-    """Hold the tilt of an orientation B to W, whose heading is not used, with a thrust [N] and a yaw rate."""
+    """Hold the tilt of an orientation B to W (its heading is ignored) with a thrust [N] and a yaw rate [rad/s]."""
 
     orientation_wxyz: Quaternion
     thrust_n: Number
@@ -105,7 +105,7 @@ class Attitude(Command, frozen=True):
 @on("drone/*/cmd/rotors", is_output=True)
 @on("drone/*/accepted/rotors")
 class RotorSpeeds(Command, frozen=True):
-    """Turn the rotors at these speeds: front left, front right, rear right, rear left."""
+    """Turn the rotors at these speeds, in the order front left, front right, rear right, rear left."""
 
     speed_rad_s: Rotors
 
@@ -113,7 +113,7 @@ class RotorSpeeds(Command, frozen=True):
 @on("drone/*/cmd/mode", is_output=True)
 @on("drone/*/accepted/mode")
 class Mode(Command, frozen=True):
-    """Take off, land, stop the rotors at once, or leave the emergency; open to all with the commander's priority."""
+    """Take off, land, stop the rotors at once, or leave the emergency state; for all with the commander's priority."""
 
     mode: Literal["takeoff", "land", "emergency", "reset"]
 
@@ -122,11 +122,10 @@ class Mode(Command, frozen=True):
 class LinkState(Message, frozen=True):
     """The link between a driver and the aircraft that flies as an external drone.
 
-    `state`: `waiting` for the first datagram; `connected`, disarmed: nothing is sent that starts or steers a motor;
-    `armed`; `lost` after silence. `peer` is the address that is obeyed. `age_ms` is the wall time since the newest
-    datagram of the peer, `loss_percent` the share of its datagrams that were lost lately, `clock_offset_ms` its clock
-    less the driver's; None where it is not known. `refused` counts datagrams that were not understood, or of
-    another.
+    `state`: `waiting` for the first datagram; `connected`, but disarmed: no command that starts or steers a motor is
+    sent; `armed`; `lost` after silence. `peer` is the address whose datagrams are accepted. `age_ms` is the wall time
+    since its newest datagram, `loss_percent` the share of its recent datagrams that were lost, `clock_offset_ms` its
+    clock minus the driver's; None if unknown. `refused` counts datagrams that are invalid or from another address.
     """
 
     source: str
@@ -152,8 +151,8 @@ class LinkState(Message, frozen=True):
 class Estimate(Message, frozen=True):
     """The estimated state of a drone: position and velocity in W, attitude B to W.
 
-    `covariance` is that of position and velocity, 6 x 6, row-major, SI units; `gyro_bias_rad_s` is in B; `sensors` has
-    by name how many readings were used and refused.
+    `covariance` is that of position and velocity, 6 x 6, row-major, SI units; `gyro_bias_rad_s` is in B; `sensors`
+    gives by name the numbers of readings used and rejected.
     """
 
     position_m: Vector3
@@ -173,9 +172,9 @@ class ClusterState(Message, frozen=True):
 
     `drones` are in the order of the robots, which an assembly changes. `names` are the 4n cluster variables of n
     drones, in the order of `value`, `desired` [m, rad] and `desired_rate` [m/s, rad/s]. `trajectory_t_s` is the
-    trajectory's own time, None where none runs; `margin` is the distance to a singularity in the measure of the cluster
-    space; `reason` is why it waits or is held. `plan_step` is how many steps of the scenario's plan a restarted
-    controller leaves out.
+    trajectory's own time, None if none is running; `margin` is the distance to a singularity in the metric of the
+    cluster space; `reason` is why it waits or is held. `plan_step` is the number of steps of the scenario's plan that
+    a restarted controller skips.
     """
 
     phase: Phase
@@ -198,8 +197,8 @@ class ClusterState(Message, frozen=True):
 class Reference(Message, frozen=True):
     """The reference of a drone with its own pilot: position and velocity in W, heading.
 
-    `phase`: `waiting` on the ground, `approaching` the beginning of its path or a place, on the `path`, `holding` a
-    place, `over` once it is to land. `path_t_s` is the path's own time, None where none is flown.
+    `phase`: `waiting` on the ground, `approaching` the start of its path or a position, on the `path`, `holding` a
+    position, `over` once it is to land. `path_t_s` is the path's own time, None if none is flown.
     """
 
     phase: ReferencePhase
@@ -239,8 +238,8 @@ class CameraImage(Message, frozen=True, kw_only=True):
 class CameraInfo(Message, frozen=True, kw_only=True):
     """The intrinsics and pose of a camera; its last value is kept.
 
-    `K` is row-major; `D` k1, k2, p1, p2, k3. `position_m` is the camera's in B; `orientation_wxyz` turns K (x right, y
-    down, z ahead) to B. `exposure_s` is the time of exposure, `gate_ns` the run's.
+    `K` is row-major; `D` is k1, k2, p1, p2, k3. `position_m` is the camera's in B; `orientation_wxyz` rotates K (x
+    right, y down, z ahead) to B. `exposure_s` is the exposure time, `gate_ns` the run's gate.
     """
 
     source: str = ""
@@ -259,7 +258,7 @@ class Seen(Struct, frozen=True, gc=False):
     """A sighted hat, without the identity of its drone.
 
     `direction_B` is the unit vector from the camera to the hat's centre in B. The sigmas are standard deviations,
-    that of the direction in each of the two axes across it.
+    that of the direction about each of the two axes across it.
     """
 
     direction_B: Vector3
@@ -279,7 +278,7 @@ class Sightings(Message, frozen=True, kw_only=True):
     seen: Annotated[tuple[Seen, ...], Meta(max_length=SEEN_MAX)] = ()
 
 
-# For displays: these never gate, and may skip
+# For displays: no gate waits for these, and they may skip gates
 
 
 class DroneView(Struct, frozen=True):
@@ -296,7 +295,7 @@ class DroneView(Struct, frozen=True):
 
 @on("view/drones", writers="world")
 class ViewDrones(Message, frozen=True):
-    """All drones at one instant, and the wind at each in W."""
+    """All drones at one time, and the wind at each in W."""
 
     drones: tuple[DroneView, ...]
     wind_m_s: tuple[Vector3, ...] = ()
@@ -338,7 +337,7 @@ class ViewCluster(Message, frozen=True):
         return length_fault(self, ("value", "desired"), len(self.names))
 
 
-_triangle = itemgetter(0, 1, 2, 7, 8, 14)  # of the position, in the 6 x 6 covariance, row-major
+_triangle = itemgetter(0, 1, 2, 7, 8, 14)  # indices of the position's upper triangle in the 6 x 6 covariance, row-major
 
 
 def estimate_view(drone: str, estimate: Any) -> EstimateView:
@@ -352,7 +351,7 @@ def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:
 
 
 def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | None:
-    """Return the fault of the first of some fields that has another number of entries."""
+    """Return the fault of the first of the named fields without `length` entries; None if all have them."""
     for name in names:
         entries = len(getattr(message, name))
         if entries != length:
@@ -360,7 +359,7 @@ def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | 
     return None
 
 
-# Which commands a drone takes, and which truths of a driver are plausible
+# Commands that a drone accepts, and plausible truths of a driver
 
 _ALL: frozenset[DroneState] = frozenset(get_args(DroneState))
 _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
@@ -373,32 +372,32 @@ _SETPOINT = ("a setpoint needs it hovering or flying", AIRBORNE)
 
 
 def state_refusal(name: str, state: str, asked: str) -> str | None:
-    """Return why a drone does not take a command in its state, None if it does.
+    """Return why a drone refuses a command in its state; None if it accepts it.
 
     Args:
         name: of the drone.
-        asked: mode that it is to enter, or any other word for a setpoint.
+        asked: the requested mode; any other word for a setpoint.
     """
     need, states = _RULES.get(asked, _SETPOINT)
     return None if state in states else f"{name} is {state}; {need}"
 
 
-POSE_AGE_MAX_NS = 500_000_000  # contract; 25 gates, as an estimate that is flown on: 1 m at 2 m/s
-DISTANCE_MAX_M = 100_000.0  # of each coordinate, as places in a scenario: beyond it a tangent plane is no map
-SPEED_MAX_M_S = 200.0  # chosen: twice the fastest racing drones
-RATE_MAX_RAD_S = 100.0  # chosen: twice what a gyroscope of 2000 deg/s measures, and more
-UNIT_SLACK = 0.01  # of a quaternion's length; single precision is within 1e-6
+POSE_AGE_MAX_NS = 500_000_000  # contract; 25 gates, the limit for an estimate in flight too: 1 m at 2 m/s
+DISTANCE_MAX_M = 100_000.0  # of each coordinate, as in scenarios: a tangent plane is no map of a larger area
+SPEED_MAX_M_S = 200.0  # chosen: twice the speed of the fastest racing drones
+RATE_MAX_RAD_S = 100.0  # chosen: more than twice the range of a gyroscope of 2000 deg/s
+UNIT_SLACK = 0.01  # tolerance of a quaternion's length; single precision stays within 1e-6
 
 
 def moved_on(p_W: Sequence[float], v_W: Sequence[float], age_ns: int) -> tuple[float, float, float]:
-    """Return the position of a drone from a pose of that age: at constant velocity, then at rest [m; W]."""
+    """Return a drone's position [m; W] from a pose of that age: constant velocity for POSE_AGE_MAX_NS, then at rest."""
     age_s = min(max(0, age_ns), POSE_AGE_MAX_NS) * 1e-9
     x, y, z = (p + v * age_s for p, v in zip(p_W, v_W, strict=True))
     return x, y, z
 
 
 def truth_fault(truth: Truth, rotors: int) -> str | None:
-    """Return the first implausible value of a driver's truth whose numbers are finite; None if there is none."""
+    """Return the fault of the first implausible value in a driver's finite truth; None if all are plausible."""
     limits = (
         ("position_m", DISTANCE_MAX_M, "m"),
         ("velocity_m_s", SPEED_MAX_M_S, "m/s"),

@@ -1,15 +1,15 @@
-"""Messages as bytes, many at a time: those of a gate written from rows of numbers, and several in one payload.
+"""Many messages at a time as bytes: those of a gate, written from rows of numbers, and several in one payload.
 
     @gate, @gate/{drone}   the world's messages about its drones at one gate           GateMessages
-    @batch                 [key, payload] of everything that passed the hub, in order  encode_batch, decode_batch
+    @batch                 [key, payload] of all messages through the hub, in order  encode_batch, decode_batch
 
 Sent singly, each message of a gate would wake every reader and the hub. These keys are outside the contract and begin
 with `@`, which no wildcard of Zenoh matches: a subscriber to `**` receives only the single messages.
 
     rows of numbers ── write ──▶ bytes ── read ──▶ rows of numbers
 
-A layout is the constant part of the messages of a kind: names, array heads, and the places of the values. `write` and
-`read` are plain functions for compilation by their users, which avoids an object per message; `write` gives the same
+A layout is the constant part of a kind of message: names, array heads, and the positions of the values. `write` and
+`read` are plain functions for their callers to compile, which avoids an object per message; `write` gives the same
 bytes as `messages.encode`.
 """
 
@@ -31,20 +31,20 @@ from zsim.contract.messages import REFUSALS
 from zsim.errors import DecodeError
 from zsim.schema.message import Count
 
-KINDS = (*keys.SENSORS, "truth", "status")  # of the messages about a drone
-BATCH_MAX = 5_000  # messages of one batch; a flood of somebody's messages goes into several
-Pairs = list[tuple[str, bytes]]  # keys and payloads, in the order in which they were published
+KINDS = (*keys.SENSORS, "truth", "status")  # of messages about a drone
+BATCH_MAX = 5_000  # messages per batch; a flood is split into several
+Pairs = list[tuple[str, bytes]]  # keys and payloads in order of publication
 _INT = np.dtype("<i8")
-PATTERNS_MAX = 64  # of keys of a gate, remembered by a reader; sensors of six rates have fewer
+PATTERNS_MAX = 64  # key patterns of gates cached by a reader; sensors with six rates have fewer
 T = TypeVar("T")
 
 LITERAL, FLOATS, INT, BOOL, TEXT = range(5)  # parts of a layout
-GAP = 31  # bytes left free before each payload: what a record puts there, see `zsim.record.mcap_layout.MESSAGE`
+GAP = 31  # bytes reserved before each payload for a record's message head, `zsim.record.mcap_layout.MESSAGE`
 INT_BYTES_MAX, FLOAT_BYTES = 9, 9
-FLOAT64, FALSE, TRUE, MAP = 0xCB, 0xC2, 0xC3, 0x80  # msgpack's marks
-UINT8, INT8 = 0xCC, 0xD0  # and those of 16, 32 and 64 bits after them
-COUNT_MAX = 0x7F  # largest whole number that is its own mark
-INFINITE = np.uint64(0x7FF0_0000_0000_0000)  # exponent of what is not finite
+FLOAT64, FALSE, TRUE, MAP = 0xCB, 0xC2, 0xC3, 0x80  # msgpack's type bytes
+UINT8, INT8 = 0xCC, 0xD0  # followed by those of 16, 32 and 64 bits
+COUNT_MAX = 0x7F  # largest integer that is its own type byte
+INFINITE = np.uint64(0x7FF0_0000_0000_0000)  # exponent bits of infinities and NaN
 _encode = msgspec.msgpack.Encoder().encode
 _WHOLE = {
     kinds_of.IntType: INT,
@@ -58,7 +58,7 @@ _WHOLE = {
 def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS.
 
-    `own` names the users' sensors of the run, the sightings and the scanners; their keys follow those of KINDS.
+    `own` names the run's user sensors, sightings and scanners, whose keys follow those of KINDS.
     """
     kinds = (*KINDS, *own)
     return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in kinds)
@@ -74,7 +74,7 @@ def _places(table: tuple[str, ...]) -> dict[str, int]:
 
 
 class _PackedGate(Struct, array_like=True, gc=False):
-    """GateMessages on the wire; whole numbers as little-endian int64."""
+    """GateMessages as sent; integers as little-endian int64."""
 
     t_ns: Count
     seq: Count
@@ -90,21 +90,21 @@ _decode_batch = msgspec.msgpack.Decoder(Pairs).decode
 
 @dataclass(eq=False)
 class GateMessages:
-    """The world's messages about its drones at one gate, M of them in order of publication: columns and one buffer.
+    """The world's M messages about its drones at one gate, in order of publication, as columns and one buffer.
 
-    Message m is on the key table[which[m]], is stamped stamps[m], and its payload is
-    buffer[ends[m - 1] + GAP : ends[m]]. Columns that came over the wire may point outside of table and buffer:
-    `check` them before they are followed, or compare as they are read.
+    Message m has the key table[which[m]], the stamp stamps[m] and the payload buffer[ends[m - 1] + GAP : ends[m]].
+    Columns received from another process may point outside table and buffer: `check` them, or check each index when
+    using it.
     """
 
     t_ns: int  # gate [ns]
     seq: int  # number of the gate
     table: tuple[str, ...]  # keys; the same object at every gate
-    which: NDArray[np.int64]  # place of each message's key in the table, (M,)
+    which: NDArray[np.int64]  # index of each message's key in the table, (M,)
     stamps: NDArray[np.int64]  # t_ns of each [ns], (M,)
-    ends: NDArray[np.int64]  # where each ends in the buffer, (M,); GAP bytes before each payload are free
+    ends: NDArray[np.int64]  # end of each in the buffer, (M,); GAP bytes before each payload are reserved
     buffer: bytes | bytearray  # owned by this object
-    first: Sequence[int] = ()  # where the messages of each drone begin, and their end, (N + 1,); empty if not known
+    first: Sequence[int] = ()  # index of each drone's first message, and of the end, (N + 1,); empty if unknown
 
     @classmethod
     def of(
@@ -112,8 +112,8 @@ class GateMessages:
         t_ns: int,
         seq: int,
         table: tuple[str, ...],
-        pairs: Sequence[tuple[str, bytes]],  # keys, which are in the table, and payloads
-        stamps: Sequence[int] | None = None,  # t_ns of each [ns]; None stamps all with the gate
+        pairs: Sequence[tuple[str, bytes]],  # keys in the table, and payloads
+        stamps: Sequence[int] | None = None,  # t_ns of each [ns]; None: the gate's
         first: Sequence[int] = (),
     ) -> "GateMessages":
         """Return encoded messages as one object."""
@@ -126,7 +126,7 @@ class GateMessages:
 
     @classmethod
     def unpack(cls, payload: bytes, table: tuple[str, ...]) -> "GateMessages":
-        """Return the messages packed by `pack`, not yet checked; DecodeError if the payload is anything else."""
+        """Return the messages packed by `pack`, unchecked; DecodeError for any other payload."""
         try:
             p = _decode_gate(payload)
         except REFUSALS as error:
@@ -151,11 +151,11 @@ class GateMessages:
         """Raise DecodeError for columns that point outside table or buffer, and for negative stamps."""
         which, stamps, ends = self.which.tolist(), self.stamps.tolist(), self.ends.tolist()
         if not ends or ends[-1] != len(self.buffer) or min(map(sub, ends, [0, *ends])) < GAP:
-            _refuse("its payloads are not one behind the other")
+            _refuse("its payloads are not contiguous")
         if min(which) < 0 or max(which) >= len(self.table):
             _refuse("a key is not in its table")
         if min(stamps) < 0:
-            _refuse("a stamp is below 0")
+            _refuse("a stamp is negative")
 
     @cached_property
     def pairs(self) -> Pairs:
@@ -175,7 +175,7 @@ class GateMessages:
 
 
 class PerPattern(Generic[T]):
-    """A cache of what a reader derives by `learn` from the keys of a gate, since the same keys recur."""
+    """A cache of what `learn` derives from the keys of a gate, since the same combinations recur."""
 
     def __init__(self, learn: Callable[[GateMessages], T]) -> None:
         self._learn = learn
@@ -212,9 +212,9 @@ def decode_batch(payload: bytes) -> Pairs:
 
 
 def pairs_of(result: Any) -> Pairs:
-    """Return the [key, payload] pairs in the result of an answer; DecodeError if the payload is anything else."""
+    """Return the [key, payload] pairs in the result of an answer; DecodeError for any other result."""
     try:
-        return msgspec.convert(result, Pairs, builtin_types=(bytes,))  # or texts would pass as base64
+        return msgspec.convert(result, Pairs, builtin_types=(bytes,))  # otherwise texts would pass as base64
     except REFUSALS as error:
         raise DecodeError(f"result: {error}; must be a list of [key, payload]") from error
 
@@ -222,30 +222,30 @@ def pairs_of(result: Any) -> Pairs:
 class Program(NamedTuple):
     """The layouts of some kinds in the form used by `write`."""
 
-    ops: NDArray[np.int64]  # (K, 3): what, and its two arguments
-    first: NDArray[np.int64]  # (kinds + 1,), where the layout of each kind begins
+    ops: NDArray[np.int64]  # (K, 3): operation and its two arguments
+    first: NDArray[np.int64]  # (kinds + 1,), index of the first operation of each kind, and their number
     literals: NDArray[np.uint8]
 
 
 class TextTable(NamedTuple):
-    """Texts that may stand in a message, by number."""
+    """Texts that a message may contain, by number."""
 
     data: NDArray[np.uint8]
     ends: NDArray[np.int64]
 
 
 class Layouts:
-    """The layouts of messages of some kinds.
+    """The layouts of some kinds of messages.
 
-    A kind's whole numbers, truths and texts (by their number in Words) stand in one row, its floats in another, both
-    in the order of its fields.
+    One row holds a message's integers, booleans and texts (as indices in a TextTable), another its floats, both in the
+    order of its fields.
 
     Args:
-        kinds: of messages, in the order in which `write` counts them; with the length of its array, where a kind has
-            one that may be of several lengths.
+        kinds: message classes, in the order in which `write` numbers them; a class with an array of variable length
+            comes with that length.
 
     Raises:
-        TypeError: a field is of a type that has no place here.
+        TypeError: a field has a type without a fixed layout.
     """
 
     def __init__(self, kinds: Iterable[type[Struct] | tuple[type[Struct], int]]) -> None:
@@ -282,7 +282,7 @@ class Layouts:
                 count = len(own.item_types) if isinstance(own, kinds_of.TupleType) else length
                 self._literal(array_head(count))
             elif not isinstance(own, kinds_of.FloatType):
-                raise TypeError(f"{kind.__name__}: {field.encode_name} is of a type that has no fixed place in a row")
+                raise TypeError(f"{kind.__name__}: {field.encode_name} has a type without a fixed layout")
             self._ops.append((FLOATS, self._float, count))
             self._float += count
         self.ints, self.floats = max(self.ints, self._int), max(self.floats, self._float)
@@ -301,20 +301,20 @@ def array_head(size: int) -> bytes:
 
 
 def words(texts: Iterable[str | None]) -> TextTable:
-    """Return texts as `write` reads them."""
+    """Return the table of texts for `write`."""
     parts = [_encode(text) for text in texts]
     return TextTable(np.frombuffer(b"".join(parts), dtype=np.uint8), np.cumsum([len(part) for part in parts]))
 
 
 def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
-    """Write one message into `out` from `start` on; return its end. To be compiled.
+    """Write one message into `out` at `start`; return its end. To be compiled.
 
     Args:
         program, words: see Layouts.
-        ints: its whole numbers (I,); bits: its floats (F,) as uint64.
+        ints: its integers (I,); bits: its floats (F,) as uint64.
         out: uint8, large enough.
     """
-    at = np.uint64(start)  # a place without a sign is not looked at for being negative: bytes become words
+    at = np.uint64(start)  # unsigned indices need no test for negative values: byte loops become word copies
     for k in range(program.first[kind], program.first[kind + 1]):
         op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
         if op == LITERAL:
@@ -339,7 +339,7 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
         else:
             value, size = ints[place], 1
             if value < -32 or value > 127:
-                reach, free = (value, 8) if value > 0 else (-1 - value, 7)  # int8 reaches to -128, uint8 to 255
+                reach, free = (value, 8) if value > 0 else (-1 - value, 7)  # int8 from -128, uint8 up to 255
                 power = 0 if reach < 1 << free else 1 if reach < 1 << free + 8 else 2 if reach < 1 << free + 24 else 3
                 size = 1 << power
                 out[at] = (UINT8 if value > 0 else INT8) + power
@@ -351,14 +351,14 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
 
 
 def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints: NDArray, bits: NDArray) -> bool:
-    """Read a message that `write` has written; return False for any other, which may still be valid.
+    """Read a message written by `write`; return False for any other, even if valid.
 
-    It reads finite floats, booleans and non-negative whole numbers, but no texts. To be compiled.
+    Reads finite floats, booleans and non-negative integers, but no texts. To be compiled.
 
     Args:
         program: see Layouts.
-        data: uint8; the message is what stands in [start, end).
-        ints: takes its whole numbers (I,); bits: its floats (F,) as uint64.
+        data: uint8, with the message in [start, end).
+        ints: receives its integers (I,); bits: its floats (F,) as uint64.
     """
     at, stop = np.uint64(start), np.uint64(end)
     for k in range(program.first[kind], program.first[kind + 1]):

@@ -17,7 +17,7 @@ from zsim.errors import BadNameError
 from zsim.sensors.sensor_catalogue import STOCK
 
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
-PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a thing of up to 32
+PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a drone or cluster name of up to 32
 SENSORS = tuple(STOCK)
 SIGHTINGS = "sightings"  # a sensor of drones with cameras, computed by the world; its messages vary in length
 
@@ -28,9 +28,9 @@ FAULTS = "world/faults"
 CONTROL = "world/control"
 RADIO = "world/radio"
 VIEW_DRONES = "view/drones"
-BATCH = "@batch"  # everything that passed the hub, see zsim.contract.framing
+BATCH = "@batch"  # all messages through the hub, see zsim.contract.framing
 GATE = "@gate"  # the world's messages about all drones at a gate
-ACCESS = "@access"  # what access control lets a process do, see zsim.transport.tls
+ACCESS = "@access"  # a process's permissions under access control, see zsim.transport.tls
 
 AnyMessage = TypeVar("AnyMessage", bound=type[Struct])
 
@@ -38,11 +38,11 @@ AnyMessage = TypeVar("AnyMessage", bound=type[Struct])
 class Topic(NamedTuple):
     """The declaration of a key in the contract."""
 
-    message: Any  # type of its messages; None for a family of keys whose members declare theirs
-    writers: tuple[str, ...]  # roles that publish it; "each" stands for every process, on the keys of its own name
+    message: Any  # type of its messages; None for a family of keys, whose members declare their own
+    writers: tuple[str, ...]  # roles that publish it; "each" means every process, on keys with its own name
     readers: tuple[str, ...]  # roles that subscribe to it, besides recorders and operators, who read everything
-    last: str  # the process that answers a get with the last message: "world", "writer", or none ("")
-    is_output: bool  # whether the world counts its messages among those that a process announces with its done
+    last: str  # process that answers a get with the last message: "world", "writer", or none ("")
+    is_output: bool  # whether the world counts its messages against its publisher's done
 
 
 TOPICS: dict[str, Topic] = {}  # topics by key, `*` in place of a name
@@ -51,10 +51,10 @@ TOPICS: dict[str, Topic] = {}  # topics by key, `*` in place of a name
 def on(
     key: str, writers: str = "", readers: str = "", last: str = "", is_output: bool = False
 ) -> Callable[[AnyMessage], AnyMessage]:
-    """Return the decorator that puts a message class on a key; see Topic.
+    """Return a decorator that declares a message class for a key; see Topic.
 
     Args:
-        key: with `*` in place of a name; a second `*` makes it a family, whose members are declared one by one.
+        key: with `*` in place of a name; a second `*` makes it a family, whose members are declared individually.
         writers, readers: roles, separated by spaces.
     """
 
@@ -67,13 +67,13 @@ def on(
 
 
 def name(text: str, what: str = "name") -> str:
-    """Return `text` if it is a valid name; BadNameError with what was found and what is allowed."""
+    """Return `text` if it is a valid name; otherwise raise BadNameError."""
     if not isinstance(text, str) or not NAME.fullmatch(text):
         raise BadNameError(f"{what} is {text!r}; must be 1 to 32 of a-z 0-9 _ . -")
     return text
 
 
-# Keys by what they are about
+# Construction of keys
 
 
 def sensor(drone: str, kind: str) -> str:
@@ -167,17 +167,17 @@ def estimates_view(process_name: str) -> str:
 
 
 def process(process_name: str, what: str) -> str:
-    """Return the key of `join`, `done`, `snapshot`, `bye` or `health` of a process."""
+    """Return a key of a process; `what` is `join`, `done`, `snapshot`, `bye` or `health`."""
     return f"process/{process_name}/{what}"
 
 
 def replay(process_name: str) -> str:
-    """Return the key on which the world answers a process with the missed messages that it may read."""
+    """Return the key on which the world answers a process with the messages that it missed and may read."""
     return process(process_name, "replay")
 
 
 def access(process_name: str) -> str:
-    """Return the key on which a listening process answers the permissions of a process's certificate."""
+    """Return the key on which a listening process answers with the permissions of a process's certificate."""
     return f"{ACCESS}/{process_name}"
 
 
@@ -195,12 +195,12 @@ def session_of(token_key: str) -> str:
     return session if head else ""
 
 
-# What a key is about
+# Parsing of keys
 
 
 @lru_cache(maxsize=4096)
 def parts(key: str) -> tuple[str, str, str]:
-    """Return the parts of a key: `drone`, its name, `cmd/mode`; missing parts are empty."""
+    """Return the parts of a key, e.g. `drone`, its name, and `cmd/mode`; missing parts are empty."""
     kind, whose, what, *_ = *key.split("/", 2), "", ""
     return kind, whose, what
 
@@ -223,7 +223,7 @@ def is_accepted(key: str) -> bool:
 
 
 def is_sensor(expression: str) -> bool:
-    """Tell whether a key, or an expression, is about a drone's sensors."""
+    """Whether a key or expression concerns a drone's sensors."""
     parts = expression.split("/")
     return len(parts) == 4 and parts[0] == "drone" and parts[2] == "sensor"
 
@@ -234,13 +234,13 @@ def is_status(key: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def is_picture(key: str) -> bool:
-    """Tell whether a key carries pictures, which are large and not needed by the lockstep."""
+    """Whether a key carries pictures, which are large and not needed in the lockstep."""
     kind, _, what = parts(key)
     return kind == "drone" and what.startswith("camera/") and what.count("/") == 1
 
 
 def may_drop(key: str) -> bool:
-    """Tell whether a full link may drop messages of a key in realtime, since newer ones follow."""
+    """Whether a full link may drop a key's messages in realtime, since newer ones follow."""
     return "/sensor/" in key or key.startswith(GATE)
 
 
@@ -248,9 +248,9 @@ def may_drop(key: str) -> bool:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Tell whether a key expression matches a key, as in Zenoh; for the in-process bus and the history.
+    """Whether a key expression matches a key, as in Zenoh; for the in-process bus and the history.
 
-    `*` matches one chunk, `**` any number of chunks, `$*` a part of one; a chunk that begins with `@` is matched only
+    `*` matches one chunk, `**` any number of chunks, `$*` a part of one; a chunk that begins with `@` matches only
     literally.
     """
     return expression == key or _compiled(expression).fullmatch(f"{key}/") is not None
@@ -262,7 +262,7 @@ _PART = "[^/]*"
 
 @lru_cache(maxsize=4096)  # expressions come from other processes too, in requests
 def _compiled(expression: str) -> re.Pattern[str]:
-    """Return the pattern of an expression, for keys with "/" at their end.
+    """Return the pattern of an expression, for keys followed by "/".
 
     The text between two wildcards is matched at its first occurrence, without backtracking (atomic groups), so that
     no expression takes more than linear time per wildcard.

@@ -1,4 +1,4 @@
-"""Messages about the run: time, events, who takes part, injected faults, and requests. The contract, version 1."""
+"""Messages about the run, contract version 1: time, events, participation, injected faults, and requests."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -9,16 +9,17 @@ from msgspec import UNSET, Struct, UnsetType, field
 from zsim.contract.keys import on
 from zsim.schema.message import Count, Message, Number, Whole
 
-GATES_MAX = 1_000_000  # of one `step`: 5.5 hours at 20 ms
-RATE_MAX = 1000.0  # simulated per wall second; beyond it nothing paces
-PRIORITY_MAX = 100  # programs have 0, operators 10
-SOON_S = 0.5  # wall
+GATES_MAX = 1_000_000  # per `step`: 5.5 hours at 20 ms
+RATE_MAX = 1000.0  # simulated per wall time; faster rates cannot be paced
+PRIORITY_MAX = 100  # programs use 0, operators 10
+SOON_S = 0.5  # wall time
+WAITING_SHOWN = 4  # processes named in a line
 
 
 class Waiting(Struct, frozen=True):
-    """A process that the world waits for, its host, and the wall time since when [s].
+    """A process that the world waits for, its host, and for how long [s of wall time].
 
-    `held_by` names those among the others whose outputs it reads: it is not the cause, and may only wait for them.
+    `held_by` names those of the others whose outputs it reads: it may only be waiting for them, and not be the cause.
     """
 
     name: str
@@ -26,19 +27,31 @@ class Waiting(Struct, frozen=True):
     since_wall_s: Number
     held_by: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        on = f" on {self.host}" if self.host else ""
+        held = f", held by {', '.join(self.held_by)}" if self.held_by else ""
+        return f"{self.name}{on} ({self.since_wall_s:.1f} s{held})"
+
 
 def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
-    """Return the processes that hold up a run whose clock is in `state`: of the awaited ones, the causes if known.
+    """Return the awaited processes that block a run whose clock is in `state`; only the causes, if known.
 
-    Waits of up to SOON_S are normal while it runs, and do not count.
+    Waits of up to SOON_S are normal in a running run, and do not count.
     """
     late = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
     return [each for each in late if not each.held_by] or late
 
 
+def waiting_text(state: str, waiting: Sequence[Waiting]) -> str:
+    """Return "waiting for" with the processes that hold up a run, empty if none does; see `holding_up`."""
+    late = holding_up(state, waiting)
+    more = [f"{len(late) - WAITING_SHOWN} more"] if len(late) > WAITING_SHOWN else []
+    return f"waiting for {', '.join([*map(str, late[:WAITING_SHOWN]), *more])}" if late else ""
+
+
 @on("clock", writers="world", readers="each", last="world")
 class Clock(Message, frozen=True):
-    """The gate that the world has published; its `rate` is measured. `waiting_for` is filled while time stands."""
+    """The gate that the world has published; its `rate` is measured. `waiting_for` is filled while time is stopped."""
 
     run_id: str
     step: Count
@@ -47,13 +60,15 @@ class Clock(Message, frozen=True):
     waiting_for: tuple[Waiting, ...] = ()
 
 
+ADMISSIONS = ("join", "restart", "superseded")  # events of a process that takes part, or does so again
+INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery")  # events of a drone in need of help
 EVENT_KINDS = (
-    "join", "restart", "superseded", "doubled", "no_show", "slow_reader", "silent", "silent_end", "standstill", "leave",
-    "death", "drop", "failure", "overdue", "fingerprint", "commander", "release", "mode", "command", "control",
-    "refused", "outputs_missing", "fault", "fault_end", "fault_clear", "collision", "emergency", "landing", "flip",
-    "impact", "battery", "touchdown", "mission", "diverged", "end",
+    *ADMISSIONS, "doubled", "no_show", "slow_reader", "silent", "silent_end", "standstill", "leave", "death", "drop",
+    "failure", "overdue", "fingerprint", "commander", "release", "mode", "command", "control", "refused",
+    "outputs_missing", "fault", "fault_end", "fault_clear", "collision", *INCIDENTS, "landing", "mission", "diverged",
+    "end",
 )  # fmt: skip
-"""All kinds of events; docs/protocol.md says when each comes."""
+"""All kinds of events, explained in docs/protocol.md."""
 
 
 @on("world/radio", writers="world", readers="each", last="world")
@@ -61,8 +76,8 @@ class RadioLinks(Message, frozen=True):
     """The connectivity at a gate between the agents of drones that exchange messages, if the scenario has a radio.
 
     Drones are given by their indices in `world/info`; the index after the last one is the ground station of the agents
-    of clusters and of the run, if the radio has a `station_m`. `hears` has, for each index, those whose messages are
-    received, ascending; `reception` has the probability of each, before the radio's `loss`, and is empty if all are 1.
+    of clusters and of the run, if the radio has a `station_m`. `hears` has, for each index, those whose messages it
+    receives, ascending; `reception` has the probability of each, before the radio's `loss`, and is empty if all are 1.
     """
 
     hears: tuple[tuple[Count, ...], ...]
@@ -85,10 +100,10 @@ class Event(Message, frozen=True):
 
 @on("process/*/join", writers="each")
 class Join(Message, frozen=True):
-    """A process takes part from now on; of several incarnations, which are random, the newest counts.
+    """A process joins the run; of several incarnations (random numbers), the newest counts.
 
     `period_ns` is the interval of its dones: a multiple of the gate, 0 for never. `serves` names processes that need
-    not join, since this one does their work. `slack_ns` is how far the world may be ahead of the dones of a process
+    not join, since this one replaces them. `slack_ns` is how far the world may be ahead of the dones of a process
     without a period, 0 for any.
     """
 
@@ -106,7 +121,7 @@ class Join(Message, frozen=True):
 
 @on("process/*/done", writers="each")
 class Done(Message, frozen=True):
-    """Everything stamped up to `done_ns` is processed and answered; `sent` outputs were sent since the last done."""
+    """All messages up to `done_ns` are processed and answered; `sent` outputs were sent since the last done."""
 
     run_id: str
     incarnation: int
@@ -158,10 +173,10 @@ class Health(Message, frozen=True):
 
 
 class Fault(Struct, frozen=True):
-    """An injected fault: a kind and parameters of docs/faults.md, a drone, link, cluster or process as its target.
+    """An injected fault: kind and parameters as in docs/faults.md; its target is a drone, link, cluster or process.
 
     It acts in the gates after `from_ns` up to `until_ns`, or until it is cleared. `source` is "scenario" or the process
-    that requested it. `rank` counts earlier ones of the same kind, target and start: each has its own random stream.
+    that requested it. `rank` counts earlier faults of the same kind, target and start: each has its own random stream.
     """
 
     id: Count
@@ -209,7 +224,7 @@ class ControlAnswer(Struct, frozen=True):
 class ClusterRequest(Message, frozen=True):
     """A request accepted on `cluster/{c}/control` or `drone/{d}/control` before the outputs of the gate `t_ns`.
 
-    `source` is the requesting process; `error` is why it is refused. `controller` is the process that answered.
+    `source` is the requesting process; `error` is the reason for a refusal. `controller` is the process that answered.
     """
 
     op: str
@@ -224,7 +239,7 @@ class ClusterRequest(Message, frozen=True):
 
 
 def _infinite_fault(field: str, value: Any) -> str | None:
-    """Return the fault of a field of any content whose numbers must be finite."""
+    """Return the fault of a field with arbitrary content if it contains a number that is not finite."""
     infinite = next((number for number in _numbers(value) if not math.isfinite(number)), None)
     return None if infinite is None else f"{field} holds {infinite}; must be finite numbers"
 

@@ -1,11 +1,10 @@
-"""The state of an agent or a run as plain values, and as bytes: maps, lists, texts, numbers and plain arrays.
+"""The state of an agent or a run as plain values (maps, lists, texts, numbers, arrays), and as bytes.
 
-Reading it runs no foreign code. An agent gives its state itself (`snapshot`). Every object of a world whose attributes
-change as the run proceeds, and cannot be computed again from the scenario, lists them in its class's `SAVED`, each with
-how it is restored:
+Reading it runs no foreign code. An agent provides its own state (`snapshot`). An object of a world lists in its class's
+`SAVED` all attributes that change during a run and cannot be recomputed from the scenario, with how to restore each:
 
     a type    the value, as this type (msgspec.convert)
-    IN_PLACE  numbers are copied into the array, or the list of arrays: compiled code holds on to their memory
+    IN_PLACE  numbers are copied into the array, or list of arrays, whose memory compiled code refers to
     PART      another such object, a list of them, or None
 """
 
@@ -21,9 +20,9 @@ from zsim.errors import DecodeError, UserCodeError
 from zsim.schema import plugin
 from zsim.schema.checker import show
 
-VERSION = 1  # of what `pack` writes, the field `version` of the message
+VERSION = 1  # of the format of `pack`; field `version` of the message
 ARRAY = 1  # code of a msgpack extension: (type, shape, numbers) of an array
-TYPES = ("<f8", "<i8", "<i4", "<u8", "|i1", "|b1")  # that an array may have
+TYPES = ("<f8", "<i8", "<i4", "<u8", "|i1", "|b1")  # allowed in arrays
 
 State = dict[str, Any]  # names and values: numbers, texts, bytes, None, lists and maps of them, and arrays of numbers
 IN_PLACE, PART = "in place", "part"
@@ -37,12 +36,12 @@ class _Array(msgspec.Struct, array_like=True):
 
 
 def pack(state: State) -> bytes:
-    """Return a state as bytes, equal for equal states; TypeError if it contains values that a State may not."""
+    """Return a state as bytes, equal for equal states; TypeError if it contains values not allowed in a State."""
     return _ENCODER.encode(state)
 
 
 def unpack(payload: bytes) -> State:
-    """Return a packed state; DecodeError if the payload was not written by `pack`."""
+    """Return the state in a payload; DecodeError if it was not written by `pack`."""
     try:
         return _DECODER.decode(payload)
     except REFUSALS as error:
@@ -53,15 +52,13 @@ def checked(state: Any, owner: type) -> State | None:
     """Return the checked result of a user's `snapshot`, a state or None.
 
     Raises:
-        UserCodeError: it is not a state; the line names the class, the first value that is not plain, and its path.
+        UserCodeError: it is not a state; the line names the class, and the first invalid value with its path.
     """
     if state is None:
         return None
     what = f"{plugin.full_name(owner)}.snapshot returns"
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
-        raise UserCodeError(
-            f"{what} {show(state)}; must be a map of plain values by name, {{}} where there is no state"
-        )
+        raise UserCodeError(f"{what} {show(state)}; must be a map of plain values by name, {{}} if there is no state")
     try:
         pack(state)
     except (TypeError, *REFUSALS) as error:
@@ -72,7 +69,7 @@ def checked(state: Any, owner: type) -> State | None:
 
 
 def _flaws(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield path and text of the values of a state that cannot be packed."""
+    """Yield the path and type of each value of a state that cannot be packed."""
     if isinstance(value, dict):
         for name, each in value.items():
             yield from _flaws(each, f"{path}.{name}" if path else str(name))
@@ -110,7 +107,7 @@ _DECODER = msgspec.msgpack.Decoder(State, ext_hook=_unpacked)
 
 
 def saved_state(part: Any) -> State:
-    """Return the state of an object and of all that it consists of, for `pack`."""
+    """Return the state of an object and all its parts, for `pack`."""
     state = {}
     for name, how in part.SAVED.items():
         value = getattr(part, name)
@@ -121,7 +118,7 @@ def saved_state(part: Any) -> State:
 
 
 def restore(part: Any, state: State) -> None:
-    """Let an object, made anew from the same scenario, continue from an unpacked state.
+    """Set the state of an object that was newly created from the same scenario.
 
     Raises:
         KeyError, TypeError, ValueError: the state is of another scenario or version.
@@ -138,7 +135,7 @@ def restore(part: Any, state: State) -> None:
                     restore(each, saved)
         else:
             setattr(part, name, msgspec.convert(value, how))
-    if hasattr(part, "restored"):  # computes what follows from the state
+    if hasattr(part, "restored"):  # recomputes derived attributes
         part.restored()
 
 

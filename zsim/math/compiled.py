@@ -1,20 +1,20 @@
-"""Compiles plain-float mathematics with numba; without numba the same source runs as Python. And columns of rows.
+"""Compiles plain-float mathematics with numba, without which the same source runs as Python; and names columns of rows.
 
-No fast-math and no fused operations, so that the same input gives the same bits, compiled or not.
+Without fast-math or fused operations, so that the same input gives the same bits, compiled or not.
 
-    inlined     part of a kernel that takes views of arrays, floats and tuples, and makes no array
-    noinline    the same, rarely run: kept out of its caller's code
-    compiled    part of a kernel that may make arrays
-    kernel      called from Python and kept on disk; 1 / 0 is inf, as in numpy
-    portable    called from Python and kept on disk; 1 / 0 raises ZeroDivisionError, as in Python
-    deferred    a kernel that does not import numba, and runs as Python until something else has
+    inlined     part of a kernel that takes array views, floats and tuples, and allocates no array
+    noinline    the same, rarely run, and not inlined into its caller
+    compiled    part of a kernel that may allocate arrays
+    kernel      called from Python and cached on disk; 1 / 0 is inf, as in numpy
+    portable    called from Python and cached on disk; 1 / 0 raises ZeroDivisionError, as in Python
+    deferred    a kernel that runs as Python until other code has imported numba
     columns     names of the columns of a row of numbers, which compiled code reads as constants
 
-Numba's own cache on disk looks only at the file of a function, although everything that the function calls is compiled
-into it. So the name of what is kept carries the digest of every file that its module imports, directly or not.
+Numba's own disk cache depends only on the file of a function, although everything that it calls is compiled into it. So
+the name of a cache entry includes a digest of every file that its module imports, directly or indirectly.
 
-An `inlined` function owns no array whose references are counted: the atomic counts that numba keeps for every view
-took a fifth of a gate's time, calls of functions that were not inlined another.
+An `inlined` function owns no reference-counted array: numba's atomic reference counts of views took a fifth of a gate's
+time, calls of functions that were not inlined another fifth.
 """
 
 import hashlib
@@ -32,20 +32,20 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-COMPILES = find_spec("numba") is not None  # whether anything is compiled here
+COMPILES = find_spec("numba") is not None  # whether functions are compiled
 _EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
-_UNCOUNTED: dict[str, Any] = {"_nrt": False}  # numba's name for doing without its counts; making an array is refused
+_UNCOUNTED: dict[str, Any] = {"_nrt": False}  # numba's option to omit reference counts; forbids allocating arrays
 _IMPORTS = re.compile(r"^from (zsim[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
 _NAME = re.compile(r"\w+")
 
 
 def cache_folder() -> str:
-    """Return a folder for compiled code where numba finds none of its own; empty where it does, or where there is none.
+    """Return a folder for compiled code if numba has none of its own; empty if it has, or if no folder is available.
 
-    Numba keeps compiled code beside the source, or in the user's cache. Where neither can be written, as in many
-    containers and for users without a home, every process would compile everything again; and without HOME the cache
-    of a user whom the system does not know is a folder named `~` in the current one. The code in the folder is run, so
-    nobody else may write there.
+    Numba caches compiled code in the source's folder or in the user's cache. If neither is writable, as in many
+    containers and for users without a home, every process would compile everything again; and without HOME, the cache
+    of a user unknown to the system is a folder named `~` in the current one. Code in the folder is executed, so no
+    other user may write there.
     """
     home_cache = Path(os.environ.get("XDG_CACHE_HOME", os.path.expanduser("~/.cache")), "numba")
     if _is_writable(Path(__file__).parent / "__pycache__") or (home_cache.is_absolute() and _is_writable(home_cache)):
@@ -74,7 +74,7 @@ def _is_writable(folder: Path) -> bool:
 
 @cache
 def _numba() -> Any:
-    """Return numba, imported where the first function is to be compiled: it takes a third of a second."""
+    """Return numba, imported when the first function is compiled: importing takes a third of a second."""
     if not COMPILES:
         return None
     import numba
@@ -97,9 +97,9 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
 
 
 class Part:
-    """A function of kernels, which call it without the entry for Python: that was a quarter of the time to compile.
+    """A function called by kernels, compiled without a Python entry point, which took a quarter of the compile time.
 
-    Python calls a compilation of its own, with the entry, which is kept on disk as those of kernels are.
+    For calls from Python it is compiled separately with an entry point, and cached on disk like a kernel.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -109,7 +109,7 @@ class Part:
 
     @cached_property
     def dispatcher(self) -> Any:
-        """What compiled code calls."""
+        """The version that compiled code calls."""
         return _compile(self.py_func, {**self._options, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
     @cached_property
@@ -141,43 +141,43 @@ def noinline(function: Function) -> Function:
 
 
 def _kept(function: Function, options: dict[str, Any]) -> Function:
-    """Return a function whose compilation is kept on disk, under a name that changes with any of its sources."""
+    """Return a function whose compilation is cached on disk, under a name that changes with any of its sources."""
     if not COMPILES:
         return function
     version = _digest_of_module(function.__module__)
     function.__qualname__ = f"{function.__qualname__}_{version}"
     try:
         dispatcher: Any = _compile(function, {**options, "cache": True})
-    except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
+    except RuntimeError:  # neither its folder nor the user's cache is writable
         return _compile(function, options)
-    if dispatcher is not function:  # as it is where NUMBA_DISABLE_JIT is set
+    if dispatcher is not function:  # equal if NUMBA_DISABLE_JIT is set
         dispatcher.compile = partial(_compile_once, dispatcher, dispatcher.compile)
     return dispatcher
 
 
 def _compile_once(dispatcher: Any, compile_for: Callable[[Any], Any], signature: Any) -> Any:
-    """Compile a kernel in one process of a machine, while others that need it wait and then load the result.
+    """Compile a kernel in one process per machine, while others that need it wait and then load the result.
 
-    Processes of a run start together, and each would compile the same for half a minute.
+    The processes of a run start together, and would each compile the same code for half a minute.
     """
     if is_kept(dispatcher):
         return compile_for(signature)
     from numba.core.compiler_lock import global_compiler_lock
 
-    from zsim.output_folder import wait_for_lock  # here: what is imported above counts as a kernel's source
+    from zsim.output_folder import wait_for_lock  # imported here, since imports at the top count as a kernel's sources
 
     lock = Path(dispatcher.stats.cache_path, f"{dispatcher.__qualname__}.lock")
-    # numba's lock first: a thread that holds it may come to a kernel that another thread is about to compile
+    # numba's lock first: a thread that holds it may need a kernel that another thread is about to compile
     with global_compiler_lock, open(lock, "w") as file:
         wait_for_lock(file)
         try:
             return compile_for(signature)
         finally:
-            lock.unlink(missing_ok=True)  # it is kept by now
+            lock.unlink(missing_ok=True)  # now cached
 
 
 def kernel(makes_arrays: bool = True) -> Callable[[Function], Function]:
-    """Return the decorator; `makes_arrays` is False for one that, like all it calls, only uses arrays it is given."""
+    """Return the decorator; `makes_arrays` is False if the kernel and all that it calls allocate no arrays."""
     options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
     return lambda function: _kept(function, options)
 
@@ -187,7 +187,7 @@ def portable(function: Function) -> Function:
 
 
 class Deferred(Part):
-    """A kernel that runs as Python, to the same bits, until something has imported numba."""
+    """A kernel that runs as Python, with identical results, until other code has imported numba."""
 
     @cached_property
     def dispatcher(self) -> Any:
@@ -198,14 +198,14 @@ class Deferred(Part):
 
 
 def deferred(makes_arrays: bool = True) -> Callable[[Function], Function]:
-    """Return the decorator, as of a `kernel`; for mathematics that the setting up of a run uses as well."""
+    """Return the decorator, as for a `kernel`; for mathematics also used while a run is set up."""
     options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
     made: Any = lambda function: Deferred(function, options) if COMPILES else function  # noqa: E731
     return made
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Tell whether a compilation of a kernel, as its sources are now, is on disk; it is then only loaded."""
+    """Whether a kernel compiled from its current sources is on disk, so that it only needs to be loaded."""
     stats = getattr(function, "stats", None)  # of numba's dispatcher
     folder = stats and stats.cache_path
     return bool(folder) and any(Path(folder).glob(f"*{function.__qualname__}*.nbc"))
@@ -217,7 +217,7 @@ def _digest_of_module(module: str) -> str:
 
 
 def sources(module: str) -> frozenset[Path]:
-    """Return the files of a module and of all modules of zsim that it imports at its top, directly or not."""
+    """Return the files of a module and of all zsim modules that it imports at the top, directly or indirectly."""
     reached: set[str] = set()
     waiting = [module]
     while waiting:
@@ -232,13 +232,13 @@ def sources(module: str) -> frozenset[Path]:
 def _imported(module: str) -> tuple[str, ...]:
     """Return the modules of zsim that a loaded module imports."""
     text = Path(str(sys.modules[module].__file__)).read_text(encoding="utf-8")
-    lines = _IMPORTS.findall(text)  # of a package, from which modules or names are taken
+    lines = _IMPORTS.findall(text)  # packages, with the modules or names imported from each
     named = [name for package, names in lines for name in (package, *(f"{package}.{n}" for n in _NAME.findall(names)))]
     return tuple(name for name in named if getattr(sys.modules.get(name), "__file__", None))
 
 
 def digest(files: Iterable[Path]) -> str:
-    """Return a hash of the files' texts, whatever folders they lie in."""
+    """Return a hash of the files' contents, independent of their folders."""
     return hashlib.sha256(b"".join(sorted(map(_text, files)))).hexdigest()[:12]
 
 
@@ -248,7 +248,7 @@ def _text(path: Path) -> bytes:
 
 
 class Field(NamedTuple):
-    """Numbers of one name in a row: their unit ("1" for none), and how many there are."""
+    """A named group of numbers in a row, its unit ("1" if dimensionless), and its width."""
 
     name: str
     unit: str
@@ -256,21 +256,21 @@ class Field(NamedTuple):
 
 
 class Columns(Protocol):
-    """First columns by the names of the fields, and `size`."""
+    """The first column of each field by name, and `size`."""
 
     def __getattr__(self, name: str) -> int: ...
 
 
 def columns(name: str, fields: Iterable[Field]) -> Columns:
-    """Return the first column of every field by its name, and the columns in all as `size`.
+    """Return the first column of every field by name, and the total number of columns as `size`.
 
         STATE = columns("State", (Field("p_WB", "m", 3), Field("q_WB", "1", 4), Field("energy", "J")))
         row[STATE.p_WB : STATE.p_WB + 3]      row[STATE.energy]      np.zeros((count, STATE.size))
 
-    It is a named tuple of integers: compiled code reads its attributes as constants.
+    The result is a named tuple of integers, whose attributes compiled code reads as constants.
 
     Raises:
-        ValueError: two fields have one name.
+        ValueError: two fields have the same name.
     """
     listed = tuple(fields)
     first = [0, *accumulate(field.width for field in listed)]

@@ -69,9 +69,9 @@ class Completeness(Struct, frozen=True):
     gaps: tuple[GateGap, ...] = ()  # gates that are missing
     messages_missing: int = 0  # of the world, by their numbers; those of missing gates among them
     ended: bool = True  # the end of the run is on record
-    closed: bool = True  # its writer has closed it; it was not cut
+    closed: bool = True  # its writer has closed it
     last_ns: int = 0  # its last gate [ns]
-    damaged: tuple[str, ...] = ()  # what cannot be read of it, each with its place
+    damaged: tuple[str, ...] = ()  # unreadable parts with their positions
 
     @property
     def complete(self) -> bool:
@@ -104,7 +104,7 @@ class _Numbered(Struct):
     seq: int
 
 
-UNREAD = -1  # in place of a number that stands otherwise than our own encoder writes it
+UNREAD = -1  # marks a number that is not encoded as by our own encoder
 _WIDTH = np.full(256, -1, dtype=np.int64)  # bytes of an unsigned integer behind its first byte, by that (MessagePack)
 _WIDTH[:0x80] = 0
 _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8
@@ -195,7 +195,7 @@ def completeness(
         for m in wanted[np.argsort(spans.start[wanted])].tolist():
             take(names[spans.channel.item(m)], spans.content[spans.start.item(m) : spans.end.item(m)])
         for start, end in zip(spans.start[is_clock].tolist(), spans.end[is_clock].tolist(), strict=True):
-            with suppress(*messages.REFUSALS):  # garbage by somebody else, recorded as it came
+            with suppress(*messages.REFUSALS):  # garbage from another program, recorded as received
                 clocks.append(decode(spans.content[start:end]))
     gates = GateCount()
     for clock in sorted(clocks, key=lambda clock: (clock.seq if is_replay else clock.t_ns, clock.seq)):
@@ -228,7 +228,7 @@ def record_completeness(path: Path) -> Completeness:
 
 
 def _is_numbered(key: str, external: Container[str]) -> bool:
-    """Tell whether only the world publishes on a key, numbered without gaps; keys of external drones are excluded."""
+    """Whether only the world publishes on a key, numbered without gaps; keys of external drones are excluded."""
     group, drone, what = keys.parts(key)
     if group != "drone":
         return key == keys.EVENT

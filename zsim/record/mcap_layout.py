@@ -146,7 +146,7 @@ def places(source: Source) -> Iterator[RecordSpan]:
 
 
 def is_cut(source: Source, at: int) -> bool:
-    """Tell whether the bytes after the last whole record are the beginning of another one.
+    """Whether the bytes after the last whole record are the beginning of another one.
 
     Otherwise they are damaged: a wrong length makes everything after it unreadable.
     """
@@ -191,7 +191,7 @@ def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterato
 
 
 def is_complete(source: Source) -> bool:
-    """Tell whether a file has its footer."""
+    """Whether a file has its footer."""
     foot = len(source) - len(MAGIC) - FOOTER_SIZE
     return foot >= len(MAGIC) and source[foot] == Opcode.FOOTER and source[-len(MAGIC) :] == MAGIC
 
@@ -257,7 +257,7 @@ def unmap(source: Source) -> None:
 
 
 def is_ours(source: Source) -> bool:
-    """Tell whether zsim wrote a record, given its first bytes; zsim gives every chunk a checksum."""
+    """Whether zsim wrote a record, given its first bytes; zsim gives every chunk a checksum."""
     return source[LIBRARY : LIBRARY + len(OURS)] == OURS
 
 

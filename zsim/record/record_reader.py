@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from zsim.errors import RecordError
 from zsim.record import mcap_layout as layout
 
-SHOWN = 3  # gaps, or damaged chunks, in one line; how many more there are is shown
-CRC = struct.Struct("<I")  # of all that stands before the data's end; MCAP has 0 where none was computed
-OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that before the end of the one before it
+SHOWN = 3  # gaps or damaged chunks listed in one line; others are counted
+CRC = struct.Struct("<I")  # checksum of everything before the data end; 0 in MCAP if not computed
+OVERLAP_NS = 1_000_000_000  # simulated time; a chunk usually begins less than this before the previous one's end
 
 
 class Recorded(NamedTuple):
-    """A message of a record, not decoded."""
+    """A message in a record, not decoded."""
 
     key: str
     payload: bytes
@@ -31,13 +31,13 @@ class Recorded(NamedTuple):
 
 
 class MessageSpans(NamedTuple):
-    """Messages of a chunk, channel by channel, in the order in which they were written."""
+    """Messages of a chunk, by channel, each in the order written."""
 
     content: bytes  # of the chunk
-    channel: NDArray[np.int64]  # number of each one's channel, (M,)
-    start: NDArray[np.int64]  # where its payload begins in the content, (M,)
-    end: NDArray[np.int64]  # where it ends, (M,)
-    t_ns: NDArray[np.int64]  # its stamp, (M,)
+    channel: NDArray[np.int64]  # channel number of each message, (M,)
+    start: NDArray[np.int64]  # start of its payload in the content, (M,)
+    end: NDArray[np.int64]  # end of its payload, (M,)
+    t_ns: NDArray[np.int64]  # its stamp [ns], (M,)
 
 
 class _Chunk(NamedTuple):
@@ -52,9 +52,9 @@ _Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, messag
 
 
 class RecordReader:
-    """A record as on disk at the time of opening; a writer may be appending to it.
+    """A record as it was on disk when opened; a writer may be appending to it.
 
-    Reading raises RecordError for chunks of other tools with an unsupported compression.
+    Reading raises RecordError for other tools' chunks with an unsupported compression.
 
     Attributes:
         damaged: skipped parts with their positions: chunks whose checksum differs, and, as one entry, everything after
@@ -75,10 +75,10 @@ class RecordReader:
         except OSError as error:
             raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
         layout.check_magic(self._source, self.path)
-        self.complete = layout.is_complete(self._source)  # the record was closed, not cut
+        self.complete = layout.is_complete(self._source)  # whether the record was closed
         self._keys: dict[int, str] = {}
         self._data_end: layout.RecordSpan | None = None
-        self._rest: int | None = None  # from where on nothing can be read, if so
+        self._rest: int | None = None  # start of the unreadable end; None if there is none
         self._damaged: set[layout.RecordSpan] = set()  # chunks
         self._chunks = list(self._scan())
 
@@ -93,9 +93,9 @@ class RecordReader:
 
         Args:
             keys: exact keys; chunks without any of them are not decompressed.
-            by_time: in order of simulated time, messages of one time as they were written; otherwise all as
-                they were written. In memory are the chunks that overlap in time, and stragglers one by one.
-            from_ns: chunks with older messages only are skipped; a chunk spans a quarter of a wall second.
+            by_time: whether to sort by simulated time, and within the same time as written, instead of all as written.
+                Chunks that overlap in time are held in memory, and stragglers one by one.
+            from_ns: chunks with only older messages are skipped; a chunk spans a quarter of a wall second.
         """
         wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
         late = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
@@ -109,7 +109,7 @@ class RecordReader:
         return dict(self._keys)
 
     def spans(self, wanted: Collection[int]) -> Iterator[MessageSpans]:
-        """Yield the payload positions of some channels, chunk by chunk, for reading many messages as arrays."""
+        """Yield the positions of some channels' payloads, chunk by chunk, for reading many messages as arrays."""
         mapped = 0
         for chunk in self._chunks:
             if chunk.channels.isdisjoint(wanted):
@@ -131,7 +131,7 @@ class RecordReader:
             yield MessageSpans(content, channel[rows], starts + layout.MESSAGE.size, ends, times)
 
     def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return channel and position of every message of a chunk, by its indexes if these cover all its content."""
+        """Return channel and position of every message of a chunk, from its indexes if they cover all its content."""
         head = layout.HEAD.size + layout.INDEX_HEAD.size
         at = [(index.start + head, layout.INDEX_ENTRY * index.messages) for index in chunk.indexes]
         data = b"".join([self._source[start : start + size] for start, size in at])
@@ -150,14 +150,14 @@ class RecordReader:
 
     @property
     def damaged(self) -> tuple[str, ...]:
-        """Return the damage found so far; everything after unreadable records is one entry."""
+        """The damage found so far; everything after unreadable records is one entry."""
         heads = [(place.start, layout.chunk_head(self._source, place)) for place in sorted(self._damaged)]
         span = "the chunk at byte {}, {:.2f} to {:.2f} s"
         chunks = [span.format(at, head.first_ns / 1e9, head.last_ns / 1e9) for at, head in heads]
         return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
 
     def differs(self) -> bool:
-        """Tell whether a closed record was changed after its writer closed it; the whole file is read.
+        """Whether a closed record was changed after its writer closed it; reads the complete file.
 
         Names of keys and indexes have no checksum of their own.
         """
@@ -167,7 +167,7 @@ class RecordReader:
         return stated not in (0, layout.crc_until(self._source, self._data_end.start))
 
     def last(self, key: str) -> Recorded | None:
-        """Return the last written message of a key, None if there is none."""
+        """Return the last written message of a key; None if there is none."""
         for number in (number for number, name in self._keys.items() if name == key):
             for chunk in reversed(self._chunks):
                 if number in chunk.channels and (recorded := list(self._as_written([chunk], {number: key}))):
@@ -175,9 +175,9 @@ class RecordReader:
         return None
 
     def last_chunk(self, key: str, is_it: Callable[[bytes], bool]) -> tuple[int, list[Recorded]] | None:
-        """Return the start of the chunk with the last message of a key, and its content before that message.
+        """Return the start of the chunk with the last matching message of a key, and its content before that message.
 
-        `is_it`: tells by the payload whether it is the wanted one.
+        `is_it`: whether a payload matches.
         """
         channels = {number for number, name in self._keys.items() if name == key}
         for chunk in reversed([chunk for chunk in self._chunks if not chunk.channels.isdisjoint(channels)]):
@@ -198,7 +198,7 @@ class RecordReader:
         self.close()
 
     def _places(self) -> Iterator[layout.RecordSpan]:
-        """Yield all records, and note the channels (possibly only in the summary) and the end of the data."""
+        """Yield all records, noting the channels (possibly only in the summary) and the data end."""
         opcode, end = 0, len(layout.MAGIC)
         for place in layout.places(self._source):
             opcode, end = place.opcode, place.end
@@ -215,11 +215,11 @@ class RecordReader:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
         found = self._places()
         chunk_groups = [group for group in layout.groups(self._source, found) if group.place.opcode == Opcode.CHUNK]
-        for _ in found:  # of the summary
+        for _ in found:  # read the channels in the summary
             continue
         for place, indexes, _ in chunk_groups:
             counts = {index.channel: index.messages for index in indexes}
-            if place is chunk_groups[-1].place and not self.complete:  # its indexes may have been cut
+            if place is chunk_groups[-1].place and not self.complete:  # its indexes may be truncated
                 content = layout.content_of(self._source, place)
                 if content is None:
                     self._damaged.add(place)
@@ -251,7 +251,7 @@ class RecordReader:
                 yield Recorded(wanted[number], content[at + payload : at + head + length], t_ns, wall_ns)
 
     def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
-        """Yield by time, holding no more chunks in memory than overlap in time, and stragglers."""
+        """Yield messages by time, holding in memory only the chunks that overlap in time, and stragglers."""
         held, floors = self._stragglers(chunks, wanted)
         starts = [floors.get(number, chunk.first_ns) for number, chunk in enumerate(chunks)]
         for number in sorted(range(len(chunks)), key=starts.__getitem__):
@@ -266,10 +266,10 @@ class RecordReader:
         yield from (message for _, _, message in held)
 
     def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Held], dict[int, int]]:
-        """Return messages stamped long before the rest of their chunk, and the first time of that rest, by chunk.
+        """Return messages stamped long before the rest of their chunk, and by chunk the first time of the rest [ns].
 
-        A program that does not stamp gives every chunk a message of time 0. By their oldest messages, all chunks would
-        be read and held at the beginning.
+        A program that does not stamp its messages gives every chunk one of time 0. Ordered by their oldest messages,
+        all chunks would be read and held at the beginning.
         """
         strays: list[_Held] = []
         floors: dict[int, int] = {}
@@ -278,10 +278,10 @@ class RecordReader:
             if chunk.first_ns >= chunks[number - 1].last_ns - OVERLAP_NS:
                 continue
             entries = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
-            floor_ns = 0  # before most of its times, robust against a few outliers on either side
+            floor_ns = 0  # below most of its times, robust against a few outliers on either side
             if times := sorted(t_ns for t_ns, _, _ in entries):
                 middle, late = times[len(times) // 2], times[3 * len(times) // 4]
-                floor_ns = middle - 3 * (late - middle) - OVERLAP_NS  # evenly spread, 2 (late - middle) do
+                floor_ns = middle - 3 * (late - middle) - OVERLAP_NS  # 2 (late - middle) suffices for uniform times
             strays += (each for each in entries if each[0] < floor_ns)
             floors[number] = min((t_ns for t_ns, _, _ in entries if t_ns >= floor_ns), default=chunk.first_ns)
         return strays, floors
@@ -291,9 +291,9 @@ def record_notes(reader: RecordReader) -> list[str]:
     """Return warnings about a truncated or damaged record, one line each."""
     notes = []
     if not reader.complete:
-        notes.append("the record was cut: its writer did not close it; everything up to the cut was read")
+        notes.append("the record was cut off: its writer did not close it; everything before the cut was read")
     if reader.damaged:
-        notes.append(f"the record is damaged, and this was passed over: {shown(reader.damaged)}")
+        notes.append(f"the record is damaged; skipped: {shown(reader.damaged)}")
     return notes
 
 

@@ -1,6 +1,6 @@
 """Runs a world and its agents in one process on an in-memory bus.
 
-The agents receive the same inputs in the same order as on Zenoh, and therefore give the same bits.
+The agents receive the same inputs in the same order as on Zenoh, and therefore give identical results.
 """
 
 import copy
@@ -18,7 +18,7 @@ from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
 from zsim.runtime.membership import Membership
 from zsim.scenario.faults import PROCESS_KILL
 
-GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
+GATES_MAX = 10  # maximum gates of the world in a row, if commands are delayed by as many
 
 
 class SteppedWorld(Protocol):
@@ -37,21 +37,21 @@ class SteppedWorld(Protocol):
 
 
 class _Route(NamedTuple):
-    inboxes: tuple[Inbox, ...]  # of the agents that read them
-    is_counted: bool  # whether the world counts them among the outputs of their sender
-    is_relayed: bool  # whether that is all that it does with them
+    inboxes: tuple[Inbox, ...]  # of the agents that read the key
+    is_counted: bool  # whether the world counts its messages as outputs of their sender
+    is_relayed: bool  # whether the world does nothing else with them
 
 
 class Bus:
-    """The bus of one process: every message goes to the sink, the world and the inboxes that read it."""
+    """The bus of one process: every message goes to the sink, the world, and the inboxes of its readers."""
 
     def __init__(
         self,
         coordinator: SteppedWorld,
         agents: Sequence[Agent],  # in the order in which they are stepped
         wall_ns: Callable[[], int],
-        sink: Callable[[str, Any], None] = lambda key, message: None,  # takes every message in order of publication
-        # takes the world's messages of a gate; without it the sink is given each one decoded
+        sink: Callable[[str, Any], None] = lambda key, message: None,  # receives every message in order of publication
+        # receives the world's messages of each gate; without it the sink receives each one decoded
         gate_sink: Callable[[GateMessages], None] | None = None,
     ) -> None:
         self._coordinator = coordinator
@@ -61,7 +61,7 @@ class Bus:
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted, uncounted=agent.uncounted)) for agent in agents]
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
-        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads any
+        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and its readers
         host, run_id = socket.gethostname(), coordinator.run_id
         self._memberships = {
             agent.name: Membership(agent.name, host, run_id, agent.next_seq, agent.serves, agent.period_ns)
@@ -70,7 +70,7 @@ class Bus:
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
-        self._failures: dict[str, UserCodeError] = {}  # by the agent that cannot go on, the first one first
+        self._failures: dict[str, UserCodeError] = {}  # by agent, in order of failure
 
     def join(self) -> None:
         """Rehearse every agent and join the run."""
@@ -85,7 +85,7 @@ class Bus:
     def turn(self, gates_max: int = GATES_MAX) -> bool:
         """Advance the world as far as possible, and step every agent; return whether the run continues.
 
-        Stepping several gates in a row of the world and of each agent keeps the code of each in the processor's caches.
+        Stepping the world and each agent through several gates keeps the code of each in the processor's caches.
 
         Raises:
             RunError: the world waits for a process that is not on this bus.
@@ -105,7 +105,7 @@ class Bus:
         return True
 
     def _round(self) -> bool:
-        """Step every agent through its complete gates and publish the outputs; return whether there was any."""
+        """Step every agent through its complete gates and publish the outputs; return whether any agent stepped."""
         stepped = False
         for agent, inbox in self._agents:
             steps = []
@@ -124,7 +124,7 @@ class Bus:
                 self.publish(agent, t_ns, outputs)
             stepped = stepped or bool(steps)
             if agent.name in self._failures and inbox.taken_ns != NEVER_NS:
-                inbox.start_after(NEVER_NS)  # it is handed nothing any more
+                inbox.start_after(NEVER_NS)  # it receives no further inputs
                 self._leave(agent, str(self._failures[agent.name]), failed=True)
         return stepped
 
@@ -133,7 +133,7 @@ class Bus:
         self._to_world(keys.process(agent.name, "bye"), bye)
 
     def snapshot(self) -> list[Inbox]:
-        """Return copies of the inputs that the agents have not taken, for `restore`; call it between turns."""
+        """Return copies of the inputs that the agents have not taken, for `restore`; only between turns."""
         return [copy.deepcopy(inbox) for _, inbox in self._agents]
 
     def restore(self, inboxes: Sequence[Inbox]) -> None:
@@ -144,7 +144,7 @@ class Bus:
     def end(self) -> None:
         """Publish the byes of the agents and the world's last messages.
 
-        UserCodeError if a user's class failed before the end, after everything was published.
+        UserCodeError, after everything is published, if a user's class failed earlier.
         """
         self._coordinator.publish_end()
         self._spread()
@@ -181,7 +181,7 @@ class Bus:
         for fault in faults.faults:
             if fault.kind == PROCESS_KILL:
                 raise RunError(
-                    f"faults: {PROCESS_KILL} of {fault.target} needs processes, and this run has all in one; "
+                    f"faults: {PROCESS_KILL} of {fault.target} needs separate processes, and this run has only one; "
                     f"leave it out, or fly with `zsim run` without --in-process"
                 )
         info = self._info = self._info or self._coordinator.info()

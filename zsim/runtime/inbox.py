@@ -1,7 +1,7 @@
 """The inputs of an agent sorted by gate (`Inbox`), and the readers of each key (`RoutingTable`).
 
 The order of arrival is irrelevant: a gate is complete when each of its closing keys has a message stamped with it and
-every counted sensor message has arrived. A gate of which nothing arrived shows as a gap in the numbers of a status.
+every counted sensor message has arrived. A gate of which nothing arrived shows as a gap in a status's sequence numbers.
 """
 
 from bisect import bisect_right, insort
@@ -14,19 +14,19 @@ from zsim.contract.framing import GateMessages, PerPattern
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError
 
-GAP_MAX = 10  # consecutive lost gates that are requested again; the world is never farther ahead of an agent
+GAP_MAX = 10  # maximum number of consecutive lost gates to request again; the world is never farther ahead of an agent
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
-KEYS_MAX = 200_000  # whose readers are remembered; 1000 drones have about 15 000, other processes may make up any
+KEYS_MAX = 200_000  # keys with cached readers; 1000 drones have about 15 000, other processes may invent any
 Input = tuple[str, Any]
 """A key and a message; or `keys.GATE` and a GateMessages."""
 
 
 def output_hold_ns(info: Info) -> int:
-    """Return how long after its stamp an output that closes no gate is delivered to its reader; see `Inbox.hold_ns`.
+    """Return the delay after its stamp with which an output that closes no gate is delivered [ns]; see `Inbox.hold_ns`.
 
     By then all agents have published theirs: the world is ahead of them by the command delay, or not at all if agents
-    exchange messages. In realtime outputs are delivered on arrival.
+    exchange messages. In realtime, outputs are delivered on arrival.
     """
     if info.mode == "realtime":
         return 0
@@ -34,7 +34,7 @@ def output_hold_ns(info: Info) -> int:
 
 
 def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> bool:
-    """Tell whether messages of a key are outputs of other agents that are delivered after the hold."""
+    """Whether a key's messages are outputs of other agents, delivered after the hold time."""
     return key not in gate_keys and key not in uncounted and messages.is_output(key)
 
 
@@ -48,46 +48,46 @@ class Inbox:
 
     def __init__(
         self,
-        # a message of each with t_ns == t closes the gate t; the `count` of a counted drone's sensor/status is checked
+        # keys of which one message each with t_ns == t closes the gate t
         gate_keys: Sequence[str],
-        counted: Sequence[str] = (),  # drones of which all `sensor/*` keys are read
-        # hand out what comes after its gate was taken with the next, once: in realtime an old input is better than none
+        counted: Sequence[str] = (),  # drones whose `sensor/*` messages are all waited for, by their status's `count`
+        # deliver late messages with the next gate, once: in realtime an old input is better than none
         keep_late: bool = False,
-        # keys of which this is so in any case: they belong to no gate, such as what a detector finds in a picture
+        # keys whose late messages are always delivered: they belong to no gate, such as detections in a picture
         uncounted: Sequence[str] = (),
-        # closing keys whose publishers may skip gates, as drivers of external drones: waited for while they skip none
+        # closing keys whose publishers may skip gates, such as drivers of external drones; waited for until they do
         sparse: Sequence[str] = (),
-        # after which an agent's output on a key that closes no gate is handed out, as if stamped so much later: command
-        # delay and a gate, when it has come wherever the world may be, so that no order of arrival counts
+        # delay of agents' outputs on keys that close no gate, as if stamped later: command delay plus one gate, when
+        # they have certainly arrived, so that the order of arrival is irrelevant
         hold_ns: int = 0,
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
-        # with the stamps of its last two messages; before any, they are before whatever was taken last
+        # with the stamps of the last two messages; initially before any gate
         self._sparse = dict.fromkeys(sparse, (ALWAYS_NS - 1, ALWAYS_NS - 1))
         of_world = dict.fromkeys(key for key in gate_keys if keys.is_status(key) and key not in self._sparse)
         self._not_of_world = {key: None for key in gate_keys if key not in of_world}  # not closed by GateMessages
-        self._pulse = next(iter(of_world), None)  # whose numbers show a gap
+        self._pulse = next(iter(of_world), None)  # status whose sequence numbers reveal lost gates
         self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp, then by key and number
         self._stamps: list[int] = []
-        self._lacking: dict[int, dict[str, None]] = {}  # by gate, the closing keys that have not come
+        self._lacking: dict[int, dict[str, None]] = {}  # by gate, the closing keys still missing
         self._gates: list[int] = []
         self._expected_from_ns: dict[str, int] = {}
         self._meters = {keys.status(drone): _Meter() for drone in counted}
         self._came_of: dict[str, list[int] | None] = {}
-        self._beats: dict[int, int] = {}  # by gate, the number of the pulse
+        self._beats: dict[int, int] = {}  # by gate, the sequence number of the pulse
         self._last_beat: tuple[int, int] | None = None
-        self.taken_ns = self._former_ns = -1  # the gates that were taken last; below 0 before the first
+        self.taken_ns = self._former_ns = -1  # the last two gates taken; -1 before the first
         self.hold_ns = hold_ns
         self._hold_of: dict[str, int] = {}
         self._holds = False
         self._keep_late = keep_late
         self._uncounted = frozenset(uncounted)
         self._belated: dict[tuple[str, int], Input] = {}
-        self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
-        # whether all closing keys are of publishers that may skip gates
+        self._newest: dict[str, int] = {}  # newest t_ns delivered per key, if late messages are kept
+        # whether the publishers of all closing keys may skip gates
         self.may_skip = len(self._sparse) == len(self._closing)
-        self.duplicates = 0  # messages that came again before their gate was taken
-        self.late = 0  # messages that came when their gate had been taken
+        self.duplicates = 0  # messages that arrived again before their gate was taken
+        self.late = 0  # messages that arrived after their gate was taken
 
     def put(self, key: str, message: Any) -> bool:
         """Keep one message, or GateMessages on `keys.GATE`; return False for a duplicate or one that is too late."""
@@ -102,7 +102,7 @@ class Inbox:
         due_ns = t_ns + hold_ns
         if due_ns <= self.taken_ns:
             self.late += 1
-            handed_ns = self._newest.get(key, ALWAYS_NS)  # up to there, it or a newer one was handed out
+            handed_ns = self._newest.get(key, ALWAYS_NS)  # this message or a newer one has been delivered
             if (not self._keep_late or t_ns <= handed_ns) and key not in self._uncounted:
                 return False
             self._belated[key, message.seq] = (key, message)
@@ -132,7 +132,7 @@ class Inbox:
                 self._beats[t_ns] = message.seq
             if key in self._meters:
                 self._meters[key].count(message)
-        elif type(message) is GateMessages:  # whose messages have come as one: none of them can be missing
+        elif type(message) is GateMessages:  # arrives as a unit: none of its messages can be missing
             if t_ns in self._lacking:
                 self._lacking[t_ns] = {each: None for each in self._lacking[t_ns] if each in self._not_of_world}
             else:
@@ -142,10 +142,10 @@ class Inbox:
                 self._beats[t_ns] = message.seq
         return True
 
-    # What is complete, and what is missing
+    # Complete and missing gates
 
     def next_gate_ns(self) -> int | None:
-        """Return the earliest gate not taken, by the closing messages and the gaps in the pulse's numbers."""
+        """Return the earliest gate not taken, from closing messages and gaps in the pulse's sequence numbers [ns]."""
         if not self._gates:
             return None
         t_ns = self._gates[0]
@@ -161,7 +161,7 @@ class Inbox:
         return self._gates[-1] if self._gates else None
 
     def missing(self, t_ns: int) -> str | None:
-        """Return a key that the gate still lacks, None when it is complete."""
+        """Return a key that the gate still lacks; None if it is complete."""
         for key in self._lacking.get(t_ns, self._closing):
             if self._waits_for(key, t_ns):
                 return key
@@ -171,9 +171,9 @@ class Inbox:
         return None
 
     def last_missing(self) -> str | None:
-        """Return the last closing key that the next gate waits for, so that a waiting thread wakes up only once.
+        """Return the last closing key that the next gate lacks, so that a waiting thread wakes up only once.
 
-        If no closing key is missing, it is the key of a counted message; None if nothing is missing.
+        If no closing key is missing, return the key of a counted message; None if nothing is missing.
         """
         next_ns = self.next_gate_ns()
         t_ns = self.taken_ns + 1 if next_ns is None else next_ns
@@ -183,16 +183,16 @@ class Inbox:
         return self.missing(t_ns) if next_ns is not None else None
 
     def lost(self, t_ns: int) -> str | None:
-        """Return a missing key whose message will not arrive, since its publisher has published a later one."""
+        """Return a missing key whose message will not arrive, since its publisher has published a later gate's."""
         key = self.missing(t_ns)
         if key is None or key not in self._lacking.get(t_ns, self._closing):
             return key
         return key if any(key not in self._lacking[gate] for gate in self._gates if gate > t_ns) else None
 
     def _waits_for(self, key: str, t_ns: int) -> bool:
-        """Tell whether a gate waits for a closing key.
+        """Whether a gate waits for a closing key.
 
-        A key whose publisher may skip gates is waited for if a message came for both of the gates taken last.
+        A key whose publisher may skip gates is waited for if messages arrived for both of the last gates taken.
         """
         if t_ns < self._expected_from_ns.get(key, ALWAYS_NS):
             return False
@@ -213,7 +213,7 @@ class Inbox:
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
         if self._holds:
             ready.sort(key=canonical)
-        if self._keep_late or self._belated:  # what came late is in front
+        if self._keep_late or self._belated:  # late messages come first
             ready = sorted(self._belated.values(), key=canonical) + ready
             self._belated.clear()
             for key, message in ready:
@@ -234,7 +234,7 @@ class Inbox:
 
 
 def _once(ready: list[Input]) -> list[Input]:
-    """Leave out the sensor messages that are there a second time, in a GateMessages: a replay brings them singly."""
+    """Return the inputs without sensor messages that a GateMessages also contains: a replay sends them singly."""
     gates = [message for _, message in ready if type(message) is GateMessages]
     if not gates or not any(keys.is_sensor(key) for key, _ in ready):
         return ready
@@ -243,17 +243,17 @@ def _once(ready: list[Input]) -> list[Input]:
 
 
 class _Meter:
-    """Compares the sensor messages received of a drone with the count in its status.
+    """Compares the number of sensor messages received from a drone with the count in its status.
 
     The first gate of a late joiner is not compared, since it began before the join; a status with seq 0 counts from the
     beginning.
     """
 
     def __init__(self) -> None:
-        self.came: list[int] = []  # stamps of the drone's messages that wait, sorted
-        # stamps of the drone's statuses that wait, and what they count; a meter without any is not short
+        self.came: list[int] = []  # stamps of the drone's pending messages, sorted
+        # stamps and counts of the drone's pending statuses; `short` is false without any
         self.counts: list[tuple[int, int]] = []
-        self.partial = True  # whether nothing is compared yet
+        self.partial = True  # whether the first status may count messages from before the join
 
     def count(self, status: Any) -> None:
         self.counts.append((status.t_ns, status.count))
@@ -261,7 +261,7 @@ class _Meter:
             self.partial = False
 
     def short(self, t_ns: int) -> bool:
-        """Tell whether sensor messages of the gates up to t_ns are missing."""
+        """Whether sensor messages of the gates up to t_ns are missing."""
         if self.partial:
             return False
         return bisect_right(self.came, t_ns) < sum(count for gate_ns, count in self.counts if gate_ns <= t_ns)
@@ -273,7 +273,7 @@ class _Meter:
 
 
 def _insert(stamps: list[int], t_ns: int) -> None:
-    """Insert a stamp into a sorted list; it is nearly always the latest."""
+    """Insert a stamp into a sorted list; nearly always at the end."""
     if not stamps or t_ns >= stamps[-1]:
         stamps.append(t_ns)
     else:
@@ -294,17 +294,17 @@ class RoutingTable:
         routes = RoutingTable([["drone/*/truth"], ["drone/drone1/sensor/imu", "**"]])
         routes.readers("drone/drone1/truth")      (0, 1)
 
-    Comparing every expression with every key would dominate the time of a process of 1000 drones. Here expressions with
-    wildcards for whole chunks are looked up by placing the wildcards in the key, and only those with `**` or `$*` are
-    compared one by one.
+    Comparing every expression with every key would dominate the run time of a process with 1000 drones. Expressions
+    with wildcards for whole chunks are looked up by substituting the wildcards in the key; only those with `**` or `$*`
+    are compared one by one.
 
     Args:
         expressions: key expressions of each reader; readers are identified by their index.
     """
 
     def __init__(self, expressions: Sequence[Sequence[str]]) -> None:
-        self._filed: defaultdict[str, list[int]] = defaultdict(list)  # without wildcards, or with * only
-        self._starred: defaultdict[int, set[tuple[int, ...]]] = defaultdict(set)  # by number of chunks, places of the *
+        self._filed: defaultdict[str, list[int]] = defaultdict(list)  # expressions without wildcards, or only with *
+        self._starred: defaultdict[int, set[tuple[int, ...]]] = defaultdict(set)  # by number of chunks, positions of *
         self._compared: list[tuple[str, int]] = []
         self._known: dict[str, tuple[int, ...]] = {}
         for reader, own in enumerate(expressions):
@@ -325,7 +325,7 @@ class RoutingTable:
         found = set(self._filed.get(key, ()))
         chunks = key.split("/")
         for starred in self._starred.get(len(chunks), ()):
-            if not any(chunks[place].startswith("@") for place in starred):  # which no wildcard takes
+            if not any(chunks[place].startswith("@") for place in starred):  # not matched by wildcards
                 masked = ["*" if place in starred else chunk for place, chunk in enumerate(chunks)]
                 found.update(self._filed.get("/".join(masked), ()))
         found.update(reader for expression, reader in self._compared if keys.matches(expression, key))
@@ -339,14 +339,14 @@ class RoutingTable:
 
 
 class GateRouter:
-    """Splits the messages of gates: only messages that are read are decoded, once for all readers."""
+    """Splits the messages of gates; only messages that have readers are decoded, once for all of them."""
 
     def __init__(self, routes: RoutingTable) -> None:
         self._routes = routes
         self._read = PerPattern(self._read_of)
 
     def _read_of(self, gate: GateMessages) -> list[tuple[tuple[int, ...], str, int]]:
-        """Return readers, key and index in the gate of each message that is read."""
+        """Return readers, key and index in the gate of each message that has readers."""
         which, readers_of = gate.which.tolist(), self._routes.readers
         if not which or min(which) < 0 or max(which) >= len(gate.table):
             return []
@@ -354,19 +354,19 @@ class GateRouter:
         return [(readers, key, place) for place, key in enumerate(keys_of) if (readers := readers_of(key))]
 
     def split(self, gate: GateMessages) -> Iterator[tuple[tuple[int, ...], str, Any]]:
-        """Yield readers, key and message of each message that is read, in order of publication.
+        """Yield readers, key and message of each message that has readers, in order of publication.
 
-        A message that is not of its key's type is omitted, and so is a gate whose columns point outside its table.
+        Messages that do not have their key's type are omitted, as are gates whose columns point outside their table.
         """
         for readers, key, place in self._read.of(gate):
             try:
                 message = messages.decode(key, gate.payload(place))
             except DecodeError:
-                continue  # not written by the world: as good as lost
+                continue  # not written by the world: treated as lost
             yield readers, key, message
 
     def one_by_one(self, inputs: Sequence[Input]) -> Sequence[Input]:
-        """Return inputs with the messages of gates split, as far as they are read, in canonical order."""
+        """Return inputs in canonical order, with gates split into the messages that have readers."""
         if not any(type(message) is GateMessages for _, message in inputs):
             return inputs
         single: list[Input] = []

@@ -1,13 +1,13 @@
-"""The effect of links on the messages of a gate: of its radio at the sender, of all links at the receiver. Pure.
+"""The effect of links on the messages of a gate: the radio's bandwidth at the sender, all else at the receiver.
 
-    agent ──messages──▶ Transmitter ──as many as its bandwidth lets out──▶ … ──▶ Links ──now, later, never──▶ agent
+    agent ──messages──▶ Transmitter ──within its bandwidth──▶ … ──▶ Links ──now, later or never──▶ agent
 
 The radio acts on messages between users' agents, by the connectivity that the world publishes at every gate
 (`RadioLinks`); injected link faults act on all messages.
 
-The barrier counts the messages regardless; only the agent receives them late or never. Loss and delay of a message are
-drawn from the stream of its link by the identity of the message (key, t_ns, seq), so that neither the order of arrival
-nor a restart of the receiver changes a draw.
+The lockstep counts the messages regardless; only the agent receives them late or never. Loss and delay of a message
+are drawn from its link's random stream by the identity of the message (key, t_ns, seq), so that neither the order of
+arrival nor a restart of the receiver changes a draw.
 """
 
 import math
@@ -29,9 +29,9 @@ from zsim.scenario import faults as fault_kinds
 from zsim.scenario.roles import ROLES
 from zsim.scenario.scenario import Radio
 
-LISTS_KEPT = 50  # of links: a second of them, in realtime; in lockstep two are needed
+LISTS_KEPT = 50  # lists of RadioLinks: a second of them, for realtime; lockstep needs two
 NEVER = None  # as a delay: the message is lost
-ENVELOPE = frozenset(AgentMessage.__struct_fields__)  # which a real radio would not carry
+ENVELOPE = frozenset(AgentMessage.__struct_fields__)  # fields that a real radio would not carry
 
 
 WORLD, RADIO = "world", "radio"
@@ -40,11 +40,11 @@ Point = Sequence[float]
 
 
 class Links:
-    """Delays and drops the messages of a gate for one receiver, as its links do.
+    """Delays and drops the messages of a gate for one receiver.
 
     Args:
         names: names of the receiver; an estimator of several drones has one per drone.
-        radio: receiver of the radio between users' agents; None if all of them receive all messages.
+        radio: radio between users' agents; None if all of them receive all messages.
     """
 
     def __init__(self, info: Info, names: Sequence[str], radio: Radio | None = None) -> None:
@@ -54,9 +54,9 @@ class Links:
         self._roles = {each.key: each.role for each in info.own_messages}
         self._drones = frozenset(drone.name for drone in info.drones)
         self._clusters = {cluster.name: cluster.drones for cluster in info.clusters}
-        self._list: Faults | None = None  # the newest
+        self._list: Faults | None = None  # newest
         self._faults: list[Fault] = []
-        self._later: list[tuple[int, str, Any]] = []  # the gate at which it comes, key, message
+        self._later: list[tuple[int, str, Any]] = []  # gate of delivery, key, message
         self._positions: dict[str, Point] = {}
 
     def update(self, faults: Faults) -> None:
@@ -70,7 +70,7 @@ class Links:
         self._faults = [fault for fault in faults.faults if fault.kind in KINDS and concerned(fault)]
 
     def act_at(self, t_ns: int) -> bool:
-        """Tell whether links may change the inputs of a gate."""
+        """Whether links may change the inputs of a gate."""
         return bool(self._radio or self._later) or any(fault_kinds.acts(fault, t_ns) for fault in self._faults)
 
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
@@ -99,9 +99,9 @@ class Links:
         return sorted(handed, key=canonical)
 
     def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
-        """Return the delay of a message [ns]; of several estimators, that of the drone in the key receives it.
+        """Return the delay of a message [ns] or NEVER; of several estimators, that of the drone in the key receives it.
 
-        A radio carries messages of its drones to processes that are not on the same drone.
+        A radio fault affects messages of its drones to processes that are not on the same drone.
         """
         over_radio_ns = self._radio.delay_ns(key, message) if self._radio and isinstance(message, AgentMessage) else 0
         if over_radio_ns is None:
@@ -144,12 +144,12 @@ class Links:
 
 
 def total_delay_ns(
-    faults: Iterable[Fault],  # that act on its link
+    faults: Iterable[Fault],  # acting on its link
     seed: int,  # of the scenario
-    link: str,  # name of the link's stream: its receiver
-    key: str,  # which is sent
+    link: str,  # name of the link's random stream: its receiver
+    key: str,
     message: Any,
-    # returns that between sender and receiver for a radio, None where it is not known
+    # for a radio, returns the distance between sender and receiver; None if unknown
     distance_m: Callable[[Fault], float | None] = lambda fault: None,
 ) -> int | None:
     """Return the total delay of a message by several faults [ns]; NEVER if one of them loses it.
@@ -170,7 +170,7 @@ def total_delay_ns(
         elif fault.kind == RADIO:
             d_m = distance_m(fault)
             if d_m is not None:
-                exponent = min((d_m - p["range_m"]) / p["spread_m"], 700.0)  # exp(700) is the last finite one
+                exponent = min((d_m - p["range_m"]) / p["spread_m"], 700.0)  # exp(710) overflows
                 if draw >= 1.0 / (1.0 + el.exp(exponent)):
                     return NEVER
         else:  # link_cut
@@ -179,7 +179,7 @@ def total_delay_ns(
 
 
 def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
-    """Tell whether a fault concerns the link from one of the senders to a receiver."""
+    """Whether a fault concerns the link from one of the senders to a receiver."""
     first, _, second = fault.target.partition("/")
     if second == to and first in froms:
         return True
@@ -191,7 +191,7 @@ def place_of(
 ) -> Point | None:
     """Return the position of a process [m; W]: from `places`, that of its drone, or the origin.
 
-    `where`: returns the position of a drone [m; W], None if unknown.
+    `where`: returns the position of a drone [m; W]; None if unknown.
     """
     place = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
     return where(place) if isinstance(place, str) else place
@@ -202,7 +202,7 @@ def distance_between(a: Point | None, b: Point | None) -> float | None:
 
 
 def drone_of(process: str, drones: Container[str]) -> str | None:
-    """Return the drone that carries a process, for roles (also of users) with one process per drone."""
+    """Return the drone that carries a process, for roles with one process per drone, also users'; otherwise None."""
     role, _, thing = process.partition(".")
     about = ROLES[role].about if role in ROLES else "drone"
     return thing if about == "drone" and thing in drones else None
@@ -211,10 +211,10 @@ def drone_of(process: str, drones: Container[str]) -> str | None:
 def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
     """Return the names of the processes that count as the sender of a message.
 
-    Agents may share a process under one name: they are named after the drone or cluster in the key.
+    Agents that share a process under one name are named after the drone or cluster in the key.
 
     Args:
-        roles: of users' agents, by the shape of the keys of their messages.
+        roles: of users' agents, by the shape of their messages' keys.
     """
     if role := roles.get(messages.shape_of(key)):
         return (f"{role}.{keys.thing(key)}",)
@@ -231,11 +231,11 @@ def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str,
     else:
         return (whose,) if kind == "process" else (WORLD,)
     is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
-    return (named,) if is_shared or not source else (named, source)  # another process that does its work
+    return (named,) if is_shared or not source else (named, source)  # another process in its place
 
 
 class Receiver:
-    """Decides which messages of other agents reach one agent, and when.
+    """Decides which messages of other agents reach one agent by radio, and when.
 
     Args:
         process: name of the receiver.
@@ -276,7 +276,7 @@ class Receiver:
 
 
 def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
-    """Return the probability with which a message arrives, 0 where the receiver does not hear the sender."""
+    """Return the probability that a message arrives; 0 if the receiver does not hear the sender."""
     hears = links.hears[receiver] if receiver < len(links.hears) else ()
     if sender not in hears:
         return 0.0
@@ -286,20 +286,20 @@ def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
 
 
 class Transmitter:
-    """Sends the messages of an agent one after the other, within its bandwidth.
+    """Sends the messages of an agent one after another within its bandwidth.
 
-    A message whose transmission begins before the next gate is published at this one. Others wait for a later gate,
-    whose stamp they get; beyond `queue_max` the oldest is lost.
+    A message whose transmission begins before the next gate is published at this one. Others wait for a later gate and
+    receive its stamp; beyond `queue_max` the oldest are lost.
     """
 
     def __init__(self, radio: Radio, gate_ns: int) -> None:
         self._gate_ns, self._queue_max, self._header_bytes = gate_ns, radio.queue_max, radio.header_bytes
         self._ns_per_byte = 8e6 / radio.bandwidth_kbit_s if radio.bandwidth_kbit_s else 0.0
         self._waiting: deque[tuple[str, AgentMessage]] = deque()
-        self._free_ns = 0  # when the last message has been sent
+        self._free_ns = 0  # when the last transmission ends
 
     def send(self, t_ns: int, outputs: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-        """Return the outputs of an agent to publish at a gate; outputs other than messages do not wait."""
+        """Return the outputs of an agent to publish at a gate; only messages to agents wait."""
         if not self._ns_per_byte:
             return [*outputs]
         published = []

@@ -22,8 +22,8 @@ from zsim.runtime.rate_limit import RateLimit
 
 PERIOD_S = 1.0  # contract: 1 Hz wall
 STEPS_KEPT = 1000
-READS_MAX = 8  # expressions that are listed of a process that reads many
-ALLOCATIONS = 50_000  # between two collections, chosen: a gate allocates hundreds of objects and leaves no cycle
+READS_MAX = 8  # maximum number of expressions listed per process
+ALLOCATIONS = 50_000  # between collections, chosen: a gate allocates hundreds of objects and leaves no cycles
 
 
 @dataclass
@@ -34,11 +34,11 @@ class Membership:
     host: str  # that it runs on
     run_id: str
     next_seq: Callable[[str], int]  # returns the number of its next message of a kind, from 0
-    serves: tuple[str, ...] = ()  # names of processes whose work it does
-    period_ns: int = 0  # how often it says done; 0 for never
+    serves: tuple[str, ...] = ()  # names of the processes that it replaces
+    period_ns: int = 0  # interval of its dones; 0 for never
     slack_ns: int = 0  # by how much the world may be ahead of the dones of one without a period; 0 for any
     calculates: bool = True  # whether its results depend on its arithmetic; else it states no fingerprint
-    incarnation: int = 0  # a random number of the process; 0 where none is ever restarted
+    incarnation: int = 0  # random number of the process; 0 if processes are never restarted
 
     def join(self, t_ns: int = 0) -> Join:
         return Join(
@@ -68,7 +68,7 @@ class HealthMeter:
     """Counters of one process.
 
     Attributes:
-        received, refused, dropped: messages taken in, messages not decodable, and gates given up.
+        received, refused, dropped: messages received, undecodable messages, and gates stepped incomplete.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class HealthMeter:
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
-        """Tell whether health is due, once per wall second."""
+        """Whether health is due, once per wall second."""
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:

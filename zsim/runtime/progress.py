@@ -16,7 +16,7 @@ from rich.live import Live
 from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
-from zsim.contract.run_messages import Waiting, holding_up
+from zsim.contract.run_messages import Waiting, waiting_text
 from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
@@ -232,8 +232,5 @@ def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> st
         text += f"  {line['phase']}"
     if line["state"] != "running":
         text += f"  {line['state']}"
-    waiting = holding_up(line["state"], msgspec.convert(line["waiting_for"], list[Waiting]))
-    if waiting:
-        names = [f"{w.name}{w.host and f' on {w.host}'} ({w.since_wall_s:.1f} s)" for w in waiting[:4]]
-        text += f"  waiting for {', '.join(names)}{' …' if len(waiting) > 4 else ''}"
-    return text
+    waiting = waiting_text(line["state"], msgspec.convert(line["waiting_for"], list[Waiting]))
+    return f"{text}  {waiting}" if waiting else text

@@ -22,7 +22,7 @@ class RateLimit:
         self.period = period
         self._burst = burst
         self._now = now
-        self._spent: dict[str, tuple[float, float]] = {}  # what counted, and when
+        self._spent: dict[str, tuple[float, float]] = {}  # amount spent, and when
 
     def knows(self, subject: str) -> bool:
         return subject in self._spent

@@ -44,9 +44,7 @@ WORLD_DEATHS = ("restart", "end")  # `on_death` of the world; no other process c
 LIFT_SHARE_MAX = 0.9  # maximum weight over the rotors' maximum lift; the rest is left for control
 TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # minimum cosine of a roof's slope; maximum penetration by a drone on it
 UPON_COSINE = 0.5  # minimum cosine of the slope on which a drone may stand; chosen: steeper than 60 deg is a wall
-THRUST_SHARE_MIN = (
-    0.005  # minimum hover thrust over maximum lift; chosen: 0.07 in racers that lift 15 times their weight
-)
+THRUST_SHARE_MIN = 0.005  # minimum hover thrust over lift; chosen: racers that lift 15 times their weight have 0.07
 TILT_FREE_DEG = 30.0  # deg, allowed to any drone that is light enough to fly
 # Chosen, a decade or more beyond real drones, which take 60 (large rotors) to 400 W/kg (racers) for 3 min to 2 h
 HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors

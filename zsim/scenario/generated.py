@@ -1,11 +1,11 @@
 """Obstacles generated from a seed (forest, corridor) or read from files (point clouds, surfaces).
 
 They become entries of `environment.obstacles` when a scenario is resolved, so that the record contains each of them;
-surfaces get their triangles in place of the file. The same seed gives the same obstacles, rounded to a millimetre, on
+a surface's file is replaced with its triangles. The same seed gives the same obstacles, rounded to a millimetre, on
 every machine.
 
-Files: meshes (STL, OBJ, PLY), height maps (CSV, NPY), point clouds (PCD, PLY). Formats other than numbers in text are
-read by trimesh and pypcd4, of the extra `obstacles`.
+Files: meshes (STL, OBJ, PLY), height maps (CSV, NPY), point clouds (PCD, PLY). Mesh and
+point cloud formats need trimesh and pypcd4, from the extra `obstacles`.
 """
 
 import importlib
@@ -27,15 +27,15 @@ from zsim.scenario.surroundings import TRIANGLE, TRIANGLES_MAX, packed, unpacked
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, faults_in, show, sound
 
-TRIES_MAX = 500  # places for a trunk, after which the forest is taken for full; chosen
-BYTES_MAX = 100_000_000  # of a file
+TRIES_MAX = 500  # attempts to place a trunk before the forest counts as full; chosen
+BYTES_MAX = 100_000_000  # size of a file
 Entry = dict[str, Any]
 Array = NDArray[np.float64]
 _KINDS = {"forest": Forest, "corridor": Corridor, "cloud": Cloud}
 
 
 def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a raw document whose forest, corridor and cloud are obstacles, and whose surfaces are read; and faults."""
+    """Return a raw document with obstacles in place of forest, corridor and cloud, and surfaces read; and faults."""
     environment = document.get("environment")
     if not isinstance(environment, dict):
         return document, []
@@ -72,9 +72,9 @@ def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
 
 
 def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], where: str) -> list[Entry]:
-    """Return trunks at random places, each clear of the previous ones and of the drones' start positions.
+    """Return trunks at random positions, clear of each other and of the drones' start positions.
 
-    DocumentError if the areas or spans are not rising, or so many trunks do not fit.
+    DocumentError if limits are not ascending, or the trunks do not fit.
     """
     for name in ("radius_m", "height_m"):
         low, high = getattr(own, name)
@@ -118,7 +118,7 @@ def _corridor(own: Corridor, rng: np.random.Generator) -> list[Entry]:
     bends = [*zip(middles, headings, turns, strict=False), (middles[-1], headings[-1], 0.0)]
     entries: list[Entry] = []
     for side, off in (("left", 1.0), ("right", -1.0)):
-        corners = []  # of the middle line of the walls: on the bisector of each bend
+        corners = []  # of a wall's centre line, on the bisector of each bend
         for (x, y), heading, turn in bends:
             across, away = heading - 0.5 * turn, 0.5 * off * (own.width_m + own.wall_m) / el.cos(0.5 * turn)
             corners.append((x - away * el.sin(across), y + away * el.cos(across)))
@@ -137,18 +137,18 @@ def _corridor(own: Corridor, rng: np.random.Generator) -> list[Entry]:
 def _boxes(own: Cloud, where: str) -> list[Entry]:
     """Return boxes for the occupied cells of a point cloud, merged along z, then along x.
 
-    DocumentError if the file cannot be read, or makes too many boxes.
+    DocumentError if the file cannot be read, or yields too many boxes.
     """
     points = points_of(plugin.beside(own.file), f"{where}.file")
     cells, counts = np.unique(np.floor(points / own.cell_m).astype(np.int64), axis=0, return_counts=True)
-    runs: dict[tuple[int, int], list[list[int]]] = {}  # first and last z of each, by x and y
+    runs: dict[tuple[int, int], list[list[int]]] = {}  # first and last z of each run, by x and y
     for x, y, z in cells[counts >= own.points_min].tolist():
         column = runs.setdefault((x, y), [])
         if column and column[-1][1] == z - 1:
             column[-1][1] = z
         else:
             column.append([z, z])
-    rows: dict[tuple[int, int, int], list[list[int]]] = {}  # first and last x of each, by y and both z
+    rows: dict[tuple[int, int, int], list[list[int]]] = {}  # first and last x of each run, by y and both z
     for (x, y), column in sorted(runs.items()):
         for low, high in column:
             row = rows.setdefault((y, low, high), [])
@@ -171,7 +171,7 @@ def _boxes(own: Cloud, where: str) -> list[Entry]:
 
 
 def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
-    """Return the entries of `surfaces:` with triangles in place of files, and the faults of the files."""
+    """Return the entries of `surfaces:` with triangles in place of files, and the files' faults."""
     surfaces, wrong, count = [], [], 0
     for index, entry in enumerate(given):
         where, triangles = f"environment.surfaces[{index}]", None
@@ -201,10 +201,10 @@ def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
 
 
 def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
-    """Return the triangles of a mesh, or of a height map whose cells are `cell_m` wide, (T, 9): three corners each.
+    """Return the triangles (T, 9), three corners each, of a mesh or of a height map with cells of width `cell_m` [m].
 
-    A height map has a height [m] for every corner of its cells: row by row from south to north, its middle at the
-    origin; two triangles a cell.
+    A height map has a height [m] for every corner of its cells, row by row from south to north, centred at the origin;
+    each cell gives two triangles.
 
     Raises:
         DocumentError: the file cannot be read, or is not a mesh; one line that begins with `where`.
@@ -256,7 +256,7 @@ def points_of(path: Path, where: str) -> Array:
 
 
 def _numpy_grid(path: Path) -> Array:
-    return np.load(path).astype(float, casting="same_kind")  # no archive, no complex numbers, no texts
+    return np.load(path).astype(float, casting="same_kind")  # refuses archives, complex numbers and texts
 
 
 def _text_grid(path: Path) -> Array:
@@ -272,7 +272,7 @@ def _read(path: Path, where: str, read: Callable[[Path], Any]) -> Any:
         raise
     except ModuleNotFoundError as error:
         raise DocumentError([f"{where} is {show(str(path))}: {missing(error) or error}"]) from error
-    except Exception as error:  # whatever a reader of somebody else's file raises
+    except Exception as error:  # readers of foreign files raise any error
         _refuse(
             path, where, f"cannot be read ({str(error).splitlines()[0] if str(error) else type(error).__name__})", ""
         )

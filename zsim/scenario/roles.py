@@ -14,21 +14,21 @@ from zsim.errors import ScenarioError
 from zsim.scenario.scenario import OnDeath, OnOverdue, OwnAgent, Scenario
 from zsim.schema.checker import listed
 
-MAIN = "main"  # thing of an agent that is of the whole run
+MAIN = "main"  # second part of the name of an agent for the run
 OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
-PILOT = "reference"  # of a drone that has a reference of its own, not of every drone
+PILOT = "reference"  # only for drones with a reference of their own
 
 
 class Role(NamedTuple):
     """A role."""
 
-    extra: str  # of the distribution, that a host of it needs; empty for none
-    on_death: OnDeath  # what the death of a process means for a run where the scenario does not say
-    # what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent
+    extra: str  # extra of the distribution that its hosts need; empty if none
+    on_death: OnDeath  # default action on the death of a process
+    # scope of its processes, named ROLE.NAME after each drone or cluster; None for roles without an agent
     about: Literal["drone", "cluster", "run"] | None = None
-    agent: str = ""  # `package.module:Class` of the agent, made of world/info, scenario and name
-    joint: bool = False  # one agent may do the work of many, made of all their names
-    # what follows where it does not come back and the scenario does not say; `drop` where nothing waits
+    agent: str = ""  # `package.module:Class` of the agent, constructed from world/info, scenario and name
+    joint: bool = False  # whether one agent, given all their names, may replace many
+    # default action if it does not return; `drop` if the run does not wait for it
     on_overdue: OnOverdue = "end"
 
 
@@ -85,11 +85,11 @@ def programs(scenario: Scenario) -> list[str]:
 
 
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
-    """Return the action on the death of a process: the scenario's for it, else for its role, else the default.
+    """Return the action on the death of a process: the scenario's for it, for its role, or the default.
 
     Args:
         actions: actions of the scenario by process name or role.
-        role: role in the process's join; by default the beginning of its name.
+        role: role in the process's join; by default the first part of its name.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_death if role in ROLES else "drop"
@@ -99,7 +99,7 @@ def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None)
 def on_overdue(
     actions: Mapping[str, OnOverdue], name: str, role: str | None = None, gating: Collection[str] = ()
 ) -> OnOverdue:
-    """Return the action on a process that has not returned in time; arguments as for `on_death`.
+    """Return the action on an overdue process; arguments as for `on_death`.
 
     `gating`: roles other than agents for which the run waits.
     """
@@ -109,27 +109,27 @@ def on_overdue(
 
 
 def lets_drop(actions: Mapping[str, str], name: str) -> bool:
-    """Tell whether `on_death` or `on_overdue` explicitly lets a run continue without a process, without a failure."""
+    """Whether `on_death` or `on_overdue` explicitly lets a run continue without a process, not counted as a failure."""
     return (actions.get(name) or actions.get(name.partition(".")[0])) == "drop"
 
 
 def is_needed(name: str) -> bool:
-    """Tell whether a run needs a process of a role, unless the scenario says otherwise."""
+    """Whether by default a run cannot continue without a process."""
     role = ROLES.get(name.partition(".")[0])
     return role is not None and role.on_overdue == "end"
 
 
 def check_pace(scenario: Scenario, mode: str) -> None:
-    """Raise ScenarioError for external drones, which fly in wall time, in any mode other than realtime."""
+    """Raise ScenarioError if a mode other than realtime has external drones, which fly in wall time."""
     external = scenario.external()
     if external and mode != "realtime":
         who = f"{listed(external)} {'is' if len(external) == 1 else 'are'} external"
-        needed = "time passes there as on the wall: run it with --realtime, on processes of its own"
+        needed = "it flies in wall time: run with --realtime, in separate processes"
         raise ScenarioError([f"{scenario.name}: body of {who}, and the run is in {mode}; {needed}"])
 
 
 def check_alone(scenario: Scenario) -> None:
-    """Raise ScenarioError, with a line per field, for settings that a run in one process cannot have."""
+    """Raise ScenarioError, with a line per field, for settings that a run in one process does not support."""
     lines = []
     if scenario.gates("camera"):
         lines.append(
@@ -150,7 +150,7 @@ def drivers_of(scenario: Scenario) -> list[str]:
 
 
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
-    """Return a line on the drivers to start beside a run; none without external drones."""
+    """Return a line on the drivers to start with a run; empty without external drones."""
     drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
     awaited, others = (listed([d for d in drivers if (d in awaited_names) is wanted]) for wanted in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []
@@ -164,26 +164,26 @@ def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
 class Rights(NamedTuple):
     """Key expressions, without the federation."""
 
-    reads: tuple[str, ...] = ()  # what it may subscribe to
+    reads: tuple[str, ...] = ()  # subscriptions
     writes: tuple[str, ...] = ()
-    asks: tuple[str, ...] = ()  # what it may get; a get on a control key is a request
-    answers: tuple[str, ...] = ()  # what it may answer gets on
-    tokens: tuple[str, ...] = ()  # liveliness tokens that it may declare
-    watches: tuple[str, ...] = ()  # liveliness tokens that it may see
+    asks: tuple[str, ...] = ()  # gets; a get on a control key is a request
+    answers: tuple[str, ...] = ()  # answers to gets
+    tokens: tuple[str, ...] = ()  # liveliness tokens to declare
+    watches: tuple[str, ...] = ()  # liveliness tokens to watch
 
 
-EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # no wildcard takes a key that begins with @
+EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # wildcards do not match keys that begin with @
 ALL_RIGHTS = Rights(*[EVERYTHING] * len(Rights._fields))
 LAST_VALUES = tuple(key for key, topic in TOPICS.items() if topic.last)
 _READER = Rights(reads=("**", keys.BATCH), asks=LAST_VALUES, watches=(keys.token("*"),))
 
 
 def rights_for(process: str, scenario: Scenario) -> Rights:
-    """Return the rights of a process by its name, role.thing; there is one world and one recorder, without a thing.
+    """Return the rights of a process by its name, role.thing; the names of world and recorder are their roles alone.
 
-    A camera or detector that is not named after a drone serves all drones with cameras. A user's role named after a
+    A camera or detector that is not named after a drone serves all drones with cameras. A user's process named after a
     drone has the rights of its estimator, one named after a cluster those of its controller, which it may replace. Any
-    other role takes part, and reads the keys that all may read.
+    other process may take part, and read the keys that all may read.
     """
     role, _, thing = process.partition(".")
     if process == WORLD:
@@ -215,7 +215,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
     granted = [own]
     if about != "cluster" and thing in [drone.name for drone in scenario.drones]:
         sensed = [keys.gate(thing)]
-        if scenario.estimation.use_sightings is True:  # all that the drones of its cluster sense
+        if scenario.estimation.use_sightings is True:  # all sensors of its cluster's drones
             mates = next((cluster.drones for cluster in scenario.clusters if thing in cluster.drones), [thing])
             sensed.append(keys.GATE)
             for mate in mates:
@@ -231,7 +231,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
 
 
 def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
-    """Return the rights of an agent of a user's class: reading all but the truth, and commanding its own drones."""
+    """Return the rights of a user's agent: to read everything except the truth, and to command its own drones."""
     drones = [drone.name for drone in scenario.drones]
     of = {"drone": [thing], "run": drones}
     own = of.get(agent.per) or scenario.cluster(thing).drones
@@ -243,7 +243,7 @@ def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
 
 
 def _granted(role: str, **names: Sequence[str]) -> Rights:
-    """Return the rights of a role, by the messages of the contract, on the keys of some drones, clusters or processes.
+    """Return a role's rights from the contract's messages on the keys of some drones, clusters or processes.
 
     `names`: names of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
     """

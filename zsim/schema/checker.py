@@ -1,4 +1,4 @@
-"""All faults of a document against a typed description.
+"""Checks a document against a typed description and reports all faults.
 
 msgspec stops at the first fault; a user correcting a scenario needs all of them.
 """
@@ -18,21 +18,21 @@ from msgspec import inspect as types
 
 from zsim.errors import DocumentError
 
-SHOWN_MAX = 60  # characters of what was found that fit into a line
+SHOWN_MAX = 60  # characters of a value shown in an error
 FAULTS_MAX = 100  # lines; further faults are counted
-COUNTED_MAX = 10_000  # of further faults: a document of 1 MB can have many more, each of which takes time
-NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # of the representation only
+COUNTED_MAX = 10_000  # further faults counted: a document of 1 MB can have many more, and each takes time
+NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # limits of the representation
 
 Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the document itself is empty
 
 
 def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
-    """Yield the path and the fault of every place where `value` does not fit the type `description`."""
+    """Yield the path and text of every fault of `value` against the type `description`."""
     yield from _check(value, _type_info(description), path)
 
 
 def faults_in(error: DocumentError) -> list[Fault]:
-    """Return the faults whose path and text are the lines of an error."""
+    """Return the faults in the lines of an error."""
     return [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
 
 
@@ -41,7 +41,7 @@ def first_fault(value: Any, description: Any) -> Fault | None:
 
 
 def first_lines(lines: Iterable[str]) -> list[str]:
-    """Return the lines of the first faults, and one with the number of the rest."""
+    """Return the first FAULTS_MAX lines, and a line with the number of further ones."""
     rest = iter(lines)
     first = list(islice(rest, FAULTS_MAX))
     more = sum(1 for _ in islice(rest, COUNTED_MAX))
@@ -51,8 +51,8 @@ def first_lines(lines: Iterable[str]) -> list[str]:
 def sound(value: Any, description: Any) -> Any:
     """Return the sound parts of a faulty document.
 
-    Structs become namespaces with the same fields: as given, by default, or None if missing or faulty. Lists keep their
-    length. Valid values are returned unchanged.
+    Structs become namespaces with the same fields: given values, defaults, or None if missing or faulty. Lists keep
+    their length. Valid values are returned unchanged.
     """
     return _sound(value, _type_info(description))
 
@@ -64,7 +64,7 @@ def _type_info(description: Any) -> types.Type:
 
 def _check(value: Any, info: types.Type, path: str) -> Iterator[Fault]:
     if isinstance(info, types.Metadata):
-        description = (info.extra_json_schema or {}).get("description")  # in place of what the type says is allowed
+        description = (info.extra_json_schema or {}).get("description")  # replaces the text derived from the type
         if description is None:
             yield from _check(value, info.type, path)
         elif any(_check(value, info.type, path)):
@@ -139,7 +139,7 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
             and (info.le is None or value <= info.le)
         ):
             wide = whole and not -(2**63) <= value < 2**63
-            allowed = "a whole number of 63 bits and sign" if wide else _limits(info)
+            allowed = "a signed whole number of 64 bits" if wide else _limits(info)
     elif isinstance(info, types.LiteralType):
         allowed = _expected(info) if value not in info.values else None
     elif isinstance(info, types.BoolType | types.BytesType | types.StrType):
@@ -214,7 +214,7 @@ def suggestion(name: Any, known: Iterable[str]) -> str:
 
 
 def field_path(path: str, name: Any) -> str:
-    """Return the path of a field below another, on one printable line for any name."""
+    """Return the path of a field below another, printable on one line for any name."""
     text = str(name)
     text = text if text.isprintable() and len(text) <= SHOWN_MAX else show(text)
     return f"{path}.{text}" if path else text
@@ -226,14 +226,14 @@ def show(value: Any) -> str:
     try:
         text = repr(value) if isinstance(value, str | bytes | float) else _as_json(value)
     except ValueError:
-        text = "a number of more than 4300 digits"  # CPython refuses to write it
+        text = "a number of more than 4300 digits"  # CPython refuses to convert it
     except RecursionError:
         text = f"a {'map' if isinstance(value, dict) else 'list'} nested too deep"
     return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 3]}..."
 
 
 def _as_json(value: Any) -> str:
-    """Return maps and lists as in a file; NaN and infinities by name."""
+    """Return maps and lists as JSON, with NaN and infinities by name."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_as_json(key)}: {_as_json(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):

@@ -87,5 +87,5 @@ def bound(kind: Any, given: Any, where: str) -> Any:
 
 
 def has_parameters(kind: Callable[..., Any]) -> bool:
-    """Tell whether a class declares `Parameters`."""
+    """Whether a class declares `Parameters`."""
     return getattr(kind, "Parameters", None) is not None

@@ -1,11 +1,11 @@
 """User code named in a document: `package.module`, `package.module:Class` or `package.module:function`.
 
-A module is found as Python finds modules: installed beside zsim, or on PYTHONPATH. The folder of the document is
-searched last (`search`), so a module beside the scenario's file needs no installation on that machine, and hides
-nothing that is installed. On other hosts the module must be installed.
+Modules are found as usual in Python: installed, or on PYTHONPATH. The folder of the document is searched last
+(`search`), so a module in the scenario's folder needs no installation on that machine, and hides no installed module.
+On other hosts the module must be installed.
 
-Importing a module runs it: fly scenarios of others only if you trust their modules. Commands that only read documents
-look names up without importing anything (`names_only`).
+Importing a module runs it: fly other people's scenarios only if you trust their modules. Commands that only read
+documents look up names without importing anything (`names_only`).
 """
 
 import ast
@@ -33,12 +33,12 @@ from zsim.errors import PACKAGES, DocumentError, NotTrustedError, UserCodeError,
 from zsim.schema.checker import show
 
 Object = TypeVar("Object")
-FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
-IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, for the same reason, and what it then holds
-NO_LOOKUP = "unseen"  # or this
-WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
+FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes search there too
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value that forbids imports
+NO_LOOKUP = "unseen"  # value that also forbids looking up names
+WHERE = "install it, or put it on PYTHONPATH or in the scenario's folder"
 
-MADE = "zsim_own_"  # begins the names of modules made for what notebooks and scripts define: zsim_api.own_code
+MADE = "zsim_own_"  # prefix of modules generated for code in notebooks and scripts: zsim_api.own_code
 LIBRARIES = tuple(f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib"))
 
 MODULE_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z"
@@ -46,15 +46,15 @@ CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(*places: Path) -> None:
-    """Search modules in the folder of the present document, in this process and its child processes.
+    """Search for modules in the folder of the current document, in this process and its child processes.
 
-    It replaces the former folders, so that the environment of a program that reads many documents does not grow.
+    Former folders are replaced, so that the environment of a program that reads many documents does not grow.
 
     Args:
-        places: folders, that of the document first; missing ones are left out.
+        places: folders, that of the document first; missing ones are ignored.
     """
     found = dict.fromkeys(str(place.resolve()) for place in places if place.is_dir())
-    os.environ[FOLDERS] = json.dumps([*found])  # a name may hold any separator
+    os.environ[FOLDERS] = json.dumps([*found])  # a folder's name may contain any separator
 
 
 def folders() -> tuple[Path, ...]:
@@ -62,7 +62,7 @@ def folders() -> tuple[Path, ...]:
 
 
 def beside(name: str) -> Path:
-    """Return the path of a file named in a scenario: in the folders of its modules, or the working directory."""
+    """Return the path of a file named in a scenario: in the folders of its modules or the working directory."""
     places = [folder / name for folder in (*folders(), Path())]
     return next((place for place in places if place.is_file()), places[0])
 
@@ -73,10 +73,10 @@ def names_only(wanted: bool = True, looked_up: bool = True) -> Iterator[list[str
 
     Args:
         wanted: whether to prevent them.
-        looked_up: whether an unknown name is a fault, as it is with imports.
+        looked_up: whether an unknown name is a fault, as with imports.
 
     Yields:
-        names that were found and not imported, as in documents; empty if imports are allowed.
+        names in documents that were not imported; empty if imports are allowed.
     """
     former, _SKIPPED[:] = os.environ.get(IMPORTS), []
     if wanted:
@@ -97,12 +97,12 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
     """Return the class of a name `package.module:Class`.
 
     Args:
-        where: file and path of the field that names it, for the fault.
+        where: file and path of the field that names it, for the error.
         kind: class or Protocol whose public methods it must have.
-        is_constructed: whether its constructor is called as that of `kind`.
+        is_constructed: whether its constructor must take the arguments of that of `kind`.
 
     Raises:
-        DocumentError: there is no such module or class, or a method is missing or takes other arguments; one line.
+        DocumentError: the module or class does not exist, or a method is missing or takes other arguments; one line.
         NotTrustedError: it exists, but must not be imported.
     """
     loaded = _attribute(name, where, "Class", isclass)
@@ -126,7 +126,7 @@ def load_function(name: str, where: str) -> Callable[..., Any]:
 
 
 def load_any(name: str, where: str, kind: type) -> Any:
-    """Return the class, function or object of a kind named `package.module:Name`; errors as for `load`."""
+    """Return the class, function or instance of `kind` named `package.module:Name`; errors as for `load`."""
     return _attribute(name, where, "class", lambda found: callable(found) or isinstance(found, kind))
 
 
@@ -136,7 +136,7 @@ def load_module(name: str, where: str) -> ModuleType:
 
 
 def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Object:
-    """Return the object of a kind that a module `package.module` defines under a fixed name; errors as for `load`."""
+    """Return the instance of `kind` that a module `package.module` defines as `attribute`; errors as for `load`."""
     found = getattr(load_module(name, where), attribute, None)
     if not isinstance(found, kind):
         holds = f"whose {attribute} is {show(type(found).__name__)}" if found else f"which defines no {attribute}"
@@ -145,12 +145,12 @@ def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Ob
 
 
 def is_own(kind: type) -> bool:
-    """Tell whether a class is a user's."""
+    """Whether a class is a user's."""
     return kind.__module__.partition(".")[0] not in PACKAGES
 
 
 def is_library(path: str) -> bool:
-    """Tell whether a file belongs to Python or an installed package."""
+    """Whether a file belongs to Python or an installed package."""
     return path.startswith(LIBRARIES) or "site-packages" in path or "dist-packages" in path
 
 
@@ -159,24 +159,24 @@ def full_name(kind: type) -> str:
 
 
 RAISED = (Exception, SystemExit)
-"""What a user's code may raise. An exit ends a run as an exception does, or it would go unreported."""
+"""Exceptions of user code that end a run with an error; an exit would otherwise go unreported."""
 
 
 def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
-    """Return an exception of a user's code as an error that names class, method, file and line; None for others.
+    """Return an exception of user code as an error that names class, method, file and line; None for other exceptions.
 
     Args:
-        error: exception caught in zsim, where its traceback begins.
+        error: exception whose traceback begins in zsim, where it was caught.
         where: process and simulated time.
     """
     if isinstance(error, UserCodeError):
-        return UserCodeError(error.text, error.where or where)  # another one, to be raised from it
+        return UserCodeError(error.text, error.where or where)  # a new one, to be raised from it
     walked = list(walk_tb(error.__traceback__))
     frames = [(frame, line) for frame, line in walked if is_user_frame(frame)]
     if not frames:
         return None
     if isinstance(error, SystemExit) and walked[-1][0].f_globals.get("__name__", "").partition(".")[0] in PACKAGES:
-        return None  # the handler of a signal that came meanwhile
+        return None  # raised by a signal handler meanwhile
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -184,14 +184,14 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
 
 def innermost_line(frame: FrameType | None) -> str:
-    """Return file and line of the user's code executed by a frame, in parentheses; empty if there is none."""
+    """Return file and line of the innermost user code in a frame's stack, in parentheses; empty if there is none."""
     while frame and not is_user_frame(frame):
         frame = frame.f_back
     return f" ({_place(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
 
 
 def is_user_frame(frame: FrameType) -> bool:
-    """Tell whether a frame is in a user's file or notebook, or in an installed package named in a document."""
+    """Whether a frame is in a user's file or notebook, or in an installed package named in a document."""
     package, path = frame.f_globals.get("__name__", "").partition(".")[0], frame.f_code.co_filename
     if package in PACKAGES or (path.startswith("<") and package != "__main__"):
         return False
@@ -202,14 +202,14 @@ def numbers(returned: Any) -> NDArray[np.float64]:
     """Return a result of user code as an array; ValueError if it is not a regular array of real numbers."""
     array = np.asarray(returned)
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"no real numbers: {array.dtype}")
+        raise ValueError(f"not real numbers: {array.dtype}")
     return array.astype(float, copy=False)
 
 
 def raised_by_user(failure: UserCodeError) -> BaseException | None:
-    """Return what a user's code has raised, its traceback beginning with its own first line; None if it only returned.
+    """Return the exception raised by user code, with its traceback cut to begin there; None if no code raised.
 
-    Only for a failure that is caught: the traceback of what is returned is changed.
+    Only for a failure already caught: the traceback of the returned exception is changed.
     """
     raised: BaseException | None = failure
     while raised is not None:
@@ -230,15 +230,15 @@ def _place(path: str, line: int) -> str:
     cell = _CELL.fullmatch(path)
     if cell is None:
         return f"{path.removeprefix(f'{os.getcwd()}{os.sep}')}:{line}"
-    notebook = sys.modules.get("IPython")  # none in another process
+    notebook = sys.modules.get("IPython")  # absent in other processes
     shell = notebook.get_ipython() if notebook else None
     named = shell.compile.format_code_name(path) if shell else None
     number = f"In[{cell[1]}]" if cell[1] else named[1] if named else "of the notebook"
     return f"cell {number}, line {line}"
 
 
-_LOADED: set[str] = set()  # packages that documents have named
-_SKIPPED: list[str] = []  # what documents have named and was not imported
+_LOADED: set[str] = set()  # packages named in documents
+_SKIPPED: list[str] = []  # names in documents that were not imported
 
 
 def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool]) -> Any:
@@ -249,7 +249,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
     module = _imported(module_name, f"{where} is {show(name)}", attribute)
     found = getattr(module, attribute, None)
     if not is_kind(found):
-        if module_name.startswith(MADE):  # it was given in Python
+        if module_name.startswith(MADE):  # given as an object in Python
             raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name module:{kind}"])
         is_one = isfunction if kind == "function" else isclass
         own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
@@ -260,7 +260,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
 
 
 def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
-    """Import a module if allowed; else check that it exists and that its text defines the attribute."""
+    """Import a module if allowed; otherwise check that it exists and that its source defines the attribute."""
     package = name.partition(".")[0]
     if not may_import() and package not in PACKAGES:
         if os.environ[IMPORTS] != NO_LOOKUP:
@@ -268,7 +268,7 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
         full = f"{name}:{attribute}" if attribute else name
         if full not in _SKIPPED:
             _SKIPPED.append(full)
-        raise NotTrustedError([f"{what}, code of the document's own, which is imported only with --trust"])
+        raise NotTrustedError([f"{what}, code that comes with the document and is imported only with --trust"])
     _LOADED.add(package)
     for folder in map(str, folders()):
         if folder not in sys.path:
@@ -296,12 +296,12 @@ def located(name: str, what: str) -> ModuleSpec:
         if spec is None:
             reason = f"ModuleNotFoundError: No module named {part!r}"
             raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"])
-    assert spec is not None  # a name has a part
+    assert spec is not None  # every name has at least one part
     return spec
 
 
 def _find(name: str, what: str, attribute: str) -> None:
-    """Find a module without running it; DocumentError if it does not exist or its text does not bind the name."""
+    """Find a module without running it; DocumentError if it does not exist or its source does not bind the name."""
     spec = located(name, what)
     if not attribute or not (spec.origin or "").endswith(".py"):
         return
@@ -316,7 +316,7 @@ def _find(name: str, what: str, attribute: str) -> None:
 
 
 def _bound(body: ast.AST) -> set[str]:
-    """Return the names that the text of a module binds, also in branches; `*` for a star import."""
+    """Return the names that a module's source binds, also in branches; `*` for a star import."""
     names: set[str] = set()
     for node in ast.iter_child_nodes(body):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
@@ -337,10 +337,10 @@ def _imported_names(tree: ast.AST) -> set[str]:
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
-    """Return the parameters of a method and those expected, if it cannot be called as that of `kind`; else None."""
+    """Return the parameters of a method and those expected if it cannot be called like that of `kind`; else None."""
     wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
     if not (isfunction(wanted) and isfunction(own)) or wanted is own:
-        return None  # of a builtin, or bound in its own way
+        return None  # of a builtin, or a descriptor of another kind
     positional, required = Parameter.POSITIONAL_OR_KEYWORD, Parameter.empty
     parameters = signature(wanted).parameters.items()
     given = [name for name, each in parameters if each.default is required and each.kind is positional]

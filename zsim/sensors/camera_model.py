@@ -107,7 +107,7 @@ def distortion_slopes(lens: Lens, x: Number, y: Number) -> tuple[Number, Number,
 
 
 def folds(lens: Lens) -> bool:
-    """Tell whether the distortion folds the picture: some pixel has no ray of its own."""
+    """Whether the distortion folds the picture: some pixel has no ray of its own."""
     u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, FOLD_GRID) for side in (lens.width, lens.height)))
     with np.errstate(all="ignore"):
         x, y = undistorted(lens, u.ravel(), v.ravel())

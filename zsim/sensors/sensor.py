@@ -23,7 +23,7 @@ VALUES_MAX = 6  # numbers of one reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
 LatencyMs = Annotated[float, Meta(ge=0, le=10_000)]
 CorrelationS = Annotated[float, Meta(ge=0, le=1e6)]
-UNSENSED = ("text", "number[]")  # no field of a sensor's message: what it measures has a fixed number of numbers
+UNSENSED = ("text", "number[]")  # field types not allowed in a sensor's message, which has a fixed number of values
 
 
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -71,7 +71,7 @@ class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Sample(Message, frozen=True):
-    """The first fields of every sensor's message; `t_sample_ns` is the instant of the measurement."""
+    """The first fields of every sensor's message; `t_sample_ns` is the time of the measurement."""
 
     t_sample_ns: Whole
 
@@ -99,7 +99,7 @@ class Channel(Struct, frozen=True, omit_defaults=True):
 
 
 class SensorTruth(Struct, frozen=True):
-    """The truth at a sensor at one instant. W: world (east, north, up); B: body; S: sensor.
+    """The truth at a sensor at one time. W: world (east, north, up); B: body; S: sensor.
 
     Attributes:
         t_s: simulated time [s].

@@ -1,13 +1,14 @@
-"""The sensors of a drone: the stock ones in the contract's order, and a user's own by the modules that define them.
+"""The sensors of a drone: the stock ones in the contract's order, and users' sensors by the modules that define them.
 
-A scenario may give error models in the words and units of data sheets and of Kalibr; they are read into the fields of
-`zsim.sensors.sensor.ErrorModel`, which are in the channel's unit:
+A scenario may give error models with the names and units of data sheets and of Kalibr; they are converted to the
+fields of `zsim.sensors.sensor.ErrorModel`, in the channel's unit:
 
     imu: {accel_m_s2: {density_ug_sqrt_hz: 175}, gyro_deg_s: {bias_instability_deg_h: 2, correlation_s: 300}}
     imu: {accelerometer_noise_density: 0.0017, gyroscope_random_walk: 2.0e-5, update_rate: 200}
 
-White noise of density N is what an Allan deviation of slope -1/2 shows at 1 s, in the units of an angle or velocity
-random walk 60 N; a random walk K of the bias has slope +1/2 and K at 3 s (IEEE Std 952-1997, annex C). Kalibr's
+The density N of white noise is the Allan deviation at 1 s on the line of slope -1/2, or 60 N in the units of an angle
+or velocity random walk; a random walk K of the bias is that at 3 s on the line of slope +1/2 (IEEE Std 952-1997, annex
+C). Kalibr's
 `noise_density` and `random_walk` are these two in SI units (ethz-asl/kalibr, wiki, "IMU Noise Model").
 """
 
@@ -57,13 +58,13 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     front_camera: FrontCamera | UnsetType = UNSET
     bottom_camera: BottomCamera | UnsetType = UNSET
     sightings: SightingModel | UnsetType = UNSET
-    """What a detector makes of the cameras' pictures, without pictures: computed by the world."""
+    """The results of a detector in the cameras' pictures, computed by the world without pictures."""
     range: RangeConfig | UnsetType = UNSET
     lidar: LidarConfig | UnsetType = UNSET
     depth: DepthConfig | UnsetType = UNSET
     own: dict[str, dict[str, Any]] | UnsetType = UNSET
-    """A user's sensors, by name: settings with every field, `module` and `declared`. A file has them beside the
-    others, see `flattened`."""
+    """Users' sensors by name: settings with every field, `module` and `declared`. A file lists them among the other
+    sensors, see `flattened`."""
 
     def cameras(self) -> dict[str, Camera]:
         found = {name: getattr(self, f"{name}_camera") for name in CAMERAS}
@@ -95,9 +96,9 @@ PRESETS = {
 }
 AS_PRINTED = {"imu": stock_sensors.IMU_AS_PRINTED}
 
-MODULE, DECLARED = "module", "declared"  # what the section of a user's sensor says beside its settings
+MODULE, DECLARED = "module", "declared"  # keys of a user's sensor, in addition to its settings
 FIELDS = tuple(name for name in Sensors.__struct_fields__ if name != "own")
-RESERVED = ("status", "truth", "own", "accel", "gyro", "rotor", "link", "process")  # of keys and of faults' kinds
+RESERVED = ("status", "truth", "own", "accel", "gyro", "rotor", "link", "process")  # used in keys and fault kinds
 NAME = r"[a-z][a-z0-9_]{0,31}"
 NAME_ALLOWED = f"a letter and up to 31 of a-z 0-9 _, none of {', '.join(RESERVED)}"
 
@@ -107,12 +108,12 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
     """Return the SENSOR of a user's module.
 
     Raises:
-        DocumentError: there is none, or it is inconsistent; one line.
+        DocumentError: the module defines no SENSOR, or an inconsistent one; one line.
     """
     sensor = plugin.load_object(module_name, where, "SENSOR", SensorType)
     try:
         _check(sensor)
-    except (NameError, TypeError, ValueError) as error:  # a name in an annotation that is nowhere at run time
+    except (NameError, TypeError, ValueError) as error:  # NameError: an annotation undefined at run time
         raise DocumentError([f"{where} is {show(module_name)}: SENSOR.{error}"]) from error
     return sensor
 
@@ -124,7 +125,7 @@ def _check(sensor: SensorType) -> None:
             raise TypeError(f"{part} is {show(str(kind))}; must be a subclass of {base.__name__}")
     shared, own = (get_type_hints(kind, include_extras=True) for kind in (Sensor, sensor.settings))
     for name, kind in shared.items():
-        if own[name] != kind:  # the limits of the settings that all sensors share would be lost
+        if own[name] != kind:  # the limits of the shared settings would be lost
             what = f"settings: {sensor.settings.__name__}.{name} has a type of its own"
             raise TypeError(f"{what}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
     fields = Declaration.of(sensor).fields
@@ -150,8 +151,8 @@ def separate(
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], list[Fault]]:
     """Return a `sensors:` section without users' sensors, the users' sensors with all settings, and their faults.
 
-    A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports` any other
-    is a fault; one that must not be imported (`plugin.names_only`) is left out.
+    A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports`, any
+    other is a fault; one that must not be imported (`plugin.names_only`) is omitted.
     """
     rest = {name: value for name, value in section.items() if name in FIELDS}
     own: dict[str, dict[str, Any]] = {}
@@ -180,13 +181,13 @@ def separate(
 
 
 def flattened(sensors: dict[str, Any]) -> dict[str, Any]:
-    """Return a resolved `sensors:` section in the form of a file: users' sensors beside the others."""
+    """Return a resolved `sensors:` section as in a file, with users' sensors among the others."""
     rest = {name: value for name, value in sensors.items() if name != "own"}
     return rest | sensors.get("own", {})
 
 
 def declarations(drones: Any) -> dict[str, Declaration]:
-    """Return the declarations of the users' sensors of a scenario's drones, by name, sorted."""
+    """Return the declarations of users' sensors on a scenario's drones, sorted by name."""
     sections: dict[str, dict[str, Any]] = {}
     for drone in drones:
         sections = own_sections(drone) | sections
@@ -194,13 +195,13 @@ def declarations(drones: Any) -> dict[str, Declaration]:
 
 
 def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
-    """Return the sound sections of the users' sensors of a drone."""
+    """Return the sections of a drone's user sensors; empty if they are faulty."""
     own = drone.sensors.own if drone.sensors is not None else None
     return own if isinstance(own, dict) else {}
 
 
 def sensor_names(sensors: Any) -> list[str]:
-    """Return the names of the sensors of a drone with this section, as far as it is sound."""
+    """Return the names of the sensors in the sound part of a drone's `sensors:` section."""
     optional = [name for name in ("sightings", *SCANNERS) if getattr(sensors, name)]
     return [*STOCK, *optional, *(sensors.own or ())]
 
@@ -235,7 +236,7 @@ def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterat
 
 
 def _plain(value: Struct) -> dict[str, Any]:
-    """Return a struct in the form of a file: maps, lists, texts and numbers."""
+    """Return a struct as plain maps, lists, texts and numbers."""
     return msgspec.json.decode(msgspec.json.encode(value))
 
 
@@ -243,11 +244,11 @@ class Unit(NamedTuple):
     """A field of the error model in another unit."""
 
     field: str
-    factor: float  # the field in the channel's unit, for one of this
+    factor: float  # value in the channel's unit per value in this unit
 
 
-EVERY = {"noise_density": Unit("density", 1.0), "random_walk": Unit("bias_walk", 1.0)}  # of channels in SI units, or uT
-BY_UNIT: dict[str, dict[str, Unit]] = {  # by the unit of the channel
+EVERY = {"noise_density": Unit("density", 1.0), "random_walk": Unit("bias_walk", 1.0)}  # for channels in SI units or uT
+BY_UNIT: dict[str, dict[str, Unit]] = {  # by the channel's unit
     "m/s^2": {
         **EVERY,
         "density_ug_sqrt_hz": Unit("density", 1e-6 * G_M_S2),
@@ -268,7 +269,7 @@ BY_UNIT: dict[str, dict[str, Unit]] = {  # by the unit of the channel
     "m": EVERY,
     "m/s": EVERY,
 }
-KALIBR = {  # keys of Kalibr's imu.yaml, by the path in the section of the IMU
+KALIBR = {  # paths in the IMU's section, by key in Kalibr's imu.yaml
     "accelerometer_noise_density": ("accel_m_s2", "noise_density"),
     "accelerometer_random_walk": ("accel_m_s2", "random_walk"),
     "gyroscope_noise_density": ("gyro_deg_s", "noise_density"),
@@ -281,7 +282,7 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
     """Return a `sensors:` section with its error models converted to the fields of ErrorModel, and the faults.
 
     Args:
-        sensors: by name; what is no map, and a user's own sensors, are returned as they are.
+        sensors: by name; users' sensors, and values that are not maps, are returned unchanged.
         where: path of the section.
     """
     wrong: list[Fault] = []
@@ -323,7 +324,7 @@ def _in_unit(model: dict[str, Any], units: dict[str, Unit], where: str, wrong: l
         if key in model:
             found = [*faults(model[key], NonNegative, f"{where}.{key}")]
             if unit.field in read:
-                text = f"says what another of the fields for {unit.field} says; must be the only one"
+                text = f"is given beside another field for {unit.field}; must be the only one"
                 found.append((f"{where}.{key}", text))
             wrong += found
             if not found:

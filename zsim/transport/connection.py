@@ -18,24 +18,24 @@ from zsim.transport.session import Query, Session, config_of, open_session
 from zsim.transport.tls import Identity, Permissions, permissions_of
 from zsim.transport.zenoh_settings import Mode, Settings
 
-ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
-PAUSE_S = 0.1  # between two queries to a hub where no world answers: another federation's, or one that is starting
-ANSWER_S = 1.0  # a hub that is there answers within milliseconds, unless it still compiles
+ATTEMPT_S = 1.0  # one attempt to connect, so that waiting can be reported and interrupted
+PAUSE_S = 0.1  # between queries to a hub without a world's answer: another federation's, or one that is starting
+ANSWER_S = 1.0  # a hub answers within milliseconds, unless it is still compiling
 _OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
-_OTHER = "another is given by --listen, and to the other commands by --connect"
+_OTHER = "give another with --listen, and with --connect to the other commands"
 _LISTEN_FAULTS = {  # by errno
     errno.EADDRINUSE: f"another process listens there; {_OTHER}",
     errno.EADDRNOTAVAIL: f"that is no address of this machine (`ip address` lists them); {_OTHER}",
     errno.EACCES: f"this user may not open it; ports below 1024 need root; {_OTHER}",
     errno.EPERM: f"this process may not open it; {_OTHER}",
     errno.EINVAL: f"the address lacks its network interface, as in tcp/[fe80::1%eth0]:7447; {_OTHER}",
-    errno.ENODEV: "there is no such network interface, of those that `ip address` shows",
-    errno.EMFILE: "this process has too many files open; allow more by `ulimit -n`",
+    errno.ENODEV: "this machine has no such network interface; `ip address` lists them",
+    errno.EMFILE: "this process has too many files open; allow more with `ulimit -n`",
     errno.ENFILE: "this machine has too many files open; end other programs, or raise fs.file-max",
     errno.EAFNOSUPPORT: f"this machine has no addresses of that kind (IPv6 is off); {_OTHER}",
     errno.ENOMEM: "this machine has too little memory left",
 }
-_LISTEN_TEXTS = {  # of Zenoh, where the system has no number
+_LISTEN_TEXTS = {  # parts of Zenoh's errors without an errno
     "lookup address": f"the name is not known on this machine; {_OTHER}",
     "invalid port": f"the port must be from 1 to 65535; {_OTHER}",
 }
@@ -47,7 +47,7 @@ def listen(
 ) -> Iterator[Session]:
     """Open the hub: a listening router, of which every other role is a client.
 
-    A peer would suffice for clients, but does not forward between two routers connected to it. SessionError if an
+    A peer would suffice for clients, but does not forward between routers connected to it. SessionError if an
     endpoint is in use or malformed, or the identity is unusable.
     """
     with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub(mode)) as session:
@@ -70,16 +70,16 @@ def route(
 def connect(
     endpoint: str,  # e.g. "tcp/192.168.1.2:7447"
     federation: str,
-    mode: Mode = "lockstep",  # of the run, if it is known already
+    mode: Mode = "lockstep",  # of the run, if known
     wait_s: float | None = None,  # how long to try; None tries once
-    # whether it never gates; then a silence of LEASE_READER_MS counts as its death, in lockstep too
+    # whether the run never waits for it; then a silence of LEASE_READER_MS counts as its death, in lockstep too
     reader: bool = False,
     identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
 ) -> Iterator[Session]:
     """Open a client of the hub (or of a router).
 
     Raises:
-        SessionError: no process listens there within `wait_s`, or a certificate, here or there, is refused.
+        SessionError: no process listens there within `wait_s`, or one side refuses the other's certificate.
     """
     identity = identity or Identity()
     client = zenoh_settings.connecting(endpoint, identity, wait_s or 0.5)
@@ -117,7 +117,7 @@ def _listening(
 
 
 def no_listening(endpoints: Sequence[str], error: str) -> str:
-    """Return why listening on endpoints fails, and the remedy; `error` is Zenoh's text."""
+    """Return the reason why listening on endpoints failed, and the remedy; `error` is Zenoh's text."""
     found = _OS_ERROR.search(error)
     why = _LISTEN_FAULTS.get(int(found[1]) if found else 0)
     if why is None:
@@ -130,11 +130,11 @@ def no_listening(endpoints: Sequence[str], error: str) -> str:
 def find_world(
     endpoint: str,  # see `connect`
     federation: str,
-    wait_s: float | None = None,  # how long to wait for a world; None waits for ever
-    say: Callable[[str], None] = lambda text: None,  # called at growing intervals with what is waited for
-    stopped: Callable[[], bool] = lambda: False,  # tells whether to wait no longer
+    wait_s: float | None = None,  # how long to wait for a world; None: forever
+    say: Callable[[str], None] = lambda text: None,  # called at growing intervals while waiting
+    stopped: Callable[[], bool] = lambda: False,  # whether to stop waiting
     reader: bool = False,
-    run_id: str | None = None,  # of the only run to take part in; None takes any
+    run_id: str | None = None,  # of the only acceptable run; None: any
     identity: Identity | None = None,
 ) -> Iterator[tuple[Session, messages.Info]]:
     """Yield a session and the `world/info` of its run.
@@ -168,7 +168,7 @@ def find_world(
                 time.sleep(PAUSE_S)
             except SessionError as error:
                 if "nobody listens" not in str(error) or "not supported" in str(error):
-                    raise  # no waiting mends it
+                    raise  # waiting would not help
             if waited_s >= limit_s:
                 why = _no_answer(link, identity) if link is not None else _no_link(endpoint)
                 raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")
@@ -191,12 +191,12 @@ def _no_answer(link: Session, identity: Identity | None) -> str:
         return f"{may_be}; correct --federation, or wait longer"
     return (
         f"{may_be}, or we are refused or not allowed here; correct --federation, wait longer, "
-        "or let us in with `zsim certs init --operator` and start the world again"
+        "or admit us with `zsim certs init --operator` and start the world again"
     )
 
 
 def _no_link(endpoint: str) -> str:
-    """Return why there is no session; a port that accepts connections may use another protocol, or TLS."""
+    """Return why no session opened; a port that accepts connections may use TLS or another protocol."""
     nobody = "; start one with `zsim world`"
     protocol, _, place = endpoint.partition("/")
     if protocol != "tcp":
@@ -206,11 +206,11 @@ def _no_link(endpoint: str) -> str:
         socket.create_connection((host.strip("[]"), int(port)), ANSWER_S).close()
     except (OSError, OverflowError, ValueError):
         return nobody
-    return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"
+    return ", but the process that listens there refuses us; for a world with TLS, use tls/ and --tls FOLDER"
 
 
 def read_permissions(link: Session) -> Permissions | None:
-    """Return our permissions under access control at the other end, None without an answer.
+    """Return our permissions under access control at the other end; None without an answer.
 
     SessionError if this process is not admitted.
     """
@@ -223,7 +223,7 @@ def read_permissions(link: Session) -> Permissions | None:
 
 
 def read_info(link: Session) -> messages.Info | None:
-    """Return the `world/info` answered by the hub, None without an answer."""
+    """Return the `world/info` answered by the hub; None without an answer."""
     for sample in link.get(keys.INFO, timeout_s=ANSWER_S):
         try:
             return messages.decode(keys.INFO, sample.payload)

@@ -1,8 +1,8 @@
 """Limits the backlog of the hub's links: a stalled reader that the run does not wait for loses its link.
 
 On a full link Zenoh either drops messages or blocks the sender, and with it the run, for all readers of a key alike.
-Participants must lose nothing, so everything blocks; a reader that the run does not wait for is therefore disconnected
-before its link is full, and immediately if it reconnects and stalls again.
+Participants must lose nothing, so all messages block; a reader that the run does not wait for is therefore disconnected
+before its link is full, and kept out for a while if it reconnects and stalls repeatedly.
 
 Order of this file: the watch, the sessions of each process, the TCP connections of this process, and the local
 processes at their far ends.
@@ -29,28 +29,28 @@ if sys.platform == "linux":
     import fcntl
     import termios
 
-LOOK_S = 0.05  # wall time between two looks
-# Zenoh's thread that closes links is also the one that passes on what participants publish. Once that is blocked by a
-# full link, the link stays for HUB_CLOSE_AFTER_US: so it has to be closed before, while the kernel still takes more.
-STALL_BYTES = 1 << 16  # unacknowledged, from which on a link is looked at; the kernel takes 0.4 MB at least (measured)
-STALL_S = 0.1  # wall time in which a far end that lives acknowledges something, beside …
-ROUND_TRIPS = 3.0  # … so many of its round trips
-HELD_BYTES, HELD_S = 1 << 20, 1.0  # one that takes something all the time, but never catches up
-FRESH_S = 0.2  # between two looks at who is at which far end
-SPARED, SPARED_S = 3, 60.0  # times within so long that the link of a session is closed before it is kept out …
-KEPT_OUT_S = 30.0  # … for so long
-TOLD_S = 10.0  # between two reports of one session
+LOOK_S = 0.05  # wall time between checks
+# The Zenoh thread that closes links also forwards the participants' messages. Once a full link blocks it, that link
+# stays for HUB_CLOSE_AFTER_US: so it must be closed earlier, while the kernel still accepts data.
+STALL_BYTES = 1 << 16  # unacknowledged bytes from which a link is watched; the kernel accepts 0.4 MB or more (measured)
+STALL_S = 0.1  # wall time within which a live far end acknowledges something, in addition to …
+ROUND_TRIPS = 3.0  # … this many of its round trips
+HELD_BYTES, HELD_S = 1 << 20, 1.0  # limits for a reader that keeps reading, but never catches up
+FRESH_S = 0.2  # wall time between updates of the sessions at the far ends
+SPARED, SPARED_S = 3, 60.0  # a session whose links are closed this often within this time is kept out …
+KEPT_OUT_S = 30.0  # … for this time
+TOLD_S = 10.0  # wall time between reports on one session
 
 OWN_FILES = "/proc/self/fd"
 TCP_INFO = struct.Struct("68xI48xQ")  # tcpi_rtt [µs] and tcpi_bytes_acked in struct tcp_info, linux/tcp.h
 RESET, IN_BACKGROUND = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)  # struct linger, socket(7)
-QUEUED = struct.Struct("i")  # of SIOCOUTQ, linux/sockios.h: bytes that the far end has not acknowledged
+QUEUED = struct.Struct("i")  # result of SIOCOUTQ, linux/sockios.h: unacknowledged bytes
 TABLES = ("/proc/net/tcp", "/proc/net/tcp6")
-COMMAND_MAX = 80  # characters of a command line that are shown
+COMMAND_MAX = 80  # characters shown of a command line
 
 
 class Awaited(NamedTuple):
-    """A process that the run waits for: its name and those whose work it does, and the pid in its join."""
+    """A process that the run waits for: its name and those of the processes it replaces, and the pid in its join."""
 
     names: tuple[str, ...]
     pid: int
@@ -60,15 +60,15 @@ class ClosedLink(NamedTuple):
     """A link that was closed."""
 
     address: str  # of its far end
-    process: str  # at that end, by pid and command, if it is on this machine
-    names: tuple[str, ...]  # of the processes that its session stands for
-    held_bytes: int  # in the kernel
-    times: int  # that a link of its session was closed so far
+    process: str  # pid and command of the process there, if on this machine
+    names: tuple[str, ...]  # of the processes with its session
+    held_bytes: int  # in the kernel's send queue
+    times: int  # how often links of its session have been closed
 
 
 @dataclass
 class _Backlog:
-    """The backlog of a link: since when nothing is acknowledged, and since when there is too much."""
+    """The backlog of a link: bytes acknowledged, and wall times of the last progress and of the last low backlog."""
 
     acknowledged: int
     moved_s: float
@@ -76,13 +76,13 @@ class _Backlog:
 
 
 class LinkWatch:
-    """Watches the links of the hub, in a separate thread while the context is entered."""
+    """Watches the links of the hub in a separate thread; a context manager."""
 
     def __init__(
         self,
         link: Session,
         tokens: "SessionTokens",
-        awaited: Callable[[], list[Awaited]],  # returns the participants that must not lose anything
+        awaited: Callable[[], list[Awaited]],  # returns the participants, which must lose nothing
         sockets: "LinkSockets | None" = None,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -94,12 +94,12 @@ class LinkWatch:
         self._backlogs: dict[str, _Backlog] = {}
         self._far_ends: dict[str, FarEnd] = {}
         self._refreshed_s = -FRESH_S
-        self._times: dict[str, list[float]] = {}  # at which links of a session were closed
-        self._told_s: dict[str, float] = {}  # when a link of a session was last reported
+        self._times: dict[str, list[float]] = {}  # wall times at which links were closed, by session
+        self._told_s: dict[str, float] = {}  # wall time of the last report, by session
         self._kept_out_s: dict[str, float] = {}
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="links", daemon=True)
-        # links that were closed, in order, one of a session in TOLD_S; to be taken from it
+        # links closed, oldest first, at most one per session in TOLD_S; consumed by the caller
         self.closed: deque[ClosedLink] = deque()
 
     def __enter__(self) -> "LinkWatch":
@@ -115,7 +115,7 @@ class LinkWatch:
             self.look()
 
     def look(self) -> None:
-        """Check all links once, and close stalled ones."""
+        """Check all links once, and close stalled ones that the run does not wait for."""
         now_s, queued = self._wall_s(), self._sockets.queued()
         self._backlogs = {address: self._backlogs[address] for address in queued if address in self._backlogs}
         for address, held_bytes in queued.items():
@@ -130,12 +130,12 @@ class LinkWatch:
         for address in sorted(standing, key=lambda address: -queued.get(address, 0)):
             far = self._far_ends.get(address)
             names = self._tokens.processes(far.session) if far else ()
-            who = " ".join(names) or ("a router" if far and far.is_router else "somebody")
+            who = " ".join(names) or ("a router" if far and far.is_router else "an unknown process")
             lines.append(f"{who} at {address}")
         return lines
 
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:
-        """Tell whether a link acknowledges nothing, or never catches up."""
+        """Whether a link acknowledges nothing, or never catches up."""
         if held_bytes < STALL_BYTES:
             self._backlogs.pop(address, None)
             return False
@@ -161,7 +161,7 @@ class LinkWatch:
         return self._far_ends.get(address)
 
     def _judge(self, address: str, held_bytes: int, now_s: float) -> None:
-        """Close a link, unless a participant that must lose nothing is or may be behind it."""
+        """Close a link unless a participant is, or may be, at its far end."""
         far, inode = self._far_end(address, now_s), local_socket(address)
         if far is None or far.is_router:
             return
@@ -169,7 +169,7 @@ class LinkWatch:
         if any(name in each.names for each in awaited for name in names):
             return
         pid = owner(inode)
-        if not names:  # then it is known by its pid at best
+        if not names:  # without tokens, only its pid may identify it
             unknown = [each.pid for each in awaited if not any(map(self._tokens.sessions, each.names))]
             if int(pid) in unknown if pid else unknown:
                 return
@@ -179,20 +179,20 @@ class LinkWatch:
         times.append(now_s)
         if len(times) >= SPARED and now_s - times[-SPARED] < SPARED_S:
             self._kept_out_s[far.session] = now_s + KEPT_OUT_S
-        # a link that held nothing back, as of a session that is kept out, is not worth a report
+        # a link without a backlog, such as that of a session kept out, is not reported
         if held_bytes >= STALL_BYTES and now_s - self._told_s.get(far.session, -TOLD_S) >= TOLD_S:
             self._told_s[far.session] = now_s
             self.closed.append(ClosedLink(address, command(pid), names, held_bytes, len(times)))
 
 
-Sessions = frozenset[str]  # by Zenoh's names of them: hexadecimal digits
+Sessions = frozenset[str]  # Zenoh's identifiers, in hexadecimal
 
 
 class SessionTokens:
     """The sessions of each process, known by liveliness tokens and updated in threads of Zenoh.
 
-    A token `process/{p}` shows that a process lives, but not its session: Zenoh does not name the holder, and a query
-    of its admin space, which does, can block a router for good (eclipse-zenoh/zenoh#2619). So each process also
+    A token `process/{p}` shows that a process is alive, but not its session: Zenoh does not name the holder, and a
+    query of its admin space, which does, can block a router forever (eclipse-zenoh/zenoh#2619). So each process also
     declares `process/{p}/session/{session}`.
     """
 
@@ -202,7 +202,7 @@ class SessionTokens:
         self._alive: set[str] = set()
 
     def watch(self) -> None:
-        """Follow the tokens from now on; existing ones are known immediately."""
+        """Follow the tokens from now on, including existing ones."""
         self._link.on_token(keys.token("**"), self._on_token)
 
     def sessions(self, process: str) -> Sessions:
@@ -213,7 +213,7 @@ class SessionTokens:
         return list(self._sessions)
 
     def is_alive(self, process: str) -> bool:
-        """Tell whether any session has a token of a process."""
+        """Whether any session holds a token of a process."""
         return process in self._alive or process in self._sessions
 
     def processes(self, session: str) -> tuple[str, ...]:
@@ -244,11 +244,11 @@ class LinkSockets:
 
     Zenoh does not expose them, and lets sockets linger for 10 s when it closes them itself, such as that of a stopped
     process in realtime; this blocks the thread that also forwards messages. So lingering is disabled on every socket
-    found here. Only Linux lists connections; elsewhere there are none.
+    found here. Connections are only found on Linux.
     """
 
     def __init__(self) -> None:
-        self._far: dict[tuple[int, int], str] = {}  # address by file and inode; empty for what is no connection
+        self._far: dict[tuple[int, int], str] = {}  # address by file and inode; empty if not a connection
 
     def queued(self) -> dict[str, int]:
         """Return the bytes in the kernel's send queue of each far end."""
@@ -274,7 +274,7 @@ class LinkSockets:
             connection.shutdown(socket.SHUT_RDWR)
 
     def _open(self, address: str) -> socket.socket:
-        """Return a duplicate socket of a connection; OSError if it is gone."""
+        """Return a duplicate of a connection's socket; OSError if it is gone."""
         for file, far in self._connections().items():
             if far == address:
                 duplicate = socket.socket(fileno=os.dup(file))
@@ -284,7 +284,7 @@ class LinkSockets:
         raise OSError(f"{address}: no connection")
 
     def _connections(self) -> dict[int, str]:
-        """Return the far end of each TCP connection by its file, and disable lingering on all of them."""
+        """Return the address of each TCP connection's far end by file, and disable lingering on all of them."""
         far: dict[tuple[int, int], str] = {}
         for name in os.listdir(OWN_FILES):
             with suppress(OSError):
@@ -303,22 +303,22 @@ class LinkSockets:
 
 
 def _far_end(connection: socket.socket) -> str:
-    """Return the far end of a TCP connection as Zenoh writes it, empty for any other socket."""
+    """Return the far end of a TCP connection in Zenoh's notation; empty for any other socket."""
     if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.type != socket.SOCK_STREAM:
         return ""
     try:
         host, port, *_ = connection.getpeername()
     except OSError:
-        return ""  # it listens
+        return ""  # a listening socket
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def local_socket(address: str) -> str:
-    """Return the inode of the socket whose end has an address; empty if it is not on this machine, or not on Linux."""
+    """Return the inode of the local socket bound to an address; empty if it is on another machine, or not on Linux."""
     host, _, port = address.rpartition(":")
     host = host.strip("[]")
     packed = socket.inet_pton(socket.AF_INET6 if ":" in host else socket.AF_INET, host)
-    words = struct.unpack(f"={len(packed) // 4}I", packed)  # as the tables have it: 32-bit words in the machine's order
+    words = struct.unpack(f"={len(packed) // 4}I", packed)  # as in the tables: 32-bit words in the machine's order
     end = "".join(f"{word:08X}" for word in words) + f":{int(port):04X}"
     for table in TABLES:
         with suppress(OSError), open(table, encoding="ascii") as lines:
@@ -330,7 +330,7 @@ def local_socket(address: str) -> str:
 
 
 def owner(inode: str) -> str:
-    """Return the pid of the process that has a socket open; empty if there is none or it is not accessible."""
+    """Return the pid of the process with a socket open; empty if there is none, or it is not accessible."""
     for pid in filter(str.isdigit, os.listdir("/proc")) if inode else ():
         with suppress(OSError), os.scandir(f"/proc/{pid}/fd") as files:
             for file in files:
@@ -341,7 +341,7 @@ def owner(inode: str) -> str:
 
 
 def command(pid: str) -> str:
-    """Return pid and command of a process; empty without a pid."""
+    """Return the pid and command of a process for reports; empty without a pid."""
     if not pid:
         return ""
     with suppress(OSError):

@@ -1,10 +1,10 @@
 """The identity of a process on the network, diagnosis of failed TLS links, and the permissions of a certificate.
 
-Zenoh reports only that it could not connect. Python's ssl repeats the handshake with the same files and reports the
+Zenoh reports only that it could not connect. Repeating the handshake with Python's ssl and the same files reveals the
 reason. Dates are checked here, so that the error can name an expired certificate.
 
 Zenoh silently drops messages that access control does not permit. So a listening process answers a get on
-`@access/NAME` with `Permissions` to every client with a certificate of its authority, and the client raises an error
+`@access/NAME` with `Permissions` for every client with a certificate of its authority, and the client raises an error
 instead of sending.
 """
 
@@ -21,36 +21,36 @@ from typing import Any, Literal, NamedTuple
 from msgspec import Struct
 
 CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # in a folder of `zsim certs init`
-DAYS = 30.0  # how long a certificate is good for, as it lies on its host
-PROBE_S = 2.0  # of one step of the handshake; a process that listens and is not frozen answers within milliseconds
-LATE_S = 1.0  # in TLS 1.3 a server judges the client's certificate after the client thinks that all is well
+DAYS = 30.0  # validity of a certificate
+PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answers within milliseconds
+LATE_S = 1.0  # in TLS 1.3 a server checks the client's certificate after the client has finished
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
-NETWORKED = ("tcp", "udp", "ws")  # of what Zenoh's wheel has without encryption; the others stay on the machine
+NETWORKED = ("tcp", "udp", "ws")  # unencrypted protocols in Zenoh's wheel that leave the machine
 MEND = "make new ones with zsim certs init"
 RENEW = f"{MEND} --renew"
 ADDRESS_MEND = f"name that in the hosts file and {MEND}, or connect to another address"
 Act = Literal["publish", "read", "ask"]
-MESSAGES: dict[Act, str] = {"publish": "put", "read": "declare_subscriber", "ask": "query"}  # Zenoh's, by act
-SHOWN_MAX = 4  # names or expressions in a line
-OTHER_CERTIFICATE = "take that of a process that may, or of an operator (zsim certs init --operator NAME)"
+MESSAGES: dict[Act, str] = {"publish": "put", "read": "declare_subscriber", "ask": "query"}  # Zenoh's names
+SHOWN_MAX = 4  # names or expressions shown in a line
+OTHER_CERTIFICATE = "use that of a process that may, or of an operator (zsim certs init --operator NAME)"
 
 _ENDPOINT = re.compile(r"(?:tls|quic)/\[?(?P<host>[^\]]*?)\]?:(?P<port>\d+)(?:[?#].*)?")
-_UNRELATED = (18, 19, 20, 21)  # X509_V_ERR_ self-signed, self-signed in chain, no issuer here, signature unverified
+_UNRELATED = (18, 19, 20, 21)  # X509_V_ERR_: self-signed, self-signed in chain, no local issuer, unverified signature
 _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
 
 
 class Identity(NamedTuple):
     """The identity of a process: its host, its certificate, and the processes that it admits."""
 
-    host: str = socket.gethostname()  # the name that its messages give
-    tls: Path | None = None  # folder with ca.pem, certificate.pem and key.pem; None goes without TLS
-    access: Path | None = None  # file with Zenoh's access control, for a process that listens; None admits everybody
+    host: str = socket.gethostname()  # name in its messages
+    tls: Path | None = None  # folder with ca.pem, certificate.pem and key.pem; None: without TLS
+    access: Path | None = None  # file with Zenoh's access control, for a listening process; None admits all
     insecure: bool = False  # whether links may leave the machine without TLS
-    process: str = ""  # name that the certificate must have; empty for any
+    process: str = ""  # required name in the certificate; empty: any
 
     @property
     def files(self) -> tuple[Path, Path, Path]:
-        """The certificate of the common authority, the certificate of the process, and its key."""
+        """The certificate of the common authority, that of the process, and its key."""
         assert self.tls is not None
         return self.tls / AUTHORITY, self.tls / CERTIFICATE, self.tls / KEY
 
@@ -60,7 +60,7 @@ def is_tls(endpoint: str) -> bool:
 
 
 def leaves_machine(endpoint: str) -> bool:
-    """Tell whether links of an endpoint use a network; False for a malformed endpoint."""
+    """Whether unencrypted links of an endpoint use a network; False for a malformed endpoint."""
     protocol, _, place = endpoint.partition("/")
     host = (place.rpartition(":")[0] or place).strip("[]")
     if protocol not in NETWORKED or host == "localhost":
@@ -72,13 +72,13 @@ def leaves_machine(endpoint: str) -> bool:
 
 
 def own_fault(identity: Identity) -> str | None:
-    """Return the fault of a process's own files, None if they are valid."""
+    """Return the fault of a process's own files; None if they are valid."""
     for path in identity.files:
         try:
             with open(path, "rb") as file:
                 file.read(1)
         except OSError as error:
-            needed = f"{AUTHORITY}, {CERTIFICATE} and {KEY}, as zsim certs init makes"
+            needed = f"{AUTHORITY}, {CERTIFICATE} and {KEY}, as created by zsim certs init"
             return f"{path}: cannot be read ({error.strerror}); --tls needs a folder with {needed}"
     try:
         certificate = _read_own(identity)
@@ -88,17 +88,17 @@ def own_fault(identity: Identity) -> str | None:
         return fault
     found, wanted = _name(certificate), identity.process
     if wanted in ("", found):
-        return None  # else access control would drop whatever this process sends
+        return None  # otherwise access control would drop everything that this process sends
     return f"{identity.tls}: the certificate is for {found}; must be for {wanted}; give --tls the folder of that"
 
 
 def own_name(identity: Identity) -> str:
-    """Return the name in a process's own certificate, which `own_fault` has found valid."""
+    """Return the name in a process's own certificate, which must be valid by `own_fault`."""
     return _name(_read_own(identity))
 
 
 def no_link(identity: Identity, endpoint: str, error: str) -> str:
-    """Return a line on why a client could not connect; `error` is Zenoh's text."""
+    """Return a line that explains why a client could not connect; `error` is Zenoh's text."""
     if fault := peer_fault(identity, endpoint):
         return f"cannot connect to {endpoint}: {fault}"
     return f"nobody listens on {endpoint}; start a world there ({error})"
@@ -107,7 +107,7 @@ def no_link(identity: Identity, endpoint: str, error: str) -> str:
 def peer_fault(identity: Identity, endpoint: str) -> str | None:
     """Return why a handshake with the process listening on an endpoint fails.
 
-    None if it does not fail, or if no process listens or answers, which may change.
+    None if it succeeds, or if no process listens or answers, which may change.
     """
     place = _ENDPOINT.fullmatch(endpoint)
     if identity.tls is None or place is None:
@@ -126,7 +126,7 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
             return fault
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in _UNRELATED:
-            return f"the listener's certificate is of another authority than ours; {MEND} and use one set"
+            return f"the listener's certificate is from another authority than ours; {MEND} and use one set"
         if error.verify_code not in _MISNAMED:
             return f"the listener's certificate is refused ({error.verify_message}); {MEND}"
     except ssl.SSLError as error:
@@ -159,11 +159,11 @@ def _words(error: ssl.SSLError, endpoint: str) -> str | None:
     if "EXPIRED" in reason:
         return f"our certificate has expired by the listener's clock; {RENEW}"
     if "UNKNOWN_CA" in reason or "DECRYPT_ERROR" in reason:
-        return f"our certificate is of another authority than the listener's; {MEND} and use one set"
+        return f"our certificate is from another authority than the listener's; {MEND} and use one set"
     if "ALERT" in reason:
         return f"the listener refuses our certificate ({_reason(error)}); {MEND}"
     if "WRONG_VERSION" in reason or "RECORD_LAYER" in reason or "HTTP" in reason:
-        return f"the listener has no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
+        return f"the listener has no TLS; start it with --tls, or use tcp/ instead of {endpoint.split('/')[0]}/"
     return None
 
 
@@ -173,7 +173,7 @@ def _reason(error: Exception) -> str:
 
 
 def _date_fault(certificate: dict[str, Any]) -> str | None:
-    """Return a text for a certificate that has expired or is not yet valid; None if it is valid now."""
+    """Return the fault of a certificate that has expired or is not yet valid; None if it is valid now."""
     if not certificate:
         return None
     now_s, whose = time.time(), f"the certificate of {_name(certificate)}"
@@ -192,7 +192,7 @@ def _name(certificate: dict[str, Any]) -> str:
 
 
 def _read_own(identity: Identity) -> dict[str, Any]:
-    """Return the content of a process's own certificate, read by a handshake with itself in memory.
+    """Return the content of a process's own certificate, read from a handshake with itself in memory.
 
     ssl.SSLError if key, certificate and authority do not match.
     """
@@ -210,24 +210,24 @@ def _read_own(identity: Identity) -> dict[str, Any]:
 
 
 class Permissions(Struct, frozen=True):
-    """The permissions of one process at a listening process; expressions include the federation's name."""
+    """The permissions that a listening process grants to another; expressions include the federation's name."""
 
-    listener: str  # name of the process that listens
+    listener: str  # name of the listening process
     process: str  # name in the certificate
-    allowed: dict[Act, tuple[str, ...]] = {}  # expressions by act; empty for a process that is not admitted
-    known: tuple[str, ...] = ()  # names that are admitted, where this one is not
+    allowed: dict[Act, tuple[str, ...]] = {}  # expressions by act; empty if not admitted
+    known: tuple[str, ...] = ()  # names that are admitted, if this one is not
 
     def refusal(self) -> str | None:
-        """Return why the process is not admitted, None if it is."""
+        """Return why the process is not admitted; None if it is."""
         if self.allowed:
             return None
         return (
             f"certificate for {self.process} is not admitted by {self.listener}; must be for one of "
-            f"{_shown(self.known)}; let it in with zsim certs init, and start {self.listener} again"
+            f"{_shown(self.known)}; admit it with zsim certs init, and start {self.listener} again"
         )
 
     def denial(self, act: Act, expression: str, prefix: str) -> str:
-        """Return a line on an action that is not permitted; keys are without the federation's prefix."""
+        """Return the error for an action that is not permitted; keys are without the federation's prefix."""
         kind = expression.partition("/")[0]
         allowed = [each.removeprefix(prefix) for each in self.allowed.get(act, ())]
         alike_first = sorted(allowed, key=lambda each: each.partition("/")[0] != kind)
@@ -236,7 +236,7 @@ class Permissions(Struct, frozen=True):
 
 
 def permissions_of(access: Mapping[str, Any], listener: str, process: str) -> Permissions:
-    """Return the permissions of a process, by its certificate, under Zenoh's access control at a listening process.
+    """Return the permissions that Zenoh's access control at a listening process grants to a certificate's name.
 
     Args:
         access: the content of an access.json that Zenoh has accepted.

@@ -19,7 +19,7 @@ class Traffic:
 
     Args:
         table: keys of the world's messages about the drones of the run, see `run_key_table`.
-        refused: called for each batch, or part of one, that cannot be decoded.
+        refused: called for each batch, or gate within one, that cannot be decoded.
     """
 
     def __init__(self, link: Session, table: tuple[str, ...], refused: Callable[[], None] = lambda: None) -> None:

@@ -1,8 +1,8 @@
 """Zenoh's settings for a session, and the limit of open files.
 
-Settings are {path in Zenoh's configuration: JSON5}; reasons in docs/decisions/0002. The limit of open files
-(RLIMIT_NOFILE, `ulimit -n`) is checked in advance: Zenoh panics, or waits without end, where a socket or a thread's
-event queue cannot be opened.
+Settings are {path in Zenoh's configuration: JSON5}, explained in docs/decisions/0002. The limit of open files
+(RLIMIT_NOFILE, `ulimit -n`) is checked in advance: Zenoh panics, or waits forever, if a socket or a thread's event
+queue cannot be opened.
 """
 
 import json
@@ -18,35 +18,35 @@ LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its
 LEASE_REALTIME_MS = 1_000
 # The run does not wait for a process that only reads, so its loss need not be noticed within a second.
 LEASE_READER_MS = 10_000
-CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
-# A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.
-# A stopped participant does not: time stands before its link is full.
+CLOSE_AFTER_US = 3_600_000_000  # -1 means forever, and panics in 1.10.2
+# A stopped reader (a recorder, `zsim echo`) fills its link and then blocks the hub for all; so it loses its link.
+# A stopped participant does not: simulated time stops before its link is full.
 HUB_CLOSE_AFTER_US = 10_000_000
 CONNECT_RETRY_MS = 100
-# Connections that say nothing keep joiners out while so many of them are open and not yet given up: of Zenoh's own 100
-# for 10 s each, a hundred kept them out for 10 s. A handshake takes a few round trips; with TLS over a satellite 2 s.
+# Silent connections block new ones once this many are open, until they time out: with Zenoh's defaults, 100 and 10 s, a
+# hundred blocked joins for 10 s. A handshake takes a few round trips: with TLS over a satellite, 2 s.
 ACCEPT_PENDING, ACCEPT_MS = 1000, 3_000
-SESSIONS_MAX = 4_000  # at a hub; of Zenoh's own 1000 a run of as many drones needs two more
+SESSIONS_MAX = 4_000  # at a hub; Zenoh's default of 1000 is two too few for a run with 1000 drones
 QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's limit, 2 its default
 
 _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
 _TLS = "transport/link/tls"
 ACCESS = "access_control"
 
-SESSION_FILES = 32  # of a process with a session; 22 measured, and room for what is read while it loads
+SESSION_FILES = 32  # of a process with a session; 22 measured, the others for files read while it loads
 CLIENT_FILES = 3  # of a hub, for each process that connects; 2.2 measured, more while many connect at once
 ROLE_FILES = 2  # of a launcher, for each process that it starts: its standard input and its log
-HOST_FILES = 2  # of a launcher, for each host: its ssh connection, and a file that is copied there
-WORKER_FILES = 4  # of a sweep, for each worker: both ends of its pipe and what ends with it
-SERVER_FILES = 256  # of a gateway or console: a session, and 100 connections each of HTTP and lines that make room
-SPARE_CLIENTS = 4  # of a hub, for who comes beside the processes of the run: a console, `zsim echo`
+HOST_FILES = 2  # of a launcher, for each host: its ssh connection, and a file being copied
+WORKER_FILES = 4  # of a sweep, for each worker: both ends of its pipe, and its end
+SERVER_FILES = 256  # of a gateway or console: a session, and 100 connections each for HTTP and lines
+SPARE_CLIENTS = 4  # of a hub, for clients besides the run's processes: a console, `zsim echo`
 
 Mode = Literal["lockstep", "realtime"]
 Settings = dict[str, str]
 
 
 def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
-    """Return the settings of every session; `mode` is Zenoh's (client, peer, router), a `reader` never gates."""
+    """Return the settings of every session; `mode` is Zenoh's (client, peer, router); no gate waits for a `reader`."""
     lease = LEASE_READER_MS if reader else LEASE_REALTIME_MS if timing == "realtime" else LEASE_LOCKSTEP_MS
     return {
         "mode": json.dumps(mode),
@@ -54,8 +54,8 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
         "scouting/gossip/enabled": "false",
         "connect/retry": f"{{period_init_ms: {CONNECT_RETRY_MS}, period_max_ms: {2 * CONNECT_RETRY_MS}}}",
         "transport/link/tx/lease": str(lease),
-        "transport/shared_memory/enabled": "false",  # on by default; needs /dev/shm, and leaves its segments there
-        "timestamping/enabled": "false",  # a router's default; messages have their own time, and nobody reads Zenoh's
+        "transport/shared_memory/enabled": "false",  # on by default; needs /dev/shm, and leaves segments there
+        "timestamping/enabled": "false",  # a router's default; messages have their own time
         _CLOSE_AFTER: str(CLOSE_AFTER_US),
     }
 
@@ -89,9 +89,9 @@ def hub(timing: Mode) -> Settings:
     """Return the additional settings of the hub, which has no upstream and opens without waiting for a peer.
 
     In lockstep its queues are as long as Zenoh allows, so that a link is closed before it is full (see link_watch). In
-    realtime long queues would only delay the messages on a slow link.
+    realtime, long queues would only delay the messages on a slow link.
 
-    A router keeps Zenoh's half second, in which it learns the queryables of its upstream.
+    A router keeps Zenoh's delay of half a second, in which it learns the queryables of its upstream.
     """
     queue = {"transport/link/tx/queue/size/data": str(QUEUE_LOCKSTEP)} if timing == "lockstep" else {}
     return {"scouting/delay": "0", **queue}
@@ -103,19 +103,19 @@ def upstream(endpoint: str, identity: Identity) -> Settings:
 
 def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Settings:
     """Return the settings of TLS, with certificates on both sides, and of access control."""
-    for endpoint in endpoints:  # no combination is less secure than it looks
+    for endpoint in endpoints:  # refuse combinations that are less secure than they look
         secure = tls.is_tls(endpoint)
         if secure and identity.tls is None:
-            raise SessionError(f"{endpoint}: needs a certificate; give --tls the folder that zsim certs init made")
+            raise SessionError(f"{endpoint}: needs a certificate; give --tls a folder created by zsim certs init")
         if not secure and identity.tls is not None:
             raise SessionError(f"{endpoint}: is not encrypted; with --tls it must be tls/ADDRESS:PORT")
         if not secure and not identity.insecure and tls.leaves_machine(endpoint):
             raise SessionError(
                 f"{endpoint}: is not encrypted and leaves this machine; give --tls and a tls/ endpoint (zsim certs "
-                "init makes certificates), or --insecure on a network that nobody else uses"
+                "init makes certificates), or --insecure on a private network"
             )
     if identity.access is not None and identity.tls is None:
-        raise SessionError(f"{identity.access}: access control goes by certificate; give --tls too")
+        raise SessionError(f"{identity.access}: access control needs certificates; give --tls too")
     if identity.tls is None:
         return {}
     if fault := tls.own_fault(identity):
@@ -187,7 +187,7 @@ def require_files(needed: int, what: str) -> None:
 
 
 def allow_files(wanted: int) -> int | None:
-    """Raise the soft limit to the wanted number, as far as the hard limit allows; return it, None without a limit."""
+    """Raise the soft limit to the wanted number as far as the hard limit allows; return it, None if unlimited."""
     if sys.platform == "win32":
         return None
     import resource

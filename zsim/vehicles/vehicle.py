@@ -1,9 +1,9 @@
-"""A vehicle: its parameters, and how a scenario names one: `ardrone2`, `crazyflie2`, or a module with a VEHICLE.
+"""A vehicle: its parameters, and its name in a scenario: `ardrone2`, `crazyflie2`, or a module with a VEHICLE.
 
-Some parameters a scenario may override for a drone. Geometry in B: x forward, y left, z up, origin at the centre of
-mass. Thrust, torque and drag hold at an air density of 1.225 kg/m^3. A drone whose `arm_m`, `thrust_n_s2` or
-`torque_nm_s2` is overridden is taken as similar in shape: lengths of the airframe grow with the arm, a rotor's radius
-with the fourth root of its thrust coefficient, its inertia with its torque coefficient.
+A scenario may override some parameters for a drone. Geometry is in B: x forward, y left, z up, origin at the centre of
+mass. Thrust, torque and drag apply at an air density of 1.225 kg/m^3. A drone with overridden `arm_m`, `thrust_n_s2` or
+`torque_nm_s2` is assumed to be similar in shape: airframe lengths scale with the arm, a rotor's radius with the fourth
+root of its thrust coefficient, and its inertia with its torque coefficient.
 """
 
 import importlib
@@ -23,13 +23,13 @@ from zsim.schema import plugin
 from zsim.schema.checker import faults, show
 from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 
-ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a hover at every heading; more do not go into a message
-ARM_MISS_MAX = 0.01  # of the arm, chosen: what rounding of a drawing leaves
-BALANCE_MAX = 1e-6  # of the arm, by which the centre of the rotors may miss that of mass
-LIFT_MIN = 0.2  # of the mean thrust, chosen: a rotor that bears less in hover has nothing left to steer with
-RANK_MIN = 1e-3  # least share that one of roll, pitch and yaw may have of the strongest
+ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hover at every heading; more do not fit into a message
+ARM_MISS_MAX = 0.01  # maximum mismatch over the arm, chosen: rounding in a drawing
+BALANCE_MAX = 1e-6  # maximum distance between the rotors' centre and the centre of mass, over the arm
+LIFT_MIN = 0.2  # minimum hover thrust of a rotor over the mean, chosen: with less it cannot contribute to control
+RANK_MIN = 1e-3  # minimum ratio of the weakest of thrust, roll, pitch and yaw to the strongest
 
-DEFAULT_MODEL, MODELS = "ardrone2", ("ardrone2", "crazyflie2")  # of zsim, each a module of this package
+DEFAULT_MODEL, MODELS = "ardrone2", ("ardrone2", "crazyflie2")  # each a module of this package
 ALLOWED = f"{', '.join(MODELS)}, or package.module of your own that defines VEHICLE"
 
 Mass = Annotated[float, Meta(gt=0, le=100)]
@@ -41,33 +41,33 @@ TakeoffHeight = Annotated[float, Meta(ge=0.3, le=5)]
 class Limits(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The limits of the firmware for a commander; defaults of the AR.Drone SDK's outdoor set if it has them.
 
-    How far they go is chosen: what larger and racing aircraft fly, and the loops still hold.
+    Their ranges are chosen: they include larger and racing aircraft, and the loops remain stable.
     """
 
     tilt_deg: Annotated[float, Meta(gt=0, le=60)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
-    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=30)] = 5.0  # chosen, the SDK has none; 20 deg hold 6 m/s
+    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=30)] = 5.0  # chosen, none in the SDK; 20 deg suffice for 6 m/s
     vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=10)] = 1.0  # outdoor_control_vz_max
     yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0  # outdoor_control_yaw, 3.49 rad/s
-    altitude_m: Positive = 100.0  # altitude_max: what it takes for no limit
+    altitude_m: Positive = 100.0  # altitude_max, a value that the SDK treats as unlimited
 
 
 PerAxis = tuple[NonNegative, NonNegative, NonNegative]
 
 
 class Aerodynamics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the air does to it besides `drag_n_s_m`; u is the velocity of the body, or of a rotor, against the air in B.
+    """Aerodynamics besides `drag_n_s_m`; u is the velocity of the body, or of a rotor, relative to the air, in B.
 
-    Body: -linear u - quadratic |u| u, by axis, at the centre of mass. Each rotor at speed w, where it is:
+    Body: -linear u - quadratic |u| u, per axis, at the centre of mass. Each rotor with speed w, at its position:
     -k_d w (u_x, u_y) across, (k_h (u_x^2 + u_y^2) - k_z w u_z) along its thrust. Svacha, Mohta and Kumar, Improving
-    quadrotor trajectory tracking by compensating for aerodynamic effects, ICUAS 2017, as RotorPy (Folk et al. 2023)
-    has it; the linear part by axis is the rotor drag of Faessler, Franchi and Scaramuzza, RA-L 3 (2018) 620-626.
-    The firmware knows `drag_n_s_m` alone: to it the rest is a disturbance.
+    quadrotor trajectory tracking by compensating for aerodynamic effects, ICUAS 2017, in the form of RotorPy (Folk et
+    al. 2023); the linear part per axis is the rotor drag of Faessler, Franchi and Scaramuzza, RA-L 3 (2018) 620-626.
+    The firmware models only `drag_n_s_m`: the rest is a disturbance.
     """
 
     linear_drag_n_s_m: PerAxis = (0.0, 0.0, 0.0)
     quadratic_drag_n_s2_m2: PerAxis = (0.0, 0.0, 0.0)  # c_D of RotorPy: 1/2 rho c A
     rotor_drag_n_s2_m: NonNegative = 0.0  # k_d, of each rotor
-    rotor_inflow_n_s2_m: NonNegative = 0.0  # k_z, of each rotor: thrust that a climb costs and a descent brings
+    rotor_inflow_n_s2_m: NonNegative = 0.0  # k_z, of each rotor: thrust lost in a climb and gained in a descent
     rotor_lift_n_s2_m2: NonNegative = 0.0  # k_h, of each rotor: translational lift
 
 
@@ -86,15 +86,15 @@ class Airframe(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     hull_radius_m: Positive
     foot_xy_m: Positive  # |x| and |y| of a foot
     foot_depth_m: Positive  # below the centre of mass
-    foot_sag_m: Positive  # by which the feet give under the weight; sets their stiffness
+    foot_sag_m: Positive  # compression of the feet under the weight; sets their stiffness
     foot_damping_ratio: NonNegative  # of critical, of the aircraft bouncing on its four feet
     friction: NonNegative
     rim_xy_m: Positive  # |x| and |y| of the upper corners
     rim_height_m: Real  # of the upper corners above the centre of mass
-    reach_m: Positive  # farther than any of these points from the centre of mass
+    reach_m: Positive  # exceeds the distance of all these points from the centre of mass
     hull_frequency_rad_s: Positive  # of two equal drones pressed together
     hull_damping_ratio: NonNegative  # of critical, of two equal drones pressed together
-    clearance_m: Positive  # free space about its centre at the start: hull and room
+    clearance_m: Positive  # free space around its centre at the start: hull and margin
 
 
 class Battery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -108,51 +108,51 @@ class Battery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Firmware(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The design parameters of the firmware's loops, sequences and observer.
 
-    The gains of rate, tilt and velocity loop follow from the rotors' lag: rate_per_lag over the overdriven lag, and
-    each outer loop slower than the one in it by `loop_ratio`.
+    The gains of rate, tilt and velocity loops follow from the rotors' lag: rate_per_lag over the overdriven lag, with
+    each outer loop slower than its inner loop by `loop_ratio`.
     """
 
-    lag_lead: Annotated[float, Meta(gt=0, le=1)]  # the motors are overdriven so that this share of their lag is left
+    lag_lead: Annotated[float, Meta(gt=0, le=1)]  # share of the motors' lag that remains after overdriving
     rate_per_lag: Positive  # rate gain times the overdriven lag
-    lag_min_s: Positive  # faster rotors do not make a faster loop
+    lag_min_s: Positive  # faster rotors do not speed up the loop
     loop_ratio: Positive
-    yaw_share: Positive  # of the rate gain, about the vertical
-    body_rate_max_rad_s: Positive  # wanted of the tilt loop
+    yaw_share: Positive  # yaw rate gain over the rate gain
+    body_rate_max_rad_s: Positive  # maximum demand of the tilt loop
     climb_share: Positive  # vertical velocity gain over the rate gain
-    hold_1_s: Positive  # position gain on the own odometry
+    hold_1_s: Positive  # position gain on its own odometry
     height_1_s: Positive
-    brake_s: NonNegative  # where a hold begins: about the stopping distance over speed
-    tilt_cut_cosine: Annotated[float, Meta(ge=-1, le=1)]  # of the tilt beyond which the motors are cut
-    lift_share_min: Fraction  # of the weight: thrust never asked below
-    spin_up_s: NonNegative  # rotors at their least before the climb
+    brake_s: NonNegative  # look-ahead of a hold's position: about the stopping distance over speed
+    tilt_cut_cosine: Annotated[float, Meta(ge=-1, le=1)]  # cosine of the tilt at which the motors are cut
+    lift_share_min: Fraction  # minimum commanded thrust over the weight
+    spin_up_s: NonNegative  # rotors at minimum speed before the climb
     takeoff_m_s: Positive
-    takeoff_s_max: Positive  # then it hovers where it is
+    takeoff_s_max: Positive  # after this it hovers at its position
     arrived_m: Positive
-    arrived_m_s: Positive  # a take-off is over, with the height within arrived_m
-    descent_m_s: Positive  # of a landing near the ground
-    descent_far_1_s: NonNegative  # faster by this per metre over flare_m
+    arrived_m_s: Positive  # a take-off ends below this speed and with the height within arrived_m
+    descent_m_s: Positive  # speed of a landing near the ground
+    descent_far_1_s: NonNegative  # increase of that speed per metre above flare_m
     flare_m: NonNegative
-    touch_share: Fraction  # of the weight: below, thrust that does not descend stands on the ground
-    touch_m_s: Positive  # a descent that has stopped
-    touch_s: NonNegative  # for which both hold before the rotors stop
-    low_battery_percent: Annotated[float, Meta(ge=0, le=50)]  # it lands; below twice as much it does not take off
+    touch_share: Fraction  # thrust over weight below which a drone that does not descend is on the ground
+    touch_m_s: Positive  # descent speed below which it does not descend
+    touch_s: NonNegative  # duration of both before the rotors stop
+    low_battery_percent: Annotated[float, Meta(ge=0, le=50)]  # below this it lands; below twice this, no take-off
     disturbance_walk: Positive  # horizontal disturbance, m/s^2/sqrt(s)
     lift_walk: Positive  # vertical disturbance, m/s^2/sqrt(s)
-    tilt_walk: Positive  # of the attitude, least, rad/sqrt(s)
-    bias_walk: Positive  # of the gyro, least, rad/s/sqrt(s)
-    lift_bias_walk: Positive  # of the vertical accelerometer, least, m/s^2/sqrt(s)
+    tilt_walk: Positive  # minimum for the attitude, rad/sqrt(s)
+    bias_walk: Positive  # minimum for the gyro bias, rad/s/sqrt(s)
+    lift_bias_walk: Positive  # minimum for the vertical accelerometer bias, m/s^2/sqrt(s)
 
 
 class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A multirotor. The first block of fields are defaults of a scenario's drone.
+    """A multirotor. The first block of fields gives the defaults of a scenario's drone.
 
     Raises:
-        ValueError: the rotors cannot hold it level, in one line.
+        ValueError: the rotors cannot hold it level; one line.
     """
 
     mass_kg: Mass
     inertia_kg_m2: tuple[Positive, Positive, Positive]
-    arm_m: Arm  # centre to the farthest rotor, the size of the airframe
+    arm_m: Arm  # centre to the farthest rotor; the scale of the airframe
     thrust_n_s2: Positive
     torque_nm_s2: Positive
     rotor_time_constant_s: RotorLag
@@ -206,7 +206,7 @@ def vehicle_of(model: str, where: str = "model") -> Vehicle:
         where: file and path of the field that names it.
 
     Raises:
-        DocumentError: there is none, or its parameters are faulty; a line for each fault.
+        DocumentError: it does not exist, or its parameters are faulty; a line for each fault.
     """
     if model in MODELS:
         return importlib.import_module(f"zsim.vehicles.{model}").VEHICLE
@@ -247,14 +247,14 @@ def allocation(vehicle: Vehicle) -> np.ndarray:
 
 
 def is_balanced(vehicle: Vehicle) -> bool:
-    """Tell whether rotors at equal speed give no moment."""
+    """Whether rotors at equal speed give no moment."""
     return bool(np.abs(allocation(vehicle).sum(axis=1)).max() <= BALANCE_MAX * len(vehicle.rotors))
 
 
 def mixing(vehicle: Vehicle) -> np.ndarray:
     """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3), with zero total thrust.
 
-    The pseudo-inverse of `allocation`, of an unbalanced vehicle of it below a row of thrust.
+    The pseudo-inverse of `allocation`, for an unbalanced vehicle extended by a row for thrust.
     """
     layout = allocation(vehicle)
     if is_balanced(vehicle):
@@ -263,7 +263,7 @@ def mixing(vehicle: Vehicle) -> np.ndarray:
 
 
 def lift_shares(vehicle: Vehicle) -> np.ndarray:
-    """Return the ratio of each rotor's thrust to the mean, (R,), without a moment: 1 if they are balanced."""
+    """Return each rotor's thrust over the mean when the total moment is zero, (R,): 1 if balanced."""
     layout, count = allocation(vehicle), len(vehicle.rotors)
     if is_balanced(vehicle):
         return np.ones(count)

@@ -7,11 +7,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
+from zsim.contract.run_messages import INCIDENTS
 from zsim_bridges.console.run_condition import (
     LATE_MS,
     LINK_LOSS_PERCENT,
     LINK_OLD_MS,
     LINK_SILENT_S,
+    LOST,
     Check,
     DroneCondition,
     Severity,
@@ -29,9 +31,8 @@ STATE_COLOURS = {
     "landing": BLUE,
     "emergency": RED,
 }
-_BAD = ("death", "failure", "overdue", "silent", "no_show", "collision", "emergency", "flip", "impact", "touchdown")
 EVENT_COLOURS = {
-    **dict.fromkeys(("refused", "battery", *_BAD), RED),
+    **dict.fromkeys(("refused", "collision", *LOST, *INCIDENTS), RED),
     **dict.fromkeys(("landing", "fault", "fault_end", "fault_clear"), AMBER),
     "accepted": BLUE,
     "done": GREEN,

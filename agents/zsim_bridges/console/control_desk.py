@@ -170,7 +170,7 @@ class ControlDesk:
         return held | {EVERY} if held else held
 
     def name_of(self, page: int) -> str:
-        known = self._pages.get(page)  # the lock may not be held, so the page may close
+        known = self._pages.get(page)  # may be called without the lock, so the page may have closed
         return known.name if known else "a page"
 
     def _silent_s(self, page: int) -> float:

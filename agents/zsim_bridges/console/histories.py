@@ -298,7 +298,7 @@ class VariablePlots:
         windows = {f"{span_s:g} s around" if replayed else f"the last {span_s:g} s": span_s for span_s in WINDOWS_S}
         self._window = gui.add_dropdown("window", list(windows))
         self._windows = windows
-        self._errors = gui.add_checkbox("Errors", False, hint="From the desired values; of a drone, from the true ones")
+        self._errors = gui.add_checkbox("Errors", False, hint="Relative to desired values; for a drone, to true ones")
         self._freeze = gui.add_checkbox(
             "Freeze", False, hint="Drag over a plot to zoom, double-click to reset the zoom"
         )

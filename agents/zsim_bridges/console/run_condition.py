@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from zsim.contract.flight_messages import ViewCluster, state_refusal
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Clock, Event, Fault, Health, holding_up
+from zsim.contract.run_messages import ADMISSIONS, Clock, Event, Fault, Health, holding_up, waiting_text
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.flight_check import (
     AIRBORNE,
@@ -41,7 +41,7 @@ LOST = {
     "diverged": "diverged",
 }
 """Kinds of events that report the loss of a process or drone, with the name of the alarm."""
-BACK = frozenset({"join", "restart", "superseded", "silent_end", "leave"})  # event kinds that end a loss, unlike a drop
+BACK = frozenset({*ADMISSIONS, "silent_end", "leave"})  # event kinds that end a loss, unlike a drop
 OFF_REFERENCE_M = 2.0  # error of a length of a formation; chosen: the smallest distance between the paper's drones
 FLOWN_PHASES = frozenset({"assembling", "engaged"})  # phases in which a formation's controller flies all of its drones
 
@@ -283,7 +283,6 @@ TILT_MAX_DEG = 30.0  # tilt of a drone before take-off; chosen: above any slope,
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 LIMITS = EngagementLimits()  # limits within which a formation's controller lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
-WAITING_SHOWN = 4  # number of awaited processes that are named
 STANDS_S = 2.0  # wall; a running world that waits for longer is shown as waiting
 NO_RUN = {"t_s": 0.0, "replay": False, "age_s": 0.0, "alarms": []}
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
@@ -593,8 +592,6 @@ def _waiting(clock: Clock | None, world: str) -> str:
     """Describe which processes the world is waiting for, and where absent ones are expected."""
     if clock is None:
         return "waiting for the world's clock"
-    late = holding_up(clock.state, clock.waiting_for)
-    names = [f"{each.name}{each.host and f' on {each.host}'} ({each.since_wall_s:.0f} s)" for each in late]
-    rest = [f"{len(names) - WAITING_SHOWN} more"] if len(names) > WAITING_SHOWN else []
-    where = f" in {world}" if world and not all(each.host for each in late) else ""
-    return f"waiting for {', '.join([*names[:WAITING_SHOWN], *rest])}{where}" if names else ""
+    text = waiting_text(clock.state, clock.waiting_for)
+    all_present = all(each.host for each in holding_up(clock.state, clock.waiting_for))
+    return f"{text} in {world}" if world and not all_present else text

@@ -15,7 +15,7 @@ from msgspec import UNSET
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.flight_messages import EstimateView, LinkState, ViewCluster, ViewDrones, ViewEstimates
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Event, Fault, Health
+from zsim.contract.run_messages import INCIDENTS, Event, Fault, Health
 from zsim.errors import DecodeError
 from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
@@ -27,7 +27,6 @@ EVENTS_KEPT = 200  # number of newest single events
 ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # rows of distinct events; rows of the console's own requests
 OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds of events that answer an operator's request
 ALL, OWN = "all", "own actions"
-INCIDENTS = frozenset({"emergency", "flip", "impact", "touchdown", "battery"})  # kinds of events that concern a drone
 KINDS: dict[str, frozenset[str]] = {
     ALL: frozenset(),
     OWN: frozenset(),
@@ -112,7 +111,7 @@ class ViewBuffer:
         self.failsafes: dict[str, Event] = {}  # last automatic landing or stop of each drone, until its next mode
         self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
         self.end = ""  # why the run ended, by its last event; empty while it continues
-        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that our commands cause
+        self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that the console causes
 
     def open(self) -> None:
         """Subscribe, and read the values published last."""

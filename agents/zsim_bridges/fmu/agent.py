@@ -358,7 +358,7 @@ def _parameter(model: FmuModel, name: str, value: Any) -> tuple[Variable, list[A
     try:
         return variable, [_typed(each, variable) for each in values]
     except ValueError:
-        raise RunError(f"--param {name} is {value!r}; must be a {variable.kind}, as {variable.type} is") from None
+        raise RunError(f"--param {name} is {value!r}; must be a value of {variable.type} ({variable.kind})") from None
 
 
 def _typed(value: Any, variable: Variable) -> Any:

@@ -116,7 +116,7 @@ class FmuModel:
         if self.library not in names:
             has = {name.split("/")[1] for name in names if name.startswith("binaries/") and name.count("/") == 2}
             listed = ", ".join(sorted(has)) or "none"
-            raise RunError(f"{path}: has no library for {folder}, but for {listed}; export it for this machine")
+            raise RunError(f"{path}: has no library for {folder}, only for {listed}; export it for this machine")
         experiment = self.description.defaultExperiment
         fixed_s = about.fixedInternalStepSize
         self.step_s = fixed_s if fixed_s is not None else _number(experiment.stepSize) if experiment else None

@@ -1,1 +1,1 @@
-"""Compares formation laws: the same scenarios, seeds and sensors for all, one table, one page."""
+"""Compares formation laws in the same scenarios with the same seeds and sensors, in one table and on one page."""

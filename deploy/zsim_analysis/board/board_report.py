@@ -1,6 +1,6 @@
-"""Makes the page of a board, its tables and figures; and its table for the terminal.
+"""Makes the report page of a board with its tables and figures, and its table for the terminal.
 
-Figures: all measures of all laws, the ways of the drones seen from above, and shapes over time.
+Figures: all measures of all laws, the paths of the drones from above, and shape errors over time.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,8 +30,8 @@ from zsim_analysis.sweep.sweep_run import Row
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.VERMILION, style.SKY, style.PURPLE, style.BLACK, style.GREY)
 MARKS = "osD^vP*X"
-ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law, and of what stands around the axes
-LEAST_IN = 0.5  # height of a row of ways
+ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law, and of everything around the axes
+LEAST_IN = 0.5  # height of a row of paths
 
 
 def make_board_report(
@@ -40,7 +40,7 @@ def make_board_report(
     progress: Callable[[str], None] = lambda _: None,
     formats: Sequence[str] = (),
 ) -> Board:
-    """Write all files of a board but its journal; return its means. ReportError: the folder cannot be written."""
+    """Write all files of a board except its journal; return its means; ReportError if the folder cannot be written."""
     board = board_of(request, rows)
     write_tables(request.out, board, rows)
     figures = board_figures(board, rows)
@@ -71,7 +71,7 @@ def terminal_text(board: Board) -> Group:
 
 
 def board_figures(board: Board, rows: Sequence[Row]) -> Iterator[style.ReportFigure]:
-    """Yield the figures of a board; ways and shapes over time are those of the first seed."""
+    """Yield the figures of a board; paths and shape errors over time are those of the first seed."""
     yield _measures(board)
     first = {(row["scenario"], row["law"]): row for row in rows if row["seed"] == 1 and row["failure"] is None}
     if first:
@@ -107,7 +107,7 @@ def _measures(board: Board) -> style.ReportFigure:
         axes.set_ylim(len(board.laws) - 0.5, -0.5)
     style.letter_panels(list(panels.flat[: len(shown)]))
     style.legend_above(figure, panels[0, 0])
-    spread = f"Means over {board.seeds} seeds; lines from the least to the greatest."
+    spread = f"Means over {board.seeds} seeds; lines from the minimum to the maximum."
     caption = f"{spread} A law without a mark has no such measure."
     return style.ReportFigure("measures.png", "What the laws achieve", caption, figure)
 
@@ -143,14 +143,14 @@ def _ways(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigure
                     axes.plot(*p[known[-1], drone], "o", color=colour, ms=2.2)
         panels[line, 0].set_ylabel(scenario.replace("_", " "), fontsize=style.PAPER_PT)
     caption = (
-        "Seen from above, x to the right; each drone in its colour, a dot where it was last in the air; dashed, the "
-        "way of the reference's centre. Panels of a row have one scale."
+        "Seen from above, x to the right; each drone in its colour, with a dot where it was last in the air; dashed: "
+        "path of the reference's centre. All panels of a row have the same scale."
     )
-    return style.ReportFigure("ways.png", "The ways of the drones, first seed", caption, figure)
+    return style.ReportFigure("ways.png", "Paths of the drones, first seed", caption, figure)
 
 
 def _box(board: Board, scenario: str, first: dict[tuple[str, str], Row]) -> tuple[Any, Any]:
-    """Return the corners of the smallest box, with a metre more, that holds all ways of a scenario [m]."""
+    """Return the corners of the bounding box of all paths of a scenario, with a margin of one metre [m]."""
     rows = [first[scenario, law] for law in board.laws if (scenario, law) in first]
     places = np.concatenate([np.zeros((1, 2)), *(np.array(row["track_m"], float).reshape(-1, 2) for row in rows)])
     return np.nanmin(places, axis=0) - 1.0, np.nanmax(places, axis=0) + 1.0
@@ -178,7 +178,7 @@ def _shapes(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigu
     style.legend_above(figure, panels[0, 0])
     about_all = "; ".join(f"{each.replace('_', ' ')}: {about(each)}" for each in board.scenarios)
     caption = (
-        "Root mean square distance of the drones from their places, after what the law leaves open; "
-        f"laws without places are not shown. {about_all[0].upper()}{about_all[1:]}."
+        "Root mean square distance of the drones from their positions, after the best fit that the law leaves open; "
+        f"laws without desired positions are not shown. {about_all[0].upper()}{about_all[1:]}."
     )
     return style.ReportFigure("shapes.png", "Shape error over time, first seed", caption, figure)

@@ -1,12 +1,12 @@
-"""How well a formation was flown, in figures that all laws share; of true motion, in the window of the report. Pure.
+"""How well a formation was flown, in measures that all laws share, from the true motion within the report's window.
 
-`measures` is a function for `report.metrics`, so that a sweep over parameters of a law has them, too:
+`measures` is a function for `report.metrics`, so that sweeps over parameters of a law can have them, too:
 
     zsim sweep scenario.yaml --vary agents.pilot.parameters.gain_1_s=0.2,0.4 \
         --set report.metrics=zsim_analysis.board.measures:measures
 
-Only drones count that are in the air: of a formation that has lost one, the figure of the others. What they were to
-fly is what their plan says, also where they were held.
+Only drones in the air are measured: if a formation has lost one, the measures are those of the others. The reference is
+always that of the plan, even while drones were held.
 """
 
 from dataclasses import replace
@@ -26,18 +26,18 @@ from zsim_analysis.reading.shortfall import window_of
 
 
 class Figure(NamedTuple):
-    """What a formation is to be."""
+    """The desired figure of a formation."""
 
     reference: FormationReference
-    places: Array | None  # (n, 2) of the drones [m]; None where a law has none
+    places: Array | None  # (n, 2) positions of the drones in the figure [m]; None for laws without them
     invariances: tuple[str, ...]  # what of the places the law leaves open
 
 
 class Wanted(NamedTuple):
-    """What a formation was to be, at some instants."""
+    """The desired figure of a formation over time."""
 
-    centre: Array  # (T, 2) [m; W]
-    places: Array | None  # (T, n, 2) of the drones [m; W]; None where a law has none
+    centre: Array  # (T, 2) desired centre [m; W]
+    places: Array | None  # (T, n, 2) desired positions [m; W]; None for laws without them
     invariances: tuple[str, ...]  # what of the places the law leaves open
 
 
@@ -45,25 +45,26 @@ class Flown(NamedTuple):
     """The horizontal motion of a formation within its window."""
 
     t_s: Array  # (T,)
-    p: Array  # (T, n, 2) true places [m; W]; NaN of drones that are not in the air
+    p: Array  # (T, n, 2) true positions [m; W]; NaN for drones that are not in the air
     wanted: Wanted | None
 
 
 def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, float | None]:
-    """Return the figures of a flight; None where there is none of a kind.
+    """Return the measures of a flight; None for those that it does not have.
 
-    shape_error_m: root mean square distance of the drones from the figure's places, after the best move, turn or
-        growth of it that the law leaves open; of a lattice the deviation of its sides from the spacing.
-    place_error_m: the same distance with nothing left open. None for flocks, which have no places.
-    centre_error_m: distance of the drones' centre from where it was to be, root mean square.
+    shape_error_m: root mean square distance of the drones from the figure's positions, after the best translation,
+        rotation or scaling that the law leaves open; for a lattice, the deviation of its sides from the spacing.
+    place_error_m: the same distance without any fit. None for flocks, which have no desired positions.
+    centre_error_m: root mean square distance of the drones' centre from the desired one.
     effort_m2_s: integral of the squared horizontal velocity command over the whole flight, mean over the drones.
-    separation_m: least distance of two drones in the air.
-    messages_per_drone_s: sent to others, per drone and simulated second: of pilots their messages; of a controller
-        the estimates that it needs and the commands that it gives.
-    cpu_per_s: CPU time of the whole flight in one process, per simulated second; None of a record.
+    separation_m: minimum distance of two drones in the air.
+    messages_per_drone_s: messages to others, per drone and simulated second: those of the pilots, or the estimates
+        that a controller needs and the commands that it gives.
+    cpu_per_s: CPU time of the whole flight in one process, per simulated second; None for a record.
 
     Args:
-        figure: that was to be flown; None: that of the pilots' parameters.
+        flight: the flight as arrays.
+        figure: the desired figure; None: that of the pilots' parameters.
     """
     flown = flown_of(flight, figure)
     window_s, _ = window_of(flight)
@@ -80,7 +81,7 @@ def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, 
     }
     if flown.wanted is not None:
         centre, places, _ = flown.wanted
-        if places is not None:  # the centre of the drones in the air; without places, that of all
+        if places is not None:  # the desired centre of the drones in the air only
             centre = _mean(np.where(np.isnan(flown.p), np.nan, places))
             found["place_error_m"] = _rms(flown.p - places)
         found["centre_error_m"] = _rms(_mean(flown.p) - centre)
@@ -106,17 +107,16 @@ def flown_of(flight: RecordedFlight, figure: Figure | None = None, whole: bool =
 
 
 def shape_errors(flown: Flown) -> Array:
-    """Return at each instant (T,) the root mean square distance from the places that fit best [m].
+    """Return the root mean square distance from the best-fitting positions over time (T,) [m].
 
-    NaN without places, and with less than two drones in the air.
-
-    The figure is moved, turned and enlarged as far as the law leaves it open.
+    The figure is translated, rotated and scaled as far as the law leaves it open. NaN without desired positions, and
+    with fewer than two drones in the air.
     """
     wanted = flown.wanted
     if wanted is None or wanted.places is None:
         return np.full(len(flown.t_s), np.nan)
     planes = (flown.p, np.where(np.isnan(flown.p), np.nan, wanted.places))
-    p, c = (each[..., 0] + 1j * each[..., 1] for each in planes)  # places in the plane as complex numbers
+    p, c = (each[..., 0] + 1j * each[..., 1] for each in planes)  # positions in the plane as complex numbers
     with np.errstate(invalid="ignore", divide="ignore"):
         if "translation" in wanted.invariances:
             p, c = p - _mean(p)[:, None], c - _mean(c)[:, None]
@@ -128,7 +128,7 @@ def shape_errors(flown: Flown) -> Array:
 
 
 def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
-    """Return at each instant (T,) the root mean square deviation of the sides within reach from the spacing [m]."""
+    """Return the root mean square deviation of the sides within range from the spacing over time (T,) [m]."""
     i, j = np.triu_indices(p.shape[1], 1)
     lengths = np.linalg.norm(p[:, i] - p[:, j], axis=2)
     squared = np.where(lengths < reach_m, (lengths - spacing_m) ** 2, np.nan)
@@ -136,7 +136,7 @@ def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
 
 
 def law_of(scenario: Scenario | None) -> tuple[type[Pilot], Any] | None:
-    """Return the law by which pilots fly a scenario, and its parameters; None where none does."""
+    """Return the law by which pilots fly a scenario, and its parameters; None if there is none."""
     for own in scenario.own_agents.values() if scenario else ():
         kind: Any = plugin.load(own.named, "class", object)
         if issubclass(kind, Pilot):
@@ -145,7 +145,7 @@ def law_of(scenario: Scenario | None) -> tuple[type[Pilot], Any] | None:
 
 
 def figure_of(scenario: Scenario | None) -> Figure | None:
-    """Return the figure that the pilots of a scenario were told of; None where none is flown by a law."""
+    """Return the figure in the parameters of a scenario's pilots; None if no law flies it."""
     if scenario is None or (law := law_of(scenario)) is None:
         return None
     kind, own = law
@@ -196,7 +196,7 @@ def _within(track: Track, window_s: tuple[float, float]) -> Track:
 
 
 def _mean(values: Any) -> Any:
-    """Return the mean over the drones, the second axis; NaN where there is none."""
+    """Return the mean over the drones, the second axis; NaN if there are none."""
     known = ~np.isnan(values)
     count = known.sum(axis=1)
     return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)

@@ -1,13 +1,14 @@
-"""Numbers and figures of the laws' papers, computed again with the laws as they fly, ideal agents in place of drones.
+"""Numbers and figures of the laws' papers, recomputed with the laws as flown, on ideal agents in place of drones.
 
 margins     R. Olfati-Saber, R. M. Murray, Consensus problems in networks of agents with switching topology and
-            time-delays, IEEE Trans. Automatic Control 49 (2004): consensus decays at lambda_2, and oscillates from
-            the delay pi / (2 lambda_n) on, if own states are as late as those of others
+            time-delays, IEEE Trans. Automatic Control 49 (2004): errors decay at the rate lambda_2, and consensus
+            oscillates from a delay of pi / (2 lambda_n) on, if own states are as late as those of others
 flocking    R. Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic
             Control 51 (2006): relative connectivity, deviation energy and velocity mismatch of a flock in free space
             with the paper's parameters, with and without the term of the group's aim
 bearings    S. Zhao, D. Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans.
-            Automatic Control 61 (2016): centroid and scale stay, and the figure is reached from almost everywhere
+            Automatic Control 61 (2016): centroid and scale are invariant, and the shape is reached from almost
+            everywhere
 """
 
 import math
@@ -41,17 +42,17 @@ GRAPHS: dict[str, Graph] = {
     "complete": [(i, j) for i in range(N) for j in range(i + 1, N)],
     "house": [(0, 1), (1, 2), (2, 3), (3, 0), (0, 4), (1, 4)],
 }
-STEPS_OF_DELAY = 120  # of Euler in a delay
-DELAYS = 80  # for which a network is integrated at margins
-D, R, FLOCK, AREA_STD = 7.0, 8.4, 150, 50.0  # of the paper: spacing and range [m], agents, spread of their starts [m]
-FLOCK_C1 = {"alpha": 3.0, "gamma": 0.1}  # chosen: the paper leaves them open
+STEPS_OF_DELAY = 120  # Euler steps per delay
+DELAYS = 80  # number of delays for which a network is integrated
+D, R, FLOCK, AREA_STD = 7.0, 8.4, 150, 50.0  # the paper's spacing and range [m], agents, spread of their starts [m]
+FLOCK_C1 = {"alpha": 3.0, "gamma": 0.1}  # chosen, since the paper leaves them open
 REACHED_M = 1e-3
-STARTS = 10  # random ones of figures by bearings
+STARTS = 10  # number of random starts of shapes by bearings
 FLOCK_H_S, FLOCK_S = 0.02, 30.0
 
 
 class Line(Struct, frozen=True):
-    """A number of a paper beside the one computed here."""
+    """A number of a paper, and the one computed here."""
 
     paper: str
     what: str
@@ -72,7 +73,7 @@ def laplacian(graph: Graph) -> Array:
 
 
 def consensus_rate(graph: Graph, h: float = 0.005) -> float:
-    """Return the rate at which the errors of consensus decay at last [1/s], k = 1."""
+    """Return the asymptotic rate at which the errors of consensus decay [1/s], for k = 1."""
     near = [neighbours(graph, i) for i in range(N)]
     zero = np.zeros(1)
     p = np.array([[1.0], [-2.0], [0.5], [3.0], [-1.0]])
@@ -86,17 +87,17 @@ def consensus_rate(graph: Graph, h: float = 0.005) -> float:
 
 
 def delay_margin(graph: Graph) -> float:
-    """Return the delay of all states from which on consensus no longer settles [s].
+    """Return the smallest delay of all states at which consensus no longer settles [s].
 
-    The network is integrated for many delays at a time, each a dimension with a step of its own; the margin is where
-    the growth of the fastest mode changes its sign.
+    The network is integrated for many delays at once, each of them a dimension with its own step; the margin is where
+    the growth of the fastest mode changes sign.
     """
     near, values, vectors = [neighbours(graph, i) for i in range(N)], *np.linalg.eigh(laplacian(graph))
     delays = np.linspace(0.8, 1.2, DELAYS) * math.pi / (2.0 * values[-1])
     h, zero = delays / STEPS_OF_DELAY, np.zeros(DELAYS)
     past = [np.repeat(vectors[:, -1:], DELAYS, axis=1)] * (STEPS_OF_DELAY + 1)
     peaks = []
-    for _ in range(2):  # the amplitude over as many periods, four delays each, early and late
+    for _ in range(2):  # amplitude over ten periods of four delays, early and late
         peak = np.zeros(DELAYS)
         for _ in range(10 * 4 * STEPS_OF_DELAY):
             late = past.pop(0)
@@ -109,18 +110,18 @@ def delay_margin(graph: Graph) -> float:
 
 
 class FlockTrack(NamedTuple):
-    """A flock in free space, a second apart."""
+    """A flock in free space, sampled once a second."""
 
     t_s: Array  # (T,)
-    connectivity: Array  # rank of the Laplacian / (n - 1): 1 where the flock is one
+    connectivity: Array  # rank of the Laplacian / (n - 1): 1 if the flock is connected
     energy: Array  # deviation energy / d^2
     mismatch: Array  # mean |v_i - mean v| [m/s]
-    p: Array  # (n, 2) at the end [m]
+    p: Array  # (n, 2) final positions [m]
 
 
 @cache
 def free_flock(n: int = FLOCK, with_aim: bool = True, seed: int = 1) -> FlockTrack:
-    """Return a flock that starts scattered as in the paper's section on simulations, with its parameters."""
+    """Return the flock of the paper's section on simulations, with its scattered start and its parameters."""
     draw = stream(seed, "papers/flock")
     p, v = draw.normal(0.0, AREA_STD, (n, 2)), draw.uniform(-2.0, -1.0, (n, 2))
     rows = []
@@ -144,7 +145,7 @@ def free_flock(n: int = FLOCK, with_aim: bool = True, seed: int = 1) -> FlockTra
 
 
 def _connectivity(pairs: list[list[int]]) -> float:
-    """Return (n - components) / (n - 1), which is the rank of the Laplacian over its greatest."""
+    """Return (n - components) / (n - 1), which is the rank of the Laplacian relative to its maximum."""
     group = list(range(len(pairs)))
 
     def root(i: int) -> int:
@@ -159,18 +160,18 @@ def _connectivity(pairs: list[list[int]]) -> float:
 
 
 class BearingTrack(NamedTuple):
-    """A figure by bearings from one start."""
+    """A shape by bearings from one start."""
 
     t_s: Array  # (T,)
     error: Array  # sum over the edges of |g - g*|
-    centroid_drift: float  # greatest [m]
-    scale_drift: float  # greatest, of the scale
-    distance: Array  # |p - p*|, p* of the start's centroid and scale
+    centroid_drift: float  # largest drift of the centroid [m]
+    scale_drift: float  # largest drift of the scale [m]
+    distance: Array  # |p - p*|, where p* has the centroid and scale of the start
 
 
 @cache
 def bearing_flight(seed: int = 1, h: float = 0.05, duration_s: float = 80.0) -> BearingTrack:
-    """Return the pentagon with two diagonals from a random start, integrated by Runge and Kutta's fourth order."""
+    """Return the pentagon with two diagonals from a random start, integrated by Runge–Kutta of fourth order."""
     graph, c = [*RING, (0, 2), (0, 3)], polygon(N, 1.0)
     near = [neighbours(graph, i) for i in range(N)]
 
@@ -206,7 +207,7 @@ def _scale(p: Array) -> float:
 
 
 def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
-    """Yield the numbers of the papers beside those that the laws give here."""
+    """Yield the papers' numbers beside those computed with the laws here."""
     for name, graph in GRAPHS.items():
         progress(f"consensus, {name} …")
         values = np.linalg.eigvalsh(laplacian(graph))
@@ -221,7 +222,7 @@ def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
         yield line(f"relative connectivity of {FLOCK}, {what}", 1.0, float(track.connectivity[-1]))
         yield line(f"deviation energy / d^2, {what}", 0.0, float(track.energy[-1]))
         yield line(f"velocity mismatch (m/s), {what}", 0.0, float(track.mismatch[-1]))
-    progress("figures by bearings …")
+    progress("shapes by bearings …")
     tracks = [bearing_flight(seed) for seed in range(1, STARTS + 1)]
     line = partial(Line, "Zhao, Zelazo 2016")
     yield line("drift of the centroid (m)", 0.0, max(track.centroid_drift for track in tracks))
@@ -234,7 +235,7 @@ def write_papers(out: Path, progress: Callable[[str], None]) -> list[Line]:
     """Write papers.md, flocking.png and bearings.png into a folder; return the numbers.
 
     Raises:
-        ReportError: it cannot be written.
+        ReportError: the folder cannot be written.
     """
     found = list(lines(progress))
     with file_fault(out, "cannot be written", OTHER_OUT, ReportError):
@@ -263,7 +264,7 @@ def terminal_table(found: Sequence[Line]) -> FittedTable:
 def figures(progress: Callable[[str], None] = lambda _: None) -> Iterator[style.ReportFigure]:
     progress("drawing the flock …")
     yield _flocking(free_flock(), free_flock(with_aim=False))
-    progress("drawing figures by bearings …")
+    progress("drawing shapes by bearings …")
     yield _bearings()
 
 

@@ -1,8 +1,8 @@
-"""The file of a bundle: a zip archive, the same bytes for the same content, and checked whole before any of it is used.
+"""The file of a bundle: a zip archive with the same bytes for the same content, fully checked before any use.
 
-Members are stored, not compressed: what zlib makes of them depends on its version, and a stored member cannot be larger
-than the file that holds it. What a bundle holds is in `bundle.json`, with the hash of each member and, as `seal`, of
-itself. That finds what was changed, by accident or by hand; it is no signature.
+Members are stored, not compressed: zlib's output depends on its version, and a stored member cannot be larger than the
+file that contains it. `bundle.json` lists the content of a bundle, with the hash of each member and, as `seal`, of
+itself. This detects changes by accident or by hand; it is not a signature.
 """
 
 import hashlib
@@ -30,14 +30,14 @@ MODULES, FIGURES = "modules", "figures"  # folders
 FORMAT = 1
 MEMBERS_MAX = 5000
 MANIFEST_BYTES_MAX = 4 << 20
-NAME_MAX = 200  # characters of a member's name
+NAME_MAX = 200  # longest name of a member [characters]
 PIECE_BYTES = 1 << 20
-DATE = (1980, 1, 1, 0, 0, 0)  # of every member: the first that a zip archive can state
+DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can state
 MODE = (stat.S_IFREG | 0o644) << 16
-UNIX = 3  # as the system that made it, wherever that was
+UNIX = 3  # stated as the system that wrote the archive, on any system
 PIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?==[A-Za-z0-9][A-Za-z0-9.!+_]*")  # a line of the lock
-EXTRAS = ("agents", "record", "report", "world")  # of zsim: what flies a bundle again, and draws its figures
-PART = re.compile(r"\w[\w.+@ -]*(?<![ .])")  # of a member's path: no `..`, no drive, nothing hidden
+EXTRAS = ("agents", "record", "report", "world")  # zsim's extras that fly a bundle again and draw its figures
+PART = re.compile(r"\w[\w.+@ -]*(?<![ .])")  # part of a member's path: no `..`, no drive, nothing hidden
 
 
 class File(Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,24 +48,24 @@ class File(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a bundle holds and expects, `bundle.json`."""
+    """The content of a bundle, and the expected results of flying it again: `bundle.json`."""
 
     format: int
-    zsim: str  # version that flew it
-    commit: str  # of zsim when it was bundled, empty if that is not known
-    name: str  # of the scenario
+    zsim: str  # version of zsim that flew it
+    commit: str  # commit of zsim when it was bundled; empty if unknown
+    name: str  # name of the scenario
     seed: int
     duration_s: float
     scenario_sha256: str
     truth_sha256: str
-    outputs: dict[str, str]  # SHA-256 of what the agents published, by key, as OutputHashes; empty: none are run again
-    until_ns: int  # last gate whose outputs are compared: what is answered to later ones may not be on record
-    own_code: list[str]  # classes, functions and modules of users that the scenario names
-    needs: list[str]  # NAME==VERSION of packages that these import beside those of zsim
-    not_run_again: str  # why agents are not run again but commands are read from the record; empty if they are
-    fingerprints: list[str]  # of the world and its agents
-    machine: dict[str, str]  # on which it was flown; empty where it was bundled on another
-    files: dict[str, File]  # all other members, by path
+    outputs: dict[str, str]  # SHA-256 of the agents' outputs by key, as in OutputHashes; empty: none are run again
+    until_ns: int  # last gate whose outputs are compared; those for later gates may be missing on record
+    own_code: list[str]  # users' classes, functions and modules that the scenario names
+    needs: list[str]  # NAME==VERSION of packages that these import besides zsim's
+    not_run_again: str  # why commands are read from the record and no agents are run again; empty if they are
+    fingerprints: list[str]  # fingerprints of the world and its agents
+    machine: dict[str, str]  # machine that flew it; empty if it was bundled on another
+    files: dict[str, File]  # all other members by path
     seal: str = ""  # SHA-256 of the manifest as text with this field empty
 
     def sealed(self) -> "Manifest":
@@ -84,21 +84,22 @@ class WrittenBundle(NamedTuple):
 
 
 def refuse_existing(out: Path, force: bool) -> None:
-    """Raise a RunError where the file of a bundle is there already, and `force` does not say that it is replaced."""
+    """Raise RunError if the file of a bundle exists, and `force` does not say to replace it."""
     if out.exists() and not force:
-        raise RunError(f"{out}: is there already; --force replaces it, or {OTHER_OUT}")
+        raise RunError(f"{out}: already exists; --force replaces it, or {OTHER_OUT}")
 
 
 def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | bytes], force: bool) -> WrittenBundle:
     """Write a bundle.
 
     Args:
-        manifest: without `files`.
-        members: content, or the file that has it, by path in the bundle.
-        force: whether a file that is there is replaced.
+        out: path of the bundle.
+        manifest: the manifest without `files`.
+        members: content, or the file with it, by path in the bundle.
+        force: whether to replace an existing file.
 
     Raises:
-        RunError: it is there, or cannot be written.
+        RunError: the file exists, or cannot be written.
     """
     refuse_existing(out, force)
     files = {name: File(*_hashed(content)) for name, content in sorted(members.items())}
@@ -124,10 +125,10 @@ def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | byt
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[Manifest, Path]]:
-    """Check a bundle and yield its manifest and a folder with its members, which is removed afterwards.
+    """Check a bundle; yield its manifest, and a folder with its members, which is removed afterwards.
 
     Raises:
-        RunError: it is no bundle, or was changed: the member, what was found, what must be there.
+        RunError: the file is not a bundle, or was changed; the error names the member, and what was found and expected.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -136,9 +137,7 @@ def opened(path: Path) -> Iterator[tuple[Manifest, Path]]:
             for name, expected in manifest.files.items():
                 _extract(path, archive, name, expected, folder)
     except (zipfile.BadZipFile, NotImplementedError, EOFError, UnicodeError) as error:
-        raise RunError(
-            f"{path}: is no bundle or was damaged ({error}); must be a file that `zsim bundle` made"
-        ) from error
+        raise RunError(f"{path}: is not a bundle or is damaged ({error}); must be written by `zsim bundle`") from error
     except OSError as error:
         raise RunError(f"{path}: cannot be read ({error.strerror})") from error
     try:
@@ -152,7 +151,7 @@ def is_bundle(path: Path) -> bool:
 
 
 def other_versions(lock: Iterable[str]) -> list[str]:
-    """Return which packages of a lock are installed here in another version, or not at all."""
+    """Return the packages of a lock that are installed here in another version, or not at all."""
     differing = []
     for line in lock:
         name, _, version = line.partition("==")
@@ -166,7 +165,7 @@ def other_versions(lock: Iterable[str]) -> list[str]:
 
 
 def pins_of(text: str, where: str) -> list[str]:
-    """Return the lines of a lock; RunError if one is anything but NAME==VERSION, such as an option or an address."""
+    """Return the lines of a lock; RunError if one is not NAME==VERSION but, for example, an option or a URL."""
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     for line in lines:
         if not PIN.fullmatch(line):
@@ -175,10 +174,10 @@ def pins_of(text: str, where: str) -> list[str]:
 
 
 def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
-    """Return the manifest of an archive whose members are all in it, plain files, and as large as it says."""
+    """Return the manifest of an archive after checking that it lists all members, which are plain files of its size."""
     entries = archive.infolist()
     if len(entries) > MEMBERS_MAX:
-        raise RunError(f"{path}: has {len(entries)} members; must have <= {MEMBERS_MAX}")
+        raise RunError(f"{path}: has {len(entries)} members; must be <= {MEMBERS_MAX}")
     names: set[str] = set()
     for entry in entries:
         if fault := _fault_of(entry, names):
@@ -186,43 +185,43 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
         names.add(entry.filename.casefold())
     size, stated = path.stat().st_size, sum(entry.file_size for entry in entries)
     if stated > size:
-        raise RunError(f"{path}: its members have {stated} bytes, and the file {size}; must not overlap")
+        raise RunError(f"{path}: its members have {stated} bytes, but the file only {size}; members must not overlap")
     if MANIFEST not in archive.namelist():
-        raise RunError(f"{path}: holds no {MANIFEST}; must be a file that `zsim bundle` made")
+        raise RunError(f"{path}: contains no {MANIFEST}; must be written by `zsim bundle`")
     head = archive.getinfo(MANIFEST)
     if head.file_size > MANIFEST_BYTES_MAX:
-        raise RunError(f"{path}: {MANIFEST} has {head.file_size} bytes; must have <= {MANIFEST_BYTES_MAX}")
+        raise RunError(f"{path}: {MANIFEST} has {head.file_size} bytes; must be <= {MANIFEST_BYTES_MAX}")
     text = archive.read(head)
     try:
         version: Any = msgspec.json.decode(text)
         if isinstance(version, dict) and version.get("format", FORMAT) != FORMAT:
             found = version["format"]
-            raise RunError(f"{path}: {MANIFEST} is of format {found!r:.40}; must be {FORMAT}, or take a newer zsim")
+            raise RunError(f"{path}: {MANIFEST} is of format {found!r:.40}; must be {FORMAT}; use a newer zsim")
         manifest = msgspec.json.decode(text, type=Manifest)
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise RunError(f"{path}: {MANIFEST} cannot be read ({error}); must be as `zsim bundle` wrote it") from error
     if manifest.sealed().seal != manifest.seal:
-        raise RunError(f"{path}: was changed: {MANIFEST} has another content than its seal says")
+        raise RunError(f"{path}: was changed: the content of {MANIFEST} does not match its seal")
     held = {entry.filename for entry in entries} - {MANIFEST}
     if others := sorted(held ^ set(manifest.files)):
-        fault = f"is not in {MANIFEST}" if others[0] in held else f"is missing, and in {MANIFEST}"
+        fault = f"is not in {MANIFEST}" if others[0] in held else f"is missing, but listed in {MANIFEST}"
         raise RunError(f"{path}: was changed: {others[0]} {fault}")
     for name in (README, SCENARIO, LOCK):
         if name not in held:
-            raise RunError(f"{path}: holds no {name}; must be a file that `zsim bundle` made")
+            raise RunError(f"{path}: contains no {name}; must be written by `zsim bundle`")
     return manifest
 
 
 def _fault_of(entry: zipfile.ZipInfo, names: set[str]) -> str:
-    """Return what is wrong with a member; empty if nothing is."""
+    """Describe what is wrong with a member; empty if nothing is."""
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     parts = name.split("/")
     if len(name) > NAME_MAX or not all(PART.fullmatch(part) for part in parts) or name != entry.orig_filename:
-        return "has a name that a bundle has not; must be a relative path below it"
+        return "has an invalid name; must be a relative path within the bundle"
     if name.casefold() in names:
-        return "is there twice; must be there once"
+        return "exists twice; must exist once"
     if kind not in (0, stat.S_IFREG) or entry.is_dir():
-        return "is no plain file; must be one"
+        return "is not a plain file; must be one"
     if entry.flag_bits & 1:
         return "is encrypted; must be plain"
     if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
@@ -240,11 +239,11 @@ def _extract(path: Path, archive: zipfile.ZipFile, name: str, expected: File, fo
             file.write(piece)
             size += len(piece)
     if (digest.hexdigest(), size) != (expected.sha256, expected.bytes):
-        raise RunError(f"{path}: was changed: {name} has another content than {MANIFEST} says")
+        raise RunError(f"{path}: was changed: the content of {name} does not match {MANIFEST}")
 
 
 def _hashed(content: Path | bytes) -> tuple[str, int]:
-    """Return the SHA-256 and the size of a content."""
+    """Return the SHA-256 and the size in bytes of a content."""
     digest, size = hashlib.sha256(), 0
     for piece in _pieces(content):
         digest.update(piece)

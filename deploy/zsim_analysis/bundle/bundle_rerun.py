@@ -1,4 +1,4 @@
-"""Flies a bundle again, and compares what comes out with what it says."""
+"""Flies a bundle again, and compares the results with those that it states."""
 
 import time
 from collections.abc import Callable
@@ -26,61 +26,62 @@ from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, conten
 from zsim_analysis.rerun import rerun_record
 
 Say = Callable[[str], None]
-SHOWN = 8  # differences of two machines, in a line
+SHOWN = 8  # most differences in a line
 
 
 def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
-    """Fly a bundle again; return how truth or an agent's outputs differ, empty if all is the same to the bit.
+    """Fly a bundle again; return how the truth or an agent's outputs differ, empty if all are identical to the bit.
 
     Args:
-        commands_only, say, note: as of `rerun_record`.
+        path: path of the bundle.
+        commands_only, say, note: as in `rerun_record`.
 
     Raises:
-        RunError: it is no bundle, was changed, or names code of its own, which may not be run.
+        RunError: the file is not a bundle, was changed, or names code of its own that may not be run.
         ScenarioError, RecordError: this version cannot read its scenario or its record.
     """
     with opened(path) as (manifest, folder):
         scenario = check_content(path, manifest, folder)
         lock = pins_of((folder / names.LOCK).read_text("utf-8"), f"{path}: {names.LOCK}")
         if others := other_versions([*lock, *manifest.needs]):
-            note(f"packages differ: {_shown(others)}; --install makes an environment with those of the bundle")
+            note(f"packages differ: {_shown(others)}; --install creates an environment with those of the bundle")
         if (folder / names.RECORD).exists():
             outputs = None if commands_only or manifest.not_run_again else manifest.outputs
             fault = rerun_record(folder / names.RECORD, commands_only, say, note, outputs)
         elif commands_only:
-            raise RunError(f"{path}: has no {names.RECORD}, whose commands would be read; leave --commands-only out")
+            raise RunError(f"{path}: has no {names.RECORD} with commands; omit --commands-only")
         else:
             if manifest.zsim != __version__:
                 note(f"flown by zsim {manifest.zsim}, flown again by {__version__}: the same bits are not promised")
             fault = _fly_again(manifest, folder, scenario, say)
         if fault:
-            _tell_machines(manifest, note)
+            _note_machines(manifest, note)
         else:
             say(f"the same to the bit: {manifest.name}, {manifest.duration_s:g} s, {len(scenario.drones)} drones")
         return fault
 
 
 def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
-    """Return the scenario of a bundle, which is also that of its record, and may be flown here.
+    """Return the scenario of a bundle after checking that it matches the record, and may be flown here.
 
     Raises:
-        RunError: it is another than the manifest says, or names code that may not be run.
+        RunError: the scenario does not match manifest and record, or names code that may not be run.
     """
     try:
         text = (folder / names.SCENARIO).read_text("utf-8")
     except UnicodeDecodeError as error:
-        raise RunError(f"{path}: {names.SCENARIO} is no text in UTF-8 ({error.reason})") from error
+        raise RunError(f"{path}: {names.SCENARIO} is not UTF-8 text ({error.reason})") from error
     if scenario_file.sha256(text) != manifest.scenario_sha256:
-        raise RunError(f"{path}: was changed: {names.SCENARIO} has another hash than {names.MANIFEST} says")
+        raise RunError(f"{path}: was changed: the hash of {names.SCENARIO} does not match {names.MANIFEST}")
     record = folder / names.RECORD
     if record.exists():
         with RecordReader(record) as reader:
             found = reader.last(keys.INFO)
         info = recorded_run.decode_or_none(found) if found else None
         if info is None or info.scenario != text:
-            raise RunError(f"{path}: was changed: {names.RECORD} is not of its {names.SCENARIO}")
+            raise RunError(f"{path}: was changed: {names.RECORD} does not match {names.SCENARIO}")
     elif not (folder / names.GATES).exists():
-        raise RunError(f"{path}: holds neither {names.RECORD} nor {names.GATES}; must hold one of them")
+        raise RunError(f"{path}: contains neither {names.RECORD} nor {names.GATES}; must contain one of them")
     scenario = scenario_file.from_text(text)
     if (own := scenario.own_code()) and not plugin.may_import():
         raise RunError(f"{path}: its scenario names {listed(own)}: code that a rerun runs, and only with --trust")
@@ -88,7 +89,7 @@ def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
 
 
 def _fly_again(manifest: Manifest, folder: Path, scenario: Scenario, say: Say) -> str:
-    """Fly the scenario of a bundle without a record; return how it differs."""
+    """Fly the scenario of a bundle without a record; return how the results differ, empty if they do not."""
     plugin.search(folder / names.MODULES)
     flight = InProcessFlight(scenario)
     say(f"run again: world, {', '.join(agents_of(scenario))}")
@@ -110,11 +111,11 @@ def _fly_again(manifest: Manifest, folder: Path, scenario: Scenario, say: Say) -
         return f"{what}, in the last gates, which are not in {names.GATES}"
     t_ns, key = first
     gate = f"gate {t_ns // flight.info.gate_ns} at {t_ns / 1e9:.2f} s"
-    return f"{what}, first {key} at {gate}; which field is not known without a record"
+    return f"{what}, first {key} at {gate}; without a record, the field is unknown"
 
 
 class _Watch:
-    """Hashes what a flight publishes, as `make_bundle` does with what is on record."""
+    """Hashes the messages of a flight, as `make_bundle` does with those on record."""
 
     def __init__(self, flight: InProcessFlight, manifest: Manifest, screen: Screen) -> None:
         self.hashes, self.digests = OutputHashes(manifest.until_ns), GateDigests(manifest.until_ns)
@@ -122,13 +123,13 @@ class _Watch:
         self._screen, self._throttle, self._start_s = screen, RateLimit(PERIOD_S), time.monotonic()
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take a message of anybody."""
+        """Add an agent's output."""
         if recorded_run.is_answer(key):
             self.hashes.add(key, message.t_ns, content := content_of(message))
             self.digests.add(key, message.t_ns, content)
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Take the truth of a gate."""
+        """Add the truth of a gate."""
         if self._throttle.spend():
             rate = gate.t_ns / 1e9 / max(1e-9, time.monotonic() - self._start_s)
             self._screen.clock({"t_s": gate.t_ns / 1e9, "rate": rate, "state": "again", "phase": "", "waiting_for": []})
@@ -137,12 +138,12 @@ class _Watch:
                 self.digests.add(key, t_ns, payload)
 
 
-def _tell_machines(manifest: Manifest, note: Say) -> None:
-    """Say what differs in the machine on which it was flown and this one."""
+def _note_machines(manifest: Manifest, note: Say) -> None:
+    """Note the differences between the machine that flew the bundle and this one."""
     here = {**machine(), **parts()}
     if not manifest.machine:
         prints = f"of fingerprint {', '.join(manifest.fingerprints)}, here {fingerprint()}"
-        note(f"the machines: it is not known on which it was flown, {prints}")
+        note(f"the machines: the one that flew the bundle is unknown, {prints}")
     elif differing := [
         f"{name} {manifest.machine.get(name, 'none')}, here {here.get(name, 'none')}"
         for name in sorted({*manifest.machine, *here})
@@ -150,7 +151,7 @@ def _tell_machines(manifest: Manifest, note: Say) -> None:
     ]:
         note(f"the machines differ: {_shown(differing)}")
     else:
-        note("the machines do not differ in anything that is known of them")
+        note("the machines do not differ in any known respect")
 
 
 def _shown(differing: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Makes the bundle of a run from its record: no absolute path and no name of a host is in it."""
+"""Makes the bundle of a run from its record, without absolute paths and host names."""
 
 import ast
 import base64
@@ -48,15 +48,15 @@ from zsim_analysis.report.summary import judge
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 
 PROJECT = "zsim"
-BYTES_MAX = 50_000_000  # of all users' modules: code, not data
+BYTES_MAX = 50_000_000  # largest total size of users' modules, which are to be code, not data
 MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 PATH = re.compile(r"(?<![\w./~-])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"()]+[/\\])+")  # the folders of an absolute path
-FREE_TEXT = ("text", "reason", "error", "failure")  # fields in which a message says anything
+FREE_TEXT = ("text", "reason", "error", "failure")  # fields of messages that hold free text
 OF_THE_WALL_CLOCK = (
     *("run_id", "date", "changed", "versions", "fingerprint", "mode", "real_time_factor", "wall_s", "command_age_ms"),
     *("deadlines", "deadline_misses", "deadline_misses_by", "links", "participants", "events", "events_left_out"),
     *("record", "notes"),
-)  # fields of a summary that say how it was flown, not what
+)  # fields of a summary about the circumstances of the flight, not its results
 
 
 def make_bundle(
@@ -65,31 +65,33 @@ def make_bundle(
     """Write the bundle of the run in a folder, or of a record.
 
     Args:
+        place: the folder of the run, or its record.
         out: the file; None for the scenario's name in the working folder.
-        with_record: whether the record is in it; without, it must be known that the scenario alone gives the flight.
-        note: takes lines on what it lacks.
+        with_record: whether to include the record; only a flight that its scenario alone reproduces can do without.
+        force: whether to replace an existing file.
+        note: called with each line on what the bundle lacks.
 
     Raises:
-        RunError: the record is not that of a whole flight that can be flown again, or the scenario names what a bundle
-            cannot hold; or the file cannot be written.
+        RunError: the record is not that of a complete flight that can be flown again, the scenario names something
+            that a bundle cannot hold, or the file cannot be written.
     """
     record = record_at(place)
-    whole = record_completeness(record)
-    if not whole.complete:
-        raise RunError(f"{place}: the record is {whole}; must be that of a whole flight")
+    completeness = record_completeness(record)
+    if not completeness.complete:
+        raise RunError(f"{place}: the record is {completeness}; must be that of a complete flight")
     with recorded_run.open_run(record) as run:
         out = out or Path(f"{run.scenario.name}{names.SUFFIX}")
-        refuse_existing(out, force)  # before seconds of drawing
+        refuse_existing(out, force)  # before figures are drawn, which takes seconds
         _check(place, run)
         agents = recorded_run.recorded_agents(run.reader, run.info, run.scenario)
         expected = _Expected(run, agents)
         if not with_record and (reason := agents.why_not or expected.others):
-            raise RunError(f"{place}: {reason}: only the record has that; leave --no-record out")
+            raise RunError(f"{place}: {reason}: only the record has that; omit --no-record")
         own = run.scenario.own_code()
         modules = own_modules(own)
         lock, needs = locked(modules.packages)
         if lacking := sorted(modules.packages - {each.partition("==")[0].replace("-", "_") for each in needs}):
-            note(f"{', '.join(lacking)}: not from an index, or named otherwise there; whoever flies it must have it")
+            note(f"{', '.join(lacking)}: not in a package index under this name; must be installed to fly the bundle")
         hosts = _Hosts(run.reader)
         folder = temporary_folder("bundle-")
         members: dict[str, Path | bytes] = {names.SCENARIO: run.info.scenario.encode(), **modules.files}
@@ -102,7 +104,7 @@ def make_bundle(
             members[names.GATES] = expected.digests.csv()
         flown_here = fingerprint() == run.info.fingerprint and hosts.are_only(socket.gethostname())
         if not flown_here:
-            note("flown on another machine, or by another version, than it is bundled: it is not said on which")
+            note("flown on another machine, or by another version, than this one: the bundle does not name the machine")
         _add_figures(members, copied)
         manifest = Manifest(
             format=names.FORMAT,
@@ -127,10 +129,10 @@ def make_bundle(
 
 
 def _check(place: Path, run: RecordedRun) -> None:
-    """Refuse what cannot be flown again elsewhere."""
+    """Raise RunError for a run that cannot be flown again elsewhere."""
     reader, info, scenario = run
     if reader.damaged:
-        raise RunError(f"{place}: the record is damaged: {reader.damaged[0]}; must be whole")
+        raise RunError(f"{place}: the record is damaged: {reader.damaged[0]}; must be intact")
     if info.replay_of:
         raise RunError(f"{place}: is the record of a replay; give that of run {info.replay_of}")
     if external := scenario.external():
@@ -138,7 +140,7 @@ def _check(place: Path, run: RecordedRun) -> None:
             f"{place}: has drones whose bodies are external ({listed(external)}); they cannot be flown again"
         )
     if scenario_file.sha256(info.scenario) != info.scenario_sha256:
-        raise RunError(f"{place}: its scenario is not the one whose hash it has; must be as the world recorded it")
+        raise RunError(f"{place}: its scenario does not match its recorded hash; must be as the world recorded it")
     for path, value in _texts(yaml_file.value(info.scenario)):
         if PATH.match(value):
             raise RunError(
@@ -161,7 +163,7 @@ def _texts(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
 class _Expected:
     """What flying a record again must give: `hashes` of the agents' outputs, and `digests` of all keys, gate by gate.
 
-    `others` says which inputs of the flight were none of the scenario's; empty if there were none.
+    `others` names the inputs of the flight that did not come from the scenario; empty if there were none.
     """
 
     def __init__(self, run: RecordedRun, agents: RecordedAgents) -> None:
@@ -190,12 +192,12 @@ class _Expected:
             senders.add("what programs or cameras did")
         ended_ns = until_ns + info.gate_ns + info.command_delay_ns
         if ended_ns + info.gate_ns <= scenario.duration_s * 1e9:
-            senders.add(f"an end before its time, after {ended_ns / 1e9:g} of {scenario.duration_s:g} s")
+            senders.add(f"an early end, after {ended_ns / 1e9:g} of {scenario.duration_s:g} s")
         self.others = f"the flight had {', '.join(sorted(senders))}" if senders else ""
 
 
 class _Hosts:
-    """The hosts of a run, and what stands in a bundle for their names."""
+    """The hosts of a run, and the placeholders of their names in a bundle."""
 
     def __init__(self, reader: RecordReader) -> None:
         joins = (key for key in reader.topics() if keys.matches("process/*/join", key))
@@ -209,7 +211,7 @@ class _Hosts:
         return set(self._names) == {name}
 
     def removed(self, value: Any, field: str = "") -> Any:
-        """Return a part of a message without names of hosts and without folders."""
+        """Return a part of a message without host names and folders."""
         if isinstance(value, dict):
             return {name: self.removed(each, str(name)) for name, each in value.items()}
         if isinstance(value, list):
@@ -227,9 +229,9 @@ class _Hosts:
 def _copy_record(
     reader: RecordReader, into: Path, hosts: _Hosts, has_modules: bool, note: Callable[[str], None]
 ) -> None:
-    """Copy a record without names of hosts and folders; what drones and agents have published stays as it is."""
+    """Copy a record without host names and folders, except in what drones and agents have published."""
     own_host = socket.gethostname().encode()
-    told: set[str] = set()
+    noted: set[str] = set()
     with RecordWriter(into) as writer:
         for key, payload, t_ns, wall_ns in reader.messages(by_time=False):
             kind, _, what = keys.parts(key)
@@ -242,9 +244,9 @@ def _copy_record(
                     content = None
                 cleaned = hosts.removed(content)
                 payload = payload if cleaned == content else msgpack.packb(cleaned) or b""
-            elif len(own_host) > 3 and key not in told and own_host in payload:
-                told.add(key)
-                note(f"{key}: has the name of this machine, and is in the bundle as it is")
+            elif len(own_host) > 3 and key not in noted and own_host in payload:
+                noted.add(key)
+                note(f"{key}: contains the name of this machine, and is bundled unchanged")
             writer.add(key, payload, messages.encoding(key), t_ns, wall_ns)
 
 
@@ -255,28 +257,28 @@ def _without_folders(payload: bytes, has_modules: bool) -> bytes:
     return messages.encode(msgspec.structs.replace(info, module_folders=folders, changed=changed))
 
 
-# What it needs of this machine: users' modules, and the packages, with their versions
+# What a flight needs of this machine: users' modules, and packages with their versions
 #
-# Nothing of it is imported: modules are found as Python finds them, and what they import is read in their text. A name
-# that is put together while a program runs is not found there.
+# Nothing is imported: modules are located as Python does, and their imports are read from their source. Imports of
+# names that are assembled at run time are not found.
 
 
 class OwnModules(NamedTuple):
-    """Modules of users that are no installed packages, by their path in a bundle; and packages that they import."""
+    """Users' modules that are not in installed packages, by path in a bundle; and the packages that they import."""
 
     files: dict[str, Path]
-    packages: set[str]  # as they are imported, the first part of the name
+    packages: set[str]  # names as in imports, up to the first dot
 
 
 def own_modules(names: Iterable[str]) -> OwnModules:
-    """Return the modules of some classes, functions and modules of users, and of all that these import of the like.
+    """Return users' modules: those of the given classes, functions and modules, and all that they import in turn.
 
     Args:
-        names: as `Scenario.own_code` has them.
+        names: as returned by `Scenario.own_code`.
 
     Raises:
-        DocumentError: one is nowhere.
-        RunError: they are too large, or cannot be read.
+        DocumentError: a module is not found.
+        RunError: the modules are too large, or cannot be read.
     """
     found = OwnModules({}, set())
     wanted = [(name.partition(":")[0], True) for name in names]
@@ -292,7 +294,7 @@ def own_modules(names: Iterable[str]) -> OwnModules:
         except DocumentError:
             if is_needed:
                 raise
-            continue  # what is imported only where it is there
+            continue  # an optional import
         places = [Path(spec.origin)] if spec.origin else [Path(each) for each in spec.submodule_search_locations or ()]
         if spec.origin in ("built-in", "frozen") or any(plugin.is_library(f"{place}") for place in places):
             found.packages.add(package)
@@ -303,12 +305,12 @@ def own_modules(names: Iterable[str]) -> OwnModules:
                 wanted += [(each, False) for each in _imports(path)]
     size = sum(path.stat().st_size for path in found.files.values())
     if size > BYTES_MAX:
-        raise RunError(f"the scenario's own modules have {size} bytes; must have <= {BYTES_MAX}: keep data elsewhere")
+        raise RunError(f"the scenario's own modules have {size} bytes; must be <= {BYTES_MAX}; keep data elsewhere")
     return found
 
 
 def _sources(package: str, places: Iterable[Path]) -> Iterator[tuple[Path, str]]:
-    """Yield the files of a module or a package, and their paths below the folder that holds it."""
+    """Yield the files of a module or a package, and their paths relative to the folder that contains it."""
     for place in places:
         if place.is_file() and place.name != "__init__.py":
             yield place, place.name
@@ -322,7 +324,7 @@ def _sources(package: str, places: Iterable[Path]) -> Iterator[tuple[Path, str]]
 
 
 def _imports(path: Path) -> set[str]:
-    """Return the modules that a module imports; of one made for a class of a notebook, what its pickle names."""
+    """Return the modules that a module imports; for one generated for a notebook's class, those its pickle names."""
     try:
         tree = ast.parse(path.read_bytes())
     except (OSError, SyntaxError, ValueError) as error:
@@ -344,12 +346,12 @@ def _imports(path: Path) -> set[str]:
 
 
 def locked(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
-    """Return what is installed here, as lines NAME==VERSION: all that flies, with what some packages need; and these.
+    """Return lines NAME==VERSION of installed packages: all that zsim and the given packages need, and the given ones.
 
-    A package that came from elsewhere than an index has no such line.
+    A package that was not installed from an index has no line.
 
     Args:
-        packages: as they are imported.
+        packages: names as in imports.
     """
     by_import = importlib.metadata.packages_distributions()
     own = {_canonical(name) for each in packages for name in by_import.get(each, ())}
@@ -383,7 +385,7 @@ def _canonical(name: str) -> str:
 
 
 def _add_figures(members: dict[str, Path | bytes], record: Path) -> None:
-    """Add the figures of the report, what is drawn in each as a table, and the numbers of the summary."""
+    """Add the figures of the report, the curves of each as a table, and the numbers of the summary."""
     flight, formations, summary = judge(record, answers=True)
     for figure in figures(flight, formations, summary):
         members[f"{names.FIGURES}/{figure.name}"] = figure.png()
@@ -408,17 +410,17 @@ def _drawn(drawing: Any) -> bytes:
 
 README = """# {name}
 
-A flight of zsim, a co-simulator of drone formations, in one file: a zip archive, which any tool opens.
+A flight of zsim, a co-simulator of drone formations, in one file: an ordinary zip archive.
 
-To fly it again, and to be told whether every bit is the same, with zsim {zsim}{commit}:
+To fly it again with zsim {zsim}{commit}, and check that every bit is the same:
 
     zsim rerun FILE{trust}
 
-`--install` makes an environment with the versions of packages in `{lock}` first. A file that was changed is refused.
+`--install` first creates an environment with the package versions of `{lock}`. A file that was changed is refused.
 
 | | |
 |---|---|
-| scenario | `{scenario}`, as it was flown: {duration_s:g} s, seed {seed} |
+| scenario | `{scenario}`, as flown: {duration_s:g} s, seed {seed} |
 | SHA-256 of the truth of all drones | `{truth_sha256}` |
 | SHA-256 of the agents' outputs, by key | in `{manifest}` |
 | flown on | {machine} |
@@ -431,22 +433,21 @@ To fly it again, and to be told whether every bit is the same, with zsim {zsim}{
 """
 WHAT = {
     names.SCENARIO: "the scenario, with all defaults and the seed",
-    names.LOCK: "versions of the packages with which it was bundled",
+    names.LOCK: "versions of the installed packages when it was bundled",
     names.RECORD: "every message of the flight: MCAP, opened by `zsim report`, Foxglove, or any MCAP library",
-    names.GATES: "in place of the record: a check sum of each key at each gate, by which a difference is found",
-    names.RESULTS: "errors of the formation, separations, and how the flight fell short of its plan",
-    names.FIGURES: "the figures of the report, each with the curves that are drawn in it as a table",
-    names.MODULES: "the scenario's own Python modules: code that flying it again runs",
-    names.MANIFEST: "what is in this file, with the SHA-256 of each part, and what flying it again must give",
+    names.GATES: "in place of the record: a checksum of each key at each gate, by which a difference is found",
+    names.RESULTS: "errors of the formation, separations, and deviations of the flight from its plan",
+    names.FIGURES: "the figures of the report, each with its curves as a table",
+    names.MODULES: "the scenario's own Python modules, which run when it is flown again",
+    names.MANIFEST: "the contents of this file, with the SHA-256 of each part, and what flying it again must give",
 }
 
 
 def _readme(manifest: Manifest, members: Mapping[str, Any]) -> str:
-    there = dict.fromkeys(name.partition("/")[0] for name in sorted([*members, names.MANIFEST]))
+    parts_of = dict.fromkeys(name.partition("/")[0] for name in sorted([*members, names.MANIFEST]))
     own = f"It names code of its own ({', '.join(manifest.own_code)}), which is run only with `--trust`: read it first."
-    made_for = [name for name in members if Path(name).name.startswith(plugin.MADE)]
-    if made_for:
-        own += " Classes of a notebook are in it as Python pickled them: only that version of Python reads them."
+    if any(Path(name).name.startswith(plugin.MADE) for name in members):
+        own += " It contains classes of a notebook as pickled by Python; only the same version of Python reads them."
     if manifest.not_run_again:
         own += f"\n\nIts agents are not run again but their commands are read: {manifest.not_run_again}."
     return README.format(
@@ -461,6 +462,6 @@ def _readme(manifest: Manifest, members: Mapping[str, Any]) -> str:
         truth_sha256=manifest.truth_sha256,
         manifest=names.MANIFEST,
         machine=", ".join(f"{name} {value}" for name, value in manifest.machine.items()) or "another machine",
-        files="\n".join(f"| `{name}` | {WHAT[name]} |" for name in there),
+        files="\n".join(f"| `{name}` | {WHAT[name]} |" for name in parts_of),
         code=own if manifest.own_code or manifest.not_run_again else "It names no code of its own.",
     )

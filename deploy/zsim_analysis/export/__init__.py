@@ -1,8 +1,8 @@
-"""Tables, MATLAB files and Foxglove files of a run, made from its record alone.
+"""Tables, MATLAB files and Foxglove files of a run, from its record alone.
 
-    export(DIR, Format.CSV, OUT, MessageSelection())     writes OUT, all of it or nothing
+    export(DIR, Format.CSV, OUT, MessageSelection())     writes OUT completely or not at all
 
-Imports zsim_analysis.reading. This file needs no extra packages: the command line takes the formats from it.
+Imports zsim_analysis.reading. This file needs no extra packages, since the command line takes the formats from it.
 """
 
 from enum import StrEnum

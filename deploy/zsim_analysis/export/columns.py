@@ -1,7 +1,7 @@
 """Selected messages of a record as tables: which keys and times, which columns, and rows in batches.
 
-The columns of any message of the contract follow from its type: vectors become a column per component, variables and
-sensors one per name, and what has no fixed shape becomes JSON text. All formats of tables are written from them.
+The columns of a message of the contract follow from its type: vectors become a column per component, variables and
+sensors a column per name, and content without a fixed shape becomes JSON text. All formats of tables use them.
 """
 
 import math
@@ -24,8 +24,8 @@ from zsim.scenario.faults import ROTORS
 from zsim.sensors.sensor import sensor_of
 from zsim_analysis.reading.recorded_run import decode_or_none
 
-CELLS = 100_000  # of a batch: some 5 MB as Python objects
-PROGRESS_EVERY = 10_000  # messages
+CELLS = 100_000  # cells of a batch: some 5 MB as Python objects
+PROGRESS_EVERY = 10_000  # messages between two calls of `progress`
 WHOLE_MAX = 2**63 - 1
 QUATERNION, NO_WORD = "_wxyz", r"\W"
 COUNTS = ("used", "refused")  # an estimate's counts of a sensor's samples
@@ -38,23 +38,23 @@ Values = NDArray[Any] | list[Any]
 class MessageSelection(NamedTuple):
     """Keys and times to be exported."""
 
-    expressions: tuple[str, ...] = ()  # key expressions as Zenoh's; none: every key
-    from_s: float | None = None  # simulated time of the first message [s], None: the start
-    to_s: float | None = None  # of the last one
+    expressions: tuple[str, ...] = ()  # key expressions as in Zenoh; empty: every key
+    from_s: float | None = None  # simulated time of the first message [s]; None: the start
+    to_s: float | None = None  # simulated time of the last message [s]; None: the end
 
     def keys(self, reader: RecordReader) -> list[str]:
         every = not self.expressions
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
     def messages(self, reader: RecordReader, wanted: list[str]) -> Iterator[Recorded]:
-        """Yield the messages of some keys that are within the times, in order of simulated time."""
+        """Yield the messages of some keys within the times, in order of simulated time."""
         first = 0 if self.from_s is None else round(self.from_s * 1e9)
         last = 2**64 if self.to_s is None else round(self.to_s * 1e9)
         return (message for message in reader.messages(frozenset(wanted)) if first <= message.t_ns <= last)
 
 
 def subject(key: str) -> str:
-    """Return the drone, cluster or process of a key; `world` if it concerns all."""
+    """Return the drone, cluster or process that a key is about; `world` if it is about none."""
     kind, whose, what = keys.parts(key)
     return (what or "world") if kind == "view" else whose if what else "world"
 
@@ -62,27 +62,27 @@ def subject(key: str) -> str:
 class RowBatch(NamedTuple):
     """Rows of one table, in order of time."""
 
-    kind: type[Struct]  # of the messages
-    only: str  # the subject of all rows, if each subject has a table of its own
-    names: list[str]  # subject of each
-    messages: list[Any]  # decoded
-    wall_ns: list[int]  # when each reached the recorder
+    kind: type[Struct]  # type of the messages
+    only: str  # the subject of all rows if each subject has its own table; otherwise empty
+    names: list[str]  # subject of each row
+    messages: list[Any]  # decoded messages
+    wall_ns: list[int]  # wall time at which each reached the recorder
 
 
 class Columns(NamedTuple):
-    name: str  # unique in the table
-    kind: Kind  # of all its columns
-    columns: tuple[str, ...]  # their names
-    # returns a value per row, or a table (rows, columns); None or NaN where there is none
+    name: str  # name of the field, unique in the table
+    kind: Kind  # kind of all its columns
+    columns: tuple[str, ...]  # names of the columns
+    # returns a value per row, or a table (rows, columns), with None or NaN for missing values
     values: Callable[[RowBatch], Values]
-    names: tuple[str, ...] = ()  # of the variables, one column each; empty for other fields
-    keys: Mapping[str, slice] = {}  # the columns of each key of a map; empty for other fields
+    names: tuple[str, ...] = ()  # names of variables with a column each; empty for other fields
+    keys: Mapping[str, slice] = {}  # columns of each key of a map; empty for other fields
 
 
 def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tuple[Columns, ...]:
-    """Return the columns of a message's table, given the names, or keys, that occur in each open field."""
+    """Return the columns of the table of a message type, given the names or keys that occur in each open field."""
     opens = open_fields(kind)
-    hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # `names` are in the others' columns
+    hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # other columns carry the `names`
     own = [field for field in _fields(kind) if field.name not in hidden]
     return (
         Columns("name", "text", ("name",), lambda batch: batch.names),
@@ -98,13 +98,13 @@ def column_values(table: Iterable[Columns], batch: RowBatch) -> Iterator[tuple[s
     """Yield name, kind and values of every column of a batch, in the order of the table."""
     for each in table:
         values = each.values(batch)
-        apart = values.T if isinstance(values, np.ndarray) and values.ndim == 2 else [values]
-        for name, column in zip(each.columns, apart, strict=True):
+        separate = values.T if isinstance(values, np.ndarray) and values.ndim == 2 else [values]
+        for name, column in zip(each.columns, separate, strict=True):
             yield name, each.kind, column
 
 
 def as_array(kind: Kind, values: Values) -> NDArray[Any]:
-    """Return values as int64, float64, bool or objects; whole numbers of which some are missing as float64 with NaN."""
+    """Return values as int64, float64, bool or objects; integers with missing values become float64 with NaN."""
     if kind == "text":
         return np.array(values, object)
     if kind == "whole" and not any(value is None for value in values):
@@ -113,7 +113,7 @@ def as_array(kind: Kind, values: Values) -> NDArray[Any]:
 
 
 def open_fields(kind: type[Struct]) -> dict[str, Literal["named", "numbers", "pairs"]]:
-    """Return the fields of a message whose columns depend on its content: named variables, maps of numbers or pairs."""
+    """Return the fields of a message whose columns depend on content: named variables, maps of numbers or pairs."""
     opens: dict[str, Literal["named", "numbers", "pairs"]] = {}
     for field in _fields(kind):
         match field.type:
@@ -171,7 +171,7 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
 
 
 def _plain(name: str, kind: Kind, path: str = "", convert: Callable[[Any], Any] = lambda value: value) -> Columns:
-    """Return the column of a field, or of what is at a path from the message, converted."""
+    """Return the column of a field, or of the value at a path from the message, converted."""
     get = attrgetter(path or name)
 
     def values(batch: RowBatch) -> Values:
@@ -181,7 +181,7 @@ def _plain(name: str, kind: Kind, path: str = "", convert: Callable[[Any], Any] 
 
 
 def _open(name: str, names: Sequence[str], kind: str) -> Columns:
-    """Return a column for each name, or key, of an open field; for pairs two: FIELD_KEY_used and FIELD_KEY_refused.
+    """Return a column for each name or key of an open field, or two for pairs: FIELD_KEY_used and FIELD_KEY_refused.
 
     The messages' `names` may differ from message to message.
     """
@@ -193,7 +193,7 @@ def _open(name: str, names: Sequence[str], kind: str) -> Columns:
         table = np.full((len(batch.messages), len(columns)), np.nan)
         for row, message in zip(table, batch.messages, strict=True):
             content = getattr(message, name)
-            if kind == "named":  # of a large formation thousands: at once
+            if kind == "named":  # at once, since large formations have thousands
                 row[[places[each].start for each in message.names]] = content
                 continue
             for each, value in content.items():
@@ -206,7 +206,7 @@ def _open(name: str, names: Sequence[str], kind: str) -> Columns:
 
 
 def _components(name: str, info: inspect.Type) -> list[str]:
-    """Return the columns of a field with a fixed number of numbers, none for any other field."""
+    """Return the columns of a field with a fixed number of elements; empty for any other field."""
     if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
         parts = [f"{i}{j}" for i in range(6) for j in range(6)]
     elif isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
@@ -219,22 +219,22 @@ def _components(name: str, info: inspect.Type) -> list[str]:
 
 
 def component_names(name: str, count: int) -> list[str]:
-    """Return the columns of a vector of so many numbers: `_x`, `_y` and `_z` of three, `_w` to `_z` of a quaternion."""
+    """Return the columns of a vector: `_x` to `_z` of three numbers, `_w` to `_z` of a quaternion, or else indices."""
     if name.endswith(QUATERNION) and count == len("wxyz"):
         return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
     return [f"{name}_{part}" for part in ("xyz" if count == 3 else range(count))]
 
 
 def json_text(value: Any) -> str:
-    """Return a value as JSON, in which types unknown to JSON are written as their repr."""
+    """Return a value as JSON, with types unknown to JSON as their repr."""
     try:
         return msgspec.json.encode(value, enc_hook=repr).decode()
-    except REFUSALS:  # keys that are not text, for instance
+    except REFUSALS:  # e.g. keys that are not text
         return msgspec.json.encode(repr(value)).decode()
 
 
 class Foreign(Struct, frozen=True):
-    """A message on a key unknown to the contract; `content` is its payload as JSON."""
+    """A message on a key that is not in the contract; `content` is its payload as JSON."""
 
     t_ns: int
     key: str
@@ -242,7 +242,7 @@ class Foreign(Struct, frozen=True):
 
 
 class Sighting(Struct, frozen=True):
-    """A row of a hat that was seen in a picture, or of a picture without any, whose numbers are NaN.
+    """A row for a hat that was seen in a picture, or for a picture without any, with NaN for its numbers.
 
     `hats` is the number of hats in the picture, `hat` the index of this one, from 0.
     """
@@ -261,10 +261,10 @@ class Sighting(Struct, frozen=True):
 
 
 class TableSurvey:
-    """The tables of a selection, by a first pass over the record: the `wanted` keys, and `kinds`, their types.
+    """The tables of a selection, found in a first pass over the record: the `wanted` keys, and `kinds`, their types.
 
-    `pictures` go into no table. `rows` counts messages by type, None for foreign keys, including those outside the
-    times or unreadable.
+    `pictures` is the number of pictures, which are in no table. `rows` is the number of messages by type, with None for
+    foreign keys, including messages that are outside the times or cannot be decoded.
     """
 
     def __init__(self, reader: RecordReader, selection: MessageSelection) -> None:
@@ -274,7 +274,7 @@ class TableSurvey:
         chosen = selection.keys(reader)
         self.pictures = sum(counts[key] for key in chosen if messages.type_of(key) is CameraImage)
         if not selection.expressions:
-            chosen = [key for key in chosen if not keys.is_accepted(key)]  # repeats of commands that are rows already
+            chosen = [key for key in chosen if not keys.is_accepted(key)]  # these repeat commands that have rows
         self.wanted = [key for key in chosen if messages.type_of(key) is not CameraImage]
         if (info := reader.last(keys.INFO)) is not None:
             decode_or_none(info)  # registers the messages of users' sensors
@@ -283,7 +283,7 @@ class TableSurvey:
         for key in self.wanted:
             self.rows[self.kinds.get(key)] += counts[key]
         opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
-        self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # that occur in the open fields of all messages
+        self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # those in the open fields of all messages
             kind: {field: {} for field in opens} for kind, opens in opened.items()
         }
         wanted = [key for key, kind in self.kinds.items() if opened[kind]]
@@ -304,12 +304,12 @@ class TableSurvey:
         return sum(len(each.columns) for each in self.table(kind))
 
     def rows_within(self, kind: type[Struct]) -> int:
-        """Return the number of messages of a type within the times; this reads all of them."""
+        """Return the number of messages of a type within the times, which takes reading them all."""
         wanted = [key for key, of in self.kinds.items() if of is kind]
         return sum(1 for _ in self._selection.messages(self._reader, wanted))
 
     def decode(self, recorded: Recorded) -> Any:
-        """Return a message, None if it is not of the type of its key; foreign ones as Foreign."""
+        """Return a message, as Foreign if its key is foreign; None if it does not match the type of its key."""
         if recorded.key in self.kinds:
             return decode_or_none(recorded)
         try:
@@ -328,7 +328,7 @@ class DecodedMessages:
         self._messages = messages
         self._decode = decode
         self._progress = progress
-        self.refused = 0  # messages left out so far
+        self.refused = 0  # number of messages left out so far
 
     def __iter__(self) -> Iterator[tuple[Recorded, Any]]:
         for count, recorded in enumerate(self._messages):
@@ -344,9 +344,9 @@ class DecodedMessages:
 def batches(
     decoded: Iterable[tuple[Recorded, Any]], width: Callable[[type[Struct]], int], by_name: bool = False
 ) -> Iterator[RowBatch]:
-    """Yield all rows, those of a table in order of time, given messages in order of time.
+    """Yield the rows of all tables, given messages in order of time, which each table keeps.
 
-    Batches of wide tables have fewer rows. With `by_name`, each drone, cluster and process has tables of its own.
+    Batches of wide tables have fewer rows. With `by_name`, each drone, cluster and process has its own tables.
     """
     incomplete: dict[tuple[type[Struct], str], RowBatch] = {}
     for recorded, message in decoded:
@@ -360,7 +360,7 @@ def batches(
             ] or [Sighting(*head)]
         for row in rows:
             kind = type(row)
-            only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as names of files
+            only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as file names
             batch = incomplete.setdefault((kind, only), RowBatch(kind, only, [], [], []))
             batch.names.append(name)
             batch.messages.append(row)

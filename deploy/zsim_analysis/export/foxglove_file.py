@@ -1,6 +1,6 @@
-"""Writes the Foxglove file of a record, in order of time and in bounded memory: its topics, and when each is written.
+"""Writes a record as a file for Foxglove, ordered by time and in bounded memory: its topics, and when each is written.
 
-Foxglove shows all of it; Rerun reads the transforms, poses, points, fixes, pictures, log and numbers.
+Foxglove shows all of them; Rerun reads the transforms, poses, points, fixes, pictures, log and numbers.
 """
 
 import math
@@ -33,7 +33,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.vehicles.vehicle import cross_layout
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_analysis.export import foxglove_messages as made
+from zsim_analysis.export import foxglove_messages as build
 from zsim_analysis.export.columns import DecodedMessages, MessageSelection, subject
 from zsim_analysis.export.foxglove_messages import GREY, MAGENTA, TRAIL_STEP_NS, NumericMessageType, RotorDisc
 from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of, search_modules
@@ -41,26 +41,26 @@ from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of, sear
 TF, LOG, DRONES, GROUND, TRAILS = "/tf", "/log", "/scene/drones", "/scene/ground", "/scene/trails"
 FORMATIONS, ESTIMATES = "/scene/formations", "/scene/estimates"
 POINTS, DESIRED = "/points/drones", "/points/desired"
-SCENE_STEP_NS = 100_000_000  # between two messages of a scene or of points
+SCENE_STEP_NS = 100_000_000  # interval between messages of a scene or of points
 DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event, CameraImage, CameraInfo)
-LATEST_NS = 2**32 * 10**9  # Foxglove counts seconds in 32 bits
-ARM_M = 0.1785  # m, the AR.Drone's, if the scenario is not known
-ROTOR_RADIUS = 0.57  # of the arm, if the rotors are not known: 0.102 m at the AR.Drone's 0.1785 m
+LATEST_NS = 2**32 * 10**9  # Foxglove stores seconds in 32 bits
+ARM_M = 0.1785  # arm length of the AR.Drone, for drones of an unknown scenario
+ROTOR_RADIUS = 0.57  # share of the arm length, for unknown rotors: the AR.Drone's 0.102 m / 0.1785 m
 
 
 class ConvertedRun(NamedTuple):
     """The content of a written file."""
 
-    topics: dict[str, int]  # messages by topic
-    variables: dict[str, tuple[str, ...]]  # by cluster, the fields of its numbers
-    rotors: dict[str, list[RotorDisc]]  # of every drone, in the order of the scenario
+    topics: dict[str, int]  # number of messages by topic
+    variables: dict[str, tuple[str, ...]]  # names of the numeric fields by cluster
+    rotors: dict[str, list[RotorDisc]]  # by drone, in the order of the scenario
     refused: int  # number of messages that could not be read
 
 
 def convert(
     reader: RecordReader, selection: MessageSelection, path: Path, progress: Callable[[int, int], None]
 ) -> ConvertedRun:
-    """Write the MCAP file; return its content. `progress` is called with the number of messages read, and of all."""
+    """Write the MCAP file; return its content. `progress` is called with the numbers of messages read and in all."""
     wanted = [key for key in selection.keys(reader) if messages.type_of(key) in DRAWN or key == keys.INFO]
     total = sum(reader.topics()[key] for key in wanted)
     recorded = reader.last(keys.INFO)
@@ -92,9 +92,9 @@ def convert(
 
 @contextmanager
 def deferred_signals() -> Iterator[Callable[[], None]]:
-    """Yield a function that handles SIGINT or SIGTERM received since.
+    """Defer SIGINT and SIGTERM; yield a function that handles those received meanwhile.
 
-    What their handlers raise within a call of the library would be printed there and lost.
+    An exception raised by their handlers within a call of the library would only be printed, and lost.
     """
     came: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
@@ -122,7 +122,7 @@ def _decode(recorded: Recorded) -> Any:
 def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, None]) -> dict[str, list[RotorDisc]]:
     """Return the rotors of every drone on record, in the order of the scenario.
 
-    If `world/info` does not name a drone's rotors, they are assumed in a cross.
+    If `world/info` does not give a drone's rotors, they are assumed to form a cross.
     """
     arms_m = {drone.name: drone.arm_m for drone in scenario.drones} if scenario else {}
     named = {drone.name: drone.rotors for drone in info.drones} if info else {}
@@ -136,7 +136,7 @@ def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, 
 
 @dataclass
 class Instant:
-    """Messages of one time: the last one of each key, but all events and all of cameras."""
+    """The messages of one time: the last one of each key, but all events and all messages of cameras."""
 
     t_ns: int
     truth: dict[str, Truth] = field(default_factory=dict)
@@ -150,7 +150,7 @@ class Instant:
 
 
 def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
-    """Gather messages, which come in order of time, by their time; `world/info` is left out."""
+    """Group messages, given in order of time, by time; `world/info` is left out."""
     drawn = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
     for t_ns, group in groupby(drawn, key=lambda pair: pair[1].t_ns):
         instant = Instant(t_ns)
@@ -187,7 +187,7 @@ def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: I
 
 
 class FoxgloveFile:
-    """An MCAP file that is being written; rotors by drone in the order of the scenario, spaces by cluster."""
+    """An MCAP file that is being written; `rotors` are by drone in the order of the scenario, `spaces` by cluster."""
 
     def __init__(
         self, path: Path, rotors: Mapping[str, Sequence[RotorDisc]], spaces: Mapping[str, ClusterSpace]
@@ -199,90 +199,90 @@ class FoxgloveFile:
         self._spaces = spaces
         self._colours = colours_of(rotors)
         self._channels: dict[str, Any] = {}
-        self.variables: dict[str, NumericMessageType] = {}  # of each cluster
-        self._drone = NumericMessageType("Drone", made.DRONE_NUMBERS, ("state",))
-        self._trails = made.DroneTrails()
+        self.variables: dict[str, NumericMessageType] = {}  # by cluster
+        self._drone = NumericMessageType("Drone", build.DRONE_NUMBERS, ("state",))
+        self._trails = build.DroneTrails()
         self._status: dict[str, Status] = {}
         self._next_ns: dict[str, int] = {}
         self._has_static_scene = False
-        self.counts: Counter[str] = Counter()  # messages by topic
+        self.counts: Counter[str] = Counter()  # number of messages by topic
 
     def close(self) -> None:
-        """End the file; raise OSError if it could not be written."""
+        """Finish the file; OSError if it could not be written."""
         self._file.close()
         self._checked_file.close()
 
     def write(self, instant: Instant) -> None:
-        """Write all messages of an instant; raise OSError if it cannot be written."""
+        """Write all messages of one time; OSError if they cannot be written."""
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
-            self._log(DRONES, channels.SceneUpdateChannel, made.drones(instant.t_ns, self._rotors), instant.t_ns)
-            self._log(GROUND, channels.SceneUpdateChannel, made.ground(instant.t_ns), instant.t_ns)
+            self._log(DRONES, channels.SceneUpdateChannel, build.drones(instant.t_ns, self._rotors), instant.t_ns)
+            self._log(GROUND, channels.SceneUpdateChannel, build.ground(instant.t_ns), instant.t_ns)
             self._has_static_scene = True
-        frames: list[made.FramePose] = []
+        frames: list[build.FramePose] = []
         for name, truth in instant.truth.items():
-            frames.append((made.frame(name), truth.position_m, truth.orientation_wxyz))
+            frames.append((build.frame(name), truth.position_m, truth.orientation_wxyz))
         for name, estimate in instant.estimates.items():
-            frames.append((f"{made.frame(name)}/estimate", estimate.position_m, estimate.orientation_wxyz))
+            frames.append((f"{build.frame(name)}/estimate", estimate.position_m, estimate.orientation_wxyz))
         for name, state in instant.states.items():
             for end, values in (("", state.value), ("/desired", state.desired)):
-                if placed := made.cluster_frame(state.names, values):
+                if placed := build.cluster_frame(state.names, values):
                     frames.append((f"cluster/{name}{end}", *placed))
         if frames:
-            self._log(TF, channels.FrameTransformsChannel, made.transforms(instant.t_ns, frames), instant.t_ns)
+            self._log(TF, channels.FrameTransformsChannel, build.transforms(instant.t_ns, frames), instant.t_ns)
         for name in dict.fromkeys([*instant.truth, *instant.estimates]):
             self._write_drone(instant, name)
         for name, gps in instant.gps.items():
-            fix = made.location_fix(gps, name, self._colours.get(name, GREY))
+            fix = build.location_fix(gps, name, self._colours.get(name, GREY))
             self._log(f"/drone/{name}/gps", channels.LocationFixChannel, fix, gps.t_ns)
         for name, state in instant.states.items():
             self._write_cluster(instant, name, state)
         for event in instant.events:
-            self._log(LOG, channels.LogChannel, made.log_line(event), event.t_ns)
+            self._log(LOG, channels.LogChannel, build.log_line(event), event.t_ns)
         for key, info in instant.cameras:
             drone, frame = _camera_of(key)
-            calibration = made.camera_calibration(info, frame)
+            calibration = build.camera_calibration(info, frame)
             self._log(f"/{frame}/calibration", channels.CameraCalibrationChannel, calibration, info.t_ns)
             placed = [(frame, info.position_m, info.orientation_wxyz)]
             self._log(
-                TF, channels.FrameTransformsChannel, made.transforms(info.t_ns, placed, made.frame(drone)), info.t_ns
+                TF, channels.FrameTransformsChannel, build.transforms(info.t_ns, placed, build.frame(drone)), info.t_ns
             )
         for key, image in instant.pictures:
             _, frame = _camera_of(key)
             self._log(
-                f"/{frame}/image", channels.CompressedImageChannel, made.compressed_image(image, frame), image.t_ns
+                f"/{frame}/image", channels.CompressedImageChannel, build.compressed_image(image, frame), image.t_ns
             )
         self._write_scene(instant)
 
     def _write_drone(self, instant: Instant, name: str) -> None:
-        at, t_ns = made.timestamp(instant.t_ns), instant.t_ns
+        at, t_ns = build.timestamp(instant.t_ns), instant.t_ns
         truth, estimate = instant.truth.get(name), instant.estimates.get(name)
         for topic, state in ((f"/drone/{name}/pose", truth), (f"/drone/{name}/estimate", estimate)):
             if state is not None:
-                placed = made.pose(state.position_m, state.orientation_wxyz)
-                message = PoseInFrame(timestamp=at, frame_id=made.WORLD, pose=placed)
+                placed = build.pose(state.position_m, state.orientation_wxyz)
+                message = PoseInFrame(timestamp=at, frame_id=build.WORLD, pose=placed)
                 self._log(topic, channels.PoseInFrameChannel, message, t_ns)
         status = self._status.get(name)
-        values = made.drone_numbers(truth, estimate, status)
+        values = build.drone_numbers(truth, estimate, status)
         encoded = self._drone.encode(values, (status.state if status else "",))
         self._log(f"/drone/{name}/numbers", self._drone, encoded, t_ns)
 
     def _write_cluster(self, instant: Instant, name: str, state: ClusterState) -> None:
         if name not in self.variables:
-            tidied = [made.tidy(each) for each in state.names]
+            tidied = [build.tidy(each) for each in state.names]
             fields = [f"{what}_{each}" for what in ("desired", "estimated", "true") for each in tidied]
-            kind = NumericMessageType(f"Cluster_{made.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
+            kind = NumericMessageType(f"Cluster_{build.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
             self.variables[name] = kind
         numbers = self.variables[name]
-        true = [math.nan] * len(state.names)  # unless they are known and not singular
+        true = [math.nan] * len(state.names)  # stays unless all drones' truth is known and their shape is not singular
         space, truths = self._spaces.get(name), [instant.truth[d] for d in state.drones if d in instant.truth]
         if space is not None and space.names == state.names and len(truths) == len(state.drones):
             yaw = heading([truth.orientation_wxyz for truth in truths])
             with suppress(SingularClusterError):
                 true = space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
         values = [*state.desired, *state.value, *true, state.margin]
-        if len(values) == len(numbers.numbers):  # if the number of variables changes, only the first ones are written
+        if len(values) == len(numbers.numbers):  # after a change of the number of variables, no more are written
             encoded = numbers.encode(values, (state.phase, state.reason))
             self._log(f"/cluster/{name}/variables", numbers, encoded, instant.t_ns)
 
@@ -292,20 +292,20 @@ class FoxgloveFile:
             self._log(TRAILS, channels.SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
         if truth and self._is_due(POINTS, t_ns):
             places = [(state.position_m, self._colours.get(d, GREY)) for d, state in truth.items()]
-            self._log(POINTS, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
+            self._log(POINTS, channels.PointCloudChannel, build.points(t_ns, places), t_ns)
         if instant.states and self._is_due(FORMATIONS, t_ns):
             desired = {c: m for c, state in instant.states.items() if (m := self._places(c, state)) is not None}
-            scene = made.formations(t_ns, instant.states, truth, desired)
+            scene = build.formations(t_ns, instant.states, truth, desired)
             self._log(FORMATIONS, channels.SceneUpdateChannel, scene, t_ns)
             if desired:
                 places = [(place, MAGENTA) for each in desired.values() for place in each.tolist()]
-                self._log(DESIRED, channels.PointCloudChannel, made.points(t_ns, places), t_ns)
+                self._log(DESIRED, channels.PointCloudChannel, build.points(t_ns, places), t_ns)
         if instant.estimates and self._is_due(ESTIMATES, t_ns):
-            scene = made.ellipsoids(t_ns, instant.estimates, self._colours)
+            scene = build.ellipsoids(t_ns, instant.estimates, self._colours)
             self._log(ESTIMATES, channels.SceneUpdateChannel, scene, t_ns)
 
     def _places(self, name: str, state: ClusterState) -> Any:
-        """Return the desired positions of a cluster's drones (n, 3), None if they are unknown or singular."""
+        """Return the desired positions of a cluster's drones (n, 3); None if they are unknown or singular."""
         space = self._spaces.get(name)
         if space is None or space.names != state.names or not any(state.desired):
             return None
@@ -321,7 +321,7 @@ class FoxgloveFile:
         return True
 
     def _log(self, topic: str, channel: Any, message: Any, t_ns: int) -> None:
-        """Log a message on a topic, whose channel, or type of numbers, is that of its first message."""
+        """Log a message on a topic; the topic's first message decides its channel, or its type of numbers."""
         if topic not in self._channels:
             if isinstance(channel, NumericMessageType):
                 schema = foxglove.Schema(name=channel.name, encoding="protobuf", data=channel.schema)
@@ -334,18 +334,18 @@ class FoxgloveFile:
 
 
 def _camera_of(key: str) -> tuple[str, str]:
-    """Return drone and frame of a camera by its key; x of the frame is to the right of the picture, y down, z ahead."""
+    """Return drone and frame of a camera from its key; in the frame, x points right in the picture, y down, z ahead."""
     _, drone, what = keys.parts(key)
-    return drone, f"{made.frame(drone)}/{what.split('/')[1]}_camera"
+    return drone, f"{build.frame(drone)}/{what.split('/')[1]}_camera"
 
 
 class CheckedFile:
-    """A file for a library that prints a failed write, at every further write again, rather than raise it.
+    """A file for a library that prints failed writes, each time anew, instead of raising an error.
 
     After a failed write, nothing more is written.
 
     Raises:
-        OSError: it cannot be created.
+        OSError: the file cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -368,12 +368,12 @@ class CheckedFile:
         self._try(self._file.flush)
 
     def check(self) -> None:
-        """Raise OSError if a write has failed."""
+        """Raise the OSError of a failed write, if there was one."""
         if self._failure is not None:
             raise self._failure
 
     def close(self) -> None:
-        """End the file; raise OSError if a write has failed."""
+        """Close the file; OSError if a write has failed."""
         self.flush()
         try:
             self._file.close()

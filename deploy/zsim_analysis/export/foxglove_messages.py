@@ -1,10 +1,10 @@
-"""Messages of Foxglove made from those of a run: transforms, numbers, fixes, pictures, log, points and scenes. Pure.
+"""Foxglove messages built from those of a run: transforms, numbers, fixes, pictures, log, points and scenes.
 
 Numbers are typed messages, which Foxglove plots and Rerun keeps as scalars. They are encoded as protobuf,
 https://protobuf.dev/programming-guides/encoding, with a `FileDescriptorSet` of google/protobuf/descriptor.proto as
-schema. Since only two kinds of fields are needed, protobuf's library is not.
+schema. Since only two kinds of fields are needed, this does without protobuf's library.
 
-Foxglove shows, at any time, only the last message of a topic; so each scene is the whole of what it shows.
+At any time, Foxglove shows only the last message of a topic, so each scene message is complete.
 """
 
 import math
@@ -19,7 +19,7 @@ from foxglove import messages as fox
 
 from zsim.contract.flight_messages import CameraImage, CameraInfo, ClusterState, Estimate, Status, Truth
 from zsim.contract.messages import Gps
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import INCIDENTS, Event
 from zsim.math.frames import heading, principal_axes, quaternion_from_rpy
 from zsim.presentation import colours_of, rgb
 from zsim_analysis.export.columns import Values
@@ -27,11 +27,11 @@ from zsim_analysis.export.columns import Values
 PACKAGE: Final = "zsim"
 WORLD = "world"
 DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3, as in OpenCV
-_BYTES, _EIGHT = 2, 1  # wire types: bytes after their length, eight bytes
+_BYTES, _EIGHT = 2, 1  # wire types: length and bytes, eight bytes
 _DOUBLE, _STRING = 1, 9  # FieldDescriptorProto.Type
 _OPTIONAL = 1  # FieldDescriptorProto.Label
 _FLOAT = struct.Struct("<d")
-FRAME = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw")  # variables that place a cluster's frame
+FRAME = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw")  # variables that give the position of a cluster's frame
 DRONE_NUMBERS = (
     *(f"{what}_{axis}_m" for what in ("true", "estimated") for axis in "xyz"),
     *(f"true_v{axis}_m_s" for axis in "xyz"),
@@ -41,17 +41,17 @@ DRONE_NUMBERS = (
     "sigma_m",
     "battery_percent",
 )
-WARNINGS = ("refused", "fingerprint", "outputs_missing", "fault", "landing")  # kinds of events; others: information
-FALLS = ("collision", "emergency", "flip", "impact", "touchdown", "battery")
-FAILURES = (*FALLS, "death", "failure", "overdue", "diverged")
+# kinds of events by log level; all others are information
+WARNINGS = ("refused", "fingerprint", "outputs_missing", "fault", "landing")
+FAILURES = ("collision", *INCIDENTS, "death", "failure", "overdue", "diverged")
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])
 
-FramePose = tuple[str, Any, Any]  # a frame's name, its position and its orientation in the parent frame
+FramePose = tuple[str, Any, Any]  # name of a frame, and its position and orientation in the parent frame
 Vector = Sequence[float] | Values
 
 
 class NumericMessageType:
-    """A message of float64 fields, then of text fields, named by protobuf identifiers; unknown numbers are NaN."""
+    """A message type with float64 fields, then text fields, named by protobuf identifiers; unknown numbers are NaN."""
 
     def __init__(self, name: str, numbers: Sequence[str], texts: Sequence[str] = ()) -> None:
         self.name = f"{PACKAGE}.{name}"
@@ -60,7 +60,7 @@ class NumericMessageType:
         self._text_keys = [_key(len(numbers) + place, _BYTES) for place in range(1, len(texts) + 1)]
         fields = [*((each, _DOUBLE) for each in numbers), *((each, _STRING) for each in texts)]
         described = b""
-        for number, (field, kind) in enumerate(fields, start=1):  # a FieldDescriptorProto each
+        for number, (field, kind) in enumerate(fields, start=1):  # one FieldDescriptorProto each
             counted = ((3, number), (4, _OPTIONAL), (5, kind))
             rest = b"".join(_key(tag, 0) + _varint(value) for tag, value in counted)
             described += _bytes(2, _bytes(1, field.encode()) + rest)
@@ -70,7 +70,7 @@ class NumericMessageType:
             + _bytes(4, _bytes(1, name.encode()) + described)
             + _bytes(12, b"proto3")
         )
-        self.schema = _bytes(1, file)  # a FileDescriptorSet of this one message
+        self.schema = _bytes(1, file)  # a FileDescriptorSet of this message only
 
     def encode(self, numbers: Iterable[float], texts: Iterable[str] = ()) -> bytes:
         parts = [key + _FLOAT.pack(value) for key, value in zip(self._number_keys, numbers, strict=True)]
@@ -88,7 +88,7 @@ def _key(field: int, wire_type: int) -> bytes:
 
 
 def _varint(value: int) -> bytes:
-    """Return seven bits per byte, the lowest first, the eighth bit set where more follow."""
+    """Encode a varint: seven bits per byte, lowest first, with the eighth bit set if more bytes follow."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -98,12 +98,12 @@ def _varint(value: int) -> bytes:
 
 
 def tidy(name: str) -> str:
-    """Return a name as part of a protobuf identifier."""
+    """Convert a name to a part of a protobuf identifier."""
     return re.sub(r"\W", "_", name)
 
 
 def drone_numbers(truth: Truth | None, estimate: Estimate | None, status: Status | None) -> list[float]:
-    """Return the values of DRONE_NUMBERS, NaN where one is unknown."""
+    """Return the values of DRONE_NUMBERS, with NaN for unknown ones."""
     nothing = [math.nan] * 3
     true = list(truth.position_m) if truth else nothing
     estimated = list(estimate.position_m) if estimate else nothing
@@ -164,7 +164,7 @@ def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> f
 
 
 def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values, Values] | None:
-    """Return position and orientation of a cluster's frame, None if it has none or it is not known yet."""
+    """Return position and orientation of a cluster's frame; None if it has no frame or that is not yet known."""
     if not any(values) or not set(FRAME) <= set(names):
         return None
     x_c = np.array([values[names.index(name)] for name in FRAME])
@@ -192,7 +192,7 @@ def compressed_image(image: CameraImage, frame_id: str) -> fox.CompressedImage:
 
 
 def camera_calibration(info: CameraInfo, frame_id: str) -> fox.CameraCalibration:
-    """Return the calibration of a camera, which is not part of a stereo pair."""
+    """Return the calibration of a camera that is not part of a stereo pair."""
     return fox.CameraCalibration(
         timestamp=timestamp(info.t_ns),
         frame_id=frame_id,
@@ -235,14 +235,14 @@ def points(t_ns: int, coloured: Iterable[tuple[Sequence[float], str]]) -> fox.Po
 
 MAGENTA, DARK, GREY = "#d4008f", "#30363d", "#8c959f"
 TRAIL_S = 20.0  # simulated time covered by a trail
-TRAIL_STEP_NS = 500_000_000  # between two points of a trail, and two messages of trails
-SIGMAS = 2.0  # half axes of an estimate's ellipsoid in standard deviations
-LINE_PX = 2.0  # width of lines on the screen
-GROUND_M, GROUND_STEP_M = 50, 5  # half width of the grid on the ground, and its spacing
+TRAIL_STEP_NS = 500_000_000  # interval between points of a trail, and between messages with trails
+SIGMAS = 2.0  # semi-axes of an estimate's ellipsoid in standard deviations
+LINE_PX = 2.0  # width of lines on screen
+GROUND_M, GROUND_STEP_M = 50, 5  # half the width of the grid on the ground, and its spacing
 
 
 class RotorDisc(NamedTuple):
-    """A rotor as it is drawn: its place in B, and its radius."""
+    """A rotor as it is drawn: its position in B, and its radius."""
 
     x_m: float
     y_m: float
@@ -250,7 +250,7 @@ class RotorDisc(NamedTuple):
 
 
 class BodyBox(NamedTuple):
-    """A box of a drone's body: middle and size in B, in arm lengths, and colour."""
+    """A box of a drone's body: centre and size in B, in arm lengths, and colour."""
 
     middle: tuple[float, float, float]
     size: tuple[float, float, float]
@@ -259,17 +259,17 @@ class BodyBox(NamedTuple):
 
 BODY = (
     BodyBox((0.0, 0.0, 0.0), (1.0, 0.4, 0.3), DARK),
-    BodyBox((0.35, 0.0, 0.1), (0.5, 0.3, 0.2), MAGENTA),  # the nose, as of an AR.Drone's hat over battery and camera
+    BodyBox((0.35, 0.0, 0.1), (0.5, 0.3, 0.2), MAGENTA),  # the nose, like an AR.Drone's hull over battery and camera
 )
 
 
 def arm_of(discs: Iterable[RotorDisc]) -> float:
-    """Return the length [m] of the longest arm of a drone."""
+    """Return the length of a drone's longest arm [m]."""
     return max(math.hypot(disc.x_m, disc.y_m) for disc in discs)
 
 
 def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> fox.SceneUpdate:
-    """Return the drones, each in its own frame, so that they are written once; `rotors` are theirs, by name."""
+    """Return all drones, each in its own frame, so that one message suffices; `rotors` are by drone."""
     at, entities = timestamp(t_ns), []
     for name, mark in colours_of(rotors).items():
         discs = rotors[name]
@@ -302,7 +302,7 @@ def ground(t_ns: int) -> fox.SceneUpdate:
 def formations(
     t_ns: int, states: Mapping[str, ClusterState], truth: Mapping[str, Truth], desired_m: Mapping[str, Values]
 ) -> fox.SceneUpdate:
-    """Return for each cluster the outline of its drones, and ghosts at their desired places (n, 3), if known."""
+    """Return each cluster's outline of its drones, and ghosts at their desired positions (n, 3), if known."""
     at, entities = timestamp(t_ns), []
     for name, state in states.items():
         lines, ghosts = [], []

@@ -1,7 +1,7 @@
-"""Makes an export: record in, files of other tools out, which appear when all of them are complete.
+"""Makes an export: record in, files of other tools out, which appear only when all of them are complete.
 
-Tables are a folder of CSV or Parquet files, or one file for MATLAB. Ctrl-C and full disks leave nothing that looks
-finished.
+Tables are a folder of CSV or Parquet files, or one file for MATLAB. After Ctrl-C or on a full disk, no partial export
+remains.
 """
 
 import json
@@ -37,30 +37,30 @@ from zsim_analysis.export.columns import (
     table_name,
 )
 
-DEFAULTS = {  # names beside the record
+DEFAULTS = {  # file names beside the record
     Format.CSV: "csv",
     Format.PARQUET: "parquet",
     Format.MAT: "run.mat",
     Format.FOXGLOVE: "foxglove.mcap",
 }
 MANIFEST = "export.json"  # marks a folder of tables
-MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # SciPy's first bytes of a file; MATLAB's own have a comma
-MCAP, MCAP_LIBRARY = b"\x89MCAP", b"foxglove-sdk"  # a file for Foxglove names its library; a record names zsim
-HEAD_MAX = 200  # bytes within which an MCAP file has named its library
-LAYOUT = "-layout.json"  # end of the name of the file beside one for Foxglove
-BLUEPRINT = ".rbl"  # likewise, for Rerun
-RERUN = b"RRF2"  # first bytes of Rerun's files
+MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # first bytes of a file written by SciPy; MATLAB itself writes a comma there
+MCAP, MCAP_LIBRARY = b"\x89MCAP", b"foxglove-sdk"  # a Foxglove export names its library, a record names zsim
+HEAD_MAX = 200  # first bytes of an MCAP file, in which it names its library
+LAYOUT = "-layout.json"  # suffix of the layout file beside a Foxglove export
+BLUEPRINT = ".rbl"  # suffix of the blueprint beside a Rerun export
+RERUN = b"RRF2"  # first bytes of a Rerun file
 RUN_FILES = ("run.mcap", "scenario.yaml", "summary.json", "report.html")  # files that no export may replace
 
-Progress = Callable[[int, int], None]  # messages read so far, and their number
+Progress = Callable[[int, int], None]  # number of messages read so far, and in all
 
 
 class ExportResult(NamedTuple):
     """The result of an export."""
 
-    paths: tuple[Path, ...]  # that were written
-    tables: dict[str, int]  # name and rows of each table, or topic and messages
-    notes: list[str]  # what a reader should know: whether the record was cut or damaged, and what was left out
+    paths: tuple[Path, ...]  # files and folders that were written
+    tables: dict[str, int]  # number of rows by table, or of messages by topic
+    notes: list[str]  # remarks: whether the record was cut off or damaged, and what was left out
 
 
 def export(
@@ -75,17 +75,17 @@ def export(
     """Write the record of a run in the format of another tool, all of it or nothing.
 
     Args:
-        run: its folder, or its record.
-        form: of the output.
-        out: where, None for the default place beside the record.
-        selection: of messages, None for all.
-        force: replace what an earlier export has written.
-        progress: called now and then.
-        by_name: whether each drone, cluster and process has tables of its own, of CSV and Parquet.
+        run: folder of the run, or its record.
+        form: format of the output.
+        out: path of the output; None: the default path beside the record.
+        selection: messages to export; None: all.
+        force: whether to replace an earlier export.
+        progress: called repeatedly.
+        by_name: whether each drone, cluster and process gets its own tables in CSV and Parquet.
 
     Raises:
         RunError, RecordError: there is no record.
-        ReportError: nothing on record is selected; or it cannot be written there.
+        ReportError: the selection is empty, or the output cannot be written.
         KeyboardInterrupt: nothing was written.
     """
     record, chosen = record_at(run), selection or MessageSelection()
@@ -115,7 +115,7 @@ def _tables(
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
         notes = [*record_notes(reader), *_refused(decoded.refused)]
         if survey.pictures:
-            notes.append(f"{survey.pictures} pictures are left out: a table holds none; --format foxglove has them")
+            notes.append(f"{survey.pictures} pictures are left out: tables hold none; --format foxglove has them")
         if form is not Format.MAT:
             content = {
                 "record": str(reader.path.resolve()),
@@ -127,7 +127,7 @@ def _tables(
                 "notes": notes,
                 "tables": {table.file: {"rows": table.rows, "columns": table.columns} for table in written},
             }
-            # by json, not msgspec: a path may hold bytes that are not UTF-8
+            # json rather than msgspec: a path may contain bytes that are not UTF-8
             (new / MANIFEST).write_bytes(f"{json.dumps(content, indent=2)}\n".encode())
     return ExportResult((target,), {table.file: table.rows for table in written}, notes)
 
@@ -153,7 +153,7 @@ def _foxglove(
 
 
 def _refused(count: int) -> list[str]:
-    return [f"{count} messages on record are not what their key promises and were left out"] if count else []
+    return [f"{count} messages on record do not match the type of their key and were left out"] if count else []
 
 
 def _nothing(reader: RecordReader, selection: MessageSelection) -> str:
@@ -176,19 +176,19 @@ def check_free(target: Path, force: bool, record: Path) -> None:
     if not target.exists():
         return
     if target.resolve() == record.resolve():
-        raise ReportError(f"{target}: is the record itself; give --out another place")
+        raise ReportError(f"{target}: is the record itself; give --out another path")
     if not force:
-        raise ReportError(f"{target}: exists; give --out another place, or --force to replace it")
+        raise ReportError(f"{target}: exists; give --out another path, or --force to replace it")
     if target.is_dir():
         try:
             tables = json.loads((target / MANIFEST).read_bytes())["tables"].keys()
             others = {path.name for path in target.iterdir()} - {MANIFEST, *tables}
-            other = f"it holds {min(others)}" if others else ""
+            other = f"it contains {min(others)}" if others else ""
         except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            other = f"it has no {MANIFEST} of one"
+            other = f"it has no {MANIFEST}"
         if other:
-            what = f"is a folder of something else than an export ({other})"
-            raise ReportError(f"{target}: {what}; give --out another place")
+            what = f"is a folder but not an export ({other})"
+            raise ReportError(f"{target}: {what}; give --out another path")
     elif target.is_file():
         with target.open("rb") as file:
             head = file.read(HEAD_MAX)
@@ -200,19 +200,19 @@ def check_free(target: Path, force: bool, record: Path) -> None:
             is_mcap = head.startswith(MCAP) and MCAP_LIBRARY in head
             is_export = target.name not in RUN_FILES and (head.startswith(MATLAB) or is_mcap)
         if not is_export:
-            raise ReportError(f"{target}: is a file of something else than an export; give --out another place")
+            raise ReportError(f"{target}: is a file but not an export; give --out another path")
 
 
 @contextmanager
 def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
-    """Yield a temporary path for each file or folder to be written; move them to their targets together at the end.
+    """Yield a temporary path for each file or folder to be written; at the end, move them to their targets together.
 
-    Existing ones are replaced: call `check_free` first.
+    Existing targets are replaced: call `check_free` first.
 
     Raises:
         ReportError: they cannot be written.
     """
-    # beside the target, so that files can be renamed; a TemporaryDirectory stays if Ctrl-C comes while it is made
+    # beside the target, so that files can be renamed; Ctrl-C during the creation of a TemporaryDirectory would leave it
     folder, new_parents = targets[0].parent / f".export-{secrets.token_hex(4)}", list[Path]()
     try:
         new_parents += [parent for parent in targets[0].parents if not parent.exists()]
@@ -225,7 +225,7 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
                 if target.exists():
                     target.replace(old)
                 new.replace(target)
-        except BaseException:  # after a failure or Ctrl-C the old ones are back
+        except BaseException:  # restore the old files after a failure or Ctrl-C
             for new, target, old in moves:
                 if not new.exists() and target.exists():
                     target.replace(new)
@@ -233,18 +233,18 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
                     old.replace(target)
             raise
     except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else error  # without the text that libraries add to it
+        reason = os.strerror(error.errno) if error.errno else error  # without text that libraries add
         raise ReportError(f"{targets[0]}: cannot be written ({reason}); make room and export again") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        with suppress(OSError):  # one that is not empty stays, and with it those above
+        with suppress(OSError):  # a folder that is not empty stays, and so do its parents
             for parent in new_parents:
                 parent.rmdir()
 
 
 # Tables
 
-ROW_GROUP = 65_536  # rows of a Parquet row group, of which one per table is held in memory
+ROW_GROUP = 65_536  # rows of a Parquet row group, one of which is held in memory per table
 _TYPES = {"whole": pa.int64(), "number": pa.float64(), "flag": pa.bool_(), "text": pa.string()}
 
 
@@ -257,7 +257,7 @@ class WrittenTable(NamedTuple):
 
 
 class TableFolder:
-    """A folder of tables, one per message type, or of each name too; a file is opened with its first rows."""
+    """A folder of tables, one per message type, or per type and name; files are opened with their first rows."""
 
     def __init__(self, folder: Path, suffix: str, survey: TableSurvey) -> None:
         self._folder = folder
@@ -272,11 +272,11 @@ class TableFolder:
         table = self._survey.table(batch.kind)
         schema = pa.schema([(column, _TYPES[each.kind]) for each in table for column in each.columns])
         if file not in self._sinks:
-            # an open file: Arrow takes a path with a colon for an address, and refuses names that are not UTF-8
+            # an open file, since Arrow takes a path with a colon for a URI, and refuses names that are not UTF-8
             opened = self._stack.enter_context((self._folder / file).open("wb"))
             self._sinks[file] = _Csv(opened, schema) if self._suffix == "csv" else _Parquet(opened, schema)
             self._stack.callback(self._sinks[file].close)
-        # no message holds NaN: it marks a missing value
+        # messages never contain NaN, so it marks a missing value
         rows = [pa.array(values, _TYPES[kind], from_pandas=True) for _, kind, values in column_values(table, batch)]
         self._sinks[file].write(pa.RecordBatch.from_arrays(rows, schema=schema))
         before = self._written[file].rows if file in self._written else 0
@@ -294,7 +294,7 @@ class TableFolder:
 
 
 class _Csv:
-    """A CSV file: names in the first line, flags as 0 and 1, empty cells for missing values."""
+    """A CSV file: names in the first line, booleans as 0 and 1, empty cells for missing values."""
 
     def __init__(self, file: BinaryIO, schema: pa.Schema) -> None:
         plain = [pa.field(each.name, pa.int8() if each.type == pa.bool_() else each.type) for each in schema]
@@ -333,10 +333,10 @@ class _Parquet:
 
 
 # MAT-file Level 5, https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf, which MATLAB and Octave load
-# without a toolbox. It counts the bytes of a variable in 32 bits, of which MATLAB uses 31.
-VARIABLE_MAX = 2**31 - 1  # bytes of a variable that MATLAB loads
-NAME_MAX = 63  # characters of a MATLAB name
-CHARS_MAX = 64  # of a text in a matrix of characters; longer ones are in a cell
+# without a toolbox. The size of a variable is stored in 32 bits, of which MATLAB uses 31.
+VARIABLE_MAX = 2**31 - 1  # largest size of a variable that MATLAB loads [bytes]
+NAME_MAX = 63  # longest MATLAB name [characters]
+CHARS_MAX = 64  # longest text in a character matrix; longer texts are in a cell array
 KEYWORDS = frozenset({"break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for", "function",
                       "global", "if", "otherwise", "parfor", "persistent", "return", "spmd", "switch", "try",
                       "while"})  # fmt: skip
@@ -345,7 +345,7 @@ KEYWORDS = frozenset({"break", "case", "catch", "classdef", "continue", "else", 
 class MatFile:
     """A MATLAB file: by message type, then by drone, cluster or process, a struct of arrays with a row per message.
 
-    All rows are held in memory until the end, since the format needs a variable whole.
+    All rows are held in memory until the end, since the format stores each variable in one piece.
 
     Raises:
         ReportError: a variable would be larger than MATLAB loads.
@@ -354,10 +354,10 @@ class MatFile:
     def __init__(self, path: Path, survey: TableSurvey) -> None:
         self._path = path
         self._survey = survey
-        self._blocks: dict[type[Struct], dict[str, list[dict[str, Any]]]] = {}  # by subject, arrays by field
+        self._blocks: dict[type[Struct], dict[str, list[dict[str, Any]]]] = {}  # arrays by field, by subject
         for kind, rows in survey.rows.items():
-            row = 8 * (survey.width(kind) - 1) if kind else 0  # bytes, without the name
-            if kind and rows * row > VARIABLE_MAX:  # the selected times may still reduce it
+            row = 8 * (survey.width(kind) - 1) if kind else 0  # size of a row without the name [bytes]
+            if kind and rows * row > VARIABLE_MAX:  # unless the selected times reduce it
                 _check_size(table_name(kind), survey.rows_within(kind) * row)
 
     def write(self, batch: RowBatch) -> None:
@@ -369,7 +369,7 @@ class MatFile:
             block: dict[str, Any] = {}
             for each in self._survey.table(batch.kind)[1:]:  # the first column is the name
                 values = each.values(own)
-                if each.kind == "text":  # a list until all of it is known
+                if each.kind == "text":  # a list until all texts are known
                     block[each.name] = ["" if value is None else value for value in values]
                 else:
                     block[each.name] = as_array(each.kind, values)
@@ -437,13 +437,13 @@ def _bytes(value: Any) -> int:
     if isinstance(value, dict):
         return sum(map(_bytes, value.values()))
     if isinstance(value, np.ndarray) and value.dtype == object:
-        return sum(64 + 2 * len(text) for text in value.flat)  # the head of a cell's matrix, and two bytes a character
+        return sum(64 + 2 * len(text) for text in value.flat)  # the header of each cell, and two bytes per character
     return value.nbytes if isinstance(value, np.ndarray) else 2 * len(value)
 
 
 def _check_size(variable: str, size: int) -> None:
     if size > VARIABLE_MAX:
         raise ReportError(
-            f"{variable}: would have {size / 2**30:.1f} GB, and MATLAB loads 2 GB of a variable from a MAT file of "
+            f"{variable}: would have {size / 2**30:.1f} GB; must be < 2 GB for MATLAB to load it from a MAT file of "
             "Level 5; choose --keys, --from and --to, or --format parquet, which MATLAB reads with parquetread"
         )

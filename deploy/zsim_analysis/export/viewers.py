@@ -1,9 +1,9 @@
-"""What viewers show of a Foxglove file, and where: a layout for Foxglove, a blueprint for Rerun.
+"""How viewers arrange a Foxglove file: a layout for Foxglove, a blueprint for Rerun.
 
-Both have the scene, the log, plots of the clusters' variables and of the drones' numbers, and the cameras. Rerun draws
-no scenes and plots no fields by itself, so that its blueprint holds the drones' meshes, which stand at the recorded
-poses, and names the field of each curve. It holds nothing of the flight: any Foxglove file of the same name and drones
-can be viewed with it. It is made by Rerun's own library if that is installed; established with 0.41.
+Both have the scene, the log, plots of the clusters' variables and of the drones' numbers, and the cameras. Rerun by
+itself neither draws scenes nor plots fields, so its blueprint contains meshes of the drones, placed at the recorded
+poses, and names the field of each curve. It contains nothing of the flight: any Foxglove file of the same name and
+drones can be viewed with it. Rerun's own library writes it, if that is installed (tested with 0.41).
 """
 
 import os
@@ -28,19 +28,20 @@ CURVES: tuple[tuple[str, str, Literal["solid", "dashed"]], ...] = (
     ("true", "#0072b2", "solid"),
 )
 DRONE_PLOTS = {"altitude (m)": "true_z_m", "error of the estimate (m)": "error_m", "battery (%)": "battery_percent"}
-PLOTS_MAX = 12  # plotted variables of a cluster: those of the paper's three drones
-TAB = 3  # plots in a tab
-DRONES_MAX = 12  # plotted drones
-PICTURES, CALIBRATION = "_camera/image", "_camera/calibration"  # ends of topics
-PICTURES_MAX = 6  # cameras that are shown: those of the paper's three drones
+PLOTS_MAX = 12  # most plotted variables of a cluster: those of the paper's three drones
+TAB = 3  # plots per tab
+DRONES_MAX = 12  # most plotted drones
+PICTURES, CALIBRATION = "_camera/image", "_camera/calibration"  # suffixes of topics
+PICTURES_MAX = 6  # most cameras that are shown: those of the paper's three drones
 TIMELINE = "message_log_time"  # Rerun's name of the MCAP file's log time: simulated time
-ROTOR_CORNERS = 16  # of a rotor's disc
-EYE_M, TARGET_M = (14.0, -16.0, 14.0), (2.0, -2.0, 6.0)  # chosen: the paper's formation from the ground to 15 m
-SPEED = 1.0  # simulated per wall second
+ROTOR_CORNERS = 16  # corners of a rotor's disc
+# position and target of the eye in W; chosen to show the paper's formation from the ground to 15 m
+EYE_M, TARGET_M = (14.0, -16.0, 14.0), (2.0, -2.0, 6.0)
+SPEED = 1.0  # simulated seconds per second of wall time
 
 
 class Curve(NamedTuple):
-    """A curve: topic, Rerun's component and field of its numbers, its name and its look."""
+    """A curve: topic, Rerun's component and the field of its numbers, and its name and look."""
 
     topic: str
     component: str
@@ -54,7 +55,7 @@ Plot = tuple[str, list[Curve]]  # title and curves
 
 
 def variable_plots(variables: Mapping[str, Sequence[str]]) -> dict[str, list[Plot]]:
-    """Return a plot for each of the first variables of each cluster, given the fields of its numbers."""
+    """Return a plot for each of the first variables of each cluster, given its numeric fields."""
     plots: dict[str, list[Plot]] = {}
     for cluster, fields in variables.items():
         topic, component = f"/cluster/{cluster}/variables", f"{PACKAGE}.Cluster_{tidy(cluster)}:message"
@@ -67,7 +68,7 @@ def variable_plots(variables: Mapping[str, Sequence[str]]) -> dict[str, list[Plo
 
 
 def drone_plots(topics: Collection[str], colours: Mapping[str, str]) -> list[Plot]:
-    """Return the DRONE_PLOTS of the first drones that have numbers, in the order of `colours`; none without any."""
+    """Return the DRONE_PLOTS of the first drones with numbers, in the order of `colours`; empty if none has numbers."""
     numbers = {f"/drone/{name}/numbers": name for name in colours}
     drones = [(topic, name) for topic, name in numbers.items() if topic in topics][:DRONES_MAX]
     return [
@@ -85,7 +86,7 @@ def _pictures(topics: Collection[str]) -> list[str]:
 
 
 def layout(run: foxglove_file.ConvertedRun) -> str:
-    """Return Foxglove's layout of a file as JSON."""
+    """Return Foxglove's layout for a file as JSON."""
     states = [(_path(f"/cluster/{name}/variables", "phase"), name) for name in run.variables]
     tabs = []
     for cluster, plots in variable_plots(run.variables).items():
@@ -129,7 +130,7 @@ def layout(run: foxglove_file.ConvertedRun) -> str:
 
 
 def _plot(title: str, curves: Sequence[Curve], coloured: bool) -> layouts.PlotPanel:
-    """Return a panel whose curves have their own look, or one chosen by Foxglove."""
+    """Return a panel whose curves have their own look or, if not `coloured`, a look chosen by Foxglove."""
     series = []
     for curve in curves:
         look: dict[str, Any] = {"color": curve.colour, "line_style": curve.style} if coloured else {}
@@ -145,7 +146,7 @@ def _column(*parts: tuple[float, layouts.Content]) -> layouts.SplitContainer:
 
 
 def _path(topic: str, field: str) -> str:
-    """Return a message path; a topic with characters that have a meaning in paths is quoted."""
+    """Return a message path; a topic with characters that are special in paths is quoted."""
     return f"{topic}.{field}" if re.fullmatch(r"[\w/]+", topic) else f'"{topic}".{field}'
 
 
@@ -157,8 +158,8 @@ def has_rerun() -> bool:
 
 
 def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRun) -> None:
-    """Write Rerun's blueprint of a file; `application` is the file's name without its suffix, as Rerun calls it."""
-    os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns of the entry name derived from an odd name
+    """Write Rerun's blueprint for a file; `application` is Rerun's name of it: the file name without suffix."""
+    os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns about unusual file names
     import rerun as rr
     import rerun.blueprint as rrb
     from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
@@ -166,7 +167,7 @@ def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRu
     left = rrb.Vertical(_scene(run), rrb.TextLogView(name="log", origin=foxglove_file.LOG), row_shares=[3, 1])
     views = []
     for title, curves in plots(run):
-        series: dict[Any, list[Any]] = {}  # visualizers of the curves by entity
+        series: dict[Any, list[Any]] = {}  # visualizers of curves by entity
         for curve in curves:
             source = VisualizerComponentMapping(
                 target="Scalars:scalars",
@@ -187,7 +188,7 @@ def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRu
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
-    with TemporaryDirectory() as folder:  # Rerun takes no path that is not UTF-8
+    with TemporaryDirectory() as folder:  # Rerun accepts only paths in UTF-8
         new = Path(folder) / "new.rbl"
         blueprint.save(application.encode(errors="replace").decode(), new)
         shutil.copyfile(new, path)
@@ -203,7 +204,7 @@ def plots(run: foxglove_file.ConvertedRun) -> list[Plot]:
 
 
 def _scene(run: foxglove_file.ConvertedRun) -> Any:
-    """Return the view in space: the drones' meshes at their poses, the points, everything in W."""
+    """Return the 3D view: the drones' meshes at their poses, and the points, all in W."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -228,14 +229,14 @@ def _scene(run: foxglove_file.ConvertedRun) -> Any:
 
 
 def _entity(topic: str) -> str:
-    """Return Rerun's entity path of a topic, in which a point is escaped."""
+    """Return Rerun's entity path of a topic, in which dots are escaped."""
     import rerun as rr
 
     return rr.new_entity_path(topic.strip("/").split("/"))
 
 
 class DroneMesh(NamedTuple):
-    """Triangles in the body frame: vertices (n, 3) [m; B], corners (m, 3) by vertex, colours (n, 4) 0 to 255."""
+    """Triangles in the body frame: vertices (n, 3) [m; B], indices of corners (m, 3), RGBA colours (n, 4) 0 to 255."""
 
     vertices_m: np.ndarray
     triangles: np.ndarray

@@ -1,4 +1,4 @@
-"""Flies a hunt into its folder: a space of flights and requirements in; the first violation, shrunk, out.
+"""Flies a hunt into its folder: a space of flights and requirements in; the first violation, shrunk to its causes, out.
 
 The folder of a hunt:
 
@@ -6,8 +6,8 @@ The folder of a hunt:
     flights.csv          a row for each flight, in order: faults, values, margins
     summary.json, report.html, figures/
     violation.yaml       the scenario with the remaining causes
-    violation/           its flight: record, report, figures
-    violation.zsim       the same in one file
+    violation/           the flight of that scenario: record, report, figures
+    violation.zsim       its bundle, in one file
 """
 
 import csv
@@ -45,33 +45,33 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, Task, fly_scenario
 PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml", "violation"
 BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
-SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages, beside those of `shrink`
-SAME_BITS = "same_bits"  # figure: truth is identical to the bit with the flight in which no process dies
-MISSES_MAX = 100  # successive draws that cannot be flown, chosen: then --vary is wrong
-DECIMALS = 6  # of margins in the table
+SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages besides those of `shrink`
+SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the flight in which no process dies
+MISSES_MAX = 100  # successive draws that cannot be flown, after which --vary is taken to be wrong; chosen
+DECIMALS = 6  # decimals of margins in the table
 
 
 class HuntRequest(Struct, frozen=True):
     """A hunt to fly: scenario, requirements, folder and limits.
 
-    `flights` and `budget_s` bound the search; a violation is then shrunk, in some hundred flights.
+    `flights` and `budget_s` limit the search; shrinking a violation takes some hundred further flights.
     """
 
-    document: dict[str, Any]  # of the scenario, with the overrides of the command line
-    source: str  # name of its file, for messages
+    document: dict[str, Any]  # the scenario's document, with the overrides of the command line
+    source: str  # name of the scenario's file, for messages
     requirements: tuple[str, ...]  # comparisons, or `module:function` of the user's own
     out: Path
-    seed: int = 1  # of the draws
+    seed: int = 1  # seed of the draws
     flights: int | None = None
     budget_s: float | None = None
-    faults: tuple[str, ...] = ()  # texts of `--fault`; none: all kinds
-    without: tuple[str, ...] = ()  # kinds that are not drawn
+    faults: tuple[str, ...] = ()  # texts of `--fault`; empty: all kinds
+    without: tuple[str, ...] = ()  # kinds of faults that are not drawn
     vary: tuple[str, ...] = (WIND,)
     changed: tuple[str, ...] = ()  # overrides `a.b.c=value` already applied to the document
-    most: int = 3  # faults of one flight
-    workers: int | None = None  # None: one per core
+    most: int = 3  # most faults in one flight
+    workers: int | None = None  # number of processes; None: one per core
     force: bool = False  # whether the folder may hold other files
-    console: Console | None = None  # where progress is shown, None: stderr
+    console: Console | None = None  # where progress is shown; None: stderr
     open_run: Callable[[Path], Any] | None = None  # see Task
     processes: Callable[[Scenario, Path], None] | None = None  # see Task; for flights in which processes die
 
@@ -80,7 +80,7 @@ class HuntFlight(Struct, frozen=True):
     number: int
     stage: str
     case: Case
-    margins: list[Margin]  # of the requirements
+    margins: list[Margin]  # by requirement
     failure: str | None = None
     truth_sha256: str | None = None
     shortfall: str | None = None
@@ -114,18 +114,18 @@ class Violation(Struct, frozen=True):
     """A violation of a requirement."""
 
     requirement: str
-    number: int  # of the flight in which it was found
+    number: int  # number of the flight in which it was found
     found: Case
     shrunk: Case
-    margin: float | None  # of the shrunk flight; None if a figure is unknown
-    unknown: str  # that figure, or why the flight failed
+    margin: float | None  # margin of the shrunk flight; None if a quantity is unknown
+    unknown: str  # the unknown quantity, or why the flight failed
     causes: list[CauseFound]
-    options: list[str]  # of `zsim run` with the scenario, for the shrunk flight
+    options: list[str]  # options with which `zsim run` of the scenario flies the shrunk flight
     truth_sha256: str | None
 
 
 class Tried(Struct, frozen=True):
-    """How many combinations of `together` kinds of faults were flown."""
+    """Number of combinations of `together` kinds of faults that were flown."""
 
     together: int
     tried: int
@@ -139,13 +139,13 @@ class HuntSummary(Struct, frozen=True, kw_only=True):
     requirements: tuple[str, ...]
     seed: int
     version: str = __version__
-    verdict: str  # "violated", "not violated" or, if neither is known, "interrupted"
+    verdict: str  # "violated", "not violated", or "interrupted" if neither is known
     interrupted: bool = False  # by Ctrl-C
     flights: int
     wall_s: float
     stages: list[Stage]
     coverage: list[Tried]
-    least: list[float | None]  # margin of each requirement over the search
+    least: list[float | None]  # smallest margin of each requirement in the search
     violation: Violation | None = None
 
 
@@ -159,11 +159,11 @@ class Hunted(Struct, frozen=True):
 
 
 def hunt(request: HuntRequest) -> Hunted:
-    """Hunt until a requirement is broken or the budget is spent; return the results, also after Ctrl-C.
+    """Search until a requirement is violated or the budget is spent; return the results, also after Ctrl-C.
 
     Raises:
         ScenarioError: a requirement, a fault, a field or the scenario is wrong; one line each.
-        RunError: the folder holds something else, or cannot be written; workers cannot start.
+        RunError: the folder holds something else or cannot be written, or workers cannot start.
     """
     texts, document = _with_functions(request.requirements, request.document)
     requirements = _requirements(texts)
@@ -171,7 +171,7 @@ def hunt(request: HuntRequest) -> Hunted:
     if (request.out / PLAN).exists() and not request.force:
         raise RunError(f"{request.out}: already holds a hunt; --force replaces it, or give --out another folder")
     with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is running"):
-        rmtree(request.out / VIOLATION, ignore_errors=True)  # the results of an earlier hunt
+        rmtree(request.out / VIOLATION, ignore_errors=True)  # left by an earlier hunt
         for name in (SCENARIO, BUNDLE):
             (request.out / name).unlink(missing_ok=True)
         current = _Hunt(request, space, texts, requirements)
@@ -181,7 +181,7 @@ def hunt(request: HuntRequest) -> Hunted:
 
 
 def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return requirements as comparisons, and the document with the functions among them as metrics."""
+    """Return requirements as comparisons, and the document with their functions as metrics."""
     texts, report = [], dict(document.get("report") or {})
     metrics = report.get("metrics") or []
     names = [metrics] if isinstance(metrics, str) else list(metrics)
@@ -197,29 +197,29 @@ def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[
 
 
 def _requirements(texts: Sequence[str]) -> list[Requirement]:
-    made, faults = [], []
+    requirements, faults = [], []
     for text in texts:
         try:
-            made.append(Requirement(text))
+            requirements.append(Requirement(text))
         except ScenarioError as error:
             faults += error.faults
-    if faults or not made:
+    if faults or not requirements:
         raise ScenarioError(faults or ["--require is missing; must be a condition, as 'min_separation_m > 1.5'"])
-    return made
+    return requirements
 
 
 _requirement = lru_cache(maxsize=64)(Requirement)
 
 
 def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
-    """Return the margins of a flight in the process that flew it, or why they cannot be computed.
+    """Return the margins of a flight, or why they cannot be computed; called in the process that flew it.
 
-    `twin` is the same flight without deaths of processes, with which its bits are compared; None: it has none.
+    `twin` is the same flight without deaths of processes, with which it is compared bit by bit; None: it has none.
     """
     columns = {name: row[name] for name in row if name in FIXED or name.startswith((METRIC, "clusters."))}
     figures = {**columns, **dict(figures_of(msgspec.to_builtins(summary)))}
-    made = [_requirement(text) for text in requirements]
-    names = [name for each in made for name in each.names]
+    parsed = [_requirement(text) for text in requirements]
+    names = [name for each in parsed for name in each.names]
     if SAME_BITS in names:
         same = twin is None
         if twin is not None:
@@ -228,9 +228,9 @@ def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSumma
         figures[SAME_BITS] = same
     if row.get("metrics_failure"):  # missing metrics are unknown, not wrong
         figures = {**{name: None for name in names if name.startswith(METRIC)}, **figures}
-    faults = [fault for each in made for fault in each.faults(figures)]
+    faults = [fault for each in parsed for fault in each.faults(figures)]
     try:
-        return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in made]}
+        return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in parsed]}
     except ScenarioError as error:
         return {"faults": error.faults, "margins": []}
 
@@ -244,11 +244,11 @@ class _Hunt:
         self._strategy = Strategy(space, request.seed)
         self._screen = HuntScreen(request, self._strategy)
         self.flown: list[HuntFlight] = []
-        self._scales: list[float] = []  # by requirement: margin of the flight without faults
+        self._scales: list[float] = []  # margins of the flight without faults, by requirement
         self._stages: Counter[str] = Counter()
         self._spent_s: defaultdict[str, float] = defaultdict(float)
         self._waiting: deque[Task] = deque()
-        self._cases: list[tuple[Case, str]] = []  # by number
+        self._cases: list[tuple[Case, str]] = []  # by number of the flight
         self._rows: dict[int, Row] = {}
         self._done = False
 
@@ -307,7 +307,7 @@ class _Hunt:
             yield self._waiting.popleft() if self._waiting else None
 
     def _submit(self, case: Case, stage: str, record: Path | None = None) -> int:
-        """Queue the flight of a case; return its number. ScenarioError if it cannot be flown."""
+        """Queue the flight of a case; return its number; ScenarioError if it cannot be flown."""
         scenario, number = self._space.scenario(case), len(self._cases)
         self._cases.append((case, stage))
         deadly = [fault for fault in case.faults if fault["kind"] == PROCESS_KILL]
@@ -327,7 +327,7 @@ class _Hunt:
         return number
 
     def _result(self, number: int) -> HuntFlight:
-        """Wait for a flight, and add it to the table."""
+        """Wait for the result of a flight, and add it to the table."""
         while number not in self._rows:
             row = next(self._flying)
             self._rows[row["run"]] = row
@@ -362,7 +362,7 @@ class _Hunt:
     # Stages
 
     def _search(self) -> HuntFlight | None:
-        """Return the first flight that breaks a requirement, in order; None if the budget is spent first."""
+        """Return the first flight by number that violates a requirement; None if the budget is spent first."""
         flights, budget_s = self._request.flights, self._request.budget_s
         until_s = None if budget_s is None else time.monotonic() + budget_s
         pending: deque[int] = deque()
@@ -373,14 +373,14 @@ class _Hunt:
                     drawn += 1
                     try:
                         pending.append(self._submit(self._strategy.draw(), SEARCH))
-                    except ScenarioError:  # for instance a normally distributed value beyond its field's limits
+                    except ScenarioError:  # e.g. a normally distributed value beyond the limits of its field
                         misses += 1
                         if misses == MISSES_MAX:
                             raise
                         continue
                     misses = 0
                     if drawn == 1:
-                        break  # the flight without faults shows whether all figures exist
+                        break  # the flight without faults shows whether all quantities exist
                 if not pending or (until_s is not None and time.monotonic() >= until_s):
                     return None
                 flown = self._result(pending.popleft())
@@ -432,7 +432,7 @@ class _Hunt:
         )
 
     def _recorded(self, found: HuntFlight, case: Case) -> Violation:
-        """Fly the shrunk flight for its record, and others that show the effect of each cause."""
+        """Fly the shrunk case for its record, and further cases that show the effect of each cause."""
         which, causes = found.margins.index(found.worst), causes_of(case)
         self._screen.stage = RECORD
         place = self._request.out / VIOLATION
@@ -447,7 +447,7 @@ class _Hunt:
 
 
 def cause_text(case: Case, cause: tuple[str, int | str]) -> str:
-    """Format a cause as in a command line."""
+    """Format a cause as on the command line."""
     kind, which = cause
     return f"{which}={text_of(case.values[str(which)])}" if kind == "value" else fault_text(case.faults[int(which)])
 
@@ -464,7 +464,7 @@ def fault_text(fault: Mapping[str, Any]) -> str:
 
 
 def write(hunted: Hunted) -> None:
-    """Write hunt.json, flights.csv and violation.yaml. ReportError: the folder cannot be written."""
+    """Write hunt.json, flights.csv and violation.yaml; ReportError if the folder cannot be written."""
     request, summary = hunted.request, hunted.summary
     plan = {
         "scenario": request.source, "requirements": request.requirements, "seed": request.seed,
@@ -501,7 +501,7 @@ def table(hunted: Hunted) -> str:
 
 
 class HuntScreen(SweepScreen):
-    """Shows the progress of a hunt: flights, combinations tried, least margin, remaining budget."""
+    """Shows the progress of a hunt: flights, combinations tried, smallest margin, remaining budget."""
 
     def __init__(self, request: HuntRequest, strategy: Strategy) -> None:
         self._request, self._coverage = request, strategy.coverage

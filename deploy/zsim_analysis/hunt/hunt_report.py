@@ -29,8 +29,8 @@ from zsim_analysis.hunt.space import KindSpace
 from zsim_analysis.report import figure_style as style
 from zsim_analysis.report.make_report import Picture, make_report, rendered, write_report
 
-QUARTERS = 4  # parts of a range whose number of trials is shown
-KINDS_DRAWN = 24  # greatest size of the matrix of pairs
+QUARTERS = 4  # parts of a range for which the number of flights is shown
+KINDS_DRAWN = 24  # largest matrix of pairs
 
 
 def make_hunt_report(
@@ -39,7 +39,7 @@ def make_hunt_report(
     """Write summary.json, figures and report.html of a hunt, and report and bundle of the violation.
 
     Returns:
-        Notes on parts that the bundle lacks, or why there is no bundle.
+        Notes on what the bundle lacks, or why there is none.
 
     Raises:
         ReportError: the folder cannot be written.
@@ -83,8 +83,8 @@ def _margins(summary: HuntSummary, searched: Sequence[HuntFlight]) -> style.Repo
         axes.set_title(text, fontsize=style.PAPER_PT, color=style.DARK, loc="left")
     panels[-1].set_xlabel("flight", fontsize=style.PAPER_PT)
     caption = (
-        "Margin of each flight of the search to breaking a requirement, in the unit of its figures; crosses below 0 "
-        "are violations. Line: the least margin so far. Vertical line: a figure is unknown."
+        "Margin of each flight of the search to violating a requirement, in the unit of its quantities; crosses below "
+        "0 are violations. Line: the smallest margin so far. Vertical line: a quantity is unknown."
     )
     return style.ReportFigure("margins.png", "Margins over the flights", caption, figure)
 
@@ -114,8 +114,8 @@ def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> style.Report
     bar.set_label("least margin (%)", fontsize=style.PAPER_PT)
     bar.ax.tick_params(labelsize=style.PAPER_PT - 1)
     caption = (
-        "Least margin of the flights with both kinds, as a share of that of the flight without faults, and their "
-        "number; on the diagonal those of all flights with a kind. Empty: not tried."
+        "Smallest margin of the flights with both kinds, as a share of that of the flight without faults, and their "
+        "number; on the diagonal, those of all flights with a kind. Empty: not tried."
     )
     return style.ReportFigure("pairs.png", "Kinds of faults flown together", caption, figure)
 
@@ -157,7 +157,7 @@ def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
 
 
 def kind_row(space: KindSpace, searched: Sequence[HuntFlight]) -> list[str]:
-    """Return how often a kind was flown, its least margin, and the counts by quarter of each range."""
+    """Return how often a kind was flown, its smallest margin, and the number of flights by quarter of each range."""
     flown = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
     least = min((each.worst.share for each, _ in flown), default=None)
     targets = {fault["target"] for _, fault in flown}

@@ -1,12 +1,13 @@
-"""Requirements on flights: comparisons of figures of the summary, `min_separation_m > 1.5 and not crashed`.
+"""Requirements on flights: comparisons of quantities of the summary, `min_separation_m > 1.5 and not crashed`.
 
 A requirement has numbers, texts, names, comparisons, `and`, `or`, `not`, + - * / and abs, min, max. Names are paths in
 `summary.json` and columns of a sweep: `errors.p.true_rms`, `clusters.main.engaged_share`, `collisions`,
 `metrics.NAME`. Nothing else is accepted, and nothing is executed.
 
-Its margin is the distance from violation: the difference of the two sides of a comparison, the least of an `and`, the
-greatest of an `or`; the robustness of Fainekos and Pappas (Theoretical Computer Science 410, 2009) without time. To
-compare margins with different units, each is also given as a share of the larger side.
+The margin of a requirement is its distance from violation: the difference between the sides of a comparison, the
+minimum for `and`, the maximum for `or`; this is the robustness of Fainekos and Pappas (Theoretical Computer Science
+410, 2009) without time. So that margins with different units can be compared, each is also given as a share of the
+larger side.
 """
 
 import ast
@@ -18,10 +19,10 @@ from zsim.errors import ScenarioError
 from zsim.schema.checker import show, suggestion
 
 OPTION = "--require"
-SYNTAX = "comparisons of figures and numbers, as in 'min_separation_m > 1.5 and not crashed'"
-LENGTH_MAX = 1000  # characters of a requirement
-NAMES_SHOWN = 12
-TINY = 1e-12  # least denominator of a share
+SYNTAX = "comparisons of quantities and numbers, as in 'min_separation_m > 1.5 and not crashed'"
+LENGTH_MAX = 1000  # longest requirement [characters]
+NAMES_SHOWN = 12  # most names listed in an error
+TINY = 1e-12  # smallest denominator of a share
 _COMPARES = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _ARITHMETIC: dict[type, Callable[[float, float], float]] = {
     ast.Add: lambda a, b: a + b,
@@ -36,18 +37,18 @@ class Margin(NamedTuple):
     """The margin of a requirement in a flight."""
 
     holds: bool
-    # relative to the larger side of its comparison, from -2 to 2; in a hunt relative to the flight without faults
+    # relative to the larger side of the comparison, from -2 to 2; in a hunt, to the margin of the flight without faults
     share: float
-    value: float | None  # in the unit of its figures; None if a figure is unknown
-    unknown: str = ""  # the first figure that the flight does not have
+    value: float | None  # in the unit of its quantities; None if one is unknown
+    unknown: str = ""  # the first quantity that the flight does not have
 
     def __invert__(self) -> "Margin":
         if self.unknown:
-            return self  # an unknown requirement holds neither negated
+            return self  # an unknown requirement does not hold when negated, either
         return Margin(not self.holds, -self.share, None if self.value is None else -self.value)
 
 
-BROKEN = -2.0  # share for a flight that failed or has an unknown figure
+BROKEN = -2.0  # share for a flight that failed or has an unknown quantity
 
 
 class Requirement:
@@ -70,15 +71,15 @@ class Requirement:
         self.names = tuple(dict.fromkeys(self._names(self._tree)))
 
     def margin(self, figures: Mapping[str, Any]) -> Margin:
-        """Return its margin in a flight with these figures by path.
+        """Return the margin in a flight, given its quantities by path.
 
         Raises:
-            ScenarioError: it names a figure that no flight has, or compares a text with a number.
+            ScenarioError: the requirement names a quantity that no flight has, or compares a text with a number.
         """
         return self._margin(self._tree, figures)
 
     def faults(self, figures: Mapping[str, Any]) -> list[str]:
-        """Return a line for each name that is not among the figures of a flight, with the most similar one."""
+        """Return a line for each name that is not a quantity of a flight, with the most similar one."""
         unknown = [self._unknown(name, figures) for name in self.names if name not in figures]
         return [fault for text in unknown for fault in self._fault(text).faults]
 
@@ -88,7 +89,7 @@ class Requirement:
         return ScenarioError([f"{OPTION} {show(self.text)}: {text}"])
 
     def _check(self, node: ast.AST, as_truth: bool) -> None:
-        """Raise ScenarioError on unsupported syntax; `as_truth`: where a truth value is expected, else a figure."""
+        """Raise ScenarioError for unsupported syntax; `as_truth`: a truth value is expected, otherwise a quantity."""
         parts: list[tuple[ast.AST, bool]] = []
         if as_truth and isinstance(node, ast.BoolOp):
             parts = [(each, True) for each in node.values]
@@ -127,7 +128,7 @@ class Requirement:
             if not (isinstance(node, ast.Call) and child is node.func):
                 yield from self._names(child)
 
-    # Its margin
+    # Margin
 
     def _margin(self, node: ast.AST, figures: Mapping[str, Any]) -> Margin:
         if isinstance(node, ast.BoolOp):
@@ -159,7 +160,7 @@ class Requirement:
         value = left - right if op in (">", ">=") else right - left if op in ("<", "<=") else -abs(left - right)
         value = -value if op == "!=" else value
         if math.isnan(value):
-            return Margin(False, BROKEN, None, "a figure that is not a number")
+            return Margin(False, BROKEN, None, "a quantity that is not a number")
         holds = value > 0 or (value == 0 and op in (">=", "<=", "=="))
         return Margin(holds, value / max(abs(left), abs(right), TINY), value)
 
@@ -192,7 +193,7 @@ class Requirement:
 
 
 class Unknown(NamedTuple):
-    """Stands for a figure that a flight does not have."""
+    """Stands for a quantity that a flight does not have."""
 
     name: str
 
@@ -207,7 +208,7 @@ def _operands(node: ast.AST) -> list[ast.expr]:
 
 
 def path_of(node: ast.AST) -> str:
-    """Return the dotted path of a name or attribute node, empty for others."""
+    """Return the dotted path of a name or attribute node; empty for others."""
     if isinstance(node, ast.Name):
         return node.id
     if isinstance(node, ast.Attribute):
@@ -225,5 +226,5 @@ def figures_of(document: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def worst(margins: list[Margin]) -> Margin:
-    """Return the worst margin: the least, or that of a broken requirement."""
+    """Return the worst margin: the smallest one, with violated requirements first."""
     return min(margins, key=lambda margin: (margin.holds, margin.share))

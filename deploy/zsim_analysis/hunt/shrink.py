@@ -1,10 +1,10 @@
-"""Shrinks a flight that breaks a requirement: fewest causes, then smallest values, then the shortest flight.
+"""Shrinks a flight that violates a requirement: fewest causes, then smallest values, then the shortest flight.
 
 Causes are faults, and fields that differ from the scenario. Sets of causes are flown in order of size, so that the
 result is minimal; if there are more than SUBSETS_MAX causes, single ones are removed first (delta debugging of Zeller
 and Hildebrandt, IEEE Transactions on Software Engineering 28, 2002, at its finest granularity). Every number is then
 bisected between its value and one without effect. The candidates of a step are flown in parallel, and the first one in
-order that breaks the requirement is taken: the result does not depend on which finishes first.
+order that violates the requirement is taken, so the result does not depend on which of them finishes first.
 """
 
 import math
@@ -19,22 +19,22 @@ from msgspec.structs import replace
 from zsim.scenario.scenario_file import steps_of
 from zsim_analysis.hunt.space import Case, HuntSpace
 
-SUBSETS_MAX = 6  # causes of which all subsets are flown: 62 flights
-ROUNDS = 3  # each reduces the interval to a quarter
-PASSES = 2  # over all numbers, since a smaller one may allow another to be smaller
-SHARES = (0.25, 0.5, 0.75)
-RATIO = 30.0  # ratio of two numbers from which they are interpolated logarithmically
-SHORTEST_S = 1.0  # duration of a flight, chosen
+SUBSETS_MAX = 6  # most causes of which all subsets are flown: 62 flights
+ROUNDS = 3  # rounds of a bisection, each of which reduces the interval to a quarter
+PASSES = 2  # passes over all numbers, since a smaller number may allow another to become smaller
+SHARES = (0.25, 0.5, 0.75)  # candidates of a round, as shares of the interval
+RATIO = 30.0  # ratio of two numbers from which on they are interpolated logarithmically
+SHORTEST_S = 1.0  # shortest duration of a flight; chosen
 CAUSES, NUMBERS, DURATION = "fewest causes", "smallest values", "shortest flight"  # stages
 
 Breaks = Callable[[Sequence[Case], str], list[bool]]
-"""Flies cases at a stage; returns whether each breaks the requirement, False if it cannot be flown."""
+"""Flies cases in a stage; returns whether each violates the requirement, False if it cannot be flown."""
 
-Cause = tuple[str, int | str]  # ("fault", its index) or ("value", path)
+Cause = tuple[str, int | str]  # ("fault", index) or ("value", path)
 
 
 class Shrinker:
-    """Shrinks a case that breaks a requirement; `breaks` flies candidates."""
+    """Shrinks a case that violates a requirement; `breaks` flies candidates."""
 
     def __init__(self, space: HuntSpace, breaks: Breaks) -> None:
         self._space, self._breaks = space, breaks
@@ -69,7 +69,7 @@ class Shrinker:
     # Numbers
 
     def smallest(self, case: Case) -> Case:
-        """Return the case with each number as small in effect as still breaks the requirement."""
+        """Return the case with the effect of each number as small as still violates the requirement."""
         for _ in range(PASSES):
             before = case
             for place in range(len(case.faults)):
@@ -102,7 +102,7 @@ class Shrinker:
         return case
 
     def _fewest_axes(self, case: Case, place: int, name: str) -> Case:
-        """Return the case with as many components of a vector at 0 as possible, the smallest first."""
+        """Return the case with as many components of a vector at 0 as possible, starting with the smallest."""
         while True:
             vector = case.faults[place][name]
             axes = sorted((abs(x), axis) for axis, x in enumerate(vector) if x)
@@ -114,22 +114,22 @@ class Shrinker:
                 return case
             case = tried[broken.index(True)]
 
-    def _bisected(self, made: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
-        """Return the case with the number closest to the mildest one that still breaks, with few digits."""
-        low, high = 0.0, 1.0  # shares of the way from the mildest number to the one that breaks
+    def _bisected(self, case_of: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
+        """Return the case with the number closest to the mildest one that still violates, with few digits."""
+        low, high = 0.0, 1.0  # interval between the mildest number (0) and the one that violates (1)
         for _ in range(ROUNDS):
             shares = [low + share * (high - low) for share in SHARES]
-            broken = self._breaks([made(_between(mildest, value, share)) for share in shares], NUMBERS)
+            broken = self._breaks([case_of(_between(mildest, value, share)) for share in shares], NUMBERS)
             first = broken.index(True) if any(broken) else len(shares)
             low, high = [low, *shares][first], [*shares, high][first]
-        found = made(_between(mildest, value, high)) if high < 1.0 else case
+        found = case_of(_between(mildest, value, high)) if high < 1.0 else case
         number = _between(mildest, value, high)
-        short = [made(each) for digits in (1, 2) if (each := _outward(number, mildest, value, digits)) is not None]
+        short = [case_of(each) for digits in (1, 2) if (each := _outward(number, mildest, value, digits)) is not None]
         broken = self._breaks(short, NUMBERS) if short else []
         return short[broken.index(True)] if any(broken) else found
 
     def _space_value(self, path: str) -> Any:
-        """Return the scenario's value of a field, None if it has none."""
+        """Return the scenario's value of a field; None if it has none."""
         value: Any = msgspec.to_builtins(self._space.base)
         for step in steps_of(path, self._space.document):
             if isinstance(value, list):
@@ -142,7 +142,7 @@ class Shrinker:
     # Duration
 
     def shortest(self, case: Case) -> Case:
-        """Return the case with the shortest flight that breaks the requirement, but not without its causes."""
+        """Return the case with the shortest flight that violates the requirement, but only with the case's causes."""
         if not case.faults:
             return case
         length = case.duration_s or self._space.base.duration_s
@@ -153,7 +153,7 @@ class Shrinker:
         length = case.duration_s or length
         late = case
 
-        def earlier(by_s: float) -> Case:  # the same case with all faults earlier
+        def earlier(by_s: float) -> Case:  # the same case, with all faults earlier
             faults = tuple({**each, "at_s": _round(each["at_s"] - by_s)} for each in late.faults)
             return replace(late, faults=faults, duration_s=_round(length - by_s))
 
@@ -161,10 +161,10 @@ class Shrinker:
             case = self._shorter(lambda x: earlier(length - x), max(length - first, SHORTEST_S), length, case)
         return case
 
-    def _shorter(self, made: Callable[[float], Case], least: float, most: float, case: Case) -> Case:
+    def _shorter(self, case_of: Callable[[float], Case], least: float, most: float, case: Case) -> Case:
         for _ in range(ROUNDS):
             lengths = [_round(least + share * (most - least)) for share in SHARES]
-            tried = [made(each) for each in lengths]
+            tried = [case_of(each) for each in lengths]
             broken = self._breaks(tried, DURATION)
             good = (place for place, each in enumerate(tried) if broken[place] and self._holds_idle(each))
             first = next(good, len(tried))
@@ -212,8 +212,8 @@ def _outward(number: float, mildest: float, value: float, digits: int) -> float 
         return None
     unit = 10.0 ** (math.floor(math.log10(abs(number))) - digits + 1)
     steps = number / unit
-    whole = math.ceil(steps - 1e-9) if value > mildest else math.floor(steps + 1e-9)
-    found = _round(whole * unit, digits + 1)
+    rounded = math.ceil(steps - 1e-9) if value > mildest else math.floor(steps + 1e-9)
+    found = _round(rounded * unit, digits + 1)
     return found if min(mildest, value) <= found <= max(mildest, value) and found != number else None
 
 

@@ -1,17 +1,19 @@
 """The space that a hunt draws flights from, and the strategy by which it draws them.
 
-The space has kinds of faults with their targets, times and magnitudes, fields of the scenario, and seeds. Ranges follow
-from the declarations of the kinds (`zsim.scenario.faults`), whose limits are those of the simulation, far beyond normal
-flight. For a limit of LARGE and more, magnitudes are drawn from SMALL_SHARE to LARGE_SHARE of it (GPS bias: 1 to
-1000 m; link delay: 0.6 to 600 ms), for a lower one above 1 from its hundredth part on (gust: 1 to 100 m/s), each decade
-equally often; shares and probabilities are drawn uniformly. Rules narrow ranges: `gust velocity_m_s=1..6 for_s=2..8`.
+The space consists of kinds of faults with their targets, times and magnitudes, fields of the scenario, and seeds. The
+ranges follow from the declarations of the kinds (`zsim.scenario.faults`), whose limits are those of the simulation, far
+beyond normal flight. If a limit is LARGE or more, magnitudes are drawn from SMALL_SHARE to LARGE_SHARE of it (GPS bias:
+1 to 1000 m; link delay: 0.6 to 600 ms); if it is lower but above 1, from one hundredth of it to the limit (gust: 1 to
+100 m/s); in both cases all decades are equally likely. Shares and probabilities are drawn uniformly. Rules narrow
+ranges: `gust velocity_m_s=1..6 for_s=2..8`.
 
-The strategy covers all small combinations of kinds, and exploits low margins. Every second flight has kinds of which a
-pair, or else a triple, has not been tried together (Kuhn, Wallace and Gallo, IEEE Transactions on Software Engineering
-30, 2004: software failures need few simultaneous conditions). The others are neighbours of the flights with the lowest
-margins, of which the best of each set of kinds is kept (MAP-Elites of Mouret and Clune, arXiv 1504.04909): numbers
-moved slightly, a fault replaced, or one taken from another elite. Draws depend on the seed, the number of the flight
-and the margins of flights at least LAG before it, but not on the number of processes or their speed.
+The strategy covers all small combinations of kinds, and exploits low margins. Every second flight has a pair of kinds
+that has not been tried together, or a triple once all pairs have been (Kuhn, Wallace and Gallo, IEEE Transactions on
+Software Engineering 30, 2004: few simultaneous conditions suffice for software failures). The others are neighbours of
+the flights with the lowest margins, of which the best for each set of kinds is kept (MAP-Elites of Mouret and Clune,
+arXiv 1504.04909): numbers are moved slightly, or a fault is replaced, or taken from another elite. Draws depend on the
+seed, the number of the flight and the margins of flights at least LAG before it, but not on the number or speed of
+processes.
 """
 
 import copy
@@ -42,25 +44,25 @@ from zsim_analysis.sweep.design import SEED, SEEDS, Draw, Grid, Seeds, parse, te
 OPTION = "--fault"
 SYNTAX = "a kind and NAME=LOW..HIGH or NAME=VALUE, as in 'gust velocity_m_s=1..6 for_s=2..8'"
 WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # default of --vary, chosen
-LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # see above, chosen
-LEAST_S = 0.5  # duration of a fault, chosen: shorter ones are a few samples
-DECADES = 30.0  # ratio of the ends of a range from which every decade is drawn equally often
-ONE_WAY_SHARE = 1 / 3  # chosen
-DIGITS = 4  # significant digits of drawn numbers, so that their texts are exact
+LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # see the module's docstring; chosen
+LEAST_S = 0.5  # shortest duration of a fault; chosen: shorter ones last only a few samples
+DECADES = 30.0  # ratio of the ends of a range from which on all decades are equally likely
+ONE_WAY_SHARE = 1 / 3  # probability that a flag of a fault is set; chosen
+DIGITS = 4  # significant digits of drawn numbers, so that their texts represent them exactly
 _RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
-LAG = 32  # greatest number of pending flights, chosen: more than the processes of a machine
-TRIES = 24  # random sets of kinds, of which the one with the most untried combinations is flown
-STEPS = (0.3, 0.1, 0.03)  # shares of a range, chosen
-AGAIN = 0.25  # share of new random flights once all combinations have been tried
+LAG = 32  # most pending flights; chosen: more than the processes of a machine
+TRIES = 24  # random sets of kinds, of which the one with most untried combinations is flown
+STEPS = (0.3, 0.1, 0.03)  # standard deviations of moves, as shares of a range; chosen
+AGAIN = 0.25  # probability of an untried combination in place of a neighbour, and of a random one when none is left
 
 
 class Case(Struct, frozen=True):
     """The conditions of one flight."""
 
     seed: int
-    values: dict[str, Any] = {}  # of scenario fields, by path
-    faults: tuple[dict[str, Any], ...] = ()  # as in a scenario
-    duration_s: float | None = None  # None: the scenario's
+    values: dict[str, Any] = {}  # values of scenario fields by path
+    faults: tuple[dict[str, Any], ...] = ()  # faults as in a scenario
+    duration_s: float | None = None  # None: that of the scenario
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -69,14 +71,14 @@ class Case(Struct, frozen=True):
 
 
 class Knob(Struct, frozen=True):
-    """A parameter of a fault with the range or the values that it is drawn from."""
+    """A parameter of a fault, with the range or the values from which it is drawn."""
 
     name: str
-    low: float = 0.0  # of the number, or of the magnitude of a vector or signed number
+    low: float = 0.0  # limit of the number, or of the magnitude of a vector or signed number
     high: float = 0.0
     shape: str = "number"  # "number", "signed", "vector", or "choice"
     choices: tuple[Any, ...] = ()
-    weights: tuple[float, ...] = ()  # of the choices; empty: equal
+    weights: tuple[float, ...] = ()  # probabilities of the choices; empty: equal
 
     @property
     def by_decades(self) -> bool:
@@ -88,7 +90,7 @@ class Knob(Struct, frozen=True):
         return self._of(self._magnitude(rng.uniform()), _direction(rng, self.shape))
 
     def near(self, value: Any, rng: Generator, step: float) -> Any:
-        """Return a value at a normally distributed distance, with std `step` of the range; a random choice."""
+        """Return a value at a normal distance with standard deviation `step` of the range; for a choice, a new draw."""
         if self.shape == "choice" or value is None:
             return self.draw(rng)
         place = self.place(value) + step * rng.normal()
@@ -103,7 +105,7 @@ class Knob(Struct, frozen=True):
         return self._of(self._magnitude(float(np.clip(place, 0.0, 1.0))), direction)
 
     def place(self, value: Any) -> float:
-        """Return the position of a value in its range, from 0 to 1."""
+        """Return the position of a value within its range, from 0 to 1."""
         size = float(np.linalg.norm(value)) if self.shape != "number" else float(value)
         if self.high <= self.low:
             return 0.0
@@ -143,7 +145,7 @@ class KindSpace(Struct, frozen=True):
 
     name: str
     kind: FaultKind
-    knobs: dict[str, Knob]  # of its target, times and parameters
+    knobs: dict[str, Knob]  # target, times and parameters by name
 
     def draw(self, rng: Generator) -> dict[str, Any]:
         return _clean({"kind": self.name, **{name: knob.draw(rng) for name, knob in self.knobs.items()}})
@@ -169,13 +171,13 @@ class HuntSpace:
     Args:
         document: raw document of the scenario.
         source: name of its file, for messages.
-        rules: texts of `--fault`, each a kind with narrower ranges; none: all kinds except deaths of processes.
+        rules: texts of `--fault`, each a kind with narrower ranges; empty: all kinds except deaths of processes.
         without: kinds that are not drawn.
         vary: texts of `--vary`; seeds are always drawn.
-        most: greatest number of faults in one flight.
+        most: most faults in one flight.
 
     Raises:
-        ScenarioError: with one line for every fault of these and of the scenario.
+        ScenarioError: with one line for every fault in the arguments and the scenario.
     """
 
     def __init__(
@@ -207,8 +209,8 @@ class HuntSpace:
         document = copy.deepcopy(self.document)
         faults = []
         for path, value in case.values.items():
-            taken = lambda _, value=value: copy.deepcopy(value)  # noqa: E731 - of apply_override
-            faults.append(scenario_file.apply_override(document, f"{path}={text_of(value)}", taken))
+            parsed = lambda _, value=value: copy.deepcopy(value)  # noqa: E731 - argument of apply_override
+            faults.append(scenario_file.apply_override(document, f"{path}={text_of(value)}", parsed))
         if lines := [f"--vary {fault.removeprefix('--set ')}" for fault in faults if fault]:
             raise ScenarioError(lines)
         document[SEED] = case.seed
@@ -218,7 +220,7 @@ class HuntSpace:
         return document
 
     def options(self, case: Case) -> list[str]:
-        """Return the differences of a flight from the scenario, as options of `zsim run`."""
+        """Return the differences between a flight and the scenario, as options of `zsim run`."""
         words = ["--seed", str(case.seed)]
         if case.duration_s is not None:
             words += ["--duration", f"{case.duration_s:g}"]
@@ -228,7 +230,7 @@ class HuntSpace:
             words += ["--set", f"faults={text_of([*(self.document.get('faults') or []), *case.faults])}"]
         return words
 
-    # What is drawn
+    # Draws
 
     def _fields(self, vary: Sequence[str], faults: list[str]) -> Iterator[tuple[str, Draw | Grid]]:
         for text in vary:
@@ -309,7 +311,7 @@ class HuntSpace:
         return {knob.name: knob for knob in knobs}
 
     def _check_ends(self, rules: Sequence[str]) -> None:
-        """Refuse invalid values: check both ends of every range, and each listed value."""
+        """Raise ScenarioError for invalid values, checking both ends of every range and each listed value."""
         for path, axis in self.fields.items():
             both = (axis.first, axis.second) if isinstance(axis, Draw) else axis.values
             for value in both if isinstance(axis, Grid) or axis.kind == "uniform" else both[:1]:
@@ -355,7 +357,7 @@ def _given(name: str, text: str, kind: FaultKind) -> Knob:
         raise ValueError(f"is {show(text)}; must be LOW..HIGH, finite numbers with LOW <= HIGH")
     is_number = name in COMMON[2:] or (parameter is not None and parameter.shape in ("number", "vector"))
     if parameter is not None and not is_number:
-        raise ValueError(f"is {show(text)}; must be a value, as of a {parameter.shape}")
+        raise ValueError(f"is {show(text)}; must be a value of a {parameter.shape}")
     if parameter is not None and parameter.shape == "vector":
         if low < 0:
             raise ValueError(f"is {show(text)}; must be a range of the magnitude, from 0 on, or [x, y, z]")
@@ -364,7 +366,7 @@ def _given(name: str, text: str, kind: FaultKind) -> Knob:
 
 
 def _knob_of(p: FaultParameter) -> Knob | None:
-    """Return the default range or values of a parameter, None if it is not drawn."""
+    """Return the default range or values of a parameter; None if it is not drawn."""
     if p.shape == "choice":
         return Knob(p.name, shape="choice", choices=p.choices)
     if p.shape == "flag":
@@ -392,7 +394,7 @@ def links_of(scenario: Scenario) -> list[str]:
 
 
 class Elite(NamedTuple):
-    """The flight with the lowest margin of a set of kinds."""
+    """The flight with the lowest margin for a set of kinds."""
 
     margin: Margin
     case: Case
@@ -434,12 +436,12 @@ class Coverage:
 
 
 class Strategy:
-    """Draws the flights of a hunt; `learn` must be called in the same order."""
+    """Draws the flights of a hunt; `learn` must be called in the same order as `draw`."""
 
     def __init__(self, space: HuntSpace, seed: int) -> None:
         self.space, self.seed = space, seed
         self._planned = Coverage(list(space.kinds), space.most)
-        self.coverage = Coverage(list(space.kinds), space.most)  # of the flights that were flown
+        self.coverage = Coverage(list(space.kinds), space.most)  # combinations in finished flights
         self.elites: dict[tuple[str, ...], Elite] = {}
         self._drawn = 0
 

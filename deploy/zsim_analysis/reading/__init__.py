@@ -1,1 +1,1 @@
-"""A record read: its messages, a flight as arrays, its formations, their errors, and the verdict on the flight."""
+"""Reading of records: messages, a flight as arrays, its formations and their errors, and the verdict on the flight."""

@@ -1,4 +1,4 @@
-"""Errors of single drones: of estimates, references and flown velocities; distances between drones. Pure."""
+"""Errors of single drones: of estimates, against references, and of velocities; distances between drones."""
 
 from itertools import combinations
 from typing import NamedTuple
@@ -12,31 +12,31 @@ from zsim.vehicles.vehicle import vehicle_of
 from zsim_analysis.reading.formation import common_instants
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 
-SIGMAS = 2.0  # half width of the drawn band, in standard deviations
-DEGREES = 6  # of freedom of a drone's NEES: position and velocity
-ESTIMATES_MAX = 200_000  # evaluated per flight, which takes a second
+SIGMAS = 2.0  # half the width of the drawn band in standard deviations
+DEGREES = 6  # degrees of freedom of a drone's NEES: position and velocity
+ESTIMATES_MAX = 200_000  # most estimates evaluated per flight, which takes a second
 FLOWN = ("approaching", "path", "holding")  # phases of a reference in the air
-POSITION, YAW = (0, 1, 2), 3  # columns of errors and velocities: x, y, z, heading
-INSTANTS = 1500  # number of instants at which distances are computed, more than a figure has pixels
+POSITION, YAW = (0, 1, 2), 3  # columns of errors and of velocities: x, y, z, heading
+INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels
 
 
 class EstimateErrors(NamedTuple):
-    """Estimate − truth of one drone at K instants."""
+    """Estimate − truth of one drone at K times."""
 
     t_s: Array  # (K,) simulated time
     error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
-    sigma: Array  # (K, 4) their standard deviations as stated by the estimator
+    sigma: Array  # (K, 4) standard deviations of these as stated by the estimator
     # (K,) normalised estimation error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is
     # DEGREES for a consistent estimator [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
     nees: Array
 
     def share_inside(self, rows: np.ndarray) -> Array:
-        """Return the share (4,) of the errors at the instants `rows` that are within SIGMAS standard deviations."""
+        """Return the share (4,) of the errors in `rows` that are within SIGMAS standard deviations."""
         return np.mean(np.abs(self.error[rows]) <= SIGMAS * self.sigma[rows], axis=0)
 
 
 class VelocityResponse(NamedTuple):
-    """Commanded and flown velocity of one drone at C instants, those of its commands."""
+    """Commanded and true velocity of one drone at the times of its C commands."""
 
     t_s: Array  # (C,) simulated time
     # commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s], by the true heading
@@ -47,7 +47,7 @@ class VelocityResponse(NamedTuple):
 def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
     """Return the errors of the estimates of every drone that has both truth and estimates on record.
 
-    If there are more than ESTIMATES_MAX estimates, only every n-th instant of truth is evaluated.
+    If there are more than ESTIMATES_MAX estimates, only every n-th truth sample is evaluated.
     """
     step = 1 + sum(len(each.t_ns) for each in flight.estimates.values()) // ESTIMATES_MAX
     errors = {}
@@ -69,23 +69,23 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
 def nees(error: Array, covariance: Array) -> Array:
     """Return eᵀ P⁻¹ e (K,) of errors (K, n) and their covariances (K, n, n); NaN where P is not positive definite."""
     values, vectors = np.linalg.eigh(covariance)
-    definite = values[:, 0] > 1e-12 * np.maximum(values[:, -1], 1e-30)  # below, the divisor is rounding error
+    definite = values[:, 0] > 1e-12 * np.maximum(values[:, -1], 1e-30)  # below this, the divisor is only rounding error
     along = np.einsum("kij,ki->kj", vectors, error)
     squares = np.sum(along**2 / np.where(definite[:, None], values, 1.0), axis=1)
     return np.where(definite, squares, np.nan)
 
 
 class ReferenceErrors(NamedTuple):
-    """Truth − reference of one drone at K instants, from its first in the air to its last."""
+    """Truth − reference of one drone at K times, from the first to the last one in the air."""
 
     t_s: Array  # (K,) simulated time
     error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
     reference: Array  # (K, 3) reference position in W [m]
-    on_path: np.ndarray  # (K,) bool: on its path, not approaching it or holding a place
+    on_path: np.ndarray  # (K,) bool: on its path, neither approaching it nor holding a position
 
 
 class Tracking(Struct, frozen=True):
-    """Errors of one drone against its reference, within a window and in the air; None without such instants."""
+    """Errors of one drone against its reference, within a window and in the air; None without such samples."""
 
     true_rms_m: float | None
     true_max_m: float | None
@@ -144,16 +144,16 @@ def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
 
 
 class Distances(NamedTuple):
-    """True distances of the drones at K instants."""
+    """True distances of the drones at K times."""
 
     t_s: Array  # (K,) simulated time
     pairs: tuple[tuple[str, str], ...]  # names, in the order of the columns of `between`
-    between: Array  # (K, P) [m] of every pair; no columns if there are more pairs than requested
-    nearest: Array  # (K, N) [m] of each drone to its nearest neighbour
+    between: Array  # (K, P) distance of each pair [m]; no columns if there are more pairs than requested
+    nearest: Array  # (K, N) distance of each drone to its nearest neighbour [m]
 
 
 class Separations(NamedTuple):
-    """Limits of distances [m]: the controllers' margin and alarm, and where two hulls touch; None if unknown."""
+    """Limits of distances [m]: the controllers' margin and alarm, and the contact of two hulls; None if unknown."""
 
     margin_m: float | None
     alarm_m: float | None
@@ -161,7 +161,7 @@ class Separations(NamedTuple):
 
 
 def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
-    """Return the distances of simulated drones, of each pair if there are at most `pairs_max`; None below two."""
+    """Return the distances of simulated drones, of each pair if they are at most `pairs_max`; None below two drones."""
     tracks = [track for track in flight.tracks if len(track.t_ns) and not track.external]
     t_ns, places = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):
@@ -182,7 +182,7 @@ def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
 
 
 def separations(flight: RecordedFlight) -> Separations:
-    """Return the limits of distances in a flight's scenario: the largest of its clusters, and of any two hulls."""
+    """Return the limits of distances in a flight's scenario: the largest ones of its clusters and of any two hulls."""
     gains = [cluster.gains for cluster in flight.scenario.clusters] if flight.scenario else []
     margin_m = max((each.separation_min_m for each in gains), default=None)
     alarm_m = max((each.separation_alarm_m for each in gains), default=None)

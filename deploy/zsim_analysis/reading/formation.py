@@ -1,4 +1,4 @@
-"""A formation flight as arrays: desired, estimated and true variables, their errors and statistics. Pure."""
+"""A formation flight as arrays: desired, estimated and true variables, their errors and statistics."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,14 +15,14 @@ from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_
 from zsim_agents.formation.trajectory import TrajectoryError, named_values
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, Times, Track
 
-BLOCK = 512  # instants whose distances are held in memory at once
+BLOCK = 512  # number of samples whose distances are held in memory at once
 
 
 class ParameterErrors(Struct, frozen=True):
     """Errors of one cluster parameter against its desired value, in its own unit (m or rad).
 
-    `est` is what the controller saw (estimate − desired), `true` what the drones did (truth − desired), at
-    the same instants. std² + mean² = rms². None: no such instant.
+    `est` is what the controller saw (estimate − desired), `true` what the drones did (truth − desired), over the same
+    samples. std² + mean² = rms². None: no such samples.
     """
 
     est_std: float | None
@@ -35,7 +35,7 @@ class ParameterErrors(Struct, frozen=True):
 
 @dataclass
 class Formation:
-    """K instants of a cluster of n drones; m or rad, NaN where unknown."""
+    """K samples of a cluster of n drones; m or rad, NaN where unknown."""
 
     name: str
     drones: tuple[str, ...]
@@ -55,7 +55,7 @@ class Formation:
 
     @property
     def engaged_s(self) -> float | None:
-        """When it was first engaged, None if it never was."""
+        """Time of the first engagement; None if there was none."""
         return next((float(t_s) for t_s, phase in zip(self.t_s, self.phases, strict=True) if phase == "engaged"), None)
 
     @property
@@ -64,18 +64,18 @@ class Formation:
 
     @property
     def since_engaged(self) -> NDArray[np.bool_]:
-        """Which instants (K,) are not before the first engagement; all if there was none."""
+        """Mask (K,) of the samples from the first engagement on; all samples if there was none."""
         return self.t_s >= (-np.inf if self.engaged_s is None else self.engaged_s)
 
     def within(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
         return (self.t_s >= window_s[0]) & (self.t_s <= window_s[1])
 
     def judged(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
-        """Return which instants (K,) of a window count for statistics: before, the desired value is the estimate."""
+        """Return a mask (K,) of a window's engaged samples; in others, the desired value may be just the estimate."""
         return self.within(window_s) & self.engaged
 
     def engaged_share(self, window_s: tuple[float, float]) -> float | None:
-        """Return the share of a window's instants at which it was engaged, None without any instant."""
+        """Return the share of a window's samples in which it was engaged; None without samples."""
         rows = self.within(window_s)
         return float(self.judged(window_s).sum() / rows.sum()) if rows.any() else None
 
@@ -107,20 +107,17 @@ def formations_of(flight: RecordedFlight) -> list[Formation]:
 
 
 def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | None) -> Formation | None:
-    """Return a cluster's formation.
-
-    None if its controller published nothing, or variables of another convention than the scenario's.
-    """
+    """Return a cluster's formation; None if its controller published nothing, or not the scenario's variables."""
     if not len(states.t_ns):
         return None
     cluster = cluster_of(scenario, states.name)
-    try:  # without the cluster's own space: the default of so many drones
+    try:  # if the cluster is unknown, the default space of that many drones
         space = scenario_space(scenario, cluster) if scenario and cluster else cluster_space(len(states.drones))
     except (ValueError, NotTrustedError):
         return None
     if states.names != space.names:
         return None
-    # on the wire, all zeros stand for unknown
+    # on the wire, all zeros means unknown
     value, desired = (
         np.where(rows.any(axis=1, keepdims=True), rows, np.nan) for rows in (states.value, states.desired)
     )
@@ -128,10 +125,10 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
     members = [by_name[name] for name in states.drones if name in by_name]
     true = np.full((len(states.t_ns), space.size), np.nan)
     orders = np.array(states.orders or [" ".join(states.drones)] * len(true))
-    for order in dict.fromkeys(orders.tolist()):  # one, unless the drones were assigned to other places
+    for order in dict.fromkeys(orders.tolist()):  # only one, unless drones were reassigned
         rows = np.flatnonzero(orders == order)
-        seated = [by_name[name] for name in order.split() if name in by_name]
-        true[rows] = _true(space, seated if len(seated) == len(members) else members, states.t_ns[rows])
+        ordered = [by_name[name] for name in order.split() if name in by_name]
+        true[rows] = _true(space, ordered if len(ordered) == len(members) else members, states.t_ns[rows])
     est_error, true_error = (
         np.array([space.difference(*pair) for pair in zip(to, desired, strict=True)]) for to in (value, true)
     )
@@ -140,7 +137,7 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
 
 
 def _true(space: ClusterSpace, members: list[Track], wanted_ns: Times) -> Array:
-    """Return the true cluster variables (K, 4n); NaN without truth, without frame, or if a drone is external."""
+    """Return the true cluster variables (K, 4n); NaN without truth, for a singular shape, or if a drone is external."""
     true = np.full((len(wanted_ns), space.size), np.nan)
     if len(members) < space.n or any(track.external for track in members):
         return true
@@ -157,7 +154,7 @@ def _true(space: ClusterSpace, members: list[Track], wanted_ns: Times) -> Array:
 
 
 def common_instants(tracks: list[Track]) -> tuple[Times, list[NDArray[np.intp]]]:
-    """Return the instants at which all drones have truth, and their indices in each track."""
+    """Return the times at which all drones have truth, and their indices in each track."""
     if not tracks:
         return np.zeros(0, np.int64), []
     t_ns = tracks[0].t_ns
@@ -167,11 +164,11 @@ def common_instants(tracks: list[Track]) -> tuple[Times, list[NDArray[np.intp]]]
 
 
 def min_separation_m(tracks: list[Track]) -> float | None:
-    """Return the least true distance [m] of two drones that are both in the air, external ones where they are known.
+    """Return the minimum true distance [m] of two drones in the air, with external ones at the times of their poses.
 
-    Where no status shows a drone in the air, all instants count; None when there are no two drones.
+    If no status ever shows two drones in the air, all samples count. None if there are fewer than two drones.
     """
-    simulated = [track for track in tracks if not track.external]  # their truth has more instants
+    simulated = [track for track in tracks if not track.external]  # whose truth has more samples
     each = (_least_m(tracks), _least_m(simulated) if len(simulated) < len(tracks) else None)
     return min((least for least in each if least is not None), default=None)
 
@@ -200,19 +197,19 @@ def _least_m(tracks: list[Track]) -> float | None:
 
 
 class GoalErrors(NamedTuple):
-    """Errors (K, 4n) of a formation against its plan's target; NaN once its plan leads it elsewhere.
+    """Errors (K, 4n) of a formation against its plan's target; NaN once the plan leads elsewhere.
 
     The paper's Figure 5 shows these errors, which include the climb from the ground.
     """
 
-    goal: Array  # (4n,) m or rad, NaN for variables that the target does not name
+    goal: Array  # (4n,) m or rad; NaN for variables that the target does not name
     # est, true: (K, 4n) estimate − goal and truth − goal, angles wrapped to ±π
     est: Array
     true: Array
 
 
 def goal_errors(formation: Formation, scenario: Scenario | None) -> GoalErrors | None:
-    """Return the errors of a formation against its plan's target; None if its plan has none, or it was refused."""
+    """Return the errors of a formation against its plan's target; None if there is no target, or it is invalid."""
     cluster = cluster_of(scenario, formation.name)
     if scenario is None or cluster is None or not cluster.plan.target or cluster.plan.takeoff_s is None:
         return None

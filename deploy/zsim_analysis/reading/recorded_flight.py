@@ -1,6 +1,6 @@
 """A flight as arrays: tracks, estimates, commands, radio links, cluster states, events and processes.
 
-`read_flight` makes them from a record in one pass, `FlightReader` from the messages of a flight in this process.
+`read_flight` builds them from a record in one pass, `FlightReader` from the messages of a flight in this process.
 """
 
 from array import array
@@ -32,7 +32,7 @@ from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
-CONNECTS = 0.5  # probability from which a link counts as connected; it defines the range
+CONNECTS = 0.5  # probability of reception from which a link counts as connected; it defines the range
 
 
 @dataclass
@@ -40,10 +40,10 @@ class Track:
     """True motion of one drone, W and B as in the contract."""
 
     name: str
-    t_ns: Times  # (T,) instants of truth, ascending and unique
+    t_ns: Times  # (T,) times of the truth, ascending and unique
     truth: Array  # (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B]
-    status_t_ns: Times  # (S,) instants of status
-    states: list[str]  # (S,) state of the firmware by name
+    status_t_ns: Times  # (S,) times of the status
+    states: list[str]  # (S,) names of the firmware's state
     battery_percent: Array  # (S,)
     # the body is external, so that `truth` is the pose published by its driver, which is an estimate
     external: bool = False
@@ -54,13 +54,13 @@ class Track:
 
     @property
     def yaw(self) -> Array:
-        """Return the heading (T,) [rad]."""
+        """The heading (T,) [rad]."""
         w, x, y, z = self.truth[:, 6:10].T
         return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
     @property
     def yaw_rate(self) -> Array:
-        """Return the angular velocity about the vertical axis of W (T,) [rad/s]."""
+        """The angular velocity about the vertical axis of W (T,) [rad/s]."""
         w, x, y, z = self.truth[:, 6:10].T
         up_B = np.column_stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
         return np.sum(up_B * self.truth[:, 10:13], axis=1)
@@ -81,7 +81,7 @@ class DroneEstimates:
 
 @dataclass
 class DroneReferences:
-    """Where one drone that flies by itself was to be."""
+    """The reference of one drone that flies on its own."""
 
     t_ns: Times  # (K,) ascending and unique
     place: Array  # (K, 4) x, y, z in W [m], yaw [rad, not wrapped]
@@ -95,13 +95,13 @@ class VelocityCommands:
     t_ns: Times  # (C,) ascending and unique
     velocity: Array  # (C, 3) [m/s] as sent
     yaw_rate: Array  # (C,) [rad/s]
-    # (C,) whether the velocity is in W; otherwise x is forward and y left by the sender's estimated heading
+    # (C,) whether the velocity is in W; otherwise x is forward and y left according to the sender's estimated heading
     in_W: NDArray[np.bool_]
 
 
 @dataclass
 class ClusterStates:
-    """Published states of one cluster's controller: K instants, n variables."""
+    """Published states of one cluster's controller: K samples of n variables."""
 
     name: str
     drones: tuple[str, ...]
@@ -111,11 +111,11 @@ class ClusterStates:
     desired: Array
     phases: list[str]
     reasons: list[str]  # (K,) why it waits or is held
-    requests: list[ClusterRequest]  # accepted and refused, from sources other than its plan
-    orders: list[str] = field(default_factory=list)  # (K,) its drones in the order of the robots, between spaces
+    requests: list[ClusterRequest]  # accepted and refused ones, from sources other than its plan
+    orders: list[str] = field(default_factory=list)  # (K,) drones in the order of the robots, separated by spaces
 
     def robot_of(self, row: int, drone: str) -> int:
-        """Return which robot a drone is at an instant; as in `drones` where no order is on record."""
+        """Return the index of the robot that a drone is in a row, in the order of `drones` if none is on record."""
         order = self.orders[row].split() if self.orders else []
         return order.index(drone) if drone in order else self.drones.index(drone)
 
@@ -135,22 +135,24 @@ class RecordedProcess:
 
 
 class RadioSummary(Struct, frozen=True):
-    """The reception of drones, averaged over the instants of a window."""
+    """The reception of drones, averaged over a window."""
 
-    heard_mean: float  # expected number of drones heard by a drone: 4 with a loss of one half count as 2
-    connected_share: float  # share of instants at which every drone can reach all others, also via relays
+    heard_mean: float  # expected number of drones that a drone hears: 4 with a loss of one half count as 2
+    connected_share: float  # share of time in which every drone can reach all others, directly or via relays
 
 
 class RadioHistory:
-    """The links of N drones at K instants, without those of a ground station.
+    """The links between N drones at K times, without those of a ground station.
 
     Attributes:
-        t_ns: instants, ascending.
+        t_ns: times, ascending, (K,).
         heard: expected number of other drones whose messages arrive, (K, N).
         connected: whether the graph of links of at least CONNECTS, before loss, was strongly connected, (K,).
-        share: probability that a message of drone j arrives at drone i, mean over the instants, (N, N).
+        share: probability that a message of drone j arrives at drone i, mean over time, (N, N).
 
     Args:
+        links: those at each time.
+        drones: N.
         loss: share of messages lost at any distance.
     """
 
@@ -177,7 +179,7 @@ class RadioHistory:
 def _graph(
     hears: tuple[tuple[int, ...], ...], reception: tuple[tuple[float, ...], ...], drones: int
 ) -> tuple[NDArray[np.float64], bool]:
-    """Return the reception of drone j at drone i, (N, N), and whether the graph is strongly connected."""
+    """Return the reception probability of drone j at drone i, (N, N), and whether the graph is strongly connected."""
     matrix = np.zeros((drones, drones))
     chances = reception or [(1.0,) * len(heard) for heard in hears]
     for i, row in enumerate(zip(hears[:drones], chances[:drones], strict=False)):
@@ -190,7 +192,7 @@ def _graph(
 
 @dataclass
 class RecordedFlight:
-    """A flight with all that a report needs of it; fields that are not on record are None or empty."""
+    """All that a report needs of a flight; fields that are not on record are None or empty."""
 
     info: Info | None
     scenario: Scenario | None
@@ -198,32 +200,32 @@ class RecordedFlight:
     clusters: list[ClusterStates]
     events: list[Event]
     processes: list[RecordedProcess]
-    messages: int  # number on record, over all keys
-    completeness: Completeness  # of the record
+    messages: int  # number of messages on record, over all keys
+    completeness: Completeness
     wall_s: float  # wall time from the first to the last truth message, by the recorder's clock
-    undecoded: int = 0  # number of payloads that are not of the type of their key
-    began_ns: int | None = None  # wall time of the first truth message, nanoseconds since 1970; None without truth
-    # estimates, commands: by drone; empty unless requested
+    undecoded: int = 0  # number of payloads that do not match the type of their key
+    began_ns: int | None = None  # wall time of the first truth message [ns since 1970]; None without truth
+    # estimates and commands by drone; empty unless requested
     estimates: dict[str, DroneEstimates] = field(default_factory=dict)
     commands: dict[str, VelocityCommands] = field(default_factory=dict)
-    others: dict[str, int] = field(default_factory=dict)  # number of messages by key, of those that no report reads
-    cpu_s: float | None = None  # CPU time from the first gate to the last, of a flight in a process of its own
-    radio: RadioHistory | None = None  # None where the scenario has none
-    references: dict[str, DroneReferences] = field(default_factory=dict)  # of drones that fly by themselves, by drone
+    others: dict[str, int] = field(default_factory=dict)  # number of messages by key, of the keys that no report reads
+    cpu_s: float | None = None  # CPU time from the first gate to the last of a flight in a process of its own
+    radio: RadioHistory | None = None  # None if the scenario has no radio
+    references: dict[str, DroneReferences] = field(default_factory=dict)  # of drones that fly on their own, by drone
 
     @property
     def end(self) -> dict[str, Any] | None:
-        """Data of the world's last `end` event, None without one."""
+        """Data of the world's last `end` event; None without one."""
         return next((event.data for event in reversed(self.events) if event.kind == "end"), None)
 
     @property
     def replay_of(self) -> str:
-        """The run_id of the run that was played back, "" for a flight."""
+        """The run_id of the run that was replayed; empty for a flight."""
         return self.info.replay_of if self.info else ""
 
     @property
     def first_ns(self) -> int:
-        """First instant of truth."""
+        """Time of the first truth message."""
         return min((int(track.t_ns[0]) for track in self.tracks if len(track.t_ns)), default=0)
 
     @property
@@ -232,10 +234,10 @@ class RecordedFlight:
 
 
 def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
-    """Return the flight of a record; raises RecordError if there is none.
+    """Return the flight of a record; RecordError if there is no record.
 
-    With `answers` it includes the drones' estimates and velocity commands; without `motion`, the truth, status
-    and reference messages of one instant per second only.
+    With `answers`, it includes the drones' estimates and velocity commands; without `motion`, truth, status and
+    reference messages only once per second.
     """
     with RecordReader(path) as reader:
         flight = FlightReader(answers)
@@ -253,7 +255,7 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
         return recorded
 
 
-# Messages, reduced to the fields that are read
+# Messages, reduced to the fields that are used
 
 
 class _Truth(Struct):
@@ -306,14 +308,14 @@ class _Velocity(Struct):
 
 
 class _Rows:
-    """Rows of numbers with their times, and for some messages texts of each, stored compactly."""
+    """Rows of numbers with their times, and texts for some messages, stored compactly."""
 
     def __init__(self, width: int, kind: str) -> None:
         self.t_ns, self.values, self.width = array("q"), array(kind), width
         self.texts: list[tuple[str, ...]] = []
 
     def by_time(self, last: bool = False) -> tuple[Times, np.ndarray, list[tuple[str, ...]]]:
-        """Return times (R,) [ns], ascending and unique, rows (R, width), texts: the first, or last, of each instant."""
+        """Return unique ascending times (R,) [ns], and the first or last row (R, width) and texts at each of them."""
         step, count = -1 if last else 1, len(self.t_ns)
         t_ns, chosen = np.unique(np.array(self.t_ns, np.int64)[::step], return_index=True)
         chosen = count - 1 - chosen if last else chosen
@@ -325,7 +327,7 @@ _Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
 
 
 class FlightReader:
-    """Collects a flight message by message; with `answers`, the drones' estimates and velocity commands, too."""
+    """Collects a flight message by message; with `answers`, including the drones' estimates and velocity commands."""
 
     def __init__(self, answers: bool = False) -> None:
         self._answers = answers
@@ -349,7 +351,7 @@ class FlightReader:
         self._handlers: dict[str, _Handler | None] = {}
 
     def handler(self, key: str) -> _Handler | None:
-        """Return the decoder of a key's messages and what stores them, None for keys that no report needs."""
+        """Return a decoder of a key's messages and a function that stores them; None for keys that no report needs."""
         if key not in self._handlers:
             group, _, what = keys.parts(key)
             kinds: dict[str, tuple[type[Struct], Callable[[str, Any], None]]] = {
@@ -372,7 +374,7 @@ class FlightReader:
         return self._handlers[key]
 
     def add(self, key: str, payload: bytes, wall_ns: int = 0) -> None:
-        """Add a message of a record; one that cannot be decoded is counted. `wall_ns` is needed for truth only."""
+        """Add a recorded message, or count it if it cannot be decoded. `wall_ns` is needed for truth only."""
         if (handler := self.handler(key)) is None:
             return
         decoder, store = handler
@@ -388,7 +390,7 @@ class FlightReader:
         store(keys.parts(key)[1], message)
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Add a message, not encoded, of a flight in this process."""
+        """Add a message of a flight in this process, which is not encoded."""
         if handler := self.handler(key):
             handler[1](keys.parts(key)[1], message)
         else:
@@ -441,7 +443,7 @@ class FlightReader:
         rows.values.extend((command.yaw_rate_rad_s, command.frame == "world"))
 
     def _add_state(self, cluster: str, state: _State) -> None:
-        """Add a state; one with another number of variables replaces all earlier ones."""
+        """Add a state; a state with another number of variables replaces all earlier ones."""
         if not len(state.value) == len(state.desired) == len(state.names) > 0:
             return
         width = 2 * len(state.names)
@@ -515,8 +517,8 @@ class FlightReader:
     def _flown_commands(self) -> dict[str, VelocityCommands]:
         """Return the commands of each drone that were obeyed, by time.
 
-        Those are obeyed whose source the next status names as commander, or that were sent while no commander was
-        named.
+        A command was obeyed if the latest status names its source as commander, or if that names no commander and the
+        next status names none or this source.
         """
         kept: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
         for (drone, source), rows in self._commands.items():

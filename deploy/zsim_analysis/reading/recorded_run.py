@@ -1,8 +1,8 @@
-"""The record of a run, opened to be played back or flown again: its messages, its processes, and each gate's inputs.
+"""The record of a run, opened to be replayed or flown again: its messages, its processes, and the inputs of each gate.
 
-A record has the order in which messages passed the world: what stands before the clock of a gate was received before
-that gate was integrated. Two flights are compared by hashes of their messages: `OutputHashes` of all outputs of agents
-on a key tell whether they are identical, `GateDigests`, a checksum of each key at each gate, where they first differ.
+A record has the order in which messages passed the world: messages before the clock of a gate were received before
+that gate was integrated. Two flights are compared by hashes of their messages: `OutputHashes`, of all outputs of agents
+by key, show whether they are identical; `GateDigests`, checksums by key and gate, show where they first differ.
 """
 
 import csv
@@ -33,13 +33,13 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.hosting import agents_of
 
-# events of a process that was absent for a part of the run
+# events of a process that was absent for part of the run
 ABSENCES = ("death", "failure", "restart", "superseded", "doubled", "drop", "leave")
-CAUSES = ("truth", "estimate")  # leaves of keys, in whose order a difference spreads
+CAUSES = ("truth", "estimate")  # last parts of keys, in the order in which a difference spreads
 
 
 class RecordedRun(NamedTuple):
-    """An open record, and the run's `world/info` and scenario on it."""
+    """An open record, with the run's `world/info` and scenario."""
 
     reader: RecordReader
     info: messages.Info
@@ -51,14 +51,14 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
     """Yield the record in a run's folder, or in a file.
 
     Raises:
-        RunError: there is none.
-        RecordError: it is no record, or has no world/info.
-        ScenarioError: this version cannot read its scenario.
+        RunError: there is no record.
+        RecordError: the file is not a record, or has no world/info.
+        ScenarioError: this version cannot read the scenario.
     """
     with RecordReader(record_at(place)) as reader:
         recorded = reader.last(keys.INFO)
         if recorded is None:
-            raise RecordError(f"{reader.path}: has no world/info, so that its run is unknown")
+            raise RecordError(f"{reader.path}: has no world/info, so its run is unknown")
         try:
             info = messages.decode(keys.INFO, recorded.payload)
         except DecodeError as error:
@@ -68,7 +68,7 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
 
 
 def search_modules(record: Path, info: messages.Info | None) -> None:
-    """Search modules named by a run's scenario where the run found them, beside its record, and in this folder."""
+    """Let modules of a run's scenario be found where the run found them, beside its record, and in this folder."""
     recorded = info.module_folders if info and info.module_folders is not UNSET else ()
     plugin.search(*(record.parent / each for each in recorded), record.parent, Path.cwd())
 
@@ -82,12 +82,12 @@ def scenario_of(info: messages.Info | None) -> Scenario | None:
 
 
 def is_answer(key: str) -> bool:
-    """Tell whether agents publish on a key: commands, or what they tell each other."""
+    """Return whether agents publish on a key: commands, or messages for other agents."""
     return keys.is_command(key) or messages.is_relayed(messages.type_of(key))
 
 
 def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
-    """Return the last gate whose answers are all on record: without them the last gate had not been flown [ns].
+    """Return the last gate of which all answers are on record, without which the last gate could not be flown [ns].
 
     Raises:
         RecordError: there is no gate on record.
@@ -99,14 +99,14 @@ def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
 
 
 def sender_of(key: str, message: Any) -> str:
-    """Return the name of the process that published an output: a command, or what agents publish for each other."""
+    """Return the name of the process that published an output: a command, or a message for other agents."""
     stated = message.controller if isinstance(message, run_messages.ClusterRequest) else message.source
     role = "estimator" if isinstance(message, flight_messages.Estimate) else "controller"
     return stated or f"{role}.{keys.thing(key)}"
 
 
 def decode_or_none(recorded: Recorded) -> Any:
-    """Return the message of a key of the contract, None if its payload is not of the key's type."""
+    """Return the message on a key of the contract; None if its payload does not match the type of the key."""
     try:
         return messages.decode(recorded.key, recorded.payload)
     except DecodeError:
@@ -116,8 +116,8 @@ def decode_or_none(recorded: Recorded) -> Any:
 def command_age_ms(path: Path) -> dict[str, float] | None:
     """Return p50, p99 and max [ms] of the wall time from a drone's status to the command that answers it.
 
-    Both times are those at which the recorder received the messages. For runs whose world ended before it reported
-    its own figures; None when no command answers a status on record.
+    Both times are those at which the recorder received the messages. This is for runs whose world ended before it
+    reported its own statistics. None if no command on record answers a status.
     """
     with RecordReader(path) as reader:
         wanted = {k for k in reader.topics() if keys.leaf(k) in ("status", "velocity") and not keys.is_accepted(k)}
@@ -137,17 +137,17 @@ def command_age_ms(path: Path) -> dict[str, float] | None:
 
 
 class DriverLink(Struct, frozen=True):
-    """Quality of the link to one external drone over a run; None for figures that its driver did not report."""
+    """Quality of the link to one external drone over a run; None for values that its driver did not report."""
 
     peer: str  # address of the aircraft
-    age_max_ms: float | None  # largest reported age of the newest datagram, in wall time
-    # loss_mean_percent, loss_max_percent: of the datagrams sent by the aircraft
+    age_max_ms: float | None  # largest reported age of the newest datagram in wall time
+    # loss_mean_percent, loss_max_percent: loss of the datagrams that the aircraft sent
     loss_mean_percent: float | None
     loss_max_percent: float | None
     round_trip_ms: float | None  # median
-    lost: int  # number of times that the link was lost, which is after a second of silence
-    lost_s: float  # total duration of the losses, simulated time
-    refused: int  # datagrams that were malformed or of another sender, over all consecutive drivers
+    lost: int  # how often the link was lost, that is, silent for a second
+    lost_s: float  # total duration of the losses in simulated time
+    refused: int  # number of datagrams that were malformed or from another sender, over all consecutive drivers
 
     def __str__(self) -> str:
         figures = (
@@ -193,7 +193,7 @@ def driver_links(path: Path) -> dict[str, DriverLink]:
 
 
 class AgentProcess(NamedTuple):
-    """A process of zsim's agents: its name, and the names of all agents that it ran."""
+    """A process of zsim's agents: its name, and the names of all agents in it."""
 
     name: str
     members: tuple[str, ...]
@@ -206,12 +206,12 @@ class AgentProcess(NamedTuple):
 class RecordedAgents(NamedTuple):
     """The agents that took part in a run."""
 
-    processes: tuple[AgentProcess, ...]  # whose agents can be run again; empty if there is a reason not to
-    why_not: str  # that reason
-    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to their controllers and pilots, each in order
-    fingerprints: frozenset[str]  # numeric, of these processes
-    truth_sha256: str | None  # as reported by the world at the end of the run, None if the record has no end
-    failure: str  # of a user's code in one of these processes, by which the run ended; empty if there was none
+    processes: tuple[AgentProcess, ...]  # those whose agents can be run again; empty if `why_not`
+    why_not: str  # why no agents can be run again; empty if they can
+    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to their controllers and pilots, in order for each
+    fingerprints: frozenset[str]  # numeric fingerprints of these processes
+    truth_sha256: str | None  # as the world reported it at the end of the run; None if the record has no end
+    failure: str  # failure of a user's code in these processes by which the run ended; empty if there was none
 
     @property
     def names(self) -> frozenset[str]:
@@ -222,7 +222,7 @@ class RecordedAgents(NamedTuple):
 def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenario) -> RecordedAgents:
     """Return the agents that took part in the run of a record.
 
-    Processes of others do not announce a fingerprint, or serve names that are no agents of the scenario.
+    Other processes announce no fingerprint, or serve names that are not agents of the scenario.
     """
     known = set(agents_of(scenario)) if scenario.drones else set()
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
@@ -246,7 +246,7 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
 def _why_not(
     info: messages.Info, scenario: Scenario, events: Sequence[run_messages.Event], names: frozenset[str]
 ) -> str:
-    """Return why the agents cannot be run again, empty if they can."""
+    """Return why the agents cannot be run again; empty if they can."""
     if info.mode == "realtime":
         return "in realtime it is not in the scenario when they answered"
     if not names:
@@ -271,12 +271,12 @@ def _why_not(
 
 
 def _ends_by_failure(event: run_messages.Event, names: frozenset[str]) -> bool:
-    """Return whether the run ended by this failure of a user's code in one of these agents."""
+    """Return whether an event is the failure of a user's code in one of these agents that ended the run."""
     return event.kind == "failure" and event.subject in names and event.data.get("on_death") == "end"
 
 
 def _read(reader: RecordReader, expression: str) -> Iterator[tuple[str, Any]]:
-    """Yield key and message on an expression in the order of the record; invalid ones, refused by the world, not."""
+    """Yield the valid messages on a key expression, with their keys, in the order of the record."""
     wanted = [key for key in reader.topics() if keys.matches(expression, key)]
     for recorded in reader.messages(wanted, by_time=False):
         if (message := decode_or_none(recorded)) is not None:
@@ -284,15 +284,15 @@ def _read(reader: RecordReader, expression: str) -> Iterator[tuple[str, Any]]:
 
 
 class GateInputs(NamedTuple):
-    """What a record holds of a gate."""
+    """The content of a record for one gate."""
 
     t_ns: int
-    inputs: list[Recorded]  # received by the world since the previous gate, in order
+    inputs: list[Recorded]  # messages received by the world since the previous gate, in order
     truth: dict[str, bytes]  # payloads at the gate, by drone
 
 
 def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
-    """Yield the inputs of each gate of a record, as far as it is whole."""
+    """Yield the inputs of each gate of a record that has truth."""
     truth_keys = {keys.truth(drone): drone for drone in drones}
     wanted = {keys.CLOCK, keys.EVENT, *truth_keys}
     for key in reader.topics():
@@ -313,23 +313,23 @@ def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
             truth[truth_keys[recorded.key]] = recorded.payload
         elif recorded.key != keys.CLOCK:
             inputs.append(recorded)
-        elif recorded.t_ns > last_ns and truth:  # the clock of a gate is repeated while time stands still
+        elif recorded.t_ns > last_ns and truth:  # the clock of a gate is repeated while simulated time stands still
             yield GateInputs(recorded.t_ns, inputs, truth)
             inputs, truth, last_ns = [], {}, recorded.t_ns
 
 
 def content_of(message: Any) -> bytes:
-    """Return an agent's output as on the wire, but without its process, which agents may share."""
+    """Return an agent's output as on the wire, but without the name of its process, which agents may share."""
     return messages.encode(
         replace(message, **{"controller" if isinstance(message, run_messages.ClusterRequest) else "source": ""})
     )
 
 
 class OutputHashes:
-    """SHA-256 of the outputs of agents up to an instant, by key.
+    """SHA-256 of the outputs of agents up to a gate, by key.
 
     Args:
-        until_ns: the last instant whose outputs count; outputs for later gates may be missing on record.
+        until_ns: the last gate whose outputs are hashed; those for later gates may be missing on record.
     """
 
     def __init__(self, until_ns: int) -> None:
@@ -346,7 +346,7 @@ class OutputHashes:
 
 
 class GateDigests:
-    """A checksum of the messages on each key at each gate. `until_ns` as in OutputHashes."""
+    """Checksums of the messages on each key at each gate; `until_ns` as in OutputHashes."""
 
     def __init__(self, until_ns: int) -> None:
         self._until_ns = until_ns
@@ -358,7 +358,7 @@ class GateDigests:
             at[key] = at.get(key, 0) + zlib.crc32(payload) & 0xFFFFFFFF
 
     def csv(self) -> bytes:
-        """Return a table: `t_ns`, then a column for each key, with 8 hex digits or empty."""
+        """Return a CSV table: `t_ns`, then a column for each key with 8 hexadecimal digits, or empty."""
         names = sorted({key for at in self._sums.values() for key in at})
         file = io.StringIO()
         writer = csv.writer(file, lineterminator="\n")
@@ -369,12 +369,12 @@ class GateDigests:
 
 
 def first_difference(expected: bytes, found: bytes) -> tuple[int, str] | None:
-    """Return the first instant [ns] and key at which two tables of `GateDigests.csv` differ; None if they are equal.
+    """Return the first time [ns] and key at which two tables of `GateDigests.csv` differ; None if they are equal.
 
-    Among the keys of an instant, the first is chosen in the order of cause: truth, estimates, others.
+    Among keys that differ at the same time, the likely cause comes first: truth, then estimates, then others.
 
     Raises:
-        ValueError: one is not such a table.
+        ValueError: one of them is not such a table.
     """
     rows = zip_longest(_rows(expected), _rows(found), fillvalue=(0, dict[str, str]()))
     for (t_ns, a), (other_ns, b) in rows:

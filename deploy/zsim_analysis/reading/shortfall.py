@@ -1,4 +1,4 @@
-"""The verdict on a flight: deviations from its plan, and incidents of its drones. Pure except `verdict`.
+"""The verdict on a flight: deviations from its plan, and incidents of its drones. Only `verdict` reads a file.
 
 Order of this file: shortfalls, the window of the statistics, and their texts; then drones, then formations.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import INCIDENTS, Event
 from zsim.errors import NotTrustedError
 from zsim.record import Completeness
 from zsim.record.completeness import SECOND_NS
@@ -28,35 +28,35 @@ from zsim_analysis.reading.formation import cluster_of
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
 NOT_AS_PLANNED = "NOT AS PLANNED"
-ENGAGES_S = 20.0  # chosen: a formation engages 4 to 12 s after its take-off; a run may end before
-MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # chosen: half a second; m or rad, below which a reference is at rest
-HELD_MAX_S = 2.0  # chosen: four times the wait after a fault; a longer hold is a deviation from the plan
-LATE_MAX_S = 1.0  # chosen: two attempts at a step of the plan; a longer missing part of a reference is reported
+ENGAGES_S = 20.0  # time from take-off within which a formation must engage; chosen: it takes 4 to 12 s
+MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # a reference that moves less (m or rad) in this time is at rest; chosen
+HELD_MAX_S = 2.0  # longest total hold that still follows the plan; chosen: four times the wait after a fault
+LATE_MAX_S = 1.0  # longest missing part of a reference that is not reported; chosen: two attempts at a step of the plan
 SAMPLE_NS = 100_000_000  # sampling interval of a reference that is compared with the plan's
-STRAYED_M, STRAYED_S = 5.0, 3  # chosen: twice the least distance of drones, for so many successive seconds
-SETTLED_S = 10.0  # chosen: time from the engagement until drones must be in their places
+# a drone that is farther off for that many successive seconds has strayed; chosen: twice the minimum separation
+STRAYED_M, STRAYED_S = 5.0, 3
+SETTLED_S = 10.0  # time from the engagement until drones must be at their positions; chosen
 SAME = 1e-3  # m or rad; tolerance of the reference against the plan's, which is computed by the same formulas
-CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # name prefixes of planned controllers, and operators
-INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery", "landing")  # events of drones
-CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents by which a drone comes down
-ONE_HIT_NS = 500_000_000  # chosen: a touchdown within this time of an impact belongs to it
-REFUSED_NS = 5_000_000_000  # chosen: a command refused within this time before a landing explains it
+CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # name prefixes of plans' controllers, and of operators
+CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents that bring a drone down
+ONE_HIT_NS = 500_000_000  # a touchdown within this time of an impact belongs to it; chosen
+REFUSED_NS = 5_000_000_000  # a command refused within this time before a landing explains it; chosen
 LEADS = ("hold", "land", "target", "trajectory", "assemble")  # requests that make a formation leave its plan
 
 
 class Shortfall(Struct, frozen=True):
     """A deviation of a flight from its plan, or an incident."""
 
-    # of a drone: emergency, flip, impact, touchdown, battery, landing (its first incident), mission (incomplete),
-    # strayed (far from its place or reference), reference (no take-off), override (flown by others); of a cluster:
-    # plan (a step refused to the end, or flown in part), engagement (never), held (for long), request (led by others),
-    # early (the run ended before a step was due), window (contains instants without engagement); collision; process
-    # (an expected one died, failed, or never joined); record (incomplete)
+    # drones: emergency, flip, impact, touchdown, battery, landing (the first incident), mission (incomplete),
+    # strayed (far from its position or reference), reference (no take-off), override (flown by others); clusters:
+    # plan (a step refused to the end, or flown in part), engagement (never), held (too long), request (commanded by
+    # others), early (the run ended before a step was due), window (not engaged in all of it); and collision, process
+    # (an expected one died, failed, or never joined), record (incomplete)
     kind: str
-    subject: str  # the cluster, drone, process, or "record"; for a collision both, as "drone1, drone2"
-    t_s: float  # its beginning, simulated time
+    subject: str  # the cluster, drone, process, or "record"; for a collision both parties, as "drone1, drone2"
+    t_s: float  # simulated time at which it began
     text: str
-    fails: bool  # the flight did not follow its plan; the command ends with code 1
+    fails: bool  # whether the flight did not follow its plan; the command then ends with code 1
 
 
 class Verdict(Struct, frozen=True):
@@ -67,7 +67,7 @@ class Verdict(Struct, frozen=True):
 
 
 def verdict(record: Path) -> Verdict:
-    """Return the verdict on the flight of a record as in its report, without reading all of its motion.
+    """Return the same verdict on a recorded flight as its report, without reading all of its motion.
 
     Raises:
         RecordError: there is no such record.
@@ -89,7 +89,7 @@ def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Sh
 
 
 def marks_of(lines: Sequence[Shortfall]) -> list[tuple[str, bool]]:
-    """Return a line for each shortfall, and whether it is a failure."""
+    """Return the line of each shortfall, and whether it is a failure."""
     return [(f"{NOT_AS_PLANNED if each.fails else 'note'}: {each.text}", each.fails) for each in lines]
 
 
@@ -101,7 +101,7 @@ def window_of(flight: RecordedFlight) -> tuple[tuple[float, float], str]:
 def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple[float, float], str]:
     """Return the window of a run's statistics [s], and a note if it is not the scenario's.
 
-    The default without one in the scenario is the last two thirds of the run.
+    If the scenario has none, it is the last two thirds of the run.
     """
     default = (length_s / 3, length_s)
     if wanted_s is None:
@@ -118,7 +118,7 @@ def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple
 
 
 def phase_shares(t_s: Array, phases: list[str], window_s: tuple[float, float]) -> dict[str, float]:
-    """Return the share of each phase of a formation in a window's instants, the greatest first."""
+    """Return the share of each phase of a formation among the samples of a window, the largest first."""
     rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
     return {phase: count / len(rows) for phase, count in Counter(phases[row] for row in rows).most_common()}
 
@@ -133,20 +133,20 @@ def span_text(span_s: tuple[float, float]) -> str:
 
 
 def percent_text(share: float) -> str:
-    """Format a share in percent; only exact shares are shown as 100 or 0."""
+    """Format a share in percent; only exactly 1 and 0 are shown as 100 and 0."""
     percent = 100 * share if share in (0.0, 1.0) else min(max(100 * share, 0.1), 99.9)
     return f"{percent:.3g}"
 
 
 def _processes(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield the expected processes that were lost permanently, unless the scenario allows dropping them."""
+    """Yield the expected processes that were lost for good, unless the scenario allows dropping them."""
     scenario = flight.scenario
     expected = {*expected_processes(scenario), *agent_names(scenario), WORLD} if scenario else set()
     actions = scenario.processes if scenario else Processes()
     dropped = {event.subject for event in flight.events if event.kind == "drop"}  # without a replacement
     for event in flight.events:
         if event.kind == "end":
-            return  # deaths after it do not matter
+            return  # deaths after the end do not matter
         if event.subject not in expected:
             continue
         on_death = event.data.get("on_death")
@@ -170,7 +170,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield a line for each drone with incidents: the first of each kind, by time."""
     by_drone: dict[str, list[Event]] = {}
     for event in flight.events:
-        if event.kind in INCIDENTS:
+        if event.kind in (*INCIDENTS, "landing"):
             by_drone.setdefault(event.subject, []).append(event)
     for drone, events in by_drone.items():
         first = {event.kind: event for event in reversed(events)}
@@ -180,7 +180,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
         in_order = sorted(first.values(), key=lambda event: (event.t_ns, event.seq))
         parts = [_incident_text(event, _refusal_before(event, flight)) for event in in_order]
         text = f"{drone}: {', '.join(parts)}{_active_faults(drone, (events[0].t_ns, events[0].seq), flight)}"
-        fails = not all(  # a landing after a program other than a controller stopped sending is not a failure
+        fails = not all(  # a landing because a program other than a controller fell silent is not a failure
             event.kind == "landing"
             and event.data.get("cause") == "silence"
             and not str(event.data.get("commander") or "").startswith(CONTROLLER)
@@ -195,9 +195,9 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _refusal_before(event: Event, flight: RecordedFlight) -> str:
-    """Return the reason of a drone's latest refused command, if that may explain an event; else empty.
+    """Return the reason of a drone's latest refused command if that may explain an event; empty otherwise.
 
-    Only the first of many equal refusals are events; the last of them says that further ones are only counted.
+    Only the first of many equal refusals are events; the last of these says that further ones are only counted.
     """
     commands = f"drone/{event.subject}/cmd/"
     for each in reversed(flight.events):
@@ -231,7 +231,7 @@ def _incident_text(event: Event, refused: str) -> str:
 
 
 def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> str:
-    """Return the faults of a drone or the world that were active at an instant: (t_ns, number of the event)."""
+    """Describe the faults of a drone or the world that were active at a time: (t_ns, sequence number of the event)."""
     active: dict[object, str] = {}
     for each in flight.events:
         if (each.t_ns, each.seq) > at:
@@ -247,9 +247,9 @@ def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> s
 
 
 def _collisions_and_missions(flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield each pair of drones, or of a drone and an obstacle, that collided, and incomplete missions.
+    """Yield each collision of two drones, or of a drone and an obstacle, and each incomplete mission.
 
-    Of the missions that a bridge reported, the latest one of each drone counts.
+    Of the missions that bridges reported, only each drone's latest one matters.
     """
     pairs: dict[frozenset[object], list[Event]] = {}
     for event in flight.events:
@@ -307,7 +307,7 @@ def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention
 
 
 def _of_reference(drone: str, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield that a drone did not fly its reference, or was far from it."""
+    """Yield a shortfall if a drone did not fly its reference, or strayed from it."""
     own = flight.references[drone]
     track = next((each for each in flight.tracks if each.name == drone), None)
     flown = np.isin(own.phases, FLOWN)
@@ -357,11 +357,11 @@ def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[f
     if flight.scenario and cluster:
         yield from _strayed(states, flight, flight.scenario, cluster)
     yield from _held(states, flight)
-    asked = [each for each in states.requests if each.ok and each.op in LEADS]
-    if asked and takeoff_s is not None:
-        first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in asked[:3])
-        more = f" and {len(asked) - 3} more" if len(asked) > 3 else ""
-        yield _line(states, "request", asked[0].t_ns / 1e9, f"asked {first}{more}")
+    requests = [each for each in states.requests if each.ok and each.op in LEADS]
+    if requests and takeoff_s is not None:
+        first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in requests[:3])
+        more = f" and {len(requests) - 3} more" if len(requests) > 3 else ""
+        yield _line(states, "request", requests[0].t_ns / 1e9, f"asked {first}{more}")
     if flight.scenario and cluster and plan and takeoff_s is not None:
         for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
             if due_s is not None and due_s >= end_s:
@@ -392,7 +392,7 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
         op, why = step
         begun = begun if begun and begun[0] == op else (op, float(states.t_ns[place]) / 1e9)
         last = place + 1 == len(states.reasons)
-        flown = engaged or (was_engaged and states.phases[place] == "assembling")  # from one formation to another
+        flown = engaged or (was_engaged and states.phases[place] == "assembling")  # also while formations change
         if flown and (last or states.phases[place + 1] == "landing"):
             yield _line(states, "plan", begun[1], f"the {op} of the plan was refused to the end: {why}", True)
 
@@ -400,7 +400,7 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
 def _strayed(
     states: ClusterStates, flight: RecordedFlight, scenario: Scenario, cluster: Cluster
 ) -> Iterator[Shortfall]:
-    """Yield the drones whose true positions were far from their places in the engaged formation, and for how long.
+    """Yield the drones whose true positions were far from those desired in the engaged formation.
 
     The estimates that the controller uses may differ. Interventions are excluded.
     """
@@ -425,7 +425,7 @@ def _strayed(
 
 
 def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, what: str, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a shortfall if a drone was far from its place for STRAYED_S; `away_m` are its distances once a second."""
+    """Yield a shortfall if a drone was far off for STRAYED_S; `away_m` are its distances from `what` once a second."""
     stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
     long = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
     if long:
@@ -458,7 +458,7 @@ def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _moves(states: ClusterStates) -> bool:
-    """Return whether the reference moves at the end, without a hold or the separation guard being active."""
+    """Return whether the reference moves at the end, with neither a hold nor the separation guard active."""
     last = states.t_ns > states.t_ns[-1] - MOVES_NS
     phases = {phase for phase, row in zip(states.phases, last, strict=True) if row}
     moved = float(np.ptp(states.desired[last], axis=0).max())
@@ -466,7 +466,7 @@ def _moves(states: ClusterStates) -> bool:
 
 
 class PlannedReference(NamedTuple):
-    """The reference of a plan from start_s on, and the variables (entries of c) that it names."""
+    """The reference of a plan from start_s on, and the variables that it names, as indices into c."""
 
     space: ClusterSpace
     reference: Reference
@@ -474,7 +474,7 @@ class PlannedReference(NamedTuple):
     entries: NDArray[np.intp]
 
     def flown(self, states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return at which rows of `states` the engaged formation followed it."""
+        """Return a mask of the `rows` of `states` in which the engaged formation followed the reference."""
         on = np.zeros(len(rows), bool)
         for i, row in enumerate(rows.tolist()):
             if states.phases[row] == "engaged":
@@ -485,13 +485,13 @@ class PlannedReference(NamedTuple):
 
 
 def _planned(states: ClusterStates, scenario: Scenario, cluster: Cluster, takeoff_s: float) -> PlannedReference | None:
-    """Return the trajectory or else the target of a cluster's plan; None without one, or if it was refused."""
+    """Return the trajectory, or else the target, of a cluster's plan; None without either, or if it is refused."""
     steps = [each.request for each in plan_of(cluster) if isinstance(each.request, MoveTo | Follow)]
     try:
         space = scenario_space(scenario, cluster)
         if space.names != states.names or not steps:
             return None
-        base = states.desired[states.phases.index("engaged")].copy()  # a formation engages at its current place
+        base = states.desired[states.phases.index("engaged")].copy()  # a formation engages where it is
         base[space.neutral] = 0.0
         names, reference, start_s = dict[str, None](), None, takeoff_s
         for step in steps:
@@ -511,19 +511,19 @@ def _planned(states: ClusterStates, scenario: Scenario, cluster: Cluster, takeof
 
 def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
     """Yield a shortfall if a part of the plan's trajectory was not flown."""
-    t_s, whole_s = states.t_ns / 1e9 - planned.start_s, planned.reference.duration_s
+    t_s, duration_s = states.t_ns / 1e9 - planned.start_s, planned.reference.duration_s
     run_s, land_s = float(t_s[-1]), np.inf if plan.land_s is None else plan.land_s - planned.start_s
-    due_s = min(np.inf if whole_s is None else whole_s, land_s, run_s)
+    due_s = min(np.inf if duration_s is None else duration_s, land_s, run_s)
     if due_s <= 0.0:
-        return  # the run ended before it, which is reported as early, or its landing is planned before it
-    if whole_s is not None and run_s < min(whole_s, land_s):
-        text = f"the run ended at {seconds_text(run_s)} of {seconds_text(whole_s)} s of its trajectory"
+        return  # the run ended before it, which is reported as early, or the landing is planned before it
+    if duration_s is not None and run_s < min(duration_s, land_s):
+        text = f"the run ended at {seconds_text(run_s)} of {seconds_text(duration_s)} s of its trajectory"
         yield _line(states, "early", run_s + planned.start_s, text)
     rows = _sampled(states, np.flatnonzero((t_s >= 0.0) & (t_s <= due_s)))
     at_s, on = t_s[rows], planned.flown(states, rows)
     refusals = _waits(states, "trajectory", planned.start_s)
     begin_s = 0.0
-    if whole_s is None and on.any() and not refusals:
+    if duration_s is None and on.any() and not refusals:
         begin_s = float(at_s[on][0])  # an endless one is joined in motion once the formation reaches it
     flown_s = float(np.diff(np.r_[at_s, due_s])[on].sum())
     if due_s - begin_s - flown_s <= LATE_MAX_S:
@@ -543,7 +543,7 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
 
 
 def _target_reached(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
-    """Yield a shortfall if the reference reached the plan's target late, or the formation landed before."""
+    """Yield a shortfall if the reference reached the plan's target late, or the formation landed first."""
     engaged_ns = states.t_ns[states.phases.index("engaged")]
     rows = _sampled(states, np.flatnonzero(states.t_ns >= engaged_ns))
     on = planned.flown(states, rows)
@@ -566,7 +566,7 @@ def _sampled(states: ClusterStates, rows: NDArray[np.intp], every_ns: int = SAMP
 
 
 def _waits(states: ClusterStates, op: str, from_s: float) -> str:
-    """Describe when, and why at first, a step of the plan was refused after from_s; empty if it was not."""
+    """Describe when a step of the plan was refused after from_s, and why at first; empty if it was not."""
     rows = np.flatnonzero(states.t_ns / 1e9 >= from_s).tolist()
     steps = [(row, waiting_step(states.reasons[row])) for row in rows if states.phases[row] == "engaged"]
     found = [(row, step[1]) for row, step in steps if step and step[0] == op]
@@ -577,7 +577,7 @@ def _waits(states: ClusterStates, op: str, from_s: float) -> str:
 
 
 def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[Shortfall]:
-    """Yield the phases of the window other than engaged."""
+    """Yield a shortfall if the formation was not engaged throughout the window."""
     t_s = states.t_ns / 1e9
     shares = phase_shares(t_s, states.phases, window_s)
     others = {phase: share for phase, share in shares.items() if phase != "engaged"}

@@ -41,7 +41,7 @@ from zsim_analysis.report.make_report import Picture, facts, rendered, write_pag
 from zsim_analysis.report.summary import STATISTICS, RunSummary, flies_paper_test, judge
 
 ABSENT = "–"
-RUNS_PER_TABLE = 2  # side by side with all their statistics: as many as fit the page
+RUNS_PER_TABLE = 2  # runs side by side with all their statistics; more do not fit the page
 THERE = "there"  # cell of a named item, such as a drone, that another run does not have
 NAMED, NAMES_MAX = 3, 100  # runs in the page's file name, and characters of their names
 MARK, MARK_WITHIN = b": comparison</title>", 4_000  # identifies our pages, within their first bytes
@@ -58,7 +58,7 @@ class ComparedRun:
 
     @property
     def label(self) -> str:
-        """Its name in tables and figures, marked unless it was flown as planned."""
+        """Its name in tables and figures, marked if it was not flown as planned."""
         return self.name if self.summary.as_planned else f"{self.name} {UNPLANNED}"
 
     def formation(self, cluster: str) -> Formation | None:
@@ -72,16 +72,16 @@ def compare(
     progress: Callable[[str], None] = lambda _: None,
     formats: Sequence[str] = (),
 ) -> list[ComparedRun]:
-    """Read the records of several runs and write the page that compares them; arguments as of `write_page`.
+    """Read the records of several runs and write the page that compares them; further arguments as for `write_page`.
 
     Raises:
-        RecordError: one of them has no record, or no truth of any drone on it.
+        RecordError: a run has no record, or its record contains no truth of any drone.
         ReportError: a run is given twice, or the page cannot be written, or would replace something else.
     """
     places = [directory.resolve() for directory in directories]
     for number, directory in enumerate(directories):
         if places[number] in places[:number]:
-            raise ReportError(f"{directory}: is given twice; a run is compared with others")
+            raise ReportError(f"{directory}: is given twice; must be given once")
     if out.exists() and MARK not in _head(out):
         raise ReportError(f"{out}: exists and is not a comparison of runs; give --out another path")
     runs = []
@@ -93,7 +93,7 @@ def compare(
 
 
 def comparison_path(directories: Sequence[Path]) -> Path:
-    """Return the default path of a comparison: beside the first run, with a unique name."""
+    """Return the default path of a comparison: beside the first run, with a name that no other comparison has."""
     names = [name.replace("/", "-") for name in run_names(directories)]
     more = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
     stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{more}"
@@ -114,7 +114,7 @@ def _head(page: Path) -> bytes:
 
 
 def run_names(directories: Sequence[Path]) -> list[str]:
-    """Return short unique names: folder names with as many parents as needed, or else with a number.
+    """Return short unique names: folder names with as many parents as needed, or numbered if that does not suffice.
 
     Bytes that are not UTF-8 become question marks, since matplotlib cannot draw them.
     """
@@ -163,7 +163,7 @@ class ComparisonRow(NamedTuple):
 
 
 def fact_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
-    """Return the facts of each run's page, and further ones that may differ, a row for each label."""
+    """Return a row for each fact on the runs' own pages, and for further facts that may differ."""
     columns = [
         dict(facts(run.summary))
         | {
@@ -203,14 +203,14 @@ def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
         ComparisonRow(path, tuple(_text(each[path]) if path in each else ABSENT for each in flat))
         for path in paths
         if not path.startswith(items)
-        and (path in partial_paths or any(each[path] != flat[0][path] for each in flat))  # their texts may be alike
+        and (path in partial_paths or any(each[path] != flat[0][path] for each in flat))  # equal texts do not suffice
     ]
 
 
 def flattened(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
     """Yield path and value of every leaf; named items are identified by their names, independent of order.
 
-    Items without names are identified by their numbers, each with all its fields as one value; empty lists are omitted.
+    Items without names are identified by their indices, each with all its fields as one value; empty lists are omitted.
     """
     if isinstance(value, Mapping):
         for name, item in value.items():
@@ -235,14 +235,14 @@ def _text(value: Any) -> str:
 
 
 def notes(runs: Sequence[ComparedRun]) -> list[str]:
-    """Return remarks: shortfalls, identical flights, drones and clusters of only some runs, notes of each run."""
+    """Return remarks: shortfalls, identical flights, drones and clusters of only some runs, and each run's notes."""
     lines = [
         f"{run.name}: {'not as planned: ' * each.fails}{each.text}" for run in runs for each in run.summary.shortfalls
     ]
     by_hash: dict[str, list[str]] = {}
     for run in runs:
         by_hash.setdefault(run.summary.truth_sha256, []).append(run.name)
-    lines += [f"{_listed(names)} flew the same bits." for names in by_hash.values() if len(names) > 1]
+    lines += [f"{_listed(names)} are identical to the bit." for names in by_hash.values() if len(names) > 1]
     lines += _missing("Drone", {run.name: [track.name for track in run.flight.tracks] for run in runs})
     lines += _missing("Cluster", {run.name: [formation.name for formation in run.formations] for run in runs})
     for cluster in clusters(runs):
@@ -273,16 +273,16 @@ def _listed(names: Sequence[str]) -> str:
 
 # Figures
 
-COLUMNS = 3  # greatest number of runs in a row of a figure
-ROOM = 0.03  # margin beyond the greatest RMS, so that its mark is not cut
-ROWS_MAX = 24  # parameters in one figure; 6 drones
+COLUMNS = 3  # most runs in a row of a figure
+ROOM = 0.03  # margin beyond the largest RMS, as a share of the axis, so that its mark is not cut off
+ROWS_MAX = 24  # most parameters in one figure: those of 6 drones
 DESIRED: dict[str, Any] = {"color": style.BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
 LANE_IN = 0.24  # height of a run's lane of marks
 HATCHES = {"assembly": "////", "held": "xxxx", "landing": "....", style.FAULT: "", style.TAKE_OVER: "\\\\\\\\"}
 POINTS = {"take-off": "^", "engagement": "D", "collision": "X"}
 FACE, FAULT_FACE = 0.35, 0.65
-EMPTY, GREY_FACE = "#e6eaee", "#b6bfc9"  # of an empty lane, and of a bar in the legend
-NAME_MAX = 20  # characters of a run's name beside its lane
+EMPTY, GREY_FACE = "#e6eaee", "#b6bfc9"  # colours of an empty lane and of a bar in the legend
+NAME_MAX = 20  # most characters of a run's name beside its lane
 
 
 def clusters(runs: Iterable[ComparedRun]) -> list[str]:
@@ -364,7 +364,7 @@ def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[style.Rep
             yield style.ReportFigure(
                 f"figure_5_errors_{cluster}_{number}.png",
                 f"Formation parameters' errors{numbered(5, paper)}{suffix}",
-                "Runs side by side, each row on one scale, that of the windows (shaded), which larger errors leave.",
+                "Runs side by side; each row has one scale, set by the windows (shaded), so larger errors leave it.",
                 _draw_errors(some, runs, cluster, names[:ROWS_MAX]),
             )
     for file, number, what, group in parameter_groups(names):
@@ -433,7 +433,7 @@ def _draw_errors(
     style.letter_panels(grid[0])
     for name, axes in zip(names, grid[:, 0], strict=True):
         axes.set_ylabel(style.label(name), fontsize=style.PAPER_PT)
-        limit = 0.0  # the greatest error within the window of any run
+        limit = 0.0  # the largest error within the window of any run
         for run in runs:
             formation = run.formation(cluster)
             if formation and name in formation.names:
@@ -488,7 +488,7 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
     style.letter_panels(lanes)
     first = grid[0][0]
     first.plot([], [], label="desired, while engaged", **DESIRED)
-    for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):  # without a run's colour
+    for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):  # in no run's colour
         face = style.DARK if kind == style.FAULT else GREY_FACE
         first.fill_between(
             [], [], facecolor=face, edgecolor=style.DARK, hatch=HATCHES.get(kind, ""), lw=0.8, label=kind
@@ -510,7 +510,7 @@ class RunMarks(NamedTuple):
 
 
 def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
-    """Draw a lane for each run, the first at the top: bars for bands, markers for instants."""
+    """Draw a lane for each run, the first at the top: bars for bands, markers for instantaneous events."""
     for place, run in enumerate(marks):
         colour = run_style(place).color
         lanes.axhline(place, color=EMPTY, lw=1.0, zorder=1)
@@ -551,7 +551,7 @@ def _draw_plans(runs: Sequence[ComparedRun]) -> Figure:
     for axes in grid[:, 0]:
         axes.set_ylabel("north y (m)", fontsize=style.PAPER_PT)
     (left, right), (low, high) = grid[0, 0].get_xlim(), grid[0, 0].get_ylim()
-    half = 0.52 * max(right - left, high - low)  # of the square range that all plans have
+    half = 0.52 * max(right - left, high - low)  # half the side of the square range of all plans
     grid[0, 0].set_xlim((left + right) / 2 - half, (left + right) / 2 + half)
     grid[0, 0].set_ylim((low + high) / 2 - half, (low + high) / 2 + half)
     style.letter_panels(grid.flat[: len(runs)])
@@ -579,7 +579,7 @@ def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
         panels[-1].tick_params(labelbottom=True)
         style.draw_marks(panels, style.time_marks(run.flight, run.formations[0] if run.formations else None))
     style.letter_panels([grid[3 * (index // across), index % across] for index in range(len(runs))])
-    for kind in (0, 2):  # one range of altitudes, and one of charges
+    for kind in (0, 2):  # all runs have the same range of altitude and of charge
         drawn = [each for each in grid[kind::3].flat if each.lines]
         limits = [each.get_ylim() for each in drawn]
         for each in drawn:
@@ -595,7 +595,7 @@ def _drone_colours(runs: Sequence[ComparedRun]) -> dict[str, str]:
 
 
 def _name_drones(figure: Figure, axes: Axes, colours: Mapping[str, str]) -> None:
-    """Add the drones to the legend; of many only the first and the last."""
+    """Add the drones to the legend; of many drones, only the first and the last."""
     named = list(colours.items())
     for name, colour in named if len(named) <= NAMED_MAX else (named[0], named[-1]):
         axes.plot([], [], color=colour, lw=1.1, label=name)

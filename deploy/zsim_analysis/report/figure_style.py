@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from msgspec import Struct
 
+from zsim.contract.run_messages import ADMISSIONS
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.roles import PILOT
 from zsim_agents.formation.spaces.cluster_space import unit
@@ -19,15 +20,15 @@ from zsim_analysis.reading.formation import Formation
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 
 COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's conference papers
-DPI = 200  # of PNG files
-PAPER_PT = 8.0  # text size: that of a paper's captions
+DPI = 200  # resolution of PNG files
+PAPER_PT = 8.0  # text size [pt], that of a paper's captions
 LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of a legend entry without its name, in text sizes
-LETTER_PAD_PT = 3.0  # between the letter of a panel and its axes
+LETTER_PAD_PT = 3.0  # distance between a panel's letter and its axes
 MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter and height of a line, in text sizes
-MARK_LINES, MARK_PAD_IN = 4, 0.05  # greatest number of lines of a mark's reason, and margin above a mark
+MARK_LINES, MARK_PAD_IN = 4, 0.05  # most lines of a mark's reason, and margin above a mark
 FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE does not accept Type 3
-POINTS = 2000  # per line: more than a page has pixels
-# Okabe and Ito's colours, distinct with every kind of colour vision.
+POINTS = 2000  # most points per line: more than a page has pixels
+# Okabe and Ito's colours, distinguishable with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
 GREY, DARK, GRID = "#8c959f", "#444c56", "#c9d1d9"
@@ -35,14 +36,14 @@ AMBER = "#9a6a00"  # an orange that is legible as small print on white
 DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (5, 3)), "zorder": 4}
 MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 1.1, "zorder": 2}  # wide enough to be visible behind the truth
 TRUE: dict[str, Any] = {"color": BLUE, "lw": 0.6, "zorder": 3}
-SPREAD = (5.0, 50.0, 95.0)  # percentiles
-SPREAD_INSTANTS = 1000  # at which percentiles are computed
+SPREAD = (5.0, 50.0, 95.0)  # percentiles that are drawn
+SPREAD_INSTANTS = 1000  # number of times at which percentiles are computed
 SYMBOLS = {"x_c": "$x_c$", "y_c": "$y_c$", "z_c": "$z_c$", "p": "$p$", "q": "$q$", "beta": "$\\beta$"}
 GREEK = {"phi": "\\phi", "rho": "\\rho"}
 
 
 class ReportFigure(Struct, frozen=True):
-    """A figure with its file name, and its title and caption on the page."""
+    """A figure with its file name, and with its title and caption on the page."""
 
     name: str
     title: str
@@ -57,11 +58,11 @@ class ReportFigure(Struct, frozen=True):
 
     @property
     def is_column(self) -> bool:
-        """Whether it is as wide as a column, two of which fit a page."""
+        """Whether it is as wide as a column, two of which fit on a page."""
         return self.drawing.get_size_inches()[0] <= COLUMN_IN
 
     def png(self) -> bytes:
-        """Return the figure as a PNG file; this fixes the layout for all its files."""
+        """Return the figure as a PNG file, which fixes the layout for all its files."""
         file = io.BytesIO()
         self.drawing.savefig(file, format="png")
         self.drawing.set_layout_engine("none")
@@ -105,13 +106,13 @@ def label(name: str) -> str:
 
 
 def scale(axes: Axes, *values: Array, pad: float = 0.06) -> None:
-    """Set the range of a y axis to that of `values`, unless that is empty or has no width."""
+    """Set the range of a y axis to that of `values`, unless that is empty or a single value."""
     if limits := padded_range(np.concatenate(values), pad):
         axes.set_ylim(limits)
 
 
 def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
-    """Return the range of the finite samples, padded at each end by a share of it; None if it is empty."""
+    """Return the range of the finite samples, padded at each end by a share of it; None if there are none."""
     known = samples[np.isfinite(samples)]
     if not len(known) or known.max() <= known.min():
         return None
@@ -125,7 +126,7 @@ def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
 
 
 def thinned(x: Array, y: Array) -> tuple[Array, Array]:
-    """Reduce a line to at most POINTS points: minimum and maximum of each bin, which keeps all extremes."""
+    """Reduce a line to at most POINTS points, the minimum and maximum of each bin, so that all extremes remain."""
     if len(x) <= POINTS:
         return x, y
     size = -(-len(x) // (POINTS // 2))
@@ -139,9 +140,9 @@ def thinned(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
-    """Draw many lines as their median, the band from 5 to 95 %, and their extremes, which are all kept.
+    """Draw many lines as their median, the band from 5 to 95 %, and all their extremes.
 
-    t_s is (K,) simulated time, values (K, N), NaN where unknown.
+    t_s (K,) is simulated time, values (K, N) are NaN where unknown.
     """
     known = np.isfinite(values).any(axis=1)
     t_s, values = t_s[known], values[known]
@@ -159,7 +160,7 @@ def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
 
 
 def letter_panels(panels: Iterable[Axes]) -> None:
-    """Letter panels in reading order, (a), (b) and so on; a single one gets no letter."""
+    """Letter panels (a), (b) and so on, in reading order; a single panel gets no letter."""
     panels = list(panels)
     for number, axes in enumerate(panels if len(panels) > 1 else ()):
         letters = chr(ord("a") + number % 26) * (1 + number // 26)
@@ -181,7 +182,7 @@ def finish(figure: Figure, lettered: Iterable[Axes], grid: Any, legend_columns: 
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
-    """Put the legend of all axes above a figure: each name once, those of `axes` first."""
+    """Put a legend above a figure with each name of all axes once, those of `axes` first."""
     named: dict[str, Any] = {}
     for each in (axes, *figure.axes):
         for handle, name in zip(*each.get_legend_handles_labels(), strict=True):
@@ -196,22 +197,22 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
 def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
     """Write a warning about the flight above a complete figure, and enlarge the figure by its height.
 
-    `head` is the first line; `reason` is wrapped below it, and cut after MARK_LINES lines.
+    `head` is the first line; `reason` is wrapped below it, and cut off after MARK_LINES lines.
     """
     width_in, height_in = figure.get_size_inches()
     letters = int(72 * width_in / (MARK_EMS * PAPER_PT))
     lines = [head, *wrap(reason, letters, max_lines=MARK_LINES, placeholder=" …")]
-    whole_in = height_in + len(lines) * LINE_EMS * PAPER_PT / 72 + MARK_PAD_IN
+    total_in = height_in + len(lines) * LINE_EMS * PAPER_PT / 72 + MARK_PAD_IN
     mark = figure.suptitle("\n".join(lines), va="top", color=colour, fontsize=PAPER_PT, fontweight="bold")
-    mark.set_y(1 - MARK_PAD_IN / whole_in)
-    mark.set_in_layout(False)  # matplotlib would lay it over a legend that stands above the axes
-    figure.set_size_inches(width_in, whole_in)
-    top, room_px = height_in / whole_in, 0.0  # below it axes and the legends above them are laid out
+    mark.set_y(1 - MARK_PAD_IN / total_in)
+    mark.set_in_layout(False)  # matplotlib would place it over a legend above the axes
+    figure.set_size_inches(width_in, total_in)
+    top, room_px = height_in / total_in, 0.0  # the axes and the legends above them are below this height
     for legend, box in [(legend, legend.get_window_extent()) for legend in figure.legends]:
-        if box.y0 > figure.bbox.height / 2:  # not one below the axes
+        if box.y0 > figure.bbox.height / 2:  # a legend above the axes
             room_px = max(room_px, box.height + figure.dpi * PAPER_PT / 72)
             legend.set_bbox_to_anchor((0.0, 0.0, 1.0, top), figure.transFigure)
-    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):  # it ignores an anchored legend
+    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):  # it ignores anchored legends
         engine.set(rect=(0.0, 0.0, 1.0, top - room_px / figure.bbox.height))
 
 
@@ -224,7 +225,6 @@ SHORT, HAIRLINE_PT = 0.005, 0.8  # bands shorter than this share of the axis are
 WINDOW = "window of the statistics"
 WINDOW_GREY = "#e7ebf0"  # lighter than the grid lines
 ASSEMBLY = {"taking_off": "assembly", "assembling": "assembly"}
-RETURNS = ("restart", "superseded", "join")  # events of a process that takes part again
 
 
 class Band(Struct, frozen=True):
@@ -236,12 +236,12 @@ class Band(Struct, frozen=True):
 
 
 class TimeMarks(Struct, frozen=True):
-    """Marks on the time axes of a flight; times [s], None for events that did not occur."""
+    """Marks on the time axes of a flight [s]; None for events that did not occur."""
 
-    takeoff_s: float | None = None  # of the first drone
-    engaged_s: float | None = None  # of the formation
+    takeoff_s: float | None = None  # take-off of the first drone
+    engaged_s: float | None = None  # engagement of the formation
     bands: tuple[Band, ...] = ()  # phases, faults and take-overs
-    span_s: tuple[float, float] | None = None  # the whole run, shown on every time axis; None: the range of the data
+    span_s: tuple[float, float] | None = None  # the whole run, which every time axis shows; None: the range of the data
 
     def has(self, kind: str) -> bool:
         return any(band.kind == kind for band in self.bands)
@@ -250,7 +250,7 @@ class TimeMarks(Struct, frozen=True):
 def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> TimeMarks:
     """Return the marks of a flight, with the phases and the engagement of a formation."""
     bands = [*_faults(flight), *_take_overs(flight)]
-    if formation and formation.phases:  # all except idle and engaged
+    if formation and formation.phases:  # phases except idle and engaged
         phases = np.array(formation.phases)
         starts = np.flatnonzero(np.r_[True, phases[1:] != phases[:-1]])
         ends = np.r_[formation.t_s[starts[1:]], formation.t_s[-1]]
@@ -260,35 +260,35 @@ def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> Ti
                 bands.append(Band(kind, float(formation.t_s[start]), float(end_s)))
     climbing = [track for track in flight.tracks if "taking_off" in track.states]
     takeoffs_s = [track.status_t_ns[track.states.index("taking_off")] / 1e9 for track in climbing]
-    start_s = flight.first_ns / 1e9 if flight.replay_of else 0.0  # a replay may begin anywhere
+    start_s = flight.first_ns / 1e9 if flight.replay_of else 0.0  # a replay may begin at any time
     engaged_s = formation.engaged_s if formation else None
     kinds = list(dict.fromkeys(band.kind for band in bands))
-    united: list[Band] = []  # overlapping or adjacent bands of a kind, such as of several drones, are merged
+    merged: list[Band] = []  # overlapping or adjacent bands of a kind, e.g. of several drones, are merged
     for band in sorted(bands, key=lambda band: (kinds.index(band.kind), band.from_s)):
-        if united and united[-1].kind == band.kind and band.from_s <= united[-1].to_s:
-            united[-1] = Band(band.kind, united[-1].from_s, max(united[-1].to_s, band.to_s))
+        if merged and merged[-1].kind == band.kind and band.from_s <= merged[-1].to_s:
+            merged[-1] = Band(band.kind, merged[-1].from_s, max(merged[-1].to_s, band.to_s))
         else:
-            united.append(band)
-    return TimeMarks(min(takeoffs_s, default=None), engaged_s, tuple(united), (start_s, flight.last_ns / 1e9))
+            merged.append(band)
+    return TimeMarks(min(takeoffs_s, default=None), engaged_s, tuple(merged), (start_s, flight.last_ns / 1e9))
 
 
 def _faults(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the injected faults; those that are not ended last until the end of the flight."""
+    """Yield the injected faults; those without an end last until the end of the flight."""
     ends = {event.data.get("id"): event.t_ns for event in flight.events if event.kind in ("fault_end", "fault_clear")}
     for place, event in enumerate(flight.events):
         if event.kind == "fault":
             end_ns = ends.get(event.data.get("id"))
             if end_ns is None and event.data.get("kind") == PROCESS_KILL:  # until the process takes part again
                 later = (each for each in flight.events[place + 1 :] if each.subject == event.subject)
-                if back := next((each for each in later if each.kind in RETURNS), None):
-                    done_ns = back.data.get("done_ns", back.t_ns)  # the last gate of its predecessor
+                if back := next((each for each in later if each.kind in ADMISSIONS), None):
+                    done_ns = back.data.get("done_ns", back.t_ns)  # last gate that its predecessor completed
                     is_known = isinstance(done_ns, int)
                     end_ns = max(event.t_ns, min(back.t_ns, done_ns)) if is_known else back.t_ns
             yield Band(FAULT, event.t_ns / 1e9, (flight.last_ns if end_ns is None else end_ns) / 1e9)
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the times when someone other than the scenario's agents flew a drone, from acquisition or first command."""
+    """Yield when others than the scenario's agents flew a drone, from its acquisition or the first command on."""
     since_ns: dict[str, int] = {}
     planned = {"controller", PILOT, *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:
@@ -307,7 +307,7 @@ def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def draw_marks(axes: Iterable[Axes], marks: TimeMarks, whole: bool = True) -> None:
-    """Draw marks into time axes that already contain their data; `whole` extends them to the whole run."""
+    """Draw marks into time axes that already contain their data; with `whole`, extend these to the whole run."""
     for each in axes:
         if whole and marks.span_s:
             each.update_datalim([(t_s, 0.0) for t_s in marks.span_s], updatey=False)

@@ -1,8 +1,8 @@
 """Figures of a flight, sized for a page: those of its formations, as in the paper, and those of its drones.
 
 Formations: errors (Figure 5), position (6), orientation (7) and shape (8). Drones: plan view; altitude, state and
-battery; errors of estimates; velocities; errors against references; distances; radio. Few drones have a line or a
-column each; many are drawn as their spread.
+battery; errors of estimates; velocities; errors against references; distances; radio. A few drones get a line or a
+column each; larger fleets are drawn as their spread.
 """
 
 import math
@@ -30,18 +30,18 @@ from zsim_analysis.reading.recorded_flight import Array, RadioHistory, RecordedF
 from zsim_analysis.reading.shortfall import span_text
 from zsim_analysis.report import figure_style as style
 
-EACH_MAX = 4  # drones with a column each on a page
-PAIRS_MAX = 6  # pairs with a line each: of four drones
-NAMED_MAX = 12  # drones in a legend
+EACH_MAX = 4  # most drones that get a column each on a page
+PAIRS_MAX = 6  # most pairs of drones that get a line each: those of four drones
+NAMED_MAX = 12  # most drones named in a legend
 SMALL_PT = style.PAPER_PT - 1.5
 
 # Formations
 
 POSITION = ("x_c", "y_c", "z_c")
 ORIENTATION = ("roll", "pitch", "yaw")
-ROWS_MAX = 16  # parameters in one figure; 4 drones, and the height of a page
-ROW_IN = 1.0  # height of a parameter over time, with its letter
-ROWS_IN = 8.4  # of all rows, on a page of 9.25 in
+ROWS_MAX = 16  # most parameters in one figure: those of 4 drones, which fill the height of a page
+ROW_IN = 1.0  # height of a parameter's panel, with its letter [in]
+ROWS_IN = 8.4  # most height of all rows [in], on a page of 9.25 in
 MOVED_MAX = 3  # parameters of a large formation that are drawn individually
 
 
@@ -114,7 +114,7 @@ def _by_unit(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def draw_error(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
-    """Draw the estimated and true errors of a parameter at the instants `rows`."""
+    """Draw the estimated and true errors of a parameter at the samples `rows`."""
     i, since = formation.column(name), formation.since_engaged[rows]
     _draw_error(axes, formation.t_s[rows], formation.true_error[rows, i], formation.est_error[rows, i])
     style.scale(axes, formation.true_error[rows, i][since], formation.est_error[rows, i][since])
@@ -137,7 +137,7 @@ def _draw_no_goal(axes: Axes) -> None:
 
 
 def _draw_others(axes: Axes, formation: Formation, members: Sequence[str], rows: np.ndarray) -> None:
-    """Draw the spread of the true errors of many parameters at the instants `rows`."""
+    """Draw the spread of the true errors of many parameters at the samples `rows`."""
     style.dress(axes)
     axes.axhline(0, color=style.BLACK, lw=0.5, zorder=1)
     errors = formation.true_error[:, [formation.column(name) for name in members]]
@@ -211,14 +211,14 @@ def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
 
 # Plan view
 
-ROOM = 0.06  # margin at each end of the plan's range, so that marks at its edge are not cut
-OUTLINES = 7  # formations in the plan, few enough to be distinguishable
-APART = 0.6  # of the formation's size: nearer outlines would overlap
-RING_MAX = 4  # drones whose outline connects them in order; for more it is their hull
+ROOM = 0.06  # margin at each end of the plan, as a share of its range, so that marks at its edge are not cut off
+OUTLINES = 7  # most outlines of a formation in the plan, few enough to be distinguishable
+APART = 0.6  # smallest distance between outlines, as a share of the formation's size; closer ones would overlap
+RING_MAX = 4  # most drones whose outline connects them in order; that of more drones is their convex hull
 
 
 def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
-    """Draw the true paths from above, with the outlines of the formations at some instants."""
+    """Draw the true paths from above, with the outlines of the formations at several times."""
     figure = style.new_figure(style.COLUMN_IN, 1.15 * style.COLUMN_IN)
     axes = figure.subplots()
     style.dress(axes, "north y (m)")
@@ -288,7 +288,7 @@ def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
 
 
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
-    """Draw the outlines of a formation with their times, at instants at which they do not overlap."""
+    """Draw the outlines of a formation with their times, skipping outlines that would overlap."""
     members = [track for name in formation.drones for track in tracks if track.name == name]
     t_ns, places = common_instants(members)
     if not len(t_ns):
@@ -317,8 +317,8 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
 
 # Altitude, state and battery
 
-LANES_IN = 5.0  # greatest height of all states, half of it on the page
-LANES_NAMED = 12  # greatest number of drones named beside their states
+LANES_IN = 5.0  # most height of the panel of states relative to the other panels; on the page it takes half of it [in]
+LANES_NAMED = 12  # most drones named beside their states
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {
     "landed": style.GREY,
@@ -395,7 +395,7 @@ ERRORS = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
 INSIDE = 0.9545  # share of a normal error within SIGMAS standard deviations
 CONSISTENT = "95 % of χ²"  # range of NEES that contains 95 % of the samples of a consistent estimator
 BAND_GREY = "#9aa5b1"  # different from the colours of all time marks
-FLOOR = 0.1  # of NEES on its logarithmic axis
+FLOOR = 0.1  # smallest NEES drawn on its logarithmic axis
 
 
 def draw_estimates(
@@ -404,7 +404,7 @@ def draw_estimates(
     window_s: tuple[float, float],
     marks: style.TimeMarks,
 ) -> Figure:
-    """Draw estimate − truth with its band, and NEES, of every drone; for many drones their spread."""
+    """Draw estimate − truth with its band, and the NEES, of each drone; for many drones their spread."""
     if len(errors) > EACH_MAX:
         return _draw_many_estimates(errors, colours, window_s, marks)
     figure = style.new_figure(style.PAGE_IN, 0.8 + 0.95 * (len(ERRORS) + 1))
@@ -427,7 +427,7 @@ def draw_estimates(
         for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no data
             axes.set_title(note, loc="right", fontsize=SMALL_PT, pad=2.0)
         style.draw_marks(column, marks)
-    since_s = -np.inf if marks.engaged_s is None else marks.engaged_s  # the large sigmas of the start leave the axes
+    since_s = -np.inf if marks.engaged_s is None else marks.engaged_s  # large initial sigmas leave the axes
     for i, row in enumerate(grid[:-1]):
         reach = 0.0
         for each in errors.values():
@@ -443,7 +443,7 @@ def draw_estimates(
 
 
 def _rows(errors: drone_errors.EstimateErrors, window_s: tuple[float, float]) -> np.ndarray:
-    """Return which instants are within the window; all if none is."""
+    """Return a mask of the samples within the window; if there are none, of all samples."""
     rows = (errors.t_s >= window_s[0]) & (errors.t_s <= window_s[1])
     return rows if rows.any() else np.ones(len(rows), bool)
 
@@ -465,7 +465,7 @@ def _draw_many_estimates(
     marks: style.TimeMarks,
 ) -> Figure:
     """Draw position error and mean NEES over time, and the statistics of each drone within the window."""
-    t_s = reduce(np.intersect1d, (each.t_s for each in errors.values()))  # instants with estimates of all drones
+    t_s = reduce(np.intersect1d, (each.t_s for each in errors.values()))  # times at which all drones have an estimate
     places = [np.searchsorted(each.t_s, t_s) for each in errors.values()]
     pairs = list(zip(errors.values(), places, strict=True))
     distance = np.column_stack(
@@ -476,7 +476,7 @@ def _draw_many_estimates(
     grid = figure.subplots(2, 2, width_ratios=(1.3, 1), sharex="col")
     style.dress(grid[0, 0], "position error (m)")
     style.draw_spread(grid[0, 0], t_s, distance, style.BLUE)
-    judged = t_s >= (marks.engaged_s or 0.0)  # before it, the noise of the start would set the scale
+    judged = t_s >= (marks.engaged_s or 0.0)  # earlier, the initial noise would set the scale
     grid[0, 0].set_ylim(0.0, 1.1 * float(np.max(distance[judged], initial=0.0)) or None)
     _draw_nees(grid[1, 0], t_s, nees, style.BLUE, of=len(errors))
     grid[1, 0].set_yscale("linear")
@@ -484,7 +484,7 @@ def _draw_many_estimates(
     style.draw_marks(grid[:, 0], marks)
     style.label_time(grid[1:, 0])
     numbers, look = np.arange(1, len(errors) + 1), {"c": [colours[name] for name in errors], "s": 14, "zorder": 3}
-    statistics = []  # of each drone: RMS position error [m], the stated one [m], mean share of x, y, z within SIGMAS
+    statistics = []  # per drone: RMS position error [m], stated RMS [m], mean share of x, y, z within SIGMAS
     for each in errors.values():
         rows = _rows(each, window_s)
         squares = (
@@ -558,13 +558,13 @@ def _draw_many_velocities(responses: Mapping[str, drone_errors.VelocityResponse]
     return figure
 
 
-OFF = ("east (m)", "north (m)", "up (m)", "heading (deg)")  # of truth − reference
+OFF = ("east (m)", "north (m)", "up (m)", "heading (deg)")  # components of truth − reference
 
 
 def draw_references(
     errors: Mapping[str, drone_errors.ReferenceErrors], colours: Mapping[str, str], marks: style.TimeMarks
 ) -> Figure:
-    """Draw truth − reference of every drone that flies by itself; for many drones their spread."""
+    """Draw truth − reference of each drone with a reference of its own; for many drones their spread."""
     figure = style.new_figure(style.COLUMN_IN, 0.9 + 0.85 * len(OFF))
     grid = figure.subplots(len(OFF), 1, squeeze=False, sharex=True)
     t_s = reduce(np.union1d, (each.t_s for each in errors.values()))
@@ -580,9 +580,9 @@ def draw_references(
             continue
         for name, each in errors.items():
             gaps = np.diff(each.t_s, prepend=each.t_s[0]) > GAP_S
-            whole = np.where(gaps, np.nan, scale * each.error[:, i])
-            style.line(axes, each.t_s, whole, color=colours[name], lw=0.5, zorder=2)
-            on_path = np.where(each.on_path, whole, np.nan)
+            error = np.where(gaps, np.nan, scale * each.error[:, i])
+            style.line(axes, each.t_s, error, color=colours[name], lw=0.5, zorder=2)
+            on_path = np.where(each.on_path, error, np.nan)
             style.line(axes, each.t_s, on_path, color=colours[name], lw=1.2, zorder=3, label=name)
     style.draw_marks(grid[:, 0], marks)
     style.finish(figure, grid[:, 0], grid, 3)
@@ -595,7 +595,7 @@ def draw_distances(
     colours: Mapping[str, str],
     marks: style.TimeMarks,
 ) -> Figure:
-    """Draw the distance of every pair in both colours, and the limits; for many drones that to the nearest one."""
+    """Draw the distance of each pair in both its colours, and the limits; for many drones, that to the nearest one."""
     figure = style.new_figure(style.COLUMN_IN, 2.5)
     axes = figure.subplots()
     if distances.pairs:
@@ -624,8 +624,8 @@ def draw_distances(
 
 # Radio
 
-CELLS_MAX = 6  # drones for which cells have room for a number
-DARK_SHARE = 0.6  # from which a cell is dark
+CELLS_MAX = 6  # most drones at which cells have room for a number
+DARK_SHARE = 0.6  # share above which a cell is dark and its number white
 
 
 def draw_radio(radio: RadioHistory, names: Sequence[str], marks: style.TimeMarks) -> Figure:

@@ -55,13 +55,13 @@ from zsim_analysis.report.summary import (
     tracking_table,
 )
 
-FAULTS_MAX = 6  # at the head of a page
+FAULTS_MAX = 6  # most faults listed at the top of a page
 REFERENCE = (
     "Estimate − desired is what the controller sees; truth − desired is what the drones do. Until the formation is "
     "engaged, the controller takes its own estimate as the desired value."
 )
 GOAL = "(a) Against the target of the plan; the climb from the ground is in z_c. "
-SPREAD = "Of the variables that have no row: median, 5 to 95 % and extremes of truth − desired. "
+SPREAD = "For variables without a row: median, 5 to 95 % and extremes of truth − desired. "
 
 Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 
@@ -122,33 +122,33 @@ def planned_figures(
         yield PlannedFigure(
             "plan_view.png",
             "Plan view",
-            "True paths from above, squares where they begin and dots where they end; black: desired centroid; grey: "
-            "the formation at some instants of simulated time.",
+            "True paths from above; squares: start, dots: end; black: desired centroid; grey: "
+            "the formation at several simulated times.",
             partial(draw_plan, flight, formations),
         )
     if apart := distances(flight, PAIRS_MAX):
-        what = "every two drones" if apart.pairs else "each drone to the nearest other one: median, 5 to 95 %, extremes"
+        what = "each pair of drones" if apart.pairs else "each drone to the nearest other: median, 5 to 95 %, extremes"
         yield PlannedFigure(
             "distances.png",
             "Distances between drones",
-            f"True distance of {what}; below the first line the controller's guard parts them.",
+            f"True distance of {what}; below the upper line the controller's separation guard acts.",
             partial(draw_distances, apart, separations(flight), colours, marks),
         )
     if off := reference_errors(flight):
         yield PlannedFigure(
             "references.png",
             "Errors against the drones' references",
-            "Truth − reference of every drone that flies by itself, in the air: thick on its path, thin on the way "
-            "to it or holding a place. Of many drones: median, 5 to 95 % and extremes.",
+            "Truth − reference of each drone that flies on its own, while in the air: thick on its path, thin while "
+            "approaching it or holding a position. For many drones: median, 5 to 95 % and extremes.",
             partial(draw_references, off, colours, marks),
         )
     if flight.radio:
         yield PlannedFigure(
             "radio.png",
             "Radio",
-            "(a) Share of the messages of a drone that arrive at another, over the whole run, by range and loss. (b) "
-            "Drones heard, those whose messages arrive in part counted in part. Grey: not every drone reaches all by "
-            "links that carry half of the messages or more, not even over others.",
+            "(a) Share of a drone's messages that arrive at another drone, over the whole run, given range and loss. "
+            "(b) Expected number of drones heard. Grey: some drone cannot reach all others, not even via relays, over "
+            "links that carry at least half of the messages.",
             partial(draw_radio, flight.radio, [track.name for track in flight.tracks], marks),
         )
     if has_truth:
@@ -162,18 +162,18 @@ def planned_figures(
         yield PlannedFigure(
             "estimates.png",
             "Estimates",
-            "Estimate − truth with the band of two standard deviations that the estimator states, and NEES, the error "
-            "of position and velocity squared and divided by its covariance: 6 on average where that is true. Shares "
-            "and means, above the panels, are those of the window; the axes hold all since the engagement, and what is "
-            "larger before it leaves them.",
+            "Estimate − truth with the band of two standard deviations that the estimator states, and the NEES, the "
+            "squared error of position and velocity normalised by its covariance, which is 6 on average for a "
+            "consistent estimator. Shares and means above the panels are those of the window; the axes cover all "
+            "errors since the engagement, so earlier, larger ones leave them.",
             partial(draw_estimates, errors, colours, window_s, marks),
         )
     if responses := velocity_responses(flight):
         yield PlannedFigure(
             "velocities.png",
             "Commanded and flown velocity",
-            "By the drone's heading. Flown: in truth; commanded: as sent by whoever flew the drone, without the delay "
-            "of the link. Of many drones: median, 5 to 95 % and extremes of the difference.",
+            "In the drone's heading frame. Flown: true velocity; commanded: as sent by whoever flew the drone, without "
+            "the delay of the link. For many drones: median, 5 to 95 % and extremes of the difference.",
             partial(draw_velocities, responses, colours, marks),
         )
 
@@ -188,12 +188,12 @@ def _of_cluster(
     yield PlannedFigure(
         f"figure_5_errors{suffix}.png",
         f"Formation parameters' errors{numbered(5, paper)}",
-        f"{GOAL if goal else ''}{reference} Against the reference, the whole run. {window} The window of the "
+        f"{GOAL if goal else ''}{reference} Against the reference, over the whole run. {window} The window of the "
         f"statistics, on an axis of its own. {large}{REFERENCE}",
         partial(draw_errors, formation, window_s, marks, goal),
     )
     for file, number, what, names in parameter_groups(formation.names):
-        shown = ", ".join(names) if len(names) <= ROWS_MAX else f"of the {len(names)} variables those that move most"
+        shown = ", ".join(names) if len(names) <= ROWS_MAX else f"values of the most moving of {len(names)} variables"
         yield PlannedFigure(
             f"{file}{suffix}.png",
             f"{what}{numbered(number, paper)}",
@@ -227,7 +227,7 @@ def page(summary: RunSummary, pictures: Sequence[Picture]) -> str:
 
 
 def facts(summary: RunSummary) -> list[tuple[str, str]]:
-    """Return the lines at the top of the page: label and value."""
+    """Return label and value of each line at the top of the page."""
     age = summary.command_age_ms
     ages = f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
@@ -237,8 +237,8 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     kinds, misses = {each.kind for each in summary.shortfalls}, "not known"
     but_for = {
         "as far as the run went": "early" in kinds,
-        "but for what others asked or flew": bool(kinds & {"override", "request"}),
-        "but for a short hold": "held" in kinds,
+        "except for what others requested or flew": bool(kinds & {"override", "request"}),
+        "except for a short hold": "held" in kinds,
     }
     planned = ", ".join(part for part, holds in but_for.items() if holds) or "yes"
     begun = [event for event in summary.events if event.kind == "fault"]
@@ -270,12 +270,12 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
 
 
 def changed_text(changed: Sequence[str] | None) -> str:
-    """Describe the differences of a scenario from its file."""
+    """Describe how a scenario differs from its file."""
     return "not known" if changed is None else ", ".join(changed) or "nothing: as in its file"
 
 
 def obstacle_text(distances_m: Mapping[str, float]) -> str:
-    """Describe the least distance of any drone from obstacles."""
+    """Describe the minimum distance of any drone from obstacles."""
     nearest = min(distances_m, key=lambda drone: distances_m[drone])
     return f"at least {distances_m[nearest]:.2f} m in truth, of {nearest}, from its centre to a surface"
 
@@ -291,7 +291,7 @@ def date_text(date: str | None) -> str:
 
 
 def rendered(name: str, pictures: Iterable[Picture], package: str = "zsim_analysis.report", **values: Any) -> str:
-    """Return a page: a template of a package, which may use those of this one, with `figures` and other values."""
+    """Return a page from a template of a package, which may use this package's templates, with figures and `values`."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
         autoescape=True,
@@ -318,12 +318,12 @@ def write_report(
     Files of these figures in other formats, from an earlier report, are removed because they are outdated.
 
     Args:
-        directory: of the run or the sweep.
+        directory: directory of the run or the sweep.
         summary: content of summary.json.
-        figures: drawn one by one.
-        page: makes the page from the pictures.
+        figures: figures, which are drawn one by one.
+        page: returns the page with the given pictures.
         progress: called with a text at each step.
-        formats: further formats of the figures beside PNG, of `zsim_analysis.report.FORMATS`.
+        formats: further formats of the figures besides PNG, from `zsim_analysis.report.FORMATS`.
 
     Raises:
         ReportError: the directory cannot be written.
@@ -344,7 +344,7 @@ def write_page(
     progress: Callable[[str], None],
     formats: Sequence[str] = (),
 ) -> None:
-    """Write one page; an earlier one is replaced when the new one is complete. Arguments and errors as `write_report`.
+    """Write one page, which replaces an earlier one once it is complete; arguments and errors as in `write_report`.
 
     Figures in other formats are written into a folder beside the page, NAME-figures.
     """
@@ -371,7 +371,7 @@ def _render(
 
 
 def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[str]) -> None:
-    """Remove files of figures in formats other than these."""
+    """Remove the files of figures in formats other than these."""
     for figure, _ in pictures:
         for form in set(FORMATS) - set(formats):
             if (earlier := (folder / figure.name).with_suffix(f".{form}")).is_file():
@@ -380,7 +380,7 @@ def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[
 
 @contextmanager
 def _put_in_place(directory: Path, report: Path, figures: Path) -> Iterator[Path]:
-    """Yield a folder whose files are moved into a directory when all are complete, none on a full disk or Ctrl-C.
+    """Yield a folder whose files are moved into a directory once all are complete, or none on a full disk or Ctrl-C.
 
     Raises:
         ReportError: the directory cannot be written (the error names `report`), or `figures` in it is a symbolic link,

@@ -1,6 +1,6 @@
 """summary.json: the facts and the errors of a flight; and its tables of errors, for the page and the terminal.
 
-Errors of the paper's Test 1 stand beside those that the paper prints: I. Mas, S. Curi, R. Sanchez Pena, Open-source
+Errors of the paper's Test 1 are shown beside those that the paper prints: I. Mas, S. Curi, R. Sanchez Pena, Open-source
 Multi-UAV Simulator for the ROS Environment.
 """
 
@@ -45,7 +45,7 @@ from zsim_analysis.reading.shortfall import (
 )
 
 STATISTICS = {"est. std": "est_std", "true std": "true_std", "true RMS": "true_rms", "true mean": "true_mean"}
-EVENTS_PER_KIND = 100  # so that many refusals do not displace a restart
+EVENTS_PER_KIND = 100  # most events of a kind, so that many refusals do not crowd out a restart
 EVENTS_MAX = 1000
 
 
@@ -62,12 +62,12 @@ class EventLine(Struct, frozen=True):
 class ClusterErrors(Struct, frozen=True):
     """The errors of one cluster within the window."""
 
-    drones: tuple[str, ...]  # of the cluster
-    # over the instants of the window at which it was engaged; None each if it never was
+    drones: tuple[str, ...]  # names of the cluster's drones
+    # over the samples of the window in which the cluster was engaged; values are None if it never was
     errors: dict[str, ParameterErrors]
     paper_std: dict[str, float] = {}  # Table I for a flight of Test 1, otherwise empty
-    engaged_share: float | None = None  # share of the window's instants at which it was engaged; None without any
-    phases: dict[str, float] = {}  # shares of the window's instants by phase
+    engaged_share: float | None = None  # share of the window's samples in which it was engaged; None if there are none
+    phases: dict[str, float] = {}  # shares of the window's samples by phase
 
     @property
     def part(self) -> str:
@@ -83,12 +83,12 @@ class RecordFacts(Struct, frozen=True):
     """The record from which the report was made."""
 
     messages: int
-    complete: bool  # no message of the world is missing, nor the end of the run
+    complete: bool  # neither a message of the world nor the end of the run is missing
     state: str  # the same in words, with what is missing
-    gates: int  # on record
+    gates: int  # number of gates on record
     gates_missing: int  # according to the clocks
-    gaps: list[dict[str, float]]  # sequences of missing gates: their number, and the first and the last gate
-    messages_missing: int  # of the world, according to sequence numbers
+    gaps: list[dict[str, float]]  # runs of missing gates: their number, and the first and the last one
+    messages_missing: int  # messages of the world that are missing according to sequence numbers
     undecoded: int  # messages that do not match the type of their key
     truth_instants: int  # truth messages in the hash: those of simulated drones
     truth_missing: int  # further truth messages that a complete run of this length would have
@@ -102,29 +102,31 @@ class RunSummary(Struct, frozen=True):
     seed: int | None
     mode: str | None
     run_id: str | None
-    date: str | None  # when it was flown, to the second in UTC (ISO 8601)
-    changed: list[str] | None  # overrides `a.b.c=value` of the scenario's file
+    date: str | None  # when the run was flown, to the second in UTC (ISO 8601)
+    changed: list[str] | None  # overrides `a.b.c=value` applied to the scenario's file
     versions: dict[str, str]
     fingerprint: str | None
     real_time_factor: float | None
     wall_s: float
     sim_s: float
     ended: str
-    as_planned: bool  # the flight followed its plan until the end of the run; `shortfalls` has the deviations
+    as_planned: bool  # whether the flight followed its plan until the end of the run; see `shortfalls`
     shortfalls: list[Shortfall]
     deadlines: int | None
     deadline_misses: int | None
     deadline_misses_by: dict[str, int]
     command_age_ms: dict[str, float] | None
-    links: dict[str, DriverLink]  # to the aircraft that flew as external drones, by drone
+    links: dict[str, DriverLink]  # links to the aircraft that flew as external drones, by drone
     window_s: tuple[float, float]
-    window_note: str  # why the window is not that of the scenario, empty if it is
+    window_note: str  # why the window is not that of the scenario; empty if it is
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
-    obstacle_distance_m: dict[str, float]  # least, from each drone's centre to obstacles and surfaces; empty without
-    tracking: dict[str, Tracking]  # against the references of single drones, within the window
-    radio: RadioSummary | None  # within the window; None if the scenario has none
+    obstacle_distance_m: dict[
+        str, float
+    ]  # least distance of each drone's centre from obstacles and surfaces; empty without these
+    tracking: dict[str, Tracking]  # errors against the references of single drones within the window
+    radio: RadioSummary | None  # reception within the window; None if the scenario has no radio
     paper_table_1: dict[str, float]
     events: list[EventLine]
     events_left_out: dict[str, int]
@@ -139,7 +141,8 @@ def judge(
 ) -> tuple[RecordedFlight, list[Formation], RunSummary]:
     """Return the flight of a record, its formations and its summary.
 
-    With `answers` it includes the drones' estimates and velocity commands. `progress` receives a text at each step.
+    With `answers`, the flight includes the drones' estimates and velocity commands. `progress` is called with a text at
+    each step.
 
     Raises:
         RecordError: there is no record, or it contains no truth of any drone.
@@ -173,7 +176,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     }
     wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
     ended = str(end.get("reason", "ended"))
-    if not flight.end:  # a record without an end does not show which process died
+    if not flight.end:  # a record without an end event does not show which process died
         at, cut = f"{flight.last_ns / 1e9:.2f} s", not flight.completeness.closed
         ended = f"the record {'was cut after' if cut else 'ends here at'} {at}: no end is on record"
     lines: list[EventLine] = []
@@ -229,7 +232,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
 
 
 def obstacle_distances_m(flight: RecordedFlight) -> dict[str, float]:
-    """Return each drone's least true distance [m] from obstacles and surfaces to its centre, < 0 inside an obstacle."""
+    """Return the least true distance of each drone's centre from obstacles and surfaces [m], < 0 inside an obstacle."""
     if flight.scenario is None:
         return {}
     around = Surroundings(flight.scenario.environment)
@@ -246,7 +249,7 @@ def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
     order, truth = np.lexsort((drone, t_ns)), TruthHash(len(t_ns))
     truth.add(t_ns[order], states[order])
     gate_ns, missing = flight.info.gate_ns if flight.info else None, 0
-    if gate_ns and len(t_ns):  # a flight has truth from 0 or the first gate on, a replay from its start
+    if gate_ns and len(t_ns):  # a flight has truth from 0 or from the first gate on, a replay from its start on
         first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns)
         missing = max(0, len(tracks) * ((last_ns - first_ns) // gate_ns + 1) - len(t_ns))
     return RecordFacts(
@@ -307,10 +310,10 @@ def _notes(
         yield f"{', '.join(others)} {text}"
 
 
-# Tables of errors; a large formation first has a table of groups of parameters
+# Tables of errors; that of a large formation begins with groups of parameters
 
 PAPER_COLUMN = "paper std"
-COLUMNS = {  # by name on the page: column on the terminal, and statistic
+COLUMNS = {  # by name on the page: column heading in the terminal, and statistic
     "parameter": (Column("parameter", "name"), ""),
     PAPER_COLUMN: (Column("paper\nstd", worth=4, right=True), ""),
     "est. std": (Column("est.\nstd", worth=3, right=True), "est_std"),
@@ -327,12 +330,12 @@ GROUP_COLUMNS = {
     "worst": (Column("worst", worth=3, right=True), ""),
     "of": (Column("of", "name"), ""),
 }
-SINGLY_MAX = 24  # more parameters are shown in groups; 6 drones have 24
+SINGLY_MAX = 24  # most parameters with a row each, those of 6 drones; more are shown in groups
 FRAME = {"x_c": "position", "y_c": "position", "z_c": "position"} | dict.fromkeys(("roll", "pitch", "yaw"), "attitude")
 
 
 class ErrorTable(Struct, frozen=True):
-    """Columns and rows of text; `rest` has every parameter if the rows are groups."""
+    """Columns and rows of text; if the rows are groups, `rest` has every parameter."""
 
     columns: list[str]
     rows: list[list[str]]
@@ -351,7 +354,7 @@ def error_table(cluster: ClusterErrors) -> ErrorTable:
     single = ErrorTable(columns, rows)
     if len(cluster.errors) <= SINGLY_MAX:
         return single
-    # for each group its size, its root mean square errors, and the parameter with the largest RMS
+    # for each group: its size, its RMS errors, and the parameter with the largest RMS
     rows = []
     groups: dict[tuple[str, str], list[str]] = {}
     for name in cluster.errors:
@@ -366,7 +369,7 @@ def error_table(cluster: ClusterErrors) -> ErrorTable:
     return ErrorTable(list(GROUP_COLUMNS), rows, single)
 
 
-TRACKING_COLUMNS = {  # by their names on the page
+TRACKING_COLUMNS = {  # by name on the page: column heading in the terminal
     "drone": Column("drone", "name"),
     "true RMS (m)": Column("true\nRMS (m)", right=True),
     "on path (m)": Column("on\npath (m)", worth=3, right=True),
@@ -407,7 +410,7 @@ def terminal_text(summary: RunSummary) -> Group:
 
 
 def table(summary: RunSummary, cluster: str) -> FittedTable:
-    """Return the errors of one cluster, with the paper's Table I for Test 1, for the terminal."""
+    """Return the errors of one cluster for the terminal, for Test 1 with the paper's Table I."""
     judged = summary.clusters[cluster]
     content = error_table(judged)
     title = f"Formation errors of {cluster} from {span_text(summary.window_s)}"
@@ -422,7 +425,7 @@ def table(summary: RunSummary, cluster: str) -> FittedTable:
     return FittedTable(columns, content.rows, f"{title}{beside}{mark}", caption, lines=HEAVY_HEAD)
 
 
-# What the paper prints, and which flights are comparable with it, judged by their scenarios
+# The paper's printed values, and which flights are comparable with them, judged by their scenarios
 
 # Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
 PAPER_TABLE_1 = {
@@ -455,18 +458,19 @@ TEST_2_REFERENCE = {
     "q": "4",
     "beta": "pi/4",
 }
-COMPARED_S = (0.0, 7.0, 31.0, 88.0, 140.0)  # chosen: expressions with equal values at these times are the same
+COMPARED_S = (0.0, 7.0, 31.0, 88.0, 140.0)  # expressions with equal values at these times count as the same; chosen
 ROBOTS = 3
-TOLERANCE = 1e-3  # of a target written with fewer digits
-SETTLED_S, JUDGED_S = 100.0, 200.0  # from the take-off to the window, and the window: of scenarios/step.yaml
-GUST_MAX_M_S = 0.5  # of scenarios/step.yaml; the paper names no wind
+TOLERANCE = 1e-3  # [m or rad] of values written with fewer digits
+# shortest time from the take-off to the window, and shortest window, as in scenarios/step.yaml
+SETTLED_S, JUDGED_S = 100.0, 200.0
+GUST_MAX_M_S = 0.5  # as in scenarios/step.yaml; the paper names no wind
 
 
 def paper_table_of(flight: RecordedFlight, formation: Formation, window_s: tuple[float, float]) -> Mapping[str, float]:
     """Return Table I for a formation that flew Test 1 over a complete window; empty for any other flight."""
-    scenario, whole = flight.scenario, flight.completeness.complete
+    scenario, is_complete = flight.scenario, flight.completeness.complete
     faults = any(event.kind == "fault" for event in flight.events)
-    if not whole or faults or scenario is None or scenario.report.window_s != window_s:
+    if not is_complete or faults or scenario is None or scenario.report.window_s != window_s:
         return {}
     return paper_table(scenario, formation.name) if formation.engaged_share(window_s) == 1.0 else {}
 
@@ -476,7 +480,7 @@ def paper_table(scenario: Scenario, cluster: str) -> Mapping[str, float]:
     own, window_s = cluster_of(scenario, cluster), scenario.report.window_s
     if own is None or window_s is None or own.plan.takeoff_s is None:
         return {}
-    # the window is within the run, after the formation has settled, and as long as the paper's
+    # the window lies within the run, after the formation has settled, and is as long as the paper's
     start, end = window_s
     over_s = min(scenario.duration_s, scenario.duration_s if own.plan.land_s is None else own.plan.land_s)
     is_judged = start >= own.plan.takeoff_s + SETTLED_S and end - start >= JUDGED_S and end <= over_s
@@ -493,7 +497,7 @@ def flies_paper_test(flight: RecordedFlight, cluster: str) -> bool:
 
 
 def _is_set_up(scenario: Scenario, cluster: Cluster) -> bool:
-    """Return whether a cluster of three has the paper's drones and sensors, calm air and no faults."""
+    """Return whether a cluster of ROBOTS has the paper's drones and sensors, calm air and no faults."""
     wind = scenario.environment.wind
     calm = not any(wind.steady_m_s) and wind.gust_m_s <= GUST_MAX_M_S
     as_printed = all(_is_printed(scenario.drone(name)) for name in cluster.drones)
@@ -520,7 +524,7 @@ def _is_along_equation_4(plan: ClusterPlan) -> bool:
 
 
 def _is_printed(drone: Drone) -> bool:
-    """Return whether a drone is an unmodified AR.Drone with the noise of the paper and no detector."""
+    """Return whether a drone is an unmodified AR.Drone with the paper's sensor noise and no detector."""
     sensors = drone.sensors
     plain = Drone(name=drone.name, position_m=drone.position_m, yaw_deg=drone.yaw_deg, sensors=sensors)
     more = sensors.own is not UNSET or sensors.sightings is not UNSET

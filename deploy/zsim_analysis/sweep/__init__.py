@@ -1,6 +1,6 @@
-"""A sweep: one scenario flown many times, with other seeds and other values of its fields.
+"""A sweep: one scenario flown many times with different seeds and values of its fields.
 
-    plan = make_plan("step.yaml", document, vary, runs)    checked as a whole
+    plan = make_plan("step.yaml", document, vary, runs)    a plan, with all combinations checked
     sweep(SweepRequest(plan, DIR, workers=2))              flies the runs that are missing in DIR
     make_sweep_report(DIR)                                 distributions with intervals, DIR/report.html
 

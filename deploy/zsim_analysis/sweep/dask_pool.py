@@ -1,6 +1,6 @@
 """The workers of a sweep on several hosts: a running Dask cluster.
 
-Dask repeats a run whose worker died, and gives up a run in which several workers died.
+Dask repeats a run whose worker died, and gives up on a run in which several workers died.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ _alone = threading.Lock()
 
 
 def fly_alone(task: Task) -> Row:
-    """Fly a run, one at a time in each process: more threads would only wait for each other."""
+    """Fly a run, one at a time in each process, since more threads would only wait for each other."""
     with _alone:
         return fly(task)
 
@@ -92,7 +92,7 @@ class DaskPool:
         Raises:
             RunError: the cluster is gone, a worker has another zsim version, or rows cannot be recorded.
         """
-        pending: dict[Any, Task] = {}  # by future
+        pending: dict[Any, Task] = {}  # tasks by future
         try:
             with nullcontext() if self._is_lent else self._client:
                 try:
@@ -107,18 +107,18 @@ class DaskPool:
                             row = failed_row(task, "several workers died in it, see Dask's allowed-failures")
                         except CancelledError:
                             raise
-                        except Exception as error:  # raised by `fly`: every further run would fail as well
+                        except Exception as error:  # raised by `fly` if every further run would fail as well
                             raise RunError(f"{self._where}: {reason_of(error)}") from error
                         yield row
                         self._fill(flying, pending, tasks)
                 finally:
                     if self._is_lent and pending:
                         self._client.cancel(list(pending))
-        except (OSError, CancelledError) as error:  # broken links are OSErrors too
+        except (OSError, CancelledError) as error:  # broken links are OSErrors, too
             raise RunError(f"{self._where}: the cluster is gone; the same command continues") from error
 
     def _prepare(self) -> None:
-        """Wait for workers, check that they have this zsim version, and give them the user's modules."""
+        """Wait for workers, check that they have this version of zsim, and send them the user's modules."""
         if not self._client.nthreads():
             self._say(f"waiting for workers at {self._at}; start `dask worker {self._at}` on every host")
             self._client.wait_for_workers(1)
@@ -142,7 +142,7 @@ class DaskPool:
 
 
 def _checked(client: Any) -> Any:
-    """Return `client` if it is usable: a connected synchronous Client; otherwise raise RunError."""
+    """Return `client` if it is a connected synchronous Client; RunError otherwise."""
     if not isinstance(client, Client) or client.asynchronous or client.status != "running":
         found = "that is closed" if isinstance(client, Client) and client.status != "running" else "asynchronous"
         shown = f"a Client {found}" if isinstance(client, Client) else show(str(type(client).__name__))

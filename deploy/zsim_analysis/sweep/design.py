@@ -30,11 +30,11 @@ from zsim.schema.checker import first_fault, first_lines, show
 from zsim_agents.hosting import check_classes
 
 PLAN = "plan.json"
-METRICS = "report.metrics"  # names the user's functions that compute metrics of a run
+METRICS = "report.metrics"  # field that names the user's functions that compute metrics of a run
 RUNS_MAX = 1_000_000
 SEED = "seed"
-SHOWN_MAX = 24  # characters of a value in a table or figure
-SEEDS = 2**32  # exclusive limit of drawn seeds: at most ten digits
+SHOWN_MAX = 24  # most characters of a value in a table or figure
+SEEDS = 2**32  # drawn seeds are smaller: at most ten digits
 SYNTAX = "seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
 PAIRED = "paired"
 FieldPath = tuple[str | int, ...]  # steps to a field of a scenario from the top
@@ -45,31 +45,31 @@ _VALUE = re.compile(r" is [^;]*")  # the part of a fault that differs from run t
 
 
 class SweepPlan(Struct, frozen=True, kw_only=True):
-    """One scenario and its variations: the same plan gives the same runs, on any host and in any order."""
+    """A scenario and its variations: the same plan gives the same runs, on any host and in any order."""
 
     source: str  # name of the scenario's file, for messages
     document: dict[str, Any]  # the file with the overrides of the command line, presets not yet expanded
     vary: tuple[str, ...]  # texts of `--vary`, in their order
-    runs: int  # a plan with more runs begins with the same ones
+    runs: int  # number of runs; a plan with more runs begins with the same ones
     records: bool = False  # whether every run keeps its record
     changed: tuple[str, ...] | None = None  # overrides `a.b.c=value` of the command line; None: not known
-    version: str = __version__  # of zsim; another version may give other numbers
+    version: str = __version__  # version of zsim; others may give other numbers
 
 
 def difference(old: SweepPlan, new: SweepPlan) -> str | None:
-    """Return how two plans differ, None if `new` continues `old`."""
+    """Return how two plans differ; None if `new` continues `old`."""
     if old.version != new.version:
         return f"it was started by zsim {old.version}, this is {new.version}"
     if old.document != new.document:
         keys = sorted(old.document.keys() | new.document.keys())
         other = next(key for key in keys if old.document.get(key) != new.document.get(key))
         return f"its scenario has another {other}"
-    fields = []  # of each plan: values by paths from the top of the scenario
+    fields = []  # for each plan: values by path from the top of the scenario
     for plan in (old, new):
         parts = [text.partition("=") for text in plan.vary]
         fields.append({whole_path(path.strip(), plan.document): values for path, _, values in parts})
     if SEED in fields[0] and fields[1].get(SEED, "").startswith(f"{fields[0][SEED]},"):
-        fields[1][SEED] = fields[0][SEED]  # further seeds behind the same ones
+        fields[1][SEED] = fields[0][SEED]  # the same seeds, followed by further ones
     if list(fields[0].items()) != list(fields[1].items()):
         return f"it varies {' '.join(old.vary) or 'nothing'}, not {' '.join(new.vary) or 'nothing'}"
     if old.records != new.records:
@@ -87,14 +87,14 @@ def is_sweep(folder: Path) -> bool:
 
 
 class Seeds(Struct, frozen=True):
-    """A distinct seed for every run or, if paired, for every run of a combination, with the same seeds in each."""
+    """A distinct seed for every run or, if paired, for every run of a combination, the same in all combinations."""
 
     path: str = SEED
-    paired: bool = False  # drawn values are then the same for all combinations, too
-    values: tuple[int, ...] = ()  # the seeds; empty: drawn with the scenario's seed
+    paired: bool = False  # if so, drawn values are also the same for all combinations
+    values: tuple[int, ...] = ()  # empty: drawn with the scenario's seed
 
     def draw(self, seed: int, count: int) -> list[int]:
-        """Return the first seeds, drawn with a scenario's seed; a larger count begins with the same ones."""
+        """Return the first `count` seeds, drawn with a scenario's seed; a larger count begins with the same ones."""
         if self.values:
             return list(self.values[:count])
         rng = stream(seed, "sweep/seed")
@@ -112,17 +112,17 @@ class Grid(Struct, frozen=True):
 
     @property
     def names(self) -> list[str]:
-        """Abbreviated values; values cut to the same text are shown by their differing part, or numbered."""
+        """Abbreviated values; those with equal abbreviations are shown by their differing part, or numbered."""
         texts = [f"{value:g}" if isinstance(value, float) else text_of(value) for value in self.values]
-        made = {place: without_made(text) for place, text in enumerate(texts) if text.startswith(plugin.MADE)}
-        names = [*map(_cut, distinct(texts, made))]
+        generated = {place: without_made(text) for place, text in enumerate(texts) if text.startswith(plugin.MADE)}
+        names = [*map(_cut, distinct(texts, generated))]
         for short in [name for name, often in Counter(names).items() if often > 1]:
             alike = [place for place, name in enumerate(names) if name == short]
             texts = parts = [text_of(self.values[place]) for place in alike]
-            if any(len(text) > SHOWN_MAX for text in texts):  # show them from the first differing word on
+            if any(len(text) > SHOWN_MAX for text in texts):  # show them from the first word that differs
                 letters = enumerate(zip(*texts, strict=False))
-                whole = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
-                start = max(texts[0].rfind(mark, 0, whole) for mark in " ,[{:") + 1
+                common = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
+                start = max(texts[0].rfind(mark, 0, common) for mark in " ,[{:") + 1
                 parts = [_cut(f"…{text[start:]}" if start else text) for text in texts]
             others = {name for name in names if name != short}
             is_distinct = len({*parts, *others}) == len(parts) + len(others)
@@ -202,24 +202,24 @@ def _grid_values(text: str) -> tuple[Any, ...]:
 
 
 def text_of(value: Any) -> str:
-    """Format a value as `--set` takes it, on one line."""
+    """Format a value on one line, as `--set` takes it."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def without_made(value: Any) -> str:
-    """Format a value; a class of a notebook or a script without the module that was generated for it."""
+    """Format a value; the name of a notebook's or script's class without the module generated for it."""
     text = text_of(value)
     return text.partition(":")[2] if text.startswith(plugin.MADE) else text
 
 
-def distinct(texts: Sequence[str], made: Mapping[int, str]) -> list[str]:
-    """Return `texts` with those of `made` in their places, numbered if already in use: `Law-2`.
+def distinct(texts: Sequence[str], generated: Mapping[int, str]) -> list[str]:
+    """Return `texts` with those of `generated` at their indices, numbered if already in use: `Law-2`.
 
-    All classes that a function makes have the same name.
+    All classes that a function creates have the same name.
     """
     found = [*texts]
-    known = {text for place, text in enumerate(texts) if place not in made}
-    for place, name in made.items():
+    known = {text for place, text in enumerate(texts) if place not in generated}
+    for place, name in generated.items():
         numbered = (f"{name}-{number}" if number > 1 else name for number in count(1))
         found[place] = next(each for each in numbered if each not in known)
         known.add(found[place])
@@ -262,8 +262,8 @@ def is_inside(one: FieldPath, other: FieldPath) -> bool:
 class SweepDesign:
     """The runs of a plan; runs and points (combinations of the grid's values) are numbered from 0.
 
-    Run i flies point i modulo the number of points. `seeds` is the axis of seeds, None: all runs have the scenario's
-    seed; `paired`: the n-th runs of all points have the same seed.
+    Run i flies point i modulo the number of points. `seeds` is the axis of seeds; if None, all runs have the scenario's
+    seed. If `paired`, the n-th runs of all points have the same seed.
     """
 
     def __init__(self, plan: SweepPlan) -> None:
@@ -277,7 +277,7 @@ class SweepDesign:
 
     @property
     def seed(self) -> int:
-        """The scenario's seed, with which seeds and values are drawn; an invalid one is never flown."""
+        """The scenario's seed, with which seeds and values are drawn; the default seed if it is invalid."""
         seed = self.plan.document.get(SEED)
         return seed if isinstance(seed, int) and seed >= 0 else _DEFAULT_SEED
 
@@ -315,7 +315,7 @@ class SweepDesign:
         return {axis.path: axis.draw(self.seed, count) for axis in drawn}
 
     def scenario(self, run: int) -> Scenario:
-        """Return the resolved scenario of a run; sweeps fly in lockstep.
+        """Return the resolved scenario of a run, which flies in lockstep.
 
         Raises:
             ScenarioError: with one line for every fault.
@@ -343,7 +343,7 @@ class SweepDesign:
         return scenario
 
     def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:
-        """Return the faults of every combination: each point of the grid, each run if values are drawn."""
+        """Return the faults of all combinations: of each point of the grid, or of each run if values are drawn."""
         drawn = any(isinstance(axis, Draw) for axis in self.axes)
         checked = self.plan.runs if drawn else min(self.plan.runs, self.points)
         runs_of: dict[str, tuple[str, list[int]]] = {}
@@ -378,12 +378,12 @@ def make_plan(
     earlier_faults: Sequence[str] = (),
     changed: Sequence[str] | None = None,
 ) -> SweepPlan:
-    """Return the plan of a sweep after checking all its combinations; arguments as of SweepPlan, and:
+    """Return the plan of a sweep after checking all its combinations; arguments are as in SweepPlan, except:
 
     Args:
         runs: None: one for each combination of the grid and each given seed.
-        progress: called with the index of the combination that is checked, and their number.
-        earlier_faults: of the overrides, reported with the others.
+        progress: called with the index of the combination that is being checked, and the number of combinations.
+        earlier_faults: faults of the overrides, which are reported with the others.
 
     Raises:
         ScenarioError: with one line for every fault of the variations and of the resulting scenarios.
@@ -399,7 +399,7 @@ def make_plan(
         except ValueError as error:
             vary_faults.append(f"--vary {_shown(text)}: {error}")
     faults = [*earlier_faults, *vary_faults]
-    source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may be any bytes
+    source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may contain any bytes
     sets = None if changed is None else tuple(changed)
     texts = tuple(fields.values())
     plan = SweepPlan(source=source, document=document, vary=texts, runs=runs or 1, records=records, changed=sets)
@@ -432,7 +432,7 @@ def _refuse_overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -
 
 
 def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
-    """Return the faults of the number of runs; `all_known`: no axis was refused (it might have been a drawn one)."""
+    """Return the faults of the number of runs; `all_known`: no axis was refused, which might have drawn its values."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]
@@ -449,7 +449,7 @@ def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
 def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict[str, Any], list[str]]:
     """Return the raw document, as `scenario_file.load` takes it, and the faults of the overrides.
 
-    `set_texts` are texts `a.b.c=value` of `--set`; `values` replace top-level fields of the file, unless None.
+    `set_texts` are the texts `a.b.c=value` of `--set`; `values` that are not None replace top-level fields of the file.
 
     Raises:
         ScenarioError: the file does not contain a map.

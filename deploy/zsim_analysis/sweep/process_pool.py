@@ -1,6 +1,6 @@
 """The worker processes of a sweep on this host: one that dies is replaced, and its run is repeated.
 
-A worker flies many runs, so that imports and kernels are loaded once. `ProcessPoolExecutor` would break as a whole when
+A worker flies many runs, so that imports and kernels are loaded once. `ProcessPoolExecutor` would fail completely when
 a worker dies, without showing which run was fatal.
 """
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 READY, _END = "ready", "end"
 SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
-DEATHS_MAX = 3  # of workers in one run, or consecutively before they are ready
-EXIT_S = 5.0  # wall time within which an idle worker exits by itself
+DEATHS_MAX = 3  # most deaths of workers in one run, or in sequence before they are ready
+EXIT_S = 5.0  # wall time within which an idle worker exits on its own
 
 
 def work(link: Connection) -> None:
@@ -46,8 +46,8 @@ def work(link: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher receives and handles it
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=exit_with_launcher, name="launcher-monitor", daemon=True).start()
-    warnings.simplefilter("ignore", RuntimeWarning)  # a state that overflows is reported in the run's row
-    from zsim_analysis.sweep.sweep_run import fly  # not before the signals are set: it takes seconds
+    warnings.simplefilter("ignore", RuntimeWarning)  # the run's row reports a state that overflows
+    from zsim_analysis.sweep.sweep_run import fly  # after the signals are set, since it takes seconds
 
     link.send(READY)
     try:
@@ -68,10 +68,10 @@ def cores() -> int:
 
 @contextlib.contextmanager
 def _bare_start() -> Iterator[None]:
-    """Start processes that import neither from the working folder nor the main module of this program.
+    """Start processes that import neither modules of the working folder nor this program's main module.
 
     `spawn` imports the main module again, which would rerun a script without `if __name__ == "__main__"`. Workers do
-    not need it: classes that a script defines are put into a module of their own.
+    not need it, since classes that a script defines are put into a module of their own.
     """
     main, former = sys.modules["__main__"], os.environ.get(SAFE_PATH)
     sys.modules["__main__"] = ModuleType("__main__")
@@ -97,13 +97,13 @@ class WorkerProcess:
         self.task: Task | None = None
 
     def send(self, task: Task) -> None:
-        """Send a task; a dead worker is noticed by `receive`."""
+        """Send a task; `receive` detects a dead worker."""
         self.task = task
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.link.send(task)
 
     def receive(self) -> Row | str | RuntimeError | None:
-        """Return its next message; None if it is dead."""
+        """Return the worker's next message; None if it is dead."""
         try:
             return self.link.recv()
         except (EOFError, OSError):
@@ -111,7 +111,7 @@ class WorkerProcess:
             return None
 
     def stop(self) -> None:
-        """End the process, immediately if it flies a task."""
+        """End the process, immediately if it is flying a task."""
         if self.task is None:
             with contextlib.suppress(OSError):
                 self.link.send(None)
@@ -137,7 +137,7 @@ class ProcessPool:
     def rows(self, tasks: Iterator[Task | None]) -> Generator[Row]:
         """Yield the rows of tasks as they finish; when exhausted or closed, all workers have ended.
 
-        `tasks` yields None while its next task depends on unfinished rows; it is asked again after the next row.
+        `tasks` yields None while its next task depends on unfinished rows; it is continued after the next row.
 
         Raises:
             RunError: workers cannot start, or rows cannot be recorded.

@@ -3,7 +3,7 @@
 The folder of a sweep:
 
     plan.json        the plan
-    journal.jsonl    finished runs that are not in the table yet, one JSON line each
+    journal.jsonl    finished runs that are not yet in the table, one JSON line each
     sweep.parquet    finished runs, one row each
     runs/000012/     record of run 12, if records are kept
 """
@@ -38,10 +38,10 @@ from zsim_analysis.sweep.sweep_run import FIXED, Row, Task
 JOURNAL, TABLE, RUNS, LOCK = "journal.jsonl", "sweep.parquet", "runs", ".lock"
 NEW_PLAN = f".{PLAN}.new"
 PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata
-PLAIN_S = 10.0  # wall time between two lines without a terminal
-BAR = 20  # characters
-FAILURES_MAX = 5  # lines about why runs failed
-UNMEASURED_MAX = 5  # lines about runs without metrics of the user
+PLAIN_S = 10.0  # wall time between lines of progress without a terminal
+BAR = 20  # width of the progress bar [characters]
+FAILURES_MAX = 5  # most lines about why runs failed
+UNMEASURED_MAX = 5  # most lines about runs without the user's metrics
 _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 
@@ -50,19 +50,19 @@ class SweepRequest(Struct, frozen=True):
 
     plan: SweepPlan
     out: Path  # folder of the sweep
-    workers: int | None = None  # processes on this host, None: one per core
-    dask: Any = None  # a Dask client, or the address of a scheduler, whose workers are used instead
+    workers: int | None = None  # number of processes on this host; None: one per core
+    dask: Any = None  # a Dask client, or the address of a scheduler, whose workers fly the runs instead
     force: bool = False  # whether the folder may hold other files
-    console: Console | None = None  # where progress is shown, None: stderr
+    console: Console | None = None  # where progress is shown; None: stderr
     open_run: Callable[[Path], Any] | None = None  # see Task
-    modules: tuple[Path, ...] = ()  # with definitions of a notebook or a script; copied into the folder
+    modules: tuple[Path, ...] = ()  # generated for definitions of a notebook or a script; copied into the folder
 
 
 def sweep(request: SweepRequest) -> list[Row]:
     """Fly the runs that are missing in the folder; return the rows of all finished runs.
 
     Raises:
-        RunError: the folder holds something else, or cannot be written; workers cannot start.
+        RunError: the folder holds something else or cannot be written, or workers cannot start.
         KeyboardInterrupt: on Ctrl-C, with the finished runs in the table.
     """
     plan = request.plan
@@ -129,7 +129,7 @@ def _tasks(folder: "SweepFolder", runs: list[int], open_run: Callable[[Path], An
 
 
 class SweepScreen:
-    """A context that shows the progress of a sweep: a live line on a terminal or in a notebook, else plain lines."""
+    """Context that shows the progress of a sweep: a live line on a terminal or in a notebook, otherwise plain lines."""
 
     def __init__(
         self, total: int, done: int, console: Console | None = None, now_s: Callable[[], float] = time.monotonic
@@ -176,14 +176,14 @@ class SweepScreen:
             self.say(self.line())
 
     def unmeasured(self, run: int, reason: str) -> None:
-        """Report a run whose user metrics failed; only the first UNMEASURED_MAX are reported."""
+        """Report a run without the user's metrics; only the first UNMEASURED_MAX are reported."""
         self._unmeasured += 1
         if self._unmeasured <= UNMEASURED_MAX:
             more = "; further ones are in the table" if self._unmeasured == UNMEASURED_MAX else ""
             self.say(f"run {run}: {reason}{more}")
 
     def line(self) -> str:
-        """Return the finished runs, the runs per hour since the start, and the remaining time at that rate."""
+        """Describe the finished runs, the runs per hour since the start, and the remaining time at that rate."""
         filled = int(BAR * self._done / self._total)
         text = f"{'█' * filled}{'░' * (BAR - filled)} {self._done} / {self._total} runs"
         flown, elapsed_s = self._done - self._before, self._now_s() - self._start_s
@@ -197,7 +197,7 @@ class SweepScreen:
 
 
 def span(seconds: float) -> str:
-    """Format a duration, to the second below an hour."""
+    """Format a duration, to the second if it is below an hour."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
@@ -225,7 +225,7 @@ class SweepFolder:
         return [rows[run] for run in sorted(rows)]
 
     def compact(self) -> list[Row]:
-        """Move the journal's rows into the table, and return all rows; a crash in between loses nothing.
+        """Move the journal's rows into the table, and return all rows; a crash at any time loses none.
 
         Raises:
             ReportError: the table cannot be written.
@@ -237,7 +237,7 @@ class SweepFolder:
 
 
 def load(path: Path) -> SweepFolder:
-    """Return the sweep in a folder. Raises RunError: its plan cannot be read."""
+    """Return the sweep in a folder; RunError if its plan cannot be read."""
     try:
         return SweepFolder(path, msgspec.json.decode((path / PLAN).read_bytes(), type=SweepPlan))
     except (OSError, msgspec.MsgspecError, ValueError) as error:
@@ -248,10 +248,10 @@ def load(path: Path) -> SweepFolder:
 def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
     """Yield the folder of a new or continued sweep, locked against other sweeps.
 
-    With `force` it may hold other files; a run, or another sweep, is always refused.
+    With `force`, it may contain other files, but never a run or another sweep.
 
     Raises:
-        RunError: another sweep is running there, or it holds something else.
+        RunError: another sweep is running in the folder, or it contains something else.
     """
     with file_fault(path, "cannot be made", OTHER_OUT):
         if not is_sweep(path) and ((path / RECORD).exists() or (path / TABLE).exists()):
@@ -264,7 +264,7 @@ def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFo
 
 
 def _write_plan(path: Path, plan: SweepPlan) -> None:
-    """Write the plan, unless the folder holds another sweep; a sweep without a finished run may be replaced."""
+    """Write the plan; RunError if the folder has another sweep, unless none of its runs is finished."""
     try:
         content = indented_json(plan)
     except UnicodeEncodeError as error:
@@ -283,19 +283,19 @@ def _write_plan(path: Path, plan: SweepPlan) -> None:
 
 
 class Journal:
-    """Appends rows, each synced to the disk before its run counts as finished; a line cut by a crash is dropped.
+    """Appends rows, each synced to disk before its run counts as finished; a line cut off by a crash is dropped.
 
     Raises:
-        RunError: it cannot be written.
+        RunError: the journal cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
             self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-            whole = path.read_bytes().rfind(b"\n") + 1
-            os.ftruncate(self._file, whole)
-            os.lseek(self._file, whole, os.SEEK_SET)
+            end = path.read_bytes().rfind(b"\n") + 1
+            os.ftruncate(self._file, end)
+            os.lseek(self._file, end, os.SEEK_SET)
         except OSError as error:
             raise self._error(error) from error
 
@@ -306,10 +306,10 @@ class Journal:
         os.close(self._file)
 
     def append(self, row: Row) -> None:
-        """Append a row; once this returns, it survives a crash and a power failure.
+        """Append a row, which then survives a crash and a power failure.
 
         Raises:
-            RunError: it cannot be written.
+            RunError: the row cannot be written.
         """
         line = msgspec.json.encode(row) + b"\n"
         try:
@@ -324,13 +324,13 @@ class Journal:
 
 
 def read_journal(path: Path) -> list[Row]:
-    """Return the rows of a journal without an incomplete last line; none if there is no such file."""
+    """Return the rows of a journal, without an incomplete last line; empty if there is no such file."""
     content = path.read_bytes() if path.exists() else b""
     return msgspec.json.Decoder().decode_lines(content[: content.rfind(b"\n") + 1])
 
 
 def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence[Axis]) -> None:
-    """Write the rows atomically, in the order of the runs. Raises ReportError: the file cannot be written."""
+    """Write the rows atomically, in the order of the runs; ReportError if the file cannot be written."""
     ordered = sorted(rows, key=lambda row: row["run"])
     schema = _schema(ordered, axes).with_metadata({PLAN_METADATA: msgspec.json.encode(plan)})
     json_columns = [field.name for field in schema if field.metadata]
@@ -347,7 +347,7 @@ def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence
 
 
 def read_table(path: Path) -> list[Row]:
-    """Return the rows of a table, none if there is no such file; empty cells are None.
+    """Return the rows of a table, with None for empty cells; no rows if there is no such file.
 
     Raises:
         ReportError: the file is not a table of a sweep.
@@ -368,12 +368,12 @@ def read_table(path: Path) -> list[Row]:
 
 
 def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
-    """Return the columns: inputs, results, then the errors in the order of their first occurrence."""
+    """Return the columns: inputs, results, then errors in the order of their first occurrence."""
     fixed = [
         (name, next(_TYPES[each] for each in (*getattr(kind, "__args__", ()), kind) if each in _TYPES))
         for name, kind in FIXED.items()
     ]
-    varied: list[tuple[str, pa.DataType | None]] = []  # None: values of different types, stored as JSON
+    varied: list[tuple[str, pa.DataType | None]] = []  # None: values of different types, which are stored as JSON
     for axis in axes:
         kinds = {type(value) for value in axis.values} if isinstance(axis, Grid) else {float}
         if kinds == {int, float}:

@@ -1,6 +1,6 @@
-"""The figures of a sweep: the runs of each point of the grid, with their mean and its confidence interval.
+"""The figures of a sweep: the runs at each point of the grid, with their mean and its confidence interval.
 
-Order of this file: the figures; one quantity in a panel; means and their intervals; the x axis of a grid.
+Order of this file: figures; one quantity in a panel; means and their intervals; the x axis of a grid.
 """
 
 import re
@@ -32,10 +32,10 @@ from zsim_analysis.sweep.sweep_summary import (
     share_interval,
 )
 
-PANELS_MAX = 24  # quantities in one figure, enough for 6 drones
-COLUMNS = 3  # of panels
-NARROW_MAX = 8  # points side by side in a panel of a third of the page
-SLICES = 6  # of a drawn value's range, each with its own mean
+PANELS_MAX = 24  # most quantities in one figure, enough for 6 drones
+COLUMNS = 3  # columns of panels
+NARROW_MAX = 8  # most points side by side in a panel as wide as a third of the page
+SLICES = 6  # groups of runs by a drawn value, each with its own mean
 LEGEND_COLUMNS = 4
 ONE_RUN, BEYOND_AXIS, TABLE_I = "one run", "the interval goes beyond the axis", "the paper's Table I"
 NEVER_AS_PLANNED = "no run as planned"
@@ -44,7 +44,7 @@ SHARES = (
     ("of these, as planned", "D", style.BLUE),
     ("of these, without collision", "s", style.BLACK),
 )
-LEVEL_LETTERS, UPRIGHT_LETTERS = 28, 25  # of PAPER_PT that fit a panel's width and height, three across a page
+LEVEL_LETTERS, UPRIGHT_LETTERS = 28, 25  # letters of PAPER_PT that fit the width and height of a third of a page
 FORMULA = re.compile(r"\$[^$]*\$")
 
 
@@ -76,7 +76,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
         more = f" The first {POINTS_MAX} points are shown; the tables have all."
     beside = ", beside the paper" if results.paper_std else ""
     for name, title, what, panels in (
-        ("metrics", "Figures of the user's own", f"What {results.metrics_function} returned of each run.", own),
+        ("metrics", "Figures of the user's own", f"What {results.metrics_function} returned for each run.", own),
         ("true_rms", "How well the formation was flown", f"RMS of truth − desired within the window{window}.", rms),
         (
             "est_std",
@@ -91,14 +91,14 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
         "safety.png",
         "How the runs ended, and how close the drones came to each other",
         "(a) Share of runs that ended well, and of those flown as planned and without a collision, "
-        f"with exact intervals. (b) Least true distance between two drones in the air.{more}",
+        f"with exact intervals. (b) Minimum true distance between two drones in the air.{more}",
         _draw_safety(results),
     )
     for i, path in enumerate(results.drawn if own or rms else ()):
         yield style.ReportFigure(
             f"drawn_{i + 1}.png",
             f"Against {field_name(path)}",
-            f"Each quantity over the drawn value; means of {SLICES} slices with equally many runs.",
+            f"Each quantity against the drawn value; means of {SLICES} slices with equally many runs.",
             _draw_slices(results, path, [*own, *rms]),
         )
 
@@ -125,7 +125,7 @@ def _panel_grid(count: int, across: int, row_in: float) -> tuple[Figure, Any]:
 
 
 def _draw_safety(results: SweepResults) -> Figure:
-    """Draw the shares of runs that ended well, and the least separations if there are any."""
+    """Draw the shares of runs that ended well, and the minimum separations if there are any."""
     axis = GridAxis(results.design) if results.design.points > 1 else None
     has_separations = len(finite(results.flown(SEPARATION))) > 0
     figure = style.new_figure(style.PAGE_IN if has_separations else style.COLUMN_IN, 3.0)
@@ -143,7 +143,7 @@ def _draw_safety(results: SweepResults) -> Figure:
                 x = place.x + 0.5 * side * (place.room[1] - place.room[0])
                 look: dict[str, Any] = {"color": tint, "mfc": "white" if side >= 0 else tint}
                 axes.errorbar([x], [share.value], yerr=ends, fmt=mark, ms=5, lw=1.4, capsize=4, **look)
-        shown = style.GREY if axis and len(axis.series) > 1 else own  # colours then mark the series
+        shown = style.GREY if axis and len(axis.series) > 1 else own  # colours then distinguish the series
         axes.plot([], [], mark, color=shown, mfc="white" if side >= 0 else shown, ms=5, label=name)
     axes.set_ylim(-0.03, 1.03)
     if axis:
@@ -193,7 +193,7 @@ def _name(
             axes.plot([], [], color=axis.colour(place), lw=3, label=axis.series[place.series])
     style.legend_above(figure, axes, LEGEND_COLUMNS)
     if never and not axis:
-        style.mark_figure(figure, NEVER_AS_PLANNED, "", MARK)  # none of the runs followed its plan
+        style.mark_figure(figure, NEVER_AS_PLANNED, "", MARK)  # no run followed its plan
 
 
 def most_runs(results: SweepResults) -> int:
@@ -202,7 +202,7 @@ def most_runs(results: SweepResults) -> int:
 
 
 def mean_label(results: SweepResults) -> str:
-    """Return the legend of a mean, with its number of runs, called seeds if only those differ."""
+    """Return the legend of a mean with its number of runs, which are called seeds if only these differ."""
     counts = {results.ended_well(point)[0] for point in range(results.design.points)} - {0}
     many = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
     what = "runs" if results.drawn or not results.has_seeds else "seeds"
@@ -211,7 +211,7 @@ def mean_label(results: SweepResults) -> str:
 
 
 def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
-    """Draw quantities over a drawn value, with the means of slices of it."""
+    """Draw quantities against a drawn value, with the means of slices of it."""
     figure, grid = _panel_grid(len(panels), COLUMNS, 1.8)
     x, beyond = results.values(path), False
     for axes, panel in zip(grid, panels, strict=True):
@@ -261,13 +261,13 @@ def wrapped(text: str, letters: int) -> str:
 
 # One quantity in a panel
 
-DOTS_MAX = 400  # runs of a point that are drawn individually
-BINS = (5, 30)  # of a histogram, least and most
-GOLDEN = 0.6180339887  # multiples of the golden ratio, modulo 1, spread dots evenly and reproducibly
+DOTS_MAX = 400  # most runs of a point that are drawn individually
+BINS = (5, 30)  # least and most bins of a histogram
+GOLDEN = 0.6180339887  # fractional part of the golden ratio; its multiples modulo 1 spread dots evenly and reproducibly
 
 
 def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "GridAxis | None") -> bool:
-    """Draw one quantity: a histogram without an axis, else all points; return whether an interval leaves the axis."""
+    """Draw one quantity at all points, or as a histogram without `axis`; return whether an interval leaves the axis."""
     if axis is None:
         style.dress(axes)
         axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=style.PAPER_PT)
@@ -348,7 +348,7 @@ def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") 
 
 # Means and their intervals
 
-MEAN_ROOM = 0.08  # margin at each end of an axis, as a share of the samples' range; intervals may exceed it
+MEAN_ROOM = 0.08  # margin at each end of an axis, as a share of the samples' range, which intervals may exceed
 BEYOND = {"y": ("v", "^"), "x": ("<", ">")}  # marks at the low and the high end of an axis
 
 
@@ -381,32 +381,32 @@ def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"]
 
 # The x axis of a grid
 
-POINTS_MAX = 24  # side by side in one panel; the tables have all
+POINTS_MAX = 24  # most points side by side in one panel; the tables have all
 # colours of the combinations of the other fields
 SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
-DECADES_MIN = 30.0  # ratio of the largest to the smallest value from which an axis may be logarithmic
-TURNED_FROM = 34  # characters of all labels, with a space each, that fit side by side in a panel
-ABOVE = 1.1  # of the height of axes: above the runs and the marks of intervals that leave the axes
+DECADES_MIN = 30.0  # ratio of the largest to the smallest value from which on an axis may be logarithmic
+TURNED_FROM = 34  # most characters of all labels, with a space each, that fit side by side in a panel
+ABOVE = 1.1  # height of marks above runs and intervals, as a share of the height of the axes
 MARK = style.VERMILION
-GROUP_MAX = 0.3  # share of the range that the combinations at one value take: room for six marks
-TICKS_MAX = 8  # labelled values of an axis; of more values only some are labelled
+GROUP_MAX = 0.3  # largest share of the range that the combinations at one value take: room for six marks
+TICKS_MAX = 8  # most labelled values of an axis; of more values, only some are labelled
 
 
 class Place(Struct, frozen=True):
     """Where a point of the grid is drawn."""
 
-    x: float  # of its middle
+    x: float  # its centre
     room: tuple[float, float]  # the range of x over which its runs are spread
     series: int = 0  # index of its combination of the other fields
 
 
 class GridAxis:
-    """The x axis of a sweep over several points: numbers at their value, anything else side by side.
+    """The x axis of a sweep over several points: numbers at their values, anything else side by side.
 
     Attributes:
         field: the field on the axis; None if the points stand side by side.
         series: texts of the combinations of the other fields; [""] if there are none.
-        places: by point.
+        places: where to draw each point.
     """
 
     def __init__(self, design: SweepDesign) -> None:
@@ -430,7 +430,7 @@ class GridAxis:
         self.field = field
         self._numbers = [float(design.at(point)[field]) for point in range(design.points)]
         values = sorted(set(self._numbers))
-        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # over decades, with most values small
+        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # values over decades, most of them small
             steps = np.diff(values)
             self._is_logarithmic = bool(steps.max() > 2 * steps.min())
         combinations = [

@@ -1,7 +1,7 @@
 """Makes the report of a sweep: table in; summary.json, figures/*.png and report.html out; and tables for the terminal.
 
-A table has a row for each point of the grid. On the page it has intervals, and is split to fit the page; on a terminal
-it is brief, and split into as few tables as its width allows without cutting names.
+A table has a row for each point of the grid. On the page, it has intervals and is split to fit the page; on a terminal,
+it is brief and split into as few tables as the width allows without cutting names.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,11 +38,11 @@ from zsim_analysis.sweep.sweep_summary import (
     field_name,
 )
 
-POINTS_MAX = 200  # in a table of the page; sweep.parquet has all
-DETAILED_MAX = 24  # points with a table of their own
+POINTS_MAX = 200  # most points in a table of the page; sweep.parquet has all
+DETAILED_MAX = 24  # most points with a table of their own
 OVERVIEW = ("runs", "ended well", "as planned", "engaged", "no collision", "separation (m)", "least (m)")
 OWN = "figures of your own"
-BLOCK_COLUMNS = 6  # that fit the page, including those of the grid's fields
+BLOCK_COLUMNS = 6  # most columns that fit the page, including those of the grid's fields
 QUANTILES = "true RMS, 5 to 95 %"
 
 
@@ -66,7 +66,7 @@ def make_sweep_report(
 
 
 class PointTable(NamedTuple):
-    """Column heads and a row of cells for each point, without the grid's fields."""
+    """Column headings and a row of cells for each point, without the grid's fields."""
 
     heads: list[str]
     rows: list[list[str]]
@@ -114,7 +114,7 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
 
 
 def axes_of(summary: SweepSummary) -> list[FieldName]:
-    """Return the names of the grid's fields; without any, one for the only point."""
+    """Return the names of the grid's fields, or one name for the only point if there are none."""
     return [field_name(path) for path in summary.points[0].values] or [FieldName("point")]
 
 
@@ -123,7 +123,7 @@ def values_of(point: GridPoint) -> list[str]:
 
 
 def heading_of(point: GridPoint) -> str:
-    """Return the fields of a point with their values as words."""
+    """Describe the fields of a point and their values."""
     return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
 
 
@@ -139,7 +139,7 @@ def differing(summary: SweepSummary) -> dict[str, str]:
 def _blocks(
     points: Sequence[GridPoint], axes: Sequence[FieldName], table: PointTable
 ) -> list[tuple[list[str], list[list[str]]]]:
-    """Split a table into blocks of columns that fit the page; return heads and rows, each with the grid's fields."""
+    """Split a table into blocks of columns that fit the page; return headings and rows, each with the grid's fields."""
     across = max(2, BLOCK_COLUMNS - len(axes))
     blocks = []
     for part in np.array_split(np.arange(len(table.heads)), max(1, -(-len(table.heads) // across))):
@@ -150,7 +150,7 @@ def _blocks(
 
 
 def facts(summary: SweepSummary) -> list[tuple[str, str]]:
-    """Return the lines at the top of the page: label and value."""
+    """Return label and value of each line at the top of the page."""
     well = summary.finished - sum(summary.failed.values())
     hosts = ", ".join(f"{host} ({count})" for host, count in summary.hosts.items())
     return [
@@ -171,7 +171,7 @@ def windows_of(summary: SweepSummary) -> str:
 
 
 def marks_of(summary: SweepSummary) -> list[str]:
-    """Return the deviations of the runs from their plan, a line each."""
+    """Return a line for each kind of deviation of the runs from their plan."""
     runs = f"of {summary.finished} runs"
     lines = [f"{count} {runs} not as planned: {text}" for text, count in summary.not_as_planned.items()]
     if summary.judged_unengaged:
@@ -228,7 +228,7 @@ def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: d
 
 
 def overview(point: GridPoint, brief: bool = False) -> list[str]:
-    shares = []  # in percent, with their intervals unless brief
+    shares = []  # in percent, with the interval unless brief
     for share in (point.ended_well, point.as_planned, point.without_collision):
         interval = f" [{100 * share.low:.3g}, {100 * share.high:.3g}]" if share and not brief else ""
         shares.append(f"{100 * share.value:.3g} %{interval}" if share else "–")
@@ -241,7 +241,7 @@ def overview(point: GridPoint, brief: bool = False) -> list[str]:
 
 
 def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False) -> str:
-    """Return the mean of a column, with its interval unless brief, and its number of runs if not all."""
+    """Return the mean of a column, with its interval unless brief, and with its number of runs if those are not all."""
     spread = point.spreads.get(column)
     if spread is None:
         return "–"
@@ -251,7 +251,7 @@ def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False)
 
 
 def _difference(point: GridPoint, column: str, brief: bool = False) -> str:
-    """Return the mean of paired differences with its interval, and the number of pairs."""
+    """Return the mean of paired differences, with its interval and the number of pairs."""
     spread = point.differences.get(column)
     if spread is None:
         return "–"
@@ -263,7 +263,7 @@ def _difference(point: GridPoint, column: str, brief: bool = False) -> str:
 
 
 def _spread(spread: Distribution, form: str) -> str:
-    """Return a mean with half the width of its interval, or the samples if they are too few for one."""
+    """Return a mean with half the width of its interval, or all samples if they are too few for an interval."""
     if spread.samples:
         return ", ".join(f"{each:{form}}" for each in spread.samples)
     half = spread.mean.high - spread.mean.value
@@ -277,15 +277,15 @@ def _noted(text: str, note: str) -> str:
 # Terminal
 
 TERMINAL_POINTS_MAX = 40
-BETWEEN = 3  # characters between two columns of a table
-EDGE = 1  # characters saved after the last column of a table, including its edges
-ERRORS_MAX = 9  # parameters, as many as in the paper's Table I
-HEAD = 8  # characters of a head that are not wrapped
-AXES_MAX = 3  # fields of the grid with a column each; more share one
+BETWEEN = 3  # width between two columns of a table [characters]
+EDGE = 1  # width saved after the last column of a table, including its edges [characters]
+ERRORS_MAX = 9  # most parameters, as many as in the paper's Table I
+HEAD = 8  # width up to which a heading is not wrapped [characters]
+AXES_MAX = 3  # most fields of the grid with a column each; more share one
 
 
 class TerminalColumn(Struct, frozen=True):
-    """A column: its head, which is wrapped only between words, and a cell for each point."""
+    """A column: its heading, which is wrapped only between words, and a cell for each point."""
 
     head: str
     cells: tuple[str, ...]
@@ -296,12 +296,12 @@ class TerminalColumn(Struct, frozen=True):
 
     @property
     def width(self) -> int:
-        """Its characters, with the space to the next column."""
+        """Its width in characters, with the space to the next column."""
         return max(map(len, (*self.lines, *self.cells))) + BETWEEN
 
 
 class TerminalText(Struct, frozen=True):
-    """Text for the terminal, fitted to its width: deviations from the plan, then the tables."""
+    """Text for the terminal, fitted to its width: deviations from the plan, then tables."""
 
     summary: SweepSummary
 
@@ -315,7 +315,7 @@ class TerminalText(Struct, frozen=True):
 
 
 def terminal_tables(summary: SweepSummary) -> list[PointTable]:
-    """Return the user's metrics, paired differences, ends of runs, and errors; a table may have no columns."""
+    """Return tables of the user's metrics, paired differences, ends of runs, and errors; some may have no columns."""
     points, level = summary.flown[:TERMINAL_POINTS_MAX], f"{100 * summary.level:g} %"
     own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
     columns = {f"{prefix}.true_rms": each for prefix, each in summary.parameters.items()}
@@ -324,7 +324,7 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     # the first parameters of the first cluster except headings; for Test 1 these are the paper's
     shown = [(column, each.name) for column, each in flown.items() if each.cluster == cluster]
     errors = dict([(column, name) for column, name in shown if not name.startswith("phi_")][:ERRORS_MAX])
-    compared = {  # of the user's metrics, otherwise of the errors
+    compared = {  # differences of the user's metrics if there are any, otherwise of the errors
         column: title
         for column, title in differing(summary).items()
         if column in summary.metrics or (not summary.metrics and column in errors)
@@ -336,7 +336,7 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     title_pairs = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
     caption_pairs = f"means ± half of the {level} interval, of n pairs; few pairs are listed\n"
     title_ends = f"{summary.scenario}: {summary.finished} of {summary.runs} runs"
-    caption_ends = f"means over the runs as planned; least over all runs; {level} intervals are in the report\n"
+    caption_ends = f"means over the runs as planned; minima over all runs; {level} intervals are in the report\n"
     ends = [overview(point, brief=True) for point in points]
     return [
         _table(points, own, partial(_mean, form=".4g", brief=True), title_own),
@@ -347,7 +347,7 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
 
 
 def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Text | Table]:
-    """Yield title, tables and caption; tables are at most `width` characters wide if a single column fits."""
+    """Yield title, tables and caption; tables are at most `width` characters wide if each column fits on its own."""
     names = [str(name) for name in axes_of(summary)]
     values = [values_of(point) for point in summary.flown[:TERMINAL_POINTS_MAX]]
     if len(names) > AXES_MAX:
@@ -370,7 +370,7 @@ def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Te
 
 
 def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
-    """Split columns into as few parts of similar size as fit a width in characters; wider columns stand alone."""
+    """Split columns into as few parts of similar size as fit a width in characters; wider columns are alone."""
     for count in range(1, len(columns) + 1):
         ends = np.linspace(0, len(columns), count + 1).round().astype(int).tolist()
         parts = [columns[start:end] for start, end in pairwise(ends)]

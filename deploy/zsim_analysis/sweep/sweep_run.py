@@ -1,17 +1,17 @@
 """One run of a sweep: its task, its flight in this process, and its row of the table.
 
-It is judged as by `zsim report`, without a record on disk. `report.metrics` names functions of the user that compute
-further figures from the flight:
+It is judged as by `zsim report`, without a record on disk. `report.metrics` names the user's functions that compute
+further numbers from the flight:
 
     def metrics(flight: RecordedFlight) -> float | Mapping[str, float]
     def metrics(run: zsim.Run) -> float | Mapping[str, float]
 
-The name of the argument decides what is passed: `flight` the arrays of a RecordedFlight, any other name the recorded
-run.
+The name of the argument decides what is passed: for `flight`, the arrays of a RecordedFlight; for any other name, the
+recorded run.
 
-A number becomes the column `metrics.` and the function's name, a mapping a column `metrics.NAME` for each of its names.
-The unit at the end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None
-become empty cells. An exception of a function becomes the run's `metrics_failure`; its other columns are kept.
+A number becomes the column `metrics.FUNCTION`, a mapping a column `metrics.NAME` for each of its names. The unit at the
+end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None become empty
+cells. An exception of a function becomes the run's `metrics_failure`; its other columns are kept.
 """
 
 import math
@@ -50,74 +50,74 @@ from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
 FLIGHT = "flight"  # name of the argument for a RecordedFlight
-METRICS_MAX = 100  # of one function
+METRICS_MAX = 100  # most metrics of one function
 _NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
 
 Row = dict[str, Any]
-"""Values by column; the columns are `FIXED`, the varied paths, when each cluster was engaged (`engaged_column`),
-the errors by their paths in summary.json, and `metrics.NAME` of the user's own."""
+"""Values by column: `FIXED`, the varied paths, the time of each cluster's engagement (`engaged_column`), the errors by
+their paths in summary.json, and the user's `metrics.NAME`."""
 
 
 class Task(Struct, frozen=True):
     """A run to be flown."""
 
-    run: int  # its number
-    point: int  # of the grid
+    run: int  # number of the run
+    point: int  # point of the grid
     varied: dict[str, Any]  # values by path, without the seed
     scenario: Scenario  # resolved, with the run's seed
-    record: str | None = None  # folder for the record, None to keep none
-    open_run: Callable[[Path], Any] | None = None  # makes a `zsim.Run` of a record, for metrics
-    more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns, of JSON values
+    record: str | None = None  # folder for the record; None to keep none
+    open_run: Callable[[Path], Any] | None = None  # opens a record as a `zsim.Run`, for metrics
+    more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns with JSON values
     processes: Callable[[Scenario, Path], None] | None = None  # flies it as processes into a folder; None: in process
-    judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # returns further columns from its summary
+    judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # returns further columns from summary and row
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
-    """The columns that every run has, in their order; None if a failed run has no value."""
+    """The columns that every run has, in order; None if a failed run has no value."""
 
     run: int
     point: int
     seed: int
-    failure: str | None = None  # why it did not end well
+    failure: str | None = None  # why the run did not end well
     ended: str | None = None  # the reason given by the world
     truth_sha256: str | None = None
     sim_s: float | None = None
     wall_s: float | None = None  # wall time of the flight
     real_time_factor: float | None = None
     min_separation_m: float | None = None
-    collisions: int | None = None  # contacts between drones, and with obstacles
-    min_obstacle_distance_m: float | None = None  # of any drone's centre from obstacles and surfaces; None without
+    collisions: int | None = None  # number of contacts between drones and with obstacles
+    min_obstacle_distance_m: float | None = None  # of any drone's centre; None without obstacles and surfaces
     # whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight
     crashed: bool | None = None
-    # whether every cluster was engaged at some instant of the judged window, None without a cluster
+    # whether every cluster was engaged at some time within the judged window; None without a cluster
     engaged: bool | None = None
-    # whether every cluster was engaged at every instant of it, None without a cluster
+    # whether every cluster was engaged throughout the judged window; None without a cluster
     engaged_throughout: bool | None = None
     as_planned: bool | None = None  # whether the flight followed its plan
-    shortfall: str | None = None  # its first deviation from the plan
-    metrics_failure: str | None = None  # why it lacks requested metrics of the user
+    shortfall: str | None = None  # first deviation of the flight from its plan
+    metrics_failure: str | None = None  # why the run lacks metrics that the user requested
     # window_from_s, window_to_s: the judged window
     window_from_s: float | None = None
     window_to_s: float | None = None
-    window_note: str | None = None  # why it is not that of the scenario, empty if it is
-    date: str | None = None  # when it was flown (ISO 8601, UTC)
-    host: str = ""  # where it was flown
-    fingerprint: str = ""  # hosts with equal fingerprints give equal bits
+    window_note: str | None = None  # why the window is not the scenario's; empty if it is
+    date: str | None = None  # when the run was flown (ISO 8601, UTC)
+    host: str = ""  # host that flew the run
+    fingerprint: str = ""  # hosts with equal fingerprints give identical bits
 
 
-# columns with the value of the same name in the run's summary
+# columns that are fields of the run's summary
 OF_SUMMARY = ("ended", "truth_sha256", "sim_s", "wall_s", "real_time_factor", "min_separation_m", "as_planned",
               "window_note", "date")  # fmt: skip
 FIXED = {field.name: field.type for field in msgspec.structs.fields(RunResult)}
 
 
 def engaged_column(cluster: str) -> str:
-    """Return the column of the first instant [s] of the judged window at which a cluster was engaged."""
+    """Return the name of the column with the first time within the judged window at which a cluster was engaged [s]."""
     return f"clusters.{cluster}.engaged_s"
 
 
 def make_row(result: RunResult, varied: Mapping[str, Any], errors: Mapping[str, Any]) -> Row:
-    """Return the row of a run: first its number, point, seed and varied values, then its results."""
+    """Return the row of a run: its number, point, seed and varied values, then its results."""
     columns: Row = msgspec.structs.asdict(result)
     inputs = {name: columns.pop(name) for name in ("run", "point", "seed")}
     return {**inputs, **varied, **columns, **errors}
@@ -129,10 +129,10 @@ def failed_row(task: Task, reason: str, **known: Any) -> Row:
 
 
 def fly(task: Task) -> Row:
-    """Return the row of a run; an error of the run is in its row and does not end the sweep.
+    """Fly a run; return its row, which also has the error of a failed run, so that the sweep goes on.
 
     Raises:
-        RecordError, OSError: its record cannot be written, nor could that of any other run.
+        RecordError, OSError: the record cannot be written, which would fail for other runs, too.
     """
     needs_run = task.open_run and any(map(_takes_run, task.scenario.report.metric_names))
     if task.record is None and (needs_run or task.processes):
@@ -156,7 +156,7 @@ def fly(task: Task) -> Row:
         summary = summarise(flight, formations, Path(task.record or "") / RECORD)
     except (RecordError, OSError):
         raise
-    except Exception as error:  # of any type: the scenario caused it
+    except Exception as error:  # of any type, since the scenario caused it
         return failed_row(task, reason_of(error), **where)
     engaged = engaged_s(formations, summary.window_s)
     clusters = [cluster.name for cluster in task.scenario.clusters]
@@ -182,7 +182,7 @@ def fly(task: Task) -> Row:
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
     for i, (name, cluster) in enumerate([] if diverged else summary.clusters.items()):
         # Errors by their paths in summary.json. They are None for a cluster that was not engaged, and for a flight
-        # that was not as planned: the errors of drones that stay on the ground, hover or fall are not comparable.
+        # that was not as planned, since errors of drones that stay on the ground, hover or fall are not comparable.
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
         counts = summary.as_planned and engaged[name] is not None
         for parameter, errors in cluster.errors.items():
@@ -201,7 +201,7 @@ def fly_scenario(
 ) -> tuple[RecordedFlight, Exception | None]:
     """Fly a resolved scenario; return the flight, and the error if it diverged.
 
-    With `answers`, and for metrics of the user, it includes the drones' estimates and commands.
+    With `answers`, and for the user's metrics, the flight includes the drones' estimates and commands.
     """
     flight, cpu = InProcessFlight(scenario), _CpuTime()
     reader = FlightReader(answers or bool(scenario.report.metric_names))
@@ -212,7 +212,7 @@ def fly_scenario(
 
 
 class _CpuTime:
-    """An observer of a flight: measures the CPU time of this process from the first gate to the last."""
+    """An observer of a flight that measures the CPU time of this process from the first gate to the last."""
 
     def __init__(self) -> None:
         self._gates_s: list[float] = []
@@ -222,7 +222,7 @@ class _CpuTime:
         return self._gates_s[-1] - self._gates_s[0] if self._gates_s else None
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Do nothing: the time is read at gates."""
+        """Do nothing, since the time is read at gates."""
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         self._gates_s[1:] = [time.process_time()]
@@ -230,13 +230,13 @@ class _CpuTime:
 
 @contextmanager
 def _record(task: Task) -> Iterator[RecordWriter | None]:
-    """Yield the writer of the record, None if none is kept; an incomplete record keeps the suffix .part."""
+    """Yield the writer of the record, or None if none is kept; an incomplete record keeps the suffix .part."""
     if task.record is None:
         yield None
         return
     folder = Path(task.record)
     part = folder.with_name(f"{folder.name}.part")
-    for leftover in (folder, part):  # of an earlier attempt
+    for leftover in (folder, part):  # left by an earlier attempt
         rmtree(leftover, ignore_errors=True)
     try:
         part.mkdir(parents=True)
@@ -262,20 +262,20 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
 
 
 def made_modules(names: Iterable[str], folders: Iterable[Path]) -> list[Path]:
-    """Return the files of modules among `names` that were generated for definitions of a notebook or a script."""
+    """Return the files of those modules in `names` that were generated for definitions of a notebook or a script."""
     made = dict.fromkeys(name.partition(":")[0] for name in names if name.startswith(plugin.MADE))
     files = [folder / f"{module}.py" for module in made for folder in folders]
     return [file for file in files if file.is_file()]
 
 
 def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dict[str, float | None]:
-    """Return the first instant [s] of a window at which each cluster was engaged, None if it never was."""
+    """Return the first time within a window at which each cluster was engaged [s]; None if it never was."""
     rows = {each.name: np.flatnonzero(each.judged(window_s)) for each in formations}
     return {each.name: float(each.t_s[rows[each.name][0]]) if len(rows[each.name]) else None for each in formations}
 
 
 def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
-    """Return the metrics that the user's functions compute, by column, and why some are missing, in one line."""
+    """Return the metrics of the user's functions by column, and a line on why some are missing, None if none are."""
     metrics: dict[str, float | None] = {}
     failures: list[str] = []
 
@@ -297,10 +297,10 @@ def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | No
 
 
 def _takes_run(name: str) -> bool:
-    """Return whether a user's function takes the recorded run: its argument is not called `flight`."""
+    """Return whether a user's function takes the recorded run, that is, its argument is not called `flight`."""
     try:
         arguments = signature(plugin.load_function(name, METRICS)).parameters
-    except (DocumentError, TypeError, ValueError):  # reported when it is called
+    except (DocumentError, TypeError, ValueError):  # reported when the function is called
         return False
     return next(iter(arguments), FLIGHT) != FLIGHT
 
@@ -324,5 +324,5 @@ def _metrics_of(name: str, given: Callable[[], Any]) -> tuple[dict[str, float | 
         return metrics, None
     except DocumentError as error:
         return {}, error.faults[0]
-    except (Exception, SystemExit) as error:  # of any type: the user's function raised it
+    except (Exception, SystemExit) as error:  # of any type, since the user's function raised it
         return {}, f"{METRICS} {name}: {reason_of(error)}"

@@ -1,6 +1,7 @@
-"""summary.json of a sweep: distributions and confidence intervals at each point of its grid; names of fields. Pure.
+"""summary.json of a sweep: distributions and confidence intervals at each point of its grid; names of fields.
 
-`SweepResults` has the rows in columns, from which summary, tables and figures are made.
+`SweepResults` has the rows in columns, from which summary, tables and figures are made. Nothing here reads or writes
+files.
 """
 
 import math
@@ -23,12 +24,12 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 
 Samples = NDArray[np.float64]
 
-LEVEL = 0.95  # of all intervals
-RUNS_MIN = 5  # chosen: Student's interval of two runs is nine times as wide as their distance; fewer are listed
+LEVEL = 0.95  # confidence level of all intervals
+RUNS_MIN = 5  # fewest runs with an interval; chosen: that of two runs is 13 times as wide as their distance
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
-_FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # in a text, but not in a name such as drone1
-_COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # of a parameter: its cluster's name, and its own
+_FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1
+_COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # a parameter's column: its cluster's name, and its own
 
 
 class ConfidenceInterval(Struct, frozen=True):
@@ -40,9 +41,9 @@ class ConfidenceInterval(Struct, frozen=True):
 
 
 def mean_interval(samples: Samples) -> ConfidenceInterval:
-    """Return the mean of samples (n,) with Student's interval: mean ± t(n − 1) s / √n; none below RUNS_MIN samples.
+    """Return the mean of samples (n,) with Student's interval, mean ± t(n − 1) s / √n, or NaN below RUNS_MIN samples.
 
-    It is exact for normal samples, and for others asymptotically by the central limit theorem.
+    The interval is exact for normal samples, and asymptotically correct for others by the central limit theorem.
     """
     n = len(samples)
     middle = float(np.mean(samples)) if n else math.nan
@@ -64,7 +65,7 @@ def share_interval(count: int, of: int) -> ConfidenceInterval:
 
 
 class Distribution(Struct, frozen=True):
-    """The distribution of a quantity over runs of a point."""
+    """The distribution of a quantity over the runs of a point."""
 
     runs: int
     mean: ConfidenceInterval
@@ -74,11 +75,11 @@ class Distribution(Struct, frozen=True):
     p95: float
     least: float
     greatest: float
-    samples: tuple[float, ...] = ()  # all of them if too few for an interval, otherwise empty
+    samples: tuple[float, ...] = ()  # all samples if they are too few for an interval; otherwise empty
 
 
 def distribution(samples: Samples) -> Distribution | None:
-    """Return the distribution of the finite samples among (n,); None without any."""
+    """Return the distribution of the finite ones of samples (n,); None if there are none."""
     known = finite(samples)
     if not len(known):
         return None
@@ -93,7 +94,7 @@ def finite(samples: Samples) -> Samples:
 
 
 def count_text(count: int, of: int) -> str:
-    """Return the number of runs behind a mean as text, empty if it is all of them."""
+    """Return the number of runs behind a mean as text; empty if it is all runs."""
     return f"n = {count}" if count < of else ""
 
 
@@ -101,7 +102,7 @@ class FormationParameter(Struct, frozen=True):
     """A variable of a formation."""
 
     name: str
-    cluster: str | None = None  # the formation's name, None if there is only one
+    cluster: str | None = None  # the formation's name; None if there is only one
 
     @property
     def titled(self) -> str:
@@ -114,9 +115,9 @@ class FormationParameter(Struct, frozen=True):
 
 
 def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, FormationParameter]:
-    """Return the formation parameters of columns of errors, by the columns' prefix; names may contain points.
+    """Return the formation parameters of columns of errors, by column prefix; names may contain dots.
 
-    Columns are such as errors.x_c.true_rms, or clusters.NAME.errors.x_c.true_rms for clusters after the first.
+    Examples of columns: errors.x_c.true_rms, and clusters.NAME.errors.x_c.true_rms for clusters after the first.
     """
     prefixes = dict.fromkeys(column.rpartition(".")[0] for column in columns)
     matches = {each: match for each in prefixes if (match := _COLUMN.fullmatch(each))}
@@ -131,22 +132,22 @@ class GridPoint(Struct, frozen=True):
     label: str
     values: dict[str, Any]  # by path; empty if only seeds and drawn values vary
     names: dict[str, str]  # the abbreviated values, unique for each field
-    runs: int  # finished ones
-    ended_well: ConfidenceInterval | None  # share of them; None without a run
-    # share of the runs that ended well in which no drone collided or fell
+    runs: int  # number of finished runs
+    ended_well: ConfidenceInterval | None  # share of the finished runs; None without any
+    # share of the runs that ended well in which no drone collided or crashed
     without_collision: ConfidenceInterval | None
-    # runs that ended well with every cluster engaged at some instant of the judged window; None without clusters
+    # runs that ended well with every cluster engaged at some time within the judged window; None without clusters
     engaged: int | None
     as_planned: ConfidenceInterval | None  # share of the runs that ended well that followed their plan
-    spreads: dict[str, Distribution]  # by column, of the runs that ended well and followed their plan
-    excluded: int = 0  # runs that ended well without following their plan: not in spreads and differences
-    least_separation_m: float | None = None  # of all runs that ended well, None if unknown
-    # by column: its value minus that of the run with the same seed at the first point, over the pairs of which both
-    # runs are in the spreads; empty at the first point, and if seeds are not paired
+    spreads: dict[str, Distribution]  # by column, over the runs that ended well and followed their plan
+    excluded: int = 0  # runs that ended well without following their plan, which are in neither spreads nor differences
+    least_separation_m: float | None = None  # over all runs that ended well; None if unknown
+    # by column: value minus that of the run with the same seed at the first point, over the pairs with both runs in the
+    # spreads; empty at the first point, and if seeds are not paired
     differences: dict[str, Distribution] = {}
 
     def count(self, column: str) -> str:
-        """Return the number of runs behind a mean as text, empty if it is all that ended well."""
+        """Return the number of runs behind a mean as text; empty if it is all that ended well."""
         well = round(self.ended_well.value * self.runs) if self.ended_well else 0
         spread = self.spreads.get(column)
         return count_text(spread.runs, well) if spread else ""
@@ -164,12 +165,12 @@ class SweepSummary(Struct, frozen=True):
     runs: int
     finished: int
     failed: dict[str, int]
-    not_engaged: int  # runs that ended well, but a cluster was never engaged within the judged window
+    not_engaged: int  # runs that ended well, but with a cluster that was never engaged within the judged window
     # number of runs that ended well without following their plan, by the first deviation; texts that differ only in
     # numbers count as one
     not_as_planned: dict[str, int]
-    judged_unengaged: int  # runs that ended well whose window holds instants at which a cluster was not engaged
-    # the judged windows, least start and greatest end of all runs; None if no run has one
+    judged_unengaged: int  # runs that ended well, but with a cluster that was not engaged throughout the window
+    # span of the judged windows of all runs: earliest start and latest end; None if no run has one
     windows_s: tuple[float, float] | None
     paper_std: dict[str, float]  # Table I by parameter, empty except for Test 1
     level: float
@@ -177,11 +178,11 @@ class SweepSummary(Struct, frozen=True):
     hosts: dict[str, int]
     fingerprints: dict[str, int]
     version: str
-    parameters: dict[str, FormationParameter]  # of the formations, by the prefix of their columns
+    parameters: dict[str, FormationParameter]  # parameters of the formations, by column prefix
     metrics: tuple[str, ...]  # columns of the user's metrics
-    unmeasured: dict[str, int]  # number of runs without those, by the reason
+    unmeasured: dict[str, int]  # number of runs without the user's metrics, by reason
     points: list[GridPoint]
-    window_notes: dict[str, int] = {}  # number of runs that ended well, by why their window is not the scenario's
+    window_notes: dict[str, int] = {}  # runs that ended well, by the reason why their window is not the scenario's
 
     @property
     def flown(self) -> list[GridPoint]:
@@ -189,7 +190,7 @@ class SweepSummary(Struct, frozen=True):
 
     @property
     def known(self) -> set[str]:
-        """The columns that have a number in some run."""
+        """The columns with a number in at least one run."""
         return {column for point in self.points for column in point.spreads}
 
 
@@ -211,7 +212,7 @@ class SweepResults:
         report = design.plan.document.get("report")
         named = (report.get("metrics") or ()) if isinstance(report, Mapping) else ()
         names = [named] if isinstance(named, str) else named
-        self.metrics_function = " and ".join(map(without_made, names))  # of the user, with a module unless made for it
+        self.metrics_function = " and ".join(map(without_made, names))  # with its module unless that was generated
         self.has_seeds = design.seeds is not None
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
         self.paper_std: Mapping[str, float] = {}
@@ -222,13 +223,13 @@ class SweepResults:
                     self.paper_std = PAPER_TABLE_1
 
     def values(self, column: str, point: int | None = None) -> Samples:
-        """Return a column for the runs that ended well, at one point or all; NaN where unknown."""
+        """Return a column for the runs that ended well, at one point or at all; NaN where unknown."""
         chosen = self.well if point is None else self.well & (self.points == point)
         cells = [row.get(column) for row, is_chosen in zip(self.rows, chosen, strict=True) if is_chosen]
         return np.array([np.nan if cell is None else cell for cell in cells], np.float64)
 
     def flown(self, column: str, point: int | None = None) -> Samples:
-        """Return `values`, NaN for runs that did not follow their plan, which would bias the statistics."""
+        """Return `values` with NaN for runs that did not follow their plan, which would bias the statistics."""
         return np.where(self.values("as_planned", point) == 0, np.nan, self.values(column, point))
 
     def differences(self, column: str, point: int) -> Samples:
@@ -242,12 +243,12 @@ class SweepResults:
         return finite(np.array([value - first.get(run - point, np.nan) for run, value in own.items()], np.float64))
 
     def ended_well(self, point: int) -> tuple[int, int]:
-        """Return how many of a point's finished runs ended well, and how many there are."""
+        """Return how many of a point's finished runs ended well, and their number."""
         at_point = self.points == point
         return int((at_point & self.well).sum()), int(at_point.sum())
 
     def without_collision(self, point: int) -> tuple[int, int]:
-        """Return in how many of a point's runs that ended well no drone collided or fell, and how many there are."""
+        """Return in how many of a point's runs that ended well no drone collided or crashed, and their number."""
         collisions, crashed = self.values("collisions", point), self.values("crashed", point)
         return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
 
@@ -257,16 +258,16 @@ class SweepResults:
         return int((flags == 1).sum()), int(np.isfinite(flags).sum())
 
     def never_as_planned(self) -> list[int]:
-        """Return the points with finished runs, none of which ended well and followed its plan."""
+        """Return the points with finished runs of which none ended well and followed its plan."""
         points = []
         for point in range(self.design.points):
             (well, runs), (planned, of) = self.ended_well(point), self.count("as_planned", point)
-            if runs and not planned and (of or not well):  # without a cluster runs are not judged
+            if runs and not planned and (of or not well):  # runs without a cluster are not judged
                 points.append(point)
         return points
 
     def windows_s(self) -> tuple[float, float] | None:
-        """Return the least start and the greatest end [s] of the judged windows, None if no run has one."""
+        """Return the earliest start and the latest end of the judged windows [s]; None if no run has one."""
         start, end = (self.values(f"window_{side}_s") for side in ("from", "to"))
         known = np.isfinite(start) & np.isfinite(end)
         return (float(start[known].min()), float(end[known].max())) if known.any() else None
@@ -276,7 +277,7 @@ class SweepResults:
             return [row[column] for row in rows if row.get(column)]
 
         def counted(texts: Iterable[str]) -> dict[str, int]:
-            """Count texts, most frequent first; those that differ only in numbers count as the first one."""
+            """Count texts, most frequent first; texts that differ only in numbers count as the first of them."""
             first: dict[str, str] = {}
             return dict(Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts).most_common())
 
@@ -338,27 +339,27 @@ class SweepResults:
 
 # Names of fields
 
-UNITS = {  # by suffix, longer ones first
+UNITS = {  # units by suffix of a name, longer suffixes first
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_nm_s2": "N m s²", "_rad_s": "rad/s", "_deg_s": "deg/s", "_n_s_m": "N s/m",
     "_n_s2": "N s²", "_1_s2": "1/s²", "_m_s2": "m/s²", "_percent": "%", "_1_s": "1/s", "_m_s": "m/s", "_px2": "px²",
     "_deg": "deg", "_rad": "rad", "_mah": "mAh", "_px": "px", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT",
     "_m": "m", "_s": "s",
 }  # fmt: skip
-OF_CHANNEL = {  # units relative to that of the channel: zsim.sensors
+OF_CHANNEL = {  # units of noise parameters relative to the unit of their channel: zsim.sensors
     "noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "bias_instability": "", "quantum": "",
 }  # fmt: skip
-SECTIONS = ("environment", "sensors", "drones", "clusters", "agents", "metrics")  # omitted from names of their fields
+SECTIONS = ("environment", "sensors", "drones", "clusters", "agents", "metrics")  # omitted from their fields' names
 WORDS = {
     "gps": "GPS", "imu": "IMU", "mag": "magnetometer", "baro": "barometer", "accel": "accelerometer",
     "gyro": "gyroscope", "takeoff": "take-off",
 }  # fmt: skip
 OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
-OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # omitted from names too
+OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # likewise omitted from names
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
 
 class FieldName(Struct, frozen=True):
-    """Words and unit of a field; the unit may be empty."""
+    """The name of a field in words, and its unit, which may be empty."""
 
     words: str
     unit: str = ""
@@ -380,13 +381,13 @@ def field_name(path: str) -> FieldName:
     kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
     kept = [step for step in kept[:-1] if step not in OF_CLASS] + kept[-1:]
     kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
-    parted: list[tuple[str, str]] = []  # words and unit of each step
+    parted: list[tuple[str, str]] = []  # words and unit of each step of the path
     for step in kept:
         end = next((end for end in UNITS if step.endswith(end) and step != end), "")
         words = " ".join(WORDS.get(word, word) for word in step.removesuffix(end).split("_"))
         parted.append((words, UNITS.get(end, "")))
     if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
-        name = steps[-1]  # of a variable: angles are in rad, in deg if the name ends so
+        name = steps[-1]  # a variable: an angle is in rad, or in deg if its name ends in that
         parted[-1] = (name[:-4], "deg") if name.endswith("_deg") else (name, unit(name))
     measure = parted[-1][1]
     if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:

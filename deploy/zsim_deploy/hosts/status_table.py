@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FIRST_S = 1.0  # simulated time from which the run counts as flying
 SILENT_S = 1.0  # wall time without an answer after which a host is shown as silent; it is probed twice a second …
 ROUND_TRIPS = 2.0  # … plus this many of its round trips, because over a slow link every answer takes long
-WAITED_S = 0.5  # wall time of a wait for a process from which it is shown; shorter waits are normal in lockstep
+WAITED_S = 0.5  # wall time after which a wait for a process is shown; shorter waits are normal in lockstep
 SILENT_PROCESS_S = 1.8  # wall time; health arrives once a second, so a stopped process is shown within 2 s
 STALE_S = 3.0  # wall time after which a process's health is no longer shown; it arrives once a second
 AROUND = 4  # lines of a terminal besides the rows: progress, two of the table's head, and the count of hidden rows

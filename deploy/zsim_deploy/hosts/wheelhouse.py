@@ -359,7 +359,7 @@ async def pip(*arguments: str, progress: Progress) -> None:
             lines.append(line.decode(errors="replace").strip())
             if (match := NO_INDEX.search(lines[-1])) and not unanswered:
                 unanswered = _reason(match[1])
-                progress(f"the package index does not answer ({unanswered}); asking once more")
+                progress(f"the package index does not answer ({unanswered}); trying once more")
         await process.wait()
     finally:
         if process.returncode is None:

@@ -1,1 +1,1 @@
-"""A run on this host: processes started, supervised, ended. Imports roles and inventory."""
+"""A run on this host: starts, supervises and ends its processes. Imports roles and inventory."""

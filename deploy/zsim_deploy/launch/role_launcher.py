@@ -1,10 +1,11 @@
-"""The processes of a run on this host: started, watched and stopped; their output goes to logs.
+"""Starts, watches and stops the processes of a run on this host; their output goes to logs.
 
-On Linux they are forked from a process that has imported everything, which is much faster; on other systems, and if
-this fork server is gone or does not answer, they are started as normal programs. Either way they are children of this
+On Linux they are forked from a process that has imported everything, which is much faster. On other systems, and if
+this fork server has ended or does not answer, they are started as programs. Either way they are children of this
 process.
 
-Beside them: the users' programs that are started and supervised like roles, and the console, which outlives the run.
+This file also has the users' programs, which are started and supervised like roles, and the console, which outlives the
+run.
 """
 
 import ctypes
@@ -35,23 +36,23 @@ SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
-}  # threads slow matrices of a dozen rows down, and would compete with the other roles
+}  # threads slow down matrices of a dozen rows, and would compete with the other roles
 FORKSERVER = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver")
 COMMAND = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli")
-ZSIM = (sys.executable, SAFE_PATH, "-m", "zsim_deploy")  # as a user starts it: Ctrl-C while it loads is a line, too
-ROOM = " " * 1024  # padding of the fork server's command line, over which each role writes its own
+ZSIM = (sys.executable, SAFE_PATH, "-m", "zsim_deploy")  # as a user starts it: Ctrl-C while it loads prints one line
+ROOM = " " * 1024  # pads the fork server's command line, which each role overwrites with its own
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
-PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
-REPLY_MAX = 32  # bytes, of an answer: READY, or a process id
-ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
-POLL_S = 0.01  # polling interval of a process's end
-UNKNOWN = 0  # exit code, as in Popen, if the status was collected elsewhere
-HERE = "here"  # host of a program that `zsim up` starts itself
+PACKET_MAX = 1 << 17  # size of a packet with a command line, bytes; a thousand names of drones take half of it
+REPLY_MAX = 32  # size of a reply, READY or a process id, bytes
+ANSWER_S = 5.0  # wall time for the fork server to reply, which takes 20 ms unless it is stopped
+POLL_S = 0.01  # polling interval of the end of a process, wall time
+UNKNOWN = 0  # exit code if the status was collected elsewhere, as in Popen
+HERE = "here"  # shown as the host of a program that `zsim up` starts itself
 LEAVES_S = 2.0  # wall time for a program to notice the end of the run before it is interrupted
 END_S = 10.0  # wall time for a console to end beside a replay
-COPIED_S = 22.0  # wall time for a console to end after a run: its pages may copy for 20 s
-INTERRUPTED_S = 1.0  # the same after Ctrl-C: the run may take 2 s, and in all 3 s are promised
-SLOW_S = 2.0  # wall time for a console to end after which a notice is shown
+COPIED_S = 22.0  # wall time for a console to end after a run; its pages may copy for 20 s
+INTERRUPTED_S = 1.0  # the same after Ctrl-C; the run may take 2 s, and 3 s in all are promised
+SLOW_S = 2.0  # wall time after which a notice says that a console has not ended yet
 
 
 class RoleProcess(Protocol):
@@ -65,9 +66,12 @@ class RoleProcess(Protocol):
 
 
 class ChildProcess:
-    """A role as a child process, given arguments of the `zsim` command; `logs`: folder for its standard error.
+    """A role as a child process.
 
-    `on_line` takes every line of its standard output; with None they go to the log too.
+    Args:
+        arguments: of the `zsim` command.
+        logs: folder of the log, which has its standard error.
+        on_line: takes every line of its standard output; None: they go to the log too.
     """
 
     is_program = False
@@ -109,7 +113,7 @@ class ChildProcess:
 
     @property
     def code(self) -> int | None:
-        """Return its exit code, None while it lives; negative for a signal."""
+        """Exit code; None while the process lives, negative after a signal."""
         return self._process.poll() if self._process else None
 
     def outcome(self) -> str:
@@ -119,10 +123,10 @@ class ChildProcess:
         return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
-        """Ask it to leave; no effect once it has ended."""
+        """Ask the process to leave; without effect once it has ended."""
         if self._process is None or self._process.stdin is None or self._process.stdin.closed:
             return
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # the process has ended
             self._process.stdin.write(f"stop {reason}\n")
             self._process.stdin.flush()
 
@@ -155,9 +159,9 @@ class ChildProcess:
 
 
 class RoleLauncher:
-    """Starts roles. Must be entered by the main thread, which then waits until they can be started.
+    """Starts roles; a context that the main thread must enter, which waits until roles can be started.
 
-    `say` takes a notice on slow steps; `run`: label of the fork server in `ps`.
+    `say` takes a notice on slow steps; `run`: label of the fork server in the output of `ps`.
     """
 
     def __init__(self, say: Callable[[str], None], run: str = "") -> None:
@@ -169,10 +173,10 @@ class RoleLauncher:
 
     def __enter__(self) -> "RoleLauncher":
         if sys.platform == "linux":
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # the parent process may have ignored it
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a parent process may have set it to be ignored
             try:
                 self._start_forkserver()
-            except BaseException:  # Ctrl-C, too
+            except BaseException:  # including Ctrl-C
                 self._stop_forkserver()
                 raise
         return self
@@ -181,9 +185,9 @@ class RoleLauncher:
         self._stop_forkserver()
 
     def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> RoleProcess:
-        """Start a `zsim` command, its standard input a pipe.
+        """Start a `zsim` command with a pipe as standard input.
 
-        Its standard error goes to the log; its standard output too, unless it is `listened` to: then that is a pipe.
+        Standard error goes to the log, and so does standard output, unless `listened`: then it is a pipe.
         """
         with self._lock:
             return self._fork(arguments, log, listened) or subprocess.Popen(
@@ -211,7 +215,7 @@ class RoleLauncher:
             start.over()
 
     def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> "ForkedProcess | None":
-        """Fork a role; None if the fork server cannot do it. The process waits for a byte before it begins."""
+        """Fork a role, and let it begin by writing a byte; None if the fork server cannot do that."""
         packet = json.dumps(list(arguments)).encode()
         if self._line is None or len(packet) > PACKET_MAX:
             return None
@@ -233,13 +237,13 @@ class RoleLauncher:
                 if file is not None:
                     os.close(file)
             return None
-        with suppress(BrokenPipeError):  # it was killed
+        with suppress(BrokenPipeError):  # the role was killed
             os.write(go_write, b"!")
         os.close(go_write)
         return ForkedProcess(int(reply), os.fdopen(stdin_write, "w"), None if out_read is None else os.fdopen(out_read))
 
     def _receive(self) -> bytes:
-        """Return an answer; if the fork server is gone or silent, stop it and return an empty one."""
+        """Return a reply; if the fork server has ended or is silent, stop it and return an empty one."""
         reply = b""
         if self._line is not None:
             with suppress(OSError):
@@ -249,7 +253,7 @@ class RoleLauncher:
         return reply
 
     def _stop_forkserver(self) -> None:
-        """End the fork server; further roles are started as programs."""
+        """End the fork server, so that further roles are started as programs."""
         if self._line is not None:
             self._line.close()
             self._line = None
@@ -278,7 +282,7 @@ class ForkedProcess:
             return self._code
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end and return its exit code; subprocess.TimeoutExpired after `timeout` seconds."""
+        """Wait for the process to end, and return its exit code; subprocess.TimeoutExpired after `timeout` seconds."""
         until_s = None if timeout is None else time.monotonic() + timeout
         while (code := self.poll()) is None:
             if until_s is not None and time.monotonic() >= until_s:
@@ -304,10 +308,11 @@ def _subreaper() -> Iterator[None]:
 
 
 class ProgramProcess:
-    """A program, its output in the log of its name; see `RunProcess`.
+    """A user's program, as a `RunProcess`; its output goes to the log NAME.log.
 
     Args:
-        folder: in which it runs; None: the current one.
+        words: the command line.
+        folder: working folder; None: the current one.
     """
 
     is_program = True
@@ -322,7 +327,7 @@ class ProgramProcess:
         self._words, self._environment, self._folder = words, environment, folder
         self._log = logs / f"{name}.log"
         self._program: Program | None = None
-        self._asked: threading.Timer | None = None
+        self._interruption: threading.Timer | None = None
 
     def start(self) -> None:
         if self._program is not None:
@@ -339,7 +344,7 @@ class ProgramProcess:
 
     @property
     def code(self) -> int | None:
-        """Return its exit code, None while it lives; negative for a signal."""
+        """Exit code; None while the process lives, negative after a signal."""
         code = self._program.code if self._program else None
         return code if code is None or code <= 128 else 128 - code
 
@@ -350,11 +355,11 @@ class ProgramProcess:
         return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
-        """Interrupt it, as Ctrl-C does, unless it ends by itself within LEAVES_S."""
-        if self._program is not None and self._asked is None:
-            self._asked = threading.Timer(LEAVES_S, self._program.interrupt)
-            self._asked.daemon = True
-            self._asked.start()
+        """Interrupt the program, as Ctrl-C does, unless it ends by itself within LEAVES_S; `reason` is not used."""
+        if self._program is not None and self._interruption is None:
+            self._interruption = threading.Timer(LEAVES_S, self._program.interrupt)
+            self._interruption.daemon = True
+            self._interruption.start()
 
     def wait(self, timeout_s: float) -> bool:
         return self._program is None or self._program.wait(max(0.0, timeout_s)) is not None
@@ -364,8 +369,8 @@ class ProgramProcess:
             self._program.kill()
 
     def close(self) -> None:
-        if self._asked is not None:
-            self._asked.cancel()
+        if self._interruption is not None:
+            self._interruption.cancel()
         if self._program is not None:
             self._program.close()
 
@@ -373,9 +378,10 @@ class ProgramProcess:
 def programs_of(
     scenario: Scenario, names: Iterable[str], endpoint: str, out: Path, launch: Launch
 ) -> list[ProgramProcess]:
-    """Return some of the users' programs of a scenario; they run in the folder of its modules, beside its file.
+    """Return users' programs of a scenario; they run in the folder of its modules, which is that of its file.
 
     Args:
+        names: the programs.
         endpoint: of the run.
         out: folder of the run.
     """
@@ -394,17 +400,17 @@ def programs_of(
 
 
 class RunConsole:
-    """Owns the console of a run, which continues until the report is made and its pages have copied it.
+    """Owns the console of a run, which goes on until the report is made and the console's pages have copied it.
 
-    Must be entered before the run, so that the console always ends. Ctrl-C ends the wait for its pages.
+    A context that must be entered before the run, so that the console always ends. Ctrl-C ends the wait for the pages.
     """
 
     def __init__(self) -> None:
         self.process: RunProcess | None = None
-        self.outcome = Outcome("interrupted", interrupted=True)  # of the run; set by the caller
+        self.outcome = Outcome("interrupted", interrupted=True)  # outcome of the run, set by the caller
 
     def own(self, process: RunProcess) -> None:
-        """Take a process that has not been started; end a former one."""
+        """Take over a process that has not been started, and end an earlier one."""
         if self.process is not None:
             self.process.close()
         self.process = process
@@ -432,10 +438,9 @@ class RunConsole:
 
 @contextmanager
 def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
-    """Run a console for the duration of the block, which waits for the world and prints its links.
+    """Run a console for the duration of the block; it waits for the world, and prints the links to its pages.
 
-    It connects to the world's endpoint, on this machine if that is all addresses; the default federation is the
-    record's.
+    It connects to `endpoint`, on this machine if that stands for all addresses; the default federation is the record's.
     """
     if federation is None:
         from zsim_analysis.reading.recorded_run import open_run

@@ -1,4 +1,4 @@
-"""A complete run on this host: every process of a scenario started, supervised, recorded, and ended."""
+"""A complete run on this host: starts, supervises, records and ends the processes of a scenario."""
 
 import contextlib
 import os
@@ -32,9 +32,9 @@ from zsim_deploy.launch.supervisor import EndSignals, Outcome, RunProcess, Super
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 RECORDER = "recorder"
-CONSOLE = "console.run"  # a name that a console started by hand does not take over
+CONSOLE = "console.run"  # name of the run's console; one started by hand does not take it over
 DEFAULT_PORT = 7447  # Zenoh's default
-PORTS_TRIED = 5  # in case other runs take each of them before our world listens
+PORTS_TRIED = 5  # other runs may take a free port before our world listens on it
 
 
 Shown = Screen | JsonProgress
@@ -46,17 +46,17 @@ class RunOptions:
 
     scenario: Scenario
     out: Path
-    launch: Launch  # the part that is stored for a continuation
-    order: Sequence[str] = ()  # names of processes in the order in which they are started
-    console: RunConsole | None = None  # owner of the console; None for a run without
+    launch: Launch  # options that are stored, so that the run can be continued
+    order: Sequence[str] = ()  # names of processes in the order of their start; the others follow
+    console: RunConsole | None = None  # owner of the console; None: no console
     cameras: bool = False
     detect: bool = False
-    continued: bool = False  # it continues an interrupted launch
-    json_progress: bool = False  # progress is written for the program that started this one
-    supervisor: Supervisor | None = None  # of its processes, once they are started
+    continued: bool = False  # continues an interrupted run
+    json_progress: bool = False  # writes progress as JSON, for the program that started this one
+    supervisor: Supervisor | None = None  # supervisor of the processes, once they are started
 
     def status(self) -> dict[str, Any]:
-        """Return the run's content in `zsim ps`; callable from any thread."""
+        """Return what `zsim ps` shows of the run; callable from any thread."""
         if self.supervisor:
             rows, clock = self.supervisor.rows(), self.supervisor.clock
         else:
@@ -85,9 +85,9 @@ def fly(options: RunOptions) -> Outcome:
 
 
 def run_processes(options: RunOptions, screen: Shown) -> Outcome:
-    """Run a scenario as real processes; the record is finished in any case.
+    """Run a scenario as processes; the record is finished in any case.
 
-    KeyboardInterrupt, with the reason, if nothing has flown yet, or Ctrl-C came twice.
+    KeyboardInterrupt, with the reason, if it was interrupted before the flight, or interrupted twice.
     """
 
     def interrupt(number: int, _: object) -> None:
@@ -99,7 +99,7 @@ def run_processes(options: RunOptions, screen: Shown) -> Outcome:
                 outcome = _run(options, screen, signals)
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                (options.out / "logs").rmdir()  # if it is empty, the folder may be used again
+                (options.out / "logs").rmdir()  # fails unless it is empty; then the run's folder can be reused
                 run_folder.forget_launch(options.out)
             raise
         with contextlib.suppress(RecordError):
@@ -108,10 +108,10 @@ def run_processes(options: RunOptions, screen: Shown) -> Outcome:
 
 
 def _run(options: RunOptions, screen: Shown, signals: EndSignals) -> Outcome:
-    """Prepare the folder and the fork server, and run on an endpoint; on another one if its port was lost."""
+    """Prepare the folder and the fork server, and run on a free port; on another one if that was taken meanwhile."""
     run_folder.prepare(options.out, options.scenario, options.launch, screen.say, options.continued)
     if options.camera_children() and not options.launch.rate and not options.scenario.gates("camera"):
-        screen.say("an unpaced lockstep run is faster than its cameras; --rate 1 leaves them time")
+        screen.say("an unpaced lockstep run is faster than its cameras; --rate 1 gives them time")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
         if listen := options.launch.listen:
             return _run_on(options, listen, screen, launcher, signals)
@@ -120,7 +120,7 @@ def _run(options: RunOptions, screen: Shown, signals: EndSignals) -> Outcome:
             tries, port = tries + 1, free_port(screen)
             endpoint = f"tcp/127.0.0.1:{port}"
             outcome = _run_on(options, endpoint, screen, launcher, signals)
-            # lost: another process took the port between our check of it and the start of our world
+            # Another process may take the port between our check and the start of our world.
             was_lost = outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not is_free(port)
             if not was_lost or tries == PORTS_TRIED:
                 return outcome
@@ -143,7 +143,7 @@ def _run_on(options: RunOptions, endpoint: str, screen: Shown, launcher: RoleLau
 
 def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[RunProcess]:
     logs, scenario, launch = options.out / "logs", options.scenario, options.launch
-    # Another run's world may listen where ours could not: the id keeps processes of this run from joining it.
+    # Another run's world may listen where ours could not; the run id keeps the processes of this run from joining it.
     launched = ["--launched", launch.run_id, *(["--insecure"] if launch.insecure else [])]
     reach = ["--connect", endpoint, "--federation", scenario.federation, *launched]
     pace = [*pace_options(launch.mode, launch.rate), *launched, *changed_options(launch.changed)]
@@ -156,7 +156,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
         commands[names[-1]] = ["host", *reach, "--", *names]
     else:
         for role, _, thing in (name.partition(".") for name in names):
-            name = f"{role}.{thing}"  # a name of the contract may begin with -
+            name = f"{role}.{thing}"  # -- precedes it below, since a name may begin with -
             commands[name] = (
                 ["agent", *reach, "--", name] if role in scenario.own_agents else [role, *reach, "--", thing]
             )
@@ -198,7 +198,10 @@ def run_in_process(options: RunOptions, screen: Shown) -> Outcome:
 
 
 def options_of(folder: Path) -> RunOptions:
-    """Return the options to continue an interrupted run, if it is not over; one in process is flown again."""
+    """Return the options that continue an interrupted run; RunError if it is over.
+
+    The record of an in-process run is removed, because it is flown again from its start.
+    """
     launch = run_folder.launch_of(folder)
     if launch.in_process:
         (folder / RECORD).unlink(missing_ok=True)
@@ -209,7 +212,7 @@ def options_of(folder: Path) -> RunOptions:
 
 
 def check_endpoint(endpoint: str | None, insecure: bool) -> None:
-    """Refuse an endpoint on which no world can listen: malformed, or insecure without `insecure`."""
+    """Raise SessionError for an endpoint on which no world can listen: malformed, or without TLS unless `insecure`."""
     if endpoint is None:
         return
     from zsim.transport.connection import check_listening
@@ -229,13 +232,13 @@ def check_open_files(options: RunOptions) -> None:
 
 
 def free_port(screen: Shown) -> int:
-    """Return Zenoh's port or, if that is in use, another free one, with a notice."""
+    """Return Zenoh's default port or, if that is in use, another free one, with a notice."""
     if is_free(DEFAULT_PORT):
         return DEFAULT_PORT
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    screen.say(f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (--connect for other commands)")
+    screen.say(f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (other commands need --connect)")
     return port
 
 
@@ -253,7 +256,7 @@ def is_free(port: int) -> bool:
 
 
 class CameraChild(NamedTuple):
-    """A camera or detector that is started with a run, for some drones; empty: for all that have cameras."""
+    """A camera or detector process of a run. `drones`: those it serves; empty: all that have cameras."""
 
     role: str
     name: str
@@ -261,7 +264,7 @@ class CameraChild(NamedTuple):
 
 
 def with_cameras(scenario: Scenario) -> Scenario:
-    """Return a scenario with cameras: if no drone has one, all get the AR.Drone's two."""
+    """Return a scenario with cameras; if no drone has any, each drone gets the two of the AR.Drone."""
     if any(drone.sensors.cameras() for drone in scenario.drones):
         return scenario
     two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
@@ -270,18 +273,18 @@ def with_cameras(scenario: Scenario) -> Scenario:
 
 
 def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[CameraChild]:
-    """Return the cameras and detectors that a scenario expects by name, or a user wants.
+    """Return the camera and detector processes that the scenario expects by name, or the user wants.
 
-    There is one for each drone named in `expect`, and ROLE.main for the others. `cameras`, `detect`: render the cameras
-    of all drones, detect hats in the pictures of all.
+    There is one for each drone named in `expect`, and ROLE.main for all others. `cameras`: render the cameras of all
+    drones; `detect`: detect hats in the images of all drones.
     """
-    having = watched_drones("", scenario)
-    everybody = [drone.name for drone in scenario.drones]  # pictures may come from cameras outside zsim
+    filmed = watched_drones("", scenario)
+    everybody = [drone.name for drone in scenario.drones]  # images may come from cameras outside zsim
     expected = scenario.processes.expect or ()
     children: list[CameraChild] = []
     for role, known, drones, wanted in (
-        ("camera", having, having, cameras),
-        ("detector", everybody, having or everybody, detect),
+        ("camera", filmed, filmed, cameras),
+        ("detector", everybody, filmed or everybody, detect),
     ):
         own = [CameraChild(role, f"{role}.{drone}", (drone,)) for drone in known if f"{role}.{drone}" in expected]
         main, names = f"{role}.main", {child.name for child in own}

@@ -1,6 +1,6 @@
-"""Supervises the processes of a run: reacts when one of them ends, and ends all of them.
+"""Supervises the processes of a run: reacts when one of them ends, and ends them all.
 
-The processes may run on this machine (`ChildProcess`) or on another one (`RemoteProcess`).
+The processes run on this machine (`ChildProcess`) or on another one (`RemoteProcess`).
 """
 
 import signal
@@ -22,25 +22,27 @@ from zsim_deploy import USER_FAULT
 from zsim_deploy.roles.closed_output import CLOSED, STREAMS, is_unread, redirect_output
 from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
+# Wall times
 POLL_S = 0.05  # polling interval of the processes
-END_S = 8.0  # time for the others after the world has ended; the recorder may wait for its disk
+END_S = 8.0  # time for the others to end after the world; the recorder may wait for its disk
 WORLD_FIRST_S = 1.0  # time for the world to end the run after Ctrl-C
-INTERRUPT_S = 2.0  # time for all processes after Ctrl-C; in all 3 s are promised
-SILENT_S = 10.0  # after which a world that has printed nothing is reported; it takes 1 s, and compiles with a notice
-QUIET_WORLD_S = 1.8  # a world that stands still shows its clock once a second; so a stop is reported within 2 s
-TAKE_OVER_S = 60.0  # after which a replaced process is killed; a slow successor starts in half the time
-RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; with more, restarts do not help
-RESTART_WINDOW_S = 20.0
-SUPERSEDED = 3  # exit code of a role that another process of its name has replaced
-UNREAD = "the output is no longer read"  # as by `zsim run … | head`
-OUTPUT_LOOK_S = 0.1  # between two checks whether the output is read
+INTERRUPT_S = 2.0  # time for all processes to end after Ctrl-C; 3 s in all are promised
+SILENT_S = 10.0  # time after which a silent world is reported; it takes 1 s to start, and announces that it compiles
+QUIET_WORLD_S = 1.8  # time after which the world counts as silent; it shows its clock every second, even while waiting
+TAKE_OVER_S = 60.0  # time after which a replaced process is killed; a slow successor starts in half of it
+RESTART_WINDOW_S = 20.0  # period in which restarts of a process are counted
+OUTPUT_LOOK_S = 0.1  # interval between checks whether the output is read
+
+RESTARTS_MAX = 5  # restarts of a process within RESTART_WINDOW_S; if it needs more, restarts do not help
+SUPERSEDED = 3  # exit code of a role whose name another process has taken over
+UNREAD = "the output is no longer read"  # for example by `zsim run … | head`
 
 
 class RunProcess(Protocol):
     name: str
     role: str
     restarts: int
-    is_program: bool  # a user's program: its pid differs from the one with which it joins
+    is_program: bool  # whether it is a user's program, whose pid here may differ from the one with which it joins
 
     @property
     def pid(self) -> int: ...
@@ -62,7 +64,7 @@ def end_text(code: int | None, last_line: str) -> str:
 
 
 def last_line(log: Path) -> str:
-    """Return the last line of a log, empty if there is none."""
+    """Return the last line of a log; empty if the log is missing or empty."""
     try:
         lines = log.read_text(errors="replace").strip().splitlines()
     except OSError:
@@ -71,8 +73,8 @@ def last_line(log: Path) -> str:
 
 
 def status_row(role: str, host: str, pid: int, state: str, restarts: int = 0) -> dict[str, Any]:
-    figures = dict.fromkeys(("lag_ms", "messages_per_s", "round_trip_ms"))
-    return {"role": role, "host": host, "pid": pid or None, "state": state, "restarts": restarts, **figures}
+    unknown = dict.fromkeys(("lag_ms", "messages_per_s", "round_trip_ms"))
+    return {"role": role, "host": host, "pid": pid or None, "state": state, "restarts": restarts, **unknown}
 
 
 @dataclass
@@ -83,11 +85,11 @@ class Outcome:
 
 
 class Supervisor:
-    """Starts the processes of a run, supervises them, and ends them all; `show` takes progress."""
+    """Starts the processes of a run, supervises them, and ends them all; `show` takes the progress."""
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
-        self.members: list[RunProcess] = []  # must be set before `run`; includes the world
-        self.lasting: RunProcess | None = None  # continues after the run; the caller must stop and close it
+        self.members: list[RunProcess] = []  # all processes, with the world; must be set before `run`
+        self.lasting: RunProcess | None = None  # member that outlives the run; the caller must stop and close it
         self.clock: dict[str, Any] | None = None  # the world's last clock line
         self._deaths = DeathPolicy(processes)
         self._show = show
@@ -95,19 +97,19 @@ class Supervisor:
         self._failed = False
         self._flies = False
         self._interrupted: str | None = None
-        self._until_s: float | None = None
-        self._silent_s: float | None = None  # when a world without any output is reported (monotonic)
+        self._until_s: float | None = None  # monotonic time until which processes may leave
+        self._silent_s: float | None = None  # monotonic time at which a world without any output is reported
         self._dead: set[str] = set()
-        self._lost: dict[str, int | None] = {}  # pids of processes that ended without a bye
+        self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye, by name
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
-        self._gone: list[RunProcess] = []  # replaced processes that have ended or were killed
+        self._left: list[RunProcess] = []  # replaced processes that have ended or were killed
         self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
-        """Start all processes, supervise them to the end, and end them all; `look` is called at every poll.
+        """Start all processes, supervise them until the run ends, and end them all; call `look` at every poll.
 
-        Ctrl-C and SIGTERM end the run in order; a second Ctrl-C does not wait.
+        Ctrl-C and SIGTERM end the run in order; after a second signal, KeyboardInterrupt is raised without waiting.
         """
         if self._interrupted:
             return Outcome(self._interrupted, interrupted=True)
@@ -127,15 +129,15 @@ class Supervisor:
             finally:
                 while not self._requests.empty():
                     self._requests.get()[1].cancel()
-                replaced = [*(child for child, _ in self._leaving.values()), *self._gone]
+                replaced = [*(child for child, _ in self._leaving.values()), *self._left]
                 members = [*(child for child in self.members if child is not self.lasting), *replaced]
-                with ThreadPoolExecutor(len(members)) as pool:  # one that cannot be reached does not delay the others
+                with ThreadPoolExecutor(len(members)) as pool:  # an unreachable process must not delay the others
                     for closed in [pool.submit(member.close) for member in members]:
                         closed.result()
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the row of each process in `zsim ps`; callable from any thread."""
+        """Return the rows of the processes for `zsim ps`; callable from any thread."""
         rows = []
         for child in self.members:
             state = "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended"
@@ -170,7 +172,7 @@ class Supervisor:
         kind, subject, data = event["kind"], event.get("subject", ""), event.get("data", {})
         if kind == "end":
             self._reason = self._reason or event["text"]
-        elif kind == "overdue" and data.get("on_overdue") == "drop":  # it did not return; the run continues without it
+        elif kind == "overdue" and data.get("on_overdue") == "drop":  # the run continues without it
             self.submit(give_up)
         elif kind == "overdue" or (kind == "failure" and data.get("on_death") == "end"):
             self._fail(event["text"])
@@ -180,16 +182,16 @@ class Supervisor:
             self.submit(lambda: self._on_death(subject, data.get("pid")))
 
     def _on_death(self, name: str, pid: int | None) -> None:
-        """Restart a process that the world reports dead although its exit code did not show that.
+        """Restart a process that the world reports dead, although its exit code does not show that.
 
-        It was superseded by a process that is dead now, or has ended with code 0 without a bye, as by `os._exit(0)`.
+        It was superseded by a process that is now dead, or it ended with code 0 without a bye, as with `os._exit(0)`.
         """
         for child in self.members:
             if child.name == name and (child.pid == pid or child.is_program) and child.code in (0, None):
                 self._lost[name] = child.pid
                 self._dead.discard(name)
             elif child.name == name and child.code == SUPERSEDED and name in self._dead:
-                self._show.say(f"{name} is restarted, since the process that replaced it is dead")
+                self._show.say(f"{name} is restarted, because the process that replaced it is dead")
                 self._dead.discard(name)
                 child.restarts += 1
                 child.start()
@@ -214,7 +216,7 @@ class Supervisor:
                 if outcome.set_running_or_notify_cancel():
                     try:
                         outcome.set_result(act())
-                    except Exception as error:  # of any type: the run continues
+                    except Exception as error:  # whatever it is, the run continues
                         outcome.set_exception(error)
             while to_start and self._world_watch.last_s is not None:
                 to_start.pop().start()
@@ -238,7 +240,7 @@ class Supervisor:
         )
 
     def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
-        """Apply on_death to a role that ended while the world runs."""
+        """Apply `on_death` to a process that ended while the world runs."""
         is_superseded = child.code == SUPERSEDED and not child.is_program
         if is_superseded or (child.code == 0 and self._lost.get(child.name) != child.pid):
             self._dead.add(child.name)
@@ -253,7 +255,7 @@ class Supervisor:
             world.request_stop(self._reason)
 
     def _apply_on_death(self, child: RunProcess, flies: bool) -> OnDeath:
-        """Decide what to do after the death of a process; restart it if that is the decision."""
+        """Decide what to do after the death of a process, and restart it if so decided."""
         action, why = self._deaths.decide(child.name, child.code, flies)
         if child.role != "world" or action == "restart":
             self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
@@ -263,9 +265,9 @@ class Supervisor:
         return action
 
     def submit(self, act: Callable[[], Any]) -> Future[Any]:
-        """Call a function between two polls of the processes; callable from any thread.
+        """Have a function called between two polls of the processes; callable from any thread.
 
-        The outcome is cancelled if the run ends before.
+        The returned future is cancelled if the run ends before that.
         """
         outcome: Future[Any] = Future()
         self._requests.put((act, outcome))
@@ -275,24 +277,24 @@ class Supervisor:
         self._interrupted = self._interrupted or reason
 
     def replace(self, new: RunProcess) -> None:
-        """Start a process that replaces the one of its name, which then leaves or is killed.
+        """Start a process that replaces the one with the same name, which then leaves or is killed.
 
-        RunError while another replacement is in progress: the last one started might not be the last to join.
+        RunError while that one is itself replacing another: the last process started might not be the last to join.
         """
         self._release_replaced()
         if self.is_being_replaced(new.name):
-            raise RunError(f"{new.name} is already being replaced; try again when its former process has ended")
+            raise RunError(f"{new.name} is already being replaced; try again when the replaced process has ended")
         index = next(i for i, child in enumerate(self.members) if child.name == new.name)
         old, self.members[index] = self.members[index], new
         new.restarts = old.restarts + 1
         self._dead.discard(new.name)
         self._leaving[new.name] = (old, time.monotonic())
         if not old.pid:
-            old.kill()  # it waits for its host, and must not take the name back once that is reached
+            old.kill()  # it waits for its host, and must not take the name back when that is reached
         new.start()
 
     def is_being_replaced(self, name: str) -> bool:
-        """Return whether a process of this name was replaced and has not left yet; callable from any thread."""
+        """Whether a process of this name was replaced and has not left yet; callable from any thread."""
         return name in self._leaving
 
     def _release_replaced(self) -> None:
@@ -303,19 +305,19 @@ class Supervisor:
                 child.kill()
             if hangs or child.code is not None:
                 del self._leaving[name]
-                self._gone.append(child)
+                self._left.append(child)
 
     def _fail(self, reason: str, after_end: bool = False) -> None:
-        """Note a failure; `after_end`: it overrides an orderly end that was reported, but no interrupt."""
+        """Note a failure; `after_end`: it overrides an orderly end that was reported, but not an interruption."""
         if after_end and not self._failed and not self._interrupted:
             self._reason = ""
         self._reason, self._failed = self._reason or reason, True
 
     def _finish(self) -> None:
-        """Let all processes leave; the recorder leaves last, by itself."""
+        """Let all processes leave; after an orderly end the recorder leaves last, by itself."""
         members = [child for child in self.members if child is not self.lasting]
         programs = [child for child in members if child.is_program and child.name not in self._dead]
-        for program in programs:  # one may have died after the last poll
+        for program in programs:  # they may have died since the last poll
             if program.code and self._deaths.decide(program.name, program.code, self._flies).action == "end":
                 self._fail(f"{program.name} ended: {program.outcome()}", after_end=True)
         for child in members:
@@ -332,7 +334,7 @@ class Supervisor:
             self._fail(f"the recorder ended: {recorder.outcome()}", after_end=True)
 
     def _left_s(self) -> float:
-        """Return the remaining time for the processes to leave; Ctrl-C shortens it."""
+        """Return the wall time that the processes still have to leave; Ctrl-C shortens it."""
         now_s = time.monotonic()
         latest_s = now_s + (INTERRUPT_S if self._interrupted else END_S)
         self._until_s = latest_s if self._until_s is None else min(self._until_s, latest_s)
@@ -345,19 +347,19 @@ class DeathDecision(NamedTuple):
 
 
 class DeathPolicy:
-    """Decides on restarts, from the scenario and the number of deaths of a process."""
+    """Decides what follows the death of a process, from the scenario and the number of its deaths."""
 
     def __init__(self, processes: Processes) -> None:
         self._processes = processes
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
 
     def decide(self, name: str, code: int | None, flies: bool) -> DeathDecision:
-        """Count the death of a process; return what to do, and why. `flies`: the run has begun."""
+        """Count the death of a process, and return what to do and why; `flies`: whether the run has begun."""
         processes, role = self._processes, name.partition(".")[0]
         action = on_death(processes.on_death, name)
         if action == "end":
             return DeathDecision("end", "on_death: end")
-        is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # by the scenario itself
+        is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # the scenario decides
         ends, why = False, ""
         if code == USER_FAULT and not is_settled:
             ends, why = is_needed(name), "a restart would not help"
@@ -371,29 +373,29 @@ class DeathPolicy:
         overdue = on_overdue(processes.on_overdue or {}, name, gating=processes.gating or ())
         ends = ends or overdue == "end" or processes.gates(role)
         is_awaited = not flies and not is_needed(name) and name in (processes.expect or ())
-        if ends or is_awaited:  # a run that has not begun would wait for it indefinitely
+        if ends or is_awaited:  # a run that has not begun would wait for an expected process indefinitely
             return DeathDecision("end", f"{why}; the run ends")
         return DeathDecision("drop", f"{why}; it is dropped, and the run continues without it")
 
 
 class WorldWatch:
-    """Detects when the world falls silent: a stopped process cannot report that itself.
+    """Detects that the world has fallen silent, which a stopped process cannot report itself.
 
-    It is not considered silent before its first line, because it may be compiling.
+    The world does not count as silent before its first line, because it may be compiling.
     """
 
     def __init__(self) -> None:
-        self.last_s: float | None = None  # time of the world's last line (monotonic); set by any thread
+        self.last_s: float | None = None  # monotonic time of the world's last line; set by any thread
         self._is_silent = False
         self._ends_for: list[str] = []
 
     def clock(self, line: dict[str, Any]) -> None:
-        """Remember the processes that an ended world waits for: its links close when they have read everything."""
+        """Remember the processes for which an ended world waits: its links close once they have read everything."""
         if line.get("state") == "stopped":
             self._ends_for = [each["name"] for each in line.get("waiting_for", ())]
 
     def change(self, now_s: float, pid: int) -> str | None:
-        """Return a line when the world has fallen silent or is back, None otherwise."""
+        """Return a line when the world has fallen silent or is back; otherwise None."""
         if self.last_s is None or self._is_silent == (now_s - self.last_s >= QUIET_WORLD_S):
             return None
         self._is_silent = not self._is_silent
@@ -401,17 +403,17 @@ class WorldWatch:
             return f"world (pid {pid}) is back"
         if self._ends_for:
             named = ", ".join(self._ends_for)
-            return f"world (pid {pid}) has ended and waits for {named}: stopped, or out of reach"
+            return f"world (pid {pid}) has ended and waits for {named}: stopped or out of reach"
         silent_s = now_s - self.last_s
         go_on = f"kill -CONT {pid} continues it"
         return f"world (pid {pid}) shows no sign of life for {silent_s:.1f} s: it is stopped ({go_on}) or out of reach"
 
 
 class EndSignals:
-    """A context that handles SIGTERM and SIGHUP; under nohup SIGHUP stays ignored.
+    """A context that handles SIGTERM and SIGHUP; SIGHUP stays ignored under nohup.
 
-    Nothing is raised for a closed terminal, since shells send SIGHUP more than once: `hung_up` is called, and further
-    output goes to the file `log`.
+    SIGTERM raises KeyboardInterrupt. SIGHUP, for a closed terminal, raises nothing, because shells send it more than
+    once: `hung_up` is called, and further output goes to the file `log`.
     """
 
     def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:

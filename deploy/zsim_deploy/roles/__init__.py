@@ -1,1 +1,1 @@
-"""The roles as processes, and how they are stopped. Imports arguments, and the packages that hold what they run."""
+"""The roles as processes, and how these are stopped. Imports arguments, and the packages of what they run."""

@@ -1,6 +1,6 @@
-"""Handles output that can no longer be read or written: a closed terminal, a broken pipe, a full disk.
+"""Handles output that is no longer read or cannot be written: a closed terminal, a broken pipe, a full disk.
 
-It imports nothing that opens files: `renew_streams` is called before anything else.
+This module imports nothing that opens files, because `renew_streams` must be called before any file is opened.
 """
 
 import contextlib
@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-STREAMS = 1, 2  # standard output and error
+STREAMS = 1, 2  # file descriptors of standard output and error
 CLOSED = "the terminal was closed"
 
 
 class _Output(io.FileIO):
-    """A standard stream that drops output that cannot be written; only a broken pipe is raised."""
+    """A standard stream that drops output which cannot be written; only BrokenPipeError is raised."""
 
     _lost = False
 
@@ -27,7 +27,7 @@ class _Output(io.FileIO):
             return super().write(data)
         except BrokenPipeError:
             raise
-        except OSError as error:  # a full disk, a terminal that is gone
+        except OSError as error:  # a full disk, a closed terminal
             if not self._lost and self.fileno() != STREAMS[-1]:
                 write_error(f"standard output cannot be written ({error.strerror}); further output is lost")
             self._lost = True
@@ -35,7 +35,7 @@ class _Output(io.FileIO):
 
 
 def write_error(text: str) -> None:
-    """Write a line to standard error without Python's stream, for signal handlers; it may be lost."""
+    """Write a line to standard error, bypassing Python's stream, as signal handlers must; the line may be lost."""
     with contextlib.suppress(OSError):
         os.write(STREAMS[-1], f"{text}\n".encode(errors="replace"))
 
@@ -43,7 +43,7 @@ def write_error(text: str) -> None:
 def renew_streams() -> None:
     """Reopen Python's standard streams, so that nothing fails because one is closed or its disk is full.
 
-    Must be called before any file is opened, which would get the number of a closed stream, and so its output.
+    Must be called before any file is opened: that file would get the descriptor of a closed stream, and so its output.
     """
     for number in (0, *STREAMS):
         try:
@@ -71,14 +71,14 @@ def is_unread(stream: int) -> bool:
 
 
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
-    """Redirect further output to a terminal or pipe that may be gone into a file."""
+    """Redirect further output, meant for a terminal or pipe that may be closed, to a file."""
     try:
         into = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     except OSError:
         into = os.open(os.devnull, os.O_WRONLY)
     lost = []
     for stream in streams:
-        with contextlib.suppress(OSError):  # not open at all
+        with contextlib.suppress(OSError):  # the stream is not open at all
             lost += [] if stat.S_ISREG(os.fstat(stream).st_mode) else [stream]
     if lost:
         write_error(f"{why}; further output is in {log}")

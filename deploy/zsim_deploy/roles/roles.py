@@ -1,4 +1,4 @@
-"""The roles of a run as processes: agents, recorder, router, and those that serve one run after the other.
+"""The roles of a run as processes: agents, recorder, router, and those that serve one run after another.
 
 The latter (`serve_runs`) are console, gateway, bridges, drivers, cameras and detectors. The world is in `world_role`.
 """
@@ -54,28 +54,28 @@ from zsim_deploy import USER_FAULT
 from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel, lower_priority
 
-RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # a run id that may be part of a folder's name
-PATTERN = "*?["  # special characters of patterns; fnmatch
-ANY = "*"  # in a process name, for a number
-TICK_S = 0.1  # polling interval of a router for a stop
-PROBE_S = 1.0  # how often a router that cannot connect upstream checks for the reason
-PAUSE_S = 0.2  # polling interval of a world whose run has ended and that waits for byes
-JOINS_MAX = 10_000  # remembered by a router, since names can be made up
-SLACK_GATES = 3  # a picture between two gates needs the second; one more lets world and cameras work in parallel
+RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # run ids that may be part of a folder's name
+PATTERN = "*?["  # special characters in patterns; fnmatch
+ANY = "*"  # stands for a number in a process name
+TICK_S = 0.1  # interval at which a router checks for a stop, wall time
+PROBE_S = 1.0  # interval at which a router that cannot connect upstream checks for the reason, wall time
+PAUSE_S = 0.2  # polling interval of a world whose run has ended and that waits for byes, wall time
+JOINS_MAX = 10_000  # joins remembered by a router; limited because names can be made up
+SLACK_GATES = 3  # an image between two gates needs the second one; one more lets world and cameras work in parallel
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
 Build = Callable[[Info, Scenario], Agent]
 Serve = Callable[[Session, Info, Participant, Stopped, Say], None]
-"""Serves one run with (session, info, participant, stopped, say), until the run is over or the process stopped."""
+"""Serves one run with (session, info, participant, stopped, say), until the run is over or the process is stopped."""
 StandsFor = Callable[[Info], tuple[str, ...]]  # names of the processes that a process replaces in a run
-SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0 for one that never gates
+SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0 if it does not wait for it
 Remain = Callable[[Callable[[], str | None], Callable[[], bool]], None]
-"""Called after a run with (reason, deserted); returns once there is a reason to stop, at once if deserted."""
+"""Called after a run with (reason, deserted); returns when there is a reason to stop, at once if deserted."""
 
 
 def log_printer(launched: str | None) -> Say:
-    """Return a function that prints a line on standard error; with the time in a launched process, as in a log."""
+    """Return a function that prints a line on standard error, with the time in a launched process, as for a log."""
 
     def say(text: str) -> None:
         if launched is not None:
@@ -86,9 +86,9 @@ def log_printer(launched: str | None) -> Say:
 
 
 def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
-    """Run one agent in the run of a world; `name`: of the process, if known in advance.
+    """Run one agent in the run of a world; `name`: that of the process, if known in advance.
 
-    UserCodeError if a user's class raised, or returned something unusable.
+    UserCodeError if a user's class raised an exception, or returned something unusable.
     """
     launched, who = reach.launched, reach.who._replace(process=name)
     stop = StopChannel(launched, who)
@@ -100,7 +100,7 @@ def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
             scenario = scenario_file.from_text(info.scenario)
             member = build(info, scenario)
             check_certificate(member, who)
-            also = f", and stands for {', '.join(member.serves)}" if member.serves else ""
+            also = f", and replaces {', '.join(member.serves)}" if member.serves else ""
             say(f"{member.name}: in run {info.run_id}{also}")
             gc.collect()
             gc.freeze()
@@ -113,16 +113,16 @@ def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
         print(printable(str(error)), file=sys.stderr)
         if (raised := plugin.raised_by_user(error)) is not None:
             print(printable("".join(format_exception(raised, chain=False))), end="", file=sys.stderr)
-        sys.exit(USER_FAULT)  # so that its launcher does not restart it
+        sys.exit(USER_FAULT)  # so that the launcher does not restart it
     say(f"{member.name}: left, {reason}")
-    if runner.killed:  # end as by kill -9, so that the launcher sees it die; Windows has no SIGKILL
+    if runner.killed:  # end as by kill -9, so that the launcher sees a death; Windows has no SIGKILL
         os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
     stop.exit_if_terminated()
 
 
 def agent_of(role: str, names: Sequence[str]) -> Build:
-    """Return a function that makes the agent of a role for drones or clusters, by name or by patterns like `drone*`."""
-    agent_class(role)  # loaded before the world is reached
+    """Return a function that makes the agent of a role for drones or clusters; `names` may have patterns (`drone*`)."""
+    agent_class(role)  # imports its modules before the world is reached
 
     def build(info: Info, scenario: Scenario) -> Agent:
         wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
@@ -137,7 +137,7 @@ def host(names: Sequence[str]) -> Build:
 
 
 def recorder(out: Path, reach: WorldAccess) -> None:
-    """Record the run of a world into a folder, whose name may contain RUN_ID; RecordError if that is not possible."""
+    """Record the run of a world into a folder, whose name may contain RUN_ID; RecordError if it cannot be written."""
     from zsim.output_folder import RECORD
     from zsim.record.completeness import record_completeness
     from zsim_agents.recorder import Recorder
@@ -170,7 +170,7 @@ def record_folder(out: Path, run_id: str) -> Path:
 
 
 def make_folder(folder: Path) -> None:
-    with file_fault(folder, "cannot be made", OTHER_OUT, RecordError):
+    with file_fault(folder, "cannot be created", OTHER_OUT, RecordError):
         folder.mkdir(parents=True, exist_ok=True)
 
 
@@ -197,10 +197,10 @@ def router(
 
 
 class RouterLinks:
-    """Watches the links of a router, because readers that stop reading would block the world through it.
+    """Watches the links of a router, because a client that stops reading would block the world through it.
 
-    A router does not know the run. Processes that the run does not wait for are known by their join, or by having no
-    token of their session.
+    A router does not know the run. It recognizes the processes that the run does not wait for by their join, or by the
+    absence of a token for their session.
     """
 
     def __init__(self, link: Session, say: Say) -> None:
@@ -231,7 +231,7 @@ class RouterLinks:
         while self.watch.closed:
             closed = self.watch.closed.popleft()
             names = ", ".join(closed.names) or "no process of the run"
-            what = f"took nothing of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
+            what = f"read none of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
             self._say(f"{closed.process or 'an unnamed client'} at {closed.address} ({names}) {what}")
 
 
@@ -243,18 +243,18 @@ def serve_runs(
     slack_ns: SlackNs = lambda info: 0,
     remain: Remain | None = None,
 ) -> None:
-    """Serve one run after the other of the world on an endpoint, until stopped; a launched process serves only one.
+    """Serve one run after another of the world on an endpoint, until stopped; a launched process serves only one.
 
     Args:
-        name: of the process; `role.*` for the first free number, kept until another process takes it.
-        stands_for: returns the processes that it replaces in a run.
-        slack_ns: how far the world of a run may be ahead of it; 0 for a process that never gates.
-        remain: called after the run of its launcher.
+        name: of the process; `role.*`: the role with the first free number, kept until another process takes it.
+        stands_for: returns the names of the processes that it replaces in a run.
+        slack_ns: returns how far the world of a run may be ahead of it; 0 if the world does not wait for it.
+        remain: called after the run, if the process is launched.
 
     Raises:
-        NoWorldError: there was no first world within `wait_s`.
-        SupersededError: another process of the given name has taken over.
-        SystemExit: it is launched, and was not ended by its launcher.
+        NoWorldError: no world was found within `wait_s` of the start.
+        SupersededError: another process has taken over the given name.
+        SystemExit: the process is launched, and was ended by SIGTERM from elsewhere than its launcher.
     """
     launched, wait_s = reach.launched, reach.wait_s
     who = reach.who._replace(process="" if name.endswith(ANY) else name)
@@ -276,7 +276,7 @@ def serve_runs(
                     try:
                         _serve(serve, link, participant, info, stop, say)
                         served = info.run_id
-                    except NoWorldError as error:  # the world ended just as this process joined
+                    except NoWorldError as error:  # the world ended while this process was joining
                         if launched:
                             raise
                         say(str(error))
@@ -305,7 +305,7 @@ def _serve(serve: Serve, link: Session, participant: Participant, info: Info, st
     try:
         serve(link, info, participant, stop.stopped, say)
     except ZsimError as error:
-        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would consider it dead
+        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would count it as dead
         raise
     reason = participant.end_reason or stop.reason() or "stopped"
     participant.leave(reason)
@@ -315,10 +315,10 @@ def _serve(serve: Serve, link: Session, participant: Participant, info: Info, st
 def serve_pictures(
     role: str, drones: Sequence[str], name: str, reach: WorldAccess, diameter_m: float | None = None
 ) -> None:
-    """Serve one run after the other as a camera or a detector of some drones, by name or by patterns.
+    """Serve one run after another as a camera or a detector of drones, given by names or patterns.
 
-    RunError if a run has no such drone. The pictures of a detector may come from outside zsim; it looks for hats of
-    `diameter_m`, None: the scenario's.
+    `diameter_m`: of the hats for which a detector looks; None: the scenario's. A detector's images may come from
+    outside zsim. RunError if a run has no such drone.
     """
 
     def drones_of(scenario: Scenario) -> list[str]:
@@ -334,10 +334,10 @@ def serve_pictures(
         scenario = scenario_file.from_text(info.scenario)
         own = drones_of(scenario)
         if role == "camera":
-            say(f"{participant.name}: draws for {', '.join(own)}")
+            say(f"{participant.name}: renders the cameras of {', '.join(own)}")
             CameraProcess(link, info, participant, scenario, own).run(stopped)
         else:
-            say(f"{participant.name}: looks at the pictures of {', '.join(own)}")
+            say(f"{participant.name}: looks for hats in the images of {', '.join(own)}")
             hats = scenario.environment.hats
             diameter = diameter_m or (Hats() if hats is UNSET else hats).diameter_m
             DetectorProcess(link, participant, say, own, diameter).run(stopped)
@@ -346,7 +346,7 @@ def serve_pictures(
         return tuple(f"{role}.{drone}" for drone in drones_of(scenario_file.from_text(info.scenario)))
 
     def slack_ns(info: Info) -> int:
-        """Return how far the world may be ahead; 0 if it is not waited for, as in a replay."""
+        """Return how far the world may be ahead; 0 if it does not wait for this process, as in a replay."""
         gates = not info.replay_of and scenario_file.from_text(info.scenario).gates(role)
         return SLACK_GATES * info.gate_ns if gates else 0
 
@@ -356,12 +356,15 @@ def serve_pictures(
 
 
 def process_of(role: str, names: Sequence[str]) -> str:
-    """Return the process name of the agent of one drone or cluster; empty for patterns or several."""
+    """Return the process name of a role for one drone or cluster; empty for several, or for a pattern."""
     return f"{role}.{names[0]}" if len(names) == 1 and not set(names[0]) & set(PATTERN) else ""
 
 
 def process_name(role: str, name: str, who: Identity, thing: str = "main") -> str:
-    """Return a process's name: as given, its certificate's, or the role's; SessionError if that cannot be used."""
+    """Return the name of a process: `name` if given, else its certificate's, else ROLE.THING.
+
+    SessionError if the certificate cannot be used.
+    """
     if name or who.tls is None:
         return name or f"{role}.{thing}"
     if fault := tls.own_fault(who):
@@ -370,14 +373,14 @@ def process_name(role: str, name: str, who: Identity, thing: str = "main") -> st
 
 
 def check_certificate(member: Agent, identity: Identity) -> None:
-    """Refuse to publish for other processes if access control would drop that silently."""
+    """Raise RunError for an agent whose messages access control would drop silently: those of other processes."""
     if not identity.tls:
         return
     if member.serves:
         others = ", ".join(member.serves)
         raise RunError(
             f"{member.name}: a certificate is for one process, but this one also replaces {others}; "
-            "run each separately, or without TLS"
+            "run each of them separately, or without TLS"
         )
     if fault := tls.own_fault(identity._replace(process=member.name)):
         raise RunError(fault)

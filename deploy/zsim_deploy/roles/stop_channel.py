@@ -1,12 +1,12 @@
 """How a process is stopped: by a signal, by its launcher, or because the launcher has died.
 
-A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
+The standard input of a launched process is a pipe from its launcher. The launcher writes "stop REASON"; when it dies,
 the pipe closes. So no process outlives its launcher, on any system, even after kill -9. A launcher on another host
-writes "orphan-after SECONDS" and then a "beat" every second, since the loss of a host closes no pipe. A launched
-process that receives SIGTERM instead also ends in order, but counts as dead: its launcher did not ask for it.
+writes "orphan-after SECONDS" and then a "beat" every second, because the loss of a host closes no pipe. A launched
+process that receives SIGTERM also ends in order, but counts as dead, because its launcher did not request that.
 
-When the process ends, it removes the private key that `zsim up` has copied to its host. This file also has
-`lower_priority`, for processes that no gate waits for.
+A process that ends removes the private key that `zsim up` has copied to its host. This file also has `lower_priority`,
+for processes that no gate waits for.
 """
 
 import atexit
@@ -30,22 +30,22 @@ REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTER
 HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # not on Windows
 TWICE_INTERRUPTED = "interrupted twice, ended without waiting"
 TERMINATED = 128 + signal.SIGTERM  # exit code, as in shells
-GRACE_S = 4.0  # after which a role that hangs after a request to stop is ended
-FOLDER = "identity"  # folder of the certificates below that of a run on a host
-NICE = 5  # of processes that no gate waits for
+GRACE_S = 4.0  # wall time for a role to end after a request to stop; then it is killed or interrupted
+FOLDER = "identity"  # folder of the certificates, below the folder of a run on a host
+NICE = 5  # nice value of processes that no gate waits for
 AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
-TRIES = 5
-AGAIN_S = 0.12  # the kernel allows all ordinary users together ten writes a second
+TRIES = 5  # attempts to write AUTOGROUP
+AGAIN_S = 0.12  # wall time between these; the kernel allows all ordinary users together ten writes a second
 
 
 class StopChannel:
-    """The reason to stop, once there is one.
+    """Receives the request to stop a process, and holds its reason.
 
     Args:
-        launched: id of the run that the process is part of. Then standard input is its launcher's pipe, and Ctrl-C is
-            left to the launcher. None if it was started by hand.
-        identity: its key, if leased, is removed as soon as the launcher is gone.
-        held_by: for a process that runs a user's code itself: returns, from a frame of the main thread, which code is
+        launched: id of the run that the process is part of: standard input is the pipe from its launcher, and Ctrl-C is
+            left to the launcher. None: started by hand.
+        identity: of the process; its key, if copied here by the launcher, is removed as soon as the launcher is lost.
+        held_by: for a process that itself runs a user's code: returns, for a frame of the main thread, which code is
             running. If `reason` is not called within GRACE_S, or the user presses Ctrl-C again, KeyboardInterrupt is
             raised in that code.
     """
@@ -67,7 +67,7 @@ class StopChannel:
             threading.Thread(target=self._read, name="stop channel", daemon=True).start()
         else:
             handlers = {signal.SIGTERM: lambda *_: self._stop("terminated"), signal.SIGINT: self._on_interrupt}
-            # unless ignored, as under nohup, or already handled
+            # SIGHUP is left alone if it is ignored, as under nohup, or already handled.
             fatal = (number for number in HANGUP if signal.getsignal(number) is signal.SIG_DFL)
             handlers |= dict.fromkeys(fatal, self._on_hangup)
         for number, handler in handlers.items():
@@ -82,16 +82,16 @@ class StopChannel:
         return self._reason is not None
 
     def orphaned(self) -> bool:
-        """Return whether the launcher is gone, or did not ask for this end: others then see a death, not a leave."""
+        """Whether the launcher is lost, or did not request this end; to others it must then look like a death."""
         return self._orphaned
 
     def exit_if_terminated(self) -> None:
-        """Exit, at the very end, with the code that tells the launcher that SIGTERM came from someone else."""
+        """Exit, at the very end, with the code that tells the launcher that SIGTERM came from elsewhere."""
         if self._terminated:
             raise SystemExit(TERMINATED)
 
     def restore_signals(self) -> None:
-        """Restore the former signal handlers, so that the remaining work can be interrupted as usual."""
+        """Restore the previous signal handlers, so that the remaining work can be interrupted as usual."""
         self._is_heeded.set()
         for number, handler in self._former.items():
             signal.signal(number, handler)
@@ -104,9 +104,9 @@ class StopChannel:
     def _insist(self) -> None:
         if self._is_heeded.wait(GRACE_S):
             return
-        if hasattr(signal, "pthread_kill"):  # also wakes the main thread where it sleeps
+        if hasattr(signal, "pthread_kill"):  # also wakes the main thread if it sleeps
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        else:  # Windows, where Python handles a signal of any thread in the main one
+        else:  # Windows, where Python handles a signal from any thread in the main one
             signal.raise_signal(signal.SIGINT)
 
     def _on_kill(self, *_: object) -> None:
@@ -115,7 +115,7 @@ class StopChannel:
         self._stop(REASONS[signal.SIGTERM])
 
     def _on_hangup(self, *_: object) -> None:
-        """End as after SIGTERM, without writing to a terminal that may be gone."""
+        """End as after SIGTERM, without writing to a terminal that may be closed."""
         redirect_output(Path(os.devnull))
         self._stop(CLOSED)
 
@@ -148,12 +148,12 @@ class StopChannel:
             self._lease.release()
         self._stop(reason)
         time.sleep(GRACE_S)
-        write_error(f"{reason}; this process did not end within {GRACE_S:g} s and is ended")
+        write_error(f"{reason}; this process did not end within {GRACE_S:g} s and is killed")
         os._exit(1)
 
 
 class KeyLease:
-    """A key that was copied to this host for this process, and is removed when the process ends for any reason."""
+    """A key that was copied to this host for this process; it is removed when the process ends for any reason."""
 
     def __init__(self, folder: Path) -> None:
         self._key = folder / KEY
@@ -161,14 +161,14 @@ class KeyLease:
         atexit.register(self.release)
 
     def release(self) -> None:
-        """Remove the key, but not a newer one at its path, which belongs to its successor."""
+        """Remove the key, but not a newer one at its path, which belongs to the process's successor."""
         with contextlib.suppress(OSError):
             if _stamp(self._key) == self._stamp:
                 self._key.unlink(missing_ok=True)
 
 
 def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
-    """Return the lease of a key that the launcher of a run has copied here; None if the key is this host's own."""
+    """Return the lease of the key that the launcher of a run has copied here; None if the key is this host's own."""
     folder = identity.tls
     if launched is None or folder is None or folder.parts[-3:-1] != (launched, FOLDER):
         return None
@@ -176,7 +176,7 @@ def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """Return an identifier that distinguishes a file from a newer one at its path; None if there is no file."""
+    """Return inode and change time [ns], which distinguish a file from a newer one at its path; None without a file."""
     try:
         status = path.stat()
     except OSError:
@@ -186,7 +186,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 @contextmanager
 def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Handle interrupts and SIGTERM by a function, and restore the former handlers afterwards."""
+    """Handle SIGINT and SIGTERM with a function for the duration of the block."""
     former = {number: signal.signal(number, handler) for number in REASONS}
     try:
         yield
@@ -197,27 +197,27 @@ def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGINT or SIGTERM, even if a library swallows it and fails in another way."""
-    asked = False
+    """Raise KeyboardInterrupt on SIGINT or SIGTERM, even if a library swallows it and raises another exception."""
+    is_interrupted = False
 
     def on_signal(*_: object) -> None:
-        nonlocal asked
-        asked = True
+        nonlocal is_interrupted
+        is_interrupted = True
         raise KeyboardInterrupt
 
     with handled_by(on_signal):
         try:
             yield
         except Exception as error:
-            if asked:
+            if is_interrupted:
                 raise KeyboardInterrupt from error
             raise
 
 
 def lower_priority() -> None:
-    """Give the world precedence: raise the nice value of this process, and of its session if it leads one.
+    """Give the world precedence: raise the nice value of this process, and that of its session if it leads one.
 
-    If Linux schedules by session (autogroup), nice values count only within a session.
+    Where Linux schedules by session (autogroup), the nice values of processes count only within a session.
     """
     if hasattr(os, "nice"):
         os.nice(NICE)

@@ -1,8 +1,9 @@
-"""Compiles the kernels of a run in advance, so that runs on this machine start at once.
+"""Compiles the kernels of a run in advance, so that runs on this machine start without delay.
 
-    python -m zsim_deploy.roles.warm_up EXTRA...    for the roles that need these extras; `zsim push` runs it on a host
+    python -m zsim_deploy.roles.warm_up EXTRA...
 
-Without numba there is nothing to compile. As a program it prints the name of each function that it compiles.
+compiles those of the roles that need these extras, and prints the name of each function; `zsim push` runs it on hosts.
+Without numba there is nothing to compile.
 """
 
 import importlib.util
@@ -23,17 +24,18 @@ from zsim.math.randomness import normal_quantile
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 
-SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of each kind of cluster; each kind has its own code
-ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # one is enough
-NESTED = ("groups", 2, 3)  # name, groups, drones of each
-WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras that include the world; pyproject.toml
+SIZES = {"pair": 2, "triad": 3, "template": 5}  # number of drones, by kind of cluster; each kind has its own kernels
+# scenario for the world, whose kernels are the same for any number of drones
+ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}
+NESTED = ("groups", 2, 3)  # a cluster of groups: its name, number of groups, drones per group
+WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras with which the world runs; pyproject.toml
 WITH_AGENTS = WITH_WORLD | {"agents"}
 WITH_CAMERAS = {"cameras"}
-APART_M = 4.0  # radius of circles, so that no formation is collinear
+RADIUS_M = 4.0  # radius of the circle of each formation, so that none is collinear; any value well above zero
 
 
 def main(extras: Collection[str]) -> None:
-    """Build the world and one agent of each kind, if these extras need them, which compiles their kernels."""
+    """Compile the kernels by building the world and an agent of each kind, as far as the extras include them."""
     if importlib.util.find_spec("numba") is None:
         return
     if WITH_WORLD & {*extras}:
@@ -53,7 +55,7 @@ def main(extras: Collection[str]) -> None:
 
 
 def _compile_mathematics() -> None:
-    """Call the functions that scenarios, laws and references may use, beyond those of the formations below."""
+    """Call the functions that scenarios, laws and references may use, but the formations below do not."""
     for function in (el.sin, el.cos, el.tan, el.asin, el.acos, el.atan, el.exp, el.log, el.log1p, el.square):
         function(0.5)
     for function in (el.atan2, el.power, el.hypot):
@@ -67,7 +69,7 @@ def _compile_mathematics() -> None:
 
 
 def _info(scenario: Scenario) -> Info:
-    """Return a `world/info` with which agents are made without a world, whose kernel their host does not need."""
+    """Return a `world/info` for making agents without a world, so that the world's kernel need not be compiled."""
     time = scenario.time
     drones = tuple(DroneInfo(drone.name, drone.model) for drone in scenario.drones)
     clusters = tuple(ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in scenario.clusters)
@@ -85,7 +87,7 @@ def formations() -> dict[str, Any]:
     clusters: list[dict[str, Any]] = [{"name": kind, "drones": drones} for kind, drones in names.items()]
     clusters[-1]["groups"] = [{"name": f"g{i}", "size": size} for i in range(groups)]
     drones = [
-        {"name": name, "position_m": [APART_M * math.cos(i), APART_M * math.sin(i) + 4 * APART_M * row, 0.0]}
+        {"name": name, "position_m": [RADIUS_M * math.cos(i), RADIUS_M * math.sin(i) + 4 * RADIUS_M * row, 0.0]}
         for row, each in enumerate(names.values())
         for i, name in enumerate(each)
     ]
@@ -93,11 +95,11 @@ def formations() -> dict[str, Any]:
 
 
 def _show_compilation() -> None:
-    """Print a line when a function called from Python is compiled, but not when it is loaded from disk."""
+    """Print a line for each function called from Python that is compiled, not for those loaded from disk."""
     from numba.core import event
 
     class Shown(event.Listener):
-        """Prints the outermost compilation, without those of the functions that it calls."""
+        """Prints the outermost function being compiled, not those that it calls."""
 
         depth = 0
 

@@ -1,4 +1,4 @@
-"""The central process of a run: the world of a scenario, or a record played back in its place."""
+"""The central process of a run: the world of a scenario, or a record that is played back in its place."""
 
 import gc
 import time
@@ -24,9 +24,9 @@ from zsim_deploy.roles.stop_channel import StopChannel
 if TYPE_CHECKING:
     from zsim_world.run.playback import PlaybackRange
 
-SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
-HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but a process may publish more often
-VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # always shown
+SHOWN_EVENTS = 2000  # events shown per run, besides those of VITAL kinds; the record has all of them
+HEALTH_PERIOD_S = 0.5  # minimum interval at which the health of a process is shown; contract: 1 Hz, but some send more
+VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # kinds of events that are always shown
 
 
 def world(
@@ -41,10 +41,20 @@ def world(
     all_died: bool = False,
     changed: Sequence[str] | None = None,
 ) -> None:
-    """Run the world of a scenario on the endpoints until the scenario ends or the process is stopped.
+    """Run the world of a scenario on endpoints until the scenario ends or the process is stopped.
 
-    `journal`: its folder; `all_died`: all participants are restarted as well when it continues from the journal.
-    RunError if the journal is of another run; SessionError if an endpoint is in use, or the identity cannot be used.
+    Args:
+        rate: pace in simulated seconds per wall second; 0: as fast as possible.
+        launched: id of the run, if a launcher started this process.
+        expect: names of further processes to wait for.
+        journal: folder of the run's journal, from which a restarted world continues; None: no journal.
+        all_died: whether all participants are restarted as well when the world continues.
+        changed: overrides that the scenario contains, as values of `--set`.
+
+    Raises:
+        RunError: the journal is that of another run.
+        SessionError: an endpoint is in use, or the identity cannot be used.
+        RunFailedError: a process left early.
     """
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance
@@ -55,7 +65,7 @@ def world(
     clients = {*expected_processes(scenario), *(expect or ())}
     require_files(hub_files(len(clients)), f"a world of {len(clients)} processes")
     identity = identity._replace(process=WORLD)
-    connection.check_listening(endpoints, identity)  # before anything is compiled
+    connection.check_listening(endpoints, identity)  # fails before anything is compiled
     stop = StopChannel(launched, identity)
     text = "compiling the world's kernel; later runs on this machine find it compiled"
     if is_kept(advance):
@@ -83,12 +93,12 @@ def world(
         kept, show = RunJournal(journal, run_world.run_id, sha256, screen.say, all_died), WorldProgress(screen).show
         run(run_world, endpoints, stop.reason, show, lambda: screen.say(listening), identity, kept)
         screen.say(f"ended: {run_world.ended}")
-    if run_world.left_early:  # a launcher reads it from the record
+    if run_world.left_early:  # for a launched world, the launcher reads this from the record
         raise RunFailedError("; ".join(run_world.left_early))
 
 
 class WorldProgress:
-    """Filters the progress of a run; the world calls `show` with its clocks, events and so on."""
+    """Filters the progress of a run for a sink; the world calls `show` with its clocks, events and so on."""
 
     def __init__(self, sink: ProgressSink) -> None:
         self._sink = sink
@@ -96,7 +106,7 @@ class WorldProgress:
         self._healths = RateLimit(HEALTH_PERIOD_S)
         self._reasons = HoldReasons()
         self._shown = 0
-        self._links: dict[str, str] = {}  # states by drone
+        self._links: dict[str, str] = {}  # state of the link of each drone
 
     def show(self, kind: str, message: Any, about: str) -> None:
         sink = self._sink
@@ -129,18 +139,18 @@ class WorldProgress:
 class ReplayOptions(NamedTuple):
     """How to play a record."""
 
-    choice: "PlaybackRange"  # which part of it
-    rate: float  # simulated per wall seconds; 0 = as fast as possible
-    expect: tuple[str, ...]  # names of the processes that are waited for
-    endpoints: tuple[str, ...]  # on which it listens
+    choice: "PlaybackRange"  # the part to play
+    rate: float  # simulated seconds per wall second; 0: as fast as possible
+    expect: tuple[str, ...]  # names of the processes to wait for
+    endpoints: tuple[str, ...]  # endpoints to listen on
     federation: str | None = None  # None: that of the record
 
 
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:
-    """Play a record until it is over or the process is stopped.
+    """Play a record until its end, or until the process is stopped.
 
-    RunError or RecordError if there is no record, or nothing in it to play; SessionError if an endpoint is in use, a
-    key expression is invalid, or the identity cannot be used.
+    `place`: folder of a run, or its run.mcap. RunError or RecordError if there is no record, or it has nothing to play;
+    SessionError if an endpoint is in use, a key expression is invalid, or the identity cannot be used.
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run
@@ -154,7 +164,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
         for expression in options.choice.keys:
             if not any(keys.matches(expression, key) for key in reader.topics()):
                 known = ", ".join(list(reader.topics())[:20])
-                raise RunError(f"--keys is {expression!r}; must match a key on record: {known} …")
+                raise RunError(f"--keys is {expression!r}; must match a recorded key: {known} …")
         if options.federation is not None:
             federation = keys.name(options.federation, "federation")
             scenario = msgspec.structs.replace(scenario, federation=federation)

@@ -360,7 +360,7 @@ def test_an_interrupted_cell_ends_its_workers_keeps_its_own_folder_and_the_kerne
         reply = next(each for each in replies if each["parent_header"]["msg_id"] == sent)
         assert reply["content"]["ename"] == "KeyboardInterrupt"
         shown = iter(lambda: client.get_iopub_msg(timeout=PATIENCE_S)["content"], None)
-        folder = next(found[1] for each in shown if (found := re.search(r"out='([^']*)' goes on", str(each))))
+        folder = next(found[1] for each in shown if (found := re.search(r"out='([^']*)' continues", str(each))))
         assert psutil.wait_procs(workers, PATIENCE_S)[1] == []
         again = client.execute("assert 'frame' not in globals()", reply=True, timeout=PATIENCE_S)
         assert again["content"]["status"] == "ok"

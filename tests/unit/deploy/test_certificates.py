@@ -301,7 +301,7 @@ def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(lab: Path)
     for given in (None, places):
         found = check_hosts(placed, given)
         assert [line for line in found.faults if "certificate" in line] == []
-        assert any(has_terms(line, "read", "others") for line in found.warnings)
+        assert any(has_terms(line, "read", "other users") for line in found.warnings)
     shutil.rmtree(lab / "certs/h1/world")
     for given in (None, places):
         assert any(has_terms(line, "certificate missing", "world", "h1") for line in check_hosts(placed, given).faults)

@@ -87,7 +87,7 @@ def test_what_has_no_place_and_what_places_nobody_are_told_at_once(tmp_path: Pat
         places(tmp_path, step, {"world": "lab", "estimator.drone1": "one", "estimater.*": "two"})
     *lines, last = caught.value.faults
     for name, line in zip(("estimator.drone2", "estimator.drone3", "controller.main"), lines, strict=True):
-        assert has_terms(line, "hosts.yaml", "roles", "no place", name, repr(name))
+        assert has_terms(line, "hosts.yaml", "roles", "no host", name, repr(name))
     assert has_terms(last, "hosts.yaml", "roles.estimater.*", "'step'", "world", "recorder")
     own = scenario_file.load(ROOT / "scenarios/step.yaml", ["processes.expect=[my.drone1, recorder, controller.main]"])
     found = places(tmp_path, own, {"world": "lab", "my.*": "one", "controller.main": "two"})

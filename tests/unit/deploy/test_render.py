@@ -207,7 +207,7 @@ def test_a_program_of_the_user_s_own_is_told_of_and_not_started(target: str, tmp
     text = HOSTS.replace('"estimator.*": [one, two]', '"my.*": two')
     texts = TARGETS[target](placed(tmp_path, text), own)
     assert set(READ[target](texts)) == {"world", "recorder", "controller.main", "router.yard"}
-    remark = "# my.drone1 on two is a program of your own: start it yourself, it connects to tls/192.168.1.21:7448"
+    remark = "# my.drone1 on two is a program of your own: start it yourself; it connects to tls/192.168.1.21:7448"
     remarked = [path for path, text in texts.items() if remark in text.splitlines()]
     where = {"systemd": "two/zsim.target", "compose": "two/compose.yaml", "kubernetes": "zsim.yaml"}
     assert remarked == [where[target]]
@@ -230,7 +230,7 @@ def test_a_program_of_the_scenario_is_told_of_with_its_command(tmp_path: Path) -
 @ALL
 def test_a_process_without_a_place_is_refused(target: str, tmp_path: Path, step: Scenario) -> None:
     text = HOSTS.replace('"controller.*": two, ', "")
-    with refused(InventoryError, "roles", "no place", "controller.main"):
+    with refused(InventoryError, "roles", "no host", "controller.main"):
         TARGETS[target](placed(tmp_path, text), step)
 
 

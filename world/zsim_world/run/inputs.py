@@ -144,7 +144,8 @@ class Run:
         return handler
 
     def _refuse_key_of_world(self, sample: Sample, wall_ns: int) -> None:
-        raise DecodeError(f"{sample[0]}: only the world publishes here")
+        """Refuse a message that claims to be the world's; neither recorders nor replays get it."""
+        self.refuse_sample(sample, DecodeError(f"{sample[0]}: only the world publishes here"))
 
     def _keep_foreign(self, sample: Sample, wall_ns: int) -> None:
         """Keep a message on a key outside the contract."""
@@ -209,6 +210,14 @@ class Run:
         self.health.refused += 1
         self.world.outbox.refuse(source, key[:80], messages.fault_at(key, error))
 
+    def refuse_sample(self, sample: Sample, error: DecodeError) -> None:
+        """Refuse a message; if its sender is known, it is an output of that sender, whose done counts it."""
+        key, payload = sample
+        self.refuse("somebody", key, error)
+        with suppress(DecodeError):
+            head = _head(key, payload)
+            self.world.count_output(head.controller or head.source)
+
 
 # The entries; wall times are monotonic
 
@@ -235,10 +244,7 @@ class Taken(Entry, tag=0):
             handle(sample, self.wall_ns)
         except DecodeError as error:
             run.history.add_foreign(key, payload)
-            run.refuse("somebody", key, error)
-            with suppress(DecodeError):  # counted for a known sender, whose done counts it too
-                head = _head(key, payload)
-                run.world.count_output(head.controller or head.source)
+            run.refuse_sample(sample, error)
 
 
 class Advanced(Entry, tag=1):

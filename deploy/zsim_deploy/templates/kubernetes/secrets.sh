@@ -1,7 +1,7 @@
 #!/bin/sh
-# sh secrets.sh CERTS: makes the Secrets from the folder of `zsim certs init`; none is in this file.
+# sh secrets.sh CERTS: makes the Secrets from the folder of `zsim certs init`; this file contains none of them.
 set -eu
-certs=$${1:?"usage: sh secrets.sh FOLDER, that of zsim certs init"}
+certs=$${1:?"usage: sh secrets.sh CERTS, the folder of zsim certs init"}
 put() {
     kubectl -n $space create secret generic "$$@" --dry-run=client -o yaml | kubectl apply -f -
 }

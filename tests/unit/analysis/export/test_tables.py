@@ -236,9 +236,9 @@ def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("precious")
     for form, target, *terms in (
-        (Format.CSV, tmp_path / "home", "folder", "else"),
+        (Format.CSV, tmp_path / "home", "folder", "not an export"),
         (Format.MAT, run / "run.mcap", "record", "itself"),
-        (Format.MAT, tmp_path / "home" / "thesis.tex", "file", "else"),
+        (Format.MAT, tmp_path / "home" / "thesis.tex", "file", "not an export"),
     ):
         with refused(ReportError, str(target), *terms):
             export(run, form, target, some, force=True)
@@ -262,7 +262,7 @@ def test_force_does_not_replace_a_folder_that_holds_more_or_files_that_are_not_o
     (tmp_path / "own.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64, Created on: Sun Nov 22".ljust(128))
     for name in ("flight1.mcap", "own.mat"):
         before = (tmp_path / name).read_bytes()
-        with refused(ReportError, str(tmp_path / name), "file", "else"):
+        with refused(ReportError, str(tmp_path / name), "file", "not an export"):
             export(run, Format.FOXGLOVE, tmp_path / name, MessageSelection(("clock",)), force=True)
         assert (tmp_path / name).read_bytes() == before
 

@@ -207,14 +207,14 @@ def test_a_console_that_stood_still_itself_does_not_call_the_world_silent(monito
     ("run", "waiting", "level", "terms"),
     [
         (RunCondition("running", silent_s=12.3), (), "silent", ("12 s",)),
-        (RunCondition("running"), (Waiting("estimator.drone1", "lab", 40.0),), "waiting", ("on lab (40 s)",)),
+        (RunCondition("running"), (Waiting("estimator.drone1", "lab", 40.0),), "waiting", ("on lab (40.0 s)",)),
         (
             RunCondition("running"),
             (Waiting("estimator.drone1", "lab", 0.6),),
             "running",
             ("running", "estimator.drone1"),
         ),
-        (RunCondition("waiting"), (Waiting("controller.main", "", 18.0),), "waiting", ("main (18 s) in 'lab'",)),
+        (RunCondition("waiting"), (Waiting("controller.main", "", 18.0),), "waiting", ("main (18.0 s) in 'lab'",)),
     ],
 )
 def test_only_a_world_in_which_time_goes_is_called_running(

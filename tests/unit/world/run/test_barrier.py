@@ -109,6 +109,13 @@ def test_whose_work_is_done_twice():
     assert (made.duplicates("estimator.d2"), made.substitute("estimator.d2")) == ({}, None)
 
 
+def test_two_that_serve_each_other_are_substitutes():
+    made = barrier()
+    for name, other in (("group.a", "group.b"), ("group.b", "group.a")):
+        made.join(name, join(serves=(other,)), 0, 0)
+    assert made.substitute("group.a") is made.participants["group.b"]
+
+
 def test_everybody_owes_a_done_for_the_instant_that_commands_come_from():
     made = barrier("a", "b")
     assert (blocked(made, -1), blocked(made, 0)) == ([], ["a", "b"])  # before the first gate, and after it

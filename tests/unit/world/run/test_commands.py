@@ -7,7 +7,7 @@ import pytest
 from continued import continue_from
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from refused import has_terms, refused
+from refused import has_terms, parts, refused
 from small_world import GATE_NS, events_of, small_world
 
 from zsim.contract import keys, messages
@@ -378,6 +378,25 @@ def test_one_who_has_not_joined_has_the_event_of_his_command(world: World):
     assert kinds(published) == ["command", "commander"]
     assert published[0][1].data["apply_t_ns"] == world.now_ns
     assert keys.accepted("d2", "velocity") in dict(published)
+
+
+def test_a_command_to_an_unknown_drone_is_refused_with_the_start_of_its_name(world: World):
+    ((_, refused),) = command(world, to_fly(world), drone="d" * 60)
+    assert (refused.kind, parts(refused.data["reason"])) == ("refused", ("drone", repr("d" * 40)))
+
+
+def test_a_simulated_drone_whose_commander_releases_it_hovers():
+    made = small_world()
+    made.handle(keys.command("d1", "mode"), Mode(0, 0, ME, "takeoff"), 0)
+    for _ in range(300):
+        made.advance(0)
+    made.handle(keys.command("d1", "velocity"), Velocity(made.now_ns, 1, ME, (1.0, 0.0, 0.0), 0.0), 0)
+    for _ in range(5):  # a setpoint that is not repeated is soon dropped
+        made.advance(0)
+    assert made.view(0).drones[0].state == "flying"
+    assert made.control(ControlRequest("release", {"drone": "d1"}, ME)).ok
+    made.advance(0)
+    assert made.view(0).drones[0].state == "hovering"
 
 
 def test_who_releases_it_lets_it_hover(world: World):

@@ -292,13 +292,18 @@ def test_all_is_as_before_when_all_is_cleared():
 
 
 @pytest.mark.parametrize(
-    ("kind", "more", "applied_after"), [("link_delay", {"delay_ms": 50}, 4), ("link_cut", {}, None)]
+    ("kind", "sender", "more", "applied_after"),
+    [
+        ("link_delay", "pilot.me", {"delay_ms": 50}, 4),
+        ("link_cut", "pilot.me", {}, None),
+        ("link_cut", "pilot.other", {}, 1),
+    ],
 )
-def test_commands_come_late_or_never(kind: str, more: dict[str, Any], applied_after: int | None):
+def test_commands_come_late_or_never(kind: str, sender: str, more: dict[str, Any], applied_after: int | None):
     """The sender is nobody in the lockstep: its command takes effect a gate after its arrival, and the delay."""
     made = world()
     go(made, 1)
-    add(made, kind, "pilot.me/world", **more)
+    add(made, kind, f"{sender}/world", **more)
     made.handle(keys.command("d1", "velocity"), Velocity(0, 0, "pilot.me", (0.0, 0.0, 0.0), 0.0), 0)
     applied = [m.data["apply_t_ns"] for _, m in made.take_outbox() if isinstance(m, Event) and m.kind == "command"]
     assert applied == ([] if applied_after is None else [(1 + applied_after) * GATE_NS])
@@ -314,3 +319,17 @@ def test_a_radio_out_of_reach_brings_no_command():
     go(made, 4)
     refused = [m.source for _, m in made.take_outbox() if isinstance(m, Event) and m.kind == "refused"]
     assert refused == ["pilot.near"]  # only its command comes, and a drone on the ground refuses it
+
+
+def test_the_radio_of_one_formation_loses_no_command_to_another():
+    drones = [{"name": f"d{k}", "position_m": [5 * k, 0, 0]} for k in range(1, 5)]
+    clusters = [{"name": "main", "drones": ["d1", "d2"]}, {"name": "other", "drones": ["d3", "d4"]}]
+    document = {**yaml.safe_load(SCENARIO), "drones": drones, "clusters": clusters}
+    made = World(scenario_file.from_text(json.dumps(document)), run_id="run1")
+    go(made, 1)
+    add(made, "radio", "main", range_m=10, spread_m=0.1, place={"pilot.me": [100, 0, 0]})
+    for drone in ("d1", "d3"):
+        made.handle(keys.command(drone, "velocity"), Velocity(0, 0, "pilot.me", (0.0, 0.0, 0.0), 0.0), 0)
+    go(made, 4)
+    refused = [m.subject for _, m in made.take_outbox() if isinstance(m, Event) and m.kind == "refused"]
+    assert refused == ["drone/d3/cmd/velocity"]  # only its command comes, and a drone on the ground refuses it

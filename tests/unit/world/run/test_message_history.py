@@ -2,12 +2,14 @@
 
 import pytest
 from msgspec import Struct
+from small_world import events_of, small_world
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Velocity
-from zsim.contract.run_messages import Done
+from zsim.contract.run_messages import Clock, Done
+from zsim.runtime.membership import HealthMeter
 from zsim.transport.session import ReceivedSample
-from zsim_world.run.inputs import KEEP_NS, MessageHistory
+from zsim_world.run.inputs import KEEP_NS, MessageHistory, Run, Taken
 
 SECOND_NS = 1_000_000_000
 IMU = keys.sensor("d1", "imu")
@@ -160,3 +162,14 @@ def test_only_outputs_that_can_be_read_are_taken():
         history_of().lost_outputs([*done, [VELOCITY, b"\xc1"], [keys.estimate("d1"), b"\x80"], ["of/mine", b""]], 1)
         == []
     )
+
+
+@pytest.mark.parametrize("payload", [b"\xc1", messages.encode(Clock(0, 9, "run1", 0, "running", 1.0))])
+@pytest.mark.parametrize("key", [keys.CLOCK, keys.EVENT, keys.INFO, keys.sensor("d1", "status")])
+def test_a_message_that_claims_to_be_the_world_s_is_refused_and_not_replayed(key: str, payload: bytes):
+    """A process that rejoins takes what is replayed for the world's."""
+    run = Run(small_world(), HealthMeter("world"))
+    run.world.take_outbox()
+    run.enter(Taken(0, (key, payload)))
+    assert [each.kind for each in events_of(run.world)] == ["refused"]
+    assert (run.health.refused, run.history.passed, since(run.history, -1, ["**"])) == (1, [], [])

@@ -23,7 +23,7 @@ from zsim.contract.messages import Imu
 from zsim.contract.run_messages import Clock
 from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
-from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, chunk_head, places
+from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, chunk_head, is_cut, places
 from zsim.record.record_reader import record_notes
 from zsim.record.record_writer import CHUNK_BYTES
 
@@ -234,6 +234,30 @@ def test_a_length_that_leads_behind_a_cut_is_not_told_as_the_cut(tmp_path, bit):
         assert found == record.recorded[: len(found)]
         assert (complete, len(found) <= 3 * CHUNK_MESSAGES, len(damage) >= 1) == (False, True, True)
         record.data[place + 1 + bit // 8] ^= 1 << bit % 8
+
+
+@pytest.mark.parametrize(
+    ("rest", "cut"),
+    [
+        (HEAD.pack(Opcode.MESSAGE, 5)[:-1], True),
+        (HEAD.pack(Opcode.MESSAGE, 5), True),
+        (HEAD.pack(0x7F, 5), False),
+        (HEAD.pack(Opcode.CHUNK, 3) + b"ab", False),
+    ],
+    ids=["part of a head", "head of a message", "unknown opcode", "chunk too short for its head"],
+)
+def test_bytes_after_the_last_record_are_a_cut_one_or_damaged(rest: bytes, cut: bool):
+    assert is_cut(b"before" + rest, len(b"before")) is cut
+
+
+def test_only_a_closed_record_is_compared_with_its_sum(tmp_path):
+    record = Damaged(tmp_path)
+    (end,) = [place for place in places(bytes(record.data)) if place.opcode == Opcode.DATA_END]
+    record.data[next(places(bytes(record.data))).end - 1] ^= 1  # the last letter of the writer's name
+    for data, differs in ((record.data, True), (record.data[: end.end], False)):
+        record.path.write_bytes(data)
+        with RecordReader(record.path) as reader:
+            assert (reader.complete, reader.differs()) == (differs, differs)
 
 
 def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summary(tmp_path):

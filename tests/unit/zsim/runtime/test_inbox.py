@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain_messages import GATE_NS, estimate, imu, status
+from plain_messages import GATE_NS, estimate, imu, run_info, status
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Sightings
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import Baro, encode
-from zsim.runtime.inbox import ALWAYS_NS, GAP_MAX, NEVER_NS, GateRouter, Inbox, RoutingTable
+from zsim.contract.messages import Baro, MessageInfo, encode
+from zsim.runtime.inbox import ALWAYS_NS, GAP_MAX, NEVER_NS, GateRouter, Inbox, RoutingTable, output_hold_ns
 
 STEP_NS = 5_000_000
 STATUS = keys.status("d1")
@@ -451,3 +451,12 @@ def test_messages_of_a_gate_come_among_the_others_in_canonical_order() -> None:
     names = [keys.sensor("d3", "baro"), keys.estimate("d1"), keys.sensor("d1", "baro"), keys.status("d2")]
     assert [key for key, _ in router.one_by_one(inputs)] == names
     assert router.one_by_one([other]) == [other]
+
+
+@pytest.mark.parametrize(
+    ("more", "gates"),
+    [({"user_messages": (MessageInfo("bidder/*/bid", "Bid", {}),)}, 1), ({}, 2), ({"mode": "realtime"}, 0)],
+)
+def test_outputs_of_others_are_held_until_all_agents_have_published(more: dict[str, Any], gates: int):
+    info = run_info(command_delay_ns=GATE_NS, **more)
+    assert output_hold_ns(info) == gates * GATE_NS
