@@ -52,7 +52,7 @@ class Impairment:
         self._steady = arrays.wind[WIND.steady : WIND.steady + 3].copy()
         self.rotors = {name: vehicle.rotor_names for name, vehicle in zip(drones, vehicles, strict=True)}
         self._sound = sound_actuators(len(drones), len(arrays.bodies.each))
-        self._held: dict[int, tuple[float, ...]] = {}  # by fault: the speeds at which the rotors of its drone are held
+        self._held: dict[int, tuple[float, ...]] = {}  # speeds at which a fault holds the rotors of its drone
         self._gusts: tuple[Fault, ...] = ()
         self._calm = True
 
@@ -68,7 +68,7 @@ class Impairment:
         for fault in acting:
             if fault.target in self._index:
                 self._impair(fault, self._index[fault.target], stuck)
-        # sensors that have just got stuck hold their next sample, and those that no longer are, are released
+        # newly stuck sensors hold their next sample; those no longer stuck are released
         hold = self._w.senses.fault[:, :, FAULT.hold]
         kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
         hold[:] = ss.FREE
@@ -118,10 +118,10 @@ class Impairment:
         row[ACTUATOR.faulty] = 1.0
         for r, name in enumerate(self.rotors[fault.target]):
             if which in (name, "all"):
-                if how == "efficiency":  # thrust is as the speed squared
+                if how == "efficiency":  # thrust is proportional to the speed squared
                     row[ACTUATOR.size + r] *= math.sqrt(fault.parameters["value"])
                 else:
-                    if fault.id not in self._held:  # at speed_rad_s, or at the speed at which each turned at the start
+                    if fault.id not in self._held:  # at speed_rad_s, or at each rotor's speed at the start of the fault
                         speed, speeds = fault.parameters["speed_rad_s"], self._w.bodies.state[i, STATE.size :].tolist()
                         self._held[fault.id] = tuple(speeds) if speed is None else (speed,) * len(speeds)
                     row[ACTUATOR.size + count + r] = self._held[fault.id][r]
@@ -139,7 +139,7 @@ def _impair_scanner(row: NDArray[np.float64], how: str, parameters: Mapping[str,
 
 
 def dropped(limit: float, probability: float) -> float:
-    """Return the standard normal number below which a sample is lost; `limit` is that without the fault."""
+    """Return the standard normal number below which a sample is lost; `limit` is that number without the fault."""
     if probability == 1.0:
         return math.inf
     return normal_quantile(1.0 - (1.0 - normal_probability(limit)) * (1.0 - probability))
@@ -150,6 +150,6 @@ def gust_m_s(fault: Fault, t_ns: int) -> NDArray[np.float64]:
 
     Over its length T, twice the gust gradient distance there, it rises to v and falls again.
     """
-    assert fault.until_ns is not None  # a gust always has a length
+    assert fault.until_ns is not None  # a gust always has an end
     phase = 2.0 * math.pi * (t_ns - fault.from_ns) / (fault.until_ns - fault.from_ns)
     return 0.5 * (1.0 - el.cos(phase)) * np.array(fault.parameters["velocity_m_s"])

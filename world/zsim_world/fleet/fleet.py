@@ -78,10 +78,10 @@ from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
 
 GPS_FIX = 3  # NMEA: a three-dimensional fix
 GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
-TAKEOFF_CHARGE = 2.0  # of the charge at which it lands: below, it does not take off
-UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
-QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
-NOISE_GATES = 8  # gates between two refills of the noise: that of 100 drones then fits a cache of 1 MB
+TAKEOFF_CHARGE = 2.0  # times the charge at which it lands; with less it refuses a take-off
+UPRIGHT_COSINE = 0.87  # cosine of 30 deg, the largest tilt for a take-off
+QUATERNION_SQUARE_MIN = 1e-6  # a shorter quaternion gives no orientation
+NOISE_GATES = 8  # gates between two refills; the noise of 100 drones then fits a cache of 1 MB
 _TAKES_SETPOINT = {mode for mode, state in enumerate(firmware.MODES) if state_refusal("", state, "setpoint") is None}
 
 
@@ -185,7 +185,7 @@ class Fleet:
         place = scenario.environment
         self.things = [each.name for each in (*place.obstacles, *(place.surfaces or ()))]
         self._watch = FlightWatch(self._w, self.names, self.things)
-        # loads or compiles what the first command needs: in realtime no gate may wait for it
+        # loads or compiles the function that the first command needs: in realtime no gate may wait for it
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
     @property
@@ -283,7 +283,7 @@ class Fleet:
     # Commands
 
     def lead(self, i: int, pose: NDArray[np.float64]) -> None:
-        """Set the pose of an external drone, (STATE.size + its rotors,), from which its velocity moves it on."""
+        """Set the pose of an external drone, (STATE.size + its rotors,), from which it is extrapolated."""
         self.bodies.pose[self.external[i], : len(pose)] = pose
         self.bodies.state[i, : len(pose)] = pose
 
@@ -377,8 +377,8 @@ class Fleet:
     def _mode(self, i: int) -> int:
         return int(self.boards.memory.item(i, MEMORY.mode))
 
-    def _state_refusal(self, i: int, asked: str) -> str | None:
-        return state_refusal(self.names[i], firmware.MODES[self._mode(i)], asked)
+    def _state_refusal(self, i: int, requested: str) -> str | None:
+        return state_refusal(self.names[i], firmware.MODES[self._mode(i)], requested)
 
     def _enter(self, i: int, mode: int) -> None:
         kernel.enter(self.boards.memory[i], self.boards.belief[i], mode)
@@ -410,7 +410,7 @@ class ExternalDrones:
     def take(self, drone: str, message: Any, now_ns: int) -> str | None:
         """Handle a Truth or Status of a driver; return why it is refused, or None.
 
-        `now_ns` is the newest gate. Of other messages only the stamp is checked.
+        `now_ns` is the newest gate. For other messages only the stamp is checked.
         """
         i, t_ns = self._index[drone], message.t_ns
         former = self._poses.get(i) if isinstance(message, Truth) else self._statuses.get(i)
@@ -458,13 +458,13 @@ class ExternalDrones:
 
         Stopping the rotors is always passed on; other commands depend on the newest state published by the driver.
         """
-        name, asked = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
-        if asked == "emergency":
+        name, requested = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
+        if requested == "emergency":
             return None
         if i not in self._statuses:
             return f"{name} has no state: its driver has published none; start driver.{name}"
         state: DroneState = self._statuses[i].state
-        refusal = state_refusal(name, state, asked)
+        refusal = state_refusal(name, state, requested)
         if refusal is None and kind == "rotors":
             refusal = self._fleet.rotors_fault(i, message.speed_rad_s)
         if refusal is None and kind == "attitude":
@@ -501,7 +501,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     surfaces = len(scenario.environment.surfaces or ())
     each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
     state, anchor = np.zeros((n, STATE.size + each)), np.zeros((n, POINTS, 2))
-    for i, drone in enumerate(drones):  # its feet carry its weight; from a position above the ground it falls
+    for i, drone in enumerate(drones):  # on the ground its feet carry its weight; from a position above, it falls
         yaw = math.radians(drone.yaw_deg)
         state[i, STATE.p_WB : STATE.p_WB + 3] = drone.position_m
         state[i, STATE.p_WB + 2] += row[i, VEHICLE.stand_height]
@@ -510,12 +510,12 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         anchor[i] = np.array(drone.position_m[:2]) + linear.product(contact_points(row[i])[:, :2], turn.T)
     aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
-    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # yet to be found, since no drone is at its origin
+    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # to be found in the first tick: no drone is at its origin
     eye = np.array([_look(drone) for drone in drones])
     number, above = np.zeros(1, dtype=np.int64), np.zeros(n, dtype=np.int8)
     near = NearPairs(pair=pairs, number=number, origin=np.full((n, 3), np.inf), above=above, eye=eye)
     own = rigid_body.half_decay
-    half_decay = getattr(own, "py_func", own)  # as Python: compiling it for a few numbers takes longer
+    half_decay = getattr(own, "py_func", own)  # not compiled: for a few numbers, compiling would take longer
     return Bodies(
         each=tuple(range(each)),
         vehicle=row,

@@ -20,28 +20,28 @@ from zsim_world.physics.surfaces import FEET, PLANE, POINTS, contact_point, near
 from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, SETTING, TAKING_OFF
 from zsim_world.vehicles.observer import STEP_S
 
-IMPACT_STEPS = 4  # over which a change of velocity is measured: 20 ms, about half of a contact on the feet
-IMPACT_G = 5.0  # chosen: twice what rotors and drag give a drone, on average over these; a fall from 0.4 m has it
-IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, greatest change of velocity without an impact
-UPRIGHT_AGAIN = 0.5  # chosen: cosine of the tilt below which one that was upside down may flip again
-QUIET_STEPS = round(1.0 / STEP_S)  # chosen: contacts that follow an impact within 1 s are its bounces
+IMPACT_STEPS = 4  # steps over which a change of velocity is measured: 20 ms, about half of a contact on the feet
+IMPACT_G = 5.0  # mean over these steps; chosen: twice what rotors and drag can give; a fall from 0.4 m reaches it
+IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, largest change of velocity without an impact
+UPRIGHT_AGAIN = 0.5  # chosen: cosine of the tilt; once above it, a drone may flip again
+QUIET_STEPS = round(1.0 / STEP_S)  # chosen: contacts within 1 s after an impact are its bounces
 MODE, FLIP, IMPACT, EMPTY, TOUCHDOWN = 1, 2, 4, 8, 16  # bits of the incidents of a drone
 NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; then obstacles, surfaces, drones
 
 SEEN = columns(
     "SeenColumns",
     (
-        Field("mode", "1"),  # the last one that was commanded, or that was found
+        Field("mode", "1"),  # last mode, commanded or detected
         Field("flipped", "1"),
         Field("empty", "1"),
-        Field("quiet", "steps"),  # in which no impact is found any more
-        Field("external", "1"),  # its body is
-        Field("airborne", "1"),  # out of reach of the ground and of obstacles since it last touched one
-        Field("grounded", "1"),  # its touchdown in flight has been found
-        Field("surface", "see NOTHING"),  # on which that was
+        Field("quiet", "steps"),  # remaining steps without detection of impacts
+        Field("external", "1"),  # 1: external drone
+        Field("airborne", "1"),  # has been out of reach of ground and obstacles since it last touched one
+        Field("grounded", "1"),  # its touchdown in flight has been detected
+        Field("surface", "see NOTHING"),  # surface of that touchdown
         Field("touched", "see NOTHING"),  # what it touched last
-        Field("speed", "m/s"),  # before its last impact
-        Field("v_WB", "m/s", 3 * IMPACT_STEPS),  # in the last steps, each in the place of the oldest
+        Field("speed", "m/s"),  # speed before its last impact
+        Field("v_WB", "m/s", 3 * IMPACT_STEPS),  # velocities of the last steps, a ring buffer
     ),
 )
 
@@ -62,7 +62,7 @@ class FlightWatch:
         self._bodies, self._boards = arrays.bodies, arrays.boards
         self._seen, self._found = arrays.watched
         self._names = drones
-        self._others = ("", "the ground", *things, *drones)  # by what `SEEN.touched` holds
+        self._others = ("", "the ground", *things, *drones)  # indexed by `SEEN.touched`
 
     def note_command(self, i: int, mode: int) -> None:
         """Note a commanded mode: entering it is not an incident."""
@@ -142,7 +142,7 @@ def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
 
 @inlined
 def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
-    """Note what drone i touches; return TOUCHDOWN where it first touches ground or obstacle in flight."""
+    """Note what drone i touches; return TOUCHDOWN when it first touches ground or obstacle in flight."""
     if bodies.braced[i] == 0 and bodies.state[i, STATE.p_WB + 2] > bodies.vehicle[i, VEHICLE.contact_reach]:
         seen[i, SEEN.airborne], seen[i, SEEN.grounded] = 1.0, 0.0
         return 0
@@ -159,7 +159,7 @@ def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
         seen[i, SEEN.touched] = touched
     if surface == NOTHING:
         return 0
-    left = mode == TAKING_OFF and seen[i, SEEN.airborne] != 0.0  # until then it may stand
+    left = mode == TAKING_OFF and seen[i, SEEN.airborne] != 0.0  # during take-off, once it has left the ground
     seen[i, SEEN.airborne] = 0.0
     if seen[i, SEEN.grounded] != 0.0 or not (left or mode in (HOVERING, FLYING)):
         return 0

@@ -45,7 +45,7 @@ from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import steer
 from zsim_world.vehicles.observer import DEVICE, STEP_S
 
-POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
+POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond these limits the integration has diverged
 
 
 @inlined

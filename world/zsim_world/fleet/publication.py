@@ -35,13 +35,13 @@ MESSAGES = (  # in the order of KINDS
 )
 STOCK_SENSORS = len(STOCK)
 TRUTH, STATUS = STOCK_SENSORS, STOCK_SENSORS + 1
-OWN_MESSAGES = 2  # of a simulated drone in every gate: these
+OWN_MESSAGES = 2  # truth and status of a simulated drone in every gate
 WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
 OTHER_TRUTHS = tuple((flight_messages.Truth, rotors) for rotors in range(ROTORS_MIN + 1, ROTORS_MAX + 1))
 LAYOUTS = Layouts((*MESSAGES, *OTHER_TRUTHS))
 INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
-OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in
-COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
+OPS, FIRST, LITERALS = LAYOUTS.program  # constants of the compiled code
+COMMANDER = len(firmware.MODES)  # the first word for a commander: no commander
 
 write = inlined(framing.write)
 
@@ -74,18 +74,18 @@ class PublishedState(NamedTuple):
     """The other published values of N drones."""
 
     touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
-    sigma_m: NDArray[np.float64]  # (N,), of each one's GPS
-    commanders: NDArray[np.int64]  # (N,), number of the word that names each one's
-    counts: NDArray[np.int64]  # (N, kinds), messages that each key has had
-    rotors: NDArray[np.int64]  # (N,), of each
-    own: NDArray[np.int64]  # (N,), messages beside its samples: truth and status, or none of an external drone
+    sigma_m: NDArray[np.float64]  # (N,), of each drone's GPS
+    commanders: NDArray[np.int64]  # (N,), number of the word that names each drone's commander
+    counts: NDArray[np.int64]  # (N, kinds), messages published so far per key
+    rotors: NDArray[np.int64]  # (N,), number of rotors
+    own: NDArray[np.int64]  # (N,), messages other than samples: truth and status, or none for an external drone
 
 
 class UserPayloads(NamedTuple):
     """Messages of users' sensors among the M samples of a gate, one after the other."""
 
     data: NDArray[np.uint8]
-    ends: NDArray[np.int64]  # (M,), where that of each sample ends, those of stock sensors being empty
+    ends: NDArray[np.int64]  # (M,), end of each sample's message; those of stock sensors are empty
 
 
 NO_PAYLOADS = UserPayloads(np.empty(0, dtype=np.uint8), np.empty(0, dtype=np.int64))
@@ -110,7 +110,7 @@ class GatePublication:
         self.table = key_table(fleet.names, own)
         bodies = fleet.bodies
         self._seen = PublishedArrays(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
-        self._commanders: list[str | None] = []  # of the last gate
+        self._commanders: list[str | None] = []  # commanders at the last gate
         commanders = np.zeros(fleet.count, dtype=np.int64)
         self.counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
@@ -124,7 +124,7 @@ class GatePublication:
         payloads = self._payloads()
         self._room_beside = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
         self._make_room(16 * fleet.count)
-        # loads or compiles what the first gate needs, and counts nothing
+        # loads or compiles the functions that the first gate needs, without counting messages
         uncounted = self._fleetwide._replace(counts=self.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
         publish(hold(state), *fleet.sampled, *payloads, 0)

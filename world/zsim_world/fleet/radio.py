@@ -19,7 +19,7 @@ Matrix = NDArray[np.bool_]
 
 
 class RadioChannel:
-    """The links between N drones, and a ground station where there is one: the place after theirs.
+    """The links between N drones, and, at the last index, the ground station if there is one.
 
     Args:
         scene: what blocks lines of sight.
@@ -52,8 +52,8 @@ class RadioChannel:
         """Return the message of a gate.
 
         Args:
-            position_m: of the drones in W, (N, 3).
-            faults: that act; those of kind `radio` lower the reception of the drones of their target.
+            position_m: positions of the drones in W, (N, 3).
+            faults: active faults; those of kind `radio` lower the reception of the drones of their target.
         """
         radio, topology, n = self._radio, self._topology, self._count
         place_m = np.concatenate([position_m, self._station])
@@ -114,7 +114,7 @@ def allowed(drones: list[str], topology: Topology) -> Matrix:
 
 @kernel()
 def clear_lines(place_m: NDArray, scene: Held, hears: NDArray) -> None:
-    """Take out of `hears` the pairs whose line meets an obstacle or a surface."""
+    """Remove from `hears` the pairs whose line of sight meets an obstacle or a surface."""
     for i in range(place_m.shape[0]):
         for j in range(i):
             if not (hears[i, j] or hears[j, i]):

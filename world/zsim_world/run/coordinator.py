@@ -30,7 +30,7 @@ RECORDER = "recorder"  # name and role
 START_TIMEOUT_S = 60.0  # wall; chosen, for expected processes that the launcher does not start
 START_TIMEOUT_OWN_S = 600.0  # wall; chosen, for processes that the launcher starts: compiling may take minutes
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
-ARGS_BYTES_MAX = 4000  # up to which an event repeats arguments unchanged; any operation needs far fewer
+ARGS_BYTES_MAX = 4000  # size up to which an event repeats arguments unchanged; every operation needs far less
 
 
 class Coordinator(ABC):
@@ -98,7 +98,7 @@ class Coordinator(ABC):
 
     @abstractmethod
     def result(self) -> dict[str, Any]:
-        """Return the figures of the run so far."""
+        """Return the statistics of the run so far."""
 
     @abstractmethod
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
@@ -214,7 +214,7 @@ class Coordinator(ABC):
         is_named = UNSET not in (message.run_id, message.incarnation)
         if is_named or not participant.alive or self.clock.ended is not None:
             self._leave(participant, message, wall_ns)
-        else:  # of contract 1.0, or from another process
+        else:  # a bye of contract 1.0, or from another process
             participant.farewell = message
 
     def _leave(self, participant: Participant, bye: Bye, wall_ns: int) -> None:
@@ -461,7 +461,7 @@ class Coordinator(ABC):
     # Time
 
     def may_advance(self) -> bool:
-        """Return whether the next gate may come, pacing apart."""
+        """Return whether the world may advance to the next gate, regardless of pacing."""
         clock = self.clock
         if clock.is_halted or self.barrier.away():
             return False

@@ -50,10 +50,10 @@ CALLS: dict[str, Any] = {  # methods of the world that are inputs, with the type
 encode = msgspec.msgpack.Encoder().encode
 KEEP_NS = 5_000_000_000  # simulated time kept for replays
 KEEP_BYTES = 500_000_000  # limit of the payloads kept: 1000 drones have about 300 MB in KEEP_NS
-FOREIGN_BYTES = 50_000_000  # of these, for messages outside the contract
+FOREIGN_BYTES = 50_000_000  # share of KEEP_BYTES for messages outside the contract
 LAST_MAX = 200_000  # keys whose last value is kept: 1000 drones have about 12 000
 PAGE_BYTES = 8_000_000  # payloads of one answer
-EXPRESSIONS_MAX = 1000  # of one replay; a controller of hundreds of drones reads two keys of each
+EXPRESSIONS_MAX = 1000  # key expressions of one replay; a controller of hundreds of drones reads two keys of each
 _Entry = tuple[int, int, Pairs, int, bool]
 """Messages kept together: the world's time at arrival, their stamp, keys and payloads, the size of the payloads
 [bytes], and whether they are outside the contract."""

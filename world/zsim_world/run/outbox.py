@@ -13,7 +13,7 @@ from zsim.runtime.rate_limit import SUBJECTS_MAX, RateLimit
 from zsim.scenario.roles import WORLD
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
-CHANGES_MAX = 1000  # of a source at once, as many as there may be faults; then one per gate
+CHANGES_MAX = 1000  # changes of a source at once, as many as there may be faults; then one per gate
 UNJOINED = 10  # all sources that have not joined may together do as much as this number of joined sources
 STRANGERS_MAX = 100  # newcomers, and reports about unknown processes, at once; then one per simulated second
 SECOND_NS = 1_000_000_000

@@ -35,12 +35,12 @@ from zsim_world.run.run_clock import number, refused_argument
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
 
 NOT_FLYABLE = "a replay: nobody can be flown"
-SEEK_MAX_S = 1e9  # so that nanoseconds fit an int64
-VIEWED_MAX = 10_000  # drones times instants in one answer to `views`: 2 MB
+SEEK_MAX_S = 1e9  # limit that keeps nanoseconds within an int64
+VIEWED_MAX = 10_000  # drones times time steps in one answer to `views`: 2 MB
 VIEWED_MAX_S = 60.0  # simulated, in one answer to `views`; chosen: the replay stands still while it reads them
-BEFORE_NS = 1_000_000_000  # within which every source of a view is published at least once
+BEFORE_NS = 1_000_000_000  # time within which every source of a view is published at least once
 OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish them
-MARKS_MAX = 400  # on a timeline; more would be narrower than a pixel
+MARKS_MAX = 400  # marks on a timeline; more would be narrower than a pixel
 LEFT_OUT = frozenset({"command", "end"})  # kinds of events without a mark; commands are too many
 TEXT_MAX = 120  # characters
 SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # messages that name their publisher
@@ -101,7 +101,7 @@ class Playback(Coordinator):
         )
         self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
         self._table = run_key_table(info)
-        self._kinds = len(self._table) // len(self.names)  # of messages about a drone
+        self._kinds = len(self._table) // len(self.names)  # number of kinds of messages about a drone
         self._place = {key: place for place, key in enumerate(self._table)}
         of_drones = (key for name in self.names for key in (keys.truth(name), keys.status(name), keys.estimate(name)))
         of_clusters = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
@@ -350,7 +350,7 @@ class Playback(Coordinator):
         found: list[tuple[str, bytes]] = []
         for seq, (t_ns, passed) in enumerate(self._recorded_gates.before(instants, self._viewed, BEFORE_NS)):
             last |= passed
-            if any(key.endswith("/truth") for key in passed):  # else a gap in the record, or its end
+            if any(key.endswith("/truth") for key in passed):  # otherwise a gap in the record, or its end
                 found += [(key, messages.encode(message)) for key, message in self._made_views(last, t_ns, seq)]
         return ControlAnswer(True, result=found)
 

@@ -19,7 +19,7 @@ from zsim_world.run.outbox import Refusal
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Carries out a request; returns why it is refused, an answer with a result, or None when done."""
 GATES_KEPT = 256  # gates whose publication time is kept for the age of commands; 5 s, older ones are refused
-AGES_KEPT = 1_000_000  # for the percentiles; 8 MB
+AGES_KEPT = 1_000_000  # ages kept for the percentiles; 8 MB
 MARK_NS = 10_000_000  # wall time between two marks of the rate, which covers the last second
 
 
@@ -39,7 +39,7 @@ class RunClock:
         is_complete: whether it reached its regular end, so that it cannot be continued.
     """
 
-    SAVED: ClassVar[Saved] = {  # of a run that has not ended
+    SAVED: ClassVar[Saved] = {  # state of a run that has not ended
         "rate": float,
         "now_ns": int,
         "next_ns": int,
@@ -239,7 +239,7 @@ class RealTimeFactor:
 
 
 class RunStatistics:
-    """The figures of a run in its event `end`.
+    """The statistics of a run for its event `end`.
 
     Attributes:
         world_misses: gates that the world published too late.

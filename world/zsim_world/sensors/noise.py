@@ -25,7 +25,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim_world.sensors.sensor_set import CHANNELS, CHANNELS_MAX, SENSORS, channels, noise_width, rate_of
 
-GUST_WIDTH = 3  # numbers of a gust
+GUST_WIDTH = 3  # numbers per gust
 STREAMS = tuple(zip(SENSORS, CHANNELS, strict=True))  # name and channels of each sensor
 
 
@@ -39,12 +39,12 @@ class NoiseTable:
         names = [drone.name for drone in scenario.drones]
         streams = [[stream(scenario.seed, f"{name}/{s}") for s in (*SENSORS, "wind")] for name in names]
         common = stream(scenario.seed, "wind")
-        # rows of each stream, the sample at t = 0 included
+        # rows of each stream, including the sample at t = 0
         span = gates * scenario.time.gate_ms / 1000.0
         rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
         self._rows = np.array([math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)])
         widths = [[noise_width(n, channels(drone.sensors, s)) for s, n in STREAMS] for drone in scenario.drones]
-        least = [2 * n + 1 for _, n in STREAMS]  # of the last row, which has no sensors
+        least = [2 * n + 1 for _, n in STREAMS]  # widths of the last row, which has no sensors
         self.width = np.array([[*row, GUST_WIDTH] for row in (*widths, least)], dtype=np.int64)
         ends = np.cumsum(self._rows * self.width.max(axis=0))
         self.at = np.array([0, *ends[:-1]], dtype=np.int64)
@@ -56,12 +56,15 @@ class NoiseTable:
         self.streams = np.zeros((*self.width.shape, WORDS.size), dtype=np.uint64)
         self.streams[:-1] = [[words(rng) for rng in row] for row in streams]
         self.streams[-1, -1] = words(common)
-        self.cursor[:-1], self.cursor[-1, -1] = self._rows, self._rows[-1]  # nothing drawn yet
+        self.cursor[:-1], self.cursor[-1, -1] = (
+            self._rows,
+            self._rows[-1],
+        )  # all rows count as used, so that the table is filled
         self.refill()
 
     def refill(self) -> None:
         """Replace the used rows."""
-        with np.errstate(over="ignore"):  # words wrap around, of which numpy warns where this is not compiled
+        with np.errstate(over="ignore"):  # words wrap around; numpy warns of it if this is not compiled
             refill(self.table, self.at, self._rows, self.width, self.cursor, self.streams)
 
     def _draw_start(
@@ -87,10 +90,10 @@ def refill(table: NDArray, at: NDArray, rows: NDArray, widths: NDArray, cursor: 
     """Move the unused rows of every stream to its front in the table, and draw the rest.
 
     Args:
-        table, at: as in NoiseRows; cursor: rows used of each stream, set to 0.
+        table, at: as in NoiseRows; cursor: used rows of each stream, reset to 0.
         rows: int64 (S,), rows of each stream in the table.
-        widths: int64 (N + 1, S), numbers in a row of each.
-        streams: uint64 (N + 1, S, WORDS.size), words of each.
+        widths: int64 (N + 1, S), numbers in a row of each stream.
+        streams: uint64 (N + 1, S, WORDS.size), words of each stream.
     """
     for i in range(table.shape[0]):
         for s in range(at.shape[0]):
@@ -102,18 +105,24 @@ def refill(table: NDArray, at: NDArray, rows: NDArray, widths: NDArray, cursor: 
             cursor[i, s] = 0
 
 
-WORDS = columns("StreamWords", (Field("state", "1", 2), Field("step", "1", 2)))  # of a stream, uint64: high, low
+WORDS = columns(
+    "StreamWords", (Field("state", "1", 2), Field("step", "1", 2))
+)  # state and increment of a stream, uint64: high, low
 
-_LAYERS, _SIZES = 256, 2**52  # of the ziggurat; of the numbers that a word may ask for in a layer
-_TAIL, _TAIL_INVERSE = 3.6541528853610087963519472518, 1.0 / 3.6541528853610087963519472518  # where the tail begins
-_MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645  # O'Neill, for 128 bit
+_LAYERS, _SIZES = 256, 2**52  # layers of the ziggurat; possible sizes in a layer
+_TAIL, _TAIL_INVERSE = 3.6541528853610087963519472518, 1.0 / 3.6541528853610087963519472518  # start of the tail
+_MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645  # O'Neill, multiplier for 128 bit
 _MODULUS = 2**128
 _MULTIPLIER_INVERSE = pow(_MULTIPLIER, -1, _MODULUS)
-_ROUNDING = 8  # sizes, more than what rounding makes of the first that is not inside
+_ROUNDING = 8  # sizes, more than the rounding error of the first size that is not inside
 _MULTIPLIER_HIGH, _MULTIPLIER_LOW = np.uint64(_MULTIPLIER >> 64), np.uint64(_MULTIPLIER & (2**64 - 1))
 _HALF, _HALF_BITS = np.uint64(0xFFFFFFFF), np.uint64(32)
-_TURN_SHIFT, _TURN_MASK = np.uint64(58), np.uint64(63)  # the six highest bits say how far the word is turned
-_LAYER_MASK, _SIGN_SHIFT, _SIZE_SHIFT = np.uint64(0xFF), np.uint64(8), np.uint64(9)  # of a word: layer, sign, size
+_TURN_SHIFT, _TURN_MASK = np.uint64(58), np.uint64(63)  # the six highest bits give the rotation of the word
+_LAYER_MASK, _SIGN_SHIFT, _SIZE_SHIFT = (
+    np.uint64(0xFF),
+    np.uint64(8),
+    np.uint64(9),
+)  # fields of a word: layer, sign, size
 _ONE, _SIZE_MASK = np.uint64(1), np.uint64(_SIZES - 1)
 _UNIT_SHIFT, _UNIT = np.uint64(11), 1.0 / 9007199254740992.0  # 53 bits make a number in [0, 1)
 _TAIL_SIGN_SHIFT = np.uint64(8)
@@ -125,15 +134,15 @@ class Ziggurat(NamedTuple):
     """Tables of the ziggurat, (256,) each."""
 
     width: NDArray[np.float64]  # number per size
-    inside: NDArray[np.uint64]  # sizes below it are wholly under the curve
-    height: NDArray[np.float64]  # of the curve at the layer's end
+    inside: NDArray[np.uint64]  # smaller sizes are entirely under the curve
+    height: NDArray[np.float64]  # height of the curve at the end of the layer
 
 
 def _read_tables() -> Ziggurat:
     """Read the tables of numpy's ziggurat from the numbers that it draws."""
     rng = np.random.Generator(np.random.PCG64(0))
     width = np.array([_drawn(rng, layer, 1)[0] for layer in range(_LAYERS)])
-    inside = np.zeros(_LAYERS, dtype=np.uint64)  # of layer 1: none, it is the cap
+    inside = np.zeros(_LAYERS, dtype=np.uint64)  # 0 for layer 1, which is the cap
     for layer in (0, *range(2, _LAYERS)):
         near = round(width[layer - 1] / width[layer] * _SIZES)
         sizes = range(near - _ROUNDING, near + _ROUNDING)
@@ -144,7 +153,10 @@ def _read_tables() -> Ziggurat:
 
 def _drawn(rng: np.random.Generator, layer: int, size: int) -> tuple[float, bool]:
     """Return the number that numpy draws for a word, and whether it used only this word."""
-    bits, state = rng.bit_generator, layer | size << int(_SIZE_SHIFT)  # without high bits, the word is the low ones
+    bits, state = (
+        rng.bit_generator,
+        layer | size << int(_SIZE_SHIFT),
+    )  # if the high bits are 0, the word equals the low bits
     held = bits.state
     step = held["state"]["inc"]
     before = (state - step) * _MULTIPLIER_INVERSE % _MODULUS

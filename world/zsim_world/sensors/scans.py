@@ -31,29 +31,31 @@ from zsim_world.sensors.noise import WORDS, fill, words
 from zsim_world.sensors.sampler import Between, Exposures, poses_between, released
 from zsim_world.sensors.sensor_set import rounded
 
-CONE_RAYS = 8  # about the axis of a beam with a cone, beside that along it
-SHARE_MIN = 0.2  # of the length of a ray that its depth is, at the edge of a picture of 150 deg: 0.26
-MOUNT_MAX_M = 2.0  # m, chosen: no sensor is farther from the middle of its drone where others are left out
-RAY = columns("RayColumns", (Field("direction_B", "1", 3), Field("share", "1")))  # of a distance, that is measured
+CONE_RAYS = 8  # rays around the axis of a beam with a cone, in addition to the one along it
+SHARE_MIN = 0.2  # lower bound of depth / length of a ray; at the edge of a picture of 150 deg it is 0.26
+MOUNT_MAX_M = 2.0  # m, chosen: largest assumed distance of a sensor from its drone's centre, to skip far drones
+RAY = columns(
+    "RayColumns", (Field("direction_B", "1", 3), Field("share", "1"))
+)  # share of a ray's length that is measured (depth)
 SCANNER = columns(
     "ScannerColumns",
     (
         Field("drone", "1"),
-        Field("origin", "1"),  # first of its rays' origins
-        Field("apart", "1"),  # 1: every value has an origin of its own, 0: all have one
-        Field("first", "1"),  # of its rays
+        Field("origin", "1"),  # index of the first origin of its rays
+        Field("apart", "1"),  # 1: each value has its own origin; 0: all share one
+        Field("first", "1"),  # index of its first ray
         Field("values", "1"),
-        Field("rays", "1"),  # of each value, which is the least of them
+        Field("rays", "1"),  # rays per value, which is the smallest of their distances
         Field("min", "m"),
         Field("max", "m"),
         Field("noise", "m"),
         Field("share", "1"),
         Field("square", "1/m"),
-        Field("bias", "m"),  # of this run
+        Field("bias", "m"),  # constant in a run
         Field("quantum", "m"),
         Field("miss", "1"),  # a ray is missed when its standard normal number is below this
-        Field("drop", "1"),  # likewise a message
-        Field("stuck", "1"),  # by a fault: 1 where its first message is given again and again
+        Field("drop", "1"),  # likewise for a message
+        Field("stuck", "1"),  # 1: a fault repeats its first message
     ),
 )
 
@@ -85,19 +87,19 @@ class WaitingScan(NamedTuple):
 
     t_ns: int
     t_sample_ns: int
-    place: int  # of its sensor
+    place: int  # index of its sensor
     values: bytes
 
 
 class Mounted(NamedTuple):
-    """A sensor of a drone, and its rays in B: those of a value together."""
+    """A sensor of a drone, and its rays in B, grouped by value."""
 
     drone: int
     sensor: str
     kind: type[Sample]
     camera: str
     settings: Scanner
-    origins: Array  # m, one for all or one for each value, (1 or values, 3)
+    origins: Array  # m, one for all values or one for each, (1 or values, 3)
     rays: Array  # (values * k, RAY.size)
     values: int
     fixed: dict[str, Any]
@@ -107,10 +109,10 @@ class ScanScene(NamedTuple):
     """The W sensors and the objects in their surroundings, for compiled code; N drones."""
 
     scene: Scene
-    hulls: NDArray[np.float64]  # (N,), radii [m]
+    hulls: NDArray[np.float64]  # (N,), hull radii [m]
     scanners: NDArray[np.float64]  # (W, SCANNER.size)
-    origins: NDArray[np.float64]  # of all sensors, (O, 3), m in B
-    rays: NDArray[np.float64]  # of all sensors, (R, RAY.size)
+    origins: NDArray[np.float64]  # origins of all sensors, (O, 3) [m; B]
+    rays: NDArray[np.float64]  # rays of all sensors, (R, RAY.size)
 
 
 class ScanSampler:
@@ -139,7 +141,7 @@ class ScanSampler:
         gate_ns = round(scenario.time.gate_ms * 1e6)
         self._exposures = Exposures([each.settings.rate_hz for each in self._mounted], gate_ns)
         self._later: list[WaitingScan] = []
-        self._stuck: dict[int, bytes] = {}  # by place: the message that it gives again and again
+        self._stuck: dict[int, bytes] = {}  # the repeated message, by index of the sensor
 
     def recover(self) -> None:
         """Remove the effects of faults from all sensors."""
@@ -212,7 +214,7 @@ def _beams(i: int, name: str, settings: RangeConfig, p_BS: Array, R_BS: Array) -
     half, turn = math.radians(0.5 * settings.cone_deg), 2.0 * math.pi / CONE_RAYS
     rim = [(el.cos(half), el.sin(half) * el.cos(k * turn), el.sin(half) * el.sin(k * turn)) for k in range(CONE_RAYS)]
     cone = np.array([(1.0, 0.0, 0.0), *(rim if half else ())])
-    names = sorted(settings.beams)  # the resolved text is sorted too
+    names = sorted(settings.beams)  # sorted, like the resolved scenario
     poses = [_pose(settings.beams[beam]) for beam in names]
     origins = np.array([p_BS + _turned(R_BS, p[None])[0] for p, _ in poses])
     rays = _rays(np.concatenate([_turned(R_BS, _turned(R, cone)) for _, R in poses]))
@@ -235,7 +237,7 @@ def _lidar(i: int, name: str, settings: LidarConfig, p_BS: Array, R_BS: Array) -
 def _depth(i: int, name: str, settings: DepthConfig, camera: str, of: Camera) -> Mounted:
     """Return the rays through the centres of a depth image's pixels, each a block of camera pixels."""
     pose, lens, rows, count = camera_pose(of), lens_of(of), settings.rows, settings.columns
-    wide, high = lens.width / count, lens.height / rows  # of its pixels, in the camera's
+    wide, high = lens.width / count, lens.height / rows  # size of a depth pixel in camera pixels
     places: Any = np.meshgrid((np.arange(count) + 0.5) * wide - 0.5, (np.arange(rows) + 0.5) * high - 0.5)
     x, y = undistorted(lens, *(place.ravel() for place in places))
     length = np.sqrt(x * x + y * y + 1.0)

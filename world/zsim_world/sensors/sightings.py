@@ -4,7 +4,7 @@ A hat is a ball. It is in view if it is entirely within the picture and enough o
 detector fits a circle. It can be hidden by obstacles, surfaces, hulls (flat bodies of revolution about their drones' z
 axis) and, from below, by the rim of the drone's own rotors.
 
-Each camera has a random stream; everything due in a gate is computed in one compiled call. The errors match those of
+Each camera has a random stream; all pictures due in a gate is computed in one compiled call. The errors match those of
 the detector on rendered pictures (tests compare them): of a hat's centre and apparent diameter in pixels, larger for
 small hats, for motion during the exposure and in low light; misses and false alarms. Every picture of a camera takes
 the same number of random numbers.
@@ -48,41 +48,41 @@ from zsim_world.physics.rays import HULL_FLATNESS, Scene, cast_parts
 from zsim_world.sensors.noise import WORDS, fill, words
 from zsim_world.sensors.sampler import Between, Exposures, poses_between, released
 
-VIEW = columns(  # of a hat in a camera
+VIEW = columns(  # view of a hat in a camera
     "ViewColumns",
     (
         Field("seen", "1"),  # 0 or 1
         Field("direction_K", "1", 3),  # unit vector to its centre
-        Field("share", "1"),  # of its edge, that is visible
-        Field("centre", "1"),  # errors of the centre of a circle through what is visible, over those of a whole one
-        Field("radius", "1"),  # likewise of its radius
+        Field("share", "1"),  # visible share of its edge
+        Field("centre", "1"),  # error of the centre of a circle fitted to the visible edge, relative to a complete one
+        Field("radius", "1"),  # likewise for its radius
         Field("range", "m"),
         Field("angle", "rad"),  # its apparent diameter
-        Field("scale", "px/rad"),  # of the picture where it is
-        Field("rate", "rad/s"),  # at which it moves over the picture
+        Field("scale", "px/rad"),  # scale of the picture at its position
+        Field("rate", "rad/s"),  # angular rate at which it moves over the picture
     ),
 )
 CAMERA = columns(  # as mounted on a drone
     "CameraColumns", (Field("lens", "1, px", 11), Field("p_BK", "m", 3), Field("q_BK", "1", 4))
 )
-AHEAD_MIN = 0.05  # cosine to the axis; flatter rays never fall on a picture of 150 deg
+AHEAD_MIN = 0.05  # cosine to the optical axis; flatter rays miss even a picture of 150 deg
 RIM_WIDE, RIM_HIGH = 1.15, 0.14  # radius and height of the rotors' rim, in radii of a hull; fitted to pictures
-POINTS = 32  # of its edge, that are looked at
+POINTS = 32  # points of a hat's edge that are checked for visibility
 COSINES, SINES = (np.array([f(2.0 * math.pi * k / POINTS) for k in range(POINTS)]) for f in (el.cos, el.sin))
-LEVEL_COSINE = 0.9  # of a ray that is not nearly upright
-SHARE_MIN = 0.3  # of its edge; of a ball with less in view a detector does not know the circle
-EDGE_PX = 3.0  # px, nearer than which to the picture's edge a detector takes a hat for cut; the blur of its rim
+LEVEL_COSINE = 0.9  # cosine to the vertical; steeper rays need another basis
+SHARE_MIN = 0.3  # share of the edge; with less in view a detector does not recognise the circle
+EDGE_PX = 3.0  # px, blur of the rim: a hat closer to the picture's edge counts as cut off
 NOISY_LIGHT = 0.4  # of a clear day, at which a picture's noise is half again of what it is by day; measured
-DETECTOR = columns(  # of one camera, and what it looks at
+DETECTOR = columns(  # detector of one camera, and the hats that it detects
     "DetectorColumns",
     (
-        Field("R_BK", "1", 9),  # with the misalignment that nobody knows
+        Field("R_BK", "1", 9),  # including the unknown misalignment
         Field("misaligned", "rad"),  # standard deviation
-        Field("radius", "m"),  # of a hat
+        Field("radius", "m"),  # radius of a hat
         Field("exposure", "s"),
         Field("centre", "px"),  # standard deviations, as in SightingModel
         Field("diameter", "px"),
-        Field("noise", "px^2"),  # in this light
+        Field("noise", "px^2"),  # at this light
         Field("blur_share", "1"),
         Field("diameter_min", "px"),
         Field("miss", "1"),
@@ -92,18 +92,21 @@ DETECTOR = columns(  # of one camera, and what it looks at
 SEEN = columns(  # a sighting
     "SeenColumns",
     (
-        Field("picture", "1"),  # its number among those of a call
+        Field("picture", "1"),  # index among the pictures of a call
         Field("direction_B", "1", 3),
         Field("range", "m"),
         Field("sigma_direction", "rad"),
         Field("sigma_range", "m"),
     ),
 )
-DRAWS = 4  # normal numbers for each hat of a picture: two for its centre, one for its diameter, one for a miss
-FALSE_DRAWS = 4  # likewise for a false alarm: whether, where (2), how large
-DIAMETER_NOISE, DIAMETER_BLUR = 1.4, 2.8  # what noise and blur make of a diameter over that of a centre; measured
-ANGLE_MAX = 3.0  # rad, of an apparent diameter; pi is that of a ball that touches the lens
-SMALLEST = 0.1  # of a hat's apparent diameter, the least that is measured
+DRAWS = 4  # normal numbers per hat and picture: two for the centre, one for the diameter, one for a miss
+FALSE_DRAWS = 4  # normal numbers per false alarm: occurrence, position (2), size
+DIAMETER_NOISE, DIAMETER_BLUR = (
+    1.4,
+    2.8,
+)  # errors of a diameter over those of a centre, from noise and from blur; measured
+ANGLE_MAX = 3.0  # rad, largest apparent diameter; pi is that of a ball that touches the lens
+SMALLEST = 0.1  # smallest measured diameter, as a share of the apparent one
 
 
 Array = NDArray[np.float64]
@@ -112,11 +115,11 @@ Array = NDArray[np.float64]
 class PictureSightings(NamedTuple):
     """The sightings in one picture."""
 
-    t_ns: int  # when they are published
+    t_ns: int  # time of publication
     drone: int
     t_sample_ns: int  # the middle of the exposure
     camera: str
-    seen: tuple[Seen, ...]  # in an order that does not tell whose hats they are
+    seen: tuple[Seen, ...]  # in an order that does not reveal whose hats they are
 
     @property
     def sensor(self) -> str:
@@ -129,14 +132,14 @@ class PictureSightings(NamedTuple):
 class Surroundings(NamedTuple):
     """The W cameras and the objects in their surroundings, for compiled code; N drones."""
 
-    drones: NDArray[np.int64]  # (W,), whose each camera is
+    drones: NDArray[np.int64]  # (W,), drone of each camera
     cameras: Array  # (W, CAMERA.size)
     detectors: Array  # (W, DETECTOR.size)
     hulls: Array  # (N,), radii [m]
     hat_B: Vector  # centre of a hat [m]
     diameter: float  # of a hat [m]
-    balls: Array  # (M, 3), centres of what only looks like a hat [m; W]
-    bare: NDArray[np.bool_]  # (N,), whether a hat can be seen at all
+    balls: Array  # (M, 3), centres of objects that only look like hats [m; W]
+    bare: NDArray[np.bool_]  # (N,), whether a drone's hat is uncovered
     scene: Scene  # obstacles and surfaces
 
 
@@ -197,7 +200,7 @@ class SightingSampler:
         return released(self._later, now_ns)
 
     def _look(self, pictures: list[tuple[int, int]], between: Between) -> None:
-        """Compute the sightings of pictures, by instant and camera, and hold them until they are due."""
+        """Compute the sightings of pictures (instant, camera), and hold them until they are due."""
         which = np.array(pictures, dtype=np.int64)
         seen: list[list[Seen]] = [[] for _ in pictures]
         for picture, x, y, z, range_m, sigma, sigma_m in look(which, *between, self._held, self._streams).tolist():
@@ -299,7 +302,7 @@ def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quater
     a, b, c = dot(d, d), dot(o, d), dot(o, o) - radius * radius
     root = b * b - a * c
     if c <= 0.0 or root <= 0.0:
-        return False  # the eye is inside of it, as that of its own camera, or the ray passes
+        return False  # the eye is inside, such as that of the hull's own camera, or the ray misses
     at = (-b - math.sqrt(root)) / a
     return 0.0 < at < far
 
@@ -357,7 +360,7 @@ def _hidden(
     e1 = scaled(e1, 1.0 / norm(e1))
     e2 = cross(ray, e1)
     hidden, drones = 0, poses.shape[0]
-    for i in range(drones + 1 if scene.tree.part.shape[0] > 0 else drones):  # the drones, then all that does not move
+    for i in range(drones + 1 if scene.tree.part.shape[0] > 0 else drones):  # the drones, then the static scene
         if i < drones and (
             i == own or _passes(eye, ray, away, vector(poses[i], STATE.p_WB), RIM_WIDE * hulls[i] + ball)
         ):
@@ -381,7 +384,7 @@ def _write_outline(hidden: int, row: NDArray) -> None:
     row[VIEW.share], row[VIEW.centre], row[VIEW.radius] = 1.0, 1.0, 1.0
     if hidden == 0:
         return
-    around = POINTS - 1  # a detector leaves out the points beside those that are hidden
+    around = POINTS - 1  # a detector ignores the points beside hidden ones
     hidden |= hidden << 1 | hidden >> 1 | hidden << around | hidden >> around
     n, x, y, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(POINTS):
@@ -409,14 +412,14 @@ def hats_in_view(
     """Write the hats that a camera has in view.
 
     Args:
-        camera: row of the camera.
+        camera: the camera on its drone.
         own: index of its drone.
-        poses: of N drones at the instant of the picture, (N, STATE.size).
+        poses: states of N drones at the instant of the picture, (N, STATE.size).
         hulls: radius of each hull [m], (N,).
         hat_B: centre of a hat in the body of its drone [m].
-        diameter: of a hat [m].
+        diameter: diameter of a hat [m].
         balls: centres of balls that only look like hats [m; W], (M, 3).
-        bare: whether the hat of each drone is visible at all, (N,).
+        bare: whether the hat of each drone is uncovered, (N,).
         scene: obstacles and surfaces.
         view: the result, (N + M, VIEW.size): drones, then balls.
     """
@@ -462,7 +465,7 @@ def hats_in_view(
 
 @inlined
 def _unit(normal: float) -> float:
-    """Return a uniform number between 0 and 1 from a standard normal one."""
+    """Convert a standard normal number to a uniform one in [0, 1]."""
     return normal_probability(-normal)
 
 

@@ -25,7 +25,9 @@ START_NS = 60_000_000_000  # wall time in which a restarted process joins; a sma
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
 SILENT_NS = 1_800_000_000  # wall time without health, which comes once a second; so silence is reported within 2 s
-DEAD_NS = 10_000_000_000  # without health, after which a process that only reads is dead: its link is closed by then
+DEAD_NS = (
+    10_000_000_000  # wall time without health after which a process that only reads is dead: its link is closed by then
+)
 STALL_NS = 300_000_000  # wall time between two checks beyond which the world itself, or its machine, was stopped
 SHOWN = 5  # expressions shown of a process that subscribes to many
 _decode_health = msgspec.msgpack.Decoder(Health).decode

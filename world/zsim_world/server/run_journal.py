@@ -27,11 +27,11 @@ from zsim.output_folder import take_lock
 from zsim_world.run import inputs
 from zsim_world.run.inputs import Entry
 
-VERSION = 4  # of the files and the states in them
+VERSION = 4  # format of the files and of the states in them
 CHECKPOINT_NS = 5_000_000_000  # simulated time between checkpoints, as long as the message history
 CHECKPOINT_WALL_NS = 1_000_000_000  # shortest wall time between checkpoints, which have 20 MB for 1000 drones
 CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the second is younger than the message history
-HASHED_BYTES = 1 << 20  # of the truth per read
+HASHED_BYTES = 1 << 20  # bytes of the truth hash's input per read
 _FRAME = struct.Struct("<II")
 
 

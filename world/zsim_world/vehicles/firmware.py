@@ -1,6 +1,6 @@
 """The firmware of the drones at 200 Hz: modes, velocity, attitude and rate loops, using only its own estimate.
 
-Loops from inside out, each about three times slower than the one it contains, with the AR.Drone's figures:
+Loops from inside out, each about three times slower than the one it contains, with the AR.Drone's values:
     rotors   overdriven so that their lag halves (15 ms)
     rate     dw/dt = 28 (w_des - w)
     tilt     w_des = 9 (z_B × z_des): closed loop about 0.12 s, inside the 0.143 s that tum_ardrone fitted
@@ -58,22 +58,22 @@ from zsim_world.physics.simd import (
 from zsim_world.vehicles import observer
 from zsim_world.vehicles.observer import BELIEF, DEVICE, FLOOR_MIN_M, STEP_S, STILL_STEPS_MIN, lift, standing_height
 
-DRIVE = columns(  # what the loops of attitude and rate need of the firmware's settings, by which these begin
+DRIVE = columns(  # settings of the attitude and rate loops, the first of SETTING
     "DriveColumns",
     (
         Field("k_rate", "1/s"),
         Field("k_tilt", "1/s"),
-        Field("overdrive", "1"),  # part of the way to a command beyond it
-        Field("slope", "1"),  # tan of the largest tilt
+        Field("overdrive", "1"),  # commanded change of speed over the desired one
+        Field("slope", "1"),  # tangent of the largest tilt
         Field("yaw_share", "1"),
-        Field("body_rate", "rad/s"),  # largest, wanted of the tilt loop
+        Field("body_rate", "rad/s"),  # largest body rate that the tilt loop demands
     ),
 )
-SETTING = columns(  # limits of what a commander may ask, and the design of vehicle.Firmware
+SETTING = columns(  # limits of commands, and the design of vehicle.Firmware
     "SettingColumns",
     (
         Field("drive", "DRIVE", DRIVE.size),
-        Field("rotor_decay", "1"),  # left of the rotors' lag after a step
+        Field("rotor_decay", "1"),  # remaining fraction of the rotors' lag after a step
         Field("k_velocity", "1/s"),
         Field("k_climb", "1/s"),
         Field("speed", "m/s"),
@@ -111,11 +111,11 @@ MEMORY = columns(
     "MemoryColumns",
     (
         Field("mode", "1"),
-        Field("steps", "1"),  # in this mode
+        Field("steps", "1"),  # steps since this mode was entered
         Field("hold_xy", "m", 2),
         Field("hold_z", "m"),
         Field("holds_xy", "1"),
-        Field("holds_z", "1"),  # or RISING: the height held rises to that of the take-off, or HOLDING: it stays
+        Field("holds_z", "1"),  # 0; RISING: the held height rises to that of the take-off; HOLDING: it is constant
         Field("touch", "1"),  # steps for which the ground has borne the weight
     ),
 )
@@ -127,17 +127,17 @@ BOARD_LANES = columns(
         Field("drive", "DRIVE", DRIVE.size),
         Field("mount", "1", 4),  # q_BS of the gyro
         Field("gyro", "rad/s", 3),  # the newest sample
-        Field("bias", "rad/s", 3),  # what is believed to be its bias
-        Field("q_WB", "1", 4),  # of the belief, as the next
+        Field("bias", "rad/s", 3),  # its estimated bias
+        Field("q_WB", "1", 4),  # estimated attitude; likewise the next
         Field("w_WB_B", "rad/s", 3),
-        Field("angle", "rad"),  # of the step's turn
-        Field("sine", "1"),  # of half of it
+        Field("angle", "rad"),  # rotation of the body in the step
+        Field("sine", "1"),  # of half this angle; likewise the next
         Field("cosine", "1"),
-        Field("north", "1"),  # where the nose points
+        Field("north", "1"),  # horizontal direction of the nose
         Field("east", "1"),
         Field("heading", "rad"),
         Field("own", "1", 4),  # heading frame in W
-        Field("z_H", "1", 3),  # wanted: z_B in the heading frame
+        Field("z_H", "1", 3),  # desired z_B in the heading frame
         Field("thrust", "N"),
         Field("yaw_rate", "rad/s"),
         Field("driven", "1"),  # 0 if the firmware itself has set the command
@@ -147,9 +147,9 @@ BOARD_ROTORS = columns(
     "BoardRotors",
     (Field("known", "ROTOR", ROTOR.size), Field("speed", "rad/s"), Field("command", "rad/s"), Field("drive", "rad/s")),
 )
-# and by how much the speed of each rotor is less than commanded (R); the one at which it is held (R)
+# followed by the fraction of the commanded speed that each rotor reaches (R), and the speed at which it is held (R)
 ACTUATOR = columns("ActuatorColumns", (Field("faulty", "1"),))
-FOLLOWS = -1.0  # rad/s, of a rotor that is not held
+FOLLOWS = -1.0  # rad/s, marks a rotor that is not held
 Gains = tuple[float, float, float, float, float, float]
 
 
@@ -333,8 +333,8 @@ def _weaken(command: NDArray, actuator: NDArray) -> None:
 class Decision(NamedTuple):
     """The firmware's decision for the next 5 ms."""
 
-    driven: bool  # True: the drive is to find the command from the last three; False: it is set
-    z_H: Vector  # along the body's z wanted, in the heading frame
+    driven: bool  # True: the drive computes the command from the fields below; False: it is already set
+    z_H: Vector  # along the desired z_B, in the heading frame
     thrust_n: float
     yaw_rate: float  # rad/s
 
@@ -365,7 +365,7 @@ def decide(
         own: the heading frame in W of the estimated attitude.
         row, rotors: parameters; setting: limits and gains; setpoint: the commander's, cleared on landing.
         silence_s: age of the setpoint; hover_s: age from which to hover, and land_s later to land.
-        charge_percent: of the battery.
+        charge_percent: charge of the battery.
     """
     _change_mode(memory, belief, setting, setpoint, silence_s, hover_s, land_s, charge_percent)
     mode, decision = int(memory[MEMORY.mode]), COMMAND_IS_SET
@@ -379,7 +379,7 @@ def decide(
 
 @inlined
 def stands(memory: NDArray, setting: NDArray) -> bool:
-    """Return whether the firmware takes the drone to stand on the ground: landed, or spinning up."""
+    """Return whether the firmware assumes that the drone stands on the ground: landed, or spinning up."""
     spinning_up = memory[MEMORY.mode] == TAKING_OFF and memory[MEMORY.steps] * STEP_S < setting[SETTING.spin_up]
     return memory[MEMORY.mode] == LANDED or spinning_up
 
@@ -431,7 +431,7 @@ def _change_mode(
 
 @inlined
 def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
-    """Return the mode in the air for this kind and age of setpoint."""
+    """Return the mode of a flying drone for this kind and age of setpoint."""
     if kind == NONE:
         return HOVERING
     if silence_s >= hover_s + land_s:
@@ -502,11 +502,11 @@ def _from_velocity(
     v = vector(belief, BELIEF.v_H)
     v_des, yaw_rate = (0.0, 0.0, 0.0), 0.0
     if mode == FLYING:
-        v_des, yaw_rate = _asked_velocity(kind, own, setting, setpoint)
+        v_des, yaw_rate = _commanded_velocity(kind, own, setting, setpoint)
     else:
         v_des = _held(memory, belief, own, setting, v_des)
     v_des = (v_des[0], v_des[1], _climb(mode, v_des[2], memory, belief, row, setting, each))
-    # what the thrust must give: the acceleration wanted, less disturbance and drag, plus the weight
+    # specific thrust: desired acceleration, less disturbance and drag, plus gravity
     f = axpy(vector(belief, BELIEF.disturbance), -row[VEHICLE.drag] / row[VEHICLE.mass], v)
     gravity, gain = row[VEHICLE.gravity], setting[SETTING.k_velocity]
     up = max(setting[SETTING.k_climb] * (v_des[2] - v[2]) - f[2] + gravity, setting[SETTING.lift_min] * gravity)
@@ -520,7 +520,7 @@ def _from_velocity(
 
 
 @inlined
-def _asked_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float]:
+def _commanded_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float]:
     """Return the commanded velocity in the heading frame [m/s] and yaw rate [rad/s], within the limits."""
     if kind == ARDRONE:
         climb = setting[SETTING.climb] * _clip(setpoint[SETPOINT.value + 2], 1.0)
@@ -551,7 +551,7 @@ def _held(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v
 @inlined
 def _climb(
     mode: int,
-    asked: float,
+    wanted: float,
     memory: NDArray,
     belief: NDArray,
     row: NDArray,
@@ -564,9 +564,9 @@ def _climb(
         return -_descent(memory, belief, row, setting, each)
     if mode == TAKING_OFF:
         return _ascent(memory, belief, row, setting)
-    if asked != 0.0:
+    if wanted != 0.0:
         memory[MEMORY.holds_z] = 0.0
-        return min(asked, setting[SETTING.k_height] * (setting[SETTING.altitude] - height))
+        return min(wanted, setting[SETTING.k_height] * (setting[SETTING.altitude] - height))
     if memory[MEMORY.holds_z] != HOLDING:
         ahead = height + belief[BELIEF.v_H + 2] / setting[SETTING.k_climb]
         memory[MEMORY.hold_z], memory[MEMORY.holds_z] = max(ahead, 2.0 * row[VEHICLE.stand_height]), HOLDING
@@ -641,7 +641,7 @@ def drive(
         iz * k_rate * yaw_share * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
     )
     mix(row, rotors, thrust_n, moment, commands)
-    for r in range(len(rotors.each)):  # under these commands the rotors reach what is wanted with a part of their lag
+    for r in range(len(rotors.each)):  # overdriven commands shorten the rotors' lag
         speed = of(speeds, 0, r)
         put_of(commands, r, clipped(rotors, r, speed + overdrive * (of(commands, 0, r) - speed)))
 

@@ -10,7 +10,7 @@ horizontal axis (heading frame), driven by white noise:
     drate/dt = noise, du/dt = noise
 measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is its drag and disturbance) and
 by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height and the accelerometer's bias besides (u -
-c v + bias; across, a bias is one with a tilt). Heading: psi and rate.
+c v + bias; horizontally, a bias is indistinguishable from a tilt). Heading: psi and rate.
 """
 
 import math
@@ -45,7 +45,7 @@ from zsim_world.sensors.sensor_set import FIELD_MIN_UT, heading_sigma
 
 STEP_S = 1.0 / BOARD_RATE_HZ  # s
 
-BELIEF = columns(  # and R rotor speeds, modelled [rad/s]
+BELIEF = columns(  # followed by R modelled rotor speeds [rad/s]
     "BeliefColumns",
     (
         Field("q_WB", "1", 4),
@@ -60,12 +60,12 @@ BELIEF = columns(  # and R rotor speeds, modelled [rad/s]
         Field("baro_samples", "1"),
         Field("mag_samples", "1"),
         Field("sonar_age", "1"),  # steps since the last good echo
-        Field("lift_bias", "m/s^2"),  # of the accelerometer along the vertical
-        Field("heading", "rad"),  # of q_WB
+        Field("lift_bias", "m/s^2"),  # vertical bias of the accelerometer
+        Field("heading", "rad"),  # heading of q_WB
         Field("stand_height", "m"),  # at which it has landed on what is not the ground; 0 on the ground
     ),
 )
-DEVICE = columns(  # the newest sample of each sensor, and whether it is new
+DEVICE = columns(  # the newest sample of each sensor, and a flag that it is new
     "DeviceColumns",
     (
         Field("accel", "m/s^2", 3),
@@ -82,22 +82,22 @@ DEVICE = columns(  # the newest sample of each sensor, and whether it is new
         Field("new_sonar", "1"),
     ),
 )
-CALIBRATION = columns(  # what the board knows of its own mounts and of the place
+CALIBRATION = columns(  # mounts and site as known to the board
     "CalibrationColumns",
     (
         Field("imu_turn", "1", 4),  # q_BS
         Field("mag_turn", "1", 4),  # q_BS
-        Field("mag_bearing", "rad"),  # heading of the horizontal field, not a number where that gives none
+        Field("mag_bearing", "rad"),  # heading of the horizontal field; NaN if it is too weak
         Field("sonar_min", "m"),
     ),
 )
 
-STILL_STEPS_MIN = 50.0  # what knowing a floor to be level to 0.05 rad is worth, at an accelerometer noise of 0.35 g
-STILL_STEPS_SWAY = 400.0  # the gyro's bias is averaged slower: in a wind a standing drone sways on its feet
-STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples have less weight
-FLOW_QUALITY_MIN = 0.3  # below, the picture shows more horizon than ground
-FLOOR_MIN_M = 0.3  # m, chosen: a landing believed to be higher is on a roof; sonars measure from 0.25 m on or less
-SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barometer
+STILL_STEPS_MIN = 50.0  # weight of the prior that the floor is level to 0.05 rad, at an accelerometer noise of 0.35 g
+STILL_STEPS_SWAY = 400.0  # slower averaging of the gyro's bias: in wind a standing drone sways on its feet
+STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks, so older samples get less weight
+FLOW_QUALITY_MIN = 0.3  # below it the picture shows more horizon than ground
+FLOOR_MIN_M = 0.3  # m, chosen: a landing estimated to be higher is on a roof; sonars measure from at most 0.25 m
+SONAR_AGE_MAX = 100.0  # steps, 0.5 s; after this time without echo, heights come from the barometer
 
 
 @inlined
@@ -261,8 +261,10 @@ def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -
     """Correct velocity, disturbance, tilt, bias and climb rate by a flow velocity; return the new heading frame."""
     e = axpy(flow_H, -1.0, vector(belief, BELIEF.v_H))
     _correct(belief, gain, GAIN.flow_v, e)
-    tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]  # these the accelerometer does not correct
-    own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
+    tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]  # the accelerometer does not correct these
+    own = _turn_by(
+        belief, own, (-tilt * e[1], tilt * e[0], 0.0)
+    )  # faster forward than estimated: pitched further forward
     _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
     _lift_by(belief, gain, GAIN.climb_z, e[2])
     return own
@@ -307,7 +309,7 @@ def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, b
 
 @inlined
 def model_rotors(belief: NDArray, decay: float, commands: PerRotor) -> None:
-    """Advance the modelled rotors by one step under commands [rad/s]; decay: what is left of their lag after it."""
+    """Advance the modelled rotors by one step under commands [rad/s]; decay: remaining fraction of their lag."""
     speeds = PerRotor(belief, BELIEF.size, 1, commands.each)
     for r in range(len(commands.each)):
         put_of(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
@@ -317,8 +319,8 @@ Array = NDArray[np.float64]
 
 DEG = math.pi / 180.0  # rad
 
-# Smallest and largest standard deviation of a sample in the design: none is trusted fully, and beyond the largest a
-# meter has practically no effect
+# Smallest and largest standard deviation of a sample in the design: no meter is trusted fully, and one beyond the
+# largest has practically no effect
 SIGMAS = {
     "accel": (0.02, 50.0),  # m/s^2
     "gyro": (1e-4, 1.0),  # rad/s
@@ -328,7 +330,7 @@ SIGMAS = {
     "mag": (0.01, 3.0),  # rad
 }
 DOUBLINGS = 24  # 2^24 steps of 5 ms are a day
-SAMPLE_RATE_MIN_HZ = 0.1  # Hz, a meter is not counted with less often
+SAMPLE_RATE_MIN_HZ = 0.1  # Hz, slower meters are ignored
 
 GAIN = columns(  # innovation -> state, in the units of the states over that of the innovation
     "GainColumns",
@@ -425,9 +427,9 @@ def _gains(d: ObserverDesign) -> Array:
     row[GAIN.accel_v : GAIN.lift_z] = horizontal.ravel()
     row[GAIN.lift_z : GAIN.sonar_z] = by_baro.ravel()
     row[GAIN.sonar_z : GAIN.baro_zero] = by_sonar[2]
-    row[GAIN.baro_zero] = 1.0 / (10.0 * d.baro[1])  # ten seconds
+    row[GAIN.baro_zero] = 1.0 / (10.0 * d.baro[1])  # averaged over ten seconds
     row[GAIN.mag_psi : GAIN.mag_rate + 1] = by_mag[0]
-    row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits whatever the BLAS
+    row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits with any BLAS
     row.setflags(write=False)
     return row
 
