@@ -123,7 +123,7 @@ def _await(condition: Callable[[], bool], what: str) -> None:
 
 
 def _runs(port: int) -> bool:
-    """Return whether a console shows drones that move."""
+    """Return whether a console shows moving drones."""
     with suppress(OSError, KeyError):  # the page is there before it shows a run
         return _shown_s(port) > 3.0
     return False

@@ -50,7 +50,7 @@ def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float]
 
 
 class Spent(NamedTuple):
-    """What a command and its descendants spent: CPU seconds, and the greatest resident memory of a process [MB]."""
+    """CPU seconds of a command and its descendants, and the largest resident memory of a process [MB]."""
 
     cpu_s: float
     peak_mb: float

@@ -13,7 +13,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Spread:
-    """A median with the least and the greatest value."""
+    """A median with the smallest and the largest value."""
 
     median: float
     low: float

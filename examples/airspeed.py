@@ -14,7 +14,7 @@ from zsim.sensors.sensor import Channel, ErrorModel, RateHz, Sample, Sensor, Sen
 
 
 class Airspeed(Sample, frozen=True):
-    """Differential pressure [Pa], and the speed of the air against the tube that it stands for [m/s]."""
+    """Differential pressure [Pa], and the corresponding airspeed along the tube [m/s]."""
 
     pressure_pa: Number
     airspeed_m_s: Number

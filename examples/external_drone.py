@@ -32,7 +32,7 @@ class Aircraft:
         if kind == "mode":
             target = {"takeoff": "taking_off", "land": "landing", "emergency": "emergency", "reset": "landed"}
             self.state, self.wanted = target[m["mode"]], (0.0, 0.0, 0.0, 0.0)
-        elif m["source"] == "world":  # it is no longer commanded: it hovers
+        elif m["source"] == "world":  # no longer commanded: it hovers
             self.state, self.wanted, self.commander, self.set_s = "hovering", (0.0, 0.0, 0.0, 0.0), None, math.inf
         elif kind == "velocity":
             (x, y, z), yaw = m["velocity_m_s"], 0.0 if m.get("frame") == "world" else self.yaw
@@ -79,7 +79,7 @@ with zenoh.open(config) as session:
         return msgpack.unpackb(good[0].payload.to_bytes()) if good else None
 
     link = {"source": ME, "peer": "its own model", "age_ms": 0.0, "loss_percent": 0.0, "round_trip_ms": None}
-    armed = []  # whether an operator has asked for it
+    armed = []  # whether an operator has requested it
 
     def answer(query: zenoh.Query) -> None:
         op = msgpack.unpackb(query.payload.to_bytes())["op"] if query.payload else ""

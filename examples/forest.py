@@ -44,7 +44,7 @@ class Pilot(zsim.Agent):
         height_m: Annotated[float, Meta(gt=0.5, le=50)] = 2.0
         speed_m_s: Annotated[float, Meta(gt=0, le=5)] = 1.5
         brake_m_s2: Annotated[float, Meta(gt=0, le=5)] = 0.8
-        margin_m: Annotated[float, Meta(gt=0, le=5)] = 0.75  # half of the width of a free way; the hull takes 0.26 m
+        margin_m: Annotated[float, Meta(gt=0, le=5)] = 0.75  # half the width of a free path; the hull takes 0.26 m
         apart_m: Annotated[float, Meta(gt=0, le=20)] = 2.0  # of two drones
         takeoff_s: Annotated[float, Meta(ge=0)] = 1.0
 

@@ -73,7 +73,7 @@ class MyEstimator:
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """Return its whole state, with which another one continues if this process dies."""
+        """Return its whole state, from which its successor continues if this process dies."""
         return {"p": self._p, "v": self._v, "yaw": self._yaw, "rate": self._rate, "used": self._used}
 
     def restore(self, state: dict[str, Any]) -> None:

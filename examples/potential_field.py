@@ -1,4 +1,4 @@
-"""A custom control law: each robot is drawn to its place in the formation and pushed away from near ones.
+"""A custom control law: each robot is attracted to its position in the formation and pushed away from near ones.
 
     PYTHONPATH=examples zsim run scenarios/step.yaml --set clusters.main.law=potential_field:PotentialField
 
@@ -10,7 +10,7 @@ import numpy as np
 from zsim_agents.formation.control_law import ControlLaw
 from zsim_agents.formation.spaces.cluster_space import Array
 
-RANGE_M = 3.0  # beyond this robots do not push each other
+RANGE_M = 3.0  # distance beyond which robots do not repel each other
 PUSH_M3_S = 2.0  # of two robots 2 m apart: each flees at 2 (1/2 - 1/3) / 2^2 = 0.08 m/s
 
 

@@ -10,7 +10,7 @@ GATE_S = 0.02  # between two points
 
 
 class Way(NamedTuple):
-    """Where three drones truly were, every gate from t = 0."""
+    """True positions of three drones at every gate from t = 0."""
 
     p_W: NDArray[np.float64]  # (K, 3, 3) positions [m]
     v_W: NDArray[np.float64]  # (K, 3, 3) velocities [m/s]
