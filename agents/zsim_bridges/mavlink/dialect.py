@@ -1,14 +1,14 @@
-"""MAVLink's messages and enumerations, of common and ardupilotmega, and its frames, as vehicles and clients use them.
+"""MAVLink's messages and enumerations (dialects common and ardupilotmega), and its frames.
 
-`dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The table has the form that
-`wire_table` describes, and the units of the definitions; a default is the definition's value for "not known". Then come
-the conversions between axes: W is east, north, up and B forward, left, up; MAVLink's are north, east, down and forward,
+`dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The table has the format that
+`wire_table` describes, and the units of the definitions; a default is the definition's value for "unknown". Then come
+conversions between axes: W is east, north, up and B forward, left, up; MAVLink's are north, east, down and forward,
 right, down. At the end are the frames of MAVLink 1 and 2: `Link` packs and signs, `Parser` takes datagrams apart.
 
 Sources: https://mavlink.io/en/messages/common.html and ardupilotmega.html for the definitions;
-https://mavlink.io/en/guide/serialization.html for the order of the bytes, CRC_EXTRA, the checksum and frames;
+https://mavlink.io/en/guide/serialization.html for byte order, CRC_EXTRA, the checksum and frames;
 https://mavlink.io/en/guide/message_signing.html for signatures;
-https://mavlink.io/en/services/mission.html#mission_item_int for whole numbers.
+https://mavlink.io/en/services/mission.html#mission_item_int for positions as integers.
 """
 
 import hmac
@@ -125,7 +125,7 @@ LandedState = IntEnum("LandedState", "UNDEFINED ON_GROUND IN_AIR TAKEOFF LANDING
 
 
 class SensorBit(IntFlag):
-    """MAV_SYS_STATUS_SENSOR: the sensors and parts that a vehicle here has."""
+    """MAV_SYS_STATUS_SENSOR: the sensors and subsystems that zsim's vehicles have."""
 
     GYRO = 0x01
     ACCEL = 0x02
@@ -162,19 +162,19 @@ class Capability(IntFlag):
 
 
 TypeMask = IntFlag("TypeMask", "X Y Z VX VY VZ AX AY AZ FORCE YAW YAW_RATE")
-"""POSITION_TARGET_TYPEMASK: the ignored parts of a setpoint."""
+"""POSITION_TARGET_TYPEMASK: the components of a setpoint to ignore."""
 
 
 class AttitudeMask(IntFlag):
-    """ATTITUDE_TARGET_TYPEMASK: the ignored parts of a setpoint."""
+    """ATTITUDE_TARGET_TYPEMASK: the components of a setpoint to ignore."""
 
     YAW_RATE = 4
     THRUST = 64
     ATTITUDE = 128
 
 
-POS_HORIZ_ABS, PRED_POS_HORIZ_ABS = 16, 512  # ESTIMATOR_STATUS_FLAGS, and EKF_STATUS_FLAGS of ArduPilot
-ALL_ESTIMATED = 0x37F  # attitude, velocities, positions relative, absolute and predicted, height over the ground
+POS_HORIZ_ABS, PRED_POS_HORIZ_ABS = 16, 512  # ESTIMATOR_STATUS_FLAGS, and ArduPilot's EKF_STATUS_FLAGS
+ALL_ESTIMATED = 0x37F  # attitude, velocities, relative, absolute and predicted positions, height above ground
 
 
 class ParamType(IntEnum):
@@ -190,16 +190,16 @@ class ParamType(IntEnum):
 
 
 NO_GPS, NO_FIX = 0, 1  # GPS_FIX_TYPE
-FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: without checks, also in flight
+FORCE = 21196.0  # param2 of COMPONENT_ARM_DISARM: skip the checks, even in flight
 TYPE_QUADROTOR, TYPE_ONBOARD_CONTROLLER = 2, 18  # MAV_TYPE
 COMPONENT_AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 MISSION, FENCE = 0, 1  # MAV_MISSION_TYPE
 ALL_MISSION_TYPES = 255
 
 
-DEGREES, LOCAL_M = 1e-7, 1e-4  # unit of x and y in messages that have them as whole numbers
-INT32_UNKNOWN = 2**31 - 1  # INT32_MAX: NaN among whole numbers of 32 bits
-UINT16_UNKNOWN = 65535  # likewise of 16 bits
+DEGREES, LOCAL_M = 1e-7, 1e-4  # units of x and y [deg, m] in messages that carry them as integers
+INT32_UNKNOWN = 2**31 - 1  # INT32_MAX: stands for NaN in 32-bit integers
+UINT16_UNKNOWN = 65535  # UINT16_MAX: likewise in 16-bit integers
 _S = math.sqrt(0.5)
 _TARGET = "target_system,target_component:B"
 _GOAL = "vx,vy,vz:f[m/s] afx,afy,afz:f[m/s/s] yaw:f[rad] yaw_rate:f[rad/s]"
@@ -348,9 +348,9 @@ _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 def checksum(data: bytes) -> int:
-    """Return the CRC-16/MCRF4XX of some bytes: the polynomial of CCITT in reflected bits, from 0xFFFF on.
+    """Return the CRC-16/MCRF4XX of `data`: the CCITT polynomial, reflected, initial value 0xFFFF.
 
-    `crc_hqx` is the same polynomial with the bits in the other order, in C.
+    `crc_hqx`, implemented in C, has the same polynomial with the bits in reverse order.
     """
     crc = crc_hqx(data.translate(_REVERSED), 0xFFFF)
     return _REVERSED[crc & 0xFF] << 8 | _REVERSED[crc >> 8]
@@ -361,12 +361,12 @@ class WireMessage(msgspec.Struct, gc=False):
 
 
 class MessageLayout(WireLayout):
-    """The layout of one kind of message in a payload: larger fields first, extensions in the order of definition.
+    """The payload layout of one message type: larger fields first, extensions in the order of definition.
 
     Attributes:
-        crc_extra: checksum of the definition, so that peers with different definitions reject each other's messages.
-        size, base_size: with the extensions [bytes], and without them, as in MAVLink 1.
-        wire_order: names of the fields in the order of the payload.
+        crc_extra: checksum of the definition; peers with different definitions reject each other's messages.
+        size, base_size: of the payload with extensions [bytes], and without them, as in MAVLink 1.
+        wire_order: names of the fields in payload order.
     """
 
     def __init__(self, entry: Entry) -> None:
@@ -390,7 +390,7 @@ class MessageLayout(WireLayout):
         return (getattr(message, self.wire_order[0]),)
 
     def pack(self, message: WireMessage) -> bytes:
-        """Return the payload with its extensions and trailing zeros.
+        """Return the payload, including extensions and trailing zeros.
 
         Raises:
             struct.error, OverflowError: a value is out of the range of its type, or an array has another length.
@@ -399,7 +399,7 @@ class MessageLayout(WireLayout):
         return self.codec.pack(*(values if self.is_flat else self.flat(values)))
 
     def unpack(self, payload: bytes) -> WireMessage:
-        """Return the message of a payload; missing bytes at the end are 0, excess bytes are ignored."""
+        """Return the message in a payload; missing trailing bytes are taken as 0, excess bytes are ignored."""
         if len(payload) != self.size:
             payload = payload[: self.size].ljust(self.size, b"\0")
         return self.kind(*self.nested(self.codec.unpack(payload)))
@@ -415,19 +415,19 @@ if TYPE_CHECKING:
 
 
 def ned(v_W: Vector) -> Vector:
-    """Return a vector of W in north, east, down; its own inverse."""
+    """Convert a vector from W (east, north, up) to north, east, down, or back."""
     return v_W[1], v_W[0], -v_W[2]
 
 
 def frd(v_B: Vector) -> Vector:
-    """Return a vector of B in forward, right, down; its own inverse."""
+    """Convert a vector from B (forward, left, up) to forward, right, down, or back."""
     return v_B[0], -v_B[1], -v_B[2]
 
 
 def attitude_ned(q_WB: Quaternion) -> Quaternion:
-    """Return the attitude forward-right-down to north-east-down, w first and not negative; its own inverse.
+    """Convert an attitude B to W to one FRD to NED, or back; w comes first and is not negative.
 
-    W to NED is half a turn about (1, 1, 0), FRD to B half a turn about x.
+    W to NED is a rotation by 180 deg about (1, 1, 0), FRD to B one by 180 deg about x.
     """
     w, x, y, z = q_WB
     w, x, y, z = -x, w, z, -y
@@ -436,32 +436,32 @@ def attitude_ned(q_WB: Quaternion) -> Quaternion:
 
 
 def wrapped(angle_rad: float) -> float:
-    """Return an angle in [-pi, pi]."""
+    """Wrap an angle to [-pi, pi]."""
     return math.remainder(angle_rad, math.tau)
 
 
 def yaw_ned(yaw_W: float) -> float:
-    """Return a yaw counter-clockwise from east as one clockwise from north [rad]; its own inverse."""
+    """Convert a yaw counter-clockwise from east to one clockwise from north [rad], or back."""
     return wrapped(0.5 * math.pi - yaw_W)
 
 
 def from_int(value: int, unit: float) -> float:
-    """Return a whole number in a unit; NaN where it is not known."""
+    """Return an integer field times its unit; NaN if it is unknown."""
     return math.nan if value == INT32_UNKNOWN else unit * value
 
 
 def to_int(value: float, unit: float) -> int:
-    """Return a value as a whole number in a unit."""
+    """Return a value as an integer number of units; INT32_UNKNOWN if it is not finite."""
     return round(value / unit) if math.isfinite(value) else INT32_UNKNOWN
 
 
 def global_ints(place: Vector) -> tuple[int, int, int]:
-    """Return latitude [deg], longitude [deg] and height [m] as whole numbers [1e-7 deg, 1e-7 deg, mm]."""
+    """Return latitude [deg], longitude [deg] and height [m] as integers [1e-7 deg, 1e-7 deg, mm]."""
     return round(1e7 * place[0]), round(1e7 * place[1]), round(1000 * place[2])
 
 
 def int16(value: float) -> int:
-    """Return the nearest whole number of 16 bits, within 32767 either way."""
+    """Round a value, and clip it to ±32767."""
     return max(-32767, min(32767, round(value)))
 
 
@@ -470,20 +470,20 @@ HEADER_1, HEADER_2 = 6, 10  # bytes before the payload
 CHECKSUM_BYTES = 2
 SIGNED = 0x01  # MAVLINK_IFLAG_SIGNED
 ID_MAX_1 = 255  # message ids have one byte in MAVLink 1
-KEY_BYTES = 32  # a secret key
-SIGNATURE_BYTES = 13  # link id, 6 of time, 6 of hash
-HASH_BYTES = 6  # the first of SHA-256
-LINK_ID = b"\0"  # of signatures
+KEY_BYTES = 32  # length of a secret key
+SIGNATURE_BYTES = 13  # 1 of link id, 6 of timestamp, 6 of hash
+HASH_BYTES = 6  # leading bytes of the SHA-256 in a signature
+LINK_ID = b"\0"  # link id in our signatures
 TICKS_PER_S = 100_000  # unit of timestamps: 10 us
 EPOCH_S = 1_420_070_400  # 2015-01-01 in seconds since 1970: zero of timestamps
-BEHIND_MAX = 6_000_000  # ticks, a minute: greatest lag of a new stream
+BEHIND_MAX = 6_000_000  # ticks (one minute) that the first timestamp of a new stream may lag
 TIMESTAMP_MAX = 2**48 - 1
-STREAMS_MAX = 4096  # remembered; only holders of the key begin any
+STREAMS_MAX = 4096  # most streams remembered; only holders of the key can begin one
 Version = Literal[1, 2]
 
 
 class Received(NamedTuple):
-    """A message, its sender, its number on the link, and whether it was signed."""
+    """A received message, its sender, its sequence number, and whether it was signed."""
 
     message: WireMessage
     system_id: int
@@ -493,10 +493,10 @@ class Received(NamedTuple):
 
 
 class Signing:
-    """Signs frames with a key of 32 bytes, and checks the signatures of received ones.
+    """Signs frames with a key of KEY_BYTES, and verifies the signatures of received ones.
 
     Attributes:
-        timestamp: of the newest frame signed or accepted [10 us since 2015].
+        timestamp: of the newest frame signed or accepted [10 us since 2015-01-01].
     """
 
     def __init__(self, key: bytes) -> None:
@@ -511,13 +511,13 @@ class Signing:
         self.timestamp = max(self.timestamp, min(TIMESTAMP_MAX, int((unix_s - EPOCH_S) * TICKS_PER_S)))
 
     def sign(self, frame: bytes) -> bytes:
-        """Return the signature that follows a frame, header to checksum."""
+        """Return the signature to append to a frame, which reaches from header to checksum."""
         self.timestamp += 1
         head = LINK_ID + self.timestamp.to_bytes(6, "little")
         return head + self._hash(frame + head)
 
     def refusal(self, frame: bytes, signature: bytes, system_id: int, component_id: int) -> str | None:
-        """Return why a signed frame is refused, `bad_signature` or `replayed`; None if it is accepted."""
+        """Return why a signed frame is rejected, `bad_signature` or `replayed`; None if it is accepted."""
         if not hmac.compare_digest(self._hash(frame + signature[:-HASH_BYTES]), signature[-HASH_BYTES:]):
             return "bad_signature"
         stream = system_id, component_id, signature[0]
@@ -535,7 +535,7 @@ class Signing:
 
 
 class Link:
-    """Packs the messages of one component for one link, and numbers them; MAVLink 1 has no extensions or signatures."""
+    """Packs and numbers the messages of one component on one link; MAVLink 1 has no extensions or signatures."""
 
     def __init__(self, system_id: int, component_id: int, signing: Signing | None = None, version: Version = 2) -> None:
         self._address = bytes([system_id, component_id])
@@ -547,7 +547,7 @@ class Link:
         """Return the frame of a message.
 
         Raises:
-            ValueError: MAVLink 1 has no place for the message.
+            ValueError: the message's id is too large for MAVLink 1.
             struct.error, OverflowError: a value is out of the range of its type, or an array has another length.
         """
         layout = LAYOUTS[type(message)]
@@ -570,11 +570,12 @@ class Parser:
     """Splits received datagrams into frames and decodes them.
 
     Args:
-        signing: checks signatures, without which no frame is accepted; None to read frames unchecked.
+        signing: verifies signatures, and unsigned frames are rejected; None to ignore signatures.
 
     Attributes:
-        refused: frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (flags that must not be
-            ignored), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, bytes outside frames.
+        refused: number of rejected frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible`
+            (unknown flags that must not be ignored), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`,
+            the number of bytes outside frames.
     """
 
     def __init__(self, signing: Signing | None = None) -> None:
@@ -601,10 +602,10 @@ class Parser:
         return min(places) if places else None
 
     def _accept(self, data: bytes, begin: int, end: int) -> Received | str:
-        """Return the message of a whole frame, or why it is refused."""
+        """Return the message of a complete frame, or why it is rejected."""
         is_2 = data[begin] == MAGIC_2
         flags = data[begin + 2] if is_2 else 0
-        at = begin + (4 if is_2 else 2)  # of the sequence number; sender and message id follow
+        at = begin + (4 if is_2 else 2)  # index of the sequence number; sender and message id follow
         payload_at = begin + (HEADER_2 if is_2 else HEADER_1)
         payload_end = payload_at + data[begin + 1]
         signed_end = payload_end + CHECKSUM_BYTES
@@ -625,7 +626,7 @@ class Parser:
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
-    """Return where the frame that begins at a place ends; None if the data end before it does."""
+    """Return the end of the frame that begins at `begin`; None if it is incomplete."""
     is_2 = data[begin] == MAGIC_2
     header = HEADER_2 if is_2 else HEADER_1
     if begin + header + CHECKSUM_BYTES > len(data):
