@@ -1,1 +1,1 @@
-"""Comparisons with other simulators: each row is a ratio within one run; contenders do the same work, in turn."""
+"""Comparisons with other simulators that take turns at the same work; each row is a ratio within one run."""

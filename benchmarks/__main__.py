@@ -1,9 +1,9 @@
-"""Measure, and write the results into benchmarks/README.md.
+"""Measure the parts of the benchmarks, and write the results to benchmarks/README.md.
 
 make bench                                        all parts; makes the peers' environment first
 .venv/bin/python -m benchmarks a b --repeats 7    some parts
-.venv/bin/python -m benchmarks c --against REV    this working tree beside another commit
-.venv/bin/python -m benchmarks a --page           write the page again from results/a.json, without measuring
+.venv/bin/python -m benchmarks c --against REV    this working tree against another commit
+.venv/bin/python -m benchmarks a --page           rewrite the page from results/a.json, without measuring
 """
 
 import argparse
@@ -39,11 +39,11 @@ from benchmarks.child import RefusedError
 from benchmarks.sheet import Sheet, read
 
 RESULTS = Path(__file__).parent / "results"
-BESIDE = frozenset("abf")  # parts with peers
+BESIDE = frozenset("abf")  # parts that compare zsim with peers
 
 
 class Part(NamedTuple):
-    """A part: measures a number of repeats into a sheet, and renders a sheet as Markdown."""
+    """A part of the benchmarks: `measure` fills a sheet with a number of repeats, `page` renders it as Markdown."""
 
     measure: Callable[[int], Sheet]
     page: Callable[[Sheet], str]
@@ -75,7 +75,7 @@ def main() -> None:
         "--of", nargs="+", choices=against.FLIGHTS, default=list(against.FLIGHTS), help="with --against: what is flown"
     )
     given = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are ended
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are ended too
     if unknown := set(given.parts) - set(PARTS):
         parser.error(f"part is {', '.join(sorted(unknown))}; must be of {' '.join(PARTS)}")
     chosen = {name: PARTS[name] for name in given.parts or PARTS}
@@ -109,7 +109,7 @@ def _measured(name: str, part: Part, repeats: int, path: Path) -> Sheet:
 
 
 def _where(sheet: Sheet) -> str:
-    """Return when, where and how a sheet was measured."""
+    """Describe when, where and with what a sheet was measured."""
     others = ", ".join(f"{name} {version}" for name, version in sheet.machine["peers"].items())
     peers_told = f" Beside it: {others}." if others else ""
     repeats = sheet.machine["repeats"]

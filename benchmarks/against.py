@@ -1,8 +1,8 @@
-"""Part c with `--against REV`: this working tree beside another commit of zsim, in turn on one machine.
+"""Part c with `--against REV`: this working tree against another commit of zsim, in turn on one machine.
 
-Both fly their own Test 1 with the same seed and duration, and a grid of 99 drones. Processor time is that of a long
-flight minus that of a short one, which excludes the start and the end of a run. A ratio above 1 means that this tree
-is better: real-time factor here / there, processor time and memory there / here.
+Each flies its own Test 1 with the same seed and duration, and a grid of 99 drones. Processor time is that of a long
+flight minus that of a short one, which excludes start-up and shutdown. A ratio above 1 means that this tree is better:
+real-time factor here / there, processor time and memory there / here.
 """
 
 import contextlib
@@ -25,31 +25,31 @@ from benchmarks.run import end_event, spent
 from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
-GRID = 99  # drones: 33 clusters of three, so that none is left over
+GRID = 99  # drones; 33 clusters of three, so that none is left over
 SEED = 1
-FLOWN = ("world", "agents", "record")  # extras that a flight needs
+FLOWN = ("world", "agents", "record")  # optional dependencies that a flight needs
 
 
 class Flight(NamedTuple):
-    """What both revisions fly."""
+    """A flight that both revisions make."""
 
-    label: str  # for people
-    drones: int  # number of drones
-    options: tuple[str, ...]  # of `zsim run`
-    short_s: float  # simulated; the processor time of this flight is subtracted from that of the long one
-    long_s: float  # duration of the long flight, simulated
+    label: str  # shown in tables
+    drones: int
+    options: tuple[str, ...]  # options of `zsim run`
+    short_s: float  # simulated; duration of the short flight, whose processor time is subtracted
+    long_s: float  # simulated; duration of the long flight
 
 
 FLIGHTS = {
     **{name: Flight(f"Test 1, {label}", 3, OPTIONS[name], 10.0, 330.0) for name, label in LABELS.items()},
-    # 4 s: the grid takes off at 1 s, and all its formations are engaged by then
+    # 4 s, as the grid takes off at 1 s and all its formations are engaged by then
     "grid": Flight(f"{GRID} drones, one process (`--in-process`)", GRID, ("--in-process",), 4.0, 14.0),
 }
 QUANTITIES = {"factor": "× real time", "cpu": "CPU ms per drone-second", "peak": "greatest resident memory, MB"}
 
 
 class Side(NamedTuple):
-    """A revision that flies: its checkout, and the Python that imports zsim from there."""
+    """A revision: its checkout, and the Python that imports zsim from it."""
 
     root: Path
     python: Path
@@ -59,11 +59,12 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
     """Fly both revisions in turn.
 
     Args:
-        repeats: turns.
-        revision: a commit: a hash, a tag, a branch, `HEAD~3`.
-        names: of `FLIGHTS`.
+        repeats: number of turns.
+        revision: a hash, a tag, a branch, or a relative name such as `HEAD~3`.
+        names: keys of `FLIGHTS`.
 
-    RefusedError if git does not know the revision, or a package that it needs cannot be installed.
+    Raises:
+        RefusedError: git does not know the revision, or a package that it needs cannot be installed.
     """
     sheet = Sheet("c-against", "")
     flights = {name: FLIGHTS[name] for name in FLIGHTS if name in names}
@@ -77,7 +78,7 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
             progress.tell(f"{described(side.root)}: compiled")
         for turn in range(repeats):
             for name, flight in flights.items():
-                for mine in sorted(sides, reverse=bool(turn % 2)):  # the order alternates
+                for mine in sorted(sides, reverse=bool(turn % 2)):  # so that neither is always first
                     side = sides[mine]
                     path = Path(temporary) / "grid.yaml" if name == "grid" else side.root / "scenarios" / "step.yaml"
                     progress.tell(f"{mine}, {flight.label}: {_measured(sheet, mine, name, flight, side, path)}")
@@ -86,7 +87,7 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
 
 @contextlib.contextmanager
 def checked_out(revision: str, folder: Path) -> Iterator[Side]:
-    """Check a revision out into a folder, with an environment that shares the installed packages; remove it at the end.
+    """Check a revision out with an environment that shares the installed packages; remove the checkout at the end.
 
     RefusedError if git does not know the revision, or a package that it needs cannot be installed.
     """
@@ -100,7 +101,7 @@ def checked_out(revision: str, folder: Path) -> Iterator[Side]:
 
 
 def _environment(root: Path, folder: Path) -> Path:
-    """Make an environment with zsim from a checkout and the packages of this one; return its Python."""
+    """Make an environment with zsim from a checkout and the current environment's packages; return its Python."""
     project = tomllib.loads((root / "pyproject.toml").read_text())
     ours = project["tool"]["hatch"]["build"]["dev-mode-dirs"]
     shared = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
@@ -115,7 +116,7 @@ def _environment(root: Path, folder: Path) -> Path:
 
 
 def _unmet(project: dict[str, Any]) -> list[str]:
-    """Return the requirements of a flight that the packages installed here do not meet."""
+    """Return the requirements of a flight that the installed packages do not meet."""
     extras = project.get("optional-dependencies", {})
     texts = [*project["dependencies"], *(text for extra in FLOWN for text in extras.get(extra, []))]
     wanted = [found for found in map(Requirement, texts) if found.name != project["name"]]
@@ -139,7 +140,7 @@ def _ran(command: Sequence[str], name: str) -> None:
 
 
 def described(root: Path) -> str:
-    """Return the commit of a checkout with its date, `-dirty` if something was changed since."""
+    """Return commit and date of a checkout, with `-dirty` if it has uncommitted changes."""
     asked = ["git", "-C", str(root), "log", "-1", "--format=%cs"]
     date = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
     asked = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
@@ -148,7 +149,7 @@ def described(root: Path) -> str:
 
 
 def _measured(sheet: Sheet, mine: str, name: str, flight: Flight, side: Side, path: Path) -> str:
-    """Fly a short and a long flight, and add their figures; return these as text."""
+    """Fly a short and a long flight, add the results to the sheet, and return them as text."""
     try:
         _, short_cpu_s, _ = _flown(side, flight, flight.short_s, path)
         factor, long_cpu_s, peak_mb = _flown(side, flight, flight.long_s, path)
@@ -161,7 +162,7 @@ def _measured(sheet: Sheet, mine: str, name: str, flight: Flight, side: Side, pa
 
 
 def _flown(side: Side, flight: Flight, seconds: float, path: Path) -> tuple[float, float, float]:
-    """Return real-time factor, CPU seconds of all processes, and the greatest resident memory of one of them [MB]."""
+    """Return real-time factor, CPU seconds of all processes, and peak resident memory of the largest one [MB]."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         command = [str(side.python), "-m", "zsim_deploy.cli", "run", str(path), "--no-report", "--seed", str(SEED)]

@@ -2,9 +2,9 @@
 
     python -m benchmarks.ardrone [--drones 20] [--seconds 10]
 
-A world in realtime; each drone has a pilot that is sent full navdata and sends REF and PCMD every 30 ms, as the SDK
-does. The age is measured from the sending of a PCMD that differs from the last one to the arrival of its command at
-a Zenoh client; for comparison, the time of a message of the same size from one Zenoh client to another.
+The world runs in realtime; each drone has a pilot that receives full navdata and sends REF and PCMD every 30 ms, as the
+SDK does. The age is measured from sending a PCMD that differs from the last one to the arrival of its command at a
+Zenoh client; for comparison, a message of the same size is timed from one Zenoh client to another.
 """
 
 import argparse
@@ -25,12 +25,12 @@ from benchmarks.child import Server
 from benchmarks.exchange.lap import free_port
 from zsim_bridges.ardrone import at_commands, navdata
 
-PERIOD_S = 0.03  # of the SDK
+PERIOD_S = 0.03  # command period of the SDK
 FIRST = "127.9.0.2"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-PROBE_S = 0.05  # wall time between two messages that are timed
+PROBE_S = 0.05  # wall time between two timed messages
 READY_S = 60.0
-INDOOR_RAD = 0.20944  # control:euler_angle_max
+INDOOR_RAD = 0.20944  # value of control:euler_angle_max
 
 
 def scenario(drones: int) -> str:
@@ -39,7 +39,7 @@ def scenario(drones: int) -> str:
 
 
 class Pilots:
-    """A pilot for each drone, in this process."""
+    """The pilots of all drones, in this process."""
 
     def __init__(self, addresses: list[str]) -> None:
         self.addresses = addresses
@@ -66,7 +66,7 @@ class Pilots:
         self._socket.sendto(datagram, (address, at_commands.PORT))
 
     def steer(self, share: float = 0.0, only: str = "") -> None:
-        """Send what the SDK sends every 30 ms."""
+        """Send the REF and PCMD that the SDK sends every 30 ms; `share` is the pitch, in -1 to 1."""
         for address in [only] if only else self.addresses:
             pcmd = at_commands.Pcmd(0, int(share != 0.0), 0.0, share, 0.0, 0.0)
             self._send(address, at_commands.ref(0, self.flies), pcmd)
@@ -144,7 +144,7 @@ def _await_navdata(pilots: Pilots) -> None:
 
 
 def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[float]:
-    """Steer for a time; return how long each command that differed took to its key [ms]."""
+    """Steer for `seconds`; return the time from sending each distinct command to its arrival on its key [ms]."""
     sent_s: dict[float, float] = {}
     ages_ms: list[float] = []
 
@@ -168,13 +168,13 @@ def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[flo
 
 
 def _forward(tilt_rad: float) -> float:
-    """Return the share of zsim's tilt by which the command is recognised."""
+    """Return a command's `forward`, the share of zsim's tilt limit, by which it is recognised."""
     sent = at_commands.float_of_bits(at_commands.bits_of_float(tilt_rad / INDOOR_RAD))
     return math.tan(sent * INDOOR_RAD) / math.tan(math.radians(20.0))
 
 
 def _bare_ms(one: zenoh.Session, other: zenoh.Session, pilots: Pilots) -> list[float]:
-    """Return how long messages take from one client of Zenoh to another [ms]."""
+    """Return the latencies from one Zenoh client to another [ms]."""
     begun_s: list[float] = [0.0]
     ages_ms: list[float] = []
     key = "zsim/bench/age"

@@ -1,7 +1,7 @@
-"""CPU time of drawing a picture and of finding hats in it, on one thread: python -m benchmarks.cameras [PICTURES]
+"""CPU time on one thread of drawing a picture and finding hats in it: python -m benchmarks.cameras [PICTURES]
 
-A front camera of 640 x 360 with ten drones in view, hovering and in motion; if PICTURES, a folder, is given, the
-pictures of docs/cameras.md are written into it.
+A front camera of 640 x 360 px sees ten drones, hovering and in motion. Given PICTURES, a folder, write the pictures of
+docs/cameras.md to it.
 """
 
 import sys
@@ -19,13 +19,13 @@ from zsim_agents.cameras.detector import HatDetector, decoded
 from zsim_agents.cameras.renderer import Renderer
 from zsim_agents.cameras.scene import DroneStates, Scene, default_look
 
-DRONES = 11  # one looks at ten
-REPEATS, CALLS = 30, 20  # the smallest of this many means, which excludes other load
-ROTOR_RAD_S = 400.0  # rad/s, about a hover
+DRONES = 11  # the first looks at the other ten
+REPEATS, CALLS = 30, 20  # minimum of REPEATS means of CALLS calls, which excludes other load
+ROTOR_RAD_S = 400.0  # rad/s; roughly that of hovering
 
 
 def situation(moving: bool = False) -> DroneStates:
-    """Return ten drones before one, 3 to 15 m away."""
+    """Return a drone and ten others in front of it, 3 to 15 m away."""
     rng = np.random.default_rng(3)
     ahead = np.array([0.0, *(3 + 1.2 * np.arange(1, DRONES))])
     p = np.stack([ahead, rng.uniform(-0.5, 0.5, DRONES) * ahead, 4 + rng.uniform(-0.15, 0.15, DRONES) * ahead], axis=-1)
@@ -37,7 +37,7 @@ def situation(moving: bool = False) -> DroneStates:
 
 
 def formation() -> DroneStates:
-    """Return three drones in a triangle at 4 m, the first of which looks at the others."""
+    """Return three drones in a triangle at a height of 4 m, the first facing the others."""
     p = np.array([(0.0, 0.0, 4.0), (3.0, 1.2, 4.0), (4.0, -1.3, 4.0)])
     rpy = np.array([(0.02, 0.03, 0.0), (0.05, 0.0, 2.6), (0.0, 0.04, -2.2)])
     still = np.zeros((3, 3))

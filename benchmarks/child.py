@@ -1,6 +1,6 @@
-"""Processes of the benchmarks: one that prints a result and ends, or one that answers repeatedly.
+"""Child processes of the benchmarks, which print one result and exit, or keep answering questions.
 
-Each has its own process group, so that nothing of it remains, however it ends.
+Each has its own process group, so that its children are killed with it, however it ends.
 """
 
 import contextlib
@@ -21,9 +21,10 @@ class RefusedError(Exception):
 
 
 def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
-    """Run a command in the project's folder and return the JSON of the last line that it prints.
+    """Run a command in the project's folder and return the last line of JSON that it prints.
 
-    RefusedError if it failed, or did not end in time.
+    Raises:
+        RefusedError: it failed, or did not end in time.
     """
     with tempfile.TemporaryFile("w+") as errors:
         process = _started(command, errors, stdin=subprocess.DEVNULL)
@@ -40,10 +41,10 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
 
 
 class Server:
-    """A contender that keeps running and answers lines of JSON."""
+    """A contender that keeps running and answers one line of JSON with another."""
 
     def __init__(self, command: Sequence[str]) -> None:
-        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - open as long as the process
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - stays open as long as the process runs
         self._process = _started(command, self._errors, stdin=subprocess.PIPE)
 
     @property
@@ -51,7 +52,7 @@ class Server:
         return self._process.pid
 
     def ask(self, question: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-        """Return the answer; RefusedError if it refuses, has ended, or does not answer in time."""
+        """Return the answer to a question; RefusedError if the process refuses, has ended, or is too slow."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -81,7 +82,7 @@ def _started(command: Sequence[str], errors: Any, stdin: int) -> subprocess.Pope
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Kill what remains of it and of its children."""
+    """Kill what remains of a process group."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -1,7 +1,7 @@
-"""Part d: the age of a command at the world in realtime, since the publication of the samples that it answers.
+"""Part d: the age of a command at the world in realtime, from the publication of the samples that it answers.
 
-For comparison, in the same run and with as many processes, what Zenoh alone needs: a round trip, and the path of a
-command (from the hub to N clients, through the hub to one more that waits for all, and back).
+For comparison, bare Zenoh is timed in the same run with as many processes: a round trip, and the path of a command
+(from the hub to N clients, through the hub to one more client that waits for all of them, and back).
 """
 
 import sys
@@ -15,7 +15,7 @@ from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
 SIZES = (3, 30)
-SECONDS = 15.0  # simulated, and wall
+SECONDS = 15.0  # simulated, which is also wall time
 BARE_SECONDS = 5.0
 TIMEOUT_S = 120.0
 ZSIM: dict[str, tuple[str, ...]] = {"hosted": ("--hosted",), "zsim": ()}
@@ -29,7 +29,7 @@ LABELS = {
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly in realtime and run the bare exchanges, in turn, at every size."""
+    """Fly in realtime and time bare Zenoh, in turn, at every size."""
     sheet = Sheet("d", "ms")
     progress = Progress("d", repeats * len(SIZES) * len(LABELS))
     with tempfile.TemporaryDirectory() as folder:

@@ -1,8 +1,8 @@
 """Part h: what the console costs: its share of a core, and by how much it slows a run in lockstep.
 
-The share is processor time divided by wall time of the console's process, with one page open: a client that reads all
-that a page is sent. The loss is the real-time factor with a console and such a client, divided by the mean of those
-just before and just after; this is repeated within one run, because machines drift.
+The share is the processor time of the console's process divided by wall time, with one page open: a client that reads
+all that a page is sent. The slowdown is the real-time factor with a console and such a client, divided by the mean of
+the factors just before and just after; it is measured repeatedly within one run, because machines drift.
 """
 
 import json
@@ -36,41 +36,41 @@ from zsim_bridges.console.page_server import ViewerCamera
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 SIZES = (3, 50)  # drones
-SECONDS = 15.0  # wall time over which a share is measured
-SETTLE_S = 5.0  # wall time before that: a page that is opened is sent everything at once
-FLIGHT_S = 100_000.0  # simulated, of a run whose real-time factor is measured: it is ended before
-WINDOW_S = 8.0  # wall time over which that is measured
-PAIRS = 8  # windows with a console in one run, each between two without
+SECONDS = 15.0  # wall time over which the share of a core is measured
+SETTLE_S = 5.0  # wall time before each measurement, as a newly opened page is sent everything at once
+FLIGHT_S = 100_000.0  # simulated; the run of the real-time factors is ended long before this
+WINDOW_S = 8.0  # wall time over which a real-time factor is measured
+PAIRS = 8  # windows with a console per run, each between two without
 TIMEOUT_S = 300.0
 LOOK_S = 0.2
-GOALS = {3: 15.0, 50: 60.0}  # percent of a core
+GOALS = {3: 15.0, 50: 60.0}  # maximum percentage of a core, by number of drones
 LEAST_RATIO = 0.9
-PICTURES_HZ = {3: 20.0, 50: 10.0}  # of the console, by its number of drones
-LEAST_PICTURES = 0.8  # share of them; with fewer the console was starved, and seems cheap
-LEAST_RATE = 0.9  # of real time; a slower run gave the console less to draw
-DRONES = "/drones"  # the node of the scene
-CAMERA = ViewerCamera(  # the first message of a page; viser ignores its controls before that
+PICTURES_HZ = {3: 20.0, 50: 10.0}  # picture rate of the console, by number of drones
+LEAST_PICTURES = 0.8  # minimum share of these pictures; a starved console draws fewer and seems cheap
+LEAST_RATE = 0.9  # minimum real-time factor; a slower run gives the console less to draw
+DRONES = "/drones"  # node of the drones in viser's scene
+CAMERA = ViewerCamera(  # first message of a page; viser ignores its controls before it
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
 
 
 class Share(NamedTuple):
-    """What was measured of a console in a window."""
+    """Measurements of a console over SECONDS."""
 
-    percent: float  # of a core
-    read_per_s: float  # count at the page
-    factor: float  # simulated / wall time
+    percent: float  # processor time as a percentage of a core
+    read_per_s: float  # bytes or pictures a second that reached the page
+    factor: float  # simulated time / wall time
 
 
 class Reader:
-    """A page that draws nothing: it reads all that viser sends.
+    """A client that reads all that viser sends to a page, and draws nothing.
 
     Args:
-        port: of the console.
+        port: the console's port.
 
     Attributes:
-        received: bytes.
-        pictures: how often the drones have been redrawn.
+        received: number of bytes.
+        pictures: number of updates of the drones.
     """
 
     def __init__(self, port: int) -> None:
@@ -96,7 +96,7 @@ class Reader:
 
 
 def _has_drones(said: str | bytes) -> bool:
-    """Return whether a message of viser moves the drones; it has lengths, then a packed part, then arrays."""
+    """Return whether a message of viser moves the drones; its layout is lengths, a packed part, arrays."""
     assert isinstance(said, bytes)
     packed = said[16 : 16 + int.from_bytes(said[8:16], "little")]
     told = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed), strict=False)["messages"]
@@ -123,15 +123,15 @@ def _await(condition: Callable[[], bool], what: str) -> None:
 
 
 def _runs(port: int) -> bool:
-    """Return whether a console shows moving drones."""
-    with suppress(OSError, KeyError):  # the page is there before it shows a run
+    """Return whether the console shows more than 3 s of a run."""
+    with suppress(OSError, KeyError):  # the page can be opened before it shows a run
         return _shown_s(port) > 3.0
     return False
 
 
 @contextmanager
 def _flying(folder: Path, count: int) -> Iterator[tuple[int, psutil.Process]]:
-    """Fly a number of drones at 1 x real time; yield the console's port and process."""
+    """Fly `count` drones at 1 x real time with a console; yield its port and process."""
     scenario, world, port = folder / f"grid{count}.yaml", free_port(), free_port()
     grid.write(scenario, count, 3600.0)
     endpoint = f"tcp/127.0.0.1:{world}"
@@ -145,7 +145,7 @@ def _flying(folder: Path, count: int) -> Iterator[tuple[int, psutil.Process]]:
 
 
 def _share(console: psutil.Process, port: int, read: Callable[[], int] = lambda: 0) -> Share:
-    """Return the console's processor time, and what a page is sent, over SECONDS."""
+    """Measure a console over SECONDS; `read` returns the bytes or pictures that have reached a page."""
     time.sleep(SETTLE_S)
     before, sent, simulated_s, start_s = console.cpu_times(), read(), _shown_s(port), time.monotonic()
     time.sleep(SECONDS)
@@ -176,14 +176,14 @@ def _measure_shares(sheet: Sheet, folder: Path, count: int) -> str:
 
 
 def _check_kept_up(count: int, drawn: Share) -> None:
-    """Refuse a measurement if too few pictures were drawn, or the run did not keep up with real time."""
+    """Raise RefusedError if too few pictures were drawn, or the run did not keep up with real time."""
     if drawn.read_per_s < LEAST_PICTURES * PICTURES_HZ[count] or drawn.factor < LEAST_RATE:
         found = f"{drawn.read_per_s:.1f} pictures a second at × {drawn.factor:.2f}"
         raise RefusedError(f"{count} drones: {found}; must be about {PICTURES_HZ[count]:g} at × 1")
 
 
 def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
-    """Fly one run unpaced, with a console and a page from time to time, and add its real-time factors."""
+    """Fly one run unpaced, with and without a console in turn, and add its real-time factors to the sheet."""
     scenario, world = folder / f"fast{count}.yaml", free_port()
     endpoint = f"tcp/127.0.0.1:{world}"
     grid.write(scenario, count, FLIGHT_S)
@@ -203,7 +203,7 @@ def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
 
 @contextmanager
 def _looked_at(endpoint: str) -> Iterator[None]:
-    """Run a console, and a page that reads all that it is sent."""
+    """Run a console, with a client that reads all that a page is sent."""
     port = free_port()
     with _started("console", "--connect", endpoint, "--port", str(port)):
         _await(lambda: _runs(port), "a run on the console")
@@ -222,7 +222,7 @@ def _factor(link: Session) -> float:
 
 
 def _now_s(link: Session) -> float:
-    """Return the simulated time of a run; 0 if it is not published."""
+    """Return the simulated time of a run [s], or 0 before its clock is published."""
     found = link.get(keys.CLOCK)
     return messages.decode(keys.CLOCK, found[0].payload).t_ns / 1e9 if found else 0.0
 

@@ -1,4 +1,4 @@
-"""A run in one process, measured in CPU time from its second simulated second on; prints a line of JSON.
+"""Measure the CPU time of a run in one process, from its second simulated second on; print a line of JSON.
 
 .venv/bin/python -m benchmarks.flight --drones 10 --seconds 5
 """
@@ -16,7 +16,7 @@ from benchmarks import grid
 from zsim.record import RecordWriter
 from zsim_analysis.in_process import InProcessFlight
 
-WARM_NS = 1_000_000_000  # simulated, not counted
+WARM_NS = 1_000_000_000  # simulated time that is not measured
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def fly(drones: int, seconds: float) -> dict[str, float]:
-    """Return CPU seconds per simulated second, and resident memory at the end [MB]."""
+    """Return CPU seconds per simulated second, and resident memory at the end [MB], by name."""
     flight = InProcessFlight(grid.scenario(drones, duration_s=WARM_NS / 1e9 + seconds))
     world = flight.world
     with tempfile.TemporaryDirectory() as folder:

@@ -1,7 +1,7 @@
 """Part j: what the Python interface costs: a flight by zsim.run compared with `zsim run`, and stepped flights.
 
-The flights are whole processes, in turn; both record, and neither makes a report. Steps are counted by the CPU time of
-their process, from the second simulated second on; only the truth is observed.
+The flights take turns, each as a separate process; both record, and neither makes a report. Steps are measured in CPU
+time of their process, from the second simulated second on; only the truth is observed.
 """
 
 import gc
@@ -19,9 +19,9 @@ from benchmarks.table import spread, table
 
 ROOT = Path(__file__).parents[1]
 SCENARIO = ROOT / "scenarios" / "step.yaml"
-DRONES = 3  # of it
-SECONDS = 120.0  # simulated, of a flight
-GATES = 20_000  # of a stepped flight
+DRONES = 3  # number of drones in the scenario
+SECONDS = 120.0  # simulated duration of a flight
+GATES = 20_000  # measured gates of a stepped flight
 WARM_GATES = 50
 COMMAND, PYTHON = "zsim run --in-process", "zsim.run"
 STEPS = {
@@ -29,7 +29,7 @@ STEPS = {
     "world alone, a new command to every drone": ("agents=None", True),
     "with the scenario's agents": ("agents='stock'", False),
 }
-RATIO_MAX, LEAST_GATES = 1.05, 8_000  # aims
+RATIO_MAX, LEAST_GATES = 1.05, 8_000  # at most the former, at least the latter
 
 
 def measure(repeats: int) -> Sheet:
@@ -84,7 +84,7 @@ def _said(command: list[str]) -> str:
 
 
 def stepped(agents: Any, is_commanded: bool, wrap: Callable[[Callable[[], None]], None] = lambda fly: fly()) -> float:
-    """Return gates per CPU second of a stepped flight; `wrap` calls the measured function, as under a profiler."""
+    """Return gates per CPU second of a stepped flight; `wrap` calls the measured part, e.g. under a profiler."""
     import zsim
 
     sim = zsim.Simulation(SCENARIO, agents=agents, duration_s=3600)

@@ -1,7 +1,7 @@
-"""Scenarios of any number of drones: a grid on the ground, GPS and all sensors, an estimator for each.
+"""Scenarios of any number of drones: a grid on the ground, GPS and all other sensors, an estimator for each.
 
-Three drones in a row are not a triangle and would not take off, so those of a cluster of three stand at three corners
-of a square, and the squares on a grid.
+Three drones in a row do not form a triangle and would not take off, so the drones of a cluster of three stand at three
+corners of a square, and the squares form a grid.
 """
 
 import math
@@ -13,22 +13,22 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
 
-SPACING_M = 4.0  # about ten hulls: hulls never meet, and downwash reaches no neighbour
+SPACING_M = 4.0  # about ten hulls, so that hulls never touch and downwash reaches no neighbour
 GUST_M_S = 0.5  # as in Test 1
-CLUSTER = 3  # drones per cluster: the size of the paper's
-CORNERS = ((0, 0), (1, 0), (0, 1))  # of a square
+CLUSTER = 3  # drones per cluster, as in the paper
+CORNERS = ((0, 0), (1, 0), (0, 1))  # corners of a square that are occupied
 
 
 def document(
     count: int, duration_s: float = 60.0, cluster: int = CLUSTER, drone: Mapping[str, Any] | None = None
 ) -> Any:
-    """Return the document of a scenario of `count` drones.
+    """Return the document of a scenario with `count` drones.
 
     Args:
         count: number of drones.
-        duration_s: simulated.
-        cluster: drones per cluster, each of which takes off; drones left over stand by. 0: no clusters.
-        drone: fields of every drone in addition to its position.
+        duration_s: simulated duration.
+        cluster: drones per cluster; every cluster takes off, and drones left over stay landed. 0 means no clusters.
+        drone: fields of every drone in addition to its name and position.
     """
     places = _triangles(count) if cluster == CLUSTER else _rows(count, SPACING_M)
     names = [f"drone{k + 1}" for k in range(count)]
@@ -36,7 +36,7 @@ def document(
     return {
         "name": f"grid{count}",
         "duration_s": duration_s,
-        "time": {"command_delay_gates": 5},  # 100 ms to the aircraft, as in Test 1
+        "time": {"command_delay_gates": 5},  # 100 ms until a command takes effect, as in Test 1
         "environment": {"wind": {"gust_m_s": GUST_M_S}},
         "sensors": {"preset": "paper"},
         "drones": [
@@ -70,7 +70,7 @@ def scenario(
 def write(
     path: Path, count: int, duration_s: float, cluster: int = CLUSTER, expect: Sequence[str] | None = None
 ) -> None:
-    """Write the scenario as a file; `expect` as in a scenario's `processes`."""
+    """Write the scenario to a file; `expect` as in a scenario's `processes`."""
     content = document(count, duration_s, cluster)
     content["processes"] = {"expect": expect}
     path.write_text(yaml_file.dump(content))

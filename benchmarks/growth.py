@@ -9,7 +9,7 @@ from benchmarks.child import RefusedError, result
 from benchmarks.sheet import Progress, Sheet, exponent
 from benchmarks.table import PICTURES, figure, lines, spread, table
 
-SIZES = {1: 10.0, 3: 10.0, 10: 6.0, 30: 3.0, 100: 1.5}  # drones: simulated seconds
+SIZES = {1: 10.0, 3: 10.0, 10: 6.0, 30: 3.0, 100: 1.5}  # number of drones: simulated duration [s]
 TIMEOUT_S = 300.0
 CPU = "CPU ms per drone-second"
 ONBOARD = {"plain": "extra `agents`, numba taken out", "numba": "extra `agents`"}
@@ -21,7 +21,7 @@ def measure(repeats: int) -> Sheet:
     progress = Progress("e", repeats * (len(SIZES) + 1 + len(ONBOARD)))
     with tempfile.TemporaryDirectory() as folder:
         pythons = {variant: _installed(sheet, variant, Path(folder)) for variant in ONBOARD}
-        _grown(Sheet("e", CPU), 3, 0.5)  # compiles what is not compiled yet
+        _grown(Sheet("e", CPU), 3, 0.5)  # compiles the kernels before anything is timed
         for number in range(repeats):
             for size, seconds in SIZES.items():
                 progress.tell(f"in one process, N = {size}: {_grown(sheet, size, seconds)}")
@@ -56,7 +56,7 @@ def _started(sheet: Sheet, folder: Path) -> str:
 
 
 def _installed(sheet: Sheet, variant: str, folder: Path) -> Path | None:
-    """Install a variant and fly it once, which compiles its kernels."""
+    """Install a variant and fly it once, so that its kernels are compiled."""
     print(f"e installing an onboard estimator, {variant}", file=sys.stderr, flush=True)
     try:
         python = onboard.install(variant)

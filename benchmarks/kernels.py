@@ -1,4 +1,4 @@
-"""Part b: simulated seconds of a drone per CPU second, of N drones in the air in one process."""
+"""Part b: drone-seconds simulated per CPU second, with N drones in the air in one process."""
 
 import sys
 from contextlib import ExitStack
@@ -11,12 +11,12 @@ from benchmarks.table import PICTURES, lines, ratios, table
 from benchmarks.table import spread as shown
 
 SIZES = (1, 3, 10, 100, 1000)
-CPU_S = 0.4  # per measurement
-TIMEOUT_S = 240.0  # the first one compiles
+CPU_S = 0.4  # CPU time of each measurement
+TIMEOUT_S = 240.0  # ample, as the first measurement includes compilation
 
 
 class Contender(NamedTuple):
-    """How one is run and what it does; `peer` is None for what runs in zsim's own environment."""
+    """A contender: how it is run and what it leaves out; `peer` is None if it runs in zsim's own environment."""
 
     label: str
     peer: str | None

@@ -1,4 +1,4 @@
-"""CPU time of lidars: ten drones in a forest, each with 16 x 360 rays at 10 Hz, and the same flight without them.
+"""CPU time of lidars: ten drones in a forest, each with 16 x 360 rays at 10 Hz, compared with a flight without lidars.
 
 .venv/bin/python -m benchmarks.lidar
 """
@@ -15,11 +15,11 @@ from zsim_world.fleet.publication import GatePublication
 DRONES, CHANNELS, COLUMNS, RATE_HZ = 10, 16, 360, 10.0
 FOREST = {"trees": 200, "area_m": [-25, -25, 25, 25], "gap_m": 1.0, "clear_m": 1.5}
 LIDAR = {"rate_hz": RATE_HZ, "channels": CHANNELS, "columns": COLUMNS, "elevation_deg": [-15, 15], "max_m": 40}
-WARM_UP, GATES, GATE_S = 100, 500, 0.02  # in the air after the first
+WARM_UP, GATES, GATE_S = 100, 500, 0.02  # all drones are in the air after WARM_UP gates
 
 
 def share(lidar: bool) -> float:
-    """Return CPU seconds per simulated second of fleet and messages in one thread."""
+    """Return CPU seconds per simulated second of fleet and messages, in one thread."""
     document: dict[str, Any] = {
         "name": "lidars",
         "duration_s": 60,

@@ -1,4 +1,4 @@
-"""Part a: steps per second of a world and N agents that only wait for each other."""
+"""Part a: steps per second of a world and N agents that do nothing but wait for each other."""
 
 import sys
 from typing import NamedTuple
@@ -10,13 +10,13 @@ from benchmarks.table import PICTURES, lines, ratios, table
 from benchmarks.table import spread as shown
 
 SIZES = (1, 3, 5, 10)
-SECONDS = 0.8  # wall time counted per measurement
+SECONDS = 0.8  # wall time of each measurement
 TIMEOUT_S = 60.0
 HELICS = ("helics_tcp", "helics_zmq", "helics_ipc", "helics_zmq_ss")
 
 
 class Contender(NamedTuple):
-    """How one is run and named; `peer` is None for what runs in zsim's own environment."""
+    """A contender: its name and how it is run; `peer` is None if it runs in zsim's own environment."""
 
     label: str
     peer: str | None
@@ -88,7 +88,7 @@ def _goals(sheet: Sheet) -> str:
 
 
 def _against_best(sheet: Sheet, size: int) -> str:
-    """Return zsim as a multiple of the core of HELICS that is best in each repeat."""
+    """Return zsim's rate divided by that of the fastest HELICS core, repeat by repeat."""
     mine = sheet.values.get("zsim", {}).get(size, [])
     cores = [values for name in HELICS if (values := sheet.values.get(name, {}).get(size))]
     best = [max((value for value in values if value), default=None) for values in zip(*cores, strict=False)]

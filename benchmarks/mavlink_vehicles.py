@@ -2,9 +2,9 @@
 
 .venv/bin/python -m benchmarks.mavlink_vehicles [--drones 20] [--seconds 10]
 
-All drones of a realtime run fly as ArduPilot vehicles at the full rates of telemetry, to a ground station and a program
-each. The age is from a datagram with a setpoint to its command at a Zenoh subscriber; for comparison, a plain put on
-another key to the same subscriber is timed: the difference is the delay.
+All drones of a realtime run fly as ArduPilot vehicles that send full-rate telemetry, each to a ground station and a
+program. The age runs from sending a datagram with a setpoint to the arrival of its command at a Zenoh subscriber; for
+comparison, a plain put on another key is timed to the same subscriber. The difference is the delay.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import Link, Parser
 
 HEIGHT_M = 3.0
-SETPOINTS_HZ = 20.0  # what MAVSDK sends
+SETPOINTS_HZ = 20.0  # setpoint rate of MAVSDK
 PATIENCE_S = 60.0
 GUIDED, ARM, TAKEOFF, SET_MODE = 4, 400, 22, 176
 VELOCITY_ONLY = 0xFC7 | 0x200
@@ -43,7 +43,7 @@ class Ports(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """What was measured: cores, messages and bytes a second to one client, ages [ms] sorted."""
+    """The measurements: cores used, messages and bytes a second to one client, sorted ages [ms]."""
 
     cores: float
     messages_hz: float
@@ -69,7 +69,7 @@ class Program:
         self._link, self._parser = Link(255, 190), Parser()
 
     def take_off(self) -> None:
-        """Fly until it holds its height."""
+        """Fly the vehicle until it holds its height."""
         self.until(lambda message: isinstance(message, dialect.LocalPositionNed))
         for command, params in ((SET_MODE, (1.0, GUIDED)), (ARM, (1.0,)), (TAKEOFF, (0,) * 6 + (HEIGHT_M,))):
             values = (*params, *(0.0,) * (7 - len(params)))
@@ -83,12 +83,12 @@ class Program:
         self.socket.sendto(self._link.pack(message), self._to)
 
     def until(self, true: Callable[[Any], bool]) -> None:
-        """Read until a message is as wanted."""
+        """Read messages until one satisfies `true`."""
         while not any(true(each.message) for each in self._parser.feed(self.socket.recv(65_536))):
             pass
 
     def read_for(self, seconds: float) -> tuple[int, int]:
-        """Return how many messages and bytes come."""
+        """Return the number of messages and of bytes received in `seconds`."""
         messages = size = 0
         until_s = time.monotonic() + seconds
         while time.monotonic() < until_s:
@@ -100,7 +100,7 @@ class Program:
 
 @contextmanager
 def served(drones: int) -> Iterator[tuple[Ports, int]]:
-    """Yield the ports of a run whose drones are vehicles, and the process id of the server."""
+    """Run a world and its MAVLink server; yield their ports, and the server's process id."""
     ports = Ports(free_port(), free_port(), 41_000, 42_000, 43_000)
     zsim, endpoint = (sys.executable, "-m", "zsim_deploy.cli"), f"tcp/127.0.0.1:{ports.world}"
     where = ("--gcs", f"127.0.0.1:{ports.gcs}", "--api", f"127.0.0.1:{ports.api}")
@@ -124,7 +124,7 @@ def cpu_s(pid: int) -> float:
 
 
 def subscribed(endpoint: str, arrivals: dict[str, list[float]]) -> zenoh.Session:
-    """Return a session that notes when something arrives, by key."""
+    """Return a session that appends arrival times to `arrivals`, by key."""
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{endpoint}"]')
@@ -140,16 +140,16 @@ def subscribed(endpoint: str, arrivals: dict[str, list[float]]) -> zenoh.Session
 
 
 def age_ms(arrived: list[float], send: Callable[[], None]) -> list[float]:
-    """Return the latency of each message [ms], without those that have not arrived when the next is due."""
+    """Send a message; return its latency [ms], or nothing if it has not arrived when the next one is due."""
     arrived.clear()
     sent_s = time.perf_counter()
     send()
-    time.sleep(0.5 / SETPOINTS_HZ)  # the pace of a client
+    time.sleep(0.5 / SETPOINTS_HZ)  # half a period, as two kinds of messages take turns
     return [1e3 * (arrived[0] - sent_s)] if arrived else []
 
 
 def ages_ms(program: Program, ports: Ports, count: int) -> tuple[list[float], list[float]]:
-    """Return how old setpoints are at a subscriber, by MAVLink and by Zenoh alone [ms], sorted."""
+    """Return the sorted ages of setpoints at a subscriber [ms], by MAVLink and by Zenoh alone."""
     arrivals: dict[str, list[float]] = {}
     endpoint = f"tcp/127.0.0.1:{ports.world}"
     with subscribed(endpoint, arrivals), subscribed(endpoint, {}) as other:
@@ -183,7 +183,7 @@ def measure(drones: int, seconds: float) -> Figures:
 
 
 def quantile(values: list[float], share: float) -> float:
-    """Return the value below which a share of sorted values lies."""
+    """Return the quantile of sorted values for a share in 0 to 1."""
     return values[min(len(values) - 1, int(share * len(values)))]
 
 

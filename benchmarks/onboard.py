@@ -1,6 +1,6 @@
-"""What an onboard computer of one drone needs: an estimator installed alone, with and without numba.
+"""The needs of one drone's onboard computer: an estimator installed alone, with and without numba.
 
-Each variant is installed from this project into an environment of its own in .venv-bench, and flies one drone with
+Each variant is installed from this project into an environment of its own in .venv-bench, and flies one drone against
 a world in zsim's own environment, unpaced.
 """
 
@@ -18,13 +18,13 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.peers import FOLDER, ROOT
 from benchmarks.run import CLI
 
-REMOVED: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # by variant, of extra `agents`
-SHORT_S, LONG_S = 5.0, 45.0  # simulated; their difference is free of the start
+REMOVED: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # removed from extra `agents`
+SHORT_S, LONG_S = 5.0, 45.0  # simulated; the difference of the two flights excludes start-up
 TIMEOUT_S = 180.0
 
 
 def install(variant: str) -> Path:
-    """Return the Python of a variant, installed as this project is now; RefusedError if it could not be installed."""
+    """Install a variant from the current working tree and return its Python; RefusedError if that fails."""
     folder = FOLDER / f"onboard-{variant}"
     python = folder / "bin" / "python"
     if not python.exists():
@@ -41,7 +41,7 @@ def install(variant: str) -> Path:
 
 
 def installed_mb(python: Path) -> float:
-    """Return what its packages take up, without pip and setuptools, which are not needed to fly."""
+    """Return the size of its packages [MB], without pip and setuptools, which are not needed to fly."""
     found = 0
     for path in (python.parent.parent / "lib").rglob("*"):
         parts = path.parts[path.parts.index("site-packages") + 1 :] if "site-packages" in path.parts else ()
@@ -52,16 +52,17 @@ def installed_mb(python: Path) -> float:
 
 
 def fly(python: Path, folder: Path) -> dict[str, float]:
-    """Fly one drone with its estimator; return its greatest resident memory [MB] and CPU ms per simulated second.
+    """Fly one drone; return its estimator's peak resident memory [MB] and CPU ms per simulated second.
 
-    RefusedError if world or estimator failed.
+    Raises:
+        RefusedError: world or estimator failed.
     """
     (short_s, _), (long_s, resident) = (_flown(python, folder, seconds) for seconds in (SHORT_S, LONG_S))
     return {"resident_mb": resident, "cpu_ms_per_simulated_s": 1e3 * (long_s - short_s) / (LONG_S - SHORT_S)}
 
 
 def _flown(python: Path, folder: Path, seconds: float) -> tuple[float, float]:
-    """Return what a flight takes the estimator: CPU seconds, greatest resident memory [MB]."""
+    """Return the estimator's CPU seconds and peak resident memory [MB] in a flight."""
     scenario = folder / "onboard.yaml"
     grid.write(scenario, 1, seconds, cluster=0, expect=["estimator.drone1"])
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -77,7 +78,7 @@ def _flown(python: Path, folder: Path, seconds: float) -> tuple[float, float]:
 
 
 def _quiet(command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
-    """Start a process outside the project's folder, so that it imports what is installed."""
+    """Start a process outside the project's folder, so that it imports the installed packages."""
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 

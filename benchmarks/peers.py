@@ -1,4 +1,4 @@
-"""The peers' own environment: making it, and finding out which peers could be installed."""
+"""The environment of the peers, and which of them could be installed in it."""
 
 import json
 import subprocess
@@ -11,8 +11,8 @@ FOLDER = ROOT / ".venv-bench"
 PYTHON = FOLDER / "bin" / "python"
 PINS = Path(__file__).parent / "requirements.txt"
 STATE = FOLDER / "peers.json"
-CPU_TORCH = ("--extra-index-url", "https://download.pytorch.org/whl/cpu")  # the index's own brings gigabytes of CUDA
-# peer: (arguments of pip, module that is imported as a check)
+CPU_TORCH = ("--extra-index-url", "https://download.pytorch.org/whl/cpu")  # PyPI's torch brings gigabytes of CUDA
+# peer: (arguments of pip, module that is imported to check the installation)
 PEERS: dict[str, tuple[tuple[str, ...], str]] = {
     "helics": (("helics",), "helics"),
     "mosaik": (("mosaik",), "mosaik"),
@@ -26,7 +26,7 @@ PEERS: dict[str, tuple[tuple[str, ...], str]] = {
 
 
 def ensure(say: Callable[[str], None]) -> None:
-    """Make the environment and install missing peers; for those that cannot be installed, note the reason."""
+    """Make the environment and install missing peers; store why a peer cannot be installed."""
     if not PYTHON.exists():
         say(f"making {FOLDER.name} for the peers")
         subprocess.run([sys.executable, "-m", "venv", str(FOLDER)], check=True)
@@ -35,7 +35,7 @@ def ensure(say: Callable[[str], None]) -> None:
 
 
 def missing(peer: str) -> str | None:
-    """Return why a peer cannot run, None if it can."""
+    """Return why a peer cannot run, or None if it can."""
     if not STATE.exists():
         return "its environment was not made; `make bench` makes it"
     return json.loads(STATE.read_text()).get(peer)
@@ -55,7 +55,7 @@ def versions() -> dict[str, str]:
 
 
 def _installed(peer: str, module: str, arguments: tuple[str, ...], say: Callable[[str], None]) -> str | None:
-    """Return None once the peer can be imported, else why not."""
+    """Install a peer unless it can be imported; return None, or the reason if it still cannot."""
     if _importable(module) is None:
         return None
     say(f"installing {peer} for comparison")

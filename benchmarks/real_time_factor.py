@@ -1,6 +1,6 @@
-"""Part c: how fast a whole run flies: world, estimators, controllers, record; as processes, and in one process.
+"""Part c: the speed of a complete run with world, estimators, controllers and recorder, in many processes and in one.
 
-A factor counts simulated seconds per wall second between the first gate and the last, as `summary.json` does.
+The factor is simulated seconds per wall second between the first gate and the last, as in `summary.json`.
 """
 
 import statistics
@@ -15,8 +15,8 @@ from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import figure, ratios, table
 
 TEST_1 = ROOT / "scenarios" / "step.yaml"
-SIZES = {3: 330.0, 10: 20.0, 30: 8.0, 100: 4.0}  # drones: simulated seconds; 3 is all of Test 1, the others a grid
-PROCESSES_MAX = 10  # drones; beyond, a process each needs more memory than many machines have
+SIZES = {3: 330.0, 10: 20.0, 30: 8.0, 100: 4.0}  # drones: simulated seconds; 3 is Test 1, the others are grids
+PROCESSES_MAX = 10  # drones; with more, one process per role needs more memory than many machines have
 LABELS = {
     "in_process": "one process (`--in-process`)",
     "hosted": "world, recorder, and one process for all others (`--hosted`)",
@@ -26,14 +26,14 @@ OPTIONS: dict[str, tuple[str, ...]] = {"in_process": ("--in-process",), "hosted"
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly every size in turn, as processes and in one process."""
+    """Fly every size in several processes and in one, in turn."""
     sheet = Sheet("c", "× real time")
     todo = [(name, size) for size in SIZES for name in LABELS if name != "processes" or size <= PROCESSES_MAX]
     progress = Progress("c", repeats * len(todo))
     by_role: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as folder:
         paths = {size: _scenario(Path(folder), size) for size in SIZES}
-        fly(TEST_1, 2.0, "--in-process")  # compiles what is not compiled yet
+        fly(TEST_1, 2.0, "--in-process")  # compiles the kernels before anything is timed
         for _ in range(repeats):
             for name, size in todo:
                 told = _measured(sheet, name, size, paths[size], by_role)

@@ -1,7 +1,7 @@
-"""Part i: the recorder of a federation of 50 drones: whether it writes everything, and its share of a core.
+"""Part i: the recorder of a federation of 50 drones: whether it records everything, and its share of a core.
 
-Everything is counted by `seq`, which every key has from 0 without gaps. The share is processor time by wall time from
-the first megabyte on record to the end of the run, so that start-up is left out.
+Missing messages are found by `seq`, which counts from 0 without gaps on every key. The share is processor time divided
+by wall time from the first recorded megabyte to the end of the run, which excludes start-up.
 """
 
 import subprocess
@@ -26,14 +26,14 @@ from zsim.record import RecordReader
 
 DRONES = 50
 TEST_1 = ROOT / "scenarios" / "step.yaml"
-SECONDS = 20.0  # simulated
+SECONDS = 20.0  # simulated duration
 OPTIONS: dict[str, tuple[str, ...]] = {"lockstep": (), "realtime": ("--realtime",)}
 LABELS = {"lockstep": "lockstep, as fast as it goes", "realtime": "realtime, 1×"}
-BEGUN_BYTES = 1_000_000  # on record when the run is under way
-LOOK_S = 0.25  # wall time between two looks at the recorder
+BEGUN_BYTES = 1_000_000  # size of the record from which the run counts as under way
+LOOK_S = 0.25  # wall time between two samples of the recorder's processor time
 TIMEOUT_S = 300.0
 FIELDS = ("core_percent", "messages_per_s", "megabytes_per_s", "missing", "broken")
-SLOWEST_S = 1.0  # five times the period of GPS, the slowest of what has a rate
+SLOWEST_S = 1.0  # s; five times the period of GPS, the slowest of the periodic keys
 
 
 class _Seq(msgspec.Struct):
@@ -41,16 +41,16 @@ class _Seq(msgspec.Struct):
 
 
 class Flown(NamedTuple):
-    """What a recorder did.
+    """Measurements of a recorder in one flight.
 
     Attributes:
-        cpu_s: its processor time while the run was under way.
-        wall_s: the length of that time.
-        sim_s: simulated in all.
-        messages: on record.
-        size_bytes: of the record.
-        faults: by key, where its count is broken; for views, which may skip, only repetitions and steps back.
-        missing: numbers that are not on record, views left out.
+        cpu_s: processor time while the run was under way.
+        wall_s: wall time while the run was under way.
+        sim_s: simulated time of the complete run.
+        messages: number of recorded messages.
+        size_bytes: size of the record.
+        faults: by key, where its `seq` breaks; for views, which may skip, only repetitions and steps back.
+        missing: how many values of `seq` are not on record, apart from views.
     """
 
     cpu_s: float
@@ -63,9 +63,10 @@ class Flown(NamedTuple):
 
 
 def fly(drones: int, seconds: float, *options: str) -> Flown:
-    """Fly a grid of drones with everything that they have, estimators and controllers in one process.
+    """Fly a grid of drones with all sensors, their estimators and controllers in one process.
 
-    RefusedError if the run failed.
+    Raises:
+        RefusedError: the run failed.
     """
     with tempfile.TemporaryDirectory() as temporary:
         scenario, out = Path(temporary) / "grid.yaml", Path(temporary) / "run"
@@ -90,7 +91,7 @@ def fly(drones: int, seconds: float, *options: str) -> Flown:
 
 
 def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[tuple[float, float]]:
-    """Yield wall time and the recorder's processor time [s] at intervals during a run."""
+    """Yield wall time and the recorder's processor time [s] every LOOK_S while the run is under way."""
     recorder: psutil.Process | None = None
     until_s = time.monotonic() + TIMEOUT_S
     while launcher.poll() is None and time.monotonic() < until_s:
@@ -111,7 +112,7 @@ def _recorder(launcher: int) -> psutil.Process | None:
 
 
 def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
-    """Return the keys whose count is broken, how many numbers are missing, messages, and the last time [ns]."""
+    """Return faults by key, the number of missing values of `seq`, the number of messages, and the last time [ns]."""
     expected: dict[str, int] = {}
     faults: dict[str, str] = {}
     ends_ns: dict[str, int] = {}
@@ -136,7 +137,7 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
 
 
 def _cut_short(ends_ns: Mapping[str, int], last_ns: int) -> dict[str, str]:
-    """Return the keys of drones that end before the run does: a loss at the end leaves no gap."""
+    """Return the periodic keys of drones that end before the run: a loss at the end leaves no gap in `seq`."""
     early = {key: (last_ns - end_ns) / 1e9 for key, end_ns in ends_ns.items() if key.startswith("drone/")}
     of_a_rate = {key: by_s for key, by_s in early.items() if "/sensor/" in key or key.endswith(("/truth", "/estimate"))}
     return {key: f"ends {by_s:g} s before the run" for key, by_s in of_a_rate.items() if by_s > SLOWEST_S}
@@ -146,7 +147,7 @@ def measure(repeats: int) -> Sheet:
     """Fly in both modes, in turn."""
     sheet = Sheet("i", "of a core")
     progress = Progress("i", repeats * len(LABELS))
-    run.fly(TEST_1, 2.0, "--in-process")  # compiles what is not compiled yet
+    run.fly(TEST_1, 2.0, "--in-process")  # compiles the kernels before anything is timed
     for _ in range(repeats):
         for name in LABELS:
             progress.tell(f"{LABELS[name]}: {_measured(sheet, name)}")

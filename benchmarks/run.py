@@ -1,4 +1,4 @@
-"""One run of `zsim run`: the world's figures, and the processor time of its processes."""
+"""Fly `zsim run` once, and measure the processor time and memory of its processes."""
 
 import contextlib
 import os
@@ -21,14 +21,15 @@ from zsim_deploy.inventory import MODULE
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 TIMEOUT_S = 600.0
-WAIT_S = 0.05  # polling interval of a command's end
-LOOK_S = 0.5  # polling interval of processor times, which takes milliseconds
+WAIT_S = 0.05  # polling interval for the end of a command
+LOOK_S = 0.5  # polling interval of processor times, each reading of which takes milliseconds
 
 
 def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float], dict[str, float]]:
-    """Fly once; return the world's figures (event `end`), and CPU seconds by role, start-up included.
+    """Fly once; return the data of the world's event `end`, and CPU seconds by role, including start-up.
 
-    RefusedError if the run failed.
+    Raises:
+        RefusedError: the run failed.
     """
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(temporary) / "run"
@@ -50,14 +51,14 @@ def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float]
 
 
 class Spent(NamedTuple):
-    """CPU seconds of a command and its descendants, and the largest resident memory of a process [MB]."""
+    """CPU seconds of a command and its descendants, and the peak resident memory of the largest of them [MB]."""
 
     cpu_s: float
     peak_mb: float
 
 
 def spent(command: Sequence[str], folder: Path) -> Spent:
-    """Run a command in a folder and return what it spent; RefusedError if it failed, or did not end in time."""
+    """Run a command in a folder and measure it; RefusedError if it fails, or does not end in time."""
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True
@@ -78,11 +79,11 @@ def spent(command: Sequence[str], folder: Path) -> Spent:
             said.seek(0)
             raise RefusedError(f"zsim run: exit code {process.returncode}: {said.read().strip()[-160:]}")
     assert usage is not None
-    return Spent(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3)  # ru_maxrss: kilobytes (getrusage(2))
+    return Spent(usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3)  # ru_maxrss is in kilobytes (getrusage(2))
 
 
 def end_event(folder: Path) -> dict[str, float]:
-    """Return the world's figures of a run: the data of its event `end`."""
+    """Return the data of the world's event `end` in a run's record."""
     records = RecordReader(folder / "run.mcap").messages(keys=["world/event"])
     events = [msgspec.msgpack.decode(record.payload, type=run_messages.Event) for record in records]
     return next(event.data for event in events if event.kind == "end")
@@ -102,12 +103,12 @@ def _cpu_by_role(launcher: int) -> dict[str, float]:
 
 
 def role_of(process: psutil.Process) -> str:
-    """Return `role.thing` of a process of a run, `forkserver` of the one from which roles are forked.
+    """Return `role.thing` of a process of a run, or `forkserver` for the one from which roles are forked.
 
     Raises:
-        psutil.NoSuchProcess: it has ended.
+        psutil.NoSuchProcess: the process has ended.
     """
-    words = [word for word in process.cmdline() if word]  # a forked role has empty words at the end
+    words = [word for word in process.cmdline() if word]  # a forked role has empty arguments at the end
     if words[1 : 1 + len(MODULE)] != [*MODULE]:
         return "forkserver"
     words = words[1 + len(MODULE) :]

@@ -14,13 +14,13 @@ from benchmarks.monte_carlo import way, zsim_sweep
 from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import figure, spread, table
 
-WORKERS = 2  # processes, a core each
-RUNS = 12  # of zsim's sweep
-TIMEOUT_S = 300.0  # the first one compiles
+WORKERS = 2  # number of processes, each on a core of its own
+RUNS = 12  # number of runs in zsim's sweep
+TIMEOUT_S = 300.0  # ample, as the first flight includes compilation
 
 
 class Contender(NamedTuple):
-    """Who follows the ways, how, and what is left out; `peer` is None for what runs in zsim's own environment."""
+    """A contender: how it follows the paths, and what it lacks; `peer` is None if it runs in zsim's own environment."""
 
     label: str
     peer: str | None
@@ -58,14 +58,14 @@ NOT_FLOWN = {"MuJoCo": "it has no controller of a multirotor; its bodies alone a
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly Test 1 once for its paths, start the peers, and let all fly in turn."""
+    """Fly Test 1 once for its paths, start the contenders, and let them fly in turn."""
     sheet = Sheet("f", f"runs per hour on {WORKERS} cores", notes={"sweep_runs": RUNS})
     sheet.refused = {name: why for name, c in CONTENDERS.items() if c.peer and (why := peers.missing(c.peer))}
     running = [name for name in CONTENDERS if name not in sheet.refused]
     progress = Progress("f", len(running) + repeats * (1 + len(running)))
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         path = Path(folder) / "way.npz"
-        way.write(zsim_sweep.flown_way(), path)  # compiles what is not compiled yet
+        way.write(zsim_sweep.flown_way(), path)  # also compiles the kernels before anything is timed
         crews = {name: _crew(stack, CONTENDERS[name], path) for name in running}
         for name, crew in crews.items():
             progress.tell(f"{CONTENDERS[name].label}, warm-up: {_flown(Sheet('f', ''), name, crew, 0)}")
@@ -95,7 +95,7 @@ def _swept(sheet: Sheet) -> str:
 
 
 def _flown(sheet: Sheet, name: str, crew: list[Server], seed: int) -> str:
-    """Ask all processes of a contender at once, and wait for the last; one that failed once is not asked again."""
+    """Let all processes of a contender fly at once, and wait for the last; skip a contender that has failed before."""
     if why := sheet.refused.get(f"{name}@{WORKERS}"):
         return sheet.refuse(name, WORKERS, why, [name, f"{name}_cpu_s"])
     start_s = time.perf_counter()
@@ -140,7 +140,7 @@ def _row(sheet: Sheet, name: str, label: str, flown: str) -> list[str]:
 
 
 def _ratios(sheet: Sheet) -> str:
-    """Return the ratios of zsim to the only peer with an estimator, and of its world alone to those without."""
+    """Return the ratios of zsim to the only peer with an estimator, and of its world alone to the others."""
     pairs = {
         "`zsim sweep` / RotorPy with its estimator": ("zsim", "rotorpy"),
         "zsim's world alone / gym-pybullet-drones": ("zsim_fleet", "pybullet"),

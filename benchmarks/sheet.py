@@ -1,4 +1,4 @@
-"""Figures of one part of the benchmarks: for each contender and size, a value per repeat; medians, spreads, ratios."""
+"""Results of one part of the benchmarks: a value per contender, size and repeat; their medians, spreads and ratios."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Spread:
-    """A median with the smallest and the largest value."""
+    """A median with the minimum and the maximum."""
 
     median: float
     low: float
@@ -22,15 +22,15 @@ class Spread:
 
 @dataclass
 class Sheet:
-    """What one run of a part measured.
+    """Results of one run of a part.
 
     Attributes:
-        part: letter.
-        unit: of the values.
-        values: by contender, by size, in order of the repeats; None for a repeat without a value.
-        refused: why a contender, or a contender at a size, has no value.
-        notes: anything else to be kept.
-        machine: where and with what it ran.
+        part: letter of the part.
+        unit: unit of the values.
+        values: by contender and size, in order of the repeats; None for a repeat without a value.
+        refused: why a contender has no value, by contender or by `contender@size`.
+        notes: further results.
+        machine: the machine, and the versions of the packages.
     """
 
     part: str
@@ -41,11 +41,11 @@ class Sheet:
     machine: dict[str, Any] = field(default_factory=dict)
 
     def add(self, contender: str, size: int, value: float | None) -> None:
-        """Add the value of a further repeat, None if there is none."""
+        """Append the value of the next repeat, None if it has none."""
         self.values.setdefault(contender, {}).setdefault(size, []).append(value)
 
     def refuse(self, contender: str, size: int, reason: str, rows: Sequence[str]) -> str:
-        """Note why a contender gave no values at a size in this repeat, for any of its rows; return the reason."""
+        """Note why a contender has no values at a size in this repeat, in any of `rows`; return the reason."""
         self.refused[f"{contender}@{size}"] = reason
         for row in rows:
             self.add(row, size, None)
@@ -55,17 +55,17 @@ class Sheet:
         return sorted({size for by_size in self.values.values() for size in by_size})
 
     def spread(self, contender: str, size: int) -> Spread | None:
-        """Return median, least and greatest of the repeats; None if there is none."""
+        """Return median, minimum and maximum over the repeats; None if there are no values."""
         return spread(self.values.get(contender, {}).get(size, []))
 
     def ratio(self, contender: str, reference: str, size: int) -> Spread | None:
-        """Return the ratio of a contender to the reference, repeat by repeat; None if unknown."""
+        """Return the spread of the ratio of a contender to the reference, repeat by repeat; None if unknown."""
         mine = self.values.get(contender, {}).get(size, [])
         its = self.values.get(reference, {}).get(size, [])
         return spread([a / b if a is not None and b else None for a, b in zip(mine, its, strict=False)])
 
     def best(self, contenders: list[str], size: int) -> str | None:
-        """Return the contender with the greatest median at a size."""
+        """Return the contender with the highest median at a size; None if none has values."""
         found = {name: s.median for name in contenders if (s := self.spread(name, size))}
         return max(found, key=lambda name: found[name]) if found else None
 
@@ -81,25 +81,26 @@ def read(path: Path) -> Sheet:
 
 
 def spread(values: Sequence[float | None]) -> Spread | None:
-    """Return median, least and greatest of the values; None if there are none."""
+    """Return median, minimum and maximum of the values that are not None; None if there are none."""
     found = [value for value in values if value is not None]
     return Spread(statistics.median(found), min(found), max(found)) if found else None
 
 
 def exponent(points: dict[int, float]) -> float:
-    """Return the least-squares slope of log value against log size: 1 means proportional to the size.
+    """Return the least-squares slope of log value against log size; 1 means proportional to the size.
 
-    StatisticsError if there are fewer than two points.
+    Raises:
+        StatisticsError: there are fewer than two points.
     """
     logs = [(math.log(size), math.log(value)) for size, value in points.items()]
     return statistics.linear_regression([x for x, _ in logs], [y for _, y in logs]).slope
 
 
 class Progress:
-    """Counts measurements of a part.
+    """Prints the progress of a part.
 
     Args:
-        part: letter.
+        part: letter of the part.
         total: number of measurements.
     """
 

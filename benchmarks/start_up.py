@@ -1,4 +1,4 @@
-"""The time from a role's command until it is ready, and its memory then."""
+"""The time from starting a role until it is ready, and its memory at that time."""
 
 import socket
 import subprocess
@@ -18,7 +18,7 @@ from zsim.transport.connection import find_world
 
 FEDERATION = "zsim"
 PATIENCE_S = 60.0
-LOOK_S = 0.002  # polling interval
+LOOK_S = 0.002  # polling interval while a role starts
 ROLES = {
     "world": "zsim world",
     "estimator": "zsim estimator",
@@ -31,10 +31,10 @@ ROLES = {
 
 
 def measure(folder: Path) -> dict[str, float]:
-    """Return seconds until ready by role, and `{role}_mb` resident then.
+    """Return seconds until ready by role, and resident memory at that time by `{role}_mb` [MB].
 
-    A world is ready when it answers `world/info`, a router when its port opens, the others when they have joined. A run
-    is timed to its end: six processes and one gate.
+    A world is ready when it answers `world/info`, a router when its port opens, the others when they have joined.
+    `zsim run`, with six processes and one gate, is timed to its end.
     """
     found = {"help": _timed_to_end([*CLI, "--help"])}
     scenario = folder / "start_up.yaml"
@@ -87,7 +87,7 @@ def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _until(ready: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
-    """Wait until it is ready; RefusedError if it ended, or was not ready in time."""
+    """Wait until a process is ready; RefusedError if it ends, or is not ready in time."""
     until_s = time.perf_counter() + PATIENCE_S
     while not ready():
         if process.poll() is not None:

@@ -1,4 +1,4 @@
-"""Markdown tables of a sheet."""
+"""Markdown tables and pictures of a sheet."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from benchmarks.sheet import Sheet, Spread
 
 
 def figure(value: float) -> str:
-    """Return three significant digits without an exponent."""
+    """Format a value with three significant digits, without an exponent."""
     if value == 0.0:
         return "0"
     if abs(value) >= 1000:
@@ -17,7 +17,7 @@ def figure(value: float) -> str:
 
 
 def spread(found: Spread | None) -> str:
-    """Return "median (least to greatest)"."""
+    """Format a spread as "median (minimum to maximum)"."""
     return f"{figure(found.median)} ({figure(found.low)} to {figure(found.high)})" if found else "–"
 
 
@@ -27,7 +27,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def ratios(sheet: Sheet, labels: Mapping[str, str], reference: str, size_name: str = "N") -> str:
-    """Return a table of the reference's values, and every other contender as a multiple of it in the same repeat."""
+    """Return a table with the values of the reference, and the others as multiples of it in the same repeat."""
     sizes = sheet.sizes()
     rows = [[f"{labels[reference]} [{sheet.unit}]", *(spread(sheet.spread(reference, size)) for size in sizes)]]
     for name, label in labels.items():
@@ -42,19 +42,19 @@ def ratios(sheet: Sheet, labels: Mapping[str, str], reference: str, size_name: s
 
 
 def _cell(sheet: Sheet, name: str, reference: str, size: int) -> str:
-    """Return the ratio, or why there is none."""
+    """Return the ratio to the reference, or why it is missing."""
     found = sheet.ratio(name, reference, size)
     return spread(found) if found else sheet.refused.get(f"{name}@{size}", "–")
 
 
 def lines(sheet: Sheet, labels: Mapping[str, str], path: Path, title: str, size_name: str, ours: str = "zsim") -> None:
-    """Draw medians with their spread; contenders whose name begins with `ours` are drawn bold."""
+    """Draw medians with their spread as SVG, in bold for contenders whose name begins with `ours`."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    mpl.rcParams["svg.hashsalt"] = "zsim"  # the same figures give the same file
+    mpl.rcParams["svg.hashsalt"] = "zsim"  # fixed, so that the same values give the same file
     figure, axes = plt.subplots(figsize=(8.0, 5.0), layout="constrained")
     for number, (name, label) in enumerate(labels.items()):
         found = {size: s for size in sheet.sizes() if (s := sheet.spread(name, size))}
@@ -79,7 +79,7 @@ PICTURES = ROOT / "benchmarks" / "results"
 
 
 def replaced(text: str, part: str, content: str) -> str:
-    """Return the text with the section of a part replaced; ValueError if the text has no such section."""
+    """Replace the section of a part in a page; ValueError if the page has no such section."""
     begin, end = f"<!-- measured: {part} -->\n", f"<!-- end: {part} -->"
     before, found, rest = text.partition(begin)
     _, closed, after = rest.partition(end)

@@ -1,8 +1,8 @@
-"""A custom sensor: airspeed by a pitot tube along the sensor's x axis.
+"""A custom sensor: airspeed from a pitot tube along the sensor's x axis.
 
     zsim run scenarios/step.yaml --set 'sensors.pitot={module: airspeed, mount: {position_m: [0.15, 0, 0]}}'
 
-Its errors are those of the differential pressure, by the data sheet of Sensirion's SDP31-500Pa.
+Errors are modelled on the differential pressure, after the data sheet of Sensirion's SDP31-500Pa.
 """
 
 import math
@@ -21,11 +21,11 @@ class Airspeed(Sample, frozen=True):
 
 
 class PitotConfig(Sensor, frozen=True, kw_only=True):
-    rate_hz: RateHz = 50.0  # Hz, chosen; the sensor gives up to 2000
+    rate_hz: RateHz = 50.0  # Hz; an assumption, the sensor supports up to 2000
     pressure_pa: ErrorModel = ErrorModel(
-        noise=0.1,  # Pa, zero-point repeatability of the SDP31
-        bias=0.2,  # Pa, its zero-point accuracy
-        quantum=1 / 60,  # Pa, its scale factor
+        noise=0.1,  # Pa; zero-point repeatability of the SDP31
+        bias=0.2,  # Pa; zero-point accuracy of the SDP31
+        quantum=1 / 60,  # Pa; resolution by the scale factor of the SDP31
     )
 
 
@@ -36,7 +36,7 @@ def pressure(truth: SensorTruth, settings: PitotConfig, environment: Environment
 
 
 def speed(reading: Sequence[float], settings: PitotConfig, environment: Environment) -> Sequence[float]:
-    """Return the numbers of the message: the pressure, and the corresponding speed."""
+    """Return the values of the message: the pressure [Pa] and the corresponding airspeed [m/s]."""
     pascals = reading[0]
     return [pascals, math.copysign(math.sqrt(2.0 * abs(pascals) / environment.air_density_kg_m3), pascals)]
 

@@ -1,13 +1,13 @@
-"""A custom formation law: cyclic pursuit, in which each drone follows the next one, turned by an angle.
+"""A custom formation law: cyclic pursuit, in which each drone heads for the next one, turned by an angle.
 
 zsim run examples/laws.yaml --set agents.pilot.class=cyclic_pursuit:CyclicPursuit
 PYTHONPATH=examples zsim board --laws consensus,cyclic_pursuit:CyclicPursuit --scenarios trajectory --seeds 1
 
     u_i = v_r + k R(-pi/n) (p_{i+1} - p_i)
 
-Marshall, Broucke, Francis, Formations of vehicles in cyclic pursuit, IEEE Trans. Automatic Control 49 (2004). Turned
-outwards by pi / n the drones neither close in nor spread, and circle; here the circle also follows the reference's
-velocity. The drones must be listed in their order around the centre, counter-clockwise.
+Marshall, Broucke, Francis, Formations of vehicles in cyclic pursuit, IEEE Trans. Automatic Control 49 (2004). With a
+turn of pi / n outwards the drones circle at a constant radius; here the circle also moves at the reference's velocity.
+The scenario must list the drones in counter-clockwise order around the centre.
 """
 
 import math

@@ -1,6 +1,6 @@
-"""A driver of an external drone, with zenoh and msgpack alone: its body follows velocity commands with a lag.
+"""A driver of an external drone that needs only zenoh and msgpack; the drone follows velocity commands with a lag.
 
-Where this file computes a body, a driver of yours talks to an aircraft. Give the drone `body: external` in a scenario:
+Where this file computes the motion, a real driver talks to an aircraft. Give the drone `body: external` in a scenario:
 
     zsim run SCENARIO --realtime          then          python examples/external_drone.py drone3 X Y Z
 """
@@ -18,11 +18,11 @@ ENDPOINT = WORDS.pop(0) if WORDS and "/" in WORDS[0] else "tcp/127.0.0.1:7447"
 _ = len(WORDS) in (1, 4) or sys.exit("usage: python examples/external_drone.py [ENDPOINT] DRONE [X Y Z]")
 DRONE, PLACE = WORDS[0], [float(x) for x in WORDS[1:]] or [0.0, 0.0, 0.05]
 ME, G_M_S2, LAG_S, TAKEOFF_M, CLIMB_M_S = f"driver.{DRONE}", 9.80665, 0.3, 1.0, 0.7
-HOVER_S, LAND_S = 0.5, 2.0  # of silence, after which it hovers, and then lands
+HOVER_S, LAND_S = 0.5, 2.0  # time without a command before it hovers; further time before it lands
 
 
 class Aircraft:
-    """Its position, velocity and state; level at all times."""
+    """Position, velocity and state of a body that is always level."""
 
     def __init__(self, p, yaw, state="landed"):
         self.p, self.v, self.a, self.yaw, self.yaw_rate, self.state = [*p], [0.0] * 3, [0.0] * 3, yaw, 0.0, state
@@ -32,7 +32,7 @@ class Aircraft:
         if kind == "mode":
             target = {"takeoff": "taking_off", "land": "landing", "emergency": "emergency", "reset": "landed"}
             self.state, self.wanted = target[m["mode"]], (0.0, 0.0, 0.0, 0.0)
-        elif m["source"] == "world":  # no longer commanded: it hovers
+        elif m["source"] == "world":  # the world has withdrawn the last command
             self.state, self.wanted, self.commander, self.set_s = "hovering", (0.0, 0.0, 0.0, 0.0), None, math.inf
         elif kind == "velocity":
             (x, y, z), yaw = m["velocity_m_s"], 0.0 if m.get("frame") == "world" else self.yaw
@@ -79,7 +79,7 @@ with zenoh.open(config) as session:
         return msgpack.unpackb(good[0].payload.to_bytes()) if good else None
 
     link = {"source": ME, "peer": "its own model", "age_ms": 0.0, "loss_percent": 0.0, "round_trip_ms": None}
-    armed = []  # whether an operator has requested it
+    armed = []  # holds True while an operator has armed the drone, else empty
 
     def answer(query: zenoh.Query) -> None:
         op = msgpack.unpackb(query.payload.to_bytes())["op"] if query.payload else ""
@@ -93,9 +93,9 @@ with zenoh.open(config) as session:
     clocks = session.declare_subscriber("zsim/clock", zenoh.handlers.FifoChannel(10_000))
     accepted = session.declare_subscriber(f"zsim/drone/{DRONE}/accepted/*", zenoh.handlers.FifoChannel(10_000))
     while (info := get("world/info")) is None:
-        clocks.recv()  # once a second while the world waits
+        clocks.recv()  # retry at the next clock, which comes once a second while the world waits
     place = next(drone for drone in info["drones"] if drone["name"] == DRONE)
-    truth, status = get(f"drone/{DRONE}/truth"), get(f"drone/{DRONE}/sensor/status")  # of a driver before this one
+    truth, status = get(f"drone/{DRONE}/truth"), get(f"drone/{DRONE}/sensor/status")  # left by an earlier driver
     own = truth or {
         "position_m": [float(x) for x in sys.argv[3:6]] or [0.0, 0.0, 0.05],
         "orientation_wxyz": [1, 0, 0, 0],
@@ -117,7 +117,7 @@ with zenoh.open(config) as session:
             if is_stop:
                 armed.clear()
         if t_ns <= last_ns:
-            continue  # time stands still
+            continue  # simulated time stands still
         if last_ns >= 0:
             aircraft.step(t_ns / 1e9, (t_ns - last_ns) / 1e9)
         a, p, v, yaw, last_ns = aircraft.a, aircraft.p, aircraft.v, aircraft.yaw, t_ns
@@ -134,7 +134,7 @@ with zenoh.open(config) as session:
         place_deg |= {"latitude_deg": origin["latitude_deg"] + p[1] / 111_319.49}
         place_deg |= {"longitude_deg": origin["longitude_deg"] + p[0] / east_m}
         put(f"{key}/sensor/gps", **at, **place_deg, position_m=p, velocity_m_s=v, sigma_m=0.1, fix=3, satellites=9)
-        put(f"{key}/sensor/mag", **at, field_ut=body([-2.8, 17.8, 14.0]))  # of the scenario's environment
+        put(f"{key}/sensor/mag", **at, field_ut=body([-2.8, 17.8, 14.0]))  # field of the default environment, in W
         put(f"{key}/sensor/baro", **at, pressure_pa=101_325.0 - 12.0 * p[2], altitude_m=p[2])
         put(f"{key}/sensor/sonar", **at, range_m=p[2], valid=p[2] < 4.0)
         put(f"{key}/sensor/flow", **at, velocity_m_s=body(v), quality=1.0)

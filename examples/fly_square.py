@@ -3,7 +3,7 @@
     zsim run scenarios/step.yaml --set clusters.main.plan={} --duration 120
     python examples/fly_square.py
 
-The cluster has no plan of its own there; this program takes it off, engages it, and lands it at the end.
+With an empty plan the cluster stays on the ground; this program commands takeoff, engages it, and lands it at the end.
 """
 
 import argparse
@@ -23,7 +23,7 @@ CORNERS = ((0.0, 0.0), (SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0
 
 
 def ask(link: Session, subscription: Subscription, op: str, **args: Any) -> None:
-    """Send a request until the controller grants it; end with its reason after PATIENCE_S of simulated time."""
+    """Repeat a request until the controller grants it; exit with its refusal after PATIENCE_S of simulated time."""
     until_ns = None
     while True:
         answer = link.request(keys.cluster_control(CLUSTER), op, ME, args)
@@ -36,12 +36,12 @@ def ask(link: Session, subscription: Subscription, op: str, **args: Any) -> None
 
 
 def waypoints() -> list[dict[str, Any]]:
-    """Return a square of SIDE_M at HEIGHT_M with a corner at the origin; variables not named stay as they are."""
+    """Return a square of SIDE_M at HEIGHT_M with a corner at the origin; variables not named keep their values."""
     return [{"at_s": i * LEG_S, "values": {"x_c": x, "y_c": y, "z_c": HEIGHT_M}} for i, (x, y) in enumerate(CORNERS)]
 
 
 def states(subscription: Subscription) -> Iterator[flight_messages.ClusterState]:
-    """Yield the controller's states as they come."""
+    """Yield the controller's states as they arrive."""
     while True:
         sample = subscription.receive()
         if sample is not None:
@@ -49,14 +49,14 @@ def states(subscription: Subscription) -> Iterator[flight_messages.ClusterState]
 
 
 def newest(subscription: Subscription) -> flight_messages.ClusterState:
-    """Return the next state, and discard earlier ones."""
+    """Discard queued states, and return the next one."""
     for _ in subscription.drain():
         pass
     return next(states(subscription))
 
 
 def until(subscription: Subscription, phase: str) -> flight_messages.ClusterState:
-    """Return the first state in a phase."""
+    """Wait for the first state in a phase."""
     return next(state for state in states(subscription) if state.phase == phase)
 
 
@@ -71,7 +71,7 @@ def fly(link: Session) -> None:
 
 
 def show(subscription: Subscription) -> None:
-    """Print the position of the formation at every corner; return when the trajectory ends."""
+    """Print the centroid at every corner; return when the trajectory ends."""
     due_s = 0.0
     for state in states(subscription):
         t_s = state.trajectory_t_s

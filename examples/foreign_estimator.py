@@ -1,9 +1,9 @@
-"""An estimator without zsim: estimates drone1 in lockstep, with only zenoh and msgpack.
+"""An estimator of drone1 in lockstep that does not import zsim, only zenoh and msgpack.
 
     zsim world scenarios/step.yaml --set 'processes.expect=[foreign.drone1]' --duration 60
     python examples/foreign_estimator.py tcp/127.0.0.1:7447
 
-Position and velocity come from GPS and flow by fixed gains, heading from the magnetometer as if level.
+Fixed gains combine GPS, barometer and flow; the heading comes from the magnetometer as if the drone were level.
 """
 
 import math
@@ -18,16 +18,16 @@ import zenoh
 
 ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
 ME, DRONE = "foreign.drone1", "zsim/drone/drone1"
-BEARING = math.atan2(17.8, -2.8)  # rad, of the default environment.magnetic_field_ut
-START_S = 60.0  # wall; a world that is still starting, and compiling its kernel
-SILENCE_S = 10.0  # wall; even while simulated time stands still, the world publishes its clock once a second
+BEARING = math.atan2(17.8, -2.8)  # rad; bearing of the default environment.magnetic_field_ut
+START_S = 60.0  # wall time; the world may still be starting and compiling its kernel
+SILENCE_S = 10.0  # wall time; even while simulated time stands still, the world publishes its clock once a second
 FIX_GAIN, HEIGHT_GAIN = 0.02, 0.1
-SIGMAS = (0.2, 0.2, 0.05, 0.1, 0.1, 0.1)  # m, m/s: what the gains leave of the noise of preset `paper`
+SIGMAS = (0.2, 0.2, 0.05, 0.1, 0.1, 0.1)  # m, m/s; what remains of the noise of preset `paper` with these gains
 YAW_SIGMA_RAD = 0.06
 
 
 class State:
-    """Its estimate of the drone."""
+    """Estimated state of the drone."""
 
     def __init__(self) -> None:
         self.p, self.v, self.yaw, self.fixes = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0, 0
@@ -46,7 +46,7 @@ class State:
             self.v = [c * x - s * y, s * x + c * y, z]
 
     def estimate(self, dt: float) -> dict[str, Any]:
-        """Advance by dt and return the fields of `Estimate`."""
+        """Advance by dt [s] and return the fields of `Estimate`."""
         self.p = [p + v * dt for p, v in zip(self.p, self.v, strict=True)]
         yaw = math.remainder(self.yaw, math.tau)
         return {
@@ -63,7 +63,7 @@ class State:
 
 
 class Participant:
-    """Joins the run, answers every gate, leaves when the clock stops or the world is silent."""
+    """Joins the run, answers every gate, and leaves when the clock stops or the world falls silent."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
@@ -72,7 +72,7 @@ class Participant:
         self._gate_ns = info["gate_ns"]
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        # by default each subscriber has its own thread, without a common order of messages
+        # by default each subscriber has its own thread, so that messages of different keys may swap
         in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         self._kept = [
             session.declare_subscriber(f"{DRONE}/sensor/*", in_order),
@@ -88,17 +88,17 @@ class Participant:
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def run(self) -> int:
-        """Return how many gates it answered.
+        """Answer gates until the run ends; return their number.
 
         Raises:
-            SystemExit: the world is silent.
+            SystemExit: nothing came from the world for SILENCE_S.
         """
         state, gates = State(), 0
         while True:
             sample = self._next(gates)
             kind, m = str(sample.key_expr).rsplit("/", 1)[1], msgpack.unpackb(sample.payload.to_bytes())
             state.take(kind, m)
-            if kind == "status":  # the last sensor message of a gate: all others have arrived
+            if kind == "status":  # the last sensor message of a gate, so all others have arrived
                 gates += 1
                 self._answer(m["t_ns"], state)
             elif m.get("state") == "stopped":
@@ -118,7 +118,7 @@ class Participant:
 
 
 def world_info(session: zenoh.Session) -> dict[str, Any]:
-    """Return `world/info`; wait for a world that listens already but does not answer yet."""
+    """Return `world/info`; retry while the world listens but does not answer yet, SystemExit after START_S."""
     until_s = time.monotonic() + START_S
     while time.monotonic() < until_s:
         for reply in session.get("zsim/world/info", timeout=1.0):

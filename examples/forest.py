@@ -1,14 +1,14 @@
-"""Five drones cross a forest without a map, decentralised: a pilot knows its lidar, its estimate, and what others send.
+"""Five decentralised drones cross an unmapped forest: each pilot has its lidar, its estimate, and what the others send.
 
 zsim run examples/forest.yaml
 zsim run examples/forest.yaml --seed 2
 python examples/forest.py
 
-Each pilot flies in the free direction that costs least: close to the direction of its goal, and to its present one
+Each pilot flies in the free direction of minimum cost: near the direction of its goal, and near its current course
 (after Borenstein and Koren, The vector field histogram, IEEE Trans. Robotics and Automation 7(3), 1991). A direction
-is free as far as a tube as wide as the drone and its margins meets no return of the lidar. The speed is such that it
-can stop within the free distance; it retreats from obstacles that are too near, and from drones that it hears nearby.
-Obstacles stay in the axes of the drone in which they were seen, so that errors of the estimate do not move them.
+is free up to the first lidar return in a corridor as wide as the drone and its margins. The speed allows a stop within
+the free distance; the drone retreats from obstacles that are too near, and from nearby drones that it hears.
+Obstacles are kept in the axes of the drone that saw them, so that errors of the estimate do not move them.
 """
 
 import math
@@ -20,12 +20,12 @@ from msgspec import Meta
 
 import zsim
 
-SILENT_NS = 500_000_000  # drones that have not been heard for this long are ignored
+SILENT_NS = 500_000_000  # drones not heard for this long are ignored
 DIRECTIONS = np.arange(72) * (2.0 * math.pi / 72)
 UNIT = np.stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)], axis=1)
-HEED_M = 5.0  # of drones that are heard
-DOUBT_M = 0.7  # by which drones that are heard are assumed to be nearer: estimates err
-FLOOR_M = 0.7  # returns from more than this below the drone are of the ground
+HEED_M = 5.0  # drones that are farther away are ignored
+DOUBT_M = 0.7  # other drones are assumed to be nearer by this, as estimates err
+FLOOR_M = 0.7  # returns from farther below the drone are taken for the ground
 
 
 class Where(zsim.AgentMessage, frozen=True):
@@ -40,12 +40,12 @@ class Pilot(zsim.Agent):
     """Flies one drone east, past everything that its lidar sees."""
 
     class Parameters(zsim.Parameters):
-        east_m: Annotated[float, Meta(ge=-1000, le=1000)] = 30.0  # where it stops
+        east_m: Annotated[float, Meta(ge=-1000, le=1000)] = 30.0  # x in W at which it stops
         height_m: Annotated[float, Meta(gt=0.5, le=50)] = 2.0
         speed_m_s: Annotated[float, Meta(gt=0, le=5)] = 1.5
         brake_m_s2: Annotated[float, Meta(gt=0, le=5)] = 0.8
-        margin_m: Annotated[float, Meta(gt=0, le=5)] = 0.75  # half the width of a free path; the hull takes 0.26 m
-        apart_m: Annotated[float, Meta(gt=0, le=20)] = 2.0  # of two drones
+        margin_m: Annotated[float, Meta(gt=0, le=5)] = 0.75  # half the width of a free corridor; the hull takes 0.26 m
+        apart_m: Annotated[float, Meta(gt=0, le=20)] = 2.0  # distance below which two drones avoid each other
         takeoff_s: Annotated[float, Meta(ge=0)] = 1.0
 
     messages = (Where,)
@@ -84,7 +84,7 @@ class Pilot(zsim.Agent):
         return outputs
 
     def _levelled(self, scan: Any) -> np.ndarray:
-        """Return the returns of a scan in the heading frame, ahead and to the left, without those of the ground."""
+        """Return a scan's hits (n, 2) in the heading frame, ahead and to the left [m], without those of the ground."""
         hits = np.isfinite(scan.ranges())
         points_B = scan.ranges()[hits][:, None] * scan.directions()[hits]
         w, x, y, z = self._q_WB
@@ -95,7 +95,7 @@ class Pilot(zsim.Agent):
         return np.stack([c * ahead + s * left, c * left - s * ahead], axis=1)[up > -FLOOR_M]
 
     def _velocity(self, t_ns: int) -> np.ndarray:
-        """Return the velocity to fly in the heading frame, ahead and to the left [m/s]."""
+        """Return the commanded velocity (2,) in the heading frame, ahead and to the left [m/s]."""
         own, c, s = self.parameters, math.cos(self._yaw), math.sin(self._yaw)
         to_go = own.east_m - self._p_W[0]
         others_W = self._others(t_ns)
@@ -120,7 +120,7 @@ class Pilot(zsim.Agent):
         return v
 
     def _others(self, t_ns: int) -> list[tuple[np.ndarray, float]]:
-        """Return the direction in W, and the distance [m], to the near drones that were heard."""
+        """Return offset (2,) in W [m] and distance [m] of each near drone that was heard."""
         heard = [p_W for _, (at_ns, p_W) in sorted(self._heard.items()) if t_ns - at_ns <= SILENT_NS]
         ways = [np.subtract(p_W, self._p_W)[:2] for p_W in heard]
         return [(way, away) for way in ways if 0.0 < (away := float(np.hypot(*way))) < HEED_M]

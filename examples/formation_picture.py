@@ -1,4 +1,4 @@
-"""A picture of a recorded formation, by a camera that follows it; docs/pictures/formation.jpg is one.
+"""Draw a recorded formation, seen by a camera that follows it; docs/pictures/formation.jpg is an example.
 
     python examples/formation_picture.py runs/first formation.jpg 60
 
@@ -31,14 +31,14 @@ from zsim_agents.cameras.renderer import Picture, Renderer
 from zsim_agents.cameras.scene import DroneStates, Scene, View, camera_motion, default_look, scene_of
 
 Array = NDArray[np.float64]
-SIDE = Mount(position_m=(1.0, 0.0, 0.0))  # m; ahead of its carrier, which is therefore not in the picture
+SIDE = Mount(position_m=(1.0, 0.0, 0.0))  # m; ahead of its carrier, which therefore stays out of the picture
 CAMERA = Camera(width_px=1440, height_px=720, diagonal_deg=60, rate_hz=1, mount=SIDE, noise=0, exposure_ms=2)
-AWAY, YAW_RAD, DOWN_RAD = 2.2, 0.35, 0.42  # distance in widths of the formation, heading, and how far it looks down
+AWAY, YAW_RAD, DOWN_RAD = 2.2, 0.35, 0.42  # distance in widths of the formation, heading, and downward tilt
 MAGENTA, INK, PAPER = (152, 17, 233), (40, 40, 40), (255, 255, 255)  # B, G, R
 
 
 class Instant(NamedTuple):
-    """The contents of a record at an instant: names, scene and states of its drones."""
+    """Names, scene and states of the recorded drones at one time."""
 
     names: list[str]
     scene: Scene
@@ -46,10 +46,10 @@ class Instant(NamedTuple):
 
 
 def recorded(record: Path, t_ns: int | None) -> Instant:
-    """Return the drones at the first gate from t_ns on, None: at the last one.
+    """Return the drones at the first gate at or after t_ns, or at the last gate if it is None.
 
     Raises:
-        SystemExit: the record ends before it.
+        SystemExit: the record ends before t_ns.
     """
     with RecordReader(record) as reader:
         info = msgspec.msgpack.decode(next(m.payload for m in reader.messages([keys.INFO])), type=Info)
@@ -60,7 +60,7 @@ def recorded(record: Path, t_ns: int | None) -> Instant:
             payloads = {message.key: message.payload for message in last if message}
         else:
             come = (message for message in reader.messages(wanted, from_ns=t_ns) if message.t_ns >= t_ns)
-            payloads = {message.key: message.payload for message in islice(come, len(names))}  # one of each a gate
+            payloads = {message.key: message.payload for message in islice(come, len(names))}  # one per drone and gate
     if payloads.keys() != set(wanted):
         raise SystemExit(f"{record}: ends before that instant; look at an earlier one, or leave it out for the last")
     truths = [msgspec.msgpack.decode(payloads[key], type=Truth) for key in wanted]
@@ -68,7 +68,7 @@ def recorded(record: Path, t_ns: int | None) -> Instant:
 
 
 def states(truths: Sequence[Truth]) -> DroneStates:
-    """Return the drones, from their truths."""
+    """Convert truths to the arrays that the renderer takes."""
     return DroneStates(
         np.array([truth.position_m for truth in truths]),
         np.array([truth.velocity_m_s for truth in truths]),
@@ -79,7 +79,7 @@ def states(truths: Sequence[Truth]) -> DroneStates:
 
 
 def follower(of: DroneStates) -> DroneStates:
-    """Return the drones and, last, the one that carries the camera."""
+    """Return the drones, and last the one that carries the camera."""
     middle, width = of.p_WB.mean(axis=0), float(np.ptp(of.p_WB, axis=0).max())
     q = quaternion_from_rpy([0.0, DOWN_RAD, YAW_RAD])
     place = middle - rotation_matrix(q)[:, 0] * (AWAY * max(width, 1.0))
@@ -93,7 +93,7 @@ def follower(of: DroneStates) -> DroneStates:
 
 
 def picture(instant: Instant, t_s: float) -> Picture:
-    """Return the picture as B, G, R (height, width, 3), with names and distances."""
+    """Return the picture (height, width, 3) in B, G, R, labelled with names and distances."""
     bodies, carrier = follower(instant.states), len(instant.names)
     scene = instant.scene._replace(drones=(*instant.scene.drones, default_look(has_hat=False)))
     drawn = Renderer(CAMERA, scene, carrier, 0, "follower").picture(0, t_s, bodies)
@@ -112,12 +112,12 @@ def picture(instant: Instant, t_s: float) -> Picture:
 
 
 def sides(count: int) -> list[tuple[int, int]]:
-    """Return pairs of drones: each and the next one."""
+    """Return the pairs of consecutive drones, as a ring if there are more than two."""
     return [(i, (i + 1) % count) for i in range(count)] if count > 2 else [(0, count - 1)]
 
 
 def label(drawn: Picture, text: str, at: Array) -> None:
-    """Write a text about a place of the picture [px]."""
+    """Write a text centred at a point of the picture [px]."""
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.7, 1)
     x, y = int(at[0] - width / 2), int(at[1] + height / 2)
     cv2.rectangle(drawn, (x - 6, y - height - 6), (x + width + 6, y + 6), PAPER, -1)

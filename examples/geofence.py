@@ -1,4 +1,4 @@
-"""A custom agent: lands every drone that leaves a circle around the origin, by its estimate.
+"""A custom agent: lands every drone whose estimate leaves a circle around the origin.
 
 zsim run scenarios/step.yaml --agent 'geofence:Geofence radius_m=4.0'   with a run
 zsim agent geofence:Geofence radius_m=4.0                               beside a running federation
@@ -13,9 +13,9 @@ import zsim
 
 
 class Geofence(zsim.Agent):
-    """A drone in the air whose estimate is outside of the circle is sent `land`."""
+    """Sends `land` to every airborne drone whose estimated position is outside the circle."""
 
-    name = "fence.main"  # of its process: role.thing
+    name = "fence.main"  # name of its process, as role.thing
     reads = ("drone/*/sensor/status", "drone/*/estimate")
 
     def __init__(self, radius_m: float) -> None:

@@ -1,8 +1,9 @@
-"""A custom vehicle: the AR.Drone with the larger battery, weighed. `model: larger_battery` names it.
+"""A custom vehicle, `model: larger_battery`: the AR.Drone with the larger battery, as weighed.
 
     PYTHONPATH=examples zsim run scenarios/step.yaml --set drones.drone1.model=larger_battery
 
-It replaces some of a stock vehicle's numbers; one that differs more starts as a copy of zsim/vehicles/crazyflie2.py.
+It overrides a few parameters of a stock vehicle; for a more different one, start from a copy of
+zsim/vehicles/crazyflie2.py.
 """
 
 from msgspec.structs import replace
@@ -11,6 +12,6 @@ from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 
 VEHICLE = replace(
     ARDRONE2,
-    mass_kg=0.48,  # kg, weighed
-    battery_mah=1500.0,  # mAh, printed on it
+    mass_kg=0.48,  # kg; weighed with this battery
+    battery_mah=1500.0,  # mAh; printed on the battery
 )

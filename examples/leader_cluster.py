@@ -3,7 +3,7 @@
     python examples/leader_cluster.py
     PYTHONPATH=examples zsim run scenarios/step.yaml --set clusters.main.space=leader_cluster:LeaderCluster
 
-The first command checks the Jacobian against differences, the second flies with it.
+The first command checks the Jacobian against finite differences; the second flies with it.
 """
 
 import numpy as np
@@ -11,11 +11,11 @@ import numpy as np
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.spaces.triad_cluster import TriadCluster
 
-STEP = 1e-6  # m or rad, step of the differences
+STEP = 1e-6  # m or rad; step of the finite differences
 
 
 class LeaderCluster(TriadCluster):
-    """c as in the paper, but (x_c, y_c, z_c) is robot 1's position: its command does not depend on the others."""
+    """c as in the paper, but (x_c, y_c, z_c) is robot 1's position, so its command does not depend on the others."""
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
         c = super().forward(p_W, yaw)
@@ -39,7 +39,7 @@ class LeaderCluster(TriadCluster):
 
 
 def jacobian_error(space: ClusterSpace, p_W: Array, yaw: Array) -> float:
-    """Return the greatest difference of J to central differences of `forward`, and of J J^-1 to one.
+    """Return the largest entry of |J - central differences of `forward`| and |J J^-1 - identity|.
 
     Args:
         p_W: (n, 3) [m]; yaw: (n,) [rad].

@@ -1,4 +1,4 @@
-"""Flies a scenario with many seeds, and compares two estimators against the truth.
+"""Fly a scenario with many seeds, and compare the errors of two estimators.
 
     python examples/monte_carlo.py scenarios/step.yaml --seeds 10 --duration 60
 
@@ -14,7 +14,7 @@ import zsim
 from zsim_analysis.reading.drone_errors import estimate_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 
-SETTLED_S = 10.0  # errors before are those of the first fixes
+SETTLED_S = 10.0  # s; earlier errors are excluded, as they stem from the first fixes
 
 
 def horizontal_rms_m(flight: RecordedFlight) -> float:

@@ -14,9 +14,9 @@ from zsim.contract.keys import SENSORS
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation.drone_estimator import StateEstimate
 
-GPS_GAIN = 0.02  # of a fix, after this many fixes
-HEIGHT_GAIN, HEADING_GAIN = 0.1, 0.05  # of a barometer and of a magnetometer sample
-GPS_SIGMA_M, HEIGHT_SIGMA_M, SPEED_SIGMA_M_S, YAW_SIGMA_RAD = 2.0, 0.03, 0.1, 0.02  # preset `paper`
+GPS_GAIN = 0.02  # minimum gain of a fix; the first 1 / GPS_GAIN fixes are averaged
+HEIGHT_GAIN, HEADING_GAIN = 0.1, 0.05  # minimum gains of a barometer and a magnetometer sample
+GPS_SIGMA_M, HEIGHT_SIGMA_M, SPEED_SIGMA_M_S, YAW_SIGMA_RAD = 2.0, 0.03, 0.1, 0.02  # with the noise of preset `paper`
 
 
 class MyEstimator:
@@ -39,7 +39,7 @@ class MyEstimator:
         self._rate = m.gyro_rad_s[2]
 
     def _on_mag(self, m: messages.Mag) -> None:
-        seen = self._bearing - math.atan2(m.field_ut[1], m.field_ut[0])  # as if level
+        seen = self._bearing - math.atan2(m.field_ut[1], m.field_ut[0])  # as if the drone were level
         gain = max(HEADING_GAIN, 1 / self._used["mag"])
         self._yaw += gain * math.remainder(seen - self._yaw, math.tau)
 
@@ -73,7 +73,7 @@ class MyEstimator:
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """Return its whole state, from which its successor continues if this process dies."""
+        """Return the complete state, from which a successor continues if this process dies."""
         return {"p": self._p, "v": self._v, "yaw": self._yaw, "rate": self._rate, "used": self._used}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -82,7 +82,7 @@ class MyEstimator:
         )
 
     def _covariance(self) -> tuple[float, ...]:
-        """Return the variances of white fixes under the present gain, on the diagonal of a 6 x 6 matrix."""
+        """Return a diagonal 6 x 6 matrix, row-major; its horizontal variance is that of filtered white GPS errors."""
         gain = self._gps_gain()
         level, up, speed = gain / (2 - gain) * GPS_SIGMA_M**2, HEIGHT_SIGMA_M**2, SPEED_SIGMA_M_S**2
         diagonal = (level, level, up, speed, speed, speed)

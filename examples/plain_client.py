@@ -1,4 +1,4 @@
-"""Reads drone1's IMU, flies it by velocity commands, and takes part in the lockstep, with only zenoh and msgpack."""
+"""Read drone1's IMU, fly it by velocity commands, and take part in the lockstep, with only zenoh and msgpack."""
 
 import os
 import queue
@@ -15,7 +15,7 @@ seq, last, inbox, gates, t_ns = {}, {}, queue.SimpleQueue(), 0, 0
 
 with zenoh.open(zenoh.Config.from_json5(config)) as session:
 
-    def put(key, **fields):  # BLOCK: the world would wait for a message that zenoh drops
+    def put(key, **fields):  # BLOCK, as the world would wait for ever for a message that zenoh drops
         seq[key] = seq.get(key, -1) + 1
         session.put(key, msgpack.packb({"seq": seq[key], **fields}), congestion_control=zenoh.CongestionControl.BLOCK)
 
@@ -27,11 +27,11 @@ with zenoh.open(zenoh.Config.from_json5(config)) as session:
     put(f"zsim/process/{ME}/join", t_ns=0, **run, role="plain", host="here", pid=os.getpid(), period_ns=info["gate_ns"])
     while gates * info["gate_ns"] <= SECONDS * 1e9 and last.get("clock", {}).get("state") != "stopped":
         try:
-            sample = inbox.get(timeout=10)  # s: even while time stands still, the clock comes once a second
+            sample = inbox.get(timeout=10)  # s; the clock comes once a second even while time stands still
         except queue.Empty:
             sys.exit("the world is silent")
         last[kind := str(sample.key_expr).rsplit("/", 1)[1]] = msgpack.unpackb(sample.payload.to_bytes())
-        if kind == "status":  # the gate is complete: answer it, then say done
+        if kind == "status":  # the gate is complete: answer it, then report it as done
             t_ns, gates, flying = last["status"]["t_ns"], gates + 1, last["status"]["state"] in ("hovering", "flying")
             command = {"velocity_m_s": [0.5, 0, 0], "yaw_rate_rad_s": 0} if flying else {"mode": "takeoff"}
             put(f"{DRONE}/cmd/{'velocity' if flying else 'mode'}", t_ns=t_ns, source=ME, **command)

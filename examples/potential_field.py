@@ -1,4 +1,4 @@
-"""A custom control law: each robot is attracted to its position in the formation and pushed away from near ones.
+"""A custom control law: each robot is attracted to its position in the formation and repelled by near robots.
 
     PYTHONPATH=examples zsim run scenarios/step.yaml --set clusters.main.law=potential_field:PotentialField
 
@@ -11,11 +11,11 @@ from zsim_agents.formation.control_law import ControlLaw
 from zsim_agents.formation.spaces.cluster_space import Array
 
 RANGE_M = 3.0  # distance beyond which robots do not repel each other
-PUSH_M3_S = 2.0  # of two robots 2 m apart: each flees at 2 (1/2 - 1/3) / 2^2 = 0.08 m/s
+PUSH_M3_S = 2.0  # repels each of two robots 2 m apart at 2 (1/2 - 1/3) / 2^2 = 0.08 m/s
 
 
 class PotentialField(ControlLaw):
-    """v_i = v_des,i + k (p_des,i - p_i) + the push of its neighbours, robot by robot; without a state."""
+    """Stateless, for each robot alone: v_i = v_des,i + k (p_des,i - p_i) + repulsion by its neighbours."""
 
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
         space, k_1_s = self.space, self.gains.k_1_s
@@ -28,8 +28,7 @@ class PotentialField(ControlLaw):
 
 
 def push(p_W: Array) -> Array:
-    """Return how fast robots at (n, 3) [m] flee from their neighbours (n, 3) [m/s]: down the gradient of
-    PUSH (1/d - 1/RANGE)^2 / 2."""
+    """Return the repulsion (n, 3) [m/s] of robots at (n, 3) [m], down the gradient of PUSH (1/d - 1/RANGE)^2 / 2."""
     apart_W = p_W[:, None] - p_W
     distance = np.linalg.norm(apart_W, axis=2)
     near = (distance > 0.0) & (distance < RANGE_M)

@@ -1,10 +1,10 @@
-"""A custom sensor as a program beside the world: ranges between two drones from their truth, with noise, in lockstep.
+"""A custom sensor as a separate program in lockstep: noisy ranges between two drones, from their true positions.
 
     zsim run scenarios/step.yaml --set 'processes.expect=[range.drone1]' --duration 60
     python examples/range_sensor.py tcp/127.0.0.1:7447
 
 Publishes `drone/drone1/range/drone2` five times a simulated second. The key is not part of the contract: only
-`zsim echo` and the recorder read it, and `sent` counts only commands, estimates and cluster states.
+`zsim echo` and the recorder read it, and it does not count in `sent`, unlike commands, estimates and cluster states.
 """
 
 import math
@@ -24,22 +24,22 @@ PERIOD_NS, SIGMA_M = 200_000_000, 0.1
 
 
 def measure(truths: dict[str, dict[str, Any]], rng: random.Random) -> float:
-    """Return the distance of the pair with white noise [m]."""
+    """Return the distance between the two drones, with white noise [m]."""
     here, there = (truths[drone]["position_m"] for drone in PAIR)
     return math.dist(here, there) + rng.gauss(0.0, SIGMA_M)
 
 
 class RangeSensor:
-    """Reads the truth of a pair, and says done for every gate once the range of that gate is out."""
+    """Reads the truth of two drones, and reports each gate as done once its range has been published."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._seq: dict[str, int] = {}
         info = world_info(session)
-        self._rng = random.Random(f"{info['seed']}/{ME}")  # its own stream: same seed, same noise
+        self._rng = random.Random(f"{info['seed']}/{ME}")  # a random stream of its own, reproducible from the seed
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        # by default each subscriber has its own thread, without a common order of messages
+        # by default each subscriber has its own thread, so that messages of different keys may swap
         in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         expressions = [*(f"zsim/drone/{drone}/truth" for drone in PAIR), "zsim/clock"]
         self._kept = [session.declare_subscriber(e, in_order) for e in expressions]
@@ -53,7 +53,7 @@ class RangeSensor:
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def run(self) -> int:
-        """Return how many ranges it measured."""
+        """Publish ranges until the run ends; return their number."""
         truths: dict[str, dict[str, Any]] = {}
         while True:
             sample = self._inbox.get()
@@ -78,7 +78,7 @@ class RangeSensor:
 
 
 def world_info(session: zenoh.Session) -> dict[str, Any]:
-    """Return `world/info`; wait for a world that listens already but does not answer yet."""
+    """Return `world/info`; retry while the world listens but does not answer yet."""
     while True:
         for reply in session.get("zsim/world/info", timeout=1.0):
             if reply.ok is not None:
@@ -92,7 +92,7 @@ def main() -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
-    config.insert_json5("connect/timeout_ms", "60000")  # a world that is still starting
+    config.insert_json5("connect/timeout_ms", "60000")  # the world may still be starting
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
         print(f"measured {RangeSensor(session).run()} ranges")

@@ -1,4 +1,4 @@
-"""Custom metrics of a sweep: when the formation's shape had settled, and how far it overshot.
+"""Custom metrics of a sweep: the settling time and the overshoot of the formation's shape.
 
     PYTHONPATH=examples zsim sweep scenarios/step.yaml --vary wind.gust_m_s=0,1 --set report.metrics=settling:settling
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from zsim_analysis.reading.formation import formations_of
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 
-BAND_M = 0.5  # m: a side has settled once it stays this close to its desired length; chosen
+BAND_M = 0.5  # m; a side has settled once it stays this close to its desired length; an assumption
 
 
 def settling(flight: RecordedFlight) -> dict[str, float | None]:
-    """Return when the side p had settled [s after the engagement], and by how much it was too long at most [m].
+    """Return when side p settled [s after the engagement], and the maximum by which it was too long [m].
 
-    None if the formation never engaged, or never settled.
+    Both are None if the formation never engaged; the time is None if it never settled.
     """
     formation = formations_of(flight)[0]
     if formation.engaged_s is None:
@@ -28,7 +28,7 @@ def settling(flight: RecordedFlight) -> dict[str, float | None]:
 
 
 def settled(t_s: NDArray[np.float64], error_m: NDArray[np.float64], engaged_s: float) -> dict[str, float | None]:
-    """Return the figures of an error (K,) at times (K,)."""
+    """Return the metrics of an error (K,) [m] at times (K,) [s]."""
     outside = np.flatnonzero(np.abs(error_m) > BAND_M)
     first = outside[-1] + 1 if len(outside) else 0
     settled_s = float(t_s[first]) - engaged_s if first < len(t_s) else None

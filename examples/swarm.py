@@ -1,12 +1,12 @@
-"""A decentralised formation: every drone has a pilot that knows its own estimate and what the others send.
+"""A decentralised formation: every drone has a pilot that knows only its own estimate and what the others send.
 
 zsim run examples/swarm.yaml
 zsim run examples/swarm.yaml --set agents.pilot.parameters.gain_1_s=0.6
 python examples/swarm.py
 
 Consensus on displacements (Olfati-Saber, Fax and Murray 2007, Proc. IEEE 95(1)): each pilot flies
-u_i = k sum_j ((p_j - c_j) - (p_i - c_i)) over those that it hears, where c is the position of a drone in the formation.
-The error decays at the rate k lambda_2 of the graph; the centroid stays where it was.
+u_i = k sum_j ((p_j - c_j) - (p_i - c_i)) over the drones that it hears, where c is a drone's position in the formation.
+The error decays at rate k lambda_2, lambda_2 being that of the graph; the centroid does not move.
 """
 
 import math
@@ -18,7 +18,7 @@ from msgspec import Meta
 
 import zsim
 
-SILENT_NS = 500_000_000  # drones that have not been heard for this long are ignored
+SILENT_NS = 500_000_000  # drones not heard for this long are ignored
 
 
 class Position(zsim.AgentMessage, frozen=True):
@@ -30,7 +30,7 @@ class Position(zsim.AgentMessage, frozen=True):
 
 
 class Pilot(zsim.Agent):
-    """Flies one drone to its corner of a regular polygon around the centre of all."""
+    """Flies one drone to its corner of a regular polygon around the centroid of all drones."""
 
     class Parameters(zsim.Parameters):
         radius_m: Annotated[float, Meta(gt=0, le=100)] = 3.0

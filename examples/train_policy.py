@@ -21,11 +21,11 @@ from stable_baselines3 import PPO
 
 import zsim
 
-HOME_M = (0.0, 0.0, 2.0)  # of W
-START_M = 3.0  # the drone starts within this of the origin, in x and y
-LIMIT = (0.4, 0.4, 1.0)  # of the firmware's limits: 2 m/s forward and left, 1 m/s up; the heading stays
+HOME_M = (0.0, 0.0, 2.0)  # in W
+START_M = 3.0  # the start is at most this far from the origin along x and along y
+LIMIT = (0.4, 0.4, 1.0)  # fractions of the firmware's limits: 2 m/s forward and left, 1 m/s up; no yaw
 STEP_S = 0.2
-STEP = Path(__file__).parents[1] / "scenarios/step.yaml"  # the paper's sensors, gusts and delay
+STEP = Path(__file__).parents[1] / "scenarios/step.yaml"  # has the paper's sensors, gusts and delay
 SCENARIO = zsim.Scenario.load(STEP).with_(
     name="home", drones=[{"name": "drone1", "position_m": [0, 0, 0]}], clusters=[], report={}, duration_s=12
 )
@@ -37,7 +37,7 @@ def near_home(sim: zsim.Simulation, agent: str) -> float:
 
 
 def drawn(rng: np.random.Generator) -> Mapping[str, Any]:
-    """Return an episode's start and wind."""
+    """Return a random start and wind for an episode."""
     x, y = rng.uniform(-START_M, START_M, 2).tolist()
     return {
         "drones.drone1.position_m": [x, y, 0.0],
@@ -46,13 +46,13 @@ def drawn(rng: np.random.Generator) -> Mapping[str, Any]:
 
 
 def home_env() -> TransformAction[Any, Any, Any]:
-    """Return the environment: estimates are observed, three velocities are the action."""
+    """Return the environment, with estimates as observations and three velocities as the action."""
     env = zsim.gym_env(SCENARIO, reward=near_home, randomise=drawn, observe="estimate", step_s=STEP_S)
     return TransformAction(env, velocities, Box(-1.0, 1.0, (3,), np.float32))
 
 
 def velocities(action: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the action (4,) of `zsim.Interface` for one of the policy (3,)."""
+    """Convert an action of the policy (3,) to one of `zsim.Interface` (4,)."""
     return np.append(action * LIMIT, 0.0).astype(np.float32)
 
 
@@ -63,13 +63,13 @@ def learner(seed: int = 1) -> PPO:
 
 
 def episode_rewards(model: PPO, seeds: range) -> NDArray[np.float64]:
-    """Return the sum of rewards of each episode (len(seeds),) that the policy flies without exploring."""
+    """Return the policy's total reward in each episode (len(seeds),), flown without exploration."""
     env = home_env()
     return np.array([flown(model, env, seed) for seed in seeds])
 
 
 def flown(model: PPO, env: TransformAction[Any, Any, Any], seed: int) -> float:
-    """Fly an episode; return its reward."""
+    """Fly an episode without exploration; return its total reward."""
     seen, _ = env.reset(seed=seed)
     total, is_over = 0.0, False
     while not is_over:
@@ -79,7 +79,7 @@ def flown(model: PPO, env: TransformAction[Any, Any, Any], seed: int) -> float:
 
 
 class Trained(zsim.PolicyAgent):
-    """The trained policy as an agent; `file` is what `PPO.save` wrote."""
+    """The trained policy as an agent; `file` was written by `PPO.save`."""
 
     observe, action, step_s = "estimate", "velocity", STEP_S
 
@@ -87,14 +87,14 @@ class Trained(zsim.PolicyAgent):
         self.model = PPO.load(file, device="cpu")
 
     def policy(self, observations: dict[str, NDArray[np.float32]]) -> Mapping[str, ArrayLike]:
-        """Fly each drone by its observation."""
+        """Return the action of each drone for its observation."""
         return {
             drone: velocities(self.model.predict(seen, deterministic=True)[0]) for drone, seen in observations.items()
         }
 
 
 def main() -> None:
-    """Train, save the policy and the scenario, and print the gain."""
+    """Train, save the policy and the scenario, and print the mean rewards before and after."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--steps", type=int, default=30_000)
     parser.add_argument("--seed", type=int, default=1)

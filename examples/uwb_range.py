@@ -1,9 +1,9 @@
-"""A custom sensor: the range from a drone's UWB tag to an anchor that stands in the field.
+"""A custom sensor: the range from a drone's UWB tag to an anchor at a fixed position.
 
     zsim run scenarios/step.yaml --set 'sensors.my_uwb={module: uwb_range, anchor_m: [0, 0, 2]}'
 
-The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. Several
-anchors are several sensors with the same module.
+The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. For
+several anchors, declare several sensors with this module.
 """
 
 from collections.abc import Sequence
@@ -17,19 +17,19 @@ from zsim.sensors.sensor import Channel, ErrorModel, RateHz, Sample, Sensor, Sen
 
 
 class UwbRange(Sample, frozen=True):
-    """Distance from the tag's antenna to the anchor's [m]."""
+    """Distance between the antennas of tag and anchor [m]."""
 
     range_m: Number
 
 
 class UwbConfig(Sensor, frozen=True, kw_only=True):
-    rate_hz: RateHz = 10.0  # Hz, chosen: one of ten tags that take turns
-    range_m: ErrorModel = ErrorModel(noise=0.1)  # m, data sheet of the DWM1000: 10 cm
+    rate_hz: RateHz = 10.0  # Hz; an assumption, as if ten tags took turns
+    range_m: ErrorModel = ErrorModel(noise=0.1)  # m; data sheet of the DWM1000: 10 cm
     anchor_m: Vector3 = (0.0, 0.0, 0.0)  # in W
 
 
 def distance(truth: SensorTruth, settings: UwbConfig, environment: Environment) -> Sequence[float]:
-    """Return |p_WS - p_WA| [m]."""
+    """Return |p_WS - p_WA| [m], from the sensor S to the anchor A."""
     return [float(np.linalg.norm(truth.p_WS - settings.anchor_m))]
 
 

@@ -3,8 +3,8 @@
 zsim run examples/wall.yaml
 python examples/wall.py
 
-Each beam limits how fast the formation may approach what it sees: v . u <= a (r - keep), with r along u. Where
-r >= keep at first, it stays so: a control barrier function of first order (Ames, Xu, Grizzle and Tabuada, Control
+Each beam limits how fast the formation may approach what it sees: v . u <= a (r - keep), with r along u. If
+r >= keep initially, it remains so: a control barrier function of first order (Ames, Xu, Grizzle and Tabuada, Control
 barrier function based quadratic programs for safety critical systems, IEEE Trans. Automatic Control 62(8), 2017).
 """
 
@@ -19,11 +19,11 @@ from zsim.sensors.scanner import Range
 from zsim_agents.formation.spaces.cluster_space import Array
 
 OLD_NS = 500_000_000  # older measurements are ignored
-TURNED = {"front": 0.0, "left": np.pi / 2, "back": np.pi, "right": -np.pi / 2}  # beams about a drone's heading [rad]
+TURNED = {"front": 0.0, "left": np.pi / 2, "back": np.pi, "right": -np.pi / 2}  # rad, from the drone's heading
 
 
 class OffTheWall(zsim.ControlLaw):
-    """The proportional law, limited by the beams; without a state."""
+    """The proportional law, its approach speed limited by the beams; stateless."""
 
     class Parameters(zsim.Parameters):
         keep_m: Annotated[float, Meta(gt=0, le=10)] = 2.0
@@ -39,7 +39,7 @@ class OffTheWall(zsim.ControlLaw):
             if sample is None or self.now_ns - sample.t_sample_ns > OLD_NS:
                 continue
             for beam, range_m in zip(sample.beams, sample.ranges_m, strict=True):
-                if beam in TURNED and range_m > 0.0:  # 0: nothing is within reach
+                if beam in TURNED and range_m > 0.0:  # 0 means that nothing is in range
                     u_W = np.array([np.cos(heading + TURNED[beam]), np.sin(heading + TURNED[beam])])
                     most = self.parameters.approach_1_s * (range_m - self.parameters.keep_m)
                     c_dot[centre] -= max(float(u_W @ c_dot[centre]) - most, 0.0) * u_W

@@ -1,9 +1,9 @@
-"""An FMU of FMI 3 that flies a drone to a point: a velocity by the remaining distance, at most 1 m/s.
+"""An FMU of FMI 3 that flies a drone to a point, at a velocity proportional to the distance and at most 1 m/s.
 
     python -m pythonfmu3 build -f examples/waypoint_fmu.py --handle-state --serialize-state
     zsim fmu Waypoint.fmu --drone drone1 --map p=estimate.position_m --map v=velocity_m_s --frame world
 
-Its state can be saved and restored, so that a restarted process continues where the former one was.
+Its state can be saved and restored, so that a restarted process continues where its predecessor stopped.
 """
 
 import math

@@ -141,7 +141,7 @@ def test_alarms_stay_until_they_are_acknowledged_and_failsafes_say_their_cause(
         name: {"commander": "console.run" if name == "drone2" else "controller.main"}
         for name in ("drone1", "drone2", "drone3")
     }
-    head.get_by_text("main: partly flown by others").wait_for()
+    head.get_by_text("main: other commanders").wait_for()
     head.get_by_text("engaged – drone2 is flown by console.run").wait_for()
 
     # a process that died, and is back

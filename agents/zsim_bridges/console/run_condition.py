@@ -130,7 +130,7 @@ def formation_alarms(
         elif phase == "held" and HELD_ON_REQUEST not in reason:
             found.append(Alarm("amber", name, "held", reason))
         if phase in FLOWN_PHASES and foreign.get(name):
-            found.append(Alarm("amber", name, "partly flown by others", foreign_text(foreign[name])))
+            found.append(Alarm("amber", name, "other commanders", foreign_text(foreign[name])))
         if phase == "engaged" and (strayed := _strayed(views[name])):
             found.append(Alarm("red", name, "off reference", strayed))
     return found

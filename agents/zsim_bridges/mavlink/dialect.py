@@ -517,7 +517,7 @@ class Signing:
         return head + self._hash(frame + head)
 
     def refusal(self, frame: bytes, signature: bytes, system_id: int, component_id: int) -> str | None:
-        """Return why a signed frame is refused, `bad_signature` or `replayed`; None if it is accepted."""
+        """Return why a signed frame is rejected, `bad_signature` or `replayed`; None if it is accepted."""
         if not hmac.compare_digest(self._hash(frame + signature[:-HASH_BYTES]), signature[-HASH_BYTES:]):
             return "bad_signature"
         stream = system_id, component_id, signature[0]
@@ -535,7 +535,7 @@ class Signing:
 
 
 class Link:
-    """Packs the messages of one component for one link, and numbers them; MAVLink 1 has no extensions or signatures."""
+    """Packs and numbers the messages of one component on one link; MAVLink 1 has no extensions or signatures."""
 
     def __init__(self, system_id: int, component_id: int, signing: Signing | None = None, version: Version = 2) -> None:
         self._address = bytes([system_id, component_id])

@@ -1,4 +1,4 @@
-"""The differences between PX4 and ArduPilot for clients: modes, parameters, rules of offboard flight.
+"""How PX4 and ArduPilot differ for clients: modes, parameters, rules for offboard flight.
 
 Sources: PX4-Autopilot, src/modules/commander/px4_custom_mode.h and the parameter reference; ArduPilot,
 ArduCopter/mode.h and the parameter list of Copter.
@@ -16,12 +16,12 @@ from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import Autopilot, ParamType
 
 REAL, INT, SHORT, BYTE = ParamType.REAL32, ParamType.INT32, ParamType.INT16, ParamType.INT8
-CM = 0.01  # m; unit of ArduPilot's parameters of places and speeds
-ID_MAX = 16  # characters of a parameter's name
+CM = 0.01  # unit of ArduPilot's lengths [m] and speeds [m/s]
+ID_MAX = 16  # most characters of a parameter's name
 
 
 FlightMode = Enum("FlightMode", "MANUAL ALTITUDE POSITION HOLD BRAKE TAKEOFF LAND RETURN MISSION OFFBOARD")
-"""The modes of both autopilots under common names."""
+"""The modes of both autopilots, under common names."""
 
 
 BY_STICKS = (FlightMode.MANUAL, FlightMode.ALTITUDE, FlightMode.POSITION)
@@ -57,7 +57,7 @@ COPTER_MODES = {
 
 
 FenceAction = Enum("FenceAction", "NONE WARN HOLD RETURN LAND")
-"""The action of a vehicle outside its fence."""
+"""What a vehicle does outside its fence."""
 
 
 PX4_FENCE = {  # GF_ACTION
@@ -65,7 +65,7 @@ PX4_FENCE = {  # GF_ACTION
     1: FenceAction.WARN,
     2: FenceAction.HOLD,
     3: FenceAction.RETURN,
-    4: FenceAction.WARN,  # terminate: not done, see docs
+    4: FenceAction.WARN,  # "terminate" only warns, see docs/mavlink.md
     5: FenceAction.LAND,
 }
 COPTER_FENCE = {  # FENCE_ACTION
@@ -73,7 +73,7 @@ COPTER_FENCE = {  # FENCE_ACTION
     1: FenceAction.RETURN,
     2: FenceAction.LAND,
     3: FenceAction.RETURN,
-    4: FenceAction.HOLD,  # brake, or land
+    4: FenceAction.HOLD,  # brake, or else land
 }
 Setting = Literal[
     "speed_m_s",
@@ -92,7 +92,7 @@ Setting = Literal[
 
 
 class ParameterSpec(NamedTuple):
-    """A parameter: its value at the start and its range; fixed ones cannot be set. Setting = value * `unit`."""
+    """A parameter: its initial value and its range; fixed ones cannot be set. Setting = value * `unit`."""
 
     name: str
     type: ParamType
@@ -153,14 +153,14 @@ def _copter(drone: Drone, system_id: int) -> list[ParameterSpec]:
 
 
 class Personality(NamedTuple):
-    """An autopilot as clients see it.
+    """An autopilot as its clients see it.
 
     Attributes:
-        specs: returns the parameters of a drone with a system id.
-        fence_actions: by the value of the parameter.
-        is_px4: PX4 enters OFFBOARD only while it receives setpoints and holds without them, sends integer parameters as
+        specs: returns the parameters of a drone, given its system id.
+        fence_actions: actions by the value of the fence's action parameter.
+        is_px4: PX4 enters OFFBOARD only while it receives setpoints, holds when they stop, sends integer parameters as
             their bytes, and has no item 0 for home in its missions.
-        version: flight_sw_version, major, minor, patch and type.
+        version: flight_sw_version: major, minor, patch and type.
     """
 
     autopilot: Autopilot
@@ -211,7 +211,7 @@ class Parameters:
 
     @property
     def fence_action(self) -> FenceAction:
-        """The action outside the fence; ArduPilot has a fence only while FENCE_ENABLE is 1."""
+        """The action outside the fence; ArduPilot's fence is active only while FENCE_ENABLE is 1."""
         if not self.values.get("FENCE_ENABLE", 1.0):
             return FenceAction.NONE
         return self._personality.fence_actions.get(int(self["fence_action"]), FenceAction.WARN)
@@ -221,7 +221,7 @@ class Parameters:
         return self.put(spec.name, value / spec.unit)
 
     def put(self, name: str, value: float) -> str | None:
-        """Set a parameter, clipped to its range; return why not."""
+        """Set a parameter, clipped to its range; return the reason for a refusal, or None."""
         spec = self._specs.get(name)
         if spec is None:
             return f"{name[:ID_MAX]}: no such parameter"
@@ -237,7 +237,7 @@ class Parameters:
         return map(self.message, self._names)
 
     def find(self, name: str, index: int) -> str | None:
-        """Return the name of a parameter by its index, or by name if that is -1; None if there is none."""
+        """Return the name of a parameter, given its index, or -1 and its name; None if it does not exist."""
         if index >= 0:
             return self._names[index] if index < len(self._names) else None
         return name if name in self._specs else None
@@ -249,7 +249,7 @@ class Parameters:
         return dialect.ParamValue(name, value, type_, len(self._names), self._names.index(name))
 
     def decoded(self, message: dialect.ParamSet) -> float:
-        """Return the value that a message sets, by the type of the parameter or else of the message."""
+        """Decode the value that a message sets, by the type of the parameter, or else that of the message."""
         spec = self._specs.get(message.param_id)
         type_ = spec.type if spec else message.param_type
         if not self._is_bytewise(type_):
@@ -258,5 +258,5 @@ class Parameters:
         return float(value)
 
     def _is_bytewise(self, type_: int) -> bool:
-        """Whether a value travels as the bytes of an integer in the field of a float."""
+        """Whether a value is sent as the bytes of an integer in a float field."""
         return self._personality.is_px4 and type_ in _INTEGERS

@@ -1,6 +1,6 @@
-"""The telemetry of a vehicle: its messages, each built from one state at a gate, and how often each is sent.
+"""The telemetry of a vehicle: its messages, each built from the state at one gate, and their rates.
 
-A builder returns None when there is nothing to send, or its sensor has failed. Messages that are due at one gate are
+A builder returns None if there is nothing to send, or its sensor has failed. Messages that are due at one gate are
 sent in the order of the table.
 """
 
@@ -34,10 +34,10 @@ from zsim_bridges.mavlink.vehicle_state import ALL_HEALTHY, Target, VehicleState
 
 Level = Literal["normal", "full"]
 SECOND_NS = 1_000_000_000
-RATE_MAX_HZ = 50.0  # Hz; one of each with a gate of 20 ms
-IMU_RATE_MAX_HZ = 200.0  # Hz; each sample of the inertial unit
+RATE_MAX_HZ = 50.0  # Hz; one message of each type per gate of 20 ms
+IMU_RATE_MAX_HZ = 200.0  # Hz; one message for each sample of the IMU
 GATE_NS = round(SECOND_NS / RATE_MAX_HZ)
-MAVLINK_VERSION = 3  # of HEARTBEAT
+MAVLINK_VERSION = 3  # in HEARTBEAT
 NAN = math.nan
 MG_PER_M_S2 = 1000.0 / G_M_S2
 GAUSS_PER_UT, MILLIGAUSS_PER_UT = 0.01, 10.0
@@ -54,11 +54,11 @@ BREACH_NONE, BREACH_ALTITUDE, BREACH_BOUNDARY = 0, 2, 3  # FENCE_BREACH
 
 
 class TelemetrySource:
-    """The source of telemetry; values that several messages need are computed once per gate.
+    """The data behind the telemetry; values that several messages need are computed once per gate.
 
     Attributes:
-        voltage_v, capacity_mah: of its battery, nominal.
-        breach: the fence that it is outside of; breaches: how often so far; breach_ns: since when.
+        voltage_v, capacity_mah: nominal values of its battery.
+        breach: which limit of the fence is breached (FENCE_BREACH); breaches: how many so far; breach_ns: since when.
     """
 
     def __init__(self, drone: Drone, state: VehicleState, flight: Flight, personality: Personality) -> None:
@@ -76,7 +76,7 @@ class TelemetrySource:
             self.__dict__.pop(name, None)
 
     def sample(self, sensor: str) -> Any:
-        """Return the newest sample of a sensor; None if there is none, or it has failed."""
+        """Return the newest sample of a sensor; None if there is none, or the sensor has failed."""
         sample = self.state.samples.get(sensor)
         return None if sample is None or self.state.has_failed(sensor) else sample
 
@@ -157,7 +157,7 @@ def gps_raw_int(s: TelemetrySource) -> WireMessage:
         lat=latitude,
         lon=longitude,
         alt=altitude,
-        eph=100,  # HDOP 1: zsim has a standard deviation alone
+        eph=100,  # HDOP 1: zsim knows only a standard deviation
         epv=100,
         vel=min(UINT16_UNKNOWN - 1, round(100 * math.hypot(vx, vy))),
         cog=round(100 * course) % 36000,
@@ -182,7 +182,7 @@ def battery_status(s: TelemetrySource) -> WireMessage:
         voltages=(voltage_mv, *(UINT16_UNKNOWN,) * 9),
         type=1,  # MAV_BATTERY_TYPE_LIPO
         battery_remaining=round(s.battery_percent),
-        charge_state=2 if s.state.is_battery_low else 1,  # LOW, OK of MAV_BATTERY_CHARGE_STATE
+        charge_state=2 if s.state.is_battery_low else 1,  # MAV_BATTERY_CHARGE_STATE: LOW, OK
     )
 
 
@@ -278,7 +278,7 @@ def altitude(s: TelemetrySource) -> WireMessage:
 
 
 def _estimator_flags(s: TelemetrySource) -> int:
-    """Return the flags of a complete estimate, without the absolute position if the GPS has failed."""
+    """Return the estimator's flags: all, without the absolute position if the GPS has failed."""
     if s.state.is_estimated and s.state.has_failed("gps"):
         return dialect.ALL_ESTIMATED & ~(dialect.POS_HORIZ_ABS | dialect.PRED_POS_HORIZ_ABS)
     return dialect.ALL_ESTIMATED
@@ -291,7 +291,7 @@ def estimator_status(s: TelemetrySource) -> WireMessage:
 
 
 def _milli_readings(s: TelemetrySource) -> tuple[int, ...] | None:
-    """Return specific force [mg], body rate [mrad/s] and magnetic field [mgauss]."""
+    """Return specific force [mg], body rate [mrad/s] and magnetic field [mgauss], in forward, right, down."""
     imu, mag = s.sample("imu"), s.state.samples.get("mag")
     if imu is None:
         return None
@@ -327,11 +327,11 @@ def optical_flow(s: TelemetrySource) -> WireMessage | None:
 
 Builder = Callable[[TelemetrySource], WireMessage | None]
 Rates = tuple[float, float]
-"""At the levels normal and full [Hz of simulated time]."""
+"""Rates at the levels normal and full [Hz of simulated time]."""
 
 
 class Row(NamedTuple):
-    """A message: builder, rates with each autopilot (None: on request alone), sensor whose samples it follows."""
+    """A message: builder, rates for each autopilot (None: only on request), the sensor whose samples it waits for."""
 
     build: Builder
     px4: Rates | None = None
@@ -385,7 +385,7 @@ ROWS: dict[type[WireMessage], Row] = {
     dialect.ScaledPressure: Row(scaled_pressure, (1.0, 5.0), (2.0, 10.0)),
     dialect.OpticalFlow: Row(optical_flow, (0.0, 15.0), None, "flow"),
 }
-STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM, as ArduCopter fills them
+STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM; contents as in ArduCopter
     1: (dialect.RawImu, dialect.ScaledPressure, dialect.ScaledImu),
     2: (dialect.SysStatus, dialect.MissionCurrent, dialect.GpsRawInt, dialect.FenceStatus),
     6: (dialect.GlobalPositionInt, dialect.LocalPositionNed),
@@ -398,7 +398,7 @@ BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in ROWS}
 
 
 class Telemetry:
-    """The messages that one vehicle sends, and their rates, which clients may change."""
+    """The messages of one vehicle and their rates, which clients may change."""
 
     def __init__(self, source: TelemetrySource, level: Level) -> None:
         self._source = source
@@ -437,13 +437,13 @@ class Telemetry:
         return messages
 
     def build(self, message_id: int) -> WireMessage | None:
-        """Return the present message; None if this vehicle does not send it."""
+        """Return the current message; None if this vehicle does not send it."""
         kind = BY_ID.get(message_id)
         self._source.advance()
         return ROWS[kind].build(self._source) if kind else None
 
     def put_interval(self, message_id: int, interval_us: float) -> bool:
-        """Send a message at an interval: -1 never, 0 as at the start; False for one that this vehicle does not send."""
+        """Set the interval of a message: -1 never, 0 the default; return False if this vehicle does not send it."""
         kind = BY_ID.get(message_id)
         if kind is None:
             return False
@@ -453,7 +453,7 @@ class Telemetry:
         return True
 
     def interval_us(self, message_id: int) -> int:
-        """Return the interval of a message: -1 if it is not sent, 0 if there is no such message."""
+        """Return the interval of a message: -1 if it is off, 0 if this vehicle has no such message."""
         kind = BY_ID.get(message_id)
         if kind is None:
             return 0
@@ -462,7 +462,7 @@ class Telemetry:
         return self._interval_ns[kind] // 1000 if kind in self._interval_ns else -1
 
     def put_stream(self, stream: int, rate_hz: float) -> None:
-        """Send a group of messages at a rate, as in the old protocol."""
+        """Set the rate of a group of messages, as in the deprecated REQUEST_DATA_STREAM."""
         for number, kinds in STREAMS.items():
             if stream in (ALL_STREAMS, number):
                 for kind in kinds:

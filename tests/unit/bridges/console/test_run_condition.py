@@ -157,7 +157,7 @@ def test_an_engaged_formation_with_a_drone_flown_by_hand_is_an_alarm_with_its_fi
     foreign = {"main": {"drone2": "console.run"}}
     found = run_condition.formation_alarms({"main": ("engaged", "")}, foreign, {"main": view})
     assert [(each.severity, each.name) for each in found] == [
-        ("amber", "partly flown by others"),
+        ("amber", "other commanders"),
         ("red", "off reference"),
     ]
     assert has_terms(found[0].text, "drone2", "console.run")

@@ -353,7 +353,7 @@ def test_a_formation_with_a_drone_flown_by_hand_is_not_told_to_be_engaged_alone(
         each if each.commander else msgspec.structs.replace(each, commander="controller.main") for each in view.drones
     )
     seen.draw((key, msgspec.structs.replace(view, drones=tuple(led))), cluster())
-    assert alarmed(seen) == [(CLUSTER, "partly flown by others", False)]
+    assert alarmed(seen) == [(CLUSTER, "other commanders", False)]
     for told in (seen.show.head()["detail"], seen.show._page.phases.content):
         assert has_terms(without_tags(told), "engaged", NAMES[1], "console.run")
 
