@@ -573,8 +573,8 @@ class Parser:
         signing: checks signatures, and unsigned frames are refused; None to accept frames unchecked.
 
     Attributes:
-        refused: frames refused, by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (flags that must
-            not be ignored), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, bytes outside frames.
+        refused: number of refused frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (unknown
+            flags), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, the number of bytes outside frames.
     """
 
     def __init__(self, signing: Signing | None = None) -> None:
