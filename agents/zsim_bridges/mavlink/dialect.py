@@ -574,7 +574,7 @@ class Parser:
 
     Attributes:
         refused: number of refused frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (unknown
-            flags), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, the number of bytes outside frames.
+            flags), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, the bytes outside frames.
     """
 
     def __init__(self, signing: Signing | None = None) -> None:
