@@ -1,8 +1,8 @@
-"""One drone of a run as an AR.Drone 2.0: messages and datagrams in, commands and datagrams out. Pure.
+"""One drone of a run presented as an AR.Drone 2.0: messages and datagrams in, commands and datagrams out. Pure.
 
-`Aircraft` is the session of one aircraft, its configuration, watchdogs and state, between a run and pilots' programs.
-`Pilot` is the effect of their REF and PCMD: modes, repeated until obeyed, and a setpoint as long as it holds, which
-`SetpointSender` converts for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; what clients of it send.
+`Aircraft` is the session of one aircraft between a run and pilots' programs: its configuration, watchdogs and state.
+`Pilot` carries out their REF and PCMD: it requests modes until they are entered, and repeats a setpoint while it is in
+force; `SetpointSender` converts it for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; clients' datagrams.
 """
 
 import math
@@ -30,13 +30,13 @@ from zsim_bridges.ardrone.navdata import (
 )
 from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, ModeName, OnboardState
 
-WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog's bit (Developer Guide 6.6, COMWDG)
-LAND_AFTER_NS = 2_000_000_000  # ns of hovering without a pilot's program before it lands, chosen
-MALFORMED_SHOWN = 20  # chosen; reports of invalid parts of datagrams, further ones are only counted
-LOW_BATTERY_PERCENT = 10.0  # %, below it zsim's firmware does not take off; below 5 % it lands
-RANGE_COSINE = math.cos(math.radians(75.0))  # of the tilt at which the firmware cuts the motors
+WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog bit is set (Developer Guide 6.6, COMWDG)
+LAND_AFTER_NS = 2_000_000_000  # chosen; ns of hovering without a pilot's program before the drone lands
+MALFORMED_SHOWN = 20  # chosen; invalid parts of datagrams that are reported; further ones are only counted
+LOW_BATTERY_PERCENT = 10.0  # %; zsim's firmware does not take off below this, and lands below 5 %
+RANGE_COSINE = math.cos(math.radians(75.0))  # cosine of the tilt at which the firmware cuts the motors
 THREADS = StateBit.AT_THREAD | StateBit.NAVDATA_THREAD | StateBit.VIDEO_THREAD | StateBit.ACQUISITION_THREAD
-ALWAYS = int(StateBit.ALTITUDE_CONTROL | StateBit.PIC_VERSION_OK | THREADS)  # of an aircraft on the ground
+ALWAYS = int(StateBit.ALTITUDE_CONTROL | StateBit.PIC_VERSION_OK | THREADS)  # bits that are set even on the ground
 CONTROL_STATES = {
     "landed": ControlState.LANDED,
     "taking_off": ControlState.TAKING_OFF,
@@ -45,20 +45,20 @@ CONTROL_STATES = {
     "landing": ControlState.LANDING,
     "emergency": ControlState.DEFAULT,
 }
-FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 with the other one small, 4 the next one
+FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 the same with the other inset, 4 the next
 NEXT_CHANNEL = 4
-AGAIN_NS = 500_000_000  # ns, chosen: a mode that is not entered is asked for again, as the pilot's REF is repeated
-ASKED_MAX = 3  # times that a mode is asked for before it is given up, chosen
-PER_GATE = 3  # setpoints that are sent at once within a gate, chosen: the world takes one at each
+AGAIN_NS = 500_000_000  # ns, chosen; a mode not yet entered is requested again, as a pilot's program repeats REF
+ASKED_MAX = 3  # chosen; requests for a mode before it is abandoned
+PER_GATE = 3  # chosen; setpoints sent immediately within a gate, since the world takes one per gate
 IN_THE_AIR = ("taking_off", *AIRBORNE)
-NO_ALTITUDE_LIMIT_MM = 100_000  # altitude_max that means none (ARDroneLib)
-CLIMB_1_S = 1.5  # 1/s, as the firmware nears its own greatest height
-CALIBRATION_YAW_RAD_S = 1.0  # rad/s, chosen: a turn takes 6 s, as on the aircraft
+NO_ALTITUDE_LIMIT_MM = 100_000  # altitude_max that stands for no limit (ARDroneLib)
+CLIMB_1_S = 1.5  # climb rate per metre left to the maximum height [1/s], as in zsim's firmware
+CALIBRATION_YAW_RAD_S = 1.0  # rad/s, chosen: a turn takes 6 s, as on the real aircraft
 FIGURES = "figures are not flown here; the aircraft's flips are its firmware's"
 
 
 class Outlets(NamedTuple):
-    """The outputs of an aircraft: commands to the run, navdata to programs, bytes to the control port, refusals."""
+    """Outputs of an aircraft: commands to the run, navdata to programs, bytes to the control port, refusals."""
 
     put: Callable[[str, Any], None]
     send_navdata: Send
@@ -67,7 +67,7 @@ class Outlets(NamedTuple):
 
 
 class Aircraft:
-    """One aircraft, flown by its pilot's programs; `gate_ns` is the resolution of arrival times."""
+    """One aircraft, flown by its pilots' programs; `gate_ns` is the resolution of arrival times."""
 
     def __init__(self, drone: Drone, source: str, gate_ns: int, outlets: Outlets) -> None:
         self._name = drone.name
@@ -101,7 +101,7 @@ class Aircraft:
 
     @property
     def camera(self) -> str:
-        """The camera whose pictures are streamed."""
+        """The camera whose images are streamed."""
         return CAMERAS[0] if self._channel in FRONT_CHANNELS else CAMERAS[1]
 
     # The run
@@ -135,7 +135,7 @@ class Aircraft:
             self.pilot.land()
 
     def _silent_ns(self) -> int:
-        """Return how long no AT command has arrived, less the gate that is the resolution of its arrival."""
+        """Return the time since the last AT command arrived, less one gate, the resolution of arrival times."""
         return 0 if self._command_ns is None else max(0, self._now_ns - self._command_ns - self._gate_ns)
 
     # Pilots' programs
@@ -150,7 +150,7 @@ class Aircraft:
             self._malformed += 1
             self._refuse(refusal if self._malformed <= MALFORMED_SHOWN else "more data that are not AT commands")
         for command in commands:
-            # numbers begin again with 0 or 1, and after a silence
+            # a program may restart its numbers at 0 or 1, and anywhere after a silence
             if command.sequence > self._last_sequence or command.sequence in (0, 1) or self._is_lost:
                 self._last_sequence = command.sequence
                 self._command_ns, self._is_lost = self._now_ns, False
@@ -185,7 +185,7 @@ class Aircraft:
                 self._refuse(f"ANIM is not obeyed: {FIGURES}")
 
     def _configure(self, config: at_commands.Config, ids: at_commands.ConfigIds | None) -> None:
-        """Set an entry, and acknowledge it even if it is refused, as the aircraft does."""
+        """Set an entry, and acknowledge it even if it is refused, as the real aircraft does."""
         self._ack = True
         key = config.key.lower()
         is_foreign = ids and not self.configuration.is_current(ids.session, ids.user, ids.application)
@@ -231,7 +231,7 @@ class Aircraft:
             (StateBit.ULTRASOUND_DEAF, self._content.is_sonar_deaf),
             (StateBit.BATTERY_LOW, status is not None and status.battery_percent < LOW_BATTERY_PERCENT),
         )
-        state = sum((bit for bit, is_set in bits if is_set), ALWAYS)  # a flag's `|` is slow
+        state = sum((bit for bit, is_set in bits if is_set), ALWAYS)  # `|` is slow for flags
         if self.pilot.state == "emergency":
             state += StateBit.EMERGENCY + (StateBit.USER_EMERGENCY if self.pilot.stopped_by_pilot else StateBit.CUTOUT)
             if float(rotations.rotation_matrix(self._state.attitude)[2, 2]) < RANGE_COSINE:
@@ -240,12 +240,12 @@ class Aircraft:
 
 
 class TiltSetpoint(NamedTuple):
-    """A PCMD within its limits: shares of the largest tilt, climb and yaw rate.
+    """A PCMD within its limits: fractions of the maximum tilt, climb and yaw rate.
 
     Attributes:
-        hover: in place, whatever the shares are.
-        right, back, up, clockwise: in [-1, 1].
-        pilot_heading_rad: clockwise from north, if right and back are those of the pilot, not of the drone.
+        hover: whether to hover in place, ignoring the fractions.
+        right, back, up, clockwise: fractions in [-1, 1].
+        pilot_heading_rad: clockwise from north, if right and back are relative to the pilot; None for the drone.
     """
 
     hover: bool
@@ -263,8 +263,9 @@ class Pilot:
     """The pilot of one drone.
 
     Attributes:
-        setpoint: that is flown; None for none.
-        has_flown: whether the flight is this pilot's; stopped_by_pilot: whether the emergency is.
+        setpoint: the setpoint in force; None for none.
+        has_flown: whether this pilot has flown the drone since it last stood; stopped_by_pilot: whether it caused the
+            emergency.
     """
 
     def __init__(
@@ -276,19 +277,19 @@ class Pilot:
         self._refuse = refuse
         self._status: Status | None = None
         self._held_take_off = self._held_emergency = False  # bits of the last REF
-        self._mode: ModeName | None = None  # that is to be entered
+        self._mode: ModeName | None = None  # the mode to be entered
         self._mode_ns, self._mode_count = 0, 0
         self.setpoint: TiltSetpoint | None = None
         self._sent_ns: int | None = None  # when the setpoint was last sent; None while it is new
         self._gate_ns, self._gate_count = -1, 0
-        self._psi_rad: float | None = None  # of the last PCMD_MAG
-        self._calibrated_ns: int | None = None  # until then it turns
+        self._psi_rad: float | None = None  # the pilot's heading in the last PCMD_MAG
+        self._calibrated_ns: int | None = None  # when the calibration turn ends
         self.has_flown = False
         self.stopped_by_pilot = False
 
     @property
     def calibrates(self) -> bool:
-        """Whether it turns to calibrate its magnetometer."""
+        """Whether the drone is turning to calibrate its magnetometer."""
         return self._calibrated_ns is not None
 
     @property
@@ -300,12 +301,12 @@ class Pilot:
         return self._status.t_ns if self._status else 0
 
     def flown_by(self) -> str | None:
-        """Return the name of another process that flies the drone."""
+        """Return the name of another process that flies the drone; None if no other does."""
         commander = self._status.commander if self._status else None
         return None if commander in (None, self._source) else commander
 
     def _is_refused(self, name: str) -> bool:
-        """Return whether a command is not obeyed, and count it."""
+        """Return whether a command must be refused, and report the reason."""
         if self._status is None:
             self._refuse(f"{name} is not obeyed: the drone has sent no status yet")
         elif other := self.flown_by():
@@ -319,14 +320,14 @@ class Pilot:
     def on_ref(self, ref: Ref) -> None:
         """Take off or land, and toggle the emergency.
 
-        The bits are levels that a pilot's program repeats; a take-off and the toggle follow from their rise.
+        The bits are levels that a pilot's program repeats; rising edges trigger a take-off and the toggle.
         """
         rises = ref.takes_off and not self._held_take_off
         toggles = ref.emergency and not self._held_emergency
         self._held_take_off, self._held_emergency = ref.takes_off, ref.emergency
         if not (rises or toggles or (not ref.takes_off and self.state in IN_THE_AIR)):
-            if not ref.takes_off and self._mode == "takeoff":  # withdrawn
-                if self._mode_count:  # it is under way, and is followed by a landing
+            if not ref.takes_off and self._mode == "takeoff":  # the take-off is withdrawn
+                if self._mode_count:  # it has been requested already, so the drone must land
                     self._sender.mode(self._now_ns, "land")
                 self._mode = None
             return
@@ -342,7 +343,7 @@ class Pilot:
             self._ask("land")
 
     def on_pcmd(self, pcmd: Pcmd | PcmdMag) -> None:
-        """Fly it from now on, until another PCMD."""
+        """Fly a PCMD until the next one arrives."""
         if isinstance(pcmd, PcmdMag):
             self._psi_rad = math.pi * share(pcmd.psi)
         if self.state not in IN_THE_AIR or self._mode in ("land", "emergency") or self._is_refused("PCMD"):
@@ -358,7 +359,7 @@ class Pilot:
         self._follow(setpoint)
 
     def calibrate(self) -> None:
-        """Turn once, in place."""
+        """Turn once in place to calibrate the magnetometer."""
         if self.state not in AIRBORNE:
             self._refuse(f"CALIB is not obeyed: the drone is {self.state}; must be in the air")
         elif not self._is_refused("CALIB"):
@@ -366,7 +367,7 @@ class Pilot:
             self._calibrated_ns = self._now_ns + self._setpoints.turn_ns
 
     def on_lost(self) -> None:
-        """Hover in place: the pilot's program is silent; its next REF counts as its first."""
+        """Hover in place, since the pilot's program is silent; its next REF counts as its first."""
         self._held_take_off = self._held_emergency = False
         if self._is_own_flight():
             self._calibrated_ns = None
@@ -417,7 +418,7 @@ class Pilot:
         if entered[mode]:
             self._mode = None
         elif mode == "takeoff" and self.state != "landed":
-            return  # it lands first
+            return  # wait until the drone has landed
         elif not self._mode_count or self._now_ns - self._mode_ns >= AGAIN_NS:
             if self._mode_count == ASKED_MAX:
                 self._mode = None
@@ -448,15 +449,15 @@ class Pilot:
 
 
 class SetpointSender:
-    """Sends setpoints to one drone: shares of the firmware's limits, below a height, in the drone's frame.
+    """Sends setpoints to one drone: fractions of the firmware's limits, in the drone's frame, up to a maximum height.
 
     Args:
-        limits: the values of zsim's shares of 1.
-        configuration: has the values of the pilot's shares of 1.
+        limits: the firmware's limits, to which zsim's fractions refer.
+        configuration: holds the limits to which the pilot's fractions refer.
 
     Attributes:
-        altitude_m, heading_rad: over the ground, and clockwise from magnetic north, to be kept up to date.
-        turn_ns: time of a whole turn of the calibration.
+        altitude_m, heading_rad: above ground, and clockwise from magnetic north; the caller keeps them up to date.
+        turn_ns: duration of one full turn for the calibration.
     """
 
     def __init__(self, sender: CommandSender, limits: Limits, configuration: Configuration) -> None:
@@ -470,7 +471,7 @@ class SetpointSender:
         self.heading_rad = 0.0
 
     def repeat_ns(self, setpoint: TiltSetpoint) -> int:
-        """Return after how long a setpoint is sent again; at every gate if it depends on height or heading."""
+        """Return the period of repeating a setpoint; 0, for every gate, if it depends on height or heading."""
         if setpoint.pilot_heading_rad is not None:
             return 0
         climb_m_s = self._configuration.number("control:control_vz_max") / 1e3 if setpoint.up > 0.0 else -math.inf
@@ -496,7 +497,7 @@ class SetpointSender:
         self._sender.velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
 
     def _climb_left_m_s(self) -> float:
-        """Return how fast it may climb below altitude_max."""
+        """Return the maximum climb rate that keeps the drone below altitude_max."""
         highest_mm = self._configuration.number("control:altitude_max")
         if highest_mm >= NO_ALTITUDE_LIMIT_MM:
             return math.inf
@@ -504,5 +505,5 @@ class SetpointSender:
 
 
 def share(value: float) -> float:
-    """Return a share of a limit, clipped to [-1, 1]."""
+    """Return a fraction of a limit, clipped to [-1, 1]."""
     return min(1.0, max(-1.0, value))

@@ -1,13 +1,14 @@
-r"""What a pilot's program sends to an AR.Drone 2.0: AT commands on UDP port 5556, and with them its configuration.
+r"""The AT commands that a pilot's program sends to an AR.Drone 2.0 on UDP port 5556, and the configuration they set.
 
-A datagram holds one or more `AT*NAME=sequence,argument,...\r`, whole. Integers are decimal, strings are quoted, a float
-is written as the signed integer that has the same 32 bits.
+A datagram holds one or more complete commands `AT*NAME=sequence,argument,...\r`. Integers are decimal, strings are
+quoted, and a float is written as the signed integer with the same 32 bits.
 
-Beside the common values of the configuration, an application, a user (`profile`) and a session have values of their
-own, each under an identifier, for the entries of their category. Whoever writes an identifier of `custom` makes it the
-current one; an unknown one begins with the defaults. The aircraft sends its configuration on the control port, TCP
-5559: a line `section:key = value\n` for each entry, and a zero byte. The list of custom configurations has blocks
-`[applis]`, `[profiles]`, `[sessions]`, with a line `id,description` for each, all ended by `\r`, and a zero byte.
+In addition to the common configuration, each application, user (`profile`) and session has its own values, stored under
+an identifier, for the entries of its category. Writing an identifier to an entry of `custom` makes it the current one;
+a new identifier starts with the defaults. The aircraft sends its configuration on the control port, TCP 5559: a line
+`section:key = value\n` per entry, then a zero byte. The list of custom configurations has the blocks `[applis]`,
+`[profiles]` and `[sessions]`, with a line `id,description` per configuration; lines end in `\r`, the list in a
+zero byte.
 
 Source: AR.Drone Developer Guide SDK 2.0, chapters 6 and 8; ARDroneLib (SDK 2.0.1), ardrone_api.c, config_keys.h,
 ardrone_control.c and ardrone_control_configuration.c.
@@ -20,8 +21,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 PORT = 5556  # UDP (ARDroneLib, config.h)
-DATAGRAM_MAX = 8192  # bytes, chosen: eight commands of the greatest length
-COMMAND_MAX = 1024  # characters of a command, its end included (Developer Guide 6.1)
+DATAGRAM_MAX = 8192  # bytes; chosen: eight commands of maximum length
+COMMAND_MAX = 1024  # characters in a command, including its terminator (Developer Guide 6.1)
 REF_CONSTANT = 0x1154_0000  # bits 18, 20, 22, 24, 28, which are always set (Developer Guide 6.6)
 TAKE_OFF_BIT, EMERGENCY_BIT = 1 << 9, 1 << 8  # of REF (Developer Guide 6.6)
 PROGRESSIVE, COMBINED_YAW, ABSOLUTE = 1, 2, 4  # bits of a PCMD's flag (Developer Guide 6.6)
@@ -29,11 +30,11 @@ SEND_CONFIGURATION, ACKNOWLEDGE, SEND_CUSTOM_LIST = 4, 5, 6  # modes of CTRL (AR
 IGNORED_NAMES = frozenset(
     ("PMODE", "MISC", "PWM", "AFLIGHT", "CAD", "ZAP", "MTRIM", "GAIN", "VISP", "VISO", "CAP", "POL", "VICON")
 )
-"""Commands of the SDK that are accepted and have no effect here."""
+"""SDK commands that are accepted but have no effect here."""
 
 
 class Ref(NamedTuple):
-    """Take off or land, and the emergency toggle."""
+    """Take-off or landing, and the emergency toggle."""
 
     sequence: int
     bits: int
@@ -48,7 +49,7 @@ class Ref(NamedTuple):
 
 
 class Pcmd(NamedTuple):
-    """Fly: shares of the limits in [-1, 1]; roll to the right, pitch backward, gaz up, yaw clockwise."""
+    """Flight demands as fractions of the limits, in [-1, 1]: roll right, pitch backward, gaz up, yaw clockwise."""
 
     sequence: int
     flag: int
@@ -59,7 +60,7 @@ class Pcmd(NamedTuple):
 
 
 class PcmdMag(NamedTuple):
-    """As Pcmd, in the pilot's own frame: psi is the controller's heading, a share of 180 deg clockwise of north."""
+    """Like Pcmd, in the pilot's frame: psi is the controller's heading clockwise from north, a fraction of 180 deg."""
 
     sequence: int
     flag: int
@@ -72,7 +73,7 @@ class PcmdMag(NamedTuple):
 
 
 class FlatTrim(NamedTuple):
-    """Take the present attitude as level."""
+    """Take the current attitude as level."""
 
     sequence: int
 
@@ -85,7 +86,7 @@ class Calibrate(NamedTuple):
 
 
 class ConfigIds(NamedTuple):
-    """The identifiers for which the next Config is meant."""
+    """The identifiers to which the next Config applies."""
 
     sequence: int
     session: str
@@ -102,7 +103,7 @@ class Config(NamedTuple):
 
 
 class Control(NamedTuple):
-    """Ask for the configuration, or clear the acknowledgement: SEND_CONFIGURATION, ACKNOWLEDGE, SEND_CUSTOM_LIST."""
+    """Request a configuration (SEND_CONFIGURATION, SEND_CUSTOM_LIST) or clear the acknowledgement (ACKNOWLEDGE)."""
 
     sequence: int
     mode: int
@@ -125,7 +126,7 @@ class Led(NamedTuple):
 
 
 class Animation(NamedTuple):
-    """Fly a figure."""
+    """Fly a preset manoeuvre, such as a flip."""
 
     sequence: int
     animation: int
@@ -133,7 +134,7 @@ class Animation(NamedTuple):
 
 
 class Ignored(NamedTuple):
-    """A command of the SDK without effect."""
+    """An SDK command that has no effect here."""
 
     sequence: int
     name: str
@@ -163,14 +164,14 @@ _SEQUENCE_MAX = 2**32 - 1
 
 
 class Parsed(NamedTuple):
-    """The commands of a datagram in order, and a text for each invalid part."""
+    """The commands of a datagram in order, and an error text for each invalid part."""
 
     commands: list[Command]
     refusals: list[str]
 
 
 class _RefusalError(ValueError):
-    """A part of a datagram is not a command; the text says why."""
+    """A part of a datagram is not a valid command; the message says why."""
 
 
 def parse(datagram: bytes) -> Parsed:
@@ -266,19 +267,19 @@ def ref(sequence: int, takes_off: bool, emergency: bool = False) -> Ref:
 
 
 CONTROL_PORT = 5559  # TCP (ARDroneLib, config.h)
-TEXT_MAX = 128  # characters of a value (Developer Guide 8.1)
-DEFAULT_ID = "00000000"  # of each level (Developer Guide 8.1)
-KEPT_MAX = 64  # configurations of a level, chosen: identifiers cost their sender nothing
+TEXT_MAX = 128  # characters in a value (Developer Guide 8.1)
+DEFAULT_ID = "00000000"  # initial identifier at each level (Developer Guide 8.1)
+KEPT_MAX = 64  # chosen; configurations kept per level, since a client may invent any number of identifiers
 END = b"\0"
 _BLOCKS = ("applis", "profiles", "sessions")
 _ID = re.compile(r"[0-9A-Za-z]{1,32}")
 Category = Literal["common", "application", "user", "session"]
 _LEVELS: dict[str, Category] = {"application": "application", "profile": "user", "session": "session"}
-"""Categories by the name that `custom` has for them."""
+"""Categories by the names that the entries of `custom` use for them."""
 
 
 class ConfigurationEntry(NamedTuple):
-    """An entry of the configuration; `fixed` cannot be written."""
+    """An entry of the configuration; the kind `fixed` is read-only."""
 
     kind: Literal["flag", "whole", "number", "text", "fixed"]
     category: Category
@@ -288,10 +289,10 @@ class ConfigurationEntry(NamedTuple):
 
 
 LIMITS = ("euler_angle_max", "control_vz_max", "control_yaw")
-"""Of tilt [rad], climb [mm/s] and yaw rate [rad/s]: the aircraft keeps a set for indoors and one for outdoors."""
-_ALTITUDE = "20|100000"  # mm; the highest means that there is no limit (ARDroneLib)
+"""Limits of tilt [rad], climb [mm/s] and yaw rate [rad/s], of which the aircraft keeps an indoor and an outdoor set."""
+_ALTITUDE = "20|100000"  # mm; the maximum stands for no limit (ARDroneLib)
 _TILT, _CLIMB, _YAW = "0|0.52", "200|2000", "0.7|6.11"  # rad, mm/s, rad/s (Developer Guide 8.6)
-_CODE = "0|255"  # codecs, modes and channels, as numbers of a byte
+_CODE = "0|255"  # codecs, modes and channels, each as one byte
 _MASK = "0|4294967295"
 _RATE = "0|20000"  # kbit/s
 _MOTORS = "\n".join(
@@ -388,21 +389,21 @@ gps:longitude|number|session|500|-1000|1000
 gps:altitude|number|session|0|-1e5|1e5
 """
 ENTRIES: dict[str, ConfigurationEntry] = {}
-"""By `section:key`; in addition, there are the identifiers and descriptions of `custom`."""
+"""Entries by `section:key`, except for the identifiers and descriptions of `custom`."""
 for _name, _kind, _category, _default, *_range in (line.split("|") for line in _TABLE.split("\n") if line):
     ENTRIES[_name] = ConfigurationEntry(_kind, _category, _default, *map(float, _range))  # type: ignore[arg-type]
 
 
 class ConfigurationError(ValueError):
-    """An entry is refused; the text says why."""
+    """The setting of an entry is refused; the message says why."""
 
 
 class Configuration:
     """The values of all entries.
 
     Args:
-        highest: the greatest value that the aircraft flies by, for entries where it is below the SDK's.
-        fixed: values of entries that are the aircraft's own.
+        highest: upper limits of the aircraft's values, for entries where they are below the SDK's.
+        fixed: values specific to this aircraft.
     """
 
     def __init__(self, highest: Mapping[str, float], fixed: Mapping[str, str]) -> None:
@@ -413,7 +414,7 @@ class Configuration:
         self._current: dict[Category, str] = dict.fromkeys(_LEVELS.values(), DEFAULT_ID)
 
     def text(self, key: str) -> str:
-        """Return the value of an entry as it is written."""
+        """Return the value of an entry as text, limited to what the aircraft can fly."""
         entry = ENTRIES[key]
         value = self._values(entry).get(key, entry.default)
         high = self._highest.get(key)
@@ -435,7 +436,7 @@ class Configuration:
         return {**{key: self.text(key) for key in ENTRIES}, **custom}
 
     def custom_list(self) -> dict[str, dict[str, str]]:
-        """Return the custom configurations that are kept: descriptions by identifier, by the block of their level."""
+        """Return the stored custom configurations: for each level's block, the descriptions by identifier."""
         return {block: dict(self._described[level]) for block, level in zip(_BLOCKS, _LEVELS.values(), strict=True)}
 
     def is_current(self, session: str, user: str, application: str) -> bool:
@@ -446,7 +447,7 @@ class Configuration:
         """Set an entry.
 
         Raises:
-            ConfigurationError: there is no such entry, it cannot be written, or it cannot have the value.
+            ConfigurationError: the entry does not exist or is read-only, or the value is invalid.
         """
         key = key.lower()
         section, _, name = key.partition(":")
@@ -457,7 +458,7 @@ class Configuration:
         if entry is None:
             raise ConfigurationError(f"{key[:60]!r} is not an entry of the configuration")
         self._values(entry)[key] = _checked(key, entry, value)
-        # the limits in force are those of the set in use
+        # keep the limits in force equal to the indoor or outdoor set in use
         place = "outdoor" if self.flag("control:outdoor") else "indoor"
         if key == "control:outdoor":
             for limit in LIMITS:
@@ -503,7 +504,7 @@ class Configuration:
 
 
 def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
-    """Return a value as it is stored: a number is clipped to its range."""
+    """Return a value in its stored form, with numbers clipped to their range."""
     if entry.kind == "fixed":
         raise ConfigurationError(f"{key} is read only")
     if entry.kind == "text":

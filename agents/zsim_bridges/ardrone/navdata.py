@@ -1,11 +1,12 @@
-"""Navdata: the packets that an aircraft sends from UDP port 5554, their options as a table, and what they contain.
+"""Navdata: the packets that an aircraft sends from UDP port 5554, the table of their options, and their contents.
 
-A packet is a header (magic, state bits, sequence number, vision flag; uint32 each), options, and last the checksum
-option, the sum of all bytes before it. An option begins with its tag and its size in bytes, both uint16, these four
-bytes included. All is little-endian and packed. The table has the form that `wire_table` describes: angles are in
-millidegrees where a name says so, theta nose up, phi to the right, psi clockwise; axes x forward, y right, z down.
+A packet consists of a header (magic, state bits, sequence number, vision flag; uint32 each), options, and finally the
+checksum option, the sum of all bytes before it. An option begins with its tag and its size in bytes, both uint16; the
+size includes these four bytes. Everything is little-endian and packed. The table has the format described in
+`wire_table`; angles are in millidegrees where a name says so, theta nose up, phi to the right, psi clockwise; axes x
+forward, y right, z down.
 
-Order of this file: the packets; then `NavdataSender`, when they are sent, and `NavdataContent`, their values. Pure.
+The packets come first, then `NavdataSender`, which schedules them, and `NavdataContent`, which fills them. Pure.
 Source: AR.Drone Developer Guide SDK 2.0, chapter 7; ARDroneLib (SDK 2.0.1), navdata_common.h and config.h; the GPS
 option of firmware 2.4 and later: its branch `gps`.
 """
@@ -27,32 +28,32 @@ from zsim_bridges.vehicle_links.drone_link import OnboardState
 from zsim_bridges.vehicle_links.wire_table import Entry, WireLayout, read_table
 
 PORT = 5554  # UDP (ARDroneLib, config.h)
-REQUEST_UNICAST = b"\x01\x00\x00\x00"  # what a program sends to be sent navdata (ARDroneLib, navdata client)
+REQUEST_UNICAST = b"\x01\x00\x00\x00"  # a program's request for navdata (ARDroneLib, navdata client)
 MAGIC = 0x5566_7788
-MAGICS = (MAGIC, 0x5566_7789)  # of a drone with a newer firmware (npm ar-drone, parseNavdata.js)
+MAGICS = (MAGIC, 0x5566_7789)  # the second is that of newer firmware (npm ar-drone, parseNavdata.js)
 DEMO_RATE_HZ, FULL_RATE_HZ = 15, 200  # Developer Guide 7.1
-SECONDS_SHIFT, MICROSECONDS = 21, (1 << 21) - 1  # of option time: seconds above, microseconds below (navdata_common.h)
-HEADER = struct.Struct("<HH")  # tag, size
+SECONDS_SHIFT, MICROSECONDS = 21, (1 << 21) - 1  # option `time`: seconds above, microseconds below (navdata_common.h)
+HEADER = struct.Struct("<HH")  # tag and size of an option
 CHECKSUM_TAG = 0xFFFF
-GPS_TAG = 27  # zimmu_3000 of 12 bytes in older SDKs
-CLIENTS_MAX = 8  # programs that receive navdata, chosen; beyond it the oldest one is dropped
+GPS_TAG = 27  # in older SDKs the tag of zimmu_3000, of 12 bytes
+CLIENTS_MAX = 8  # chosen; programs that receive navdata; a further one displaces the oldest
 REQUESTS = (b"\x01", b"Init")  # how a request for navdata begins (ARDroneLib; its Windows client)
 SECOND_NS = 1_000_000_000
-ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = 512, 2048  # of the raw accelerometer, nominal (measured: 516 to 518, 2031 to 2038)
-GYRO_LSB_PER_DEG_S = 16.4  # of the raw gyro (measured on an aircraft)
+ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = 512, 2048  # nominal for the raw accelerometer (measured: 516 to 518, 2031 to 2038)
+GYRO_LSB_PER_DEG_S = 16.4  # raw gyro (measured on an aircraft)
 MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
 MG_PER_UT = 10.0  # milligauss
-PWM_MAX = 255  # of a motor at its greatest speed; below, in proportion, chosen: the curve is not published
+PWM_MAX = 255  # at a motor's maximum speed; chosen proportional below, since the curve is not published
 VOLTAGE_MV = (0.0, 10.0, 50.0, 100.0), (9000.0, 10_500.0, 11_686.0, 12_500.0)
-"""Charges [%] and voltages [mV] of the battery: vbat_min of the SDK, two chosen, and 50 % as an aircraft showed it."""
+"""Charges [%] and voltages [mV] of the battery: the SDK's vbat_min, 50 % as measured on an aircraft, and two chosen."""
 SECONDS_MASK = 0x7FF  # 11 bits
-FIX_3D = 3  # of a GPS receiver, as in NMEA
+FIX_3D = 3  # fix type of a GPS receiver, as in NMEA
 _INT16 = 32_767
-_UNUSED_OF_DEMO = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frames, and what the cameras detect
+_UNUSED_OF_DEMO = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frame count and camera detections
 Send = Callable[[bytes, Hashable], None]
 """Sends a datagram to an address."""
 Putters = dict[str, Callable[..., None]]
-"""By the name of an option, what writes its numbers."""
+"""Functions that write an option's numbers, by its name."""
 _START = struct.Struct("<IIII")
 _SUM = struct.Struct("<HHI")
 _MOST = 1 << 32
@@ -113,7 +114,7 @@ _TABLE = f"""
 
 
 class OptionLayout(WireLayout):
-    """The layout of an option, of `size` bytes with its tag and its size; `make` makes the NamedTuple of its fields."""
+    """The layout of an option; `size` [bytes] includes its header, `make` builds the NamedTuple of its fields."""
 
     def __init__(self, entry: Entry) -> None:
         super().__init__(entry.fields)
@@ -129,11 +130,11 @@ class OptionLayout(WireLayout):
 
 
 LAYOUTS = {entry.number: OptionLayout(entry) for entry in read_table(_TABLE)}
-"""By tag."""
+"""Layouts by tag."""
 TAG_OF = {layout.name: tag for tag, layout in LAYOUTS.items()}
 FULL_TAGS = tuple(tag for tag in LAYOUTS if tag < GPS_TAG)
-"""The options of a packet of all options: 1904 bytes. The GPS is sent only on request, because readers differ in what
-its tag means."""
+"""The options of a full packet, of 1904 bytes. The GPS option is sent only on request, because clients disagree about
+the meaning of its tag."""
 DEMO, TIME, PHYS, PWM = (TAG_OF[name] for name in ("demo", "time", "phys_measures", "pwm"))
 ALTITUDE, PRESSURE, MAGNETO = (TAG_OF[name] for name in ("altitude", "pressure_raw", "magneto"))
 KALMAN_PRESSURE = TAG_OF["kalman_pressure"]
@@ -156,11 +157,11 @@ ControlState = IntEnum(
 """The upper half of demo's ctrl_state (ARDroneLib, control_states.h)."""
 
 
-LOST_COM, MAGNETO_CALIBRATION = 8, 12  # the lower half of ctrl_state while it hovers (control_states.h)
+LOST_COM, MAGNETO_CALIBRATION = 8, 12  # the lower half of ctrl_state while hovering (control_states.h)
 
 
 class NavdataError(ValueError):
-    """A datagram is not navdata; the text says why."""
+    """A datagram is not navdata; the message says why."""
 
 
 class Navdata(NamedTuple):
@@ -168,8 +169,8 @@ class Navdata(NamedTuple):
 
     Attributes:
         vision: whether the camera defines a frame.
-        options: by tag, each a NamedTuple of its fields.
-        unknown: options that are not in the table, or have another size there, by tag.
+        options: options by tag, each a NamedTuple of its fields.
+        unknown: contents, by tag, of options that are not in the table, or have another size there.
     """
 
     state: StateBit
@@ -189,10 +190,10 @@ def checksum(packet: bytes | bytearray | memoryview) -> int:
 
 
 def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, Iterable[Any]]] = ()) -> bytes:
-    """Return a packet; sequence numbers begin with 1, options have tag and values, in the order of the wire.
+    """Return a packet; sequence numbers begin with 1, `options` are tags with values in wire order.
 
     Raises:
-        struct.error: a value is out of the range of its field.
+        struct.error: a value is out of range for its field.
     """
     parts = [_START.pack(MAGIC, state, sequence, vision)]
     for tag, values in options:
@@ -203,8 +204,7 @@ def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, It
 
 
 def unpack(datagram: bytes) -> Navdata:
-    """Return a packet.
-
+    """Decode a packet.
     Raises:
         NavdataError: it is not a packet, or its checksum is wrong.
     """
@@ -239,7 +239,7 @@ def unpack(datagram: bytes) -> Navdata:
 
 
 class NavdataTemplate:
-    """A packet that is built once and refilled for each transmission; options keep their values until then."""
+    """A packet that is built once and refilled for each transmission; options keep their values until refilled."""
 
     def __init__(self, tags: Sequence[int]) -> None:
         self.tags = tuple(tags)
@@ -253,7 +253,7 @@ class NavdataTemplate:
             at += LAYOUTS[tag].size
 
     def filler(self, tag: int) -> Callable[..., None]:
-        """Return what writes the flat numbers of an option; it does nothing for one that the packet does not have."""
+        """Return a function that writes an option's flat numbers, or does nothing if the packet lacks the option."""
         at, packet = self._places.get(tag), self._packet
         if at is None:
             return lambda *_: None
@@ -268,18 +268,18 @@ class NavdataTemplate:
 
 
 class NavdataSender:
-    """Sends an aircraft's navdata: when packets are due, their options, receivers and contents.
+    """Sends an aircraft's navdata: decides when packets are due, on their options, and on their receivers.
 
-    The SDK's body axes are x forward, y right, z down; its angles theta nose up, phi to the right, psi clockwise, 0
-    where the aircraft was switched on. What no sensor of the drone measures is zero.
+    The SDK's body axes are x forward, y right, z down; its angles are theta nose up, phi to the right, and psi
+    clockwise, 0 where the aircraft was switched on. Values that no sensor of the drone measures are zero.
 
     Args:
-        state_bits: returns the state word without the bits of the mode of navdata.
-        ctrl_state: returns the state of the flight.
-        refuse: counts what cannot be sent, with the reason.
+        state_bits: returns the state word without the bits of the navdata mode.
+        ctrl_state: returns demo's ctrl_state.
+        refuse: reports what cannot be sent, with the reason.
 
     Attributes:
-        clients: addresses to which navdata is sent, the first that asked first.
+        clients: addresses to which navdata is sent, in order of their requests.
         is_bootstrap: whether packets have no options yet.
     """
 
@@ -298,14 +298,14 @@ class NavdataSender:
         self._state_bits = state_bits
         self._ctrl_state = ctrl_state
         self._refuse = refuse
-        self._last: tuple[int, int] | None = None  # rate [Hz], and number of the packet within the simulated time
+        self._last: tuple[int, int] | None = None  # rate [Hz], and packet number since the start of simulated time
         self.clients: dict[Hashable, None] = {}
         self._sequence = 0
         self._prepare(())
         self.is_bootstrap = True
 
     def on_request(self, datagram: bytes, address: Hashable, t_ns: int) -> bool:
-        """Send navdata to an address from now on; return False for a datagram that does not ask for it."""
+        """Send navdata to an address from now on; return False if the datagram does not request it."""
         if not datagram.startswith(REQUESTS):
             return False
         if address not in self.clients:
@@ -316,7 +316,7 @@ class NavdataSender:
         return True
 
     def on_instant(self, t_ns: int) -> None:
-        """Send the packet that is due: a fixed number in each simulated second, without drift."""
+        """Send a packet if one is due: a fixed number in each simulated second, without drift."""
         is_full = not (self.is_bootstrap or self._configuration.flag("general:navdata_demo"))
         rate_hz = FULL_RATE_HZ if is_full else DEMO_RATE_HZ
         number = rate_hz, t_ns * rate_hz // SECOND_NS
@@ -355,7 +355,7 @@ class NavdataSender:
         self._is_gate_new = True
 
     def _tags(self) -> tuple[int, ...]:
-        """Return the options of a packet; the GPS only if it was requested by its bit."""
+        """Return the tags of a packet's options; GPS only if its bit requests it."""
         if self.is_bootstrap:
             return ()
         options = int(self._configuration.number("general:navdata_options"))
@@ -379,7 +379,7 @@ class NavdataContent:
         self._unwrapped_deg = 0.0
 
     def update(self, message: Any) -> None:
-        """Keep a message of the drone that the onboard state does not keep."""
+        """Store a message of the drone that the onboard state does not store."""
         match message:
             case messages.Gps():
                 self._gps = message
@@ -390,7 +390,7 @@ class NavdataContent:
 
     @property
     def is_sonar_deaf(self) -> bool:
-        """Whether the sonar had no echo last."""
+        """Whether the last sonar reading had no echo."""
         return self._sonar is not None and not self._sonar.valid
 
     @property
@@ -400,7 +400,7 @@ class NavdataContent:
         if mag is None:
             return 0.0
         theta_deg, phi_deg, _ = self.angles_deg
-        roll, pitch = math.radians(phi_deg), math.radians(-theta_deg)  # right side down, nose down
+        roll, pitch = math.radians(phi_deg), math.radians(-theta_deg)  # positive right side down, and nose down
         x, y, z = mag.field_ut
         sine_roll, cosine_roll = math.sin(roll), math.cos(roll)
         forward = x * math.cos(pitch) + math.sin(pitch) * (sine_roll * y + cosine_roll * z)
@@ -409,7 +409,7 @@ class NavdataContent:
 
     @property
     def angles_deg(self) -> Vector:
-        """Theta nose up, phi to the right, psi clockwise."""
+        """Theta nose up, phi to the right, psi clockwise [deg]."""
         if self._attitude is not self._state.attitude:
             self._attitude = self._state.attitude
             last_psi_deg = self._angles_deg[2]
@@ -426,7 +426,7 @@ class NavdataContent:
         altitude_mm = max(0, round(1e3 * state.altitude_m))
         put["demo"](ctrl_state, round(charge), theta, phi, psi, altitude_mm, vx, vy, vz, *_UNUSED_OF_DEMO)
         seconds, rest_ns = divmod(max(0, t_ns), SECOND_NS)
-        put["time"]((seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000)  # begins again after 2048 s
+        put["time"]((seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000)  # wraps around after 2048 s
         put["euler_angles"](theta, phi)
         if state.imu is not None:
             fx, fy, fz = (accel / G_M_S2 for accel in state.imu.accel_m_s2)
@@ -442,7 +442,7 @@ class NavdataContent:
         return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
 
     def fill_gate(self, put: Putters, tags: tuple[int, ...]) -> None:
-        """Fill the values that change with a gate; omitted options cost nothing."""
+        """Fill in the values that change at gates; skips omitted options to save time."""
         state = self._state
         climb_mm_s = 1e3 * state.flow.velocity_m_s[2] if state.flow else 0.0
         if PWM in tags:

@@ -1,4 +1,4 @@
-"""The session with one MAVLink vehicle: requests, tracks and decodes its telemetry, and makes it carry out demands.
+"""The session with one MAVLink vehicle: requests, monitors and decodes its telemetry, and makes it carry out demands.
 
 Pure. Sources: https://mavlink.io/en/services/ (heartbeat, command, timesync, message intervals); PX4
 px4_custom_mode.h; ArduPilot Copter mode.h; https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE.
@@ -44,19 +44,26 @@ from zsim_bridges.vehicle_links.vehicle_session import (
     VehicleSession,
 )
 
-SYSTEM, COMPONENT = 245, 191  # of this driver; MAV_COMP_ID_ONBOARD_COMPUTER
+SYSTEM, COMPONENT = 245, 191  # ids of this driver; the component is MAV_COMP_ID_ONBOARD_COMPUTER
 HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
-TIMESYNC_NS = 500_000_000  # chosen: ten round trips in the window of a clock's offset
+TIMESYNC_NS = 500_000_000  # chosen: ten round trips within the window of the clock offset
 REQUEST_NS = 3_000_000_000  # chosen; time after which a missing stream is requested again
-STRANGERS_MAX = 256  # other systems that are reported, each once
+STRANGERS_MAX = 256  # other systems reported, each only once
 CLIMBED = 0.85  # chosen; fraction of the take-off height from which it counts as reached
-REPEAT_NS = 1_000_000_000  # chosen: an autopilot answers a command within some 0.1 s
-KILL_REPEAT_NS = 200_000_000  # chosen: the one command that must not be lost
-SETPOINT_NS = 40_000_000  # 25 Hz: PX4 takes 2 Hz for silence
-CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller sends one command
-STREAMED_NS = 600_000_000  # PX4 wants more than 0.5 s of setpoints before OFFBOARD
+REPEAT_NS = 1_000_000_000  # period of repeated commands; chosen: an autopilot answers within some 0.1 s
+KILL_REPEAT_NS = 200_000_000  # chosen: shorter, since this is the one command that must not be lost
+SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
+CHANGED_NS = 15_000_000  # chosen: changed setpoints may follow faster than a gate, in which a controller sends one
+STREAMED_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
-HERE = (0.0, 0.0, 0.0, math.nan, math.nan, math.nan)  # the first parameters of NAV_LAND and NAV_TAKEOFF: no place
+HERE = (
+    0.0,
+    0.0,
+    0.0,
+    math.nan,
+    math.nan,
+    math.nan,
+)  # first parameters of NAV_LAND and NAV_TAKEOFF: no position
 _RATES_HZ: dict[type, float] = {
     dialect.AttitudeQuaternion: 50,
     dialect.LocalPositionNed: 50,
@@ -69,20 +76,20 @@ _RATES_HZ: dict[type, float] = {
 }
 ACCEL_GYRO, MAG, PRESSURE = 0x003F, 0x01C0, 0x0200  # HIGHRES_IMU_UPDATED_FLAGS
 DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
-FLOW_NS = 66_000_000  # 15 Hz, the rate of the AR.Drone's own: between two velocities while no flow is measured
-FLOW_LOST_NS = 1_000_000_000  # chosen: then the estimated velocity replaces the flow
+FLOW_NS = 66_000_000  # 15 Hz, as on the AR.Drone; period of the estimated velocities that replace a missing flow
+FLOW_LOST_NS = 1_000_000_000  # chosen; time without flow after which the estimated velocity replaces it
 UT_PER_GAUSS, PA_PER_HPA = 100.0, 100.0
-DOP_M = 2.0  # m for a dilution of 1, usual for a single frequency
+DOP_M = 2.0  # position error per unit of dilution [m], usual for single-frequency receivers
 
 
 class ExternalControl(NamedTuple):
-    """How an autopilot's velocity is controlled externally, and how that mode is entered.
+    """How an autopilot's velocity is controlled externally, and how the mode for that is entered.
 
     Attributes:
-        custom_mode: the mode for that, in its heartbeats; parameters: of DO_SET_MODE, from the second on.
-        takes_off: whether it takes off in this mode; else in a mode of its own.
-        own: further modes in which only this driver has control, and from which it may return.
-        landing: in which it lands, for this driver, its pilot, or its own failsafe.
+        custom_mode: that mode, as in heartbeats; parameters: those of DO_SET_MODE, from the second on.
+        takes_off: whether the vehicle takes off in that mode, rather than in a separate one.
+        own: further modes in which this driver keeps control, and from which it may return to that mode.
+        landing: mode in which the vehicle lands, whether for this driver, its pilot, or its own failsafe.
     """
 
     custom_mode: int
@@ -98,11 +105,11 @@ CONTROL = {
         PX4_MODES[FlightMode.OFFBOARD],
         (6, 0),
         takes_off=False,
-        own=(PX4_MODES[FlightMode.TAKEOFF], PX4_MODES[FlightMode.HOLD]),  # it also holds when setpoints stop
+        own=(PX4_MODES[FlightMode.TAKEOFF], PX4_MODES[FlightMode.HOLD]),  # PX4 also holds when setpoints stop
         landing=PX4_MODES[FlightMode.LAND],
         rates_hz={**_RATES_HZ, dialect.HighresImu: 200.0},
     ),
-    Autopilot.ARDUPILOTMEGA: ExternalControl(  # it has no HIGHRES_IMU
+    Autopilot.ARDUPILOTMEGA: ExternalControl(  # ArduPilot has no HIGHRES_IMU
         COPTER_MODES[FlightMode.OFFBOARD],
         (4,),
         takes_off=True,
@@ -117,11 +124,11 @@ class AutopilotSession(VehicleSession):
     """The session with one vehicle.
 
     Args:
-        origin: of W: latitude, longitude [deg], height [m].
-        system: its system id; 0 for the first autopilot that appears.
+        origin: origin of W: latitude, longitude [deg], height [m].
+        system: the vehicle's system id; 0 for the first autopilot that appears.
         local_origin_m: origin of its local frame [m; W]; None for the reported one.
-        key: of signatures, both ways; None for none.
-        unix_s: returns wall time since 1970, used in signatures.
+        key: key of the signatures in both directions; None for no signatures.
+        unix_s: returns the wall time [s since 1970] for signatures.
     """
 
     def __init__(
@@ -177,7 +184,7 @@ class AutopilotSession(VehicleSession):
                 self._take(received.message, now_ns)
 
     def _is_vehicle(self, received: Received) -> bool:
-        """Return whether a message is from the vehicle, which the first heartbeat of an autopilot determines."""
+        """Return whether a message is from the vehicle, which the first heartbeat of an autopilot identifies."""
         message: Any = received.message
         address = received.system_id, received.component_id
         if self._autopilot is not None and address == self._autopilot.address:
@@ -210,7 +217,7 @@ class AutopilotSession(VehicleSession):
                 self._autopilot.receive(message)
                 self._telemetry.receive(message, now_ns)
                 taken_over = self._autopilot.is_taken_over(self._action == "land")
-                if taken_over != self._taken_over:  # in the air, by somebody else
+                if taken_over != self._taken_over:
                     self._taken_over = taken_over
                     what = "another program or pilot has control" if taken_over else "it is given back"
                     self.texts.append(f"{what} (mode {self._autopilot.custom_mode:#x})")
@@ -258,7 +265,7 @@ class AutopilotSession(VehicleSession):
         return AircraftState(state, self._telemetry.battery_percent, self._telemetry.pose, self._received_ns)
 
     def _has_climbed(self, autopilot: "AutopilotState") -> bool:
-        """Return whether the vehicle has reached the height of its take-off since it last stood on the ground."""
+        """Return whether the vehicle has reached its take-off height since it was last disarmed."""
         pose = self._telemetry.pose
         if pose is None:
             return False
@@ -266,7 +273,7 @@ class AutopilotSession(VehicleSession):
         if not autopilot.armed:
             self._ground_m = height_m
         if self._ground_m is None:
-            return True  # it was in the air when this driver began
+            return True  # it was in the air when this driver started
         if height_m - self._ground_m >= CLIMBED * self._takeoff_height_m:
             self._ground_m = None
         return self._ground_m is None
@@ -300,10 +307,10 @@ class AutopilotState:
                 self.sea_height_m = message.alt / 1e3
 
     def is_taken_over(self, lands: bool) -> bool:
-        """Return whether another controller, usually its pilot, has chosen its mode in the air.
+        """Return whether another controller, usually the pilot, has changed the mode in flight.
 
         Args:
-            lands: whether this driver is landing it.
+            lands: whether this driver is landing the vehicle.
         """
         control, mode = self.control, self.custom_mode
         own = mode in (control.custom_mode, *control.own) or (lands and mode == control.landing)
@@ -314,15 +321,15 @@ class AutopilotState:
         return self.custom_mode == self.control.custom_mode
 
     def command(self, number: int, *parameters: float) -> dialect.CommandLong:
-        """Return a command to it, with its parameters from the first on."""
+        """Return a command to the vehicle; `parameters` start with the first."""
         return dialect.CommandLong(*self.address, number, 0, *parameters)
 
     def state(self, flies: bool, climbed: bool) -> DroneState:
-        """Return its state as a state of the contract.
+        """Return the vehicle's state in terms of the contract.
 
         Args:
-            flies: whether it has a setpoint to fly.
-            climbed: whether it has reached the height of its take-off.
+            flies: whether the vehicle is following a setpoint.
+            climbed: whether it has reached its take-off height.
         """
         if self._terminated:
             return "emergency"
@@ -339,7 +346,7 @@ class DemandSequence:
     """The commands and setpoints that make one autopilot carry out demands.
 
     Commands are repeated until the telemetry shows their effect; setpoints are sent at once when they change, and
-    repeated while they hold.
+    repeated while they do not.
     """
 
     def __init__(self, takeoff_height_m: float) -> None:
@@ -367,19 +374,19 @@ class DemandSequence:
                 yield from self._repeat("kill", now_ns, kill, KILL_REPEAT_NS if autopilot.armed else REPEAT_NS)
 
     def _take_off(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
-        """Yield the next command: the mode, if it takes off in that, arm, take off."""
+        """Yield the next command: enter the controlled mode, if the vehicle takes off in it, then arm, take off."""
         takes_off = autopilot.control.takes_off
         if takes_off and not autopilot.is_controlled:
             yield from self._enter_mode(now_ns, autopilot)
         elif not autopilot.armed:
             yield from self._repeat("arm", now_ns, autopilot.command(Cmd.COMPONENT_ARM_DISARM, 1))
         elif autopilot.landed == LandedState.ON_GROUND:
-            # ArduPilot's height is over home, PX4's over the sea.
+            # ArduPilot's height is above home, PX4's above sea level.
             height_m = (0.0 if takes_off else autopilot.sea_height_m) + self._takeoff_height_m
             yield from self._repeat("take off", now_ns, autopilot.command(Cmd.NAV_TAKEOFF, *HERE, height_m))
 
     def _fly(self, now_ns: int, demand: Demand, autopilot: AutopilotState) -> Iterator[Any]:
-        """Yield a setpoint, and the command for the mode that accepts it."""
+        """Yield the setpoint that is due, and the command to enter the mode that accepts setpoints."""
         age_ns = now_ns - self._setpoint_ns
         if age_ns > STREAMED_NS:
             self._stream_ns = now_ns
@@ -412,14 +419,14 @@ class DemandSequence:
 
 
 class TelemetryReadings(AircraftReadings):
-    """The telemetry of one vehicle.
+    """Converts the telemetry of one vehicle.
 
     Args:
-        origin: of W: latitude, longitude [deg], height [m].
-        local_origin_m: origin of its local frame [m; W]; None for its GPS_GLOBAL_ORIGIN, or else that of W.
+        origin: origin of W: latitude, longitude [deg], height [m].
+        local_origin_m: origin of its local frame [m; W]; None for its GPS_GLOBAL_ORIGIN, until then that of W.
 
     Attributes:
-        clock, unix_clock: of messages stamped with the time since its start, and with the time since 1970.
+        clock, unix_clock: offsets for messages timestamped since boot, and since 1970.
         has_origin: whether the origin of its local frame is known.
     """
 
@@ -438,7 +445,7 @@ class TelemetryReadings(AircraftReadings):
         self.unix_clock.add_round_trip(duration_ns, now_ns)
 
     def receive(self, m: Any, now_ns: int) -> None:
-        """Decode a message that arrives now, if its values are finite."""
+        """Decode a message that arrives now; a message with non-finite values is ignored."""
         values = (getattr(m, name) for name in m.__struct_fields__)
         if not all(math.isfinite(value) for value in values if isinstance(value, float)):
             return
@@ -446,7 +453,7 @@ class TelemetryReadings(AircraftReadings):
             case dialect.AttitudeQuaternion():
                 q = dialect.attitude_ned((m.q1, m.q2, m.q3, m.q4))
                 length = el.length(q)
-                if length > 0.5:  # otherwise not an attitude
+                if length > 0.5:  # otherwise it is not an attitude
                     w, x, y, z = (part / length for part in q)
                     self._q_WB, self._w_WB_B = (w, x, y, z), frd((m.rollspeed, m.pitchspeed, m.yawspeed))
             case dialect.LocalPositionNed():
@@ -466,7 +473,7 @@ class TelemetryReadings(AircraftReadings):
                     self._read_field(taken_ns, UT_PER_GAUSS, m)
                 if updated & PRESSURE:
                     self._read_new_pressure(taken_ns, PA_PER_HPA * m.abs_pressure)
-            case dialect.ScaledImu():  # of ArduPilot: mg, mrad/s, mgauss
+            case dialect.ScaledImu():  # from ArduPilot, in mg, mrad/s and mgauss
                 taken_ns, g = self._since_boot(m, now_ns), G_M_S2 / 1e3
                 accel, gyro = (g * m.xacc, g * m.yacc, g * m.zacc), (m.xgyro / 1e3, m.ygyro / 1e3, m.zgyro / 1e3)
                 self.read("imu", taken_ns, frd(accel), frd(gyro))

@@ -1,14 +1,14 @@
-"""MAVLink's messages and enumerations (dialects common and ardupilotmega), and its frames.
+"""The MAVLink messages, enumerations (common and ardupilotmega) and frames that vehicles and clients use.
 
-`dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The table has the format that
-`wire_table` describes, and the units of the definitions; a default is the definition's value for "unknown". Then come
-conversions between axes: W is east, north, up and B forward, left, up; MAVLink's are north, east, down and forward,
-right, down. At the end are the frames of MAVLink 1 and 2: `Link` packs and signs, `Parser` takes datagrams apart.
+`dialect.Heartbeat(type=2)` is a HEARTBEAT, a record with the fields of its definition. The message table has the format
+described in `wire_table` and the units of the definitions; a default is the definition's value for "unknown". Next come
+the conversions between axes: W is east, north, up and B forward, left, up, whereas MAVLink uses north, east, down and
+forward, right, down. The frames of MAVLink 1 and 2 come last: `Link` packs and signs them, `Parser` decodes datagrams.
 
 Sources: https://mavlink.io/en/messages/common.html and ardupilotmega.html for the definitions;
-https://mavlink.io/en/guide/serialization.html for byte order, CRC_EXTRA, the checksum and frames;
+https://mavlink.io/en/guide/serialization.html for the byte order, CRC_EXTRA, the checksum and frames;
 https://mavlink.io/en/guide/message_signing.html for signatures;
-https://mavlink.io/en/services/mission.html#mission_item_int for positions as integers.
+https://mavlink.io/en/services/mission.html#mission_item_int for integer coordinates.
 """
 
 import hmac
@@ -125,7 +125,7 @@ LandedState = IntEnum("LandedState", "UNDEFINED ON_GROUND IN_AIR TAKEOFF LANDING
 
 
 class SensorBit(IntFlag):
-    """MAV_SYS_STATUS_SENSOR: the sensors and subsystems that zsim's vehicles have."""
+    """MAV_SYS_STATUS_SENSOR: the sensors and subsystems of the vehicles here."""
 
     GYRO = 0x01
     ACCEL = 0x02
@@ -162,11 +162,11 @@ class Capability(IntFlag):
 
 
 TypeMask = IntFlag("TypeMask", "X Y Z VX VY VZ AX AY AZ FORCE YAW YAW_RATE")
-"""POSITION_TARGET_TYPEMASK: the components of a setpoint to ignore."""
+"""POSITION_TARGET_TYPEMASK: the parts of a setpoint to be ignored."""
 
 
 class AttitudeMask(IntFlag):
-    """ATTITUDE_TARGET_TYPEMASK: the components of a setpoint to ignore."""
+    """ATTITUDE_TARGET_TYPEMASK: the parts of a setpoint to be ignored."""
 
     YAW_RATE = 4
     THRUST = 64
@@ -174,7 +174,7 @@ class AttitudeMask(IntFlag):
 
 
 POS_HORIZ_ABS, PRED_POS_HORIZ_ABS = 16, 512  # ESTIMATOR_STATUS_FLAGS, and ArduPilot's EKF_STATUS_FLAGS
-ALL_ESTIMATED = 0x37F  # attitude, velocities, relative, absolute and predicted positions, height above ground
+ALL_ESTIMATED = 0x37F  # attitude, velocities, height above ground; relative, absolute and predicted positions
 
 
 class ParamType(IntEnum):
@@ -197,9 +197,9 @@ MISSION, FENCE = 0, 1  # MAV_MISSION_TYPE
 ALL_MISSION_TYPES = 255
 
 
-DEGREES, LOCAL_M = 1e-7, 1e-4  # units of x and y [deg, m] in messages that carry them as integers
-INT32_UNKNOWN = 2**31 - 1  # INT32_MAX: stands for NaN in 32-bit integers
-UINT16_UNKNOWN = 65535  # UINT16_MAX: likewise in 16-bit integers
+DEGREES, LOCAL_M = 1e-7, 1e-4  # units of x and y in messages that carry them as integers
+INT32_UNKNOWN = 2**31 - 1  # INT32_MAX, which stands for "unknown" in 32-bit integer fields
+UINT16_UNKNOWN = 65535  # UINT16_MAX, likewise in unsigned 16-bit fields
 _S = math.sqrt(0.5)
 _TARGET = "target_system,target_component:B"
 _GOAL = "vx,vy,vz:f[m/s] afx,afy,afz:f[m/s/s] yaw:f[rad] yaw_rate:f[rad/s]"
@@ -348,25 +348,25 @@ _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
 def checksum(data: bytes) -> int:
-    """Return the CRC-16/MCRF4XX of `data`: the CCITT polynomial, reflected, initial value 0xFFFF.
+    """Return the CRC-16/MCRF4XX of data: the CCITT polynomial with reflected bits and the initial value 0xFFFF.
 
-    `crc_hqx`, implemented in C, has the same polynomial with the bits in reverse order.
+    `crc_hqx`, written in C, uses the same polynomial with the opposite bit order.
     """
     crc = crc_hqx(data.translate(_REVERSED), 0xFFFF)
     return _REVERSED[crc & 0xFF] << 8 | _REVERSED[crc >> 8]
 
 
 class WireMessage(msgspec.Struct, gc=False):
-    """Base of all messages."""
+    """Base class of all messages."""
 
 
 class MessageLayout(WireLayout):
-    """The payload layout of one message type: larger fields first, extensions in the order of definition.
+    """The payload layout of one message type: larger fields first, then the extensions in their order of definition.
 
     Attributes:
-        crc_extra: checksum of the definition; peers with different definitions reject each other's messages.
-        size, base_size: of the payload with extensions [bytes], and without them, as in MAVLink 1.
-        wire_order: names of the fields in payload order.
+        crc_extra: checksum of the definition, so that peers with different definitions reject each other's messages.
+        size, base_size: payload size [bytes] with the extensions, and without them as in MAVLink 1.
+        wire_order: field names in payload order.
     """
 
     def __init__(self, entry: Entry) -> None:
@@ -390,16 +390,16 @@ class MessageLayout(WireLayout):
         return (getattr(message, self.wire_order[0]),)
 
     def pack(self, message: WireMessage) -> bytes:
-        """Return the payload, including extensions and trailing zeros.
+        """Return the complete payload, with its extensions and trailing zeros.
 
         Raises:
-            struct.error, OverflowError: a value is out of the range of its type, or an array has another length.
+            struct.error, OverflowError: a value is out of range for its type, or an array has the wrong length.
         """
         values = self._wire_values(message)
         return self.codec.pack(*(values if self.is_flat else self.flat(values)))
 
     def unpack(self, payload: bytes) -> WireMessage:
-        """Return the message in a payload; missing trailing bytes are taken as 0, excess bytes are ignored."""
+        """Return the message in a payload; missing trailing bytes count as 0, excess bytes are ignored."""
         if len(payload) != self.size:
             payload = payload[: self.size].ljust(self.size, b"\0")
         return self.kind(*self.nested(self.codec.unpack(payload)))
@@ -415,19 +415,19 @@ if TYPE_CHECKING:
 
 
 def ned(v_W: Vector) -> Vector:
-    """Convert a vector from W (east, north, up) to north, east, down, or back."""
+    """Convert a vector from W to north, east, down; its own inverse."""
     return v_W[1], v_W[0], -v_W[2]
 
 
 def frd(v_B: Vector) -> Vector:
-    """Convert a vector from B (forward, left, up) to forward, right, down, or back."""
+    """Convert a vector from B to forward, right, down; its own inverse."""
     return v_B[0], -v_B[1], -v_B[2]
 
 
 def attitude_ned(q_WB: Quaternion) -> Quaternion:
-    """Convert an attitude B to W to one FRD to NED, or back; w comes first and is not negative.
+    """Return the rotation from forward-right-down to north-east-down, w first and non-negative; its own inverse.
 
-    W to NED is a rotation by 180 deg about (1, 1, 0), FRD to B one by 180 deg about x.
+    W to NED is a half-turn about (1, 1, 0), FRD to B a half-turn about x.
     """
     w, x, y, z = q_WB
     w, x, y, z = -x, w, z, -y
@@ -436,22 +436,22 @@ def attitude_ned(q_WB: Quaternion) -> Quaternion:
 
 
 def wrapped(angle_rad: float) -> float:
-    """Wrap an angle to [-pi, pi]."""
+    """Return an angle wrapped to [-pi, pi]."""
     return math.remainder(angle_rad, math.tau)
 
 
 def yaw_ned(yaw_W: float) -> float:
-    """Convert a yaw counter-clockwise from east to one clockwise from north [rad], or back."""
+    """Convert a yaw counter-clockwise from east to one clockwise from north [rad]; its own inverse."""
     return wrapped(0.5 * math.pi - yaw_W)
 
 
 def from_int(value: int, unit: float) -> float:
-    """Return an integer field times its unit; NaN if it is unknown."""
+    """Return the value of an integer field with a given unit; NaN if it is unknown."""
     return math.nan if value == INT32_UNKNOWN else unit * value
 
 
 def to_int(value: float, unit: float) -> int:
-    """Return a value as an integer number of units; INT32_UNKNOWN if it is not finite."""
+    """Return a value as an integer multiple of a unit; INT32_UNKNOWN if it is not finite."""
     return round(value / unit) if math.isfinite(value) else INT32_UNKNOWN
 
 
@@ -461,7 +461,7 @@ def global_ints(place: Vector) -> tuple[int, int, int]:
 
 
 def int16(value: float) -> int:
-    """Round a value, and clip it to ±32767."""
+    """Return the nearest integer, clipped to [-32767, 32767]."""
     return max(-32767, min(32767, round(value)))
 
 
@@ -471,19 +471,19 @@ CHECKSUM_BYTES = 2
 SIGNED = 0x01  # MAVLINK_IFLAG_SIGNED
 ID_MAX_1 = 255  # message ids have one byte in MAVLink 1
 KEY_BYTES = 32  # length of a secret key
-SIGNATURE_BYTES = 13  # 1 of link id, 6 of timestamp, 6 of hash
-HASH_BYTES = 6  # leading bytes of the SHA-256 in a signature
-LINK_ID = b"\0"  # link id in our signatures
-TICKS_PER_S = 100_000  # unit of timestamps: 10 us
-EPOCH_S = 1_420_070_400  # 2015-01-01 in seconds since 1970: zero of timestamps
-BEHIND_MAX = 6_000_000  # ticks (one minute) that the first timestamp of a new stream may lag
+SIGNATURE_BYTES = 13  # 1 for the link id, 6 for the timestamp, 6 for the hash
+HASH_BYTES = 6  # the leading bytes of a SHA-256 digest
+LINK_ID = b"\0"  # link id in all signatures
+TICKS_PER_S = 100_000  # timestamps are in units of 10 us
+EPOCH_S = 1_420_070_400  # 2015-01-01, the epoch of timestamps, in seconds since 1970
+BEHIND_MAX = 6_000_000  # ticks (one minute): maximum lag of a new stream's first timestamp
 TIMESTAMP_MAX = 2**48 - 1
-STREAMS_MAX = 4096  # most streams remembered; only holders of the key can begin one
+STREAMS_MAX = 4096  # streams remembered; only holders of the key can start one
 Version = Literal[1, 2]
 
 
 class Received(NamedTuple):
-    """A received message, its sender, its sequence number, and whether it was signed."""
+    """A message, its sender, its sequence number on the link, and whether it was signed."""
 
     message: WireMessage
     system_id: int
@@ -493,10 +493,10 @@ class Received(NamedTuple):
 
 
 class Signing:
-    """Signs frames with a key of KEY_BYTES, and verifies the signatures of received ones.
+    """Signs frames with a 32-byte key, and checks the signatures of received frames.
 
     Attributes:
-        timestamp: of the newest frame signed or accepted [10 us since 2015-01-01].
+        timestamp: that of the newest frame signed or accepted [10 us since 2015].
     """
 
     def __init__(self, key: bytes) -> None:
@@ -507,11 +507,11 @@ class Signing:
         self.timestamp = 0
 
     def advance(self, unix_s: float) -> None:
-        """Follow the wall clock [s since 1970]; timestamps never go back."""
+        """Advance the timestamp to the wall clock [s since 1970]; it never goes back."""
         self.timestamp = max(self.timestamp, min(TIMESTAMP_MAX, int((unix_s - EPOCH_S) * TICKS_PER_S)))
 
     def sign(self, frame: bytes) -> bytes:
-        """Return the signature to append to a frame, which reaches from header to checksum."""
+        """Return the signature to append to a frame, which is given from header to checksum."""
         self.timestamp += 1
         head = LINK_ID + self.timestamp.to_bytes(6, "little")
         return head + self._hash(frame + head)
@@ -547,8 +547,8 @@ class Link:
         """Return the frame of a message.
 
         Raises:
-            ValueError: the message's id is too large for MAVLink 1.
-            struct.error, OverflowError: a value is out of the range of its type, or an array has another length.
+            ValueError: the message id exceeds the range of MAVLink 1.
+            struct.error, OverflowError: a value is out of range for its type, or an array has the wrong length.
         """
         layout = LAYOUTS[type(message)]
         payload = layout.pack(message)
@@ -559,7 +559,7 @@ class Link:
             payload = payload[: layout.base_size]
             body = bytes((len(payload), seq)) + self._address + bytes([layout.id]) + payload
             return b"\xfe" + body + _crc(body, layout)
-        payload = payload.rstrip(b"\0") or b"\0"  # an empty payload keeps one byte
+        payload = payload.rstrip(b"\0") or b"\0"  # trailing zeros are dropped, but one byte must remain
         head = bytes((len(payload), SIGNED if self._signing else 0, 0, seq))
         body = head + self._address + layout.id.to_bytes(3, "little") + payload
         frame = b"\xfd" + body + _crc(body, layout)
@@ -570,12 +570,11 @@ class Parser:
     """Splits received datagrams into frames and decodes them.
 
     Args:
-        signing: verifies signatures, and unsigned frames are rejected; None to ignore signatures.
+        signing: checks signatures, and unsigned frames are refused; None to accept frames unchecked.
 
     Attributes:
-        refused: number of rejected frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible`
-            (unknown flags that must not be ignored), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`,
-            the number of bytes outside frames.
+        refused: number of refused frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (unknown
+            flags), `truncated`, `unsigned`, `bad_signature`, `replayed`; and `noise`, the bytes outside frames.
     """
 
     def __init__(self, signing: Signing | None = None) -> None:
@@ -602,7 +601,7 @@ class Parser:
         return min(places) if places else None
 
     def _accept(self, data: bytes, begin: int, end: int) -> Received | str:
-        """Return the message of a complete frame, or why it is rejected."""
+        """Return the message in a complete frame, or the reason for refusing it."""
         is_2 = data[begin] == MAGIC_2
         flags = data[begin + 2] if is_2 else 0
         at = begin + (4 if is_2 else 2)  # index of the sequence number; sender and message id follow
@@ -626,7 +625,7 @@ class Parser:
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
-    """Return the end of the frame that begins at `begin`; None if it is incomplete."""
+    """Return the end index of the frame that starts at `begin`; None if the frame is incomplete."""
     is_2 = data[begin] == MAGIC_2
     header = HEADER_2 if is_2 else HEADER_1
     if begin + header + CHECKSUM_BYTES > len(data):
@@ -637,5 +636,5 @@ def _frame_end(data: bytes, begin: int) -> int | None:
 
 
 def _crc(body: bytes, layout: MessageLayout) -> bytes:
-    """Return the checksum of a frame from its second byte to the end of its payload."""
+    """Return the checksum of a frame; `body` runs from its second byte to the end of its payload."""
     return checksum(body + bytes([layout.crc_extra])).to_bytes(2, "little")

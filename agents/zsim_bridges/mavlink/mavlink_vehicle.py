@@ -1,6 +1,6 @@
-"""One drone as a MAVLink vehicle: messages of its clients and of the drone in, messages and commands to both out.
+"""One drone presented as a MAVLink vehicle: handles messages from clients and the drone, and sends to both.
 
-Pure: no clock, no sockets. Sources: https://mavlink.io/en/services/command.html, and of setpoints
+Pure: no clock, no sockets. Sources: https://mavlink.io/en/services/command.html; for setpoints,
 https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_LOCAL_NED.
 """
 
@@ -62,27 +62,27 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender
 
 ALONG_HEADING = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)
 FROM_HERE = (MavFrame.LOCAL_OFFSET_NED, *ALONG_HEADING)
-HOVER_THRUST = 0.5  # of the thrust of a setpoint; MPC_THR_HOVER
+HOVER_THRUST = 0.5  # thrust of a setpoint, in [0, 1], that carries the weight; PX4's MPC_THR_HOVER
 YAW_RATE_MAX_RAD_S = math.radians(60.0)  # MPC_YAWRAUTO_MAX
-SPEED_MAX_M_S = 1e3  # m/s; no vehicle here flies faster
+SPEED_MAX_M_S = 1e3  # m/s; faster setpoints are refused, since no vehicle here flies that fast
 Setpoint = Target | TiltTarget
-TEXT_MAX = 50  # characters of a STATUSTEXT
-REFUSED_MAX = 100  # reasons remembered, so that each is reported once
-DO_GO_TO = 2  # MISSION_ITEM.current: fly there now, of ArduPilot's older clients
-HEARTBEAT_NS = 1_000_000_000  # ns of wall time
+TEXT_MAX = 50  # characters in a STATUSTEXT
+REFUSED_MAX = 100  # refusal reasons remembered, so that each is reported only once
+DO_GO_TO = 2  # MISSION_ITEM.current with which older ArduPilot clients request to fly there now
+HEARTBEAT_NS = 1_000_000_000  # heartbeat period [ns of wall time]
 STICK = 1000.0  # full deflection in MANUAL_CONTROL
 STICKS_UNUSED = 32767
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 AUTOPILOT_VERSION = dialect.LAYOUTS[dialect.AutopilotVersion].id
 HOME_POSITION = dialect.LAYOUTS[dialect.HomePosition].id
-SPEEDS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # SPEED_TYPE; else the horizontal one
+SPEEDS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # by SPEED_TYPE; all other types set the horizontal speed
 FAULTS = {"fault": "", "fault_end": " is over", "fault_clear": " cleared"}
 MODE_OF = {FenceAction.HOLD: FlightMode.HOLD, FenceAction.RETURN: FlightMode.RETURN, FenceAction.LAND: FlightMode.LAND}
 Point = tuple[float, float]
 
 
 class Options(NamedTuple):
-    """The identity of a vehicle: system id, autopilot, telemetry level, name of this process, and its 64-bit id."""
+    """The identity of a vehicle: system id, autopilot, telemetry level, name of this process, and 64-bit unique id."""
 
     system_id: int
     personality: Personality
@@ -92,7 +92,7 @@ class Options(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A command: seven parameters, the fifth and sixth in degrees or metres, and the frame of the place."""
+    """A command with its seven parameters, of which the fifth and sixth are in degrees or metres, and their frame."""
 
     command: int
     params: tuple[float, float, float, float, float, float, float]
@@ -110,17 +110,17 @@ class Request(NamedTuple):
         return cls(m.command, (m.param1, m.param2, m.param3, m.param4, *place), frame)
 
     def integer(self, place: int) -> int:
-        """Return a parameter as a whole number; -1 if it is not one."""
+        """Return a parameter truncated to an integer; -1 if it is not finite, negative, or 2**31 or more."""
         value = self.params[place]
         return int(value) if math.isfinite(value) and 0 <= value < 2**31 else -1
 
 
 class MavlinkVehicle:
-    """One drone as a MAVLink vehicle.
+    """One drone presented as a MAVLink vehicle.
 
     Attributes:
-        state: of the drone, to be kept up to date; watch: to be notified of events.
-        outbox: messages for its clients, to be taken.
+        state: the drone's state, which the caller keeps up to date; watch: the caller notifies it of events.
+        outbox: messages for the clients, until `take` returns them.
     """
 
     def __init__(self, drone: Drone, origin: Origin, sender: CommandSender, options: Options) -> None:
@@ -148,7 +148,7 @@ class MavlinkVehicle:
         return PlanItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), *place)
 
     def _send(self, message: WireMessage) -> None:
-        """Send a message to all clients; `take` replaces the outbox."""
+        """Send a message to all clients; reads `outbox` on each call, since `take` replaces the list."""
         self.outbox.append(message)
 
     def report(self, severity: dialect.Severity, text: str) -> None:
@@ -161,7 +161,7 @@ class MavlinkVehicle:
     # From the drone
 
     def step(self) -> None:
-        """Do what is due at a gate, after the state has been updated."""
+        """Carry out what is due at a gate, once the state has been updated."""
         self.watch.look()
         self.flight.step()
         self.outbox += map(dialect.MissionItemReached, self.flight.mission.reached)
@@ -169,7 +169,7 @@ class MavlinkVehicle:
         self.outbox += self._telemetry.due(self.state.t_ns)
 
     def tick(self, wall_ns: int) -> None:
-        """Do what is due by wall time, also while simulated time stands: heartbeats, repeated requests."""
+        """Send what is due by wall time, even while simulated time is paused: heartbeats and repeated requests."""
         if self._heartbeat_ns is None or wall_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = wall_ns
             self._send(heartbeat(self._source))
@@ -178,7 +178,7 @@ class MavlinkVehicle:
     # From clients
 
     def on_message(self, received: Received, wall_ns: int) -> None:
-        """Carry out a client's message; `wall_ns` is wall time from any zero."""
+        """Handle a client's message; `wall_ns` is wall time from an arbitrary epoch."""
         message: Any = received.message
         sender = received.system_id, received.component_id
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
@@ -230,7 +230,7 @@ class MavlinkVehicle:
                 self._send(dialect.LogEntry())
             case dialect.CommandCancel():
                 self._send(dialect.CommandAck(message.command, Result.DENIED, 0, 0, *sender))
-            case dialect.FileTransferProtocol(payload=payload):  # no files here: NAK, UnknownCommand
+            case dialect.FileTransferProtocol(payload=payload):  # there are no files here: answer NAK, UnknownCommand
                 seq = int.from_bytes(payload[:2], "little") + 1 & 0xFFFF
                 answer = seq.to_bytes(2, "little") + bytes((0, 129, 1, payload[3], 0, 0, 0, 0, 0, 0, 7))
                 self._send(dialect.FileTransferProtocol(0, *sender, answer))
@@ -238,7 +238,7 @@ class MavlinkVehicle:
                 self._deny("the origin is the scenario's")
 
     def _carry_out(self, request: Request) -> str | Result | None:
-        """Carry out a command; return None, the reason for a refusal, or that it is not supported."""
+        """Carry out a command; return None, the reason for a refusal, or UNSUPPORTED."""
         flight, state, parameters = self.flight, self.state, self._parameters
         first, second = request.params[:2]
         match request.command:
@@ -327,7 +327,7 @@ class MavlinkVehicle:
         return self.flight.go_to(Target(place, yaw_rad=yaw_rad, speed_m_s=speed))
 
     def _turn(self, request: Request) -> str | None:
-        """Turn to an angle [deg] from north, or by one in a direction, and hold the position."""
+        """Turn to a heading [deg from north], or by an angle in a given direction, and hold the position."""
         angle, _, direction, relative = request.params[:4]
         state = self.state
         if not math.isfinite(angle) or not state.is_steerable:
@@ -351,7 +351,7 @@ class MavlinkVehicle:
     def _set_point(self, setpoint: Setpoint | str) -> None:
         reason = setpoint if isinstance(setpoint, str) else self.flight.set_point(setpoint)
         if reason and without_figures(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
-            self._refused.add(without_figures(reason))  # a stream would fill the operator's screen
+            self._refused.add(without_figures(reason))  # a stream of them would flood the operator's screen
             self._deny(reason)
 
     def _steer(self, message: dialect.ManualControl) -> None:
@@ -398,7 +398,7 @@ class MavlinkVehicle:
 
 
 def _place(state: VehicleState, request: Request) -> Vector | None:
-    """Return the place of a command in W; coordinates that are not finite are the vehicle's."""
+    """Return a command's position in W, None if invalid; the vehicle's own replaces non-finite coordinates."""
     params, frame = request.params, request.frame
     item = PlanItem(frame, request.command, params[:4], *params[4:])
     if frame not in FRAMES or (abs(item.x) > 180.0 and frame not in LOCAL):
@@ -447,7 +447,7 @@ def _target(
     state: VehicleState,
 ) -> Setpoint | str:
     mask = TypeMask(message.type_mask)
-    bits = (TypeMask.Y, TypeMask.X, TypeMask.Z)  # x of W is y of MAVLink
+    bits = (TypeMask.Y, TypeMask.X, TypeMask.Z)  # x in W is y in MAVLink
     x, y, z = (None if mask & bit or not math.isfinite(p) else p for p, bit in zip(position_m, bits, strict=True))
     position = x, y, z
     bits = (TypeMask.VX, TypeMask.VY, TypeMask.VZ)
@@ -469,7 +469,7 @@ def _target(
 
 
 def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: VehicleState) -> tuple[float | None, float]:
-    """Return the yaw counter-clockwise from east, None if it is not given, and the rate."""
+    """Return the yaw counter-clockwise from east [rad], None if it is not given, and the yaw rate [rad/s]."""
     if mask & TypeMask.YAW or not math.isfinite(yaw) or abs(yaw) > 1e3:
         is_given = not mask & TypeMask.YAW_RATE and math.isfinite(yaw_rate)
         return None, -max(-100.0, min(100.0, yaw_rate)) if is_given else 0.0
@@ -479,7 +479,7 @@ def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: Vehicle
 
 
 def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoint | str:
-    """Return the target of a SET_ATTITUDE_TARGET; half thrust carries the weight [N]."""
+    """Return the target of a SET_ATTITUDE_TARGET, or the reason for a refusal; half thrust carries the weight [N]."""
     mask = AttitudeMask(message.type_mask & 0xFF)
     values = (*message.q, message.thrust, message.body_yaw_rate)
     if mask & AttitudeMask.ATTITUDE:
@@ -495,15 +495,15 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
 
 
 class DroneWatch:
-    """Watches one drone, reports changes, and acts at its fence.
+    """Monitors one drone, reports changes, and acts on breaches of its fence.
 
-    It reports sensors, battery, faults, refusals and collisions. The fence is a circle and a ceiling by
-    parameters, and circles and polygons that clients upload, in the axes of W. Source of its items:
+    It reports sensor losses, a low battery, faults, refused commands and collisions. The fence consists of a circle
+    and a ceiling set by parameters, and of circles and polygons that clients upload, all in W. Source of fence items:
     https://mavlink.io/en/services/mission.html#fence.
 
     Args:
-        source: name of this process, whose commands may be refused.
-        seen: state and flight of the drone; the breach of its fence is noted there.
+        source: name of this process; refusals of its commands are reported.
+        seen: state and flight of the drone; fence breaches are recorded there.
     """
 
     def __init__(self, drone: str, source: str, seen: TelemetrySource, parameters: Parameters, report: Report) -> None:
@@ -520,7 +520,7 @@ class DroneWatch:
         self._shapes = fence_shapes(items, self._seen.state)
 
     def on_event(self, event: Event) -> None:
-        """Report an event that is about the drone."""
+        """Report an event that concerns the drone."""
         if event.kind in FAULTS and event.data.get("target") == self._drone:
             severity = Severity.CRITICAL if event.kind == "fault" else Severity.NOTICE
             self._report(severity, f"Fault {event.data.get('kind')}{FAULTS[event.kind]}")
@@ -528,11 +528,11 @@ class DroneWatch:
             self._report(Severity.CRITICAL, f"Collision with {pair[1] if pair[0] == self._drone else pair[0]}")
         elif event.kind == "refused" and event.source == self._own and f"/{self._drone}/" in event.subject:
             is_overtaken = not event.subject.endswith("/mode") and self._seen.flight.target is None
-            if not is_overtaken:  # a setpoint that a landing overtook is no news
+            if not is_overtaken:  # a setpoint refused because a landing had begun is not worth reporting
                 self._report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
 
     def look(self) -> None:
-        """Report what has changed since the last gate."""
+        """Report what has changed since the last gate, and act on a breach of the fence."""
         state = self._seen.state
         failed = set(state.failed_sensors())
         for name in sorted(failed - self._failed):
@@ -567,7 +567,7 @@ class DroneWatch:
 
 
 class Circle(NamedTuple):
-    """A circle that must not be left (or not entered)."""
+    """A circle of the fence, which must not be left (`inside`) or not be entered."""
 
     centre_m: Point
     radius_m: float
@@ -578,7 +578,7 @@ class Circle(NamedTuple):
 
 
 class Polygon(NamedTuple):
-    """A polygon that must not be left (or not entered)."""
+    """A polygon of the fence, which must not be left (`inside`) or not be entered."""
 
     corners_m: tuple[Point, ...]
     inside: bool
@@ -593,7 +593,7 @@ class Polygon(NamedTuple):
 
 
 def fence_shapes(items: Sequence[PlanItem], state: VehicleState) -> list[Circle | Polygon]:
-    """Return the shapes of uploaded items; a polygon has one item per corner."""
+    """Return the fence shapes that uploaded items describe; a polygon has one item per corner."""
     shapes: list[Circle | Polygon] = []
     corners: list[Point] = []
     for item in items:

@@ -1,7 +1,9 @@
-"""A ROS 1 node: its slave API, and TCPROS, the connections of its topics and services.
+"""A ROS 1 node: its slave API, and the TCPROS connections of its topics and services.
 
-A connection of TCPROS begins with a header of each side; then come frames: a length and so many bytes. All lengths are
-little-endian uint32. Sources: wiki.ros.org/ROS/Slave_API, wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection Header.
+A TCPROS connection begins with a header from each side; frames follow, each a length and that many bytes. All lengths
+are little-endian uint32.
+
+Sources: wiki.ros.org/ROS/Slave_API, wiki.ros.org/ROS/TCPROS, wiki.ros.org/ROS/Connection Header.
 """
 
 import asyncio
@@ -24,28 +26,28 @@ from zsim_bridges.ros1.master_api import GraphEntry, Registration
 Answer = list[Any]
 OK, ERROR, REFUSED = 1, -1, 0
 EVERYWHERE, LOOPBACK = "0.0.0.0", "127.0.0.1"
-STOP_POLL_S = 0.1  # how soon the XML-RPC server ends
-RETRY_S, RETRY_MAX_S = 0.5, 8.0  # wall time between attempts to reach a publisher, doubling
-DONE, FAILED = b"\x01", b"\x00"  # of a service
-HEADER_MAX = 1_000_000  # bytes; definitions of the largest messages have some 10 000
-FRAME_MAX = 1_000_000  # bytes; nodes send commands alone
-HANDSHAKE_S = 10.0  # within which a header must come
-ANY_TYPE = "*"  # md5sum or type of a node that takes any
+STOP_POLL_S = 0.1  # period at which the XML-RPC server checks for its shutdown
+RETRY_S, RETRY_MAX_S = 0.5, 8.0  # first and maximum wall time between attempts to reach a publisher; it doubles
+DONE, FAILED = b"\x01", b"\x00"  # first byte of a service's response
+HEADER_MAX = 1_000_000  # bytes; the definitions of the largest messages take some 10 000
+FRAME_MAX = 1_000_000  # bytes; other nodes send only commands, which are short
+HANDSHAKE_S = 10.0  # time limit for connecting, and for the arrival of a header
+ANY_TYPE = "*"  # md5sum of a node that accepts any type
 CONNECTION_ERRORS = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
-"""Errors that end a connection: it is gone, silent, or not TCPROS."""
+"""Errors that end a connection: the peer is gone or silent, or does not speak TCPROS."""
 _LENGTH = struct.Struct("<I")
 Say = Callable[[str], None]
 
 
 class Ros1Node:
-    """One node; all but its slave API lives in one asyncio loop.
+    """One node; everything but its slave API runs in one asyncio loop.
 
     Args:
-        name: in the ROS graph, "/zsim".
-        host: name or address under which other nodes reach this host.
+        name: name in the ROS graph, such as "/zsim".
+        host: name or address at which other nodes reach this host.
 
     Attributes:
-        shutdown_reason: who requested this node to stop, and why; empty while nobody has.
+        shutdown_reason: who asked this node to stop, and why; empty until then.
     """
 
     def __init__(self, name: str, master_uri: str, host: str, say: Say) -> None:
@@ -60,25 +62,25 @@ class Ros1Node:
         self._connections: set[Task[Any]] = set()
 
     def publish(self, topic: str, kind: str, queue_size: int) -> "PublishedTopic":
-        """Publish a topic; before `running`."""
+        """Publish a topic; to be called before `running`."""
         published = self.published[topic] = PublishedTopic(topic_type_of(topic, kind), queue_size)
         return published
 
     def subscribe(self, topic: str, kind: str, callback: Callable[[Any], None]) -> None:
-        """Subscribe to a topic; before `running`. `callback` raises ValueError for a message that it refuses."""
+        """Subscribe to a topic, before `running`. `callback` raises ValueError for a message that it refuses."""
         self.subscribed[topic] = SubscribedTopic(topic_type_of(topic, kind), self.name, callback, self._say)
 
     def serve(self, name: str, act: Callable[[], str | None]) -> None:
-        """Serve a std_srvs/Empty service; before `running`. `act` returns why it failed, None where it did not."""
+        """Offer a std_srvs/Empty service, before `running`. `act` returns why it failed, None if it succeeded."""
         self.services[name] = EmptyService(EMPTY_SERVICE._replace(name=name), act)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        """Take part in the ROS graph meanwhile."""
+        """Take part in the ROS graph while the context is open."""
         loop = asyncio.get_running_loop()
 
         def update_publishers(topic: str, uris: list[str], only: bool = True) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # raised if the loop is closed
                 loop.call_soon_threadsafe(self.subscribed[topic].update, uris, only)
 
         local = self.host == "localhost" or self.host.startswith("127.")
@@ -119,7 +121,7 @@ class Ros1Node:
         self.shutdown_reason = self.shutdown_reason or reason
 
     async def _on_connection(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """Serve a subscriber or a client of a service until its connection ends."""
+        """Serve a subscriber or a service client until its connection ends."""
         task = asyncio.current_task()
         assert task is not None
         self._connections.add(task)
@@ -139,18 +141,18 @@ class Ros1Node:
                 else:
                     await endpoint.serve(reader, writer, header, self.name)
         except asyncio.CancelledError:
-            writer.transport.abort()  # data that a slow subscriber has not read would keep it open
+            writer.transport.abort()  # data that a slow subscriber has not read would keep the connection open
         finally:
             self._connections.discard(task)
             writer.close()
 
 
 class SlaveApi:
-    """XML-RPC methods for the master and other nodes; called in threads of the server.
+    """XML-RPC methods for the master and other nodes; called in the server's threads.
 
     Args:
-        port: of its TCPROS connections.
-        update: called with a topic and its publishers now.
+        port: port for TCPROS connections.
+        update: called with a topic and its current publishers.
     """
 
     def __init__(self, node: Ros1Node, port: int, update: Callable[[str, list[str]], None]) -> None:
@@ -174,13 +176,13 @@ class SlaveApi:
         return [OK, "", [[topic, s.topic_type.type] for topic, s in self._node.subscribed.items()]]
 
     def getBusInfo(self, caller: str) -> Answer:
-        """Answer all connections: number, other end, direction, transport, topic, whether it is up."""
+        """Return all connections: number, peer, direction, transport, topic, and whether it is up."""
         links = [(link.caller, "o", topic) for topic, p in self._node.published.items() for link in list(p.links)]
         links += [(uri, "i", topic) for topic, s in self._node.subscribed.items() for uri in list(s.connected)]
         return [OK, "", [[n, other, way, "TCPROS", topic, True] for n, (other, way, topic) in enumerate(links)]]
 
     def getBusStats(self, caller: str) -> Answer:
-        """Answer for each topic the bytes sent, and for each connection its number, bytes, messages, whether it is up.
+        """Return the bytes sent per topic, and for each connection its number, bytes, messages and whether it is up.
 
         Subscribed topics and services are not included.
         """
@@ -207,13 +209,13 @@ class SlaveApi:
         return [ERROR, "not subscribed", 0]
 
     def shutdown(self, caller: str, reason: str = "") -> Answer:
-        """Stop, at the request of `rosnode kill` or of a master that gives the name to another node."""
+        """Stop, as requested by `rosnode kill` or by a master that gives the name to another node."""
         self._node.request_shutdown(f"{str(caller)[:80]} asks us to stop: {str(reason)[:200]}".rstrip(": "))
         return [OK, "", 0]
 
 
 class PublishedTopic:
-    """A topic that the node publishes; a slow subscriber may be `queue_size` messages behind."""
+    """A topic that the node publishes; a slow subscriber may lag `queue_size` messages behind."""
 
     def __init__(self, topic_type: "TopicType", queue_size: int) -> None:
         self.topic_type = topic_type
@@ -222,7 +224,7 @@ class PublishedTopic:
         self.sent = 0
 
     def publish(self, make: Callable[[int], Any]) -> None:
-        """Send the message that `make` returns for a sequence number; it is called only where there are subscribers."""
+        """Send the message that `make` returns for a sequence number; called only if there are subscribers."""
         if not self.links:
             return
         framed = frame(serialize(self.topic_type.type, make(self.sent)))
@@ -231,7 +233,7 @@ class PublishedTopic:
             link.put(framed)
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
-        """Serve a subscriber whose header fits until it goes; `caller` is this node's name."""
+        """Serve a subscriber with a matching header until it disconnects; `caller` is this node's name."""
         configure(writer, header.get("tcp_nodelay") == "1")
         writer.write(encode_header(publisher_header(self.topic_type, caller)))
         link = SubscriberLink(writer, header["callerid"], self._queue_size)
@@ -239,14 +241,14 @@ class PublishedTopic:
         self.links.append(link)
         try:
             while await reader.read(4096):
-                pass  # a subscriber sends nothing more
+                pass  # a subscriber sends nothing after its header
         finally:
             self.links.remove(link)
             sender.cancel()
 
 
 class SubscriberLink:
-    """The connection of one subscriber; a full queue drops the oldest message. Counts bytes sent and messages lost."""
+    """The connection to one subscriber; a full queue drops its oldest message. Counts bytes sent and messages lost."""
 
     def __init__(self, writer: StreamWriter, caller: str, queue_size: int) -> None:
         self._writer = writer
@@ -262,7 +264,7 @@ class SubscriberLink:
         self._news.set()
 
     async def run(self) -> None:
-        """Send queued messages, until the connection ends."""
+        """Send queued messages until the connection ends."""
         with contextlib.suppress(*CONNECTION_ERRORS):
             while True:
                 await self._news.wait()
@@ -282,7 +284,7 @@ class EmptyService:
         self.act = act
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
-        """Serve a client whose header fits until it goes; `caller` is this node's name."""
+        """Serve a client with a matching header until it disconnects; `caller` is this node's name."""
         configure(writer, True)
         kind = self.topic_type.type
         kinds = {"type": kind, "request_type": f"{kind}Request", "response_type": f"{kind}Response"}
@@ -298,14 +300,14 @@ class EmptyService:
 
 
 class RefusedError(ValueError):
-    """A publisher of another type."""
+    """The publisher has another type or protocol, or refuses this node."""
 
 
 class SubscribedTopic:
-    """A topic that the node subscribes to: a connection to each publisher, made again when it breaks.
+    """A topic that the node subscribes to, with a connection to each publisher, re-established when it breaks.
 
     Attributes:
-        connected: names of connected publishers, by their slave API's URI.
+        connected: names of connected publishers by the URI of their slave API.
     """
 
     def __init__(
@@ -321,10 +323,10 @@ class SubscribedTopic:
         self.connected: dict[str, str] = {}
 
     def update(self, publishers: Iterable[str], only: bool = True) -> None:
-        """Follow these publishers, given by the URIs of their slave APIs; `only` them, or these too.
+        """Follow publishers, given by the URIs of their slave APIs: `only` these, or these in addition.
 
-        A publisher's messages from before it left the graph may still be on their way, so its connection is read to the
-        end.
+        Messages that a publisher sent before it left the graph may still be in transit, so its connection is read to
+        the end.
         """
         self._wanted = set(publishers) | (set() if only else self._wanted)
         for uri in self._wanted - set(self._tasks):
@@ -361,7 +363,7 @@ class SubscribedTopic:
 
     @contextlib.asynccontextmanager
     async def _connection(self, uri: str) -> AsyncIterator[StreamReader]:
-        """Yield the stream of a publisher once headers are exchanged."""
+        """Yield a publisher's stream once the headers have been exchanged."""
         arguments = [self._caller, self.topic_type.name, [["TCPROS"]]]
         protocol, host, port = await asyncio.to_thread(master_api.call_api, uri, "requestTopic", *arguments)
         if protocol != "TCPROS":
@@ -387,7 +389,7 @@ class SubscribedTopic:
 
 
 class TopicType(NamedTuple):
-    """Name, type, MD5 sum and definition of a topic or service, which must agree on both sides."""
+    """Name, type, MD5 sum and definition of a topic or service; the MD5 sum must agree on both sides."""
 
     name: str
     type: str
@@ -396,20 +398,20 @@ class TopicType(NamedTuple):
 
 
 def frame(payload: bytes) -> bytes:
-    """Return a payload behind its length."""
+    """Return a payload preceded by its length."""
     return _LENGTH.pack(len(payload)) + payload
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """Return a header, its own length first."""
+    """Return an encoded header, preceded by its length."""
     return frame(b"".join(frame(f"{key}={value}".encode()) for key, value in fields.items()))
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """Return the fields of a header without its own length.
+    """Return the fields of a header, given without its leading length.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the header is malformed.
     """
     fields: dict[str, str] = {}
     start = 0
@@ -426,7 +428,7 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 def publisher_header(topic_type: TopicType, caller: str) -> dict[str, str]:
-    """Return the header that a publisher answers to a subscriber."""
+    """Return the header with which a publisher answers a subscriber."""
     return {
         "callerid": caller,
         "latching": "0",
@@ -445,7 +447,7 @@ def subscriber_header(topic_type: TopicType, caller: str) -> dict[str, str]:
 
 
 def mismatch(topic_type: TopicType, header: Mapping[str, str], caller: str) -> str | None:
-    """Return why the type of a header differs from that of `caller`; None if they agree."""
+    """Return why a header's type does not match that of `caller`; None if it does."""
     missing = [field for field in ("callerid", "md5sum") if field not in header]
     if missing:
         return f"missing required {missing[0]!r} field"
@@ -462,7 +464,7 @@ async def read_frame(reader: StreamReader, limit: int = FRAME_MAX) -> bytes:
     """Return the next frame's payload.
 
     Raises:
-        ValueError: it is longer than the limit.
+        ValueError: the frame is longer than `limit` bytes.
         IncompleteReadError: the connection ended.
     """
     (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
@@ -475,14 +477,14 @@ async def read_header(reader: StreamReader) -> dict[str, str]:
     """Return the header with which a connection begins.
 
     Raises:
-        ValueError: it is none.
-        TimeoutError: it does not arrive.
+        ValueError: the header is malformed.
+        TimeoutError: it does not arrive within HANDSHAKE_S.
     """
     return decode_header(await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_S))
 
 
 def configure(writer: StreamWriter, nodelay: bool) -> None:
-    """Set whether small messages are sent at once, and notice a host that is gone."""
+    """Set whether small messages are sent at once, and enable keep-alives to detect a host that is gone."""
     raw: socket.socket = writer.get_extra_info("socket")
     raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, nodelay)
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -523,8 +525,8 @@ uint32[] tags_height
 float32[] tags_orientation
 float32[] tags_distance
 float32 tm              # us
-"""  # fields of ardrone_autonomy 1.4.1, msg/Navdata.msg; the MD5 sum leaves comments out
-EMPTY_SERVICE = TopicType("", "std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "")  # MD5 of no text at all
+"""  # fields of ardrone_autonomy 1.4.1, msg/Navdata.msg; the MD5 sum ignores comments
+EMPTY_SERVICE = TopicType("", "std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "")  # MD5 of an empty definition
 
 _store = get_typestore(Stores.ROS1_NOETIC)
 _store.register(get_types_from_msg(NAVDATA, "ardrone_autonomy/msg/Navdata"))
@@ -532,7 +534,7 @@ _store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\
 
 
 def topic_type_of(topic: str, kind: str) -> TopicType:
-    """Return a topic of a type such as "sensor_msgs/Imu"."""
+    """Return the description of a topic whose type is named like "sensor_msgs/Imu"."""
     definition, md5 = _store.generate_msgdef(_full_name(kind), ros_version=1)
     return TopicType(topic, kind, md5, definition)
 
@@ -545,23 +547,23 @@ def serialize(kind: str, message: Any) -> bytes:
     """Return the bytes of a message.
 
     Raises:
-        ValueError: a number does not go into its field.
+        ValueError: a value does not fit its field.
     """
     try:
         return bytes(_store.serialize_ros1(message, _full_name(kind)))
-    except Exception as error:  # the generated writer raises anything for invalid numbers
+    except Exception as error:  # the generated writer may raise any exception for invalid values
         raise ValueError(f"is no {kind}: {error}") from error
 
 
 def deserialize(kind: str, data: bytes) -> Any:
-    """Return the message in bytes.
+    """Return the message encoded in `data`.
 
     Raises:
-        ValueError: they are no such message.
+        ValueError: `data` do not encode a message of this type.
     """
     try:
         return _store.deserialize_ros1(data, _full_name(kind))
-    except Exception as error:  # the generated reader raises anything for invalid bytes
+    except Exception as error:  # the generated reader may raise any exception for invalid bytes
         raise ValueError(f"{len(data)} bytes are no {kind}") from error
 
 

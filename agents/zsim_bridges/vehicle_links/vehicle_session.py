@@ -1,20 +1,19 @@
-"""The parts of a driver common to all wires: its demands on an aircraft, and the session that carries them out. Pure.
+"""The wire-independent parts of a driver: demands on an aircraft, and the session that carries them out. Pure.
 
-`Failsafe` makes the demands of accepted commands, within limits, and holds or lands without commands. The rules, by the
-clock of the run:
-
+`Failsafe` turns accepted commands into demands within limits, and makes the aircraft hold or land if commands cease.
+Its rules, with times that pass at the rate of the run:
 - Nothing is demanded before an operator has armed the driver.
-- Without a setpoint for `silence.hover_s` it holds; for `silence.land_s` more, it lands.
-- Without the world for as long, whoever flies, it lands.
-- Outside the fence it lands; it does not take off from there.
-- Killed by an operator or an accepted emergency, armed or not, it stops its motors and is disarmed.
-- An aircraft that lands by itself is landed. One that is down, or in an emergency, without a command is disarmed, so
-  that a commander that keeps asking for a take-off starts no motor.
-- While the aircraft is silent, only a landing or a stop is sent: one that was switched off and on again might take the
-  next setpoint, or a repeated take-off, for a new one.
+- After `silence.hover_s` without a setpoint the aircraft holds; after a further `silence.land_s`, it lands.
+- After the same total time without the world's clock it lands, whoever is flying it.
+- Outside the fence it lands, and it does not take off from there.
+- When killed by an operator or an accepted emergency command, armed or not, it stops its motors and is disarmed.
+- An aircraft that begins to land by itself is landed. One that is down or in an emergency without a command is
+  disarmed, so that a commander that keeps requesting a take-off starts no motor.
+- While nothing is received from the aircraft, only a landing, a stop or a reset is sent: after a power cycle, it might
+  take the next setpoint or a repeated take-off for a new command.
 
-`VehicleSession` is the base of the sessions of all wires, with the aircraft's pose, readings and clock. Poses and
-readings are stamped by the clock of this process.
+`VehicleSession` is the base class of the sessions on all wires, with the aircraft's readings and clock. Poses and
+readings are timestamped by the clock of this process.
 """
 
 import math
@@ -30,27 +29,27 @@ from zsim.math.frames import geodetic_to_enu, heading, turned_about_up
 from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Silence
 
-WINDOW_NS = 5_000_000_000  # chosen: long against queues, short against the drift of two clocks (50 ppm: 0.25 ms)
-SIGMA_UNKNOWN_M = 2.0  # m, of a GPS receiver that does not report it (paper, section VI)
-P0_PA = 101_325.0  # Pa, at sea level (ISO 2533)
+WINDOW_NS = 5_000_000_000  # chosen: long compared with queuing, short compared with clock drift (50 ppm: 0.25 ms)
+SIGMA_UNKNOWN_M = 2.0  # m, for a GPS receiver that does not report its accuracy (paper, section VI)
+P0_PA = 101_325.0  # Pa, pressure at sea level (ISO 2533)
 SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
 EXPONENT = 0.190263  # R lapse / g (ISO 2533)
-PRESSURES = 250  # chosen: 10 s at 25 Hz average 0.1 m of noise to less than 1 cm
+PRESSURES = 250  # readings averaged; chosen: 10 s at 25 Hz reduce 0.1 m of noise to less than 1 cm
 STILL: Vector = (0.0, 0.0, 0.0)
 STANDING: tuple[DroneState, ...] = ("landed", "emergency")  # states in which no rotor turns
-LOSS_WINDOW = 1000  # numbers that count for the loss, a few seconds of telemetry
+LOSS_WINDOW = 1000  # messages over which the loss is computed, a few seconds of telemetry
 Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
-TAKEOFF_S = 20.0  # chosen: four times what an AR.Drone takes; then it is given up
-RESET_S = 2.0  # chosen: ten times what an AR.Drone takes to leave its emergency
-LINK_LOST_S = 1.0  # chosen: heartbeats come once a second, telemetry ten times as often
-BRAKING_M_S2 = 1.0  # chosen: half of what an AR.Drone at 12 deg of tilt has; the speed towards a fence follows from it
-RETURN_M_S = 0.5  # chosen: slow, since nobody asked for it
-BREACH_M = 1.0  # chosen: how far outside it lands; the fence itself stops it before
+TAKEOFF_S = 20.0  # time limit of a take-off; chosen: four times what an AR.Drone takes
+RESET_S = 2.0  # time limit of a reset; chosen: ten times what an AR.Drone takes to leave its emergency
+LINK_LOST_S = 1.0  # silence that means a lost link; chosen: heartbeats come once a second, telemetry ten times as often
+BRAKING_M_S2 = 1.0  # chosen: half of what an AR.Drone reaches at 12 deg of tilt; limits the speed towards a fence
+RETURN_M_S = 0.5  # speed of the return to the fence; chosen: slow, since nobody commanded it
+BREACH_M = 1.0  # distance outside the fence at which the aircraft lands; chosen; the fence normally stops it before
 Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
 
 
 class AircraftPose(NamedTuple):
-    """Position and velocity [W] of an aircraft's centre of mass, its attitude and rate, at `taken_ns` by our clock."""
+    """Position and velocity [W] of an aircraft's centre of mass, its attitude and rate, at `taken_ns` of our clock."""
 
     taken_ns: int
     position_m: Vector
@@ -60,7 +59,7 @@ class AircraftPose(NamedTuple):
 
 
 class AircraftState(NamedTuple):
-    """The state of an aircraft; `received_ns`: time of the last reception from it; None for never."""
+    """The state of an aircraft; `received_ns` is when something was last received from it, None for never."""
 
     state: DroneState = "landed"
     battery_percent: float = 0.0
@@ -69,10 +68,10 @@ class AircraftState(NamedTuple):
 
 
 class Demand(NamedTuple):
-    """The present demand on an aircraft: velocities in W, turns counter-clockwise.
+    """The current demand on an aircraft; velocities are in W, yaw rates counter-clockwise.
 
     Attributes:
-        action: `none`: send nothing that starts or steers a motor.
+        action: what the aircraft should do; for `none`, nothing that starts or steers a motor is sent.
     """
 
     action: Action
@@ -84,18 +83,18 @@ class FlightLimits(NamedTuple):
     """Limits that a driver never exceeds, in W; the fence is a cylinder around the origin.
 
     Attributes:
-        speed_m_s, climb_m_s, yaw_rate_rad_s: greatest, in any direction, up or down, either way.
-        radius_m, ceiling_m: of the fence; inf for none.
+        speed_m_s, climb_m_s, yaw_rate_rad_s: maximum horizontal speed, climb or descent rate, and yaw rate either way.
+        radius_m, ceiling_m: radius and height of the fence; inf for none.
     """
 
-    speed_m_s: float = 2.0  # chosen: what a person can walk after
-    climb_m_s: float = 1.0  # chosen: control_vz_max of the AR.Drone outdoors
-    yaw_rate_rad_s: float = 1.75  # rad/s, control_yaw of the AR.Drone indoors
+    speed_m_s: float = 2.0  # chosen: a person can follow on foot
+    climb_m_s: float = 1.0  # chosen: the AR.Drone's outdoor control_vz_max
+    yaw_rate_rad_s: float = 1.75  # chosen: the AR.Drone's indoor control_yaw
     radius_m: float = math.inf
     ceiling_m: float = math.inf
 
     def limited(self, velocity_m_s: Sequence[float], position_m: Sequence[float] | None) -> tuple[float, float, float]:
-        """Return a velocity [m/s; W] within the limits that does not lead through the fence, if a position is known."""
+        """Return a velocity [m/s; W] reduced to the limits and, if the position is known, to stop before the fence."""
         x, y, z = velocity_m_s
         speed = el.hypot(x, y)
         share = min(1.0, self.speed_m_s / speed) if speed else 1.0
@@ -114,23 +113,23 @@ class FlightLimits(NamedTuple):
         return max(-self.yaw_rate_rad_s, min(self.yaw_rate_rad_s, yaw_rate_rad_s))
 
     def is_breached(self, position_m: Sequence[float]) -> bool:
-        """Return whether an aircraft at a position [m; W] is so far outside that it must land."""
+        """Return whether an aircraft at a position [m; W] is so far outside the fence that it must land."""
         distance = el.hypot(position_m[0], position_m[1])
         return distance > self.radius_m + BREACH_M or position_m[2] > self.ceiling_m + BREACH_M
 
 
 def _approach(distance_m: float) -> float:
-    """Return the greatest speed towards a fence at which the aircraft still stops before it; outside, back to it."""
+    """Return the maximum speed towards a fence from which the aircraft can still stop; outside, negative, to return."""
     return math.sqrt(2.0 * BRAKING_M_S2 * distance_m) if distance_m > 0.0 else max(-RETURN_M_S, distance_m)
 
 
 class Failsafe:
-    """The phases of a flight, by commands and silences.
+    """Tracks the phase of a flight, which follows from commands and silences.
 
     Attributes:
         armed: whether commands are obeyed.
         commander: source of the last setpoint.
-        reason: why it last left the commander's control; empty for never.
+        reason: why the aircraft last left the commander's control; empty for never.
     """
 
     def __init__(self, silence: Silence, limits: FlightLimits, armed: bool = False) -> None:
@@ -164,7 +163,7 @@ class Failsafe:
         return None
 
     def kill(self, now_ns: int, source: str) -> None:
-        """Stop the motors, armed or not, and be disarmed."""
+        """Stop the motors, armed or not, and disarm."""
         self.armed = False
         self._enter("killed", now_ns)
         self.reason = f"killed by {source}"
@@ -174,7 +173,7 @@ class Failsafe:
         return self.phase == "landing" or (self.phase == "killed" and vehicle.state not in STANDING)
 
     def land(self, reason: str, now_ns: int) -> None:
-        """Land, if it flies for this driver."""
+        """Land if this driver is flying the aircraft."""
         if self.phase in ("taking_off", "airborne"):
             self._enter("landing", now_ns)
             self.reason, self._uncommanded = reason, True
@@ -202,7 +201,7 @@ class Failsafe:
             case flight_messages.Velocity():
                 self._setpoint, self._setpoint_ns, self.commander = command, now_ns, command.source
                 return None
-            case flight_messages.Ardrone(hover=True):  # the world's, when nobody flies the drone any more
+            case flight_messages.Ardrone(hover=True):  # the world sends this once nobody flies the drone any more
                 self._setpoint = self.commander = None
                 return None
             case _:
@@ -248,7 +247,7 @@ class Failsafe:
     def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
         """Enter the next phase once the aircraft has reached it, or because of a silence."""
         airborne = vehicle.state in AIRBORNE
-        has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # to show that it obeys
+        has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # for its telemetry to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
             self.reason, self._uncommanded = "the aircraft is in an emergency", True
             self._settle(now_ns)
@@ -261,7 +260,7 @@ class Failsafe:
         elif self.phase == "resetting" and (vehicle.state != "emergency" or now_ns - self._began_ns > RESET_S * 1e9):
             self._enter("idle", now_ns)
         elif self.phase == "idle" and self.armed and airborne:
-            self._enter("airborne", now_ns)  # a driver that is started again in flight
+            self._enter("airborne", now_ns)  # the driver was restarted in flight
         elif self.phase == "airborne" and vehicle.state == "landed" and has_had_time:
             self.reason, self._uncommanded = "the aircraft landed without a command", True
             self._settle(now_ns)
@@ -275,7 +274,7 @@ class Failsafe:
             self.land("the world is silent", now_ns)
 
     def _settle(self, now_ns: int) -> None:
-        """Record that it is down: after an uncommanded landing, only an operator can let it fly again."""
+        """Record that the aircraft is down; after an uncommanded landing, only an operator can let it fly again."""
         self._enter("idle", now_ns)
         if self._uncommanded:
             self.armed, self._uncommanded = False, False
@@ -306,7 +305,7 @@ def _is_lost(vehicle: AircraftState, now_ns: int) -> bool:
 
 
 class UdpChannel(NamedTuple):
-    """A UDP port of an aircraft, and the port here; 0 for any."""
+    """A UDP port of an aircraft, and the local port, 0 for any."""
 
     host: str
     port: int
@@ -314,12 +313,12 @@ class UdpChannel(NamedTuple):
 
 
 class LinkFigures(NamedTuple):
-    """The quality of the link; None for what is not known.
+    """The quality of the link; None for unknown values.
 
     Attributes:
-        loss_percent: of what the aircraft has sent within some seconds.
-        clock_offset_ms: its clock less that of this process.
-        refused: datagrams, or messages in them, that were not accepted.
+        loss_percent: share of the aircraft's messages lost in the last few seconds.
+        clock_offset_ms: the aircraft's clock minus that of this process.
+        refused: number of datagrams, or messages in them, that were not accepted.
     """
 
     loss_percent: float | None = None
@@ -329,15 +328,15 @@ class LinkFigures(NamedTuple):
 
 
 class VehicleSession(ABC):
-    """The state machine of one aircraft at the other end of a wire. Pure: time comes from the process.
+    """The state machine of one aircraft at the other end of a wire. Pure: the process passes in the time.
 
     Args:
-        channels: its ports, in the order in which they are numbered.
-        readings: converted from its telemetry.
-        modulus: at which the sequence numbers of its telemetry wrap around.
+        channels: the aircraft's ports; a channel number is an index into them.
+        readings: collects the measurements in its telemetry.
+        modulus: value at which the sequence numbers of its telemetry wrap around.
 
     Attributes:
-        texts: lines for the terminal, taken by the process.
+        texts: lines for the terminal, collected by the process.
     """
 
     def __init__(self, channels: tuple[UdpChannel, ...], readings: "AircraftReadings", modulus: int) -> None:
@@ -355,11 +354,11 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def receive(self, channel: int, datagram: bytes, now_ns: int) -> None:
-        """Process a datagram from one of its ports."""
+        """Process a datagram from one of the aircraft's ports."""
 
     @abstractmethod
     def advance(self, now_ns: int, demand: Demand) -> Iterable[tuple[int, bytes]]:
-        """Return the datagrams that are due, with the channel of each; called at least every 20 ms."""
+        """Return the datagrams that are due, each with its channel; called at least every 20 ms."""
 
     def figures(self) -> LinkFigures:
         clock = self.readings.clock
@@ -367,7 +366,7 @@ class VehicleSession(ABC):
 
 
 class StreamLoss:
-    """Counts gaps in numbers that go up by one, modulo some power of two."""
+    """Counts gaps in sequence numbers that increase by one, modulo a power of two."""
 
     def __init__(self, modulus: int) -> None:
         self._modulus = modulus
@@ -378,7 +377,7 @@ class StreamLoss:
         """Process the number of a message; return whether it is newer than the previous ones."""
         step = 1 if self._last is None else (number - self._last) % self._modulus
         if step == 0 or step > self._modulus // 2:
-            return False  # repeated, or overtaken
+            return False  # duplicated or out of order
         self._last = number
         self._steps.append(step)
         return True
@@ -389,13 +388,13 @@ class StreamLoss:
 
     @property
     def percent(self) -> float | None:
-        """The share of what was sent that has not arrived; None before the first message."""
+        """The share of sent messages that did not arrive [%]; None before the first message."""
         sent = sum(self._steps)
         return 100.0 * (1.0 - len(self._steps) / sent) if sent else None
 
 
 class Reading(NamedTuple):
-    """A measurement, at `taken_ns` by this process's clock; `values` follow `t_sample_ns` in its message."""
+    """A measurement taken at `taken_ns` of this process's clock; `values` follow `t_sample_ns` in its message."""
 
     sensor: str
     taken_ns: int
@@ -403,12 +402,12 @@ class Reading(NamedTuple):
 
 
 class AircraftReadings:
-    """The measurements of one aircraft; `origin` of W is latitude, longitude [deg], height [m].
+    """The measurements of one aircraft; `origin` is that of W: latitude, longitude [deg], height [m].
 
     Attributes:
-        pose: newest; None before the first.
-        clock: of the aircraft.
-        readings: not yet taken.
+        pose: newest pose; None before the first.
+        clock: offset of the aircraft's clock.
+        readings: readings not yet returned by `take`.
     """
 
     def __init__(self, origin: tuple[float, float, float]) -> None:
@@ -426,7 +425,7 @@ class AircraftReadings:
         return taken
 
     def read(self, sensor: str, taken_ns: int, *values: Any) -> bool:
-        """Add a reading if it differs from the last one: aircraft repeat what slow sensors measured before."""
+        """Add a reading if it differs from the last one, since aircraft repeat the last values of slow sensors."""
         if self._last.get(sensor) == values or not _is_finite(values):
             return False
         self._last[sensor] = values
@@ -434,13 +433,13 @@ class AircraftReadings:
         return True
 
     def read_pressure(self, taken_ns: int, pressure_pa: float, height_m: float) -> None:
-        """Add a reading of the barometer, whose height is over the origin of W.
+        """Add a barometer reading, with its height above the origin of W.
 
         Args:
-            height_m: of the aircraft by its own estimate; the first readings are compared with it, because the standard
-                atmosphere does not know the weather.
+            height_m: the aircraft's own estimate of its height; the first readings are aligned with it, because the
+                standard atmosphere does not account for the weather.
         """
-        # the height above the sea at which the standard atmosphere has this pressure, below 11 km
+        # the altitude at which the standard atmosphere has this pressure, valid below 11 km
         altitude_m = SCALE_M * (1.0 - (max(pressure_pa, 0.0) / P0_PA) ** EXPONENT)
         if self._pressures < PRESSURES:
             self._pressures += 1
@@ -450,12 +449,12 @@ class AircraftReadings:
     def gps_values(
         self, place: Vector, speed_m_s: float, course_rad: float, sigma_m: float, fix: int, satellites: int
     ) -> tuple:
-        """Return the values of a fix, with its position in W; the wires have no climb, so it is that of the pose.
+        """Return the values of a fix, with its position in W; the climb is that of the pose, since the wires send none.
 
         Args:
             place: latitude, longitude [deg], height [m].
             course_rad: clockwise from north.
-            sigma_m: 0 if it is not known.
+            sigma_m: standard deviation of the position; 0 if unknown.
         """
         x, y, z = geodetic_to_enu(place, self._origin).tolist()
         velocity = speed_m_s * math.sin(course_rad), speed_m_s * math.cos(course_rad), self.climb_m_s
@@ -471,10 +470,10 @@ def _is_finite(values: tuple) -> bool:
 
 
 class ClockOffset:
-    """The offset of another clock from this one, by the messages that arrive.
+    """Estimates the offset of another clock from this one by the messages that arrive.
 
-    The least difference between arrival and stamp within a window counts, since the delay by a link or a busy process
-    is never negative. The delay of the fastest way is half of the shortest round trip, if round trips are measured.
+    The minimum difference between arrival and timestamp within a window counts, since delays by a link or a busy
+    process are never negative. The minimum delay is half of the shortest round trip, if round trips are measured.
     """
 
     def __init__(self) -> None:
@@ -482,7 +481,7 @@ class ClockOffset:
         self._round_trips: deque[tuple[int, int]] = deque()
 
     def add(self, stamp_ns: int, arrival_ns: int) -> None:
-        """Record a message stamped by the other clock, and its arrival by this one."""
+        """Record a message's timestamp by the other clock, and its arrival by this one."""
         _keep_least(self._least, arrival_ns, arrival_ns - stamp_ns)
 
     def add_round_trip(self, duration_ns: int, arrival_ns: int) -> None:
@@ -491,13 +490,13 @@ class ClockOffset:
 
     @property
     def offset_ns(self) -> int:
-        """This clock's time less the other's; 0 while it is not known."""
+        """This clock's time minus the other's; 0 while unknown."""
         round_trip_ns = self._round_trips[0][1] if self._round_trips else 0
         return self._least[0][1] - round_trip_ns // 2 if self._least else 0
 
     @property
     def ahead_ms(self) -> float | None:
-        """The other clock's time less this one's; None while it is not known."""
+        """The other clock's time minus this one's; None while unknown."""
         return -self.offset_ns / 1e6 if self._least else None
 
     @property
@@ -506,17 +505,17 @@ class ClockOffset:
         return self._round_trips[0][1] / 1e6 if self._round_trips else None
 
     def taken_ns(self, stamp_ns: int, arrival_ns: int) -> int:
-        """Record a stamped message that arrives now; return when it was created, by this clock."""
+        """Record a timestamped message that arrives now; return when it was created, by this clock."""
         self.add(stamp_ns, arrival_ns)
         return min(arrival_ns, stamp_ns + self.offset_ns)
 
     def to_remote(self, local_ns: int) -> int:
-        """Return the other clock's time at a time of this one."""
+        """Convert a time of this clock to the other clock's."""
         return local_ns - self.offset_ns
 
 
 def _keep_least(kept: deque[tuple[int, int]], now_ns: int, value: int) -> None:
-    """Add a value to a queue whose first entry is the least within a window."""
+    """Add a value to a queue whose first entry is the minimum within a window."""
     while kept and kept[-1][1] >= value:
         kept.pop()
     kept.append((now_ns, value))
