@@ -25,7 +25,7 @@ class PitotConfig(Sensor, frozen=True, kw_only=True):
     pressure_pa: ErrorModel = ErrorModel(
         noise=0.1,  # Pa; zero-point repeatability of the SDP31
         bias=0.2,  # Pa; zero-point accuracy of the SDP31
-        quantum=1 / 60,  # Pa; resolution by the scale factor of the SDP31
+        quantum=1 / 60,  # Pa; reciprocal of the SDP31's scale factor
     )
 
 

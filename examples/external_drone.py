@@ -96,10 +96,7 @@ with zenoh.open(config) as session:
         clocks.recv()  # retry at the next clock, which comes once a second while the world waits
     place = next(drone for drone in info["drones"] if drone["name"] == DRONE)
     truth, status = get(f"drone/{DRONE}/truth"), get(f"drone/{DRONE}/sensor/status")  # left by an earlier driver
-    own = truth or {
-        "position_m": [float(x) for x in sys.argv[3:6]] or [0.0, 0.0, 0.05],
-        "orientation_wxyz": [1, 0, 0, 0],
-    }
+    own = truth or {"position_m": PLACE, "orientation_wxyz": [1, 0, 0, 0]}
     w, _, _, z = own["orientation_wxyz"]
     aircraft = Aircraft(own["position_m"], 2 * math.atan2(z, w), status["state"] if status else "landed")
     queryable = session.declare_queryable(f"zsim/drone/{DRONE}/driver", answer)

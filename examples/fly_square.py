@@ -1,4 +1,4 @@
-"""Flies the formation in a square by waypoints, through the controller's control key.
+"""Fly the formation in a square by waypoints, through the controller's control key.
 
     zsim run scenarios/step.yaml --set clusters.main.plan={} --duration 120
     python examples/fly_square.py

@@ -1,4 +1,4 @@
-"""A vehicle of six rotors, `model: hexacopter`: the AR.Drone's body, each rotor with two thirds of its thrust."""
+"""A vehicle with six rotors, `model: hexacopter`: the AR.Drone's body, with two thirds of its thrust per rotor."""
 
 import math
 from typing import Literal

@@ -2,7 +2,7 @@
 
     PYTHONPATH=examples zsim run scenarios/step.yaml --set drones.drone1.model=larger_battery
 
-It overrides a few parameters of a stock vehicle; for a more different one, start from a copy of
+It overrides a few parameters of a stock vehicle. A vehicle that differs more should start as a copy of
 zsim/vehicles/crazyflie2.py.
 """
 

@@ -11,7 +11,7 @@ from zsim_agents.formation.control_law import ControlLaw
 from zsim_agents.formation.spaces.cluster_space import Array
 
 RANGE_M = 3.0  # distance beyond which robots do not repel each other
-PUSH_M3_S = 2.0  # repels each of two robots 2 m apart at 2 (1/2 - 1/3) / 2^2 = 0.08 m/s
+PUSH_M3_S = 2.0  # two robots 2 m apart repel each other at 2 (1/2 - 1/3) / 2^2 = 0.08 m/s
 
 
 class PotentialField(ControlLaw):

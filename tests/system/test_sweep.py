@@ -216,7 +216,7 @@ BAD = {
     "too few runs": (("--vary", "duration_s=1,2,3", "--runs", "2"), "--runs is 2; must be at least 3"),
     "the same again": (("--runs", "2"), "--runs is 2; must be 1"),
     "no runs": (("--runs", "0"), "invalid value for '--runs'"),
-    "workers and dask": (("--workers", "2", "--dask", "tcp://127.0.0.1:9"), "--workers is for processes of this host"),
+    "workers and dask": (("--workers", "2", "--dask", "tcp://127.0.0.1:9"), "--workers"),
     "no scheduler": (("--dask", "nonsense://127.0.0.1:9"), "--dask nonsense://127.0.0.1:9: no scheduler"),
     "a file in the way": (("--out", __file__), "cannot be made"),
 }

@@ -90,7 +90,7 @@ def test_what_is_no_parameter_given_elsewhere_or_twice_is_refused(
 @pytest.mark.parametrize("value", [10**20, [0, 10**24], {10**20: 1}, "\udcff"], ids=ascii)
 def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
     nowhere: Any = SimpleNamespace()
-    with refused(SessionError, "world/control", "fault_add", "whole"):
+    with refused(SessionError, "world/control", "fault_add", "64-bit"):
         Session.request(nowhere, keys.CONTROL, "fault_add", "zsim.fault", {"value": value})
 
 
