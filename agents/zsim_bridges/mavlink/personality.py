@@ -92,7 +92,7 @@ Setting = Literal[
 
 
 class ParameterSpec(NamedTuple):
-    """A parameter with its initial value and range; a fixed one cannot be set. The setting is the value times `unit`."""
+    """A parameter with initial value and range; a fixed one cannot be set. The setting is the value times `unit`."""
 
     name: str
     type: ParamType
