@@ -49,15 +49,15 @@ from zsim_bridges.vehicle_links.vehicle_session import (
 NAVDATA, AT = 0, 1  # channels
 REQUEST_NS = 100_000_000  # chosen as in npm ar-drone; silence after which navdata is requested again
 CONFIG_NS = 500_000_000  # chosen; time without an acknowledgement after which an entry is sent again
-WATCHDOG_NS = 1_000_000_000  # half of the aircraft's com_watchdog
+WATCHDOG_NS = 1_000_000_000  # period of watchdog resets, half of the aircraft's com_watchdog
 RESTARTED = 100  # chosen; packets; if the sequence number falls back by more, the aircraft was restarted
-PERIOD_NS = 30_000_000  # Developer Guide 6.3: at most 30 ms between commands
-CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller sends one command
+PERIOD_NS = 30_000_000  # the Developer Guide, 6.3, allows at most 30 ms between commands
+CHANGED_NS = 15_000_000  # minimum spacing of changed demands; chosen below a gate, which brings one command
 PULSE_NS = 90_000_000  # chosen: three datagrams carry the emergency bit, of which two may be lost
 PULSES_NS = 400_000_000  # chosen: longer than a pulse takes to show in navdata, since a second one would undo the first
 VELOCITY_1_S = 2.5  # velocity gain; chosen: 46 deg of phase margin with 0.14 s of delay and 0.14 s of tilt lag
 INTEGRAL_1_S2 = 2.0  # integral gain; chosen: as fast as that margin allows; gusts last some seconds
-DRAG_1_S = 0.58  # 1/s, deceleration per speed (tum_ardrone's model fitted to flights)
+DRAG_1_S = 0.58  # 1/s, deceleration by drag per speed (tum_ardrone's model, fitted to flights)
 STEP_S_MAX = 0.1  # s; a longer pause is integrated only up to this
 ANSWER_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
 HOVER = Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0)  # flag 0: hold the position
@@ -71,7 +71,7 @@ STATES: dict[int, DroneState] = {
 }
 OPTIONS_MASK = sum(1 << tag for tag in (*FULL_TAGS, GPS_TAG))
 SONAR_MM = range(30, 6000)  # mm; values outside mean that there was no echo
-GPS_1_S = 0.1  # 1/s, chosen: the position follows the GPS, whose noise is 2 m at 5 Hz, with 0.3 m of noise
+GPS_1_S = 0.1  # 1/s, chosen; rate at which the position follows the GPS, whose 2 m of noise at 5 Hz become 0.3 m
 YAW_1_S = 0.1  # 1/s, chosen; rate at which the heading follows the magnetometer
 GAP_S_MAX = 0.5  # s; longer gaps are not integrated
 

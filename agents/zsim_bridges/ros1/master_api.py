@@ -18,7 +18,7 @@ from zsim.errors import RunError
 TIMEOUT_S = 3.0  # time limit of one call
 BODY_MAX = 1_000_000  # bytes in a request
 DONE = 1  # code of a successful answer
-DEFAULT_MASTER = "http://127.0.0.1:11311"  # the default of ROS
+DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's default
 DEFAULT_PORT = 11311
 CHECK_S = 1.0  # wall time between checks that the master still has the registration
 UNREGISTER_S = 2.0  # time limit for unregistering

@@ -18,7 +18,7 @@ from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, ReceivedSample, Session, Unanswered
 from zsim.transport.traffic import Passed, Traffic, samples
 
-BACKLOG = 100  # arrivals, one or two seconds in realtime
+BACKLOG = 100  # batches kept for a slow reader, one or two seconds in realtime
 
 
 class TrafficIntake:

@@ -23,14 +23,14 @@ STRANGERS_MAX = 100  # simultaneous connections of strangers; the oldest makes r
 REQUEST_S = 5.0  # wall time in which a request must arrive with its body; a browser on a bad link takes 1 s
 SMALL_BYTES = 16_384  # size of a body that is always accepted; commands and requests have a few hundred bytes
 BODY_BYTES_MAX = 16_000_000  # total size of all larger bodies at once; 16 of the largest that the gateway accepts
-CONNECTIONS_MAX = 1000  # twice the gateway's clients
+CONNECTIONS_MAX = 1000  # twice the gateway's maximum number of clients
 REFUSED_FROM = 400  # lowest HTTP status of an error
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 ANY_PORT = 0  # lets the kernel choose
 BACKLOG = 128  # connections that the kernel queues until they are accepted; aiohttp's default
 READ_BYTES = 16_384  # buffer for a body that no handler has read yet; a connection holds twice as much
 Resource = TypeVar("Resource")
-_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests other than HTTP are answered, not logged
+_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, but not logged
 
 
 class ServedSite(NamedTuple):
