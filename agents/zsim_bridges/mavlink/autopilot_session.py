@@ -427,7 +427,7 @@ class TelemetryReadings(AircraftReadings):
 
     Attributes:
         clock, unix_clock: offsets for messages timestamped since boot, and since 1970.
-        has_origin: whether the origin of its local frame is known.
+        has_origin: whether the origin of the vehicle's local frame is known.
     """
 
     def __init__(self, origin: tuple[float, float, float], local_origin_m: Vector | None = None) -> None:

@@ -62,7 +62,7 @@ class MavlinkOptions(NamedTuple):
     Attributes:
         level: level of the telemetry rates.
         gcs, gcs_local: address of the ground station, and the first local port that talks to it.
-        api, api_local: the first address of the programs, and the first local port that talks to them.
+        api, api_local: the programs' address for the first drone, and the first local port that talks to programs.
         key: signing key; None for no signatures.
         rate: pace requested of a run that would go as fast as possible; None for none.
         first_system_id: system id of the first drone; the others count up.

@@ -95,7 +95,7 @@ def drive(
 
 
 class DriverProcess:
-    """One aircraft in one run."""
+    """Drives one aircraft in one run."""
 
     def __init__(
         self,
