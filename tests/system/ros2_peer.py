@@ -79,8 +79,9 @@ class Peer:
             service, kind, request_definition=request, response_definition=response, timeout=120.0, **self._where
         )
         matched = threading.Event()  # a request before the service is known is lost, and the SDK waits for its answer
-        client.querier.declare_matching_listener(lambda status: matched.set() if status.matching else None)
-        if client.querier.matching_status.matching:
+        querier: Any = client.querier
+        querier.declare_matching_listener(lambda status: matched.set() if status.matching else None)
+        if querier.matching_status.matching:
             matched.set()
         matched.wait(client.timeout)
         try:
