@@ -225,7 +225,7 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
                 planned_assembly(space, goal, p_W, gains, NEAR_ROOM)
                 p_W, yaw = space.inverse(goal)
             elif start is None:
-                continue  # take-off and engagement orders, before any formation exists
+                continue  # the take-off order, before any formation exists
             elif isinstance(request, MoveTo):
                 goal = request.goal(space, goal)
                 rehearsal.check_target(start, goal, None if plan.trajectory else request.over_s)
