@@ -96,7 +96,7 @@ class TemplateCluster(ClusterSpace):
         """
         _, b_C, R_WC = self._fitted(p_W)
         n = self.n
-        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # (3, n, 3): for t_i x R^T v_i
+        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # (3, n, 3), of t_i x R^T v_i
         turn = solve(inertia(product(b_C.T, self.t_C)), arms.reshape(3, 3 * n)).reshape(3, n, 3)
         roll, pitch, _ = euler_angles(R_WC)
         cross_C = np.array([skew(b) for b in b_C]).reshape(3 * n, 3)
