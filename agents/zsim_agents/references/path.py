@@ -22,20 +22,20 @@ from zsim.math import linear
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
-DEGREE = 7  # of a piece, as in the files of uav_trajectories: the least in which place, velocity, acceleration and jerk
-# of both ends can be given
-ENDS = 3  # derivatives that are given at both ends of a path
+DEGREE = 7  # degree of a piece, as in the files of uav_trajectories: the minimum that allows position, velocity,
+# acceleration and jerk to be prescribed at both ends
+ENDS = 3  # number of derivatives prescribed at each end of a path
 BELOW, ABOVE = 11, 3  # diagonals of the equations of a minimum-snap path, ordered from piece to piece
-PEAK_SAMPLES = 64  # of a piece, where its greatest speed is looked for
+PEAK_SAMPLES = 64  # samples per piece in the search for its maximum speed
 GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
 GOLDEN_STEPS = 40  # each leaves 0.62 of the interval: 1e-10 of a piece in all
 SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # of a path that is no polynomial, between which peaks are refined
-HORIZON_S = 600.0  # of an endless path that is looked at
+HORIZON_S = 600.0  # part of an endless path that is searched for peaks
 DIFFERENCE_S = 1e-4  # of rates, for an acceleration: exact to 1e-7 of it in motions of a second
 FACTOR_DIGITS = 3  # of the factor of a fit, rounded up
-SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
+SHARE = 0.8  # share of the drone's limits, as in formations; the rest is left to the feedback
 LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: 25 gates, however short; an hour; step of the search
-STILL = 1e-9  # m, m/s or rad/s, below which nothing moves
+STILL = 1e-9  # values below this count as standstill [m, m/s or rad/s]
 RAMP = 0.25  # of a lap's time, in which the speed along the curve rises from rest, and falls again; chosen
 Curve = Callable[[float], tuple[Array, Array]]
 """From the angle [rad] to the place (4,) and its derivative by the angle."""
@@ -88,7 +88,7 @@ class PiecewisePolynomial:
         piece = bisect.bisect_right(self._begins, clamped) - 1
         local = clamped - self._begins[piece]
         place, rate = [], []
-        for highest, *others in self._axes[piece]:  # in floats: numpy takes five times as long
+        for highest, *others in self._axes[piece]:  # plain floats: numpy takes five times as long
             value, slope = highest, 0.0
             for coefficient in others:
                 slope = slope * local + value
