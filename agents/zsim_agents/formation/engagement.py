@@ -1,7 +1,8 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
-A plain object: estimates in, commands out, once per gate; requests in between. Every engagement, resumption and
-reference is checked, every refusal has a reason, and every reference starts at the present state of the formation.
+`Engagement` does no communication: each gate takes estimates and returns commands; requests arrive in between. Every
+engagement, resumption and reference is checked, every refusal gives a reason, and every reference starts at the
+present state of the formation.
 """
 
 from __future__ import annotations
@@ -59,17 +60,17 @@ from zsim_agents.formation.flight_plan import (
 from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
-DT_MAX_S = 0.1  # longest step of the integral, after a gap
-CLIMB_GAIN_1_S = 0.8  # of the climb to the assembly height
-HOLD_APART_M = 0.1  # a held formation is kept this much farther apart than the minimum
+DT_MAX_S = 0.1  # maximum integration step, which applies after a gap
+CLIMB_GAIN_1_S = 0.8  # proportional gain of the climb to the assembly height
+HOLD_APART_M = 0.1  # margin above the minimum separation for the robots of a held formation
 
 
 class Engagement:
-    """The phase machine of one formation.
+    """The state machine of the phases of one formation.
 
     Args:
         drones: names in the order of the robots.
-        plan: requests of the scenario; a requested landing drops the remaining ones.
+        plan: requests of the scenario; a landing request drops the remaining ones.
 
     Raises:
         ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
@@ -98,18 +99,18 @@ class Engagement:
         self._phase = "idle"
         self._gate: GateInput | None = None
         self._dt_s = 0.0
-        self._modes: dict[str, float] = {}  # when a mode was commanded last, by drone
+        self._modes: dict[str, float] = {}  # time of the last mode command, by drone
         self._landing_s = -math.inf
-        self._fault = ""  # why an engaged formation does not close its loop
+        self._fault = ""  # why the control loop of an engaged formation is open
         self._well_since_s = math.inf
-        self._assembly: Assembly | None = None  # while the drones fly to assigned places, or wait there
-        self._places: Places | None = None  # while the drones of a held formation are led back to them
-        self._checked = np.empty(0)  # the last reference without a fault; one at rest stays the same array
-        self._wrapped = self._checked, self._checked  # the last reference, and the same with wrapped angles
+        self._assembly: Assembly | None = None  # set while the drones fly to assigned positions or wait there
+        self._places: Places | None = None  # set while the drones of a held formation are led back
+        self._checked = np.empty(0)  # the last faultless reference; a reference at rest stays the same array
+        self._wrapped = self._checked, self._checked  # the last reference, without and with wrapped angles
 
     @property
     def phase(self) -> str:
-        """One of idle, taking_off, assembling, engaged, landing and held."""
+        """The present phase: idle, taking_off, assembling, engaged, landing or held."""
         return "held" if self._phase == "engaged" and (self._fault or self.guidance.paused) else self._phase
 
     def step(self, gate: GateInput) -> GateOutput:
@@ -118,7 +119,7 @@ class Engagement:
         self._gate = gate
         self.check.observe(gate)
         self.plan.run(gate.t_s, self._try)
-        gate = self._gate  # with the drones in the order of the robots, which an assembly changes
+        gate = self._gate  # the robots in the order set by the last assembly
         if self._phase in ("assembling", "engaged") and gate.down:
             self._phase, self._places, self._assembly = "idle", None, None
         if self._phase == "engaged":
@@ -130,14 +131,14 @@ class Engagement:
             return self._climb(gate)
         if self._phase != "landing":
             return self._output(gate, "")
-        # a take-off sent just before may still be on its way: idle only after a while on the ground
+        # a take-off command may still be in transit: idle only after some time on the ground
         if gate.down and gate.t_s - self._landing_s >= RESEND_S:
             self._phase = "idle"
         modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
         return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
 
     def request(self, request: FlightRequest) -> str | None:
-        """Grant a request and return None, or return why it is refused without changing anything."""
+        """Grant a request and return None, or change nothing and return why it is refused."""
         refusal = self._try(request)
         if refusal is None and request is Order.LAND:
             self.plan.clear()
@@ -146,12 +147,14 @@ class Engagement:
         return refusal
 
     def warm_start(self, phase: str, desired: Array, plan_step: int = 0, drones: Sequence[str] = ()) -> None:
-        """Continue in the phase and at the reference (4n,) of a former process of this formation.
+        """Continue in the phase and at the reference (4n,) of a previous process of this formation.
 
-        `drones`: names in the order of its robots, if that is not the scenario's.
+        The plan continues after the completed steps; a target or trajectory of the plan that was being flown is
+        requested again from that reference.
 
-        Its plan continues after the completed steps, by the former `GateOutput.plan_step`; a target or trajectory of
-        the plan that was being flown is requested again from that reference.
+        Args:
+            plan_step: last `GateOutput.plan_step` of the previous process.
+            drones: names in the order of the robots, if it differs from the scenario's.
         """
         self._phase = "engaged" if phase == "held" else phase
         self._name(drones or self.drones)
@@ -182,7 +185,7 @@ class Engagement:
         }
 
     def restore(self, state: State, gate: GateInput | None) -> None:
-        """Take over the snapshot of another process and the last gate that it stepped."""
+        """Restore the snapshot of another process and the last gate that it processed."""
         self._phase, self._landing_s = state["phase"], state["landing_s"]
         self._name(state["drones"])
         self._assembly = state["assembly"] and Assembly.restored(state["assembly"], self.gains)
@@ -263,7 +266,7 @@ class Engagement:
         self._phase = "engaged"
 
     def _grant_assembly(self, request: Assemble, gate: GateInput) -> None:
-        """Assign the drones to the places of a formation, and start their flight there."""
+        """Assign the drones to the positions of a formation and start their flight there."""
         if self._phase not in ("assembling", "engaged") or self._fault:
             raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
         if fault := self._way_left(gate) or self.check.assembly_fault(gate):
@@ -280,11 +283,11 @@ class Engagement:
         self.check.observe(self._gate)
 
     def _name(self, drones: Sequence[str]) -> None:
-        """Set the order of the drones to that of the robots."""
+        """Set the names of the drones, in the order of the robots."""
         self.drones = self.law.robots = self.check.drones = tuple(drones)
 
     def _way_left(self, gate: GateInput) -> str | None:
-        """Return a text on the remaining flight of the drones to their places."""
+        """Return a text on the remaining flight of the drones to their positions, None after arrival."""
         if self._assembly is None or self._assembly.arrived(gate.p_W):
             return None
         i, away_m = self._assembly.farthest(gate.p_W)
@@ -294,7 +297,7 @@ class Engagement:
         return Places(p_W, self.gains, self._held_limits, SHAPE.share)
 
     def _unflyable(self, gate: GateInput) -> str | None:
-        """Return why the drones cannot be led one by one."""
+        """Return why the drones cannot be led individually."""
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
     def _mode_commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
@@ -307,7 +310,7 @@ class Engagement:
         return tuple(due)
 
     def _climb(self, gate: GateInput) -> GateOutput:
-        """Lead the flying drones vertically to the assembly height, each by its own velocity loop."""
+        """Lead the flying drones vertically to the assembly height, each individually."""
         modes: tuple[ModeCommand, ...] = ()
         reason = self.check.state_fault(gate, AIRBORNE) if self._phase == "taking_off" else None
         if reason:
@@ -320,7 +323,7 @@ class Engagement:
         return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
 
     def _assemble(self, gate: GateInput, assembly: Assembly) -> GateOutput:
-        """Lead the drones to their places without turning; all stop if one cannot be flown."""
+        """Lead the drones to their positions without turning; all stop if one cannot be controlled."""
         if fault := self._unflyable(gate):
             return self._output(gate, fault, command=self._upright(gate, 0.0, self.gains.limits))
         assembly.advance(gate.p_W, self._dt_s)
@@ -331,7 +334,7 @@ class Engagement:
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or clear it after a time without faults."""
         fault = self._way_fault(gate) or self.check.flight_fault(gate)
-        if not fault and not self._fault:  # the checks before the flight cover a limited time of the reference
+        if not fault and not self._fault:  # the checks of a request cover only a limited time of the reference
             try:
                 c_des = self.guidance.value(gate.t_s)[0]
                 if c_des is not self._checked:
@@ -355,7 +358,7 @@ class Engagement:
                 self.law.reset()
 
     def _way_fault(self, gate: GateInput) -> str | None:
-        """Return which led drone has not reached its place; stop leading the drones if one is unflyable."""
+        """Return which drone has not rejoined its position; stop leading the drones if one cannot be controlled."""
         if self._places is None:
             return None
         if self._unflyable(gate):
@@ -376,7 +379,7 @@ class Engagement:
         return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
     def _hold(self, gate: GateInput) -> GateOutput:
-        """Keep the drones of a held formation in place, or lead them to their places without turning."""
+        """Stop the drones of a held formation, or lead them to their positions without turning."""
         if self._places is None:
             command = self._upright(gate, 0.0, self._held_limits)
         else:
@@ -384,12 +387,12 @@ class Engagement:
         return self._output(gate, self._fault, command=command)
 
     def _guarded(self, gate: GateInput, v_W: Array, limits: RobotLimits) -> FormationCommand:
-        """Return the command of velocities (n, 3) [m/s, W] without turning."""
+        """Return the command for velocities (n, 3) [m/s, W], guarded and without turning."""
         v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
 
     def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
-        """Return guarded climb rates (n,) without turning; zero if the estimates are not flyable."""
+        """Return the command for climb rates (n,) [m/s], guarded, without turning; zero if an estimate is unusable."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
         if self.check.estimate_fault(gate) is None:
@@ -406,7 +409,7 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference the desired value is the present one."""
+        """Return the output of a gate; without a reference the desired value is the estimate."""
         if command and command.alarmed:
             near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
             reason = f"{TOO_NEAR}, {near}; {reason}"
@@ -428,7 +431,7 @@ class Engagement:
         )
 
     def _is_led(self) -> bool:
-        """Tell whether the drones fly a reference begun by a step of the plan."""
+        """Return whether the drones are assembling or following a reference, as opposed to hovering or holding."""
         return self._assembly is not None or (self._phase == "engaged" and not self.guidance.paused)
 
     def _pairs(self, pairs: Pairs) -> str:

@@ -22,23 +22,23 @@ from zsim.math import linear
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
-DEGREE = 7  # of a piece, as in the files of uav_trajectories: the least in which place, velocity, acceleration and jerk
-# of both ends can be given
-ENDS = 3  # derivatives that are given at both ends of a path
+DEGREE = 7  # degree of a piece, as in the files of uav_trajectories: the minimum that allows position, velocity,
+# acceleration and jerk to be prescribed at both ends
+ENDS = 3  # number of derivatives prescribed at each end of a path
 BELOW, ABOVE = 11, 3  # diagonals of the equations of a minimum-snap path, ordered from piece to piece
-PEAK_SAMPLES = 64  # of a piece, where its greatest speed is looked for
+PEAK_SAMPLES = 64  # samples per piece in the search for its maximum speed
 GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
 GOLDEN_STEPS = 40  # each leaves 0.62 of the interval: 1e-10 of a piece in all
-SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # of a path that is no polynomial, between which peaks are refined
-HORIZON_S = 600.0  # of an endless path that is looked at
+SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths; peaks are then refined
+HORIZON_S = 600.0  # part of an endless path that is searched for peaks
 DIFFERENCE_S = 1e-4  # of rates, for an acceleration: exact to 1e-7 of it in motions of a second
 FACTOR_DIGITS = 3  # of the factor of a fit, rounded up
-SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
+SHARE = 0.8  # share of the drone's limits, as in formations; the rest is left to the feedback
 LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: 25 gates, however short; an hour; step of the search
-STILL = 1e-9  # m, m/s or rad/s, below which nothing moves
+STILL = 1e-9  # values below this count as standstill [m, m/s or rad/s]
 RAMP = 0.25  # of a lap's time, in which the speed along the curve rises from rest, and falls again; chosen
 Curve = Callable[[float], tuple[Array, Array]]
-"""From the angle [rad] to the place (4,) and its derivative by the angle."""
+"""Maps the angle [rad] to the position (4,) and its derivative with respect to the angle."""
 
 
 class PathLimits(NamedTuple):
@@ -65,7 +65,7 @@ class Peaks(NamedTuple):
     def factor(self, limits: PathLimits) -> float:
         """Return the factor by which a path must be slowed to satisfy limits; below 1 if it may be faster."""
         speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
-        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # speeds fall with time, accelerations twice
+        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # speed scales as 1/t, acceleration as 1/t^2
 
 
 class PiecewisePolynomial:
@@ -88,7 +88,7 @@ class PiecewisePolynomial:
         piece = bisect.bisect_right(self._begins, clamped) - 1
         local = clamped - self._begins[piece]
         place, rate = [], []
-        for highest, *others in self._axes[piece]:  # in floats: numpy takes five times as long
+        for highest, *others in self._axes[piece]:  # plain floats: numpy takes five times as long
             value, slope = highest, 0.0
             for coefficient in others:
                 slope = slope * local + value
@@ -108,7 +108,7 @@ class PiecewisePolynomial:
         """Return the peaks of each piece, to 1e-10 of it."""
         greatest = [(0.0, 0.0)] * 4
         for begin_s, duration_s, own in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
-            unit = own * _powers(duration_s, len(own))[:, None]  # of a local time from 0 to 1, which is well scaled
+            unit = own * _powers(duration_s, len(own))[:, None]  # in local time from 0 to 1, which is well scaled
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
@@ -154,7 +154,7 @@ def _greatest(columns: Array) -> tuple[float, float]:
 
 
 class EndMotion(NamedTuple):
-    """The derivatives of a path at its first or last place, each (4,)."""
+    """Derivatives of a path at its start or end, each (4,)."""
 
     velocity: Array
     acceleration: Array
@@ -168,7 +168,7 @@ def at_rest() -> EndMotion:
 def minimum_snap(
     times_s: Sequence[float], places: Array, begin: EndMotion | None = None, end: EndMotion | None = None
 ) -> PiecewisePolynomial:
-    """Return the path through places (m, 4) at given times with the least integral of the squared fourth derivative.
+    """Return the path through places (m, 4) at given times with the minimum integral of the squared fourth derivative.
 
     Among all paths with given derivatives up to the third at both ends, at rest by default, that is the spline of
     degree 7: Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the
@@ -211,7 +211,7 @@ def minimum_snap(
     for d in range(1, ENDS + 1):
         put(row + d - 1, m - 1, slopes[d])
         b[row + d - 1] = ends[1][d - 1] * el.power(spans[-1], float(d))
-    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # of a local time from 0 to 1, well scaled
+    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # in local time from 0 to 1: well scaled
     scale = np.array([_powers(span, size) for span in spans.tolist()])
     return PiecewisePolynomial(spans, unit / scale[:, :, None])
 
@@ -227,7 +227,7 @@ def move(
     """Return the minimum-snap path from one place to another (4,), within limits.
 
     It lasts over_s, or longer if the limits require. It begins and ends at rest, or in the given motions.
-    The yaw turns by the shorter way.
+    The yaw takes the shorter turn.
 
     Raises:
         TrajectoryError: the motion at an end is beyond the limits.
@@ -354,7 +354,7 @@ class Laps:
         return place, slope * rate
 
     def _begun(self, t: float) -> tuple[float, float]:
-        """Return angle and rate at t from rest."""
+        """Return angle and rate, time t after starting from rest."""
         s = t / self._ramp_s
         if s >= 1.0:
             return self._rate * (t - 0.5 * self._ramp_s), self._rate
