@@ -1,8 +1,8 @@
-"""Control laws of a formation, from the estimated robots and a reference to velocity commands.
+"""Control laws of a formation: from the estimates of the robots and a reference to velocity commands.
 
-The base class of all laws (`law:` of a cluster may name a subclass of your own), the stock law, the inputs that a
-scenario grants to a law beside the estimates, and, compiled, the saturation of the robots' velocities and the guard of
-the distances between them.
+This is the base class of all laws (`law:` of a cluster may name a user's subclass), the stock law, the inputs that a
+scenario grants to a law in addition to the estimates, and, compiled, the saturation of the robots' velocities and the
+guard that keeps the robots apart.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ PairTable = NDArray[np.int64]
 Kind = TypeVar("Kind", bound=Sample)
 
 RATES = ("vx", "vy", "vz", "yaw rate")  # of a robot, in the order of r_dot
-NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
+NEAR_M = 1e-6  # closer robots have no defined direction from one to the other
 SETTLED_M_S = 1e-9  # a smaller deficit of the rate is ignored
-LOAD_MIN = 1e-9  # against division by zero
-GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots in a corner need a few
+LOAD_MIN = 1e-9  # prevents division by zero
+GUARD_SWEEPS = 4  # passes over all pairs; one is enough for two robots, three robots in a corner need a few
 
 
 @dataclass(frozen=True)
 class FormationGains:
-    """Parameters of the law; all positive, validated with the scenario. For those not listed here see `RobotLimits`.
+    """Parameters of the law; positive, validated with the scenario. Those not listed below: see `RobotLimits`.
 
     Attributes:
-        k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good, unstable from about 2 on a drone's velocity loop.
+        k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good; from about 2 it is unstable with a drone's velocity loop.
         integral_1_s2: integral gain [1/s^2]; removes the offset that wind causes, 0 switches it off.
         integral_max_m_s, integral_max_rad_s: clamp of the integral term for lengths and for angles.
         separation_min_m: minimum distance between two robots of a reference, below which the guard acts.
@@ -76,7 +76,7 @@ class FormationCommand(Struct, eq=False):
     Attributes:
         v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
         factor: the common factor of the saturation, 1 without saturation.
-        guarded: pairs of robot indices that the guard holds apart; alarmed: those nearer than the alarm threshold.
+        guarded: pairs of robot indices that the guard holds apart; alarmed: pairs closer than the alarm threshold.
     """
 
     v_W: Array
@@ -87,18 +87,18 @@ class FormationCommand(Struct, eq=False):
 
 
 class ControlLaw(ABC):
-    """A control law; its demands are saturated and guarded here in the same way for all laws.
+    """A control law; this base class saturates and guards the rates of all laws alike.
 
-    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of your own
-    has `rates`, and where it has a state `reset`, `followed`, `snapshot` and `restore`.
+    A common factor for all robots preserves the direction in cluster space; the guard keeps the robots apart. A user's
+    law implements `rates` and, if it has a state, `reset`, `followed`, `snapshot` and `restore`.
 
     Args:
         space: cluster space of n robots.
-        gains: gains of the scenario; a law uses those that it needs.
+        gains: gains of the scenario; a law uses the ones it needs.
 
     Attributes:
         robots: names of the robots in messages, in order.
-        grants: inputs beside the estimates, read by `samples`, `map` and `now_ns`.
+        grants: inputs in addition to the estimates, read by `samples`, `map` and `now_ns`.
     """
 
     _granted: Grants | None = None
@@ -123,7 +123,7 @@ class ControlLaw(ABC):
     def samples(self, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
         """Return the newest sample of a sensor of each robot, in order; None before the first sample.
 
-        `t_ns` of a sample is the gate at which it was published, `t_sample_ns` the instant of measurement.
+        `t_ns` of a sample is the gate at which it was published, `t_sample_ns` the time of measurement.
 
         Args:
             sensor: name, one of `law_sensors` of the cluster.
@@ -145,20 +145,20 @@ class ControlLaw(ABC):
         return self.grants.t_ns
 
     def reset(self) -> None:  # noqa: B027 - a law may have no state
-        """Clear all state: the formation is engaged, or continues after a hold."""
+        """Clear all state, when the formation is engaged or continues after a hold."""
 
     def followed(self, dt_s: float) -> None:  # noqa: B027
         """Advance the state by dt_s [s] after a gate whose rates were neither saturated nor guarded.
 
-        It is not called after other gates, so that an integral that grows here does not wind up.
+        It is not called after other gates, so an integral advanced here does not wind up.
         """
 
     def snapshot(self) -> State | None:
-        """Return all state as plain values and arrays, {} without state, None if it cannot be transferred."""
+        """Return all state as plain values and arrays, {} if the law has none, None if it cannot be transferred."""
         return {} if type(self).reset is ControlLaw.reset and type(self).followed is ControlLaw.followed else None
 
     def restore(self, state: State) -> None:  # noqa: B027
-        """Take over the `snapshot` of another process's law, to continue with the same bits."""
+        """Restore a `snapshot` of the law in another process, to continue bit-identically."""
 
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
@@ -166,11 +166,11 @@ class ControlLaw(ABC):
         """Return the command of this gate; arguments as in `rates`, dt_s the time since the last command.
 
         Raises:
-            UserCodeError: `rates` of a user's law returned a wrong number of rates, or a non-finite one.
+            UserCodeError: `rates` of a user's law returned an array of wrong size or a non-finite rate.
         """
         n, order = self.space.n, self._order
         r_dot = self.rates(c, p_W, v_W, c_des, c_dot_des)
-        if self._is_own:  # compiled code would read beyond the end of a shorter one
+        if self._is_own:  # compiled code would read beyond the end of a shorter array
             r_dot = self._checked(r_dot)
         v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
         factor, guards, alarms = limited(r_dot, p_W, v_W, v_cmd_W, yaw_rate, order, *self.gains.limits)
@@ -224,11 +224,11 @@ class ProportionalLaw(ControlLaw):
         grow(self.integral, self._error, self.gains.integral_1_s2 * dt_s, self._clamp)
 
 
-LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock laws by their names in a scenario
+LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock laws by name in scenarios
 
 
 class Map(NamedTuple):
-    """Obstacles and surfaces of the scenario in W, including those of its forest, corridor and cloud."""
+    """Obstacles and surfaces of the scenario, in W, including those of its forest, corridor and cloud."""
 
     obstacles: Sequence[Obstacle]
     surfaces: Sequence[Surface]
@@ -268,7 +268,7 @@ class Grants:
     def put(self, key: str, sample: Sample) -> None:
         name, place = self._places[key]
         former = self._newest[name][place]
-        if former is None or sample.t_ns >= former.t_ns:  # in realtime an older one may come later
+        if former is None or sample.t_ns >= former.t_ns:  # in realtime, an older sample may arrive later
             self._newest[name][place] = sample
 
     def samples(self, law: type, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
@@ -282,7 +282,9 @@ class Grants:
             raise UserCodeError(f"{what}; must be {received.__name__}, the class of its messages")
         newest = self._newest[sensor]
         for place, sample in enumerate(newest):
-            if sample is not None and type(sample) is not kind:  # made of what `world/info` says of a user's sensor
+            if (
+                sample is not None and type(sample) is not kind
+            ):  # of the class derived from `world/info` for a user's sensor
                 newest[place] = convert(sample, kind, from_attributes=True)
         return tuple(newest)  # type: ignore[return-value] - converted above
 
@@ -312,13 +314,13 @@ def grants_of(cluster: Cluster, environment: Environment) -> Grants:
 
 
 def granted(law: Any, grants: Grants) -> Any:
-    """Return a subclass of a law's class whose instances receive these grants in the constructor of `ControlLaw`."""
+    """Return a subclass of a law's class whose instances have these grants from the constructor of `ControlLaw` on."""
     own = {"_granted": grants, "__module__": law.__module__, "__qualname__": law.__qualname__, "__doc__": law.__doc__}
     return type(law.__name__, (law,), own)
 
 
 def _is_declared_as(received: Any, kind: Any) -> bool:
-    """Tell whether a message class made from its declaration corresponds to a user's class."""
+    """Return whether a message class derived from its declaration corresponds to a user's class."""
     names = [(getattr(each, "__name__", None), getattr(each, "__struct_fields__", None)) for each in (received, kind)]
     return names[0] == names[1]
 
@@ -327,7 +329,7 @@ def _is_declared_as(received: Any, kind: Any) -> bool:
 def put_cluster_rate(
     c_des: Array, c: Array, period: Array, c_dot_des: Array, integral: Array, k: float, error: Array, c_dot: Array
 ) -> None:
-    """Write the error c_des - c, angles the short way, and the rate c_dot_des + k error + integral, all (4n,)."""
+    """Write the error c_des - c, angles the shorter way, and the rate c_dot_des + k error + integral, all (4n,)."""
     for i in range(c.size):
         apart = c_des[i] - c[i]
         error[i] = apart - period[i] * np.rint(apart / TAU)
@@ -359,12 +361,12 @@ class RobotLimits(NamedTuple):
 
 
 def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[Array, Pairs, Pairs]:
-    """Return the velocities limited against dangerous approaches, the guarded pairs, and the pairs in alarm.
+    """Return velocities that keep robots from dangerous approaches, the guarded pairs, and the pairs in alarm.
 
-    Two robots at distance d, d' = rate of the command along their line, are held to d' >= -(d_near - separation_min) /
-    guard_horizon: the distance predicted over the horizon stays above the minimum, and below it the approach is
-    reversed. d_near allows for the present velocities, which last for the response time. Each robot of a pair takes
-    half of the change; a few sweeps settle several pairs.
+    Two robots at distance d, d' = rate of the command along their line, are held to
+    d' >= -(d_near - separation_min) / guard_horizon: the distance predicted over the horizon stays above the minimum,
+    and below it the robots separate. d_near allows for the present velocities, which persist for the response time.
+    Each robot of a pair takes half of the change; several pairs need a few sweeps.
     """
     parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
     guards, alarms = hold_apart(p_W, v_W, parted_W, order, *limits)
@@ -372,7 +374,7 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[
 
 
 def numbered(order: Order) -> Pairs:
-    """Return the pairs with a number above the diagonal, in the order of their numbers."""
+    """Return the pairs that have a non-zero number above the diagonal, sorted by that number."""
     numbers = order.tolist()
     places = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]
     return tuple((i, j) for _, i, j in sorted(places))
@@ -382,10 +384,10 @@ def numbered(order: Order) -> Pairs:
 def limited(
     r_dot: Array, p_W: Array, v_W: Array, v_cmd_W: Array, yaw_rate: Array, order: Order, *limits_of: float
 ) -> tuple[float, int, int]:
-    """Write velocities (n, 3) and yaw rates (n,) of r_dot (4n,), saturated and guarded.
+    """Write the saturated and guarded velocities (n, 3) and yaw rates (n,) of r_dot (4n,).
 
-    Returns the factor of the saturation, then the result of `hold_apart`; limits_of are the fields of RobotLimits:
-    passing a tuple to compiled code takes longer than all else here.
+    Returns the factor of the saturation, then the result of `hold_apart`; limits_of are the fields of RobotLimits,
+    passed singly because a tuple argument would take longer than the computation.
     """
     limits = RobotLimits(*limits_of)
     for i in range(yaw_rate.size):
@@ -401,7 +403,7 @@ def limited(
 
 @portable
 def load(v_W: Array, yaw_rate: Array, limits: RobotLimits) -> float:
-    """Return the greatest ratio of a robot's speed, climb or yaw rate to its limit; 1 is at the limit."""
+    """Return the maximum ratio of a robot's speed, climb or yaw rate to its limit."""
     most = 0.0
     for i in range(yaw_rate.size):
         speed = math.sqrt(v_W[i, 0] * v_W[i, 0] + v_W[i, 1] * v_W[i, 1])
@@ -421,7 +423,7 @@ def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
 
 @portable
 def near_pairs(p_W: Array, within_m: float) -> PairTable:
-    """Return the pairs (m, 2), i < j, by j and then by i, of positions (n, 3) that are nearer than a distance."""
+    """Return the pairs (m, 2), i < j, of positions (n, 3) closer than within_m, sorted by j, then i."""
     n = p_W.shape[0]
     pairs, count = np.empty((n * (n - 1) // 2, 2), np.int64), 0
     for j in range(1, n):
@@ -435,10 +437,10 @@ def near_pairs(p_W: Array, within_m: float) -> PairTable:
 
 @portable
 def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
-    """Change commands in place until every pair separates at its least rate (see `guard`).
+    """Change commands in place until every pair has at least its minimum rate of separation (see `guard`).
 
-    Returns how many pairs were changed and how many are nearer than the alarm threshold; writes into order (n, n) the
-    numbers of the former, from 1 on, above the diagonal and of the latter below it, all else zero.
+    Returns how many pairs were changed and how many are closer than the alarm threshold. In order (n, n), it numbers
+    the former from 1 above the diagonal and the latter below it; all other entries are zero.
     """
     limits = RobotLimits(*limits_of)
     order[:] = 0
@@ -461,7 +463,7 @@ def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of:
 
 @portable
 def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: Order) -> int:
-    """Number the near pairs below the alarm threshold, below the diagonal; return how many there are."""
+    """Number the pairs closer than the alarm threshold below the diagonal of `order`; return their count."""
     alarms = 0
     for k in range(near.shape[0]):
         i, j = near[k, 0], near[k, 1]
@@ -492,7 +494,7 @@ def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLi
 
 @portable
 def reach(limits: RobotLimits) -> float:
-    """Return the distance beyond which no two robots come too near within the horizon."""
+    """Return the distance from which two robots cannot come too close within the horizon."""
     climb, speed = limits.climb_max_m_s, limits.speed_max_m_s
     fastest = 2.0 * math.sqrt(speed * speed + climb * climb)
     return limits.separation_min_m + fastest * (limits.guard_horizon_s + limits.response_s)
@@ -500,7 +502,7 @@ def reach(limits: RobotLimits) -> float:
 
 @portable
 def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
-    """Return the rate at which j leaves i along their line [m/s]."""
+    """Return the rate at which j moves away from i along their line [m/s]."""
     return dot(u_W, subtract(row(v_W, j), row(v_W, i)))
 
 

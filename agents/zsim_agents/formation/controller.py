@@ -21,16 +21,16 @@ from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.flight_check import GateInput
 from zsim_agents.formation.flight_plan import RequestError, read_request
 
-REQUESTS_MAX = 1000  # between two gates, as in a run that is paused; the next gate publishes them
+REQUESTS_MAX = 1000  # maximum number between two gates, e.g. while a run is paused; published at the next gate
 
-_variances_of = itemgetter(0, 7, 14)  # of the position, in the 6 x 6 covariance, row-major
+_variances_of = itemgetter(0, 7, 14)  # indices of the position's variances in the row-major 6 x 6 covariance
 
 
 class Controller(Agent):
     """Flies one cluster.
 
     Raises:
-        RunError: the scenario has no such cluster, or its plan can never be flown.
+        RunError: the scenario has no such cluster, or its plan is impossible.
     """
 
     def __init__(self, info: messages.Info, scenario: Scenario, cluster: str) -> None:
@@ -67,7 +67,7 @@ class Controller(Agent):
             self._grants.put(key, message)
         elif type(message) is flight_messages.Estimate:
             former = self._estimates[place]
-            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later
+            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime, an older estimate may arrive later
                 self._estimates[place] = message
         elif message.t_ns >= self._status_ns[place]:  # likewise
             self._states[place], self._status_ns[place] = message.state, message.t_ns
@@ -78,7 +78,10 @@ class Controller(Agent):
         self._seat(self._engagement.drones)
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
-        for request, answer in answered:  # since the last gate; a re-run of the record makes them before this one
+        for (
+            request,
+            answer,
+        ) in answered:  # requests since the last gate; a re-run of the record submits them before this gate
             key, of_request = self._request_key, (request.op, request.args, request.source)
             message = run_messages.ClusterRequest(
                 t_ns, self.next_seq(key), *of_request, answer.ok, answer.error, source
@@ -139,7 +142,7 @@ class Controller(Agent):
         self._fill(*positions, *velocities, *variances, *yaws, *yaw_sigmas, *ages_s)
         np.sqrt(self._sigma_m, self._sigma_m)
         p_W = self._p_W
-        if any(ages_s):  # old estimates are taken on at constant velocity; an age is infinite where there is none
+        if any(ages_s):  # extrapolated at constant velocity; the age of a missing estimate is infinite
             p_W = p_W + self._v_W * np.where(np.isfinite(self._age_s), self._age_s, 0.0)[:, None]
         sigmas = self._sigma_m, self._yaw_sigma
         return GateInput(t_ns * 1e-9, p_W, self._yaw, self._v_W, *sigmas, self._age_s, tuple(self._states))
@@ -216,6 +219,6 @@ _UNKNOWN = flight_messages.Estimate(
 def _finite(values: np.ndarray) -> tuple[float, ...]:
     """Return values for the wire, with non-finite ones replaced by zeros."""
     numbers = values.tolist()
-    if not math.isfinite(sum(numbers)):  # one of them is not, or the sum overflows
+    if not math.isfinite(sum(numbers)):  # one of them is not finite, or the sum overflows
         numbers = [number if math.isfinite(number) else 0.0 for number in numbers]
     return tuple(numbers)

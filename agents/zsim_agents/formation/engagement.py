@@ -1,7 +1,7 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
 A plain object: estimates in, commands out, once per gate; requests in between. Every engagement, resumption and
-reference is checked, every refusal has a reason, and every reference starts at the present state of the formation.
+reference is checked, every refusal gives its reason, and every reference starts at the formation's present state.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ from zsim_agents.formation.flight_plan import (
 from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
-DT_MAX_S = 0.1  # longest step of the integral, after a gap
-CLIMB_GAIN_1_S = 0.8  # of the climb to the assembly height
-HOLD_APART_M = 0.1  # a held formation is kept this much farther apart than the minimum
+DT_MAX_S = 0.1  # maximum step of the integral, after a gap
+CLIMB_GAIN_1_S = 0.8  # gain of the climb to the assembly height
+HOLD_APART_M = 0.1  # added to the minimum separation while a formation is held
 
 
 class Engagement:
@@ -69,10 +69,10 @@ class Engagement:
 
     Args:
         drones: names in the order of the robots.
-        plan: requests of the scenario; a requested landing drops the remaining ones.
+        plan: requests of the scenario; a requested landing drops those remaining.
 
     Raises:
-        ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
+        ValueError: the plan is impossible (see `FlightPlan`), or the number of names is not n.
     """
 
     def __init__(
@@ -98,14 +98,14 @@ class Engagement:
         self._phase = "idle"
         self._gate: GateInput | None = None
         self._dt_s = 0.0
-        self._modes: dict[str, float] = {}  # when a mode was commanded last, by drone
+        self._modes: dict[str, float] = {}  # time of the last mode command, by drone
         self._landing_s = -math.inf
-        self._fault = ""  # why an engaged formation does not close its loop
+        self._fault = ""  # why the loop of an engaged formation is open
         self._well_since_s = math.inf
-        self._assembly: Assembly | None = None  # while the drones fly to assigned places, or wait there
-        self._places: Places | None = None  # while the drones of a held formation are led back to them
-        self._checked = np.empty(0)  # the last reference without a fault; one at rest stays the same array
-        self._wrapped = self._checked, self._checked  # the last reference, and the same with wrapped angles
+        self._assembly: Assembly | None = None  # while drones fly to assigned positions or wait there
+        self._places: Places | None = None  # while drones of a held formation are led back
+        self._checked = np.empty(0)  # last valid reference; a constant one stays the same array
+        self._wrapped = self._checked, self._checked  # the last reference as it is and with wrapped angles
 
     @property
     def phase(self) -> str:
@@ -118,7 +118,7 @@ class Engagement:
         self._gate = gate
         self.check.observe(gate)
         self.plan.run(gate.t_s, self._try)
-        gate = self._gate  # with the drones in the order of the robots, which an assembly changes
+        gate = self._gate  # reordered if a request started an assembly
         if self._phase in ("assembling", "engaged") and gate.down:
             self._phase, self._places, self._assembly = "idle", None, None
         if self._phase == "engaged":
@@ -130,14 +130,14 @@ class Engagement:
             return self._climb(gate)
         if self._phase != "landing":
             return self._output(gate, "")
-        # a take-off sent just before may still be on its way: idle only after a while on the ground
+        # a take-off command may still be in transit: idle only after some time on the ground
         if gate.down and gate.t_s - self._landing_s >= RESEND_S:
             self._phase = "idle"
         modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
         return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
 
     def request(self, request: FlightRequest) -> str | None:
-        """Grant a request and return None, or return why it is refused without changing anything."""
+        """Grant a request and return None, or change nothing and return why it is refused."""
         refusal = self._try(request)
         if refusal is None and request is Order.LAND:
             self.plan.clear()
@@ -146,12 +146,12 @@ class Engagement:
         return refusal
 
     def warm_start(self, phase: str, desired: Array, plan_step: int = 0, drones: Sequence[str] = ()) -> None:
-        """Continue in the phase and at the reference (4n,) of a former process of this formation.
+        """Continue in the phase and at the reference (4n,) of this formation's previous process.
 
-        `drones`: names in the order of its robots, if that is not the scenario's.
+        `drones`: names in the order of its robots, if different from the scenario's.
 
-        Its plan continues after the completed steps, by the former `GateOutput.plan_step`; a target or trajectory of
-        the plan that was being flown is requested again from that reference.
+        Its plan continues after the steps completed according to the previous `GateOutput.plan_step`; a target or
+        trajectory of the plan that was in progress is requested again from that reference.
         """
         self._phase = "engaged" if phase == "held" else phase
         self._name(drones or self.drones)
@@ -182,7 +182,7 @@ class Engagement:
         }
 
     def restore(self, state: State, gate: GateInput | None) -> None:
-        """Take over the snapshot of another process and the last gate that it stepped."""
+        """Restore the snapshot of another process; `gate` is the last one it stepped."""
         self._phase, self._landing_s = state["phase"], state["landing_s"]
         self._name(state["drones"])
         self._assembly = state["assembly"] and Assembly.restored(state["assembly"], self.gains)
@@ -263,7 +263,7 @@ class Engagement:
         self._phase = "engaged"
 
     def _grant_assembly(self, request: Assemble, gate: GateInput) -> None:
-        """Assign the drones to the places of a formation, and start their flight there."""
+        """Assign the drones to the positions of a formation, and start their flight there."""
         if self._phase not in ("assembling", "engaged") or self._fault:
             raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
         if fault := self._way_left(gate) or self.check.assembly_fault(gate):
@@ -284,7 +284,7 @@ class Engagement:
         self.drones = self.law.robots = self.check.drones = tuple(drones)
 
     def _way_left(self, gate: GateInput) -> str | None:
-        """Return a text on the remaining flight of the drones to their places."""
+        """Return how far the drones still are from their positions, None if they have arrived."""
         if self._assembly is None or self._assembly.arrived(gate.p_W):
             return None
         i, away_m = self._assembly.farthest(gate.p_W)
@@ -294,11 +294,11 @@ class Engagement:
         return Places(p_W, self.gains, self._held_limits, SHAPE.share)
 
     def _unflyable(self, gate: GateInput) -> str | None:
-        """Return why the drones cannot be led one by one."""
+        """Return why the drones cannot be led individually."""
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
     def _mode_commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
-        """Return a mode command for each drone in one of the states, once per RESEND_S."""
+        """Return mode commands for drones in one of the states, at most once per RESEND_S each."""
         due = []
         for drone, state in zip(self.drones, gate.states, strict=True):
             if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= RESEND_S:
@@ -307,7 +307,7 @@ class Engagement:
         return tuple(due)
 
     def _climb(self, gate: GateInput) -> GateOutput:
-        """Lead the flying drones vertically to the assembly height, each by its own velocity loop."""
+        """Lead the airborne drones vertically to the assembly height, without formation control."""
         modes: tuple[ModeCommand, ...] = ()
         reason = self.check.state_fault(gate, AIRBORNE) if self._phase == "taking_off" else None
         if reason:
@@ -320,7 +320,7 @@ class Engagement:
         return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
 
     def _assemble(self, gate: GateInput, assembly: Assembly) -> GateOutput:
-        """Lead the drones to their places without turning; all stop if one cannot be flown."""
+        """Lead the drones to their positions without turning; all stop if one cannot be controlled."""
         if fault := self._unflyable(gate):
             return self._output(gate, fault, command=self._upright(gate, 0.0, self.gains.limits))
         assembly.advance(gate.p_W, self._dt_s)
@@ -329,9 +329,9 @@ class Engagement:
         return self._output(gate, reason, command=command)
 
     def _judge(self, gate: GateInput) -> None:
-        """Set the fault of an engaged formation, or clear it after a time without faults."""
+        """Set the fault of an engaged formation, or clear it after HEAL_S without a fault."""
         fault = self._way_fault(gate) or self.check.flight_fault(gate)
-        if not fault and not self._fault:  # the checks before the flight cover a limited time of the reference
+        if not fault and not self._fault:  # the check at the request covers only part of an endless reference
             try:
                 c_des = self.guidance.value(gate.t_s)[0]
                 if c_des is not self._checked:
@@ -355,7 +355,7 @@ class Engagement:
                 self.law.reset()
 
     def _way_fault(self, gate: GateInput) -> str | None:
-        """Return which led drone has not reached its place; stop leading the drones if one is unflyable."""
+        """Return which led drone is not yet in position; stop leading if one cannot be controlled."""
         if self._places is None:
             return None
         if self._unflyable(gate):
@@ -376,7 +376,7 @@ class Engagement:
         return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
     def _hold(self, gate: GateInput) -> GateOutput:
-        """Keep the drones of a held formation in place, or lead them to their places without turning."""
+        """Hold the drones of a held formation, or lead them to their positions, without turning."""
         if self._places is None:
             command = self._upright(gate, 0.0, self._held_limits)
         else:
@@ -384,12 +384,12 @@ class Engagement:
         return self._output(gate, self._fault, command=command)
 
     def _guarded(self, gate: GateInput, v_W: Array, limits: RobotLimits) -> FormationCommand:
-        """Return the command of velocities (n, 3) [m/s, W] without turning."""
+        """Return a guarded command of velocities (n, 3) [m/s, W] with zero yaw rates."""
         v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
 
     def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
-        """Return guarded climb rates (n,) without turning; zero if the estimates are not flyable."""
+        """Return a guarded command of climb rates (n,) with zero yaw rates; all zero if estimates are unusable."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
         if self.check.estimate_fault(gate) is None:
@@ -406,7 +406,7 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference the desired value is the present one."""
+        """Return the output of a gate; without a reference, the desired value is the estimated one."""
         if command and command.alarmed:
             near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
             reason = f"{TOO_NEAR}, {near}; {reason}"
@@ -428,7 +428,7 @@ class Engagement:
         )
 
     def _is_led(self) -> bool:
-        """Tell whether the drones fly a reference begun by a step of the plan."""
+        """Return whether the drones are following a reference or an assembly."""
         return self._assembly is not None or (self._phase == "engaged" and not self.guidance.paused)
 
     def _pairs(self, pairs: Pairs) -> str:

@@ -24,7 +24,7 @@ CONSTANTS = {"pi": math.pi, "e": math.e}
 
 
 class ExpressionError(ValueError):
-    """An expression is not allowed or has no finite value; the message names variable, finding and remedy."""
+    """An expression that is not allowed or not finite; the message names variable, finding and remedy."""
 
     def __init__(self, finding: str, name: str = "") -> None:
         super().__init__(f"{name}: {finding}" if name else finding)
@@ -161,7 +161,7 @@ def _divide(a: Dual, b: Dual) -> Dual:
 
 
 def _in_domain(value: float) -> float:
-    if not math.isfinite(value):  # before min or max could pass over it
+    if not math.isfinite(value):  # before min or max can hide it
         raise ValueError("outside of the domain of a function")
     return value
 
@@ -176,7 +176,7 @@ def _power(a: Dual, b: Dual) -> Dual:
 def _unary(
     function: Callable[[float], float], rate_of: Callable[[float, float, float], float]
 ) -> Callable[[Dual], Dual]:
-    """Return a function of a dual number; `rate_of` takes argument, value and a rate of the argument that is not 0."""
+    """Return a function of a dual number; `rate_of` takes the argument, the value and the argument's non-zero rate."""
 
     def apply(a: Dual) -> Dual:
         value = _in_domain(function(a[0]))
@@ -196,7 +196,7 @@ _UNARY: dict[type[ast.unaryop], Callable[[Dual], Dual]] = {
     ast.USub: _unary(operator.neg, lambda x, y, rate: -rate),
     ast.UAdd: _unary(operator.pos, lambda x, y, rate: rate),
 }
-_FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {  # with the least and greatest number of arguments
+_FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {  # with minimum and maximum number of arguments
     "sin": (_unary(el.sin, lambda x, y, rate: el.cos(x) * rate), 1, 1),
     "cos": (_unary(el.cos, lambda x, y, rate: -el.sin(x) * rate), 1, 1),
     "tan": (_unary(el.tan, lambda x, y, rate: (1 + y * y) * rate), 1, 1),

@@ -1,4 +1,4 @@
-"""Checks whether a formation may take off, be engaged or continue, and where it may be led; faults are texts.
+"""Checks whether a formation may take off, be engaged or continue, and where it may be led; faults are strings.
 
 The data of a gate are Structs, which cost a fifth of the time of a named tuple or dataclass.
 """
@@ -19,12 +19,12 @@ from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
-FAR = 1e6  # m or rad: beyond it a value is a mistake
-ROUNDING_M = 1e-9  # of a place computed from variables (1e-14 at 50 m): the limit itself is allowed
+FAR = 1e6  # m, m/s or rad: larger values are mistakes
+ROUNDING_M = 1e-9  # above the rounding of computed positions (1e-14 at 50 m), so that the limit itself is allowed
 VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
 DOWN = frozenset({"landed", "emergency"})  # states of a drone on the ground, or falling
-HELD_ON_REQUEST = "held on request"  # reasons of a formation, from which a display derives the possible requests
+HELD_ON_REQUEST = "held on request"  # this and the next: reasons from which displays derive the possible requests
 READY_TO_ENGAGE = "ready to engage"
 GUARD_PARTS = "the guard parts"
 TOO_NEAR = "ALARM"
@@ -39,50 +39,54 @@ class ShapeLimits:
         spread_min_m: minimum height of the shape.
         tilt_max_rad: maximum roll and pitch of the formation.
         condition_max: maximum condition number of J^-1.
-        height_min_m: minimum height of a robot's reference over the ground, z_W = 0.
+        height_min_m: minimum height of a robot's reference above the ground, z_W = 0.
         share: share of the robots' speed limits that a reference may use; the rest is for the law.
     """
 
-    spread_min_m: float = 1.0  # chosen: five sigma of a side's estimate keep robots out of one line
+    spread_min_m: float = 1.0  # chosen: five sigma of the estimate of a side keep the robots from being collinear
     tilt_max_rad: float = math.radians(30.0)  # chosen: far from the 90 deg where Euler angles fail
-    condition_max: float = 20.0  # chosen: beyond it a small motion in cluster space is a large one of a robot
+    condition_max: float = 20.0  # chosen: above it, small motions in cluster space are large motions of robots
     height_min_m: float = 0.5  # chosen: five rotor radii, above most of the ground effect
-    share: float = 0.8  # chosen
+    share: float = 0.8  # chosen: a fifth for the law
 
 
-# All chosen, the shape's so that no formation comes near a singularity
+# All chosen; those of the shape keep formations away from singularities
 SHAPE = ShapeLimits()
-FLIGHT_SLACK = 1.5  # of spread and tilt in flight, so that noise at the limit does not hold the formation
-SHAPE_IN_FLIGHT = dataclasses.replace(  # beyond it a formation in flight is held
+FLIGHT_SLACK = 1.5  # of the limits of spread and tilt in flight, so that noise near them does not hold the formation
+SHAPE_IN_FLIGHT = dataclasses.replace(  # a formation in flight outside of these is held
     SHAPE,
     spread_min_m=SHAPE.spread_min_m / FLIGHT_SLACK,
     tilt_max_rad=SHAPE.tilt_max_rad * FLIGHT_SLACK,
     condition_max=math.inf,
 )
-ASSEMBLY_HEIGHT_M = 1.5  # to which drones climb straight up before engagement: many rotor radii, and a fall withstood
-ASSEMBLY_WITHIN_M = 0.3  # three sigma of the barometer
-ASSEMBLY_CLIMB_M_S = 0.5  # greatest: half of what the firmware allows, so that all drones climb equally
-AGE_MAX_S = 0.5  # of an estimate that is flown on, as long as the firmware tolerates silence: 25 gates
-IN_FLIGHT_FACTOR = 2.0  # by which sigmas may be greater in flight; of a position: 2 m, as of a single GPS fix
-HEAL_S = 0.5  # without fault, after which a held formation goes on: 25 gates are no coincidence
-RESEND_S = 1.0  # after which a mode command without effect is sent again: ten times their delay in the paper's scenario
+ASSEMBLY_HEIGHT_M = (
+    1.5  # drones climb vertically to it before engagement: many rotor radii, and a drone survives the fall
+)
+ASSEMBLY_WITHIN_M = 0.3  # tolerance of that height: three sigma of the barometer
+ASSEMBLY_CLIMB_M_S = 0.5  # maximum: half of what the firmware allows, so that all drones climb alike
+AGE_MAX_S = 0.5  # maximum age of an estimate in flight, as long as the firmware tolerates silence: 25 gates
+IN_FLIGHT_FACTOR = 2.0  # of the maximum sigmas in flight; for a position 2 m, as for a single GPS fix
+HEAL_S = 0.5  # time without fault after which a held formation continues: 25 gates are no coincidence
+RESEND_S = (
+    1.0  # a mode command without effect is repeated after it: ten times the command delay in the paper's scenario
+)
 
 
 @dataclass(frozen=True)
 class EngagementLimits:
     """Maximum standard deviations for take-off and engagement."""
 
-    sigma_max_m: float = 1.0  # half of the least separation of 2 m
+    sigma_max_m: float = 1.0  # half of the minimum separation of 2 m
     yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
 
 
 class GateInput(Struct, eq=False):
-    """The newest estimates of n drones at a gate; its arrays may be overwritten for the next.
+    """The newest estimates of n drones at a gate; the arrays may be overwritten at the next gate.
 
     Attributes:
         p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where unknown.
         sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
-        age_s: (n,) ages of the estimates; infinite where there is none.
+        age_s: (n,) ages of the estimates; infinite for a drone without an estimate.
         states: (n,) `state` of each drone's sensor/status.
     """
 
@@ -96,13 +100,13 @@ class GateInput(Struct, eq=False):
     states: tuple[str, ...]
 
     def of(self, order: NDArray[np.intp]) -> GateInput:
-        """Return the gate with the robots in another order, given as (n,) present indices."""
+        """Return the gate with its drones reordered; order (n,) holds their present indices."""
         motion = self.p_W[order], self.yaw[order], self.v_W[order]
         known = self.sigma_m[order], self.yaw_sigma[order], self.age_s[order]
         return GateInput(self.t_s, *motion, *known, tuple(self.states[k] for k in order.tolist()))
 
     @property
-    def down(self) -> bool:  # no drone is in the air
+    def down(self) -> bool:  # no drone is airborne
         return DOWN.issuperset(self.states)
 
 
@@ -119,7 +123,7 @@ class Setpoint(Struct, eq=False):
 
 
 def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | None, ...]:
-    """Return setpoints from velocities (n, 3) and yaw rates (n,), None for a drone that does not follow setpoints."""
+    """Return setpoints from velocities (n, 3) and yaw rates (n,), None for drones that do not follow them."""
     every = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
     if AIRBORNE.issuperset(gate.states):
         return tuple(every)
@@ -150,10 +154,10 @@ class GateOutput(Struct, eq=False):
 
 
 class FlightCheck:
-    """Checks the estimates and states of a gate; each check returns the fault, or None.
+    """Checks the estimates and states of a gate; each check returns a fault or None.
 
     Attributes:
-        value: (4n,) cluster of the newest estimates that had a frame, zero before any.
+        value: (4n,) cluster of the newest estimates that had a frame, initially zero.
         margin: its `ClusterSpace.margin` [m], 0 while the estimates have no frame.
     """
 
@@ -166,7 +170,7 @@ class FlightCheck:
         self.margin = 0.0
         self._spread = 0.0
         self._no_frame: str | None = "nothing was observed yet"
-        self._flaw = (VALID, 0)  # of the estimates of the gate that was observed, by the limits in flight
+        self._flaw = (VALID, 0)  # of the observed estimates, by the limits in flight
         sigmas = limits.sigma_max_m, limits.yaw_sigma_max_rad
         self._at_start = (AGE_MAX_S, *sigmas)
         self._in_flight = (AGE_MAX_S, *(IN_FLIGHT_FACTOR * sigma for sigma in sigmas))
@@ -184,9 +188,9 @@ class FlightCheck:
             self._no_frame = str(error)
 
     def take_off_fault(self, gate: GateInput, assembles: bool = False) -> str | None:
-        """Return why the drones may not take off; the positions of drones already in flight do not matter.
+        """Return why the drones may not take off; airborne drones are not checked for their positions.
 
-        `assembles`: whether they will be led to assigned places, so that they may start in any shape.
+        `assembles`: they will be led to assigned positions, so they may start in any shape.
         """
         fault = self._start_fault(gate, AIRBORNE | {"landed"})
         if fault or "landed" not in gate.states:
@@ -197,7 +201,7 @@ class FlightCheck:
         return self.assembly_fault(gate) or self.formation_fault(gate)
 
     def assembly_fault(self, gate: GateInput) -> str | None:
-        """Return why the drones cannot be led one by one after their climb."""
+        """Return why the drones cannot be led individually after their climb."""
         if fault := self._start_fault(gate, AIRBORNE):
             return fault
         low = int(np.argmin(gate.p_W[:, 2]))
@@ -207,7 +211,7 @@ class FlightCheck:
         return None
 
     def flight_fault(self, gate: GateInput) -> str | None:
-        """Return why the loop of an engaged formation cannot be closed."""
+        """Return why the control loop of an engaged formation cannot be closed."""
         fault = self.state_fault(gate, AIRBORNE) or self.estimate_fault(gate) or self._no_frame
         is_wide = self._spread > SHAPE_IN_FLIGHT.spread_min_m
         if fault or (is_wide and first_outside(self.value, self._bounds_in_flight) < 0):
@@ -268,7 +272,7 @@ def _first_flaw(gate: GateInput, age_max_s: float, sigma_max_m: float, yaw_sigma
 
 @portable
 def all_near(p_W: Array, yaw: Array) -> bool:
-    """Tell whether all positions (n, 3) and headings (n,) are finite and below FAR."""
+    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR."""
     fit = True
     for i in range(yaw.size):
         fit = fit and near(p_W, i) and abs(yaw[i]) < FAR
@@ -277,7 +281,7 @@ def all_near(p_W: Array, yaw: Array) -> bool:
 
 @portable
 def near(vectors: Array, i: int) -> bool:
-    """Tell whether row i of (n, 3) is finite and below FAR; false for NaN."""
+    """Return whether row i of (n, 3) is finite and below FAR; false for NaN."""
     return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
 
 
@@ -293,9 +297,9 @@ def estimate_flaw(
     sigma_max_m: float,
     yaw_sigma_max: float,
 ) -> tuple[int, int]:
-    """Return the flaw of the first unusable estimate, and its drone; VALID if there is none.
+    """Return the flaw of the first unusable estimate and the index of its drone; (VALID, 0) if all are usable.
 
-    UNCERTAIN is of the position, TURNED of the heading.
+    UNCERTAIN: sigma of the position; TURNED: sigma of the heading.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
@@ -311,9 +315,9 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why c is not a shape to engage in or to lead to (quantity, value and limit), or None.
+    """Return why a formation may not be engaged in c or led to it (quantity, value and limit), or None.
 
-    `spread` is that of c, if already known.
+    `spread` is the spread of c, if already computed.
     """
     outside = first_outside(c, space.bounds)
     if outside >= 0:
@@ -336,7 +340,7 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: floa
 
 
 def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
-    """Return the open bounds (4n, 2) within which `shape_fault` finds no fault, apart from the condition."""
+    """Return the open bounds (4n, 2) within which `shape_fault` finds no fault except in spread and condition."""
     bounds = space.bounds.copy()
     for k in space.tilts:
         bounds[k, 0] = max(bounds[k, 0], -limits.tilt_max_rad)
@@ -354,12 +358,12 @@ def first_outside(c: Array, bounds: Array) -> int:
 
 
 def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the formation may not be led to c, because of its shape or its robots' places, or None."""
+    """Return why the formation may not be led to c, because of its shape or its robots' positions, or None."""
     return shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the robots' places in c are not allowed (too close to each other, or too low), or None."""
+    """Return why the robots' positions in c are not allowed (too close to each other, too low), or None."""
     p_W, _ = space.inverse(c)
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None

@@ -1,4 +1,4 @@
-"""Requests to a formation by a user or a scenario, and the plan of a scenario: requests and when they are due."""
+"""Requests to a formation by a user or a scenario, and the plan of a scenario: its requests with their due times."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from zsim_agents.formation.trajectory import (
     named_values,
 )
 
-RETRY_S = 0.5  # between two tries of a request that was refused
+RETRY_S = 0.5  # interval between attempts of a refused request
 WAITS = " of the plan waits: "  # in the note of a plan, between the step and the reason
 
 
@@ -32,11 +32,11 @@ class RefusalError(ValueError):
 
 
 class PlanError(ValueError):
-    """A plan can never be flown; the message begins with the path of the wrong value, from `plan`."""
+    """An impossible plan; the message starts with the path of the wrong value, from `plan`."""
 
 
 class RequestError(ValueError):
-    """A request cannot be understood; the message names the field, finding and remedy."""
+    """A request is malformed; the message names the field, finding and remedy."""
 
 
 REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError)
@@ -45,16 +45,16 @@ REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError
 class Order(Enum):
     """A request without parameters, by its name on the wire."""
 
-    TAKE_OFF = "takeoff"  # all drones; they climb straight up to the assembly height
-    ENGAGE = "engage"  # close the formation loop at the present estimate, or resume after a hold
-    PAUSE = "hold"  # stand still in formation until engaged again
-    REJOIN = "rejoin"  # lead the drones of a formation held by a fault back to their places, each by itself
+    TAKE_OFF = "takeoff"  # all drones; they climb vertically to the assembly height
+    ENGAGE = "engage"  # close the formation loop at the present estimate, or resume after a hold on request
+    PAUSE = "hold"  # hover in formation until engaged again
+    REJOIN = "rejoin"  # lead the drones of a formation held by a fault individually to their positions
     LAND = "land"  # all drones where they are
 
 
 @dataclass(frozen=True)
 class MoveTo:
-    """Move the formation to values by name, in over_s or as fast as the limits let it; `target` on the wire."""
+    """Move the formation to values by name, in over_s or as fast as allowed; `target` on the wire."""
 
     values: Mapping[str, str | float] = field(default_factory=dict)
     over_s: float | None = None
@@ -73,8 +73,8 @@ class Follow:
     Attributes:
         expressions, constants, duration_s: see `ExpressionTrajectory`; or
         waypoints: see `WaypointTrajectory`.
-        start_s: simulated time of the trajectory's t = 0; None: the arrival of the formation. A formation that arrives
-            later joins the moving trajectory.
+        start_s: simulated time of the trajectory's t = 0; None: when the formation arrives. A formation that
+            arrives later joins the moving trajectory.
     """
 
     expressions: Mapping[str, str | float] = field(default_factory=dict)
@@ -97,9 +97,9 @@ class Follow:
 
 @dataclass(frozen=True)
 class Assemble:
-    """Move each drone to an assigned place of a formation; `assemble` on the wire.
+    """Move each drone to its assigned position in a formation; `assemble` on the wire.
 
-    The formation is given by names and values, as in `MoveTo`. A further request engages it.
+    The formation is given by names and values, as in `MoveTo`. It is engaged by a separate request.
     """
 
     values: Mapping[str, str | float] = field(default_factory=dict)
@@ -110,9 +110,9 @@ FlightRequest = Order | MoveTo | Follow | Assemble
 
 @dataclass(frozen=True)
 class Scheduled:
-    """A request due at simulated time at_s, and repeated until it is granted.
+    """A request due at simulated time at_s and repeated until it is granted.
 
-    `path` is its place in the cluster's section of the scenario.
+    `path` is its path in the cluster's section of the scenario.
     """
 
     at_s: float
@@ -121,15 +121,15 @@ class Scheduled:
 
 
 class FlightPlan:
-    """Requests in order; each waits for the previous ones, except Order.LAND, which drops them.
+    """Requests in order; each waits for the previous ones, except Order.LAND, which drops those before it.
 
-    A restarted controller continues at `resume_at` of the former one.
+    A restarted controller continues at `resume_at` of its predecessor.
 
     Attributes:
-        note: why the plan waits, empty if it does not.
+        note: the waiting request and why it is refused; empty if none waits.
 
     Raises:
-        PlanError: a request can never be granted (unknown name, bad expression), or times decrease.
+        PlanError: a request is invalid (unknown name, bad expression), or times decrease.
     """
 
     def __init__(self, space: ClusterSpace, steps: Sequence[Scheduled] = ()) -> None:
@@ -158,7 +158,7 @@ class FlightPlan:
                 raise PlanError(f"{path}{text}") from None
         self._steps = tuple(steps)
         self._next = 0  # first step that is not completed
-        self._flown = 0  # first of the steps that make up the reference flown now, _next where none does
+        self._flown = 0  # first step of the reference in progress; _next if it does not come from the plan
         self._try_s = -math.inf
         self.note = ""
 
@@ -181,11 +181,11 @@ class FlightPlan:
 
     @property
     def assembles(self) -> bool:
-        """Tell whether an assembly is still ahead, so that the drones may start anywhere."""
+        """Whether an assembly is still ahead, so that the drones may start in any shape."""
         return any(isinstance(step.request, Assemble) for step in self._steps[self._next :])
 
     def resume_at(self, flying: bool) -> int:
-        """Return the number of steps that a restart skips: the completed ones, without those flown now."""
+        """Return the number of steps that a restart skips: those completed, except those in progress."""
         return self._flown if flying else self._next
 
     def start_at(self, step: int) -> None:
@@ -213,7 +213,7 @@ class FlightPlan:
 
 
 def waiting_step(reason: str) -> tuple[str, str] | None:
-    """Return the waiting step of the plan and its reason, read from a cluster state's reason; None if none waits."""
+    """Return the waiting step of the plan and its reason, parsed from a cluster state's reason; None if none waits."""
     before, waits, why = reason.rpartition(WAITS)
     return (before.rpartition("; ")[2], why) if waits else None
 
@@ -241,7 +241,7 @@ def plan_of(cluster: Cluster) -> list[Scheduled]:
     return steps
 
 
-_FIELDS = {  # of the requests with parameters, by their operation on the wire
+_FIELDS = {  # fields of the requests with parameters, by operation on the wire
     "target": {"values": "a map of numbers by variable", "over_s": "a number of seconds"},
     "trajectory": {
         "expressions": "a map of expressions by variable",
@@ -263,7 +263,7 @@ def read_request(op: object, args: object = None) -> FlightRequest:
     """Return the request of an operation on the wire, e.g. ("target", {"values": {"z_c": 12.0}}).
 
     Raises:
-        RequestError: unknown operation or field, or a field of a wrong type.
+        RequestError: an unknown operation or field, or a field of the wrong type.
     """
     if not isinstance(op, str) or op not in OPERATIONS:
         raise RequestError(f"op {str(op)[:40]!r} is unknown; allowed: {', '.join(OPERATIONS)}")

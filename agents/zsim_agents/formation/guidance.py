@@ -24,19 +24,19 @@ from zsim_agents.formation.trajectory import (
 
 SAMPLE_S = 0.5  # at 2 m/s a robot moves 1 m between two samples
 SAMPLES_MIN, SAMPLES_MAX = 41, 301
-HORIZON_S = 600.0  # of an endless trajectory that is checked before; the rest is checked while it is flown
+HORIZON_S = 600.0  # of an endless trajectory, checked at the request; the rest is checked in flight
 RAMP_MIN_S, RAMP_MAX_S = 2.0, 3600.0
-RAMP_GROWTH = 1.2  # least step of the search for a ramp that is slow enough
-RAMP_SAMPLES = 33  # odd: one falls on the peak rate of a ramp, its middle
-LOAD_TOLERANCE = 1.02  # of the share: ramps are sampled, and one may start at the limit
-BENEATH_M = 1.0  # horizontally; a robot nearer to its place than this climbs or sinks to it; chosen
-IN_PLACE_M = 1.0  # from its place, where a robot joins the formation; chosen: half of the least separation
+RAMP_GROWTH = 1.2  # minimum step of the search for a ramp that satisfies the limits
+RAMP_SAMPLES = 33  # odd, so that one is in the middle of a ramp, where its rate peaks
+LOAD_TOLERANCE = 1.02  # factor of the share: ramps are sampled, and one may start at the limit
+BENEATH_M = 1.0  # chosen: horizontal distance to its position within which a robot climbs or descends to it
+IN_PLACE_M = 1.0  # chosen: a robot this close to its position joins the formation; half of the minimum separation
 
 
 class Guidance:
     """The reference of an engaged formation, a function of simulated time.
 
-    The formation's home (its target or trajectory) is kept separately from what is flown now (a ramp onto it). A
+    The formation's home (its target or trajectory) is kept separately from the present reference (a ramp onto it). A
     variable that a request does not name keeps its goal: the value of the last request that named it; initially its
     value at engagement, or zero for the neutral ones (roll, pitch, phi_i, w_k).
 
@@ -55,20 +55,20 @@ class Guidance:
         self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last result of `value`
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        """Return c_des and its rate, each (4n,); computed once per gate."""
+        """Return c_des and its rate, each (4n,); cached per gate."""
         if self._known is None or self._known[0] is not self._flown or self._known[1] != t_s:
             self._known = (self._flown, t_s, self._flown.value(t_s))
         return self._known[2]
 
     def trajectory_t_s(self, t_s: float) -> float | None:
-        """Return the trajectory's own time [s], None without a running trajectory."""
+        """Return the time since the start of the trajectory [s], None if none is running."""
         if not isinstance(self._home, Shifted) or self.paused:
             return None
         own_s, end_s = t_s - self._home.start_s, self._home.of.duration_s
         return own_s if own_s >= 0.0 and (end_s is None or own_s <= end_s) else None
 
     def engage(self, c: Array) -> None:
-        """Start at the estimate c (4n,) and stay there."""
+        """Start at the estimate c (4n,) and hold it."""
         self._goal = c.copy()
         self._goal[self.space.neutral] = 0.0
         self._home = self._flown = Hold(c)
@@ -98,7 +98,7 @@ class Guidance:
         self._home, self.paused = home, False
 
     def pause(self, t_s: float) -> None:
-        """Come to rest near the present reference; immediately if there is no room for a ramp."""
+        """Come to rest near the present reference, or immediately if no ramp is allowed."""
         c, c_dot = self.value(t_s)
         try:
             self._flown = self._planner.ramp((c, c_dot), Hold(c), t_s)
@@ -107,7 +107,7 @@ class Guidance:
         self.paused = True
 
     def resume(self, t_s: float) -> None:
-        """Continue to the home after a pause."""
+        """Return to the home after a pause."""
         self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
@@ -144,12 +144,12 @@ class RampPlanner:
         self._space, self._gains, self._limits = space, gains, limits
 
     def ramp(self, start: tuple[Array, Array], onto: Reference, start_s: float, over_s: float | None = None) -> Ramp:
-        """Return the ramp from start (c, c_dot) onto a reference, within over_s or as fast as the limits allow.
+        """Return the ramp from start (c, c_dot) onto a reference, in over_s or as fast as the limits allow.
 
-        The ramp and up to 600 s of the reference after it are checked.
+        The ramp and up to HORIZON_S of the reference are checked.
 
         Raises:
-            TrajectoryError: the ramp is too fast or too long, or leads through a state that is not allowed.
+            TrajectoryError: the ramp is too fast or too long, or passes through a forbidden state.
         """
         from_s = max(start_s, onto.start_s) if isinstance(onto, Shifted) else start_s
         end_s = min(math.inf if onto.duration_s is None else onto.duration_s, from_s + HORIZON_S)
@@ -173,7 +173,7 @@ class RampPlanner:
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
-        """Return the fastest ramp within speed limits, its path unchecked; TrajectoryError: it takes over an hour."""
+        """Return a fast ramp within the speed limits, its path unchecked; TrajectoryError: it takes over an hour."""
         over_s = RAMP_MIN_S
         while over_s <= RAMP_MAX_S:
             ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
@@ -192,7 +192,7 @@ class RampPlanner:
         return load(*robot_rates(self._space, c, c_dot), self._gains.limits)
 
     def reference_fault(self, reference: Reference, from_s: float, to_s: float) -> str | None:
-        """Return why a reference may not be flown from from_s to to_s, or None; sampled 41 to 301 times."""
+        """Return why a reference is not allowed from from_s to to_s, or None; sampled 41 to 301 times."""
         count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
         count = count if to_s > from_s else 1
         for t_s in np.linspace(from_s, to_s, count).tolist():
@@ -206,11 +206,11 @@ class RampPlanner:
 
 
 class Places:
-    """The places p_W (n, 3) [m] of the robots of a held formation, and the motion of each robot to its place.
+    """Positions p_W (n, 3) [m, W] of the robots in a held formation, and the motion of each robot to its own.
 
-    A robot far from its place (for example after landing and taking off again) makes a shape that cannot be led as a
-    formation. It first flies horizontally at its own height, below or above the others, then vertically, at a share of
-    the robots' limits.
+    With a robot far from its position (for example after landing and taking off again), the shape cannot be controlled
+    as a formation. The robot first flies horizontally at its present height, below or above the others, then
+    vertically, at a share of the robots' limits.
     """
 
     def __init__(self, p_W: Array, gains: FormationGains, limits: RobotLimits, share: float) -> None:
@@ -228,6 +228,6 @@ class Places:
         return v_W
 
     def farthest(self, p_W: Array) -> tuple[int, float]:
-        """Return the index of the robot farthest from its place, and the distance [m]."""
+        """Return the index of the robot farthest from its position, and the distance [m]."""
         away_m = np.linalg.norm(self.p_W - p_W, axis=1)
         return int(np.argmax(away_m)), float(away_m.max())

@@ -1,6 +1,6 @@
-"""References in cluster space: a value and its rate for every instant.
+"""References in cluster space: a value and its rate at any time.
 
-Time is in seconds from the start of the reference; outside [0, duration_s] a reference stands still at the nearest
+Time is in seconds from the start of the reference; outside [0, duration_s] a reference rests at the nearest
 end. Angles are continuous in time, not wrapped. Users give values by the names of variables: in metres and radians, or
 in degrees as NAME_deg.
 """
@@ -22,13 +22,15 @@ from zsim_agents.formation.expression import Expression, ExpressionError, finite
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
 
 DEGREES = "_deg"
-ANGLE_MAX_RAD = TAU + 1e-3  # a full turn as typed with four digits; a target beyond it is meant in degrees
+ANGLE_MAX_RAD = (
+    TAU + 1e-3
+)  # a full turn with the rounding of four digits; larger targets were probably meant in degrees
 
 
 class TrajectoryError(ValueError):
-    """A trajectory is not possible as written; the message names the place, finding and remedy.
+    """An invalid trajectory; the message names the location, finding and remedy.
 
-    `at` is the path of the value below the target or the trajectory, empty for the whole.
+    `at` is the path of the value below the target or trajectory; empty: the target or trajectory itself.
     """
 
     def __init__(self, finding: str, where: str = "", at: str = "") -> None:
@@ -38,7 +40,7 @@ class TrajectoryError(ValueError):
 
 
 class Variables(Protocol):
-    """What a reference has to know of its variables; of a cluster space, or the place of one drone."""
+    """The variables of a reference: those of a cluster space, or position and heading of one drone."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -52,7 +54,7 @@ class Variables(Protocol):
 
 
 class Reference(Protocol):
-    """A motion in cluster space; duration_s is the time after which it stands still, None where it never does.
+    """A motion in cluster space; duration_s is the time after which it rests, None if it never does.
 
     `value` returns c and its exact derivative c_dot, each (4n,), at t_s.
     """
@@ -91,12 +93,12 @@ class Shifted:
 
 
 class ExpressionTrajectory:
-    """Variables as expressions of t; variables without one stay at base (4n,).
+    """Variables as expressions of t; those without an expression stay at base (4n,).
 
     Args:
         expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4, "yaw_deg": "6*t"}.
         constants: user constants by name, e.g. {"f": 0.01}.
-        duration_s: end of the motion, None for none.
+        duration_s: end of the motion; None: it does not end.
 
     Attributes:
         arguments: constructor arguments by name, as plain values.
@@ -150,8 +152,8 @@ class ExpressionTrajectory:
 class WaypointTrajectory:
     """Waypoints joined by cubics with the slopes of PCHIP: C1, at rest at both ends, without overshoot.
 
-    A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name stay as in the one before
-    (in the first: as in base). Angles that wrap turn by the shorter way.
+    A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name keep their value in the
+    previous one (the first: in base). Angles that wrap turn the shorter way.
 
     Raises:
         TrajectoryError: names the waypoint and its fault.
@@ -181,7 +183,9 @@ class WaypointTrajectory:
         self._places = np.array(places)
         self._slopes = np.zeros_like(self._places)
         if len(places) > 2:
-            from scipy.interpolate import PchipInterpolator  # here, because it takes longer to load than all else
+            from scipy.interpolate import (
+                PchipInterpolator,
+            )  # imported here, because it takes longer to load than all else
 
             self._slopes[1:-1] = PchipInterpolator(self._times, self._places)(self._times[1:-1], 1)
         self.duration_s: float | None = self._times[-1]
@@ -205,8 +209,8 @@ class WaypointTrajectory:
 class Ramp:
     """A smooth transition from a state of motion onto another, possibly moving reference; see `ramp_onto`.
 
-    c(t) = onto(t) + the offset of the start, which a quintic takes to zero with its first and second derivative. On a
-    reference at rest, from rest, this is the minimum-jerk move. It runs in [start_s, start_s + over_s] of the time of
+    c(t) = onto(t) + offset(t): a quintic takes the initial offset to zero with its first and second derivative. From
+    rest onto a reference at rest, this is the minimum-jerk move. It runs in [start_s, start_s + over_s] of the time of
     `onto`; offset and offset_rate, (4n,), are c and c_dot at start_s minus those of onto.
     """
 
@@ -246,7 +250,7 @@ def put_ramped(
 
 
 def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
-    """Return the ramp from c, moving at c_dot, at start_s onto a reference within over_s; angles by the shorter way."""
+    """Return the ramp from c, moving at c_dot, at start_s onto a reference in over_s; angles turn the shorter way."""
     c_onto, c_dot_onto = onto.value(start_s)
     return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)
 
@@ -261,7 +265,7 @@ _KINDS: dict[str, Any] = {
 
 
 def state_of(reference: Reference) -> State:
-    """Return a reference of this module as plain values; TypeError: it is not of this module."""
+    """Return a reference as plain values; TypeError: its class is not one of this module."""
     for kind, known in _KINDS.items():
         if type(reference) is known:
             arguments = getattr(reference, "arguments", None) or vars(reference)
@@ -271,7 +275,7 @@ def state_of(reference: Reference) -> State:
 
 
 def reference_of(space: ClusterSpace, state: State) -> Reference:
-    """Return the reference of a state; KeyError, TypeError, ValueError: `state_of` did not return it."""
+    """Return the reference of a state; KeyError, TypeError, ValueError: not a result of `state_of`."""
     own = ((name, value) for name, value in state.items() if name != "kind")
     arguments = {name: reference_of(space, value) if name in ("of", "onto") else value for name, value in own}
     kind = _KINDS[state["kind"]]
@@ -280,12 +284,12 @@ def reference_of(space: ClusterSpace, state: State) -> Reference:
 
 
 class Variable(NamedTuple):
-    entry: int  # of c (4n,)
-    scale: float  # from a user's unit
+    entry: int  # index in c (4n,)
+    scale: float  # factor from the user's unit
 
 
 def variable_of(space: Variables, name: object, where: str, at: str = "") -> Variable:
-    """Return the variable of a name: one of the space's, or an angle's with `_deg`; TrajectoryError: there is none."""
+    """Return the variable of a name: one of the space's, or an angle's with `_deg`; TrajectoryError: unknown."""
     text = str(name)
     angle = text.removesuffix(DEGREES)
     if text not in space.names and angle in space.names and space.in_radians[space.index(angle)]:
@@ -300,7 +304,7 @@ def named_values(space: Variables, values: object, where: str, base: Array, at: 
     """Return base (4n,) with values by name: numbers, or expressions without t.
 
     Raises:
-        TrajectoryError: not a mapping, an unknown or repeated name, not a finite number, an angle beyond one turn.
+        TrajectoryError: not a mapping, an unknown or repeated name, a non-finite value, an angle beyond one turn.
         ExpressionError: a text that is not an expression.
     """
     if not isinstance(values, Mapping):

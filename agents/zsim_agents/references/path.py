@@ -22,23 +22,23 @@ from zsim.math import linear
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
-DEGREE = 7  # of a piece, as in the files of uav_trajectories: the least in which place, velocity, acceleration and jerk
-# of both ends can be given
-ENDS = 3  # derivatives that are given at both ends of a path
-BELOW, ABOVE = 11, 3  # diagonals of the equations of a minimum-snap path, ordered from piece to piece
-PEAK_SAMPLES = 64  # of a piece, where its greatest speed is looked for
+DEGREE = 7  # of each piece, as in the files of uav_trajectories: the lowest degree that allows position, velocity,
+# acceleration and jerk to be prescribed at both ends
+ENDS = 3  # number of derivatives prescribed at each end of a path
+BELOW, ABOVE = 11, 3  # subdiagonals and superdiagonals of the banded equations of a minimum-snap path, ordered by piece
+PEAK_SAMPLES = 64  # intervals per piece in the search for its peaks
 GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
-GOLDEN_STEPS = 40  # each leaves 0.62 of the interval: 1e-10 of a piece in all
-SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # of a path that is no polynomial, between which peaks are refined
-HORIZON_S = 600.0  # of an endless path that is looked at
-DIFFERENCE_S = 1e-4  # of rates, for an acceleration: exact to 1e-7 of it in motions of a second
-FACTOR_DIGITS = 3  # of the factor of a fit, rounded up
-SHARE = 0.8  # of the drone's limits, as in formations: the rest is for the feedback
-LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: 25 gates, however short; an hour; step of the search
-STILL = 1e-9  # m, m/s or rad/s, below which nothing moves
-RAMP = 0.25  # of a lap's time, in which the speed along the curve rises from rest, and falls again; chosen
+GOLDEN_STEPS = 40  # each reduces the interval to 0.62: to 1e-10 of a piece in all
+SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths, before refinement
+HORIZON_S = 600.0  # checked part of an endless path
+DIFFERENCE_S = 1e-4  # step of finite differences of rates: relative error 1e-7 for motions over a second
+FACTOR_DIGITS = 3  # decimal places of the time factor of a fit, rounded up
+SHARE = 0.8  # of the drone's limits that a path may use, as in formations: the rest is for the feedback
+LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: minimum (25 gates), maximum, search step
+STILL = 1e-9  # samples below it [m/s, rad/s, m/s^2] are not refined; also the minimum divisor [s]
+RAMP = 0.25  # chosen: share of a lap's period in which the speed rises from rest, and in which it falls to rest
 Curve = Callable[[float], tuple[Array, Array]]
-"""From the angle [rad] to the place (4,) and its derivative by the angle."""
+"""Maps the angle [rad] to the position (4,) and its derivative with respect to the angle."""
 
 
 class PathLimits(NamedTuple):
@@ -63,17 +63,17 @@ class Peaks(NamedTuple):
     at_s: tuple[float, float, float, float]
 
     def factor(self, limits: PathLimits) -> float:
-        """Return the factor by which a path must be slowed to satisfy limits; below 1 if it may be faster."""
+        """Return the factor of the duration that just satisfies the limits; below 1 if the path may be faster."""
         speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
-        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # speeds fall with time, accelerations twice
+        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # as 1 / T and 1 / T^2
 
 
 class PiecewisePolynomial:
     """A sequence of polynomials of local time.
 
     Args:
-        durations_s: (m,) of the pieces.
-        coefficients: (m, 8, 4) of t^0 to t^7 in x, y, z, yaw.
+        durations_s: durations of the pieces, (m,).
+        coefficients: of t^0 to t^7 in x, y, z, yaw, (m, 8, 4).
     """
 
     def __init__(self, durations_s: Array, coefficients: Array) -> None:
@@ -88,7 +88,7 @@ class PiecewisePolynomial:
         piece = bisect.bisect_right(self._begins, clamped) - 1
         local = clamped - self._begins[piece]
         place, rate = [], []
-        for highest, *others in self._axes[piece]:  # in floats: numpy takes five times as long
+        for highest, *others in self._axes[piece]:  # plain floats: numpy takes five times as long
             value, slope = highest, 0.0
             for coefficient in others:
                 slope = slope * local + value
@@ -105,10 +105,10 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(durations, self.coefficients[:count])
 
     def peaks(self) -> Peaks:
-        """Return the peaks of each piece, to 1e-10 of it."""
+        """Return the peaks over all pieces, their times to 1e-10 of a piece."""
         greatest = [(0.0, 0.0)] * 4
         for begin_s, duration_s, own in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
-            unit = own * _powers(duration_s, len(own))[:, None]  # of a local time from 0 to 1, which is well scaled
+            unit = own * _powers(duration_s, len(own))[:, None]  # over local time 0 to 1, which is well scaled
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
@@ -124,9 +124,11 @@ def _powers(x: float, count: int) -> Array:
 
 
 def _greatest(columns: Array) -> tuple[float, float]:
-    """Return the maximum sum of squares of polynomials (n, k) in [0, 1], and where: by samples and golden section.
+    """Return the maximum on [0, 1] of the sum of squares of k polynomials, coefficients (n, k), and its argument.
 
-    The derivative of such a sum has at most twelve roots, so samples show all maxima wider than their distance.
+       It is found by sampling and golden section.
+    The derivative of such a sum has at most twelve roots, so
+       only maxima narrower than the spacing of the samples can be missed.
     """
     falling = columns[::-1].T.tolist()
 
@@ -154,7 +156,7 @@ def _greatest(columns: Array) -> tuple[float, float]:
 
 
 class EndMotion(NamedTuple):
-    """The derivatives of a path at its first or last place, each (4,)."""
+    """The derivatives of a path at its start or end, each (4,)."""
 
     velocity: Array
     acceleration: Array
@@ -168,19 +170,19 @@ def at_rest() -> EndMotion:
 def minimum_snap(
     times_s: Sequence[float], places: Array, begin: EndMotion | None = None, end: EndMotion | None = None
 ) -> PiecewisePolynomial:
-    """Return the path through places (m, 4) at given times with the least integral of the squared fourth derivative.
+    """Return the path through positions (m, 4) at given times that minimises the integral of the squared snap.
 
-    Among all paths with given derivatives up to the third at both ends, at rest by default, that is the spline of
-    degree 7: Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the
-    spline. From rest to rest over one second it is 35 t^4 - 84 t^5 + 70 t^6 - 20 t^7.
+    With the derivatives up to the third prescribed at both ends, zero by default, it is the spline of degree 7:
+    Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the spline.
+    From rest to rest over one second it is 35 t^4 - 84 t^5 + 70 t^6 - 20 t^7.
 
     Args:
-        times_s: (m,), rising; the first is the start of the path.
+        times_s: increasing, (m,); the first is the start of the path.
     """
     ends = begin or at_rest(), end or at_rest()
     spans = np.diff(np.asarray(times_s, float))
     m, size = len(spans), DEGREE + 1
-    slopes = np.ones((size, size))  # of t^k at 1, row by row for each derivative
+    slopes = np.ones((size, size))  # derivatives of t^k at 1, one row per derivative
     for d in range(1, size):
         slopes[d] = slopes[d - 1] * np.maximum(np.arange(size) - (d - 1.0), 0.0)
     diagonals, b = np.zeros((m * size, BELOW + 1 + ABOVE)), np.zeros((m * size, 4))
@@ -211,7 +213,7 @@ def minimum_snap(
     for d in range(1, ENDS + 1):
         put(row + d - 1, m - 1, slopes[d])
         b[row + d - 1] = ends[1][d - 1] * el.power(spans[-1], float(d))
-    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # of a local time from 0 to 1, well scaled
+    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # over local time 0 to 1, which is well scaled
     scale = np.array([_powers(span, size) for span in spans.tolist()])
     return PiecewisePolynomial(spans, unit / scale[:, :, None])
 
@@ -224,13 +226,13 @@ def move(
     begin: EndMotion | None = None,
     end: EndMotion | None = None,
 ) -> PiecewisePolynomial:
-    """Return the minimum-snap path from one place to another (4,), within limits.
+    """Return the minimum-snap path from one position (4,) to another within limits.
 
-    It lasts over_s, or longer if the limits require. It begins and ends at rest, or in the given motions.
-    The yaw turns by the shorter way.
+    It lasts over_s, or longer if the limits require it. It starts and ends at rest unless begin or end is given.
+    Yaw turns the shorter way.
 
     Raises:
-        TrajectoryError: the motion at an end is beyond the limits.
+        TrajectoryError: no path within an hour satisfies the limits; the motion at an end is too fast.
     """
     turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
     places = np.array([start, [*goal[:3], turned]])
@@ -238,7 +240,7 @@ def move(
         unit = minimum_snap((0.0, 1.0), places).peaks().factor(limits)
         return minimum_snap((0.0, max(over_s, LEAST_S, round_up(unit))), places)
     length_s = max(over_s, LEAST_S)
-    while length_s < MOVE_MAX_S:  # the ends do not slow down with the rest, so there is no factor
+    while length_s < MOVE_MAX_S:  # motions at the ends do not scale with the duration: there is no factor
         path = minimum_snap((0.0, length_s), places, begin, end)
         if path.peaks().factor(limits) <= 1.0:
             return path
@@ -297,7 +299,7 @@ def peaks_of(path: Reference) -> Peaks:
 
 
 def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -> tuple[float, float]:
-    """Return the maximum of a quantity near its largest sample, and when."""
+    """Return the maximum of a quantity near its largest sample, and its time."""
     from scipy.optimize import minimize_scalar
 
     best = int(np.argmax(samples))
@@ -320,7 +322,7 @@ def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
 
 
 def figure_eight(length_m: float, width_m: float) -> Curve:
-    """Return the lemniscate of Gerono along x, with a length and a width, from its crossing at the origin."""
+    """Return the lemniscate of Gerono with its length along x, starting at its crossing in the origin."""
 
     def at(angle: float) -> tuple[Array, Array]:
         x, y = length_m / 2.0, width_m / 2.0
@@ -333,7 +335,7 @@ def figure_eight(length_m: float, width_m: float) -> Curve:
 class Laps:
     """A curve flown for a number of laps of period_s each, plus a quarter of a period for start and stop.
 
-    The angle's rate follows a quintic at both ends, so that acceleration and jerk begin and end at zero too.
+    The angular rate follows a quintic at both ends, so that acceleration and jerk are zero there too.
     """
 
     def __init__(self, curve: Curve, period_s: float, laps: float) -> None:
@@ -354,7 +356,7 @@ class Laps:
         return place, slope * rate
 
     def _begun(self, t: float) -> tuple[float, float]:
-        """Return angle and rate at t from rest."""
+        """Return angle and rate at time t after leaving rest."""
         s = t / self._ramp_s
         if s >= 1.0:
             return self._rate * (t - 0.5 * self._ramp_s), self._rate

@@ -1,7 +1,7 @@
 """Cluster space: a formation of n robots described as one articulated body.
 
 Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad]; cluster space c
-has as many variables: position and attitude of the formation, the relative heading of each robot, and the shape.
+has as many variables: position and attitude of the formation, relative headings of the robots, and the shape.
 Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
 
 The mathematics of the cluster frame C, with Z-Y-X Euler angles, is compiled, because a gate takes microseconds.
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 TAU = 2 * math.pi
 CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
-NAMES_SHOWN = 20  # in a message; the paper's cluster has 12
+NAMES_SHOWN = 20  # maximum number of names in a message; the paper's cluster has 12
 LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
 
 
@@ -40,23 +40,23 @@ class SingularClusterError(ValueError):
 class ClusterSpace(ABC):
     """One convention of cluster variables for n robots; every method is a pure function.
 
-    A space of your own is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, whose
-    class a scenario names; it is made by `for_places`.
+    A user's space is a subclass that a scenario names. It implements `forward`, `inverse`, `jacobian`,
+    `inverse_jacobian` and `spread`, and is constructed by `for_places`.
 
     Args:
-        names: of the variables, 4 n, pitch among them. The beginning of a name gives its kind: p, q, rho are lengths, w
-            departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles that do not.
+        names: names of the 4 n variables, pitch among them. The stem of a name gives its kind: p, q, rho are lengths, w
+            deviations in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles that do not.
         spread_text: the quantity that `spread` measures, in words for messages.
 
     Attributes:
         size: number of cluster variables, 4 n.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
-        in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
-        period: (4n,) of the angles that wrap, 2 pi, and 0 for all else.
-        bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
-        neutral: (4n,) bool, true for the variables that are zero in a formation that has no other goal: tilts, relative
-            headings, departures from a template.
-        tilts: places of roll and pitch in c.
+        in_radians: (4n,) bool, true for all angles, including those that do not wrap (pitch, beta, elevation_k).
+        period: (4n,) 2 pi for the angles that wrap, 0 for all others.
+        bounds: (4n, 2) open bounds of the values of `forward`, infinite for unbounded variables.
+        neutral: (4n,) bool, true for the variables whose default goal is zero: tilts, relative headings, deviations
+            from a template.
+        tilts: indices of roll and pitch in c.
     """
 
     def __init__(self, n: int, names: Sequence[str], spread_text: str) -> None:
@@ -79,10 +79,10 @@ class ClusterSpace(ABC):
 
     @classmethod
     def for_places(cls, places_m: Array) -> ClusterSpace:
-        """Return the space of n robots, given their places (n, 3) [m]; by default cls(n).
+        """Return the space of n robots with the given nominal positions (n, 3) [m]; by default cls(n).
 
         Args:
-            places_m: the cluster's `template_m`, else where its robots start; x ahead, y left of the formation.
+            places_m: the cluster's `template_m`, else the start positions; x ahead, y left of the formation.
         """
         return cls(len(places_m))  # type: ignore[call-arg]
 
@@ -99,7 +99,7 @@ class ClusterSpace(ABC):
         """Return positions p_W (n, 3) [m] and headings yaw (n,) [rad, wrapped] of the robots of c (4n,).
 
         Raises:
-            SingularClusterError: the shape has no extent (h = 0), so that the robots' places are undefined.
+            SingularClusterError: the shape has no extent (h = 0), so that the robots' positions are undefined.
         """
 
     @abstractmethod
@@ -123,11 +123,11 @@ class ClusterSpace(ABC):
         """Return the smallest height of the shape [m] (see `spread_text`); 0 if the shape is singular."""
 
     def motion(self, c: Array, c_dot: Array) -> Array:
-        """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 have a shorter way than through the matrix."""
+        """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 avoid computing the matrix."""
         return linear.product(self.inverse_jacobian(c), c_dot)
 
     def specimen(self, apart_m: float) -> Array:
-        """Return c (4n,) of a level formation with robots at least a distance apart, for rehearsals."""
+        """Return c (4n,) of a level formation with robots at least apart_m from each other, for rehearsals."""
         radius_m = self.n * apart_m
         turns = np.arange(self.n) * (TAU / self.n)
         x, y = (el.elementwise(of)(turns) for of in (el.cos, el.sin))
@@ -137,8 +137,8 @@ class ClusterSpace(ABC):
     def margin(self, c: Array) -> float:
         """Return the distance to singularity [m]: spread(c) cos(pitch).
 
-        Zero exactly where J^-1 is singular (robots 1, 2, 3 in line or two of them in one place, a further robot on the
-        z axis through robot 1, or pitch at 90 degrees): how far one robot may move before that, in a level formation.
+        Zero exactly where J^-1 is singular (robots 1, 2, 3 collinear or two of them coincident, a further robot on the
+        z axis through robot 1, or pitch at 90 degrees). In a level formation: how far a robot may move before that.
         """
         return self.measures(c)[1]
 
@@ -148,7 +148,7 @@ class ClusterSpace(ABC):
         return spread, spread * float(el.cos(c[self._pitch]))
 
     def condition(self, c: Array) -> float:
-        """Return the condition number of J^-1 (2-norm, metres and radians as they are).
+        """Return the condition number of J^-1 (2-norm, metres and radians unweighted).
 
         It grows with the unit of length, so a formation larger than 4 m is scaled down to 4 m: a large formation is not
         closer to singularity than a small one of the same shape.
@@ -160,11 +160,11 @@ class ClusterSpace(ABC):
         return float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
 
     def difference(self, c_to: Array, c_from: Array) -> Array:
-        """Return c_to - c_from (4n,), angles that wrap by the shorter way."""
+        """Return c_to - c_from (4n,), for angles that wrap the shorter way round."""
         return self.wrapped(c_to - c_from)
 
     def wrapped(self, c: Array) -> Array:
-        """Return c (4n,), or a table (m, 4n) of them, with the angles that wrap taken to [-pi, pi]."""
+        """Return c (4n,), or a table (m, 4n) of such rows, with angles wrapped to [-pi, pi]."""
         if c.ndim > 1:
             return c - self.period * np.rint(c / TAU)
         near = np.empty(self.size)
@@ -172,7 +172,7 @@ class ClusterSpace(ABC):
         return near
 
     def index(self, name: str) -> int:
-        """Return the index of a variable in c; ValueError: there is none of that name."""
+        """Return the index of a variable in c; ValueError: the name is unknown."""
         if name not in self.names:
             raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
         return self.names.index(name)
@@ -224,14 +224,14 @@ def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Arr
 
 @portable
 def put_wrapped(c: Array, period: Array, near: Array) -> None:
-    """Write c with each variable wrapped to half a period about zero; period is 2 pi or, for none, 0."""
+    """Write c with each variable wrapped to half a period about zero; period is 2 pi, or 0 for no wrapping."""
     for k in range(c.size):
         near[k] = c[k] - period[k] * np.rint(c[k] / TAU)
 
 
 @portable
 def closest_pair(p_W: Array) -> tuple[float, int, int]:
-    """Return the least distance [m] between two of the positions (n, 3), and the indices of that pair."""
+    """Return the minimum distance [m] between two of the positions (n, 3), and the indices of that pair."""
     least, first, second = math.inf, 0, 1
     for i in range(p_W.shape[0]):
         for j in range(i + 1, p_W.shape[0]):
@@ -309,14 +309,14 @@ def pitch_yaw(x_W: Vector) -> tuple[float, float]:
 
 @portable
 def euler_axes_C(roll: float, pitch: float) -> Matrix:
-    """Return w_WC_C of a unit rate of roll, of pitch and of yaw."""
+    """Return w_WC_C for unit rates of roll, pitch and yaw."""
     sr, cr = el.sin(roll), el.cos(roll)
     sp, cp = el.sin(pitch), el.cos(pitch)
     return (1.0, 0.0, 0.0), (0.0, cr, -sr), (-sp, sr * cp, cr * cp)
 
 
 def euler_rates(roll: float, pitch: float) -> Array:
-    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C; SingularClusterError: pitch is at 90 degrees."""
+    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C; SingularClusterError: pitch is 90 degrees."""
     sr, cr = el.sin(roll), el.cos(roll)
     sp, cp = el.sin(pitch), el.cos(pitch)
     if cp < LENGTH_MIN_M:

@@ -1,8 +1,8 @@
 """The cluster space of a scenario's cluster: a stock one, a user's class, or a cluster of clusters by its groups.
 
-A group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the place and heading of robot k of the
-parent; the rest of c_k, its tilts, headings and shape, is added to the parent's variables. 4m variables of the parent
-and 4n_k - 4 of each group make 4n. The groups may be clusters of clusters themselves.
+Group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are position and heading of robot k of the
+parent; the rest of c_k (tilts, headings and shape) is appended to the parent's variables. The 4m variables of the
+parent and 4n_k - 4 of each group make 4n. The groups may be clusters of clusters themselves.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
 
 Places = NDArray[np.intp]
-BODY = ("x_c", "y_c", "z_c", "yaw")  # of a group: variables of a robot of the parent
+BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that describe a robot of the parent
 
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: the template is in one line.
+        ValueError: the template is collinear.
         DocumentError: a user's class cannot be loaded; UserCodeError: it cannot be instantiated.
     """
     starts = _starts(scenario, cluster.drones)
@@ -55,13 +55,13 @@ def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
         return own(places_m)
     try:
         return checked(own.for_places(places_m))
-    except TypeError as error:  # also of a call with wrong arguments, which has no frame of the user's
+    except TypeError as error:  # a call with wrong arguments raises it without a frame in the user's code
         failure = plugin.user_code_error(error, "")
         raise failure or UserCodeError(f"{name}.for_places raised TypeError: {error}") from error
 
 
 def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
-    """Return the start positions of drones (n, 3) [m]: x ahead and y left of the first drone, z up."""
+    """Return the start positions of drones (n, 3) [m] in axes along the heading of the first: x ahead, y left, z up."""
     by_name = {drone.name: drone for drone in scenario.drones}
     yaw = math.radians(by_name[drones[0]].yaw_deg)
     c, s = el.cos(yaw), el.sin(yaw)
@@ -69,7 +69,7 @@ def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
 
 
 def cluster_space(n: int) -> ClusterSpace:
-    """Return the space of n robots, 2 to 64, called triad: the paper's at n = 3, its generalisation otherwise."""
+    """Return the triad space of n robots, 2 to 64: the paper's for n = 3, otherwise its generalisation."""
     if not 2 <= n <= ROBOTS_MAX:
         raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
     return PairCluster() if n == 2 else TriadCluster(n)
@@ -82,13 +82,13 @@ STOCK: dict[str, Callable[[Array], ClusterSpace]] = {
 
 
 class _Group(NamedTuple):
-    """The indices of a group in the whole cluster.
+    """The indices of a group in the complete cluster.
 
     Attributes:
-        robots, rows: its robots among all; their 4n_k entries in r, four each.
-        body, rest: places of BODY and of all else in its own c.
-        own: places of the rest in the c of the whole.
-        at: places of its body in the r of the parent, four each.
+        robots, rows: its robots among all robots; their 4n_k entries in r, four each.
+        body, rest: indices of BODY and of the other variables in its own c.
+        own: indices of the rest in the complete c.
+        at: indices of its body in the parent's r.
     """
 
     space: ClusterSpace
@@ -101,11 +101,11 @@ class _Group(NamedTuple):
 
 
 class NestedCluster(ClusterSpace):
-    """c = (variables of the parent, then of each group all but x_c, y_c, z_c, yaw, as NAME.roll, NAME.pitch, ...).
+    """c = (the parent's variables, then those of each group except x_c, y_c, z_c, yaw, as NAME.roll, NAME.pitch, ...).
 
-    phi_k of the parent is the yaw of group k relative to that of the parent, NAME.phi_i the heading of a robot relative
-    to the yaw of its group. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
-    `groups` are names and spaces in the order of the robots, as many as the parent has robots.
+    phi_k of the parent is the yaw of group k relative to the parent's yaw, NAME.phi_i the heading of a robot relative
+    to its group's yaw. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
+    `groups` are names and spaces in the order of the robots, one for each robot of the parent.
     """
 
     def __init__(self, parent: ClusterSpace, groups: Sequence[tuple[str, ClusterSpace]]) -> None:
@@ -180,7 +180,7 @@ class NestedCluster(ClusterSpace):
         return c
 
     def parts(self, c: Array) -> list[Array]:
-        """Return the cluster of the parent (4m,), then the whole cluster of each group (4n_k,)."""
+        """Return the cluster of the parent (4m,), then the complete cluster of each group (4n_k,)."""
         parent = c[: self.parent.size]
         bodies = np.empty((self.parent.n, 4))
         bodies[:, :3], bodies[:, 3] = self.parent.inverse(parent)
@@ -195,14 +195,14 @@ class NestedCluster(ClusterSpace):
         return min(space.spread(part) for space, part in self._pairs(c))
 
     def measures(self, c: Array) -> tuple[float, float]:
-        """Return the least spread and margin of parent and groups: the whole is singular if one of them is."""
+        """Return the minimum spread and margin of parent and groups: if one is singular, the complete cluster is."""
         spreads, margins = zip(*(space.measures(part) for space, part in self._pairs(c)), strict=True)
         return min(spreads), min(margins)
 
     def condition(self, c: Array) -> float:
         """Return the largest condition number of the parent and the groups, each in its own measure.
 
-        J^-1 of the whole is a product of theirs: if none is large, neither is that of the whole.
+        J^-1 of the complete cluster is a product of theirs: if none is ill-conditioned, neither is the product.
         """
         return max(space.condition(part) for space, part in self._pairs(c))
 

@@ -1,10 +1,10 @@
-"""The cluster of many robots: a template that moves and rotates as a rigid body, and small departures from it.
+"""The cluster of many robots: a template that moves and rotates as a rigid body, and small deviations from it.
 
     P_i = C + R (t_i + (N w)_i)
 
-C is the centroid, t_i the template's places, N a basis of the displacements that neither move nor rotate it, and R the
-best-fit rotation of the template to the robots. No robot is privileged, and the motion of one robot changes the frame
-by only the n-th part.
+C is the centroid, t_i the template's positions, N a basis of the displacements that neither move nor rotate it, and R
+the best-fit rotation of the template to the robots. No robot is privileged, and the motion of one robot changes the
+frame only by 1/n of it.
 
 Attitudes by best fit: Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc. Am. A 4
 (1987), section 4; the same rotation as Kabsch's (1976), and never a reflection. As a formation's frame: Belta, Kumar,
@@ -36,24 +36,24 @@ from zsim_agents.formation.spaces.cluster_space import (
     row,
 )
 
-INDEPENDENT_MIN = 1e-6  # share of a direction that must be new; rounding leaves 1e-15
+INDEPENDENT_MIN = 1e-6  # minimum independent share of a direction; rounding leaves 1e-15
 PLANES = ((0, 1), (0, 2), (1, 2))
 NO_FRAME = "the robots are in one line or one place, or too far from the template: the formation has no frame"
-HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # places in the small matrix of `condition`
+HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # indices in the 7 x 7 matrix of `condition`
 
 
 class TemplateCluster(ClusterSpace):
     """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, w_1..w_{3n-6}); w in metres rms over the robots.
 
-    w_1 is growth: robots move outwards, by w_1 in the root mean square. Then come the stretches and shears that the
-    template has room for (`shape_modes`). The origin of the template's places (n, 3), n >= 3, does not matter.
+    w_1 is growth: robots move outwards, by w_1 in the root mean square. The stretches and shears that the template
+    allows follow (`shape_modes`). The origin of the template's positions (n, 3), n >= 3, is arbitrary.
 
     Raises:
-        ValueError: fewer than three places, or all in one line.
+        ValueError: fewer than three positions, or all collinear.
 
     Attributes:
-        t_C: (n, 3) places of the template about their centroid, in C [m].
-        modes_C: (n, 3, 3n - 6), N.
+        t_C: (n, 3) positions of the template relative to their centroid, in C [m].
+        modes_C: (n, 3, 3n - 6) basis N.
     """
 
     def __init__(self, places_m: ArrayLike) -> None:
@@ -69,7 +69,7 @@ class TemplateCluster(ClusterSpace):
         names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
         spread_text = "root mean square distance of the robots from the line through them"
         super().__init__(n, [*names, *numbered("w", range(1, 3 * n - 5))], spread_text)
-        self._shape = 6 + n  # place of w_1 in c
+        self._shape = 6 + n  # index of w_1 in c
 
     @classmethod
     def for_places(cls, places_m: Array) -> TemplateCluster:
@@ -92,16 +92,16 @@ class TemplateCluster(ClusterSpace):
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         """Return J; with b_C = R^T (P - C): w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
 
-        It follows from the sum of t_i x b_i being zero, which is what makes R the best fit.
+        It follows from sum of t_i x b_i = 0, the condition for R to be the best fit.
         """
         _, b_C, R_WC = self._fitted(p_W)
         n = self.n
-        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # of t_i x R^T v_i: (3, n, 3)
+        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # t_i x R^T: (3, n, 3)
         turn = solve(inertia(product(b_C.T, self.t_C)), arms.reshape(3, 3 * n)).reshape(3, n, 3)
         roll, pitch, _ = euler_angles(R_WC)
         cross_C = np.array([skew(b) for b in b_C]).reshape(3 * n, 3)
         moved_C = product(cross_C, turn.reshape(3, 3 * n)).reshape(n, 3, n, 3)  # b_i' = R^T v_i - w_WC_C x b_i
-        moved_C[range(n), :, range(n)] += R_WC.T  # less that of the centroid, which N^T ignores
+        moved_C[range(n), :, range(n)] += R_WC.T  # without the motion of the centroid, which N^T ignores
 
         J = np.zeros((self.size, n, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / n
@@ -140,26 +140,26 @@ class TemplateCluster(ClusterSpace):
         return c
 
     def spread(self, c: Array) -> float:
-        """Return the root mean square distance from the line through the robots, measured along the template.
+        """Return the root mean square distance of the robots from the line through them, measured along the template.
 
-        It is the least eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a template
-        of any size, and zero where another rotation would fit as well.
+        It is the smallest eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a
+        template of any size, and zero where another rotation fits equally well.
         """
         S = product(self._places_C(c).T, self.t_C)
         return float(eigen(inertia((S + S.T) / 2))[0][0]) / self._reach_m
 
     def condition(self, c: Array) -> float:
-        """Return the condition number of J^-1, the robots' velocities, headings and phi weighted by their rms.
+        """Return the condition number of J^-1, with the robots' velocities, headings and phi weighted by their rms.
 
-        So it does not grow with the number of robots; a formation with robots farther than 4 m from the centroid is
-        scaled down to that. w_k and the centroid are orthonormal in this measure; what is left is a matrix of 7 x 7:
-        turns, the three directions of w that they mix with, and the mean of phi.
+        With these weights it does not grow with the number of robots; a formation with robots farther than 4 m from
+        the centroid is scaled down to 4 m. w_k and the centroid are orthonormal in this measure; a 7 x 7 matrix is
+        left: turns, the three directions of w that they mix with, and the mean of phi.
         """
         place_C = self._places_C(c)
         scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
         axes = euler_axes_of(c).T
         squared = scale * scale
-        M = squared * product(axes.T, inertia(product(place_C.T, self.t_C)).T)  # the template scaled alike
+        M = squared * product(axes.T, inertia(product(place_C.T, self.t_C)).T)  # the template is scaled alike
         stiff = solve(squared * self._inertia, M.T)
         whole = squared * product(product(axes.T, inertia(product(place_C.T, place_C))), axes)
         G = np.eye(7)
@@ -171,11 +171,11 @@ class TemplateCluster(ClusterSpace):
         values = eigen(G)[0]
         return math.sqrt(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
-    def _places_C(self, c: Array) -> Array:  # (n, 3) [m], from the centroid
+    def _places_C(self, c: Array) -> Array:  # (n, 3) [m], relative to the centroid
         return self.t_C + product(self._modes, c[self._shape :]).reshape(self.n, 3)
 
     def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
-        """Return the centroid (3,), the places from it in C (n, 3), and R_WC (3, 3)."""
+        """Return the centroid (3,), the positions relative to it in C (n, 3), and R_WC (3, 3)."""
         centre_W = np.add.reduce(p_W, axis=0) / self.n
         b_W = p_W - centre_W
         gap, R_WC = fitted_rotation(product(self.t_C.T, b_W))
@@ -185,7 +185,7 @@ class TemplateCluster(ClusterSpace):
 
 
 def _root(E: Array, n: int) -> Array:
-    """Return the symmetric root of E / n (3, 3), E without negative eigenvalues but for rounding."""
+    """Return the symmetric square root of E / n (3, 3); E is positive semidefinite up to rounding."""
     values, vectors = eigen((E + E.T) / 2)
     return product(vectors * np.sqrt(np.maximum(values, 0.0) / n), vectors.T)
 
@@ -193,8 +193,8 @@ def _root(E: Array, n: int) -> Array:
 def fitted_rotation(H: Array) -> tuple[float, Array]:
     """Return how well the rotation is defined, and the rotation R (3, 3) that maximises the sum of b_i . R t_i.
 
-    H (3, 3) is the sum of t_i b_i^T. The first is the gap, half of the difference of the two greatest eigenvalues of
-    Horn's matrix [unit of H]: the smallest eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where
+    H (3, 3) is the sum of t_i b_i^T. The first result is the gap, half the difference of the two largest eigenvalues
+    of Horn's matrix [unit of H]: the smallest eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where
     several rotations fit equally well, or H is not finite.
     """
     K = np.empty((4, 4))
@@ -206,7 +206,7 @@ def fitted_rotation(H: Array) -> tuple[float, Array]:
 
 @portable
 def put_horn_matrix(H: Array, K: Array) -> bool:
-    """Write the symmetric (4, 4) whose greatest eigenvector is the quaternion, w first; return whether it is finite."""
+    """Write the symmetric (4, 4) matrix whose dominant eigenvector is the quaternion, w first; return if finite."""
     xx, xy, xz = row(H, 0)
     yx, yy, yz = row(H, 1)
     zx, zy, zz = row(H, 2)
@@ -229,7 +229,7 @@ def centred(places: ArrayLike) -> Array:
 
 
 def turns(t: Array) -> Array:
-    """Return the motions e_k x t_i of centred points under a unit turn about each axis: (3, n, 3)."""
+    """Return the motions e_k x t_i of centred points under a unit rotation about each axis, (3, n, 3)."""
     return np.array([np.cross(axis, t) for axis in np.eye(3)])
 
 
@@ -238,10 +238,10 @@ def shape_modes(t: Array) -> Array:
 
     Each mode moves the points by 1 m in the root mean square, and all are orthogonal to each other: N^T N = n I. The
     first are the homogeneous ones: growth, stretches along the axes and shears in their planes, as far as the points
-    have room for them; the others follow from moving single points, in their order.
+    allow them; the others result from displacing single points, in order.
 
     Raises:
-        ValueError: the points are in one line, or in one place.
+        ValueError: the points are collinear or coincide.
     """
     n = len(t)
     rigid = _orthonormal([*np.repeat(np.eye(3)[:, None], n, axis=1), *turns(t)], [])
@@ -257,12 +257,12 @@ def shape_modes(t: Array) -> Array:
 
 
 def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
-    """Return unit vectors (3n,) along the new part of each direction (n, 3), in order, orthogonal to those done."""
+    """Return unit vectors (3n,) along the independent part of each direction (n, 3), in order, orthogonal to `done`."""
     basis: list[Array] = []
     for direction in directions:
         v = direction.ravel()
         size = el.length(v.tolist())
-        for _ in range(2):  # the second pass removes what rounding left of the first
+        for _ in range(2):  # the second pass removes the rounding errors of the first
             earlier = np.array([*done, *basis])
             v = v - product(earlier.T, product(earlier, v)) if len(earlier) else v
         left = el.length(v.tolist())
@@ -284,7 +284,7 @@ def inertia(S: Array) -> Array:
 
 @portable
 def skew(a: Array) -> Array:
-    """Return the matrix (3, 3) of a x ."""
+    """Return the matrix (3, 3) of the cross product a x."""
     A = np.zeros((3, 3))
     A[0, 1], A[0, 2] = -a[2], a[1]
     A[1, 0], A[1, 2] = a[2], -a[0]
@@ -314,5 +314,5 @@ def rotation_of(c: Array) -> Array:
 
 @portable
 def euler_axes_of(c: Array) -> Array:
-    """Return w_WC_C of a unit rate of roll, of pitch and of yaw, row by row (3, 3)."""
+    """Return w_WC_C for unit rates of roll, pitch and yaw, one per row (3, 3)."""
     return array_of(euler_axes_C(c[3], c[4]))

@@ -1,7 +1,7 @@
-"""The clusters of two, three (the paper's) or more robots, whose frame is given by robots 1, 2 and 3.
+"""Clusters of two, three (the paper's) or more robots, whose frame is defined by robots 1, 2 and 3.
 
-Robots 1, 2, 3 give the frame C and the triangle (p, q, beta); each further robot k adds its distance rho, azimuth and
-elevation, seen from robot 1 in C. The origin is the centroid of all robots. Two robots are a rod with a direction and
+Robots 1, 2, 3 define the frame C and the triangle (p, q, beta); each further robot k adds distance rho, azimuth and
+elevation as seen from robot 1 in C. The origin is the centroid of all robots. Two robots are a rod with a direction and
 a length, without roll.
 """
 
@@ -56,7 +56,7 @@ class TriadCluster(ClusterSpace):
         names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
         spread_text = "sin(beta) min(p, q)" if n == 3 else "least of sin(beta) min(p, q) and rho_k cos(elevation_k)"
         super().__init__(n, [*names, "p", "q", "beta", *others], spread_text)
-        self._shape = 6 + n  # place of p in c
+        self._shape = 6 + n  # index of p in c
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
         c = np.empty(self.size)
@@ -110,9 +110,9 @@ class TriadCluster(ClusterSpace):
 
 @portable
 def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
-    """Write c (4n,); return whether the robots have a frame; without one nothing is written."""
+    """Write c (4n,) and return whether the robots have a frame; if not, nothing is written."""
     n = yaw.size
-    at = 6 + n  # place of p in c
+    at = 6 + n  # index of p in c
     p_1 = row(p_W, 0)
     d2, d3 = subtract(row(p_W, 1), p_1), subtract(row(p_W, 2), p_1)
     x, y, z, h, area = triad_axes(d2, d3)
@@ -132,7 +132,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
 
 @portable
 def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
-    """Write positions (n, 3) and headings (n,); return whether the shape has an extent, else they are invalid."""
+    """Write positions (n, 3) and headings (n,); return whether the shape has an extent; if not, they are invalid."""
     n = c.size // 4
     put_places_C(c, p_W)
     R_WC = matrix_from_rpy(c[3], c[4], c[5])
@@ -146,10 +146,10 @@ def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
 
 @portable
 def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
-    """Write J^-1 (4n, 4n) into zeros; return whether the shape has an extent, without which nothing is written.
+    """Write J^-1 (4n, 4n) into zeros; return whether the shape has an extent; if not, nothing is written.
 
-    Robot i moves at v_c + R_WC (w_WC_C x place_i + derivatives of its place by the shape times their rates), and turns
-    at yaw' + phi_i'.
+    Robot i moves at v_c + R_WC (w_WC_C x place_i + derivatives of place_i by the shape times their rates), and turns at
+    yaw' + phi_i'.
     """
     n = c.size // 4
     if not has_direction(c):
@@ -183,7 +183,7 @@ def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
 
 @portable
 def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
-    """Add the motion of one robot with a variable; the centroid is fixed, so that all move back by the mean."""
+    """Add the motion of one robot with a variable; all robots move back by its mean, so that the centroid is fixed."""
     n = J_inv.shape[0] // 4
     for k in range(3):
         back = rate_W[k] / n
@@ -205,8 +205,8 @@ def triad_spread(c: Array) -> float:
 def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, float]:
     """Return the axes x, y, z of C in W, h = |d2 + d3| [m] and the area |d2 x d3| [m^2] of d2 = P2 - P1, d3 = P3 - P1.
 
-    x_C points from the middle of robots 2 and 3 to robot 1, z_C along d2 x d3; robot 2 is on the left. All is zero
-    where the three robots are in line or in one place.
+    x_C points from the middle of robots 2 and 3 to robot 1, z_C along d2 x d3; robot 2 is on the left. All
+    results are zero if the three robots are collinear or coincide.
     """
     m = add(d2, d3)
     normal = cross(d2, d3)
@@ -221,12 +221,12 @@ def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, f
 
 @portable
 def put_places_C(c: Array, place: Array) -> None:
-    """Write the places of the robots from the centroid, in C (n, 3) [m]."""
+    """Write the positions of the robots relative to the centroid, in C (n, 3) [m]."""
     n = c.size // 4
     at = 6 + n
     p, q = c[at], c[at + 1]
     ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[at + 2])
-    place[:3] = 0.0  # from robot 1
+    place[:3] = 0.0  # relative to robot 1
     place[1, 0], place[1, 1] = -p * ca2, p * sa2
     place[2, 0], place[2, 1] = -q * ca3, -q * sa3
     for k in range(3, n):
@@ -249,7 +249,7 @@ def has_direction(c: Array) -> bool:
 def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, float, float]:
     """Return cos and sin of the angle at robot 1 from -x_C to robot 2, the same to robot 3, and h [m].
 
-    All is zero where there is no such axis.
+    All results are zero if the x axis is undefined.
     """
     along2, along3 = p + q * el.cos(beta), q + p * el.cos(beta)
     h = math.sqrt(max(p * along2 + q * along3, 0.0))
@@ -260,9 +260,9 @@ def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, fl
 
 @portable
 def triangle_rates(p: float, q: float, beta: float) -> tuple[Matrix, Matrix]:
-    """Return the derivatives of robot 2 from robot 1, in C, by p, by q and by beta, and those of robot 3."""
+    """Return the derivatives by p, q and beta of robot 2's position relative to robot 1, in C; the same of robot 3."""
     ca2, sa2, ca3, sa3, h = split_beta(p, q, beta)
-    by_p, by_q = -sa2 / h, sa3 / h  # of the angle of robot 2; that of robot 3 turns the other way
+    by_p, by_q = -sa2 / h, sa3 / h  # derivatives of robot 2's angle; robot 3's have the opposite sign
     of_2 = (
         (-ca2 + p * sa2 * by_p, sa2 + p * ca2 * by_p, 0.0),
         (p * sa2 * by_q, p * ca2 * by_q, 0.0),
@@ -290,7 +290,7 @@ def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
 
 @portable
 def spherical_rates(rho: float, azimuth: float, elevation: float) -> Matrix:
-    """Return the derivatives of (x, y, z) by distance, by azimuth and by elevation."""
+    """Return the derivatives of (x, y, z) by distance, azimuth and elevation."""
     sa, ca, se, ce = el.sin(azimuth), el.cos(azimuth), el.sin(elevation), el.cos(elevation)
     return (
         (ce * ca, ce * sa, se),
@@ -300,7 +300,7 @@ def spherical_rates(rho: float, azimuth: float, elevation: float) -> Matrix:
 
 
 def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
-    """Return the rows of J for p, q, beta on robots 1, 2, 3: (3, 3 robots, 3)."""
+    """Return the rows of J for p, q, beta and the columns of robots 1, 2, 3: (3, 3 robots, 3)."""
     p, q = el.length(d2_W), el.length(d3_W)
     u2, u3 = d2_W / p, d3_W / q
     t2, t3 = np.cross(z_W, u2) / p, np.cross(z_W, u3) / q
@@ -311,7 +311,7 @@ def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
 def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
     """Return the rows of J for rho, azimuth and elevation of robot index k, (3, n, 3).
 
-    In C the robot moves from robot 1 at R_WC^T (v_k - v_1) - w_WC_C x d_C.
+    In C the robot moves relative to robot 1 at R_WC^T (v_k - v_1) - w_WC_C x d_C.
     """
     x, y, z = d_C.tolist()
     flat, rho = el.hypot(x, y), el.hypot(x, y, z)
