@@ -42,7 +42,7 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
 
 
 def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]:
-    """Return the process names of the agents that match, by role, estimators first; RunError: a pattern matches none."""
+    """Return the process names of the agents that match, by role, estimators first; RunError: no match."""
     return chosen("host: process", patterns, agent_names(scenario))
 
 

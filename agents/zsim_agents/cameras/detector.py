@@ -147,7 +147,7 @@ class HatDetector:
         return whole
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
-        """Return the hat in a box of the picture at half its resolution; None without one, or if cut by the picture's edge."""
+        """Return the hat in a box of the picture at half its resolution; None: no hat, or cut by the edge."""
         u, v, wide, high = (2 * side for side in box)
         room = ROOM_PX + max(wide, high) // 6
         u0, v0, u1, v1 = u - room, v - room, u + wide + room, v + high + room
