@@ -1,7 +1,7 @@
-"""Messages that ROS 1 and ROS 2 have in common, converted from zsim's; each bridge adds its own headers. Pure.
+"""Messages common to ROS 1 and ROS 2, converted from zsim's; each bridge adds its own headers. Pure.
 
 ROS has the same W (east, north, up) and B (forward, left, up) as zsim (REP 103, REP 105), and SI units; its quaternions
-end with w. Covariances are row-major; unknown ones are zero, unless the message defines a value for this.
+end with w. Covariances are row-major; unknown ones are zero, unless the message defines another value for them.
 The classes are those of ROS 2; they also serve ROS 1, since rosbags serialises a message by the names of its fields.
 """
 
@@ -20,7 +20,7 @@ from zsim.math.rotation import Quaternion, Vector
 
 NS_PER_S = 1_000_000_000
 NAVDATA_STATES = {"landed": 2, "taking_off": 6, "hovering": 4, "flying": 3, "landing": 8, "emergency": 0}
-"""States in ardrone_autonomy's Navdata (ctrl_state >> 16 of the aircraft), in which an emergency is unknown (0)."""
+"""States in ardrone_autonomy's Navdata (the aircraft's ctrl_state >> 16), which reports an emergency as unknown (0)."""
 FIX, NO_FIX, GPS_SERVICE = 0, -1, 1  # sensor_msgs/NavSatStatus
 DIAGONAL_KNOWN = 2  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_DIAGONAL_KNOWN
 DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3: sensor_msgs/distortion_models.h
@@ -32,12 +32,12 @@ TFMessage = ros.tf2_msgs__msg__TFMessage
 
 
 def by_axis(pattern: str, axes: str, values: Sequence[float]) -> dict[str, float]:
-    """Return a vector as the fields of a message, one for each axis."""
+    """Return a vector as the fields of a message, one per axis."""
     return {pattern.format(axis): value for axis, value in zip(axes, values, strict=True)}
 
 
 def mean_rate(q_WB1: Quaternion, q_WB2: Quaternion, dt_s: float) -> Vector:
-    """Return the constant w_WB_B [rad/s] that turns one attitude into the next within dt_s."""
+    """Return the constant angular rate w_WB_B [rad/s] that turns one attitude into the next within `dt_s`."""
     w, x, y, z = quaternion_multiply(quaternion_conjugate(q_WB1), q_WB2).tolist()
     sine = math.sqrt(x * x + y * y + z * z)
     if sine == 0.0:
@@ -71,7 +71,7 @@ def transform(head: Any, child: str, position_m: Vector, q: Quaternion) -> Any:
 def odometry(
     head: Any, child: str, pose: Any, twist: Any, of_pose: Array | None = None, of_twist: Array | None = None
 ) -> Any:
-    """Return an Odometry with covariances (36,) of pose and twist; None: unknown, or exact."""
+    """Return an Odometry with covariances (36,) of pose and twist; None if these are unknown, or zero."""
     nothing = np.zeros(36)
     return ros.nav_msgs__msg__Odometry(
         head,
@@ -82,14 +82,14 @@ def odometry(
 
 
 def imu(head: Any, sample: messages.Imu, q: Quaternion, covariances: tuple[Array, Array, Array]) -> Any:
-    """Return attitude, rate and specific force in B, with their covariances, each (9,)."""
+    """Return an Imu: attitude, and rate and specific force in B, with their covariances, each (9,)."""
     of_attitude, of_rate, of_force = covariances
     rate, force = Vector3(*sample.gyro_rad_s), Vector3(*sample.accel_m_s2)
     return ros.sensor_msgs__msg__Imu(head, quaternion(q), of_attitude, rate, of_rate, force, of_force)
 
 
 def fix(head: Any, sample: messages.Gps, has_fix: bool) -> Any:
-    """Return a fix: altitude above the ellipsoid; the covariance is that of a white error, equal on all axes (ENU)."""
+    """Return a fix: altitude above the ellipsoid; the covariance is that of independent, equal errors in ENU."""
     status: Any = ros.sensor_msgs__msg__NavSatStatus(FIX if has_fix else NO_FIX, GPS_SERVICE)
     return ros.sensor_msgs__msg__NavSatFix(
         head,
@@ -103,14 +103,14 @@ def fix(head: Any, sample: messages.Gps, has_fix: bool) -> Any:
 
 
 def compressed_image(head: Any, image: CameraImage) -> Any:
-    """Return a picture as image_transport's compressed plugin sends it."""
+    """Return an image as sent by image_transport's compressed plugin."""
     return ros.sensor_msgs__msg__CompressedImage(head, image.format, np.frombuffer(image.data, np.uint8))
 
 
 def camera_info(kind: Any, head: Any, info: CameraInfo) -> Any:
     """Return the calibration of a single camera, which is not part of a stereo pair: R = 1, P = [K 0].
 
-    `kind` is the class of sensor_msgs/CameraInfo, whose fields have other names in ROS 2 (k) than in ROS 1 (K).
+    `kind` is the class of sensor_msgs/CameraInfo, whose field names differ between ROS 1 (K) and ROS 2 (k).
     """
     P = np.column_stack([np.reshape(info.K, (3, 3)), np.zeros(3)]).ravel()
     full = ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, False)

@@ -1,10 +1,9 @@
-"""Assembly of robots at arbitrary positions into a formation: all fly simultaneously to assigned positions. Pure.
+"""Assembly of robots at arbitrary positions into a formation: all fly simultaneously to assigned positions.
 
-CAPT: Turpin, Michael and Kumar, Int. J. Robotics Research 33 (2014) 98-112. Robots fly straight from start to
-goal with a common function of time u, p_i = s_i + u (g_i - s_i). The assignment that minimises the sum of squared
-distances has (s_i - s_j).(g_i - g_j) >= 0 for every pair; a pair whose starts are a and whose goals are b apart then
-keeps a distance of a b / sqrt(a^2 + b^2), at least the smaller of a and b over sqrt 2. The minimum sum of distances has
-no such bound.
+CAPT: Turpin, Michael and Kumar, Int. J. Robotics Research 33 (2014) 98-112. All fly straight from start to goal with
+a common function of time u, p_i = s_i + u (g_i - s_i). The assignment with the minimum sum of squared distances has
+(s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts a and goals b apart, no pair then comes closer than
+a b / sqrt(a^2 + b^2), at least the smaller of a and b over sqrt 2. The minimum sum of distances has no such bound.
 
 The common time stops while a robot is far behind.
 """
@@ -25,11 +24,11 @@ from zsim_agents.formation.flight_plan import RefusalError
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.trajectory import named_values, variable_of
 
-PEAK_RATE = 1.875  # ratio of the peak rate to the mean rate of the minimum-jerk function of time
+PEAK_RATE = 1.875  # peak rate of the minimum-jerk function of time over its mean rate
 LEAST_S = 2.0  # minimum duration, as for a ramp of the reference
-BEHIND_M = 0.7  # chosen: the others wait for a robot this far from its path; a third of the minimum separation
-IN_PLACE_M = 0.5  # chosen: a robot this close has arrived; two sigma of the estimate of a side
-PLACE = ("x_c", "y_c", "z_c", "yaw")  # variables that are defined for robots in any shape
+BEHIND_M = 0.7  # distance of a robot from its path at which the others wait; chosen: a third of the minimum separation
+IN_PLACE_M = 0.5  # chosen distance from the goal on arrival: two sigma of an estimated side
+PLACE = ("x_c", "y_c", "z_c", "yaw")  # variables that are defined for robots in any arrangement
 
 
 class Assembly:
@@ -90,9 +89,9 @@ def assembly_goal(
     """Return the formation (4n,) to fly to: the base with values replaced by name.
 
     Args:
-        base: (4n,) of robots in a formation. None: not in one; centre and mean heading of the robots, zero for neutral
-            variables; all others must be named.
-        p_W, yaw: positions (n, 3) [m, W] and headings (n,) [rad] of the robots.
+        base: (4n,) of robots in a formation. None: their centre and mean heading, without departures from a template;
+            all other variables must then be named.
+        p_W, yaw: of the robots, (n, 3) [m] and (n,) [rad].
 
     Raises:
         RefusalError: a variable without a value in the base is not named.
@@ -114,9 +113,9 @@ def assembly_goal(
 def planned_assembly(
     space: ClusterSpace, c: Array, p_W: Array, gains: FormationGains, apart: float = 1.0
 ) -> tuple[Assembly, NDArray[np.intp]]:
-    """Return the paths of robots at p_W (n, 3) [m] to the positions of c (4n,), and the new order of the robots.
+    """Return the paths of robots at p_W (n, 3) [m] to their positions in c (4n,), and the new order of the robots.
 
-    Entry k of the order is the former index of the robot that becomes robot k.
+    Entry k of the order is the previous index of the robot that becomes robot k.
 
     Args:
         apart: share of the minimum separation that the paths must keep.
@@ -138,14 +137,12 @@ def planned_assembly(
 
 
 def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
-    """Return the index of the goal of each start, (n,), that minimises the sum of squared distances.
-
-    Starts and goals are (n, 3), or (n, 2).
+    """Return the goal (n,) of each of n starts (n, 3), for the minimum sum of squared distances.
 
     Raises:
-        ValueError: the shapes of starts and goals differ, or a position is not finite.
+        ValueError: the numbers of goals and starts differ, or a position is not finite.
     """
-    from scipy.optimize import linear_sum_assignment  # imported here, because scipy takes longer to load than all else
+    from scipy.optimize import linear_sum_assignment  # imported here because SciPy loads slowly
 
     starts, goals = np.asarray(starts_m, float), np.asarray(goals_m, float)
     if starts.ndim != 2 or starts.shape != goals.shape or starts.shape[1] not in (2, 3):
@@ -168,7 +165,7 @@ def straight_separation(starts_m: Array, goals_m: Array) -> float:
 
 
 def _least_s(start_W: Array, goal_W: Array, gains: FormationGains) -> float:
-    """Return the duration of the slowest path at the share of the robots' limits that a reference may use."""
+    """Return the duration [s] of the longest path at the share of the robots' limits that a reference may use."""
     ways = np.abs(goal_W - start_W)
     aside_m, up_m = float(np.sqrt(ways[:, 0] ** 2 + ways[:, 1] ** 2).max()), float(ways[:, 2].max())
     slowest = max(aside_m / gains.speed_max_m_s, up_m / gains.climb_max_m_s)

@@ -1,8 +1,8 @@
-"""Control laws of a formation: from the estimates of the robots and a reference to velocity commands.
+"""Control laws of a formation: velocity commands from the estimates of the robots and a reference.
 
-This is the base class of all laws (`law:` of a cluster may name a user's subclass), the stock law, the inputs that a
-scenario grants to a law in addition to the estimates, and, compiled, the saturation of the robots' velocities and the
-guard that keeps the robots apart.
+Contains the base class of all laws (`law:` of a cluster may name a user's subclass), the stock law, the inputs that a
+scenario grants to a law besides the estimates, and the compiled saturation of the robots' velocities and guard of the
+distances between them.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ Order = NDArray[np.int64]
 PairTable = NDArray[np.int64]
 Kind = TypeVar("Kind", bound=Sample)
 
-RATES = ("vx", "vy", "vz", "yaw rate")  # of a robot, in the order of r_dot
-NEAR_M = 1e-6  # closer robots have no defined direction from one to the other
-SETTLED_M_S = 1e-9  # a smaller deficit of the rate is ignored
-LOAD_MIN = 1e-9  # prevents division by zero
-GUARD_SWEEPS = 4  # passes over all pairs; one is enough for two robots, three robots in a corner need a few
+RATES = ("vx", "vy", "vz", "yaw rate")  # components of a robot's velocity, in the order of r_dot
+NEAR_M = 1e-6  # distance below which the direction between two robots is undefined
+SETTLED_M_S = 1e-9  # smaller deficits of the separation rate are ignored
+LOAD_MIN = 1e-9  # avoids division by zero
+GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three close together need a few
 
 
 @dataclass(frozen=True)
 class FormationGains:
-    """Parameters of the law; positive, validated with the scenario. Those not listed below: see `RobotLimits`.
+    """Parameters of the law, validated with the scenario. For those not listed here see `RobotLimits`.
 
     Attributes:
-        k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good; from about 2 it is unstable with a drone's velocity loop.
-        integral_1_s2: integral gain [1/s^2]; removes the offset that wind causes, 0 switches it off.
-        integral_max_m_s, integral_max_rad_s: clamp of the integral term for lengths and for angles.
-        separation_min_m: minimum distance between two robots of a reference, below which the guard acts.
+        k_1_s: proportional gain [1/s]; 0.5 to 0.8 works well, from about 2 a drone's velocity loop makes it unstable.
+        integral_1_s2: integral gain [1/s^2]; removes the offset due to wind; 0 switches it off.
+        integral_max_m_s, integral_max_rad_s: limits of the integral term for lengths and for angles.
+        separation_min_m: minimum distance between two robots, for references and for the guard.
     """
 
     k_1_s: float = 0.6
@@ -60,7 +60,7 @@ class FormationGains:
     speed_max_m_s: float = 2.0  # limit of velocityXY in the paper's base simulator, hector_quadrotor
     climb_max_m_s: float = 1.0  # control_vz_max of the AR.Drone SDK outdoors, 1000 mm/s
     yaw_rate_max_rad_s: float = 1.75  # control_yaw of the AR.Drone SDK
-    separation_min_m: float = 2.0  # four widths of the drone in its hull, 0.52 m
+    separation_min_m: float = 2.0  # four widths of the drone with its hull, 0.52 m
     separation_alarm_m: float = 1.5
     guard_horizon_s: float = 1.0
     response_s: float = 0.3
@@ -76,7 +76,7 @@ class FormationCommand(Struct, eq=False):
     Attributes:
         v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
         factor: the common factor of the saturation, 1 without saturation.
-        guarded: pairs of robot indices that the guard holds apart; alarmed: pairs closer than the alarm threshold.
+        guarded: pairs of robot indices that the guard keeps apart; alarmed: pairs closer than the alarm threshold.
     """
 
     v_W: Array
@@ -87,18 +87,18 @@ class FormationCommand(Struct, eq=False):
 
 
 class ControlLaw(ABC):
-    """A control law; this base class saturates and guards the rates of all laws alike.
+    """A control law; the rates of every law are saturated and guarded here in the same way.
 
-    A common factor for all robots preserves the direction in cluster space; the guard keeps the robots apart. A user's
-    law implements `rates` and, if it has a state, `reset`, `followed`, `snapshot` and `restore`.
+    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A user's law
+    implements `rates` and, if it has state, `reset`, `followed`, `snapshot` and `restore`.
 
     Args:
         space: cluster space of n robots.
-        gains: gains of the scenario; a law uses the ones it needs.
+        gains: gains of the scenario, of which a law uses those it needs.
 
     Attributes:
         robots: names of the robots in messages, in order.
-        grants: inputs in addition to the estimates, read by `samples`, `map` and `now_ns`.
+        grants: inputs besides the estimates, read by `samples`, `map` and `now_ns`.
     """
 
     _granted: Grants | None = None
@@ -141,36 +141,36 @@ class ControlLaw(ABC):
 
     @property
     def now_ns(self) -> int:
-        """The gate of the estimates, simulated time [ns]."""
+        """Simulated time of the present gate [ns]."""
         return self.grants.t_ns
 
     def reset(self) -> None:  # noqa: B027 - a law may have no state
-        """Clear all state, when the formation is engaged or continues after a hold."""
+        """Clear all state, when the formation is engaged or continues after a fault."""
 
     def followed(self, dt_s: float) -> None:  # noqa: B027
         """Advance the state by dt_s [s] after a gate whose rates were neither saturated nor guarded.
 
-        It is not called after other gates, so an integral advanced here does not wind up.
+        It is not called after other gates, so that an integral accumulated here does not wind up.
         """
 
     def snapshot(self) -> State | None:
-        """Return all state as plain values and arrays, {} if the law has none, None if it cannot be transferred."""
+        """Return all state as plain values and arrays: {} if there is none, None if it cannot be transferred."""
         return {} if type(self).reset is ControlLaw.reset and type(self).followed is ControlLaw.followed else None
 
     def restore(self, state: State) -> None:  # noqa: B027
-        """Restore a `snapshot` of the law in another process, to continue bit-identically."""
+        """Restore the `snapshot` of the law in another process, to continue bit-identically."""
 
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
     ) -> FormationCommand:
-        """Return the command of this gate; arguments as in `rates`, dt_s the time since the last command.
+        """Return the command of this gate; arguments as in `rates`, and dt_s, the time since the last command [s].
 
         Raises:
             UserCodeError: `rates` of a user's law returned an array of wrong size or a non-finite rate.
         """
         n, order = self.space.n, self._order
         r_dot = self.rates(c, p_W, v_W, c_des, c_dot_des)
-        if self._is_own:  # compiled code would read beyond the end of a shorter array
+        if self._is_own:  # compiled code would read past the end of a shorter array
             r_dot = self._checked(r_dot)
         v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
         factor, guards, alarms = limited(r_dot, p_W, v_W, v_cmd_W, yaw_rate, order, *self.gains.limits)
@@ -224,7 +224,7 @@ class ProportionalLaw(ControlLaw):
         grow(self.integral, self._error, self.gains.integral_1_s2 * dt_s, self._clamp)
 
 
-LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock laws by name in scenarios
+LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock laws by name in a scenario
 
 
 class Map(NamedTuple):
@@ -257,7 +257,7 @@ class Grants:
         return {keys.sensor(drone, name): (name, i) for name in self._newest for i, drone in enumerate(self._drones)}
 
     def seat(self, drones: Sequence[str]) -> None:
-        """Set the order of the drones to that of the robots."""
+        """Set the names of the drones, in the order of the robots."""
         if not self.keys:
             return
         order = [self._drones.index(drone) for drone in drones]
@@ -268,7 +268,7 @@ class Grants:
     def put(self, key: str, sample: Sample) -> None:
         name, place = self._places[key]
         former = self._newest[name][place]
-        if former is None or sample.t_ns >= former.t_ns:  # in realtime, an older sample may arrive later
+        if former is None or sample.t_ns >= former.t_ns:  # in real time an older sample may arrive later
             self._newest[name][place] = sample
 
     def samples(self, law: type, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
@@ -282,9 +282,7 @@ class Grants:
             raise UserCodeError(f"{what}; must be {received.__name__}, the class of its messages")
         newest = self._newest[sensor]
         for place, sample in enumerate(newest):
-            if (
-                sample is not None and type(sample) is not kind
-            ):  # of the class derived from `world/info` for a user's sensor
+            if sample is not None and type(sample) is not kind:  # built from its declaration in `world/info`
                 newest[place] = convert(sample, kind, from_attributes=True)
         return tuple(newest)  # type: ignore[return-value] - converted above
 
@@ -320,7 +318,7 @@ def granted(law: Any, grants: Grants) -> Any:
 
 
 def _is_declared_as(received: Any, kind: Any) -> bool:
-    """Return whether a message class derived from its declaration corresponds to a user's class."""
+    """Return whether a message class built from its declaration corresponds to a user's class."""
     names = [(getattr(each, "__name__", None), getattr(each, "__struct_fields__", None)) for each in (received, kind)]
     return names[0] == names[1]
 
@@ -329,7 +327,7 @@ def _is_declared_as(received: Any, kind: Any) -> bool:
 def put_cluster_rate(
     c_des: Array, c: Array, period: Array, c_dot_des: Array, integral: Array, k: float, error: Array, c_dot: Array
 ) -> None:
-    """Write the error c_des - c, angles the shorter way, and the rate c_dot_des + k error + integral, all (4n,)."""
+    """Write the error c_des - c, angles by the shorter way, and the rate c_dot_des + k error + integral, each (4n,)."""
     for i in range(c.size):
         apart = c_des[i] - c[i]
         error[i] = apart - period[i] * np.rint(apart / TAU)
@@ -343,10 +341,10 @@ def grow(integral: Array, error: Array, rate: float, clamp: Array) -> None:
 
 
 class RobotLimits(NamedTuple):
-    """Limits of the saturation and of the guard, for compiled code.
+    """Limits of the saturation and the guard, for compiled code.
 
     Attributes:
-        separation_min_m: minimum distance between two robots; separation_alarm_m: closer pairs are reported.
+        separation_min_m: minimum distance between two robots; separation_alarm_m: pairs closer than this are reported.
         guard_horizon_s: prediction horizon of the guard.
         response_s: lag of a drone's velocity loop, during which the guard expects it to keep its velocity.
     """
@@ -361,12 +359,12 @@ class RobotLimits(NamedTuple):
 
 
 def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[Array, Pairs, Pairs]:
-    """Return velocities that keep robots from dangerous approaches, the guarded pairs, and the pairs in alarm.
+    """Return velocities limited to prevent dangerous approaches, the guarded pairs, and the pairs in alarm.
 
-    Two robots at distance d, d' = rate of the command along their line, are held to
-    d' >= -(d_near - separation_min) / guard_horizon: the distance predicted over the horizon stays above the minimum,
-    and below it the robots separate. d_near allows for the present velocities, which persist for the response time.
-    Each robot of a pair takes half of the change; several pairs need a few sweeps.
+    Two robots at distance d, with commanded rate d' along their line, are kept to d' >= -(d_near - separation_min) /
+    guard_horizon: the distance predicted over the horizon stays above the minimum, and below it the approach is
+    reversed. d_near allows for the present velocities, which last for the response time. Each robot of a pair takes
+    half of the change; a few sweeps settle several pairs.
     """
     parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
     guards, alarms = hold_apart(p_W, v_W, parted_W, order, *limits)
@@ -374,7 +372,7 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[
 
 
 def numbered(order: Order) -> Pairs:
-    """Return the pairs that have a non-zero number above the diagonal, sorted by that number."""
+    """Return the pairs numbered above the diagonal, in numerical order."""
     numbers = order.tolist()
     places = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]
     return tuple((i, j) for _, i, j in sorted(places))
@@ -386,8 +384,8 @@ def limited(
 ) -> tuple[float, int, int]:
     """Write the saturated and guarded velocities (n, 3) and yaw rates (n,) of r_dot (4n,).
 
-    Returns the factor of the saturation, then the result of `hold_apart`; limits_of are the fields of RobotLimits,
-    passed singly because a tuple argument would take longer than the computation.
+    Returns the factor of the saturation, then the result of `hold_apart`. limits_of are the fields of RobotLimits:
+    passing a tuple to compiled code takes longer than the computation.
     """
     limits = RobotLimits(*limits_of)
     for i in range(yaw_rate.size):
@@ -403,7 +401,7 @@ def limited(
 
 @portable
 def load(v_W: Array, yaw_rate: Array, limits: RobotLimits) -> float:
-    """Return the maximum ratio of a robot's speed, climb or yaw rate to its limit."""
+    """Return the maximum ratio of any robot's speed, climb or yaw rate to its limit."""
     most = 0.0
     for i in range(yaw_rate.size):
         speed = math.sqrt(v_W[i, 0] * v_W[i, 0] + v_W[i, 1] * v_W[i, 1])
@@ -423,7 +421,7 @@ def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
 
 @portable
 def near_pairs(p_W: Array, within_m: float) -> PairTable:
-    """Return the pairs (m, 2), i < j, of positions (n, 3) closer than within_m, sorted by j, then i."""
+    """Return the pairs (m, 2), i < j, sorted by j, then i, of positions (n, 3) closer than a distance."""
     n = p_W.shape[0]
     pairs, count = np.empty((n * (n - 1) // 2, 2), np.int64), 0
     for j in range(1, n):
@@ -437,10 +435,10 @@ def near_pairs(p_W: Array, within_m: float) -> PairTable:
 
 @portable
 def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
-    """Change commands in place until every pair has at least its minimum rate of separation (see `guard`).
+    """Change commands in place until every pair separates at least at its required rate (see `guard`).
 
-    Returns how many pairs were changed and how many are closer than the alarm threshold. In order (n, n), it numbers
-    the former from 1 above the diagonal and the latter below it; all other entries are zero.
+    Returns the numbers of changed pairs and of pairs closer than the alarm threshold. Into order (n, n) it numbers the
+    former from 1 above the diagonal and the latter below it; all other entries are zero.
     """
     limits = RobotLimits(*limits_of)
     order[:] = 0
@@ -463,7 +461,7 @@ def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of:
 
 @portable
 def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: Order) -> int:
-    """Number the pairs closer than the alarm threshold below the diagonal of `order`; return their count."""
+    """Number the pairs closer than the alarm threshold below the diagonal of order; return their count."""
     alarms = 0
     for k in range(near.shape[0]):
         i, j = near[k, 0], near[k, 1]
@@ -475,7 +473,7 @@ def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: O
 
 @portable
 def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
-    """Make robots i and j separate at least at their required rate, half of the change each; return whether changed."""
+    """Make robots i and j separate at least at the required rate, each by half; return whether commands changed."""
     line_W = subtract(row(p_W, j), row(p_W, i))
     distance = norm(line_W)
     if distance >= reach(limits):
@@ -494,7 +492,7 @@ def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLi
 
 @portable
 def reach(limits: RobotLimits) -> float:
-    """Return the distance from which two robots cannot come too close within the horizon."""
+    """Return the distance [m] beyond which two robots cannot come too close within the horizon."""
     climb, speed = limits.climb_max_m_s, limits.speed_max_m_s
     fastest = 2.0 * math.sqrt(speed * speed + climb * climb)
     return limits.separation_min_m + fastest * (limits.guard_horizon_s + limits.response_s)
@@ -502,13 +500,13 @@ def reach(limits: RobotLimits) -> float:
 
 @portable
 def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
-    """Return the rate at which j moves away from i along their line [m/s]."""
+    """Return the rate at which robot j moves away from robot i along the line between them [m/s]."""
     return dot(u_W, subtract(row(v_W, j), row(v_W, i)))
 
 
 @portable
 def direction(line_W: Vector, distance: float) -> Vector:
-    """Return the unit vector of a line; east if the robots coincide, so that they separate."""
+    """Return the unit vector of a line; x_W if the robots coincide, so that they still separate."""
     if distance < NEAR_M:
         return 1.0, 0.0, 0.0
     return line_W[0] / distance, line_W[1] / distance, line_W[2] / distance

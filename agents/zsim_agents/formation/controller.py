@@ -1,4 +1,4 @@
-"""The cluster controller as an agent: estimates and states in, velocity commands and cluster state out."""
+"""The cluster controller as an agent: turns estimates and drone states into velocity commands and a cluster state."""
 
 import math
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.flight_check import GateInput
 from zsim_agents.formation.flight_plan import RequestError, read_request
 
-REQUESTS_MAX = 1000  # maximum number between two gates, e.g. while a run is paused; published at the next gate
+REQUESTS_MAX = 1000  # maximum between two gates, e.g. while the run is paused; the next gate publishes them
 
-_variances_of = itemgetter(0, 7, 14)  # indices of the position's variances in the row-major 6 x 6 covariance
+_variances_of = itemgetter(0, 7, 14)  # variances of position in the row-major 6 x 6 covariance
 
 
 class Controller(Agent):
@@ -51,15 +51,15 @@ class Controller(Agent):
         self._control_key, self._request_key = keys.cluster_control(cluster), keys.cluster_request(cluster)
         self.writes, self.repeats = (self._state_key,), (self._request_key,)
         self._estimates = [_UNKNOWN] * len(spec.drones)
-        table = np.empty((12, len(spec.drones)))  # the numbers of a GateInput, valid until the next gate
+        table = np.empty((12, len(spec.drones)))  # arrays of the GateInput, overwritten at the next gate
         self._p_W, self._v_W, self._sigma_m = table[:9].reshape(3, len(spec.drones), 3)
         self._yaw, self._yaw_sigma, self._age_s = table[9:]
-        self._fill = partial(Packing(f"={table.size}d").pack_into, table.data, 0)  # numpy takes three times as long
+        self._fill = partial(Packing(f"={table.size}d").pack_into, table.data, 0)  # NumPy takes three times as long
         self._states: list[str] = ["landed"] * len(spec.drones)
         self._status_ns = [0] * len(spec.drones)
         self._last_state: flight_messages.ClusterState | None = None
         self._stepped_ns: int | None = None
-        self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
+        self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # requests since the last gate
 
     def receive(self, key: str, message: Any) -> None:
         place = self._place.get(key)
@@ -67,9 +67,9 @@ class Controller(Agent):
             self._grants.put(key, message)
         elif type(message) is flight_messages.Estimate:
             former = self._estimates[place]
-            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime, an older estimate may arrive later
+            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in real time an older message may arrive later
                 self._estimates[place] = message
-        elif message.t_ns >= self._status_ns[place]:  # likewise
+        elif message.t_ns >= self._status_ns[place]:  # as for estimates
             self._states[place], self._status_ns[place] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
@@ -78,10 +78,7 @@ class Controller(Agent):
         self._seat(self._engagement.drones)
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
-        for (
-            request,
-            answer,
-        ) in answered:  # requests since the last gate; a re-run of the record submits them before this gate
+        for request, answer in answered:  # published at the gate, which a re-run repeats them before
             key, of_request = self._request_key, (request.op, request.args, request.source)
             message = run_messages.ClusterRequest(
                 t_ns, self.next_seq(key), *of_request, answer.ok, answer.error, source
@@ -115,7 +112,7 @@ class Controller(Agent):
         return outputs
 
     def _seat(self, drones: Sequence[str]) -> None:
-        """Set the order of the drones to that of the robots, which an assembly changes."""
+        """Assign the drones to rows in the order of the robots, which an assembly changes."""
         if drones == self.drones:
             return
         places = [self.drones.index(drone) for drone in drones]
@@ -142,7 +139,7 @@ class Controller(Agent):
         self._fill(*positions, *velocities, *variances, *yaws, *yaw_sigmas, *ages_s)
         np.sqrt(self._sigma_m, self._sigma_m)
         p_W = self._p_W
-        if any(ages_s):  # extrapolated at constant velocity; the age of a missing estimate is infinite
+        if any(ages_s):  # old estimates are extrapolated at constant velocity; the age is infinite without an estimate
             p_W = p_W + self._v_W * np.where(np.isfinite(self._age_s), self._age_s, 0.0)[:, None]
         sigmas = self._sigma_m, self._yaw_sigma
         return GateInput(t_ns * 1e-9, p_W, self._yaw, self._v_W, *sigmas, self._age_s, tuple(self._states))
@@ -217,8 +214,8 @@ _UNKNOWN = flight_messages.Estimate(
 
 
 def _finite(values: np.ndarray) -> tuple[float, ...]:
-    """Return values for the wire, with non-finite ones replaced by zeros."""
+    """Return values for a message, with non-finite ones replaced by zeros."""
     numbers = values.tolist()
-    if not math.isfinite(sum(numbers)):  # one of them is not finite, or the sum overflows
+    if not math.isfinite(sum(numbers)):  # a value is not finite, or the sum overflows
         numbers = [number if math.isfinite(number) else 0.0 for number in numbers]
     return tuple(numbers)

@@ -1,7 +1,8 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
-A plain object: estimates in, commands out, once per gate; requests in between. Every engagement, resumption and
-reference is checked, every refusal gives its reason, and every reference starts at the formation's present state.
+`Engagement` does no communication: each gate takes estimates and returns commands; requests arrive in between. Every
+engagement, resumption and reference is checked, every refusal gives a reason, and every reference starts at the
+present state of the formation.
 """
 
 from __future__ import annotations
@@ -59,17 +60,17 @@ from zsim_agents.formation.flight_plan import (
 from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
-DT_MAX_S = 0.1  # maximum step of the integral, after a gap
-CLIMB_GAIN_1_S = 0.8  # gain of the climb to the assembly height
-HOLD_APART_M = 0.1  # added to the minimum separation while a formation is held
+DT_MAX_S = 0.1  # maximum integration step, which applies after a gap
+CLIMB_GAIN_1_S = 0.8  # proportional gain of the climb to the assembly height
+HOLD_APART_M = 0.1  # margin above the minimum separation for the robots of a held formation
 
 
 class Engagement:
-    """The phase machine of one formation.
+    """The state machine of the phases of one formation.
 
     Args:
         drones: names in the order of the robots.
-        plan: requests of the scenario; a requested landing drops those remaining.
+        plan: requests of the scenario; a landing request drops the remaining ones.
 
     Raises:
         ValueError: the plan is impossible (see `FlightPlan`), or the number of names is not n.
@@ -100,16 +101,16 @@ class Engagement:
         self._dt_s = 0.0
         self._modes: dict[str, float] = {}  # time of the last mode command, by drone
         self._landing_s = -math.inf
-        self._fault = ""  # why the loop of an engaged formation is open
+        self._fault = ""  # why the control loop of an engaged formation is open
         self._well_since_s = math.inf
-        self._assembly: Assembly | None = None  # while drones fly to assigned positions or wait there
-        self._places: Places | None = None  # while drones of a held formation are led back
-        self._checked = np.empty(0)  # last valid reference; a constant one stays the same array
-        self._wrapped = self._checked, self._checked  # the last reference as it is and with wrapped angles
+        self._assembly: Assembly | None = None  # set while the drones fly to assigned positions or wait there
+        self._places: Places | None = None  # set while the drones of a held formation are led back
+        self._checked = np.empty(0)  # the last faultless reference; a reference at rest stays the same array
+        self._wrapped = self._checked, self._checked  # the last reference, without and with wrapped angles
 
     @property
     def phase(self) -> str:
-        """One of idle, taking_off, assembling, engaged, landing and held."""
+        """The present phase: idle, taking_off, assembling, engaged, landing or held."""
         return "held" if self._phase == "engaged" and (self._fault or self.guidance.paused) else self._phase
 
     def step(self, gate: GateInput) -> GateOutput:
@@ -118,7 +119,7 @@ class Engagement:
         self._gate = gate
         self.check.observe(gate)
         self.plan.run(gate.t_s, self._try)
-        gate = self._gate  # reordered if a request started an assembly
+        gate = self._gate  # the robots in the order set by the last assembly
         if self._phase in ("assembling", "engaged") and gate.down:
             self._phase, self._places, self._assembly = "idle", None, None
         if self._phase == "engaged":
@@ -146,12 +147,14 @@ class Engagement:
         return refusal
 
     def warm_start(self, phase: str, desired: Array, plan_step: int = 0, drones: Sequence[str] = ()) -> None:
-        """Continue in the phase and at the reference (4n,) of this formation's previous process.
+        """Continue in the phase and at the reference (4n,) of a previous process of this formation.
 
-        `drones`: names in the order of its robots, if different from the scenario's.
+        The plan continues after the completed steps; a target or trajectory of the plan that was being flown is
+        requested again from that reference.
 
-        Its plan continues after the steps completed according to the previous `GateOutput.plan_step`; a target or
-        trajectory of the plan that was in progress is requested again from that reference.
+        Args:
+            plan_step: last `GateOutput.plan_step` of the previous process.
+            drones: names in the order of the robots, if it differs from the scenario's.
         """
         self._phase = "engaged" if phase == "held" else phase
         self._name(drones or self.drones)
@@ -182,7 +185,7 @@ class Engagement:
         }
 
     def restore(self, state: State, gate: GateInput | None) -> None:
-        """Restore the snapshot of another process; `gate` is the last one it stepped."""
+        """Restore the snapshot of another process and the last gate that it processed."""
         self._phase, self._landing_s = state["phase"], state["landing_s"]
         self._name(state["drones"])
         self._assembly = state["assembly"] and Assembly.restored(state["assembly"], self.gains)
@@ -263,7 +266,7 @@ class Engagement:
         self._phase = "engaged"
 
     def _grant_assembly(self, request: Assemble, gate: GateInput) -> None:
-        """Assign the drones to the positions of a formation, and start their flight there."""
+        """Assign the drones to the positions of a formation and start their flight there."""
         if self._phase not in ("assembling", "engaged") or self._fault:
             raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
         if fault := self._way_left(gate) or self.check.assembly_fault(gate):
@@ -280,11 +283,11 @@ class Engagement:
         self.check.observe(self._gate)
 
     def _name(self, drones: Sequence[str]) -> None:
-        """Set the order of the drones to that of the robots."""
+        """Set the names of the drones, in the order of the robots."""
         self.drones = self.law.robots = self.check.drones = tuple(drones)
 
     def _way_left(self, gate: GateInput) -> str | None:
-        """Return how far the drones still are from their positions, None if they have arrived."""
+        """Return a text on the remaining flight of the drones to their positions, None after arrival."""
         if self._assembly is None or self._assembly.arrived(gate.p_W):
             return None
         i, away_m = self._assembly.farthest(gate.p_W)
@@ -307,7 +310,7 @@ class Engagement:
         return tuple(due)
 
     def _climb(self, gate: GateInput) -> GateOutput:
-        """Lead the airborne drones vertically to the assembly height, without formation control."""
+        """Lead the flying drones vertically to the assembly height, each individually."""
         modes: tuple[ModeCommand, ...] = ()
         reason = self.check.state_fault(gate, AIRBORNE) if self._phase == "taking_off" else None
         if reason:
@@ -331,7 +334,7 @@ class Engagement:
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or clear it after HEAL_S without a fault."""
         fault = self._way_fault(gate) or self.check.flight_fault(gate)
-        if not fault and not self._fault:  # the check at the request covers only part of an endless reference
+        if not fault and not self._fault:  # the checks of a request cover only a limited time of the reference
             try:
                 c_des = self.guidance.value(gate.t_s)[0]
                 if c_des is not self._checked:
@@ -355,7 +358,7 @@ class Engagement:
                 self.law.reset()
 
     def _way_fault(self, gate: GateInput) -> str | None:
-        """Return which led drone is not yet in position; stop leading if one cannot be controlled."""
+        """Return which drone has not rejoined its position; stop leading the drones if one cannot be controlled."""
         if self._places is None:
             return None
         if self._unflyable(gate):
@@ -376,7 +379,7 @@ class Engagement:
         return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
     def _hold(self, gate: GateInput) -> GateOutput:
-        """Hold the drones of a held formation, or lead them to their positions, without turning."""
+        """Stop the drones of a held formation, or lead them to their positions without turning."""
         if self._places is None:
             command = self._upright(gate, 0.0, self._held_limits)
         else:
@@ -384,12 +387,12 @@ class Engagement:
         return self._output(gate, self._fault, command=command)
 
     def _guarded(self, gate: GateInput, v_W: Array, limits: RobotLimits) -> FormationCommand:
-        """Return a guarded command of velocities (n, 3) [m/s, W] with zero yaw rates."""
+        """Return the command for velocities (n, 3) [m/s, W], guarded and without turning."""
         v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
 
     def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
-        """Return a guarded command of climb rates (n,) with zero yaw rates; all zero if estimates are unusable."""
+        """Return the command for climb rates (n,) [m/s], guarded, without turning; zero if an estimate is unusable."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
         if self.check.estimate_fault(gate) is None:
@@ -406,7 +409,7 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference, the desired value is the estimated one."""
+        """Return the output of a gate; without a reference the desired value is the estimate."""
         if command and command.alarmed:
             near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
             reason = f"{TOO_NEAR}, {near}; {reason}"
@@ -428,7 +431,7 @@ class Engagement:
         )
 
     def _is_led(self) -> bool:
-        """Return whether the drones are following a reference or an assembly."""
+        """Return whether the drones are assembling or following a reference, as opposed to hovering or holding."""
         return self._assembly is not None or (self._phase == "engaged" and not self.guidance.paused)
 
     def _pairs(self, pairs: Pairs) -> str:

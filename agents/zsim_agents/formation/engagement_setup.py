@@ -1,4 +1,4 @@
-"""The engagement of a scenario's cluster: space, gains, law and plan, rehearsed before the flight.
+"""Builds the engagement of a scenario's cluster from space, gains, law and plan, and rehearses it before the flight.
 
 A plan is checked before the flight, from the drones' start positions. Refused are plans that the guidance would
 certainly refuse throughout the flight, with the factor by which their times must be stretched, and plans that end
@@ -54,16 +54,16 @@ from zsim_agents.formation.spaces.cluster_space import (
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, Shifted, ramp_onto
 
-APART_M = 2.0  # distance between robots in a rehearsal [m]; any value well above zero
-READY_S = 3.0  # minimum time from the take-off command to the engagement: a take-off; AR.Drones take 4 to 12 s
-ROOM = 1.05  # chosen: factor of the speed limits, as drones deviate by centimetres from their positions
-WAY_ROOM = 1.25  # chosen: factor for a path from the start, whose length varies with the drift in the climb
-NEAR_ROOM = 0.9  # chosen: factor of the minimum separation and height
-STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # sampling of a reference
+APART_M = 2.0  # distance between robots in a rehearsal; any value well above zero
+READY_S = 3.0  # minimum from the take-off order to the engagement, when the drones hover; AR.Drones take 4 to 12 s
+ROOM = 1.05  # chosen factor on the speed limits: a drone's position in the formation is off by some centimetres
+WAY_ROOM = 1.25  # chosen factor on a path from the start, whose length changes as the drones drift in their climb
+NEAR_ROOM = 0.9  # chosen factor on the minimum separation and height
+STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # sampling of a checked reference
 
 
 def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
-    """Return the phase machine of a cluster; raises RunError if its plan is impossible."""
+    """Return the engagement of a cluster; raises RunError if its plan can never be flown."""
     with _refusals_of(scenario, cluster):
         space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
         name = cluster.law or "proportional"
@@ -83,7 +83,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
 
 
 def check_plan(scenario: Scenario, cluster: Cluster) -> None:
-    """Raise RunError for a plan that `engagement_of` refuses, without a rehearsal of the law."""
+    """Raise RunError for a plan that `engagement_of` refuses, without rehearsing a law."""
     with _refusals_of(scenario, cluster):
         space = scenario_space(scenario, cluster)
         FlightPlan(space, plan_of(cluster))
@@ -91,16 +91,16 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
 
 
 class PlannedMotion(NamedTuple):
-    """The last reference of a plan, its earliest start, and its landing."""
+    """The last reference of a plan, its earliest start and its landing."""
 
     space: ClusterSpace
     reference: Reference
     from_s: float
     until_s: float
-    path: str  # of the request in the cluster's section of the scenario
+    path: str  # path in the cluster's section of the scenario
 
     def places(self, t_s: float) -> Array:
-        """Return the reference positions of the robots at t_s, (n, 3) [m; W]."""
+        """Return the reference positions of the robots, (n, 3) [m; W]."""
         return self.space.inverse(self.reference.value(t_s)[0])[0]
 
 
@@ -149,7 +149,7 @@ def _hovers(scenario: Scenario, cluster: Cluster) -> tuple[Array, Array]:
 
 @contextmanager
 def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
-    """Raise faults of a cluster as a RunError that names it, and for its plan the path in the scenario."""
+    """Re-raise faults as a RunError that names the cluster, and for its plan also the path in the scenario."""
     try:
         yield
     except PlanError as error:
@@ -199,7 +199,7 @@ def gains_of(gains: Gains) -> FormationGains:
 
 
 def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-    """Raise PlanError for a plan that these drones cannot fly; without a valid start formation, it is not checked."""
+    """Raise PlanError for a plan that these drones cannot fly; unchecked if they do not start in a valid formation."""
     plan = cluster.plan
     assembles = plan.assemblies is not UNSET
     if plan.takeoff_s is None or not (plan.target or plan.trajectory or assembles):
@@ -225,7 +225,7 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
                 planned_assembly(space, goal, p_W, gains, NEAR_ROOM)
                 p_W, yaw = space.inverse(goal)
             elif start is None:
-                continue  # requests before the first assembly are not checked
+                continue  # the take-off order, before any formation exists
             elif isinstance(request, MoveTo):
                 goal = request.goal(space, goal)
                 rehearsal.check_target(start, goal, None if plan.trajectory else request.over_s)
@@ -237,7 +237,7 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
 
 
 def _formation_at(space: ClusterSpace, p_W: Array, yaw: Array) -> Array | None:
-    """Return the cluster (4n,) of robots, None if it is not a shape to engage in."""
+    """Return the cluster (4n,) of the robots, None if it cannot be engaged."""
     try:
         c = space.forward(p_W, yaw)
         return None if shape_fault(space, c, SHAPE) else c
@@ -263,7 +263,7 @@ class _Rehearsal:
         self._planner = RampPlanner(space, gains, SHAPE)
 
     def check_target(self, start: Array, goal: Array, over_s: float | None) -> None:
-        """Refuse a target that is not allowed or too far for its time; TrajectoryError: it takes over an hour."""
+        """Refuse a target that is not allowed or too far for its duration; TrajectoryError: it is out of reach."""
         if fault := self._fault_at(goal):
             raise PlanError(f"plan.target: {fault}")
         home, rest = Hold(goal), np.zeros_like(start)
@@ -279,7 +279,7 @@ class _Rehearsal:
             )
 
     def check_trajectory(self, start: Array, trajectory: Reference, start_s: float, ready_s: float) -> None:
-        """Refuse a trajectory that is too fast, passes through a forbidden state, or ends too soon."""
+        """Refuse a trajectory that is too fast, leads through a forbidden state or ends too soon."""
         length_s = trajectory.duration_s
         end_s = start_s + (math.inf if length_s is None else length_s)
         if end_s <= ready_s:
@@ -304,7 +304,7 @@ class _Rehearsal:
             raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
 
     def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:
-        """Return the maximum share of its limits that a robot uses along a reference, and its time [s]."""
+        """Return the maximum share of a robot's speed limits used along a reference, and its time [s]."""
         return max(
             (load(*robot_rates(self._space, *reference.value(t_s)), self._limits), t_s)
             for t_s in _instants(from_s, to_s)

@@ -15,16 +15,16 @@ from zsim.math import elementary as el
 from zsim.scenario.scenario import CONSTANTS_MAX
 
 Dual = tuple[float, float]
-Node = tuple[Callable[[float], Dual], bool]  # a function of t, and whether it is constant
+Node = tuple[Callable[[float], Dual], bool]  # function of t, and whether it is constant
 
-TEXT_MAX = 1000  # characters
-DEPTH_MAX = 100  # nested operations
-NAME_MAX = 40  # characters of a constant
+TEXT_MAX = 1000  # maximum number of characters
+DEPTH_MAX = 100  # maximum depth of nested operations
+NAME_MAX = 40  # maximum number of characters in a constant's name
 CONSTANTS = {"pi": math.pi, "e": math.e}
 
 
 class ExpressionError(ValueError):
-    """An expression that is not allowed or not finite; the message names variable, finding and remedy."""
+    """An expression is not allowed or has no finite value; the message names the variable, finding and remedy."""
 
     def __init__(self, finding: str, name: str = "") -> None:
         super().__init__(f"{name}: {finding}" if name else finding)
@@ -127,7 +127,7 @@ class Expression:
 
 
 def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
-    """Return the constants as floats; ExpressionError: too many, a name or value that is not allowed."""
+    """Return the constants as floats; ExpressionError: there are too many, or a name or value is not allowed."""
     if len(constants) > CONSTANTS_MAX:
         raise ExpressionError(f"constants: found {len(constants)}; allowed: at most {CONSTANTS_MAX}")
     reserved = ["t", *CONSTANTS, *_FUNCTIONS]
@@ -161,7 +161,7 @@ def _divide(a: Dual, b: Dual) -> Dual:
 
 
 def _in_domain(value: float) -> float:
-    if not math.isfinite(value):  # before min or max can hide it
+    if not math.isfinite(value):  # checked at once, because min or max might discard the value
         raise ValueError("outside of the domain of a function")
     return value
 
@@ -176,7 +176,7 @@ def _power(a: Dual, b: Dual) -> Dual:
 def _unary(
     function: Callable[[float], float], rate_of: Callable[[float, float, float], float]
 ) -> Callable[[Dual], Dual]:
-    """Return a function of a dual number; `rate_of` takes the argument, the value and the argument's non-zero rate."""
+    """Return a function of a dual number; `rate_of` takes the argument, the value and the argument's nonzero rate."""
 
     def apply(a: Dual) -> Dual:
         value = _in_domain(function(a[0]))
@@ -196,7 +196,7 @@ _UNARY: dict[type[ast.unaryop], Callable[[Dual], Dual]] = {
     ast.USub: _unary(operator.neg, lambda x, y, rate: -rate),
     ast.UAdd: _unary(operator.pos, lambda x, y, rate: rate),
 }
-_FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {  # with minimum and maximum number of arguments
+_FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {  # with minimum and maximum numbers of arguments
     "sin": (_unary(el.sin, lambda x, y, rate: el.cos(x) * rate), 1, 1),
     "cos": (_unary(el.cos, lambda x, y, rate: -el.sin(x) * rate), 1, 1),
     "tan": (_unary(el.tan, lambda x, y, rate: (1 + y * y) * rate), 1, 1),

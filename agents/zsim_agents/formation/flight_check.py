@@ -1,6 +1,6 @@
-"""Checks whether a formation may take off, be engaged or continue, and where it may be led; faults are strings.
+"""Checks of whether a formation may take off, engage or fly on, and where it may be led; faults are texts.
 
-The data of a gate are Structs, which cost a fifth of the time of a named tuple or dataclass.
+The data of a gate are Structs, which are created in a fifth of the time of a named tuple or dataclass.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
-FAR = 1e6  # m, m/s or rad: larger values are mistakes
-ROUNDING_M = 1e-9  # above the rounding of computed positions (1e-14 at 50 m), so that the limit itself is allowed
-VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # state of an estimate
+FAR = 1e6  # m, m/s or rad; any greater value is taken for an error
+ROUNDING_M = 1e-9  # tolerance above the rounding of a computed position (1e-14 m at 50 m): the limit itself is allowed
+VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # findings of `estimate_flaw`
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
-DOWN = frozenset({"landed", "emergency"})  # states of a drone on the ground, or falling
-HELD_ON_REQUEST = "held on request"  # this and the next: reasons from which displays derive the possible requests
+DOWN = frozenset({"landed", "emergency"})  # states of a drone on the ground or falling
+HELD_ON_REQUEST = "held on request"  # reasons in the cluster state, from which a display derives the possible requests
 READY_TO_ENGAGE = "ready to engage"
 GUARD_PARTS = "the guard parts"
 TOO_NEAR = "ALARM"
@@ -33,43 +33,39 @@ REJOINING = "rejoining"
 
 @dataclass(frozen=True)
 class ShapeLimits:
-    """Limits of the shape in which a formation may be engaged, and to which a reference may lead it.
+    """Limits of the shape in which a formation may be engaged and to which a reference may lead it.
 
     Attributes:
         spread_min_m: minimum height of the shape.
         tilt_max_rad: maximum roll and pitch of the formation.
         condition_max: maximum condition number of J^-1.
         height_min_m: minimum height of a robot's reference above the ground, z_W = 0.
-        share: share of the robots' speed limits that a reference may use; the rest is for the law.
+        share: share of the robots' speed limits that a reference may use; the rest is left to the control law.
     """
 
-    spread_min_m: float = 1.0  # chosen: five sigma of the estimate of a side keep the robots from being collinear
-    tilt_max_rad: float = math.radians(30.0)  # chosen: far from the 90 deg where Euler angles fail
-    condition_max: float = 20.0  # chosen: above it, small motions in cluster space are large motions of robots
-    height_min_m: float = 0.5  # chosen: five rotor radii, above most of the ground effect
-    share: float = 0.8  # chosen: a fifth for the law
+    spread_min_m: float = 1.0  # chosen: five sigma of an estimated side keep the robots from being collinear
+    tilt_max_rad: float = math.radians(30.0)  # chosen: far from 90 deg, where Euler angles fail
+    condition_max: float = 20.0  # chosen: above it a small motion in cluster space moves a robot far
+    height_min_m: float = 0.5  # chosen: five rotor radii, clear of most of the ground effect
+    share: float = 0.8  # chosen
 
 
-# All chosen; those of the shape keep formations away from singularities
+# All limits are chosen; those of the shape keep every formation away from singularities
 SHAPE = ShapeLimits()
-FLIGHT_SLACK = 1.5  # of the limits of spread and tilt in flight, so that noise near them does not hold the formation
-SHAPE_IN_FLIGHT = dataclasses.replace(  # a formation in flight outside of these is held
+FLIGHT_SLACK = 1.5  # factor on spread and tilt limits in flight, so that noise at a limit does not hold the formation
+SHAPE_IN_FLIGHT = dataclasses.replace(  # a formation in flight is held outside these limits
     SHAPE,
     spread_min_m=SHAPE.spread_min_m / FLIGHT_SLACK,
     tilt_max_rad=SHAPE.tilt_max_rad * FLIGHT_SLACK,
     condition_max=math.inf,
 )
-ASSEMBLY_HEIGHT_M = (
-    1.5  # drones climb vertically to it before engagement: many rotor radii, and a drone survives the fall
-)
-ASSEMBLY_WITHIN_M = 0.3  # tolerance of that height: three sigma of the barometer
-ASSEMBLY_CLIMB_M_S = 0.5  # maximum: half of what the firmware allows, so that all drones climb alike
-AGE_MAX_S = 0.5  # maximum age of an estimate in flight, as long as the firmware tolerates silence: 25 gates
-IN_FLIGHT_FACTOR = 2.0  # of the maximum sigmas in flight; for a position 2 m, as for a single GPS fix
-HEAL_S = 0.5  # time without fault after which a held formation continues: 25 gates are no coincidence
-RESEND_S = (
-    1.0  # a mode command without effect is repeated after it: ten times the command delay in the paper's scenario
-)
+ASSEMBLY_HEIGHT_M = 1.5  # height of the vertical climb before engagement: many rotor radii, and a fall is survived
+ASSEMBLY_WITHIN_M = 0.3  # tolerance of that height, three sigma of the barometer
+ASSEMBLY_CLIMB_M_S = 0.5  # maximum; half of the firmware's limit, so that all drones climb equally
+AGE_MAX_S = 0.5  # maximum age of a usable estimate: 25 gates, as long as the firmware tolerates silence
+IN_FLIGHT_FACTOR = 2.0  # factor on the limits of sigma in flight; for a position 2 m, that of a single GPS fix
+HEAL_S = 0.5  # time without fault before a held formation continues: 25 gates rule out a coincidence
+RESEND_S = 1.0  # period of resending a mode command without effect: ten times its delay in the paper's scenario
 
 
 @dataclass(frozen=True)
@@ -77,7 +73,7 @@ class EngagementLimits:
     """Maximum standard deviations for take-off and engagement."""
 
     sigma_max_m: float = 1.0  # half of the minimum separation of 2 m
-    yaw_sigma_max_rad: float = math.radians(15.0)  # half of the 30 deg at which three sigma turn a velocity by 90 deg
+    yaw_sigma_max_rad: float = math.radians(15.0)  # half of 30 deg, where three sigma turn a velocity by 90 deg
 
 
 class GateInput(Struct, eq=False):
@@ -86,7 +82,7 @@ class GateInput(Struct, eq=False):
     Attributes:
         p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where unknown.
         sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
-        age_s: (n,) ages of the estimates; infinite for a drone without an estimate.
+        age_s: (n,) ages of the estimates; infinite without an estimate.
         states: (n,) `state` of each drone's sensor/status.
     """
 
@@ -100,13 +96,13 @@ class GateInput(Struct, eq=False):
     states: tuple[str, ...]
 
     def of(self, order: NDArray[np.intp]) -> GateInput:
-        """Return the gate with its drones reordered; order (n,) holds their present indices."""
+        """Return the gate with the robots reordered; `order` (n,) holds their present indices."""
         motion = self.p_W[order], self.yaw[order], self.v_W[order]
         known = self.sigma_m[order], self.yaw_sigma[order], self.age_s[order]
         return GateInput(self.t_s, *motion, *known, tuple(self.states[k] for k in order.tolist()))
 
     @property
-    def down(self) -> bool:  # no drone is airborne
+    def down(self) -> bool:  # whether no drone is in the air
         return DOWN.issuperset(self.states)
 
 
@@ -131,12 +127,12 @@ def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | 
 
 
 class GateOutput(Struct, eq=False):
-    """Commands of a gate, and the fields of the cluster's state message.
+    """Commands of a gate and the fields of the cluster state message.
 
     Attributes:
-        setpoints: (n,) velocity commands, None for no command.
-        phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; value and
-            desired with wrapped angles.
+        setpoints: (n,) velocity commands, None for a drone without a command.
+        phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; angles in
+            value and desired are wrapped.
         factor: common factor of the saturation, 1 without saturation.
     """
 
@@ -157,7 +153,7 @@ class FlightCheck:
     """Checks the estimates and states of a gate; each check returns a fault or None.
 
     Attributes:
-        value: (4n,) cluster of the newest estimates that had a frame, initially zero.
+        value: (4n,) cluster of the newest estimates that had a frame, zero before the first.
         margin: its `ClusterSpace.margin` [m], 0 while the estimates have no frame.
     """
 
@@ -170,7 +166,7 @@ class FlightCheck:
         self.margin = 0.0
         self._spread = 0.0
         self._no_frame: str | None = "nothing was observed yet"
-        self._flaw = (VALID, 0)  # of the observed estimates, by the limits in flight
+        self._flaw = (VALID, 0)  # first flaw of the observed gate under the limits in flight
         sigmas = limits.sigma_max_m, limits.yaw_sigma_max_rad
         self._at_start = (AGE_MAX_S, *sigmas)
         self._in_flight = (AGE_MAX_S, *(IN_FLIGHT_FACTOR * sigma for sigma in sigmas))
@@ -190,7 +186,7 @@ class FlightCheck:
     def take_off_fault(self, gate: GateInput, assembles: bool = False) -> str | None:
         """Return why the drones may not take off; airborne drones are not checked for their positions.
 
-        `assembles`: they will be led to assigned positions, so they may start in any shape.
+        `assembles`: whether they will fly to assigned positions, so that they may start in any shape.
         """
         fault = self._start_fault(gate, AIRBORNE | {"landed"})
         if fault or "landed" not in gate.states:
@@ -272,7 +268,7 @@ def _first_flaw(gate: GateInput, age_max_s: float, sigma_max_m: float, yaw_sigma
 
 @portable
 def all_near(p_W: Array, yaw: Array) -> bool:
-    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR."""
+    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR in magnitude."""
     fit = True
     for i in range(yaw.size):
         fit = fit and near(p_W, i) and abs(yaw[i]) < FAR
@@ -281,7 +277,7 @@ def all_near(p_W: Array, yaw: Array) -> bool:
 
 @portable
 def near(vectors: Array, i: int) -> bool:
-    """Return whether row i of (n, 3) is finite and below FAR; false for NaN."""
+    """Return whether row i of vectors (n, 3) is finite and below FAR in magnitude."""
     return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
 
 
@@ -299,7 +295,7 @@ def estimate_flaw(
 ) -> tuple[int, int]:
     """Return the flaw of the first unusable estimate and the index of its drone; (VALID, 0) if all are usable.
 
-    UNCERTAIN: sigma of the position; TURNED: sigma of the heading.
+    UNCERTAIN: the sigma of the position is too large; TURNED: that of the heading.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
@@ -315,9 +311,9 @@ def estimate_flaw(
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
-    """Return why a formation may not be engaged in c or led to it (quantity, value and limit), or None.
+    """Return why c is not an allowed shape (quantity, value and limit), or None.
 
-    `spread` is the spread of c, if already computed.
+    `spread`: the spread of c, if already known.
     """
     outside = first_outside(c, space.bounds)
     if outside >= 0:
@@ -340,7 +336,7 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: floa
 
 
 def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
-    """Return the open bounds (4n, 2) within which `shape_fault` finds no fault except in spread and condition."""
+    """Return the open bounds (4n, 2) outside which `shape_fault` finds a fault."""
     bounds = space.bounds.copy()
     for k in space.tilts:
         bounds[k, 0] = max(bounds[k, 0], -limits.tilt_max_rad)
@@ -350,7 +346,7 @@ def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
 
 @portable
 def first_outside(c: Array, bounds: Array) -> int:
-    """Return the index of the first variable of c beyond FAR or outside its open bounds (4n, 2), or -1."""
+    """Return the index of the first variable of c beyond FAR or outside its open bounds (4n, 2), else -1."""
     for k in range(c.size):
         if not (abs(c[k]) < FAR and bounds[k, 0] < c[k] < bounds[k, 1]):  # also true for NaN
             return k
@@ -358,12 +354,12 @@ def first_outside(c: Array, bounds: Array) -> int:
 
 
 def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the formation may not be led to c, because of its shape or its robots' positions, or None."""
+    """Return why the formation may not be led to c, because of its shape or the robots' positions, or None."""
     return shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    """Return why the robots' positions in c are not allowed (too close to each other, too low), or None."""
+    """Return why the robots' positions in c are not allowed (too close together or too low), or None."""
     p_W, _ = space.inverse(c)
     if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None

@@ -1,4 +1,4 @@
-"""Requests to a formation by a user or a scenario, and the plan of a scenario: its requests with their due times."""
+"""Requests to a formation by a user or a scenario, and the plan of a scenario: requests with their due times."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from zsim_agents.formation.trajectory import (
     named_values,
 )
 
-RETRY_S = 0.5  # interval between attempts of a refused request
-WAITS = " of the plan waits: "  # in the note of a plan, between the step and the reason
+RETRY_S = 0.5  # period of retrying a refused request
+WAITS = " of the plan waits: "  # separates the step from the reason in the note of a plan
 
 
 class RefusalError(ValueError):
@@ -45,22 +45,22 @@ REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError
 class Order(Enum):
     """A request without parameters, by its name on the wire."""
 
-    TAKE_OFF = "takeoff"  # all drones; they climb vertically to the assembly height
-    ENGAGE = "engage"  # close the formation loop at the present estimate, or resume after a hold on request
+    TAKE_OFF = "takeoff"  # all drones take off and climb vertically to the assembly height
+    ENGAGE = "engage"  # close the formation's control loop at the present estimate, or resume after a hold
     PAUSE = "hold"  # hover in formation until engaged again
-    REJOIN = "rejoin"  # lead the drones of a formation held by a fault individually to their positions
-    LAND = "land"  # all drones where they are
+    REJOIN = "rejoin"  # lead each drone of a formation held by a fault back to its position individually
+    LAND = "land"  # all drones land where they are
 
 
 @dataclass(frozen=True)
 class MoveTo:
-    """Move the formation to values by name, in over_s or as fast as allowed; `target` on the wire."""
+    """Move the formation to values by name, in over_s or as fast as the limits allow; `target` on the wire."""
 
     values: Mapping[str, str | float] = field(default_factory=dict)
     over_s: float | None = None
 
     def goal(self, space: ClusterSpace, base: Array) -> Array:
-        """Return the goal (4n,): base with the values replaced; raises TrajectoryError."""
+        """Return the goal (4n,): base with the named values replaced; raises TrajectoryError or ExpressionError."""
         if not self.values:
             raise TrajectoryError(f"target: no values; allowed: numbers by name of {', '.join(space.names)}")
         return named_values(space, self.values, "target", base)
@@ -73,8 +73,8 @@ class Follow:
     Attributes:
         expressions, constants, duration_s: see `ExpressionTrajectory`; or
         waypoints: see `WaypointTrajectory`.
-        start_s: simulated time of the trajectory's t = 0; None: when the formation arrives. A formation that
-            arrives later joins the moving trajectory.
+        start_s: simulated time of the trajectory's t = 0; None: when the formation arrives at its start. A formation
+            that arrives later joins the moving trajectory.
     """
 
     expressions: Mapping[str, str | float] = field(default_factory=dict)
@@ -97,9 +97,9 @@ class Follow:
 
 @dataclass(frozen=True)
 class Assemble:
-    """Move each drone to its assigned position in a formation; `assemble` on the wire.
+    """Move each drone to an assigned position in a formation; `assemble` on the wire.
 
-    The formation is given by names and values, as in `MoveTo`. It is engaged by a separate request.
+    The formation is given by names and values, as in `MoveTo`. A separate request engages it.
     """
 
     values: Mapping[str, str | float] = field(default_factory=dict)
@@ -123,10 +123,10 @@ class Scheduled:
 class FlightPlan:
     """Requests in order; each waits for the previous ones, except Order.LAND, which drops those before it.
 
-    A restarted controller continues at `resume_at` of its predecessor.
+    A restarted controller continues at the `resume_at` of its predecessor.
 
     Attributes:
-        note: the waiting request and why it is refused; empty if none waits.
+        note: which step of the plan waits and why, empty if none does.
 
     Raises:
         PlanError: a request is invalid (unknown name, bad expression), or times decrease.
@@ -157,8 +157,8 @@ class FlightPlan:
                     path = f"{step.path}{part}.{error.name}: "
                 raise PlanError(f"{path}{text}") from None
         self._steps = tuple(steps)
-        self._next = 0  # first step that is not completed
-        self._flown = 0  # first step of the reference in progress; _next if it does not come from the plan
+        self._next = 0  # index of the first uncompleted step
+        self._flown = 0  # index of the first step of the reference being flown, else _next
         self._try_s = -math.inf
         self.note = ""
 
@@ -181,11 +181,11 @@ class FlightPlan:
 
     @property
     def assembles(self) -> bool:
-        """Whether an assembly is still ahead, so that the drones may start in any shape."""
+        """Whether an assembly is still ahead, so that the drones may start anywhere."""
         return any(isinstance(step.request, Assemble) for step in self._steps[self._next :])
 
     def resume_at(self, flying: bool) -> int:
-        """Return the number of steps that a restart skips: those completed, except those in progress."""
+        """Return the number of steps that a restart skips: the completed ones, except those being flown."""
         return self._flown if flying else self._next
 
     def start_at(self, step: int) -> None:
@@ -200,7 +200,7 @@ class FlightPlan:
         self._try_s, self.note = state["try_s"], state["note"]
 
     def overrule(self) -> None:
-        """Note that the reference no longer follows the plan."""
+        """Record that the reference no longer follows the plan."""
         self._flown = self._next
 
     def clear(self) -> None:
@@ -213,7 +213,7 @@ class FlightPlan:
 
 
 def waiting_step(reason: str) -> tuple[str, str] | None:
-    """Return the waiting step of the plan and its reason, parsed from a cluster state's reason; None if none waits."""
+    """Return the waiting step of the plan and why it waits, from a cluster state's reason; None if no step waits."""
     before, waits, why = reason.rpartition(WAITS)
     return (before.rpartition("; ")[2], why) if waits else None
 

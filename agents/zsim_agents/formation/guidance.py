@@ -24,24 +24,24 @@ from zsim_agents.formation.trajectory import (
 
 SAMPLE_S = 0.5  # at 2 m/s a robot moves 1 m between two samples
 SAMPLES_MIN, SAMPLES_MAX = 41, 301
-HORIZON_S = 600.0  # of an endless trajectory, checked at the request; the rest is checked in flight
+HORIZON_S = 600.0  # part of a trajectory that is checked in advance; the rest is checked in flight
 RAMP_MIN_S, RAMP_MAX_S = 2.0, 3600.0
-RAMP_GROWTH = 1.2  # minimum step of the search for a ramp that satisfies the limits
-RAMP_SAMPLES = 33  # odd, so that one is in the middle of a ramp, where its rate peaks
-LOAD_TOLERANCE = 1.02  # factor of the share: ramps are sampled, and one may start at the limit
-BENEATH_M = 1.0  # chosen: horizontal distance to its position within which a robot climbs or descends to it
-IN_PLACE_M = 1.0  # chosen: a robot this close to its position joins the formation; half of the minimum separation
+RAMP_GROWTH = 1.2  # minimum growth factor in the search for a ramp that is slow enough
+RAMP_SAMPLES = 33  # odd, so that one falls on the middle of a ramp, where its rate peaks
+LOAD_TOLERANCE = 1.02  # factor on the allowed share: ramps are sampled, and a ramp may start at the limit
+BENEATH_M = 1.0  # chosen horizontal distance to its position within which a robot climbs or descends to it
+IN_PLACE_M = 1.0  # distance to its position at which a robot rejoins; chosen: half of the minimum separation
 
 
 class Guidance:
     """The reference of an engaged formation, a function of simulated time.
 
-    The formation's home (its target or trajectory) is kept separately from the present reference (a ramp onto it). A
-    variable that a request does not name keeps its goal: the value of the last request that named it; initially its
-    value at engagement, or zero for the neutral ones (roll, pitch, phi_i, w_k).
+    The formation's home (its target or trajectory) is kept separately from the reference being flown (a ramp onto it).
+    A variable that a request does not name keeps its goal: the value from the last request that named it; initially
+    its value at engagement, or zero for the neutral variables (roll, pitch, phi_i, w_k).
 
-    Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError if the path is not
-    allowed, and then change nothing.
+    Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError, and change
+    nothing, if the path is not allowed.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains) -> None:
@@ -61,14 +61,14 @@ class Guidance:
         return self._known[2]
 
     def trajectory_t_s(self, t_s: float) -> float | None:
-        """Return the time since the start of the trajectory [s], None if none is running."""
+        """Return the time since the start of the trajectory [s], None without a running trajectory."""
         if not isinstance(self._home, Shifted) or self.paused:
             return None
         own_s, end_s = t_s - self._home.start_s, self._home.of.duration_s
         return own_s if own_s >= 0.0 and (end_s is None or own_s <= end_s) else None
 
     def engage(self, c: Array) -> None:
-        """Start at the estimate c (4n,) and hold it."""
+        """Hold the formation at the estimate c (4n,)."""
         self._goal = c.copy()
         self._goal[self.space.neutral] = 0.0
         self._home = self._flown = Hold(c)
@@ -107,14 +107,14 @@ class Guidance:
         self.paused = True
 
     def resume(self, t_s: float) -> None:
-        """Return to the home after a pause."""
+        """Continue to the home reference after a pause."""
         self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
     def rejoin(self, c: Array, t_s: float) -> None:
         """Continue after a fault from rest at the estimate c (4n,); a paused formation stays there.
 
-        The path back is checked by the limits in flight, which a formation at the edge of those limits satisfies.
+        The path back is checked against the limits in flight, so that a formation near their edge can return.
         """
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
@@ -138,7 +138,7 @@ class Guidance:
 
 
 class RampPlanner:
-    """Plans the ramps of a formation within the limits of its shape and its robots."""
+    """Plans the ramps of a formation within the limits of its shape and robots."""
 
     def __init__(self, space: ClusterSpace, gains: FormationGains, limits: ShapeLimits) -> None:
         self._space, self._gains, self._limits = space, gains, limits
@@ -149,7 +149,7 @@ class RampPlanner:
         The ramp and up to HORIZON_S of the reference are checked.
 
         Raises:
-            TrajectoryError: the ramp is too fast or too long, or passes through a forbidden state.
+            TrajectoryError: the ramp is too fast or too long, or leads through a forbidden state.
         """
         from_s = max(start_s, onto.start_s) if isinstance(onto, Shifted) else start_s
         end_s = min(math.inf if onto.duration_s is None else onto.duration_s, from_s + HORIZON_S)
@@ -206,10 +206,10 @@ class RampPlanner:
 
 
 class Places:
-    """Positions p_W (n, 3) [m, W] of the robots in a held formation, and the motion of each robot to its own.
+    """The assigned positions p_W (n, 3) [m] in a held formation, and the motion of each robot to its own.
 
-    With a robot far from its position (for example after landing and taking off again), the shape cannot be controlled
-    as a formation. The robot first flies horizontally at its present height, below or above the others, then
+    A robot far from its position (for example after landing and taking off again) distorts the shape so that it cannot
+    be led as a formation. Each robot first flies horizontally at its own height, below or above the others, then
     vertically, at a share of the robots' limits.
     """
 

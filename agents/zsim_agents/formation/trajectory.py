@@ -1,6 +1,6 @@
-"""References in cluster space: a value and its rate at any time.
+"""References in cluster space: a value and its rate as functions of time.
 
-Time is in seconds from the start of the reference; outside [0, duration_s] a reference rests at the nearest
+Time is in seconds from the start of the reference; outside [0, duration_s] a reference stays at the nearer
 end. Angles are continuous in time, not wrapped. Users give values by the names of variables: in metres and radians, or
 in degrees as NAME_deg.
 """
@@ -22,15 +22,13 @@ from zsim_agents.formation.expression import Expression, ExpressionError, finite
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
 
 DEGREES = "_deg"
-ANGLE_MAX_RAD = (
-    TAU + 1e-3
-)  # a full turn with the rounding of four digits; larger targets were probably meant in degrees
+ANGLE_MAX_RAD = TAU + 1e-3  # one turn as typed with four digits; a greater target was probably meant in degrees
 
 
 class TrajectoryError(ValueError):
-    """An invalid trajectory; the message names the location, finding and remedy.
+    """A trajectory is not possible as written; the message names the value, finding and remedy.
 
-    `at` is the path of the value below the target or trajectory; empty: the target or trajectory itself.
+    `at` is the path of the value within the target or trajectory, empty if that is wrong as a whole.
     """
 
     def __init__(self, finding: str, where: str = "", at: str = "") -> None:
@@ -40,7 +38,7 @@ class TrajectoryError(ValueError):
 
 
 class Variables(Protocol):
-    """The variables of a reference: those of a cluster space, or position and heading of one drone."""
+    """What a reference needs to know of its variables, which are those of a cluster space or one drone's position."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -54,7 +52,7 @@ class Variables(Protocol):
 
 
 class Reference(Protocol):
-    """A motion in cluster space; duration_s is the time after which it rests, None if it never does.
+    """A motion in cluster space; duration_s is the time after which it stands still, None if it never does.
 
     `value` returns c and its exact derivative c_dot, each (4n,), at t_s.
     """
@@ -98,13 +96,13 @@ class ExpressionTrajectory:
     Args:
         expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4, "yaw_deg": "6*t"}.
         constants: user constants by name, e.g. {"f": 0.01}.
-        duration_s: end of the motion; None: it does not end.
+        duration_s: end of the motion, None if it is endless.
 
     Attributes:
         arguments: constructor arguments by name, as plain values.
 
     Raises:
-        ExpressionError, TrajectoryError: an unknown name, an expression or duration not allowed.
+        ExpressionError, TrajectoryError: an unknown name, or a forbidden expression or duration.
     """
 
     def __init__(
@@ -150,10 +148,10 @@ class ExpressionTrajectory:
 
 
 class WaypointTrajectory:
-    """Waypoints joined by cubics with the slopes of PCHIP: C1, at rest at both ends, without overshoot.
+    """Waypoints joined by cubics with PCHIP slopes: C1, at rest at both ends, without overshoot.
 
-    A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name keep their value in the
-    previous one (the first: in base). Angles that wrap turn the shorter way.
+    A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name stay as in the previous
+    one (in the first: as in base). Angles that wrap turn by the shorter way.
 
     Raises:
         TrajectoryError: names the waypoint and its fault.
@@ -183,9 +181,7 @@ class WaypointTrajectory:
         self._places = np.array(places)
         self._slopes = np.zeros_like(self._places)
         if len(places) > 2:
-            from scipy.interpolate import (
-                PchipInterpolator,
-            )  # imported here, because it takes longer to load than all else
+            from scipy.interpolate import PchipInterpolator  # imported here because it loads slowly
 
             self._slopes[1:-1] = PchipInterpolator(self._times, self._places)(self._times[1:-1], 1)
         self.duration_s: float | None = self._times[-1]
@@ -209,9 +205,9 @@ class WaypointTrajectory:
 class Ramp:
     """A smooth transition from a state of motion onto another, possibly moving reference; see `ramp_onto`.
 
-    c(t) = onto(t) + offset(t): a quintic takes the initial offset to zero with its first and second derivative. From
-    rest onto a reference at rest, this is the minimum-jerk move. It runs in [start_s, start_s + over_s] of the time of
-    `onto`; offset and offset_rate, (4n,), are c and c_dot at start_s minus those of onto.
+    c(t) = onto(t) + the initial offset, which a quintic reduces to zero with its first and second derivatives. From
+    rest to a reference at rest, this is the minimum-jerk move. It runs during [start_s, start_s + over_s], in the time
+    of `onto`; offset and offset_rate, (4n,), are c and c_dot at start_s minus those of `onto`.
     """
 
     onto: Reference
@@ -239,7 +235,7 @@ class Ramp:
 def put_ramped(
     c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float, value: Array, rate: Array
 ) -> None:
-    """Write c and c_dot plus the remaining offset and offset rate at share s of a ramp over over_s."""
+    """Write c and c_dot plus the remaining offset and its rate at fraction s of a ramp of duration over_s."""
     left = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
     left_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
     swing = s * (1.0 - s * s * (6.0 - s * (8.0 - 3.0 * s))) * over_s
@@ -265,7 +261,7 @@ _KINDS: dict[str, Any] = {
 
 
 def state_of(reference: Reference) -> State:
-    """Return a reference as plain values; TypeError: its class is not one of this module."""
+    """Return a reference as plain values; TypeError: its class is not of this module."""
     for kind, known in _KINDS.items():
         if type(reference) is known:
             arguments = getattr(reference, "arguments", None) or vars(reference)
@@ -275,7 +271,7 @@ def state_of(reference: Reference) -> State:
 
 
 def reference_of(space: ClusterSpace, state: State) -> Reference:
-    """Return the reference of a state; KeyError, TypeError, ValueError: not a result of `state_of`."""
+    """Return the reference of a state; KeyError, TypeError, ValueError: the state is not from `state_of`."""
     own = ((name, value) for name, value in state.items() if name != "kind")
     arguments = {name: reference_of(space, value) if name in ("of", "onto") else value for name, value in own}
     kind = _KINDS[state["kind"]]
@@ -285,11 +281,11 @@ def reference_of(space: ClusterSpace, state: State) -> Reference:
 
 class Variable(NamedTuple):
     entry: int  # index in c (4n,)
-    scale: float  # factor from the user's unit
+    scale: float  # factor from the user's unit to m or rad
 
 
 def variable_of(space: Variables, name: object, where: str, at: str = "") -> Variable:
-    """Return the variable of a name: one of the space's, or an angle's with `_deg`; TrajectoryError: unknown."""
+    """Return the variable of a name: one of the space or an angle with `_deg`; TrajectoryError: it is unknown."""
     text = str(name)
     angle = text.removesuffix(DEGREES)
     if text not in space.names and angle in space.names and space.in_radians[space.index(angle)]:
@@ -301,11 +297,11 @@ def variable_of(space: Variables, name: object, where: str, at: str = "") -> Var
 
 
 def named_values(space: Variables, values: object, where: str, base: Array, at: str = "") -> Array:
-    """Return base (4n,) with values by name: numbers, or expressions without t.
+    """Return base (4n,) with values replaced by name: numbers, or expressions without t.
 
     Raises:
-        TrajectoryError: not a mapping, an unknown or repeated name, a non-finite value, an angle beyond one turn.
-        ExpressionError: a text that is not an expression.
+        TrajectoryError: not a mapping, an unknown or repeated name, not a finite number, an angle beyond one turn.
+        ExpressionError: a text is not an expression.
     """
     if not isinstance(values, Mapping):
         raise TrajectoryError(f"found {str(values)[:40]!r}; allowed: numbers by name of variable", f"{where}:", at)
@@ -326,7 +322,7 @@ def named_values(space: Variables, values: object, where: str, base: Array, at: 
 
 
 def _refuse_twice(space: Variables, variable: Variable, given: set[int], place: tuple[str, str]) -> None:
-    """Refuse a variable given in two units, and record this one."""
+    """Raise TrajectoryError for a variable given twice, in two units; otherwise record it."""
     if variable.entry in given:
         name = space.names[variable.entry]
         raise TrajectoryError(f"is given beside the same variable; allowed: {name} or {name}{DEGREES}", *place)
@@ -334,7 +330,7 @@ def _refuse_twice(space: Variables, variable: Variable, given: set[int], place: 
 
 
 def _refuse_turns(space: Variables, variable: Variable, value: float, place: tuple[str, str]) -> None:
-    """Refuse a target angle beyond one turn: degrees were probably given as radians."""
+    """Raise TrajectoryError for an angle beyond one turn, which was probably meant in degrees."""
     if not space.in_radians[variable.entry] or abs(value * variable.scale) <= ANGLE_MAX_RAD:
         return
     if variable.scale != 1.0:

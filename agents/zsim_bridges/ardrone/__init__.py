@@ -1,1 +1,1 @@
-"""The AR.Drone 2.0 both ways: drones of a run on its wire, and the aircraft as a drone of a run."""
+"""The AR.Drone 2.0 in both directions: drones of a run as AR.Drones, and a real aircraft as a drone of a run."""

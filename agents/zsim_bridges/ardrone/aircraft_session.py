@@ -1,7 +1,7 @@
 """The session with one AR.Drone 2.0: configures it, requests and decodes its navdata, and makes it carry out demands.
 
 Pure. Units and axes of navdata: millidegrees, millimetres, milli-g; x forward, y right, z down; psi clockwise from
-where the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, chapters 6 to 8.
+the heading at which the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, chapters 6 to 8.
 """
 
 import math
@@ -47,20 +47,20 @@ from zsim_bridges.vehicle_links.vehicle_session import (
 )
 
 NAVDATA, AT = 0, 1  # channels
-REQUEST_NS = 100_000_000  # chosen as npm ar-drone: navdata is requested again after as long
-CONFIG_NS = 500_000_000  # chosen: an entry is sent again after as long without its acknowledgement
-WATCHDOG_NS = 1_000_000_000  # half of the aircraft's com_watchdog
-RESTARTED = 100  # packets, chosen: an aircraft whose number falls back by more has been switched on again
-PERIOD_NS = 30_000_000  # Developer Guide 6.3: at most 30 ms between commands
-CHANGED_NS = 15_000_000  # chosen: less than a gate, in which a controller commands once
-PULSE_NS = 90_000_000  # chosen: three datagrams have the emergency bit, of which two may be lost
-PULSES_NS = 400_000_000  # chosen: longer than a pulse takes to show in navdata, since another one would undo it
-VELOCITY_1_S = 2.5  # chosen: 46 deg of phase with 0.14 s of delay and 0.14 s of tilt lag
-INTEGRAL_1_S2 = 2.0  # chosen: as fast as that phase allows; gusts last some seconds
-DRAG_1_S = 0.58  # 1/s, of speed (tum_ardrone's flight-fitted model)
-STEP_S_MAX = 0.1  # s; over longer pauses no more is integrated
+REQUEST_NS = 100_000_000  # chosen as in npm ar-drone; silence after which navdata is requested again
+CONFIG_NS = 500_000_000  # chosen; time without an acknowledgement after which an entry is sent again
+WATCHDOG_NS = 1_000_000_000  # period of watchdog resets, half of the aircraft's com_watchdog
+RESTARTED = 100  # chosen; packets; if the sequence number falls back by more, the aircraft was restarted
+PERIOD_NS = 30_000_000  # the Developer Guide, 6.3, allows at most 30 ms between commands
+CHANGED_NS = 15_000_000  # minimum spacing of changed demands; chosen below a gate, which brings one command
+PULSE_NS = 90_000_000  # chosen: three datagrams carry the emergency bit, of which two may be lost
+PULSES_NS = 400_000_000  # chosen: longer than a pulse takes to show in navdata, since a second one would undo the first
+VELOCITY_1_S = 2.5  # velocity gain; chosen: 46 deg of phase margin with 0.14 s of delay and 0.14 s of tilt lag
+INTEGRAL_1_S2 = 2.0  # integral gain; chosen: as fast as that margin allows; gusts last some seconds
+DRAG_1_S = 0.58  # 1/s, deceleration by drag per speed (tum_ardrone's model, fitted to flights)
+STEP_S_MAX = 0.1  # s; a longer pause is integrated only up to this
 ANSWER_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
-HOVER = Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0)  # flag 0: hold the place
+HOVER = Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0)  # flag 0: hold the position
 STATES: dict[int, DroneState] = {
     ControlState.FLYING: "flying",
     ControlState.HOVERING: "hovering",
@@ -70,27 +70,27 @@ STATES: dict[int, DroneState] = {
     ControlState.LOOPING: "flying",
 }
 OPTIONS_MASK = sum(1 << tag for tag in (*FULL_TAGS, GPS_TAG))
-SONAR_MM = range(30, 6000)  # mm; outside there was no echo
-GPS_1_S = 0.1  # 1/s, chosen: how fast the position follows the GPS, whose noise is 2 m at 5 Hz, for 0.3 m
-YAW_1_S = 0.1  # 1/s, chosen: how fast the heading follows the magnetometer
-GAP_S_MAX = 0.5  # s; over longer gaps nothing is integrated
+SONAR_MM = range(30, 6000)  # mm; values outside mean that there was no echo
+GPS_1_S = 0.1  # 1/s, chosen; rate at which the position follows the GPS, whose 2 m of noise at 5 Hz become 0.3 m
+YAW_1_S = 0.1  # 1/s, chosen; rate at which the heading follows the magnetometer
+GAP_S_MAX = 0.5  # s; longer gaps are not integrated
 
 
-# What the aircraft is given; the limits are the SDK's own: of tilt and climb outdoors, of yaw rate indoors
+# The aircraft's settings; the limits are the SDK's: outdoor tilt and climb, indoor yaw rate
 TILT_RAD, CLIMB_M_S, YAW_RATE_RAD_S = 0.35, 1.0, 1.75
-SETTINGS = {  # `outdoor` brings limits of its own, so that it comes first
+SETTINGS = {  # `outdoor` comes first, since it replaces the limits
     "general:navdata_demo": "FALSE",
     "general:navdata_options": str(OPTIONS_MASK),
     "control:outdoor": "TRUE",
     "control:euler_angle_max": f"{TILT_RAD:g}",
     "control:control_vz_max": f"{1e3 * CLIMB_M_S:g}",
     "control:control_yaw": f"{YAW_RATE_RAD_S:g}",
-    "control:altitude_max": "100000",  # mm; no limit of its own: the driver's fence holds
+    "control:altitude_max": "100000",  # mm; no limit in the aircraft, since the driver enforces its fence
 }
 
 
 class AircraftSession(VehicleSession):
-    """The session with one aircraft, whose sonar has the `ultrasound` frequency 7 (22.2 Hz) or 8 (25 Hz)."""
+    """The session with one aircraft; `ultrasound` sets its sonar's frequency, 7 (22.2 Hz) or 8 (25 Hz)."""
 
     def __init__(self, host: str, readings: "NavdataReadings", ultrasound: int) -> None:
         channels = UdpChannel(host, navdata.PORT), UdpChannel(host, at_commands.PORT)
@@ -106,7 +106,7 @@ class AircraftSession(VehicleSession):
         self._state: DroneState = "landed"
         self._battery = 0.0
         self._requested_ns = self._config_ns = self._cleared_ns = self._watchdog_ns = -WATCHDOG_NS
-        self._sent: Config | None = None  # that waits for its acknowledgement
+        self._sent: Config | None = None  # the entry that awaits its acknowledgement
 
     @classmethod
     def of_run(
@@ -128,7 +128,7 @@ class AircraftSession(VehicleSession):
             self._refused += 1
             return
         if self._newest - RESTARTED < packet.sequence <= self._newest:
-            return  # overtaken
+            return  # duplicated or out of order
         if packet.sequence < self._newest:
             self._loss.restart()
         self._newest = packet.sequence
@@ -140,13 +140,13 @@ class AircraftSession(VehicleSession):
         if StateBit.COM_LOST in packet.state and StateBit.COM_LOST not in self._bits:
             self.texts.append("the aircraft has not received our commands for a while")
         if packet.bootstrap and not self._pending:
-            self._pending.extend(self._entries)  # it was switched on again
+            self._pending.extend(self._entries)  # the aircraft was restarted
         self._bits = packet.state
         demo = packet.options.get(DEMO)
         if demo is not None:
             self._battery = float(min(100, demo.battery_percent))
             self._state = STATES.get(demo.ctrl_state >> 16, "landed")
-        elif StateBit.FLYING not in packet.state:  # a bootstrap, such as after it was switched on again
+        elif StateBit.FLYING not in packet.state:  # a bootstrap packet, such as after a restart
             self._state = "landed"
         if StateBit.EMERGENCY in packet.state:
             self._state = "emergency"
@@ -169,7 +169,7 @@ class AircraftSession(VehicleSession):
             yield AT, datagram
 
     def _set_up(self, now_ns: int) -> Iterator[Command]:
-        """Yield the next entry of the configuration; a bit acknowledges each, and is cleared before the next."""
+        """Yield the next configuration entry; a state bit acknowledges each, and is cleared before the next is sent."""
         if self._received_ns is None:
             return
         acknowledged = StateBit.COMMAND_ACK in self._bits
@@ -194,7 +194,7 @@ class AircraftSession(VehicleSession):
 class FlightCommands:
     """The AT commands that make one aircraft carry out demands, without sequence numbers.
 
-    REF commands take-off or landing and is repeated while that is demanded; PCMD is sent every 30 ms.
+    REF commands a take-off or a landing, and is repeated while that is demanded; PCMD is sent every 30 ms.
     Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
     """
 
@@ -202,7 +202,7 @@ class FlightCommands:
         self._axes = _Axis(), _Axis()
         self._sent_ns = -PERIOD_NS
         self._last: Demand | None = None
-        self._rose_ns = -PULSES_NS  # when the emergency bit last did
+        self._rose_ns = -PULSES_NS  # when the emergency bit last rose
 
     def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
         """Yield the commands that are due; `emergency` and `pose` are the aircraft's."""
@@ -226,13 +226,13 @@ class FlightCommands:
                 yield self._pcmd(now_ns, demand, pose)
 
     def _toggle(self, now_ns: int, due: bool) -> Command:
-        """Return the next REF of a pulse of the emergency bit, which the aircraft obeys at its rise."""
+        """Return the next REF of a pulse of the emergency bit; the aircraft obeys the rising edge."""
         if due and now_ns - self._rose_ns >= PULSES_NS:
             self._rose_ns = now_ns
         return at_commands.ref(0, takes_off=False, emergency=now_ns - self._rose_ns < PULSE_NS)
 
     def _pcmd(self, now_ns: int, demand: Demand, pose: AircraftPose | None) -> Command:
-        """Return the command towards a velocity; tilts are shares of the limits in the aircraft's configuration."""
+        """Return the command for a velocity; tilts are fractions of the limits in the aircraft's configuration."""
         if demand.action != "fly" or pose is None:
             self._axes = _Axis(), _Axis()
             return HOVER
@@ -247,10 +247,10 @@ class FlightCommands:
 
 
 class _Axis:
-    """A velocity loop along one axis of W, about the aircraft's own tilt loop.
+    """A velocity loop along one axis of W, around the aircraft's own tilt loop.
 
-    The velocity follows a reference that answers with a lag. Its difference from the reference of the time when the
-    aircraft got its commands is wind, and is integrated.
+    The velocity follows a reference that approaches the demand with a lag. Its deviation from the reference of
+    ANSWER_NS ago, to which it now responds, is attributed to wind, and is integrated.
     """
 
     def __init__(self) -> None:
@@ -260,7 +260,7 @@ class _Axis:
         self._references: deque[tuple[int, float]] = deque()
 
     def accel(self, now_ns: int, wanted: float, measured: float, most_m_s2: float) -> float:
-        """Return the acceleration to be produced by the tilt."""
+        """Return the acceleration [m/s^2] that the tilt has to produce; wind is integrated only below `most_m_s2`."""
         dt_s = 0.0 if self._then_ns is None else min(STEP_S_MAX, (now_ns - self._then_ns) * 1e-9)
         if self._then_ns is None:
             self._reference = measured
@@ -271,7 +271,7 @@ class _Axis:
         references.append((now_ns, self._reference))
         while len(references) > 1 and references[1][0] <= now_ns - ANSWER_NS:
             references.popleft()
-        error = references[0][1] - measured  # from the reference that the velocity measured now answers to
+        error = references[0][1] - measured  # relative to the reference to which the measured velocity responds
         accel = slope + DRAG_1_S * self._reference + VELOCITY_1_S * error + self._wind_m_s2
         if abs(accel) < most_m_s2:
             self._wind_m_s2 += INTEGRAL_1_S2 * error * dt_s
@@ -279,13 +279,13 @@ class _Axis:
 
 
 class NavdataReadings(AircraftReadings):
-    """The measurements of one aircraft, and its integrated position since the start.
+    """The measurements of one aircraft, and its position integrated since the start.
 
     Args:
-        origin: of W: latitude, longitude [deg], height [m].
-        position_m: where it stands at the start [W].
-        field_ut: of the Earth [uT; W], by which its heading is known.
-        yaw_rad: its heading at the start, if that is stated; None for the magnetometer.
+        origin: origin of W: latitude, longitude [deg], height [m].
+        position_m: the aircraft's position at the start [W].
+        field_ut: the Earth's magnetic field [uT; W], which gives the heading.
+        yaw_rad: the aircraft's heading at the start; None to take it from the magnetometer.
     """
 
     def __init__(
@@ -326,13 +326,13 @@ class NavdataReadings(AircraftReadings):
             self._on_gps(gps, taken_ns)
 
     def _on_demo(self, demo: Any, options: dict[int, Any], taken_ns: int) -> None:
-        """Integrate the aircraft's own velocity, in its heading."""
+        """Integrate the aircraft's own velocity, which is relative to its heading."""
         roll, pitch = math.radians(demo.phi_mdeg / 1e3), -math.radians(demo.theta_mdeg / 1e3)
         yaw = -math.radians(demo.psi_mdeg / 1e3)
         dt_s = 0.0 if self._then_ns is None else (taken_ns - self._then_ns) * 1e-9
         self._then_ns = taken_ns
         if mag := options.get(MAGNETO):
-            m = _flipped((mag.mx, mag.my, mag.mz))  # the field of the Earth in B
+            m = _flipped((mag.mx, mag.my, mag.mz))  # the Earth's magnetic field in B
             my, mz = m[1] * math.cos(roll) - m[2] * math.sin(roll), m[1] * math.sin(roll) + m[2] * math.cos(roll)
             mx = m[0] * math.cos(pitch) + mz * math.sin(pitch)
             self._align(yaw, self._north_rad - math.atan2(my, mx), dt_s)
@@ -348,7 +348,7 @@ class NavdataReadings(AircraftReadings):
         self.read("flow", taken_ns, own, 1.0)
 
     def _align(self, yaw: float, magnetic: float, dt_s: float) -> None:
-        """Let the heading follow the magnetometer slowly, unless it is given."""
+        """Let the heading follow the magnetometer slowly, unless the initial heading was given."""
         if self._stated_yaw_rad is not None:
             if self._yaw_offset_rad is None:
                 self._yaw_offset_rad = self._stated_yaw_rad - yaw
@@ -359,18 +359,18 @@ class NavdataReadings(AircraftReadings):
         self._yaw_offset_rad += min(1.0, YAW_1_S * max(0.0, dt_s)) * error
 
     def _on_gps(self, gps: Any, taken_ns: int) -> None:
-        """Process each fix once, and let the position follow it."""
+        """Process each fix once, and let the position follow it slowly."""
         place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
         values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, FIX_3D, gps.satellites)
         before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)
         if fix != self._fix and self.read("gps", taken_ns, *values):
             self._gps_ns, self._fix = taken_ns, fix
-            if before_ns is not None:  # the first one is less accurate than the stated place
+            if before_ns is not None:  # the first fix is less accurate than the given position
                 x, y, _ = values[3]
                 share = min(1.0, GPS_1_S * (taken_ns - before_ns) * 1e-9)
                 self._x, self._y = self._x + share * (x - self._x), self._y + share * (y - self._y)
 
 
 def _flipped(v: Any) -> Vector:
-    """Return a vector in forward, right, down of the body in B."""
+    """Convert a body vector from forward, right, down to B."""
     return float(v[0]), -float(v[1]), -float(v[2])

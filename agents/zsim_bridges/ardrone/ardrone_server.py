@@ -1,6 +1,6 @@
-"""`zsim ardrone serve`: the drones of a run as AR.Drones, and the ports of each on an address of its own.
+"""`zsim ardrone serve`: presents the drones of a run as AR.Drones, each with the ports on an address of its own.
 
-The FTP server is the aircraft's as far as programs of the SDK use it: anonymous, passive, one file `version.txt`.
+The FTP server offers what SDK programs use of the aircraft's: anonymous login, passive mode, one file `version.txt`.
 Source: RFC 959; ARDroneLib, ardrone_ftp.c and its check of the firmware's version.
 """
 
@@ -29,20 +29,20 @@ from zsim_bridges.ardrone.video import VideoEncoder, VideoFrame, pave_header
 from zsim_bridges.vehicle_links import drone_link
 from zsim_bridges.vehicle_links.server import PictureServer, Say
 
-AUTHENTICATION_PORT = 5552  # UDP, where programs look for drones (ARDroneLib, config.h)
+AUTHENTICATION_PORT = 5552  # UDP, on which programs look for drones (ARDroneLib, config.h)
 QUESTION, ANSWER = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
-BACKLOG_MAX = 500_000  # chosen; backlog of a connection in bytes, some seconds; beyond it it waits for an IDR frame
-NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # a port below 1024 needs a privilege
-CONNECTIONS_MAX = 8  # at once, chosen: a pilot's program has one
-LINE_MAX = 512  # bytes of a line that is read, chosen
-BROKEN = (OSError, EOFError, TimeoutError, ValueError)  # of a connection, and of a line that is too long
+BACKLOG_MAX = 500_000  # chosen; unsent bytes of a connection, some seconds; beyond this it waits for an IDR frame
+NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # errors of a port below 1024 without a privilege
+CONNECTIONS_MAX = 8  # chosen; simultaneous connections per port, of which a pilot's program needs one
+LINE_MAX = 512  # chosen; bytes in a line
+BROKEN = (OSError, EOFError, TimeoutError, ValueError)  # errors of a broken connection, and of an overlong line
 Address = tuple[str, int]
 Refuse = Callable[[str], None]
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
-VERSION_PORT, FILES_PORT = 5551, 21  # TCP (ARDroneLib, config.h): of the version, and of videos
+VERSION_PORT, FILES_PORT = 5551, 21  # TCP ports of the version and of videos (ARDroneLib, config.h)
 VERSION_FILES = {"version.txt": b"2.4.8\r\n"}  # the newest firmware of an AR.Drone 2.0
-DATA_WITHIN_S = 10.0  # s of wall time within which a client must open the data connection, chosen
-IDLE_S = 300.0  # s of wall time without a command, chosen
+DATA_WITHIN_S = 10.0  # chosen; s of wall time within which a client must open the data connection
+IDLE_S = 300.0  # chosen; s of wall time without a command after which a connection is closed
 _FIXED = {
     "USER": "230 logged in",
     "PASS": "230 logged in",
@@ -58,7 +58,7 @@ _FIXED = {
 
 
 class ArdroneOptions(NamedTuple):
-    """How the drones are offered: see `drone_addresses`; `peers` are obeyed on addresses that are not loopback."""
+    """How the drones are offered; `addresses` as in `drone_addresses`, `peers` are obeyed on non-loopback addresses."""
 
     addresses: str
     peers: frozenset[str]
@@ -69,7 +69,7 @@ class ArdroneServer(PictureServer):
     """One run's drones as AR.Drones.
 
     Raises:
-        RunError: an address is none, or may not be offered.
+        RunError: an address is invalid, or may not be offered.
     """
 
     options: ArdroneOptions
@@ -104,7 +104,7 @@ class ArdroneServer(PictureServer):
 
     def forward(self, key: str, payload: bytes) -> None:
         kind, thing, leaf = keys.parts(key)
-        # an aircraft's electronics know sensors, the estimate, and how fast the rotors turn
+        # an aircraft's electronics know the sensor data, the estimate, and the rotor speeds
         is_onboard = leaf.startswith("sensor/") or leaf in ("estimate", "truth")
         if not (kind == "drone" and thing in self._drones and is_onboard):
             self.on_run(key, payload)
@@ -113,7 +113,7 @@ class ArdroneServer(PictureServer):
         if message is not None:
             try:
                 self._drones[thing].aircraft.update(message)
-            except (ValueError, ArithmeticError) as error:  # finite, but beyond what a field of navdata can hold
+            except (ValueError, ArithmeticError) as error:  # finite, but out of range for a field of navdata
                 self.refuse(f"{key}: {error}")
 
     def on_picture(self, key: str, payload: bytes) -> None:
@@ -123,13 +123,13 @@ class ArdroneServer(PictureServer):
             drone.video.on_picture(image)
 
     def on_event(self, event: Event) -> None:
-        """Count and print which commands of pilots' programs the world refuses."""
+        """Count and print the commands from pilots' programs that the world refuses."""
         if (event.kind, event.source) != ("refused", self.observer.name):
             return
         _, thing, what = keys.parts(event.subject)
         drone = self._drones.get(thing)
         is_overtaken = what != "cmd/mode" and drone is not None and drone.aircraft.pilot.setpoint is None
-        if not is_overtaken:  # a setpoint of the gate in which the pilot lands the drone says nothing
+        if not is_overtaken:  # the refusal of a setpoint is expected at the gate in which a landing begins
             self.refuse(f"{event.subject}: {event.data.get('reason', event.text)}")
 
 
@@ -159,7 +159,7 @@ class DroneServer:
         )
 
     async def open(self) -> list[str]:
-        """Open all ports; return a line for each optional one that is left out.
+        """Open all ports; return a line for each optional port that could not be opened.
 
         Raises:
             RunError: a port is taken, or the address is not this host's.
@@ -173,7 +173,7 @@ class DroneServer:
                     errno.EADDRNOTAVAIL: "the address is not this host's; give one that is, as --addresses",
                 }.get(error.errno or 0, error.strerror or str(error))
                 raise RunError(f"{self._name}: {kind} port {port} of {self.address} cannot be had: {why}") from error
-        try:  # few programs use it, and it needs a privilege
+        try:  # optional: few programs use this port, and it needs a privilege
             await self._files.open(self.address, FILES_PORT)
         except OSError as error:
             why = "needs a privilege" if error.errno in NOT_PERMITTED else error.strerror
@@ -194,12 +194,12 @@ class DroneServer:
 
 
 class VideoServer:
-    """Streams the pictures of one drone on its `port`, which is to be opened."""
+    """Streams the images of one drone on its `port`, which the caller opens."""
 
     def __init__(self, peers: "AllowedHosts", refuse: Refuse) -> None:
         self._refuse = refuse
         self.port = StreamPort(peers, self._serve, refuse)
-        self._ready: set[asyncio.StreamWriter] = set()  # have had an IDR frame, and all since
+        self._ready: set[asyncio.StreamWriter] = set()  # received an IDR frame and all frames since
         self._newest: CameraImage | None = None
         self._busy: asyncio.Task[None] | None = None
         self._encoder: VideoEncoder | None = None
@@ -222,7 +222,7 @@ class VideoServer:
             self._ready.discard(writer)
 
     def on_picture(self, image: CameraImage) -> None:
-        """Stream a picture; while another is encoded, only the newest waits."""
+        """Stream an image; while another is being encoded, only the newest waits."""
         self._newest = image
         if self.is_watched and self._busy is None:
             self._busy = asyncio.get_running_loop().create_task(self._stream())
@@ -260,7 +260,7 @@ class VideoServer:
 
 
 class FileServer:
-    """An FTP server with files by name."""
+    """An FTP server with `files`, given as contents by name."""
 
     def __init__(self, address: str, peers: "AllowedHosts", files: dict[str, bytes], refuse: Refuse) -> None:
         self._address = address
@@ -336,7 +336,7 @@ def _reply(writer: asyncio.StreamWriter, text: str) -> None:
 
 
 class DatagramPort(asyncio.DatagramProtocol):
-    """A UDP port: `take` is called with each datagram of a peer, and its address; what others send is refused."""
+    """A UDP port: `take` is called with each datagram from a peer and its address; others are refused."""
 
     def __init__(self, peers: "AllowedHosts", take: Callable[[bytes, Address], None], refuse: Refuse) -> None:
         self._peers = peers
@@ -345,10 +345,10 @@ class DatagramPort(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
 
     async def open(self, address: str, port: int) -> int:
-        """Bind it; return the port, where 0 asks for any.
+        """Bind the port; return its number, which the system chooses for 0.
 
         Raises:
-            OSError: it is taken, or the address is not this host's.
+            OSError: the port is taken, or the address is not this host's.
         """
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(lambda: self, local_addr=(address, port))
@@ -370,7 +370,7 @@ class DatagramPort(asyncio.DatagramProtocol):
 
 
 class StreamPort:
-    """A TCP port: `serve` serves one connection of a peer until it is over; `writers` are those of all connections."""
+    """A TCP port: `serve` serves one connection of a peer until it ends; `writers` are those of all connections."""
 
     def __init__(self, peers: "AllowedHosts", serve: Serve, refuse: Refuse) -> None:
         self._peers = peers
@@ -381,10 +381,10 @@ class StreamPort:
         self.writers: set[asyncio.StreamWriter] = set()
 
     async def open(self, address: str, port: int) -> int:
-        """Listen; return the port, where 0 asks for any.
+        """Listen on the port; return its number, which the system chooses for 0.
 
         Raises:
-            OSError: it is taken, or needs a privilege.
+            OSError: the port is taken, or needs a privilege.
         """
         self._server = await asyncio.start_server(self._accept, address, port, limit=LINE_MAX)
         return self._server.sockets[0].getsockname()[1]
@@ -425,13 +425,13 @@ class StreamPort:
 
 
 async def read_until_end(reader: asyncio.StreamReader, _: asyncio.StreamWriter) -> None:
-    """Serve a connection that only listens: what it sends is dropped."""
+    """Serve a connection whose peer only listens; received data are dropped."""
     while await reader.read(LINE_MAX):
         pass
 
 
 class AllowedHosts:
-    """The peers obeyed on an address: on loopback every program of this host, elsewhere the named hosts.
+    """The peers obeyed on an address: on loopback every program on this host, otherwise the named hosts.
 
     Raises:
         RunError: the address is not loopback, and no host is named.
@@ -454,11 +454,11 @@ def drone_addresses(text: str, drones: Sequence[str]) -> dict[str, str]:
     """Return the address of each drone that has one.
 
     Args:
-        text: the first drone's address, which those of the others follow; or DRONE=ADDRESS, separated by commas.
-        drones: of the run, in its order.
+        text: the first drone's address, which is counted up for the others; or DRONE=ADDRESS, separated by commas.
+        drones: the run's drones, in its order.
 
     Raises:
-        RunError: it is neither, names no drone of the run, or gives an address twice.
+        RunError: `text` has neither form, names a drone that is not in the run, or gives an address twice.
     """
     addresses: dict[str, str] = {}
     if "=" in text:

@@ -24,7 +24,7 @@ PORT = 5556  # UDP (ARDroneLib, config.h)
 DATAGRAM_MAX = 8192  # bytes; chosen: eight commands of maximum length
 COMMAND_MAX = 1024  # characters in a command, including its terminator (Developer Guide 6.1)
 REF_CONSTANT = 0x1154_0000  # bits 18, 20, 22, 24, 28, which are always set (Developer Guide 6.6)
-TAKE_OFF_BIT, EMERGENCY_BIT = 1 << 9, 1 << 8  # of REF (Developer Guide 6.6)
+TAKE_OFF_BIT, EMERGENCY_BIT = 1 << 9, 1 << 8  # bits of a REF (Developer Guide 6.6)
 PROGRESSIVE, COMBINED_YAW, ABSOLUTE = 1, 2, 4  # bits of a PCMD's flag (Developer Guide 6.6)
 SEND_CONFIGURATION, ACKNOWLEDGE, SEND_CUSTOM_LIST = 4, 5, 6  # modes of CTRL (ARDroneLib, control_states.h)
 IGNORED_NAMES = frozenset(
@@ -291,7 +291,7 @@ class ConfigurationEntry(NamedTuple):
 LIMITS = ("euler_angle_max", "control_vz_max", "control_yaw")
 """Limits of tilt [rad], climb [mm/s] and yaw rate [rad/s], of which the aircraft keeps an indoor and an outdoor set."""
 _ALTITUDE = "20|100000"  # mm; the maximum stands for no limit (ARDroneLib)
-_TILT, _CLIMB, _YAW = "0|0.52", "200|2000", "0.7|6.11"  # rad, mm/s, rad/s (Developer Guide 8.6)
+_TILT, _CLIMB, _YAW = "0|0.52", "200|2000", "0.7|6.11"  # ranges in rad, mm/s and rad/s (Developer Guide 8.6)
 _CODE = "0|255"  # codecs, modes and channels, each as one byte
 _MASK = "0|4294967295"
 _RATE = "0|20000"  # kbit/s

@@ -39,10 +39,13 @@ GPS_TAG = 27  # in older SDKs the tag of zimmu_3000, of 12 bytes
 CLIENTS_MAX = 8  # chosen; programs that receive navdata; a further one displaces the oldest
 REQUESTS = (b"\x01", b"Init")  # how a request for navdata begins (ARDroneLib; its Windows client)
 SECOND_NS = 1_000_000_000
-ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = 512, 2048  # nominal for the raw accelerometer (measured: 516 to 518, 2031 to 2038)
-GYRO_LSB_PER_DEG_S = 16.4  # raw gyro (measured on an aircraft)
+ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = (
+    512,
+    2048,
+)  # nominal scale and zero of the raw accelerometer (measured: 516 to 518, 2031 to 2038)
+GYRO_LSB_PER_DEG_S = 16.4  # scale of the raw gyro (measured on an aircraft)
 MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
-MG_PER_UT = 10.0  # milligauss
+MG_PER_UT = 10.0  # milligauss per microtesla
 PWM_MAX = 255  # at a motor's maximum speed; chosen proportional below, since the curve is not published
 VOLTAGE_MV = (0.0, 10.0, 50.0, 100.0), (9000.0, 10_500.0, 11_686.0, 12_500.0)
 """Charges [%] and voltages [mV] of the battery: the SDK's vbat_min, 50 % as measured on an aircraft, and two chosen."""

@@ -1,4 +1,4 @@
-"""The live video of a drone: a camera's pictures as H.264 frames behind PaVE headers. Pure.
+"""The live video of a drone: a camera's images as H.264 frames preceded by PaVE headers. Pure.
 
 PaVE is Parrot's video encapsulation, on TCP port 5555. Source: ARDroneLib (SDK 2.0.1), video_encapsulation.h.
 """
@@ -12,27 +12,31 @@ PORT = 5555  # TCP (ARDroneLib, config.h)
 SIGNATURE = b"PaVE"
 VERSION = 2
 CODEC_H264 = 4
-HEADER_SIZE = 64  # bytes that have a meaning; later firmware adds four more
-WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = 640, 360, 368  # as displayed; coded in whole macroblocks
-RATE_HZ = 30  # frames a second, for the encoder's rate control
-IDR_EVERY = 30  # frames, chosen: after a loss, decoding begins again within a second
-BIT_RATE = 1_000_000  # bit/s: video:bitrate of the SDK, 1000 kbit/s
-IDR_FRAME, P_FRAME = 1, 3  # of a header; an IDR frame has SPS and PPS before it
+HEADER_SIZE = 64  # bytes with a meaning; later firmware adds four more
+WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = (
+    640,
+    360,
+    368,
+)  # displayed size; the coded height is a whole number of macroblocks
+RATE_HZ = 30  # frames per second, for the encoder's rate control
+IDR_EVERY = 30  # frames, chosen: after a loss, decoding can resume within a second
+BIT_RATE = 1_000_000  # bit/s; the SDK's video:bitrate, 1000 kbit/s
+IDR_FRAME, P_FRAME = 1, 3  # frame types in a header; an IDR frame is preceded by SPS and PPS
 IDR, SPS, PPS = 5, 7, 8  # types of NAL units (ITU-T H.264, table 7-1)
 PRESET = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline", "x264-params": "annexb=1"}
 _HEADER = struct.Struct("<4sBBHIHHHHIIBBBBIIHBBBB2xI12x")
 
 
 class VideoError(ValueError):
-    """A picture cannot be read."""
+    """An image cannot be read."""
 
 
 class VideoFrame(NamedTuple):
-    """The NAL units of a picture, with start codes.
+    """The NAL units of an image, with start codes.
 
     Attributes:
-        is_idr: whether decoding can begin here; then it contains SPS and PPS.
-        sps_size, pps_size: bytes of these, start codes included; 0 without them.
+        is_idr: whether decoding can begin here; the frame then contains SPS and PPS.
+        sps_size, pps_size: sizes of SPS and PPS [bytes], including start codes; 0 without them.
     """
 
     data: bytes
@@ -42,7 +46,7 @@ class VideoFrame(NamedTuple):
 
 
 def pave_header(frame: VideoFrame, frame_number: int, timestamp_ms: int, stream_byte_position: int) -> bytes:
-    """Return the header of a frame; its position in the stream counts the bytes of the frames before."""
+    """Return the header of a frame; `stream_byte_position` counts the bytes of all previous frames."""
     return _HEADER.pack(
         SIGNATURE,
         VERSION,
@@ -71,7 +75,7 @@ def pave_header(frame: VideoFrame, frame_number: int, timestamp_ms: int, stream_
 
 
 class VideoEncoder:
-    """Encodes one stream of JPEG pictures as an AR.Drone 2.0 does. Needs av (PyAV)."""
+    """Encodes a stream of JPEG images like an AR.Drone 2.0. Needs av (PyAV)."""
 
     def __init__(self) -> None:
         import av
@@ -86,10 +90,10 @@ class VideoEncoder:
         self._count = 0
 
     def encode(self, jpeg: bytes, begins: bool) -> VideoFrame | None:
-        """Return the frame of a JPEG picture; `begins`: decoding must be able to begin here.
+        """Return the frame of a JPEG image; `begins` makes it one with which decoding can begin.
 
         Raises:
-            VideoError: it is not a readable JPEG.
+            VideoError: the data are not a readable JPEG.
         """
         import av
         from av.error import FFmpegError
@@ -114,7 +118,7 @@ class VideoEncoder:
 
 
 def nal_units(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield type and size of each NAL unit, its start code included (ITU-T H.264, annex B)."""
+    """Yield the type and the size of each NAL unit, including its start code (ITU-T H.264, annex B)."""
     starts = []
     at = data.find(b"\0\0\1")
     while at >= 0:

@@ -53,7 +53,7 @@ CLIMBED = 0.85  # chosen; fraction of the take-off height from which it counts a
 REPEAT_NS = 1_000_000_000  # period of repeated commands; chosen: an autopilot answers within some 0.1 s
 KILL_REPEAT_NS = 200_000_000  # chosen: shorter, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
-CHANGED_NS = 15_000_000  # chosen: changed setpoints may follow faster than a gate, in which a controller sends one
+CHANGED_NS = 15_000_000  # minimum spacing of changed setpoints; chosen below a gate, which brings one command
 STREAMED_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
 HERE = (
@@ -255,7 +255,7 @@ class AutopilotSession(VehicleSession):
             yield autopilot.command(Cmd.REQUEST_MESSAGE, dialect.LAYOUTS[kind].id)
         yield from self._sequence.advance(now_ns, demand, autopilot)
 
-    # What is known
+    # State
 
     @property
     def state(self) -> AircraftState:
@@ -427,7 +427,7 @@ class TelemetryReadings(AircraftReadings):
 
     Attributes:
         clock, unix_clock: offsets for messages timestamped since boot, and since 1970.
-        has_origin: whether the origin of its local frame is known.
+        has_origin: whether the origin of the vehicle's local frame is known.
     """
 
     def __init__(self, origin: tuple[float, float, float], local_origin_m: Vector | None = None) -> None:

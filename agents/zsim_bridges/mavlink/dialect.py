@@ -425,7 +425,7 @@ def frd(v_B: Vector) -> Vector:
 
 
 def attitude_ned(q_WB: Quaternion) -> Quaternion:
-    """Return the rotation from forward-right-down to north-east-down, w first and non-negative; its own inverse.
+    """Convert an attitude B to W to one FRD to NED, w first and non-negative; its own inverse.
 
     W to NED is a half-turn about (1, 1, 0), FRD to B a half-turn about x.
     """

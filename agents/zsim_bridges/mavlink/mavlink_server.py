@@ -1,4 +1,4 @@
-"""`zsim mavlink serve`: the drones of a run as MAVLink vehicles on UDP.
+"""`zsim mavlink serve`: presents the drones of a run as MAVLink vehicles on UDP.
 
 Each vehicle has two ports, as in PX4's simulation: one for ground stations, one for programs.
 """
@@ -32,14 +32,14 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender
 from zsim_bridges.vehicle_links.server import Say, TrafficIntake, VehicleServer
 from zsim_bridges.web import is_loopback
 
-ANSWER_S = 1.0  # wall time to wait for an answer of the world
+ANSWER_S = 1.0  # wall time to wait for an answer from the world
 TICK_S = 0.1  # wall time between two checks of what is due by wall time
 SWITCH_S = 5e-4  # s; thread switch interval, so that a setpoint does not wait for a gate; Python's default is 5 ms
-SYSTEM_IDS = 254  # 255 is the ground station's by custom
-DATAGRAM_MAX = 1400  # bytes; fits into a frame of Ethernet
+SYSTEM_IDS = 254  # 255 is the ground station's by convention
+DATAGRAM_MAX = 1400  # bytes; fits into an Ethernet frame
 READ_MAX = 65_536  # bytes
 READS_MAX = 64  # datagrams read at once, before other tasks run
-LEARNT_MAX = 8  # programs at once, on one port
+LEARNT_MAX = 8  # programs on this machine that one port remembers at once
 SILENT_S = 30.0  # wall time after which a silent program is forgotten
 REASONS = {
     "bad_crc": "a frame with a wrong checksum",
@@ -60,12 +60,12 @@ class MavlinkOptions(NamedTuple):
     """How the drones are offered.
 
     Attributes:
-        level: of the rates of telemetry.
-        gcs, gcs_local: the ground station, and the first port that talks to it.
-        api, api_local: the first of the programs' ports, and the first port that talks to them.
-        key: of signatures; None for none.
-        rate: pace requested of a run that goes as fast as possible; None for none.
-        first_system_id: of the first drone; +1 each.
+        level: level of the telemetry rates.
+        gcs, gcs_local: address of the ground station, and the first local port that talks to it.
+        api, api_local: the programs' address for the first drone, and the first local port that talks to programs.
+        key: signing key; None for no signatures.
+        rate: pace requested of a run that would go as fast as possible; None for none.
+        first_system_id: system id of the first drone; the others count up.
     """
 
     autopilot: str
@@ -94,14 +94,14 @@ class MavlinkServer(VehicleServer):
         super().__init__(link, info, observer, say, options)
         self._signing = Signing(options.key) if options.key else None
         self._counted: Counter[str] = Counter()
-        self._requests = ThreadPoolExecutor(1)  # one after the other
+        self._requests = ThreadPoolExecutor(1)  # requests are sent one at a time
         drones = scenario_file.from_text(info.scenario).drones
         first = options.first_system_id
         if first + len(drones) - 1 > SYSTEM_IDS:
             allowed = f"MAVLink has {SYSTEM_IDS} system ids, of which --first-system-id is {first}"
             raise RunError(f"{observer.name}: the run has {len(drones)} drones; {allowed}")
         self._served = {drone.name: self._offer(i, drone) for i, drone in enumerate(drones)}
-        self._routes: dict[str, tuple[str, str]] = {}  # drone and name of the message, by key
+        self._routes: dict[str, tuple[str, str]] = {}  # drone and message name, by key
         for drone in self._served:
             names = {keys.sensor(drone, name): name for name in keys.SENSORS}
             names |= {keys.truth(drone): "truth", keys.estimate(drone): "estimate", keys.status(drone): "status"}
@@ -109,7 +109,7 @@ class MavlinkServer(VehicleServer):
 
     def _offer(self, index: int, drone: Drone) -> "ServedVehicle":
         options, system_id, source = self.options, self.options.first_system_id + index, self.observer.name
-        # 64 bits by which programs recognize a vehicle: unique in all runs
+        # 64 bits by which programs recognise a vehicle, unique across runs
         unique_id = int.from_bytes(hashlib.sha256(f"{self.info.run_id}/{drone.name}".encode()).digest()[:8])
         shown = Options(system_id, PERSONALITIES[options.autopilot], options.level, source, unique_id)
         vehicle = MavlinkVehicle(drone, self.info.origin, CommandSender(drone.name, source, self.link.put), shown)
@@ -144,7 +144,7 @@ class MavlinkServer(VehicleServer):
         stack.callback(asyncio.create_task(self._tick_always()).cancel)
 
     async def on_arrivals(self, intake: TrafficIntake) -> None:
-        """Process what has arrived; of each message of a drone, only the newest."""
+        """Process what has arrived, but only the newest of each kind of message from a drone."""
         newest: dict[str, bytes] = {}
         for arrived in intake.arrivals():
             for key, payload in arrived:
@@ -164,10 +164,10 @@ class MavlinkServer(VehicleServer):
             served.vehicle.step()
             self.report_mission(served.vehicle)
             served.flush()
-            await asyncio.sleep(0)  # setpoints that have arrived meanwhile go first
+            await asyncio.sleep(0)  # let setpoints that have arrived meanwhile go first
 
     def report_mission(self, vehicle: MavlinkVehicle) -> None:
-        """Report to the world how far a mission was flown, for the record; no gate waits for it."""
+        """Report to the world how far a mission was flown, for the record; gates do not wait for this."""
         for report in vehicle.flight.mission.reports:
             args = {"drone": vehicle.name, **report._asdict()}
             self._requests.submit(self.link.request, keys.CONTROL, "mission", self.observer.name, args, ANSWER_S)
@@ -195,7 +195,7 @@ class MavlinkServer(VehicleServer):
 
 
 class ServedVehicle:
-    """A vehicle and its ports, with one sequence of message numbers."""
+    """A vehicle and its ports, which share one sequence of message numbers."""
 
     def __init__(self, vehicle: MavlinkVehicle, ports: "Sequence[VehiclePort]", link: Link) -> None:
         self.vehicle = vehicle
@@ -207,7 +207,7 @@ class ServedVehicle:
         self.send(self.vehicle.take())
 
     def send(self, messages: Sequence[WireMessage]) -> None:
-        """Send messages to all peers, many in a datagram; those with values out of range are counted instead."""
+        """Send messages to all peers, several per datagram; messages with values out of range are only counted."""
         datagrams: list[bytes] = []
         for message in messages:
             try:
@@ -247,7 +247,7 @@ class VehiclePort:
             self._socket.bind(local)
         except OSError as error:
             self._socket.close()
-            taken = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by another process, or reserved by the system
+            taken = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by a process, or by the system
             other = "other ports with --gcs-local and --api-local" if taken else "an address of this host with --listen"
             raise RunError(f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror}); give {other}") from error
         self._on_received = on_received
@@ -265,7 +265,7 @@ class VehiclePort:
         """Send to all peers; datagrams that do not fit into the buffer are lost, as on a radio link."""
         for address in self.peers.addresses(time.monotonic()) if datagrams else ():
             for datagram in datagrams:
-                with contextlib.suppress(OSError):  # nobody there, no route, no room
+                with contextlib.suppress(OSError):  # nobody listens, no route, or a full buffer
                     self._socket.sendto(datagram, address)
 
     def _read(self) -> None:
@@ -275,17 +275,17 @@ class VehiclePort:
             except (BlockingIOError, InterruptedError):
                 return
             except OSError:
-                continue  # a datagram sent before could not be delivered
+                continue  # reports that an earlier datagram could not be delivered
             if self.peers.accepts(address, time.monotonic()):
                 for received in self.parser.feed(data):
                     self._on_received(received)
 
 
 class Peers:
-    """The peers of one port: the configured one, and programs on this machine that speak to it.
+    """The peers of one port: the configured one, and programs on this machine that send to it.
 
     Attributes:
-        refused: datagrams of others.
+        refused: number of datagrams from others.
     """
 
     def __init__(self, configured: Address) -> None:
@@ -294,7 +294,7 @@ class Peers:
         self.refused = 0
 
     def accepts(self, address: Address, wall_s: float) -> bool:
-        """Return whether a datagram from an address is read; programs on this machine become peers."""
+        """Return whether datagrams from an address are accepted; programs on this machine become peers."""
         if address == self._configured:
             return True
         known = address in self._learnt

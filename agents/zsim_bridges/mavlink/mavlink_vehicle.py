@@ -311,7 +311,7 @@ class MavlinkVehicle:
         state, is_px4 = self.state, self._personality.is_px4
         if not math.isfinite(altitude_m) or (is_px4 and altitude_m == 0.0):
             altitude_m = self._parameters["takeoff_altitude_m"]
-        elif is_px4:  # PX4 has it over the sea
+        elif is_px4:  # PX4's altitude is above sea level
             altitude_m -= state.to_global(state.home_or_here_m)[2]
         if not 0.0 < altitude_m <= 10_000.0:
             return f"take-off to {altitude_m:.1f} m over home"

@@ -1,4 +1,4 @@
-"""Missions of waypoints: their items, a vehicle's progress in them, and the transfers of items, also of fences.
+"""Waypoint missions: their items, a vehicle's progress through them, and the transfer of items, including fences.
 
 Sources: https://mavlink.io/en/messages/common.html#mav_commands for the items, and
 https://mavlink.io/en/services/mission.html for the protocol.
@@ -15,12 +15,12 @@ from zsim_bridges.mavlink.dialect import FENCE, MISSION, Cmd, MavFrame, MissionR
 from zsim_bridges.mavlink.personality import Parameters
 from zsim_bridges.mavlink.vehicle_state import Target, VehicleState, is_place
 
-JUMPS_MAX = 1000  # in succession without a waypoint between them: a circle of jumps
+JUMPS_MAX = 1000  # items skipped in succession before a mission counts as an endless loop of jumps
 ABSOLUTE = (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
 RELATIVE = (
     MavFrame.GLOBAL_RELATIVE_ALT,
     MavFrame.GLOBAL_RELATIVE_ALT_INT,
-    MavFrame.GLOBAL_TERRAIN_ALT,  # the ground of zsim is level
+    MavFrame.GLOBAL_TERRAIN_ALT,  # zsim's ground is level
     MavFrame.GLOBAL_TERRAIN_ALT_INT,
 )
 LOCAL = (MavFrame.LOCAL_NED, MavFrame.LOCAL_ENU)
@@ -29,8 +29,8 @@ COMMANDS: tuple[Any, ...] = (
     *(Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_RETURN_TO_LAUNCH, Cmd.NAV_LAND),
     *(Cmd.NAV_TAKEOFF, Cmd.NAV_DELAY, Cmd.DO_JUMP, Cmd.DO_CHANGE_SPEED),
 )
-ITEMS_MAX = 1000  # chosen: of one mission; autopilots keep some hundreds
-RETRY_NS = 500_000_000  # ns of wall time until an item is requested again
+ITEMS_MAX = 1000  # items in one mission; chosen: autopilots store some hundreds
+RETRY_NS = 500_000_000  # ns of wall time after which a missing item is requested again
 TRIES_MAX = 10
 FENCE_COMMANDS: tuple[Any, ...] = (
     *(Cmd.FENCE_RETURN_POINT, Cmd.FENCE_POLYGON_INCLUSION, Cmd.FENCE_POLYGON_EXCLUSION),
@@ -41,7 +41,7 @@ Address = tuple[int, int]
 
 
 class PlanItem(NamedTuple):
-    """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is [m]. NaN is a value left out."""
+    """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is in m. NaN means not given."""
 
     frame: int
     command: int
@@ -53,16 +53,16 @@ class PlanItem(NamedTuple):
 
     @property
     def has_place(self) -> bool:
-        """Whether it gives a horizontal place; one of x and y is enough."""
+        """Whether the item has a horizontal position, for which one of x and y is enough."""
         return any(math.isfinite(value) and value for value in (self.x, self.y))
 
 
 class MissionReport(NamedTuple):
-    """How far a mission was flown, for the record of the run: `done` of its items, without ArduPilot's item 0.
+    """How far a mission was flown, for the record of the run: `done` of `items`, without ArduPilot's item 0.
 
     Attributes:
         reason: why it was aborted; "" if it was not.
-        failsafe: whether the vehicle itself aborted it, and no client.
+        failsafe: whether the vehicle aborted it, rather than a client.
     """
 
     state: Literal["active", "finished", "aborted"]
@@ -73,7 +73,7 @@ class MissionReport(NamedTuple):
 
 
 class MissionStep(NamedTuple):
-    """The present action of a mission: a target, or another action; z in W for a climb."""
+    """The current action of a mission: flying to a target, climbing to `z_m` in W, or another action."""
 
     action: Literal["fly", "climb", "land", "return", "over"]
     target: Target = Target()
@@ -81,7 +81,7 @@ class MissionStep(NamedTuple):
 
 
 def place_of(item: PlanItem, state: VehicleState) -> Vector:
-    """Return p_W [m] of an item; if x or y is left out, that of the vehicle."""
+    """Return the position of an item in W [m]; the vehicle's x or y replaces one that is not given."""
     own_x, own_y, _ = state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
     if item.frame in LOCAL:
@@ -97,16 +97,16 @@ def place_of(item: PlanItem, state: VehicleState) -> Vector:
 
 
 class Mission:
-    """A mission and the progress in it.
+    """A mission and the progress through it.
 
     Args:
-        first: number of its first item; ArduPilot's item 0 is home.
-        turns: whether the yaw of a waypoint is flown.
+        first: number of its first item; 1 for ArduPilot, whose item 0 is home.
+        turns: whether the vehicle turns to the yaw of a waypoint.
 
     Attributes:
-        reached: numbers of items that have been reached, to be reported to clients.
-        reports: of how far it was flown, to be sent to the world.
-        has_climbed: whether the requested climb is over.
+        reached: numbers of items that have been reached, yet to be reported to clients.
+        reports: reports of the progress, yet to be sent to the world.
+        has_climbed: whether the requested climb has ended.
     """
 
     def __init__(self, first: int = 0, turns: bool = True) -> None:
@@ -115,12 +115,12 @@ class Mission:
         self.items: list[PlanItem] = []
         self.reached: list[int] = []
         self.reports: list[MissionReport] = []
-        self._reported: int | None = None  # items flown at the last report; None while it is not flown
+        self._reported: int | None = None  # items done at the last report; None while the mission is not being flown
         self._index = 0
-        self._since_ns: int | None = None  # at this item
-        self._waits_at: Vector = (0.0, 0.0, 0.0)  # during a delay [m; W]
+        self._since_ns: int | None = None  # when the vehicle reached the current item
+        self._waits_at: Vector = (0.0, 0.0, 0.0)  # position held during a delay [m; W]
         self._speed_m_s: float | None = None
-        self._jumps: dict[int, int] = {}  # left, by item
+        self._jumps: dict[int, int] = {}  # jumps left, by item index
         self.has_climbed = False
 
     @property
@@ -133,7 +133,7 @@ class Mission:
 
     @property
     def is_landing(self) -> bool:
-        """Whether the present item ends on the ground."""
+        """Whether the current item ends on the ground."""
         item = self._item
         return item is not None and item.command in (Cmd.NAV_LAND, Cmd.NAV_RETURN_TO_LAUNCH)
 
@@ -146,7 +146,7 @@ class Mission:
         self._enter(0)
 
     def set_current(self, number: int) -> bool:
-        """Continue with an item; False if there is none of that number."""
+        """Continue with an item; return False if there is no item of that number."""
         index = max(0, number - self.first)
         if index >= len(self.items):
             return False
@@ -156,7 +156,7 @@ class Mission:
     # Reports
 
     def start(self) -> None:
-        """Report that it is flown from now on, unless it is flown already."""
+        """Report that the mission has started, unless it is already being flown."""
         if self._reported is None:
             self._report_active()
 
@@ -170,13 +170,13 @@ class Mission:
         self.reports.append(MissionReport("active", len(self.items), self._index))
 
     def finish(self) -> None:
-        """Report that all of it has been flown."""
+        """Report that the mission has been completed."""
         if self._reported is not None:
             self.reports.append(MissionReport("finished", len(self.items), len(self.items)))
             self._reported = None
 
     def abort(self, reason: str, failsafe: bool) -> None:
-        """Report that it is no longer flown, unless it has already ended."""
+        """Report that the mission has been aborted, unless it has already ended."""
         if self._reported is not None:
             self.reports.append(MissionReport("aborted", len(self.items), self._reported, reason, failsafe))
             self._reported = None
@@ -184,12 +184,12 @@ class Mission:
     # Steps
 
     def takeoff_height_m(self, state: VehicleState) -> float | None:
-        """Return z in W to which the mission takes off; None if it does not begin with a take-off."""
+        """Return z in W to which the mission takes off; None if the current item is not a take-off."""
         item = self._item
         return place_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
 
     def step(self, state: VehicleState, parameters: Parameters) -> MissionStep:
-        """Return the present action, skipping completed items."""
+        """Return the current action, skipping completed items."""
         for _ in range(JUMPS_MAX):
             item = self._item
             if item is None:
@@ -276,9 +276,9 @@ class MissionProtocol:
     """The item transfers of one vehicle.
 
     Args:
-        loaded: called with the type and the items of a complete upload, or of a removal.
-        home: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which asks
-            for items as MISSION_ITEM_INT first.
+        loaded: called with the type and the items of a complete upload, or with no items after a removal.
+        home: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which
+            requests items as MISSION_ITEM_INT first.
     """
 
     def __init__(
@@ -294,7 +294,7 @@ class MissionProtocol:
         self._upload: _Upload | None = None
 
     def on_message(self, message: dialect.WireMessage, sender: Address, wall_ns: int) -> bool:
-        """Process a message of the protocol; return False for any other. `wall_ns` is wall time from any zero."""
+        """Process a message of the protocol; return False for any other. `wall_ns` has an arbitrary epoch."""
         match message:
             case dialect.MissionCount():
                 upload = _Upload(sender, message.mission_type, message.count)
@@ -310,7 +310,7 @@ class MissionProtocol:
             case dialect.MissionItemInt() | dialect.MissionItem():
                 upload = self._upload
                 if upload is not None and upload.sender == sender and message.seq == len(upload.items):
-                    self._take_item(upload, message, wall_ns)  # otherwise repeated or unrequested
+                    self._take_item(upload, message, wall_ns)  # other items are repetitions, or were not requested
             case dialect.MissionRequestList(mission_type=type_):
                 self._send(dialect.MissionCount(*sender, count=len(self._stored(type_)), mission_type=type_))
             case dialect.MissionRequestInt() | dialect.MissionRequest():
@@ -337,7 +337,7 @@ class MissionProtocol:
         return True
 
     def tick(self, wall_ns: int) -> None:
-        """Request a missing item again."""
+        """Request a missing item again, or cancel the upload after TRIES_MAX repetitions."""
         upload = self._upload
         if upload is None or wall_ns - upload.asked_ns < RETRY_NS:
             return
@@ -349,7 +349,7 @@ class MissionProtocol:
 
     def _request(self, upload: _Upload, wall_ns: int) -> None:
         upload.asked_ns = wall_ns
-        as_int = (self._home is None) != bool(upload.tries % 2)  # some clients know only one of the two
+        as_int = (self._home is None) != bool(upload.tries % 2)  # some clients support only one of the two
         kind = dialect.MissionRequestInt if as_int else dialect.MissionRequest
         self._send(kind(*upload.sender, seq=len(upload.items), mission_type=upload.type))
 
@@ -403,7 +403,7 @@ def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
         return MissionResult.UNSUPPORTED_FRAME
     is_whole = item.has_place and math.isfinite(item.x) and math.isfinite(item.y)
     z = 0.0 if math.isnan(item.z) and item.command == Cmd.NAV_LAND else item.z
-    x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))  # left out
+    x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))  # not given
     if item.frame in LOCAL:
         is_good = is_place((x, y, z))
     else:

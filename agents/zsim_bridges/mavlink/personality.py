@@ -1,4 +1,4 @@
-"""How PX4 and ArduPilot differ for clients: modes, parameters, rules for offboard flight.
+"""How PX4 and ArduPilot differ for clients: modes, parameters, and rules for offboard flight.
 
 Sources: PX4-Autopilot, src/modules/commander/px4_custom_mode.h and the parameter reference; ArduPilot,
 ArduCopter/mode.h and the parameter list of Copter.
@@ -17,7 +17,7 @@ from zsim_bridges.mavlink.dialect import Autopilot, ParamType
 
 REAL, INT, SHORT, BYTE = ParamType.REAL32, ParamType.INT32, ParamType.INT16, ParamType.INT8
 CM = 0.01  # unit of ArduPilot's lengths [m] and speeds [m/s]
-ID_MAX = 16  # most characters of a parameter's name
+ID_MAX = 16  # maximum number of characters in a parameter's name
 
 
 FlightMode = Enum("FlightMode", "MANUAL ALTITUDE POSITION HOLD BRAKE TAKEOFF LAND RETURN MISSION OFFBOARD")
@@ -73,7 +73,7 @@ COPTER_FENCE = {  # FENCE_ACTION
     1: FenceAction.RETURN,
     2: FenceAction.LAND,
     3: FenceAction.RETURN,
-    4: FenceAction.HOLD,  # brake, or else land
+    4: FenceAction.HOLD,  # brake, or land if that is impossible
 }
 Setting = Literal[
     "speed_m_s",
@@ -92,7 +92,7 @@ Setting = Literal[
 
 
 class ParameterSpec(NamedTuple):
-    """A parameter: its initial value and its range; fixed ones cannot be set. Setting = value * `unit`."""
+    """A parameter with initial value and range; a fixed one cannot be set. The setting is the value times `unit`."""
 
     name: str
     type: ParamType
@@ -249,7 +249,7 @@ class Parameters:
         return dialect.ParamValue(name, value, type_, len(self._names), self._names.index(name))
 
     def decoded(self, message: dialect.ParamSet) -> float:
-        """Decode the value that a message sets, by the type of the parameter, or else that of the message."""
+        """Decode the value in a message by the parameter's type, or by the message's for an unknown parameter."""
         spec = self._specs.get(message.param_id)
         type_ = spec.type if spec else message.param_type
         if not self._is_bytewise(type_):

@@ -200,7 +200,7 @@ def position_target_local_ned(s: TelemetrySource) -> WireMessage | None:
         return None
     x, y, z = target.position_m
     mask = TypeMask.AX | TypeMask.AY | TypeMask.AZ
-    for p, bit in ((x, TypeMask.Y), (y, TypeMask.X), (z, TypeMask.Z)):  # x of W is y of MAVLink
+    for p, bit in ((x, TypeMask.Y), (y, TypeMask.X), (z, TypeMask.Z)):  # x in W is y in MAVLink
         mask |= bit if p is None else TypeMask(0)
     mask |= TypeMask.YAW_RATE if target.yaw_rad is not None else TypeMask.YAW
     frame, axes = (MavFrame.BODY_NED, frd) if target.along_heading else (MavFrame.LOCAL_NED, ned)

@@ -1,7 +1,7 @@
-"""The flight of one vehicle: its arming state, its mode, its targets, and the commands that make it hold them.
+"""The flight of one vehicle: its arming state, mode and targets, and the commands that make it hold these.
 
-A landed drone of zsim has no separate armed state: armed means that it takes off on command. Places are approached like
-references of drones: `zsim_agents.references.cruise`.
+A landed drone of zsim has no armed state; here, armed means that it takes off on command. Positions are approached like
+the references of drones, by `zsim_agents.references.cruise`.
 """
 
 import math
@@ -18,17 +18,17 @@ from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, Mode
 
 OVER_ON_GROUND = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN, FlightMode.MISSION)
 Report = Callable[[Severity, str], None]
-ANSWER_NS = 1_000_000_000  # ns within which the drone should begin a take-off or a landing
-ARRIVED_M = 0.3  # m of the height at which a climb is over
-STEP_NS = 40_000_000  # ns; the law is evaluated 25 times a second
-BURST = 500  # commands at once: half of what the world records of a source that is not in the lockstep
+ANSWER_NS = 1_000_000_000  # ns within which the drone should begin a requested take-off or landing
+ARRIVED_M = 0.3  # m; a climb ends this close to its height
+STEP_NS = 40_000_000  # ns; the guidance law is evaluated 25 times a second
+BURST = 500  # commands in one burst: half of what the world records of a source outside the lockstep
 
 
 class Flight:
     """The flight of one vehicle; requests return None, or the reason for their refusal.
 
     Args:
-        name: of this process among the commanders of drones.
+        name: name of this process, as in the commander of a drone.
     """
 
     def __init__(
@@ -49,9 +49,9 @@ class Flight:
         self._control = FlightControl(parameters, state, sender, course)
         self._is_armed = self._was_airborne = False
         self._armed_ns = 0
-        self._setpoint_ns: int | None = None  # simulated time of a client's newest setpoint
+        self._setpoint_ns: int | None = None  # simulated time of the newest setpoint from a client
         self._return_stage = 0
-        self._mission_returns = False  # whether its return is an item of the mission
+        self._mission_returns = False  # whether the return under way is an item of the mission
         self.mode = personality.first_mode
         self.mission = Mission(first=0 if personality.is_px4 else 1, turns=personality.is_px4)
 
@@ -59,7 +59,7 @@ class Flight:
 
     @property
     def target(self) -> Target | TiltTarget | None:
-        """The held target; None while nothing is sent."""
+        """The target being held; None while nothing is sent."""
         return self._control.target
 
     @property
@@ -92,7 +92,7 @@ class Flight:
         return reason
 
     def disarm(self, force: bool) -> str | None:
-        """Disarm it; in the air, if forced, the rotors stop at once."""
+        """Disarm the vehicle; if forced, even in the air, where the rotors stop at once."""
         if not self._state.is_airborne:
             if self._is_armed:
                 self._stand("Disarmed")
@@ -108,7 +108,7 @@ class Flight:
         self._stand("Emergency: rotors stopped")
 
     def reboot(self) -> str | None:
-        """Restart, on the ground only; leave an emergency."""
+        """Restart, which is possible only on the ground, and leave an emergency."""
         if self._state.is_airborne:
             return "in flight"
         if self._state.state == "emergency":
@@ -118,7 +118,7 @@ class Flight:
         return None
 
     def take_off(self, altitude_m: float) -> str | None:
-        """Take off to an altitude over home."""
+        """Take off to an altitude above home."""
         has_mode = FlightMode.TAKEOFF in self._personality.modes
         reason = self.refusal() or self._takeoff_refusal()
         if reason is None and not has_mode and self.mode is not FlightMode.OFFBOARD:
@@ -149,7 +149,7 @@ class Flight:
         return reason
 
     def set_point(self, target: Target | TiltTarget) -> str | None:
-        """Take a setpoint of a stream; it is flown in OFFBOARD (GUIDED), and at once."""
+        """Accept a setpoint of a stream; in OFFBOARD (GUIDED) it is followed at once."""
         self._setpoint_ns = self._state.t_ns
         if self.mode is not FlightMode.OFFBOARD:
             return None if self._personality.is_px4 else "not in GUIDED"
@@ -157,19 +157,19 @@ class Flight:
         if reason is None and self._control.climb_to_m is None:
             self._control.hold(target)
             if isinstance(target, Target) and self._is_armed and not self._state.is_airborne:
-                z = target.position_m[2]  # no take-off begins with a tilt
+                z = target.position_m[2]  # only a target above the vehicle starts a take-off
                 if target.velocity_m_s[2] > 0.0 or (z is not None and z > self._state.position_m[2] + ARRIVED_M):
                     self._control.ask("takeoff")
         return reason
 
     def steer_by_sticks(self, target: Target) -> None:
-        """Fly by a joystick, in the modes that otherwise hold."""
+        """Follow a joystick, in the modes that otherwise hold the position."""
         if self.mode in HOLDING and self._state.is_steerable and self._is_armed and not self.refusal():
             self._setpoint_ns = self._state.t_ns
             self._control.hold(target)
 
     def start_mission(self, first: int | None = None) -> str | None:
-        """Fly the mission, from a given item or the present one on."""
+        """Fly the mission from a given item on, or from the current one."""
         reason = self.refusal() or self._takeoff_refusal()
         if reason is None and first is not None and not self.mission.set_current(first):
             reason = f"no item {first}"
@@ -230,7 +230,7 @@ class Flight:
             self._fly_home()
         elif self.mode is FlightMode.LAND:
             self._control.ask("land")
-        elif self._is_stream_silent() and self.target is not None:  # ArduPilot holds a position anyway
+        elif self._is_stream_silent() and self.target is not None:  # ArduPilot keeps a position without a stream
             if self.mode is FlightMode.OFFBOARD and self._personality.is_px4:
                 self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
                 self._enter(FlightMode.HOLD)
@@ -255,7 +255,7 @@ class Flight:
                 self._enter(FlightMode.HOLD)
 
     def _fly_home(self) -> None:
-        """Climb to the return height, fly home, and land, in this order."""
+        """Climb to the return height, fly home, and land."""
         home_x, home_y, home_z = self._state.home_or_here_m
         x, y, z = self._state.position_m
         target = self.target
@@ -315,13 +315,13 @@ class Flight:
 class FlightControl:
     """Sends a drone the commands that make it hold a target.
 
-    The world accepts one more command of a source at each gate, so each gate allows one here; a new target is sent at
-    once while the burst lasts.
+    The world accepts one more command from a source at each gate, so each gate adds one to the allowance here; a new
+    target is sent at once as long as the allowance permits.
 
     Attributes:
-        target: held at present; None while nothing is sent.
-        climb_to_m: z in W of the climb under way.
-        asked: the mode that the firmware has yet to enter, and since when it is requested.
+        target: target being held; None while nothing is sent.
+        climb_to_m: z in W at which the climb under way ends; None without a climb.
+        asked: mode that the firmware has yet to enter, and when it was requested.
     """
 
     def __init__(self, parameters: Parameters, state: VehicleState, sender: CommandSender, course: Course) -> None:
@@ -329,11 +329,11 @@ class FlightControl:
         self._state = state
         self._sender = sender
         self._course = course
-        self._asked: tuple[Target, Cruise] | None = None  # of the course
+        self._asked: tuple[Target, Cruise] | None = None  # target and speeds that the course follows
         self.target: Target | TiltTarget | None = None
         self.climb_to_m: float | None = None
         self.asked: tuple[Literal["takeoff", "land"], int] | None = None
-        self._is_pending = False  # a target that could not be sent at once
+        self._is_pending = False  # whether a new target could not be sent at once
         self._allowed = BURST
         self._sent_ns = 0
 
@@ -342,17 +342,17 @@ class FlightControl:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the target never brings the vehicle to rest; one that holds a tilt flies away."""
+        """Whether the target never brings the vehicle to rest, as with a velocity, a turn or a tilt."""
         target = self.target
         if not isinstance(target, Target):
             return target is not None
         return any(target.velocity_m_s) or (target.yaw_rad is None and target.yaw_rate_rad_s != 0.0)
 
     def hold(self, target: Target | TiltTarget) -> None:
-        """Hold a target from now on, and send it at once; a climb under way is finished first."""
+        """Hold a target from now on, and send it at once, unless a climb under way has to end first."""
         self.target = target
         if self._state.is_steerable and self.climb_to_m is None:
-            self._is_pending = self._allowed <= BURST // 10  # the rest is for repetitions
+            self._is_pending = self._allowed <= BURST // 10  # the rest is reserved for repetitions
             if not self._is_pending:
                 self._send()
 
@@ -363,7 +363,7 @@ class FlightControl:
             self.hold(Target(self._course.stop(*self._motion())))
 
     def climb(self, z_m: float) -> None:
-        """Climb, or take off, vertically to z in W."""
+        """Climb or take off vertically to z in W."""
         self.target, self.climb_to_m = None, z_m
         if not self._state.is_airborne:
             self.ask("takeoff")
@@ -382,7 +382,7 @@ class FlightControl:
         return True
 
     def ask(self, mode: Literal["takeoff", "land"]) -> None:
-        """Request a mode from the firmware; repeat only without an answer."""
+        """Request a mode from the firmware; the request is repeated only if the firmware does not respond."""
         if self.asked is None or self.asked[0] != mode or self._state.t_ns - self.asked[1] > ANSWER_NS:
             self.asked = mode, self._state.t_ns
             if mode == "land":
@@ -433,7 +433,7 @@ class FlightControl:
             self._sender.attitude(t_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)
 
     def _velocity(self, target: Target) -> tuple[Vector, float]:
-        """Return the velocity [m/s], in the axes of the target, and the yaw rate [rad/s] that lead to it."""
+        """Return the velocity [m/s], in the axes of the target, and the yaw rate [rad/s] that lead to the target."""
         speeds, (t_s, here, moving) = self._parameters.speeds, self._motion()
         level = min(target.speed_m_s or math.inf, speeds.horizontal_m_s)
         asked = target, speeds._replace(horizontal_m_s=level)
@@ -444,6 +444,6 @@ class FlightControl:
         return self._course.velocity(t_s, here, moving)
 
     def _motion(self) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
-        """Return simulated time [s], place and heading, and their rates."""
+        """Return simulated time [s], position and heading, and their rates; the yaw rate counts as 0."""
         state = self._state
         return state.t_ns * 1e-9, (*state.position_m, state.yaw_rad), (*state.velocity_m_s, 0.0)

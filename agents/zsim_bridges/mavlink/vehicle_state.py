@@ -1,4 +1,4 @@
-"""The state of a vehicle, estimated or true where no estimator runs, its sensors' health; and targets for it."""
+"""The state of a vehicle, estimated or, without an estimator, true; the health of its sensors; and targets for it."""
 
 import math
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from zsim_bridges.mavlink.dialect import SensorBit
 from zsim_bridges.vehicle_links.drone_link import has_attitude
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
-SAMPLES_MISSED = 5  # periods of a sensor without a sample: it has failed
+SAMPLES_MISSED = 5  # periods without a sample after which a sensor counts as failed
 LOW_BATTERY_PERCENT = 20.0  # chosen: above BAT_CRIT_THR and the like, so that the pilot is warned before they act
 OFF_THE_GROUND = ("taking_off", "hovering", "flying", "landing")
 SENSORS = {
@@ -29,7 +29,7 @@ SENSORS = {
     "flow": SensorBit.FLOW,
 }
 ALL_HEALTHY = SensorBit(sum(SensorBit))
-PLACE_MAX_M = 1e6  # m; positions farther away are refused
+PLACE_MAX_M = 1e6  # m; positions beyond this are refused
 Axes = tuple[float | None, float | None, float | None]
 NOWHERE: Axes = (None, None, None)
 
@@ -39,11 +39,11 @@ class VehicleState:
 
     Attributes:
         t_ns: simulated time of the newest status.
-        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and body rate in B.
-        is_estimated: whether these are the estimator's.
-        sigma_m: standard deviation of the horizontal and of the vertical position; 0 for the truth.
-        samples: the newest of each sensor, by name.
-        home_m: home in W, first where it was switched on; None before it is known.
+        position_m, velocity_m_s: in W; q_WB, rate_rad_s: attitude, and angular rate in B.
+        is_estimated: whether position, velocity and attitude are the estimator's.
+        sigma_m: standard deviations of the horizontal and the vertical position; 0 for the truth.
+        samples: newest sample of each sensor, by name.
+        home_m: home in W, initially where the vehicle was switched on; None before it is known.
     """
 
     def __init__(self, drone: Drone, origin: Origin) -> None:
@@ -66,7 +66,7 @@ class VehicleState:
         }
 
     def update(self, name: str, message: Any) -> None:
-        """Note a message of the drone or of its estimator; `name` is the last part of its key."""
+        """Process a message of the drone or of its estimator; `name` is the last part of its key."""
         match message:
             case flight_messages.Status():
                 if self.status is None:
@@ -112,7 +112,7 @@ class VehicleState:
 
     @property
     def yaw_rad(self) -> float:
-        """Counter-clockwise from east."""
+        """Yaw counter-clockwise from east."""
         return float(frames.heading(self.q_WB))
 
     @property
@@ -142,18 +142,18 @@ class VehicleState:
         return place[0], place[1], place[2]
 
     def to_local(self, latitude_deg: float, longitude_deg: float, height_m: float) -> Vector:
-        """Return p_W [m] of a point on the Earth."""
+        """Return the position in W [m] of a geodetic point."""
         x, y, z = frames.geodetic_to_enu((latitude_deg, longitude_deg, height_m), self.origin).tolist()
         return x, y, z
 
     @property
     def home_or_here_m(self) -> Vector:
-        """Home in W; the present position before home is known."""
+        """Home in W; the current position until home is known."""
         return self.home_m or self.position_m
 
     @property
     def altitude_m(self) -> float:
-        """Height over home."""
+        """Height above home."""
         return self.position_m[2] - self.home_or_here_m[2]
 
     @property
@@ -167,12 +167,12 @@ class Target(NamedTuple):
     """A position or velocity to be held.
 
     Attributes:
-        position_m: in W, None in axes where only the velocity counts.
-        velocity_m_s: flown, added to the velocity towards the position.
-        yaw_rad: counter-clockwise from east; None to turn at the rate.
+        position_m: position in W; None in axes in which only the velocity counts.
+        velocity_m_s: velocity that is added to that towards the position.
+        yaw_rad: counter-clockwise from east; None to turn at `yaw_rate_rad_s`.
         yaw_rate_rad_s: counter-clockwise.
-        along_heading: the velocity is forward, left, up instead of in W.
-        speed_m_s: limit of the horizontal speed; None for the vehicle's.
+        along_heading: whether the velocity is forward, left, up instead of in W.
+        speed_m_s: limit of the horizontal speed; None for the vehicle's own.
     """
 
     position_m: Axes = NOWHERE
@@ -188,7 +188,7 @@ class Target(NamedTuple):
 
 
 class TiltTarget(NamedTuple):
-    """A tilt to be held: attitude B to W, thrust [N], yaw rate [rad/s] counter-clockwise."""
+    """A tilt to be held: attitude B to W, thrust [N], and yaw rate [rad/s] counter-clockwise."""
 
     q_WB: Quaternion
     thrust_n: float

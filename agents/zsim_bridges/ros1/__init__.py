@@ -1,1 +1,1 @@
-"""The drones in a ROS 1 graph, under the names and with the messages of ardrone_autonomy, without ROS on this host."""
+"""The drones in a ROS 1 graph, with the names and messages of ardrone_autonomy; needs no ROS on this host."""

@@ -1,4 +1,4 @@
-"""A node at its ROS master: XML-RPC calls, addresses, and a registration that outlives a restart of the master."""
+"""A node's dealings with its ROS master: XML-RPC calls, addresses, and a registration that survives its restart."""
 
 import http.client
 import os
@@ -15,21 +15,21 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from zsim.errors import RunError
 
-TIMEOUT_S = 3.0  # of one call
-BODY_MAX = 1_000_000  # bytes of a request
-DONE = 1  # code of an answer
-DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's own
+TIMEOUT_S = 3.0  # time limit of one call
+BODY_MAX = 1_000_000  # bytes in a request
+DONE = 1  # code of a successful answer
+DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's default
 DEFAULT_PORT = 11311
-CHECK_S = 1.0  # wall time between two checks whether the master still has the registration
-UNREGISTER_S = 2.0  # in which to unregister
+CHECK_S = 1.0  # wall time between checks that the master still has the registration
+UNREGISTER_S = 2.0  # time limit for unregistering
 
 
 class ApiError(Exception):
-    """An answer that is an error, or not of ROS's form."""
+    """An answer is an error, or does not have the form that ROS prescribes."""
 
 
 CALL_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error, ExpatError, ValueError, TypeError, ApiError)
-"""Errors of a call without an answer."""
+"""Errors of a call that yields no valid answer."""
 
 
 class _Transport(xmlrpc.client.Transport):
@@ -40,10 +40,10 @@ class _Transport(xmlrpc.client.Transport):
 
 
 def call_api(uri: str, method: str, *arguments: Any) -> Any:
-    """Return the value that a master or a node answers.
+    """Call a method of a master or a node, and return its answer's value.
 
     Raises:
-        one of CALL_ERRORS: it does not answer, or refuses.
+        one of CALL_ERRORS: the peer does not answer, or refuses.
     """
     with xmlrpc.client.ServerProxy(uri, transport=_Transport()) as proxy:
         answer: Any = getattr(proxy, method)(*arguments)
@@ -56,11 +56,11 @@ def call_api(uri: str, method: str, *arguments: Any) -> Any:
 
 
 class _Handler(SimpleXMLRPCRequestHandler):
-    timeout = 10.0  # s, of a client that sends nothing
+    timeout = 10.0  # s after which a client that sends nothing is disconnected
     protocol_version = "HTTP/1.1"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing of clients that are silent or send no XML-RPC."""
+        """Log nothing about clients that are silent or do not send XML-RPC."""
 
     def do_POST(self) -> None:
         size = self.headers.get("content-length", "")
@@ -72,7 +72,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 
 
 class XmlRpcServer(ThreadingMixIn, SimpleXMLRPCServer):
-    """Serves calls of an object's public methods, each connection in a thread of its own."""
+    """Serves calls of an object's public methods, with one thread per connection."""
 
     daemon_threads = True
 
@@ -81,16 +81,16 @@ class XmlRpcServer(ThreadingMixIn, SimpleXMLRPCServer):
         self.register_instance(api)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log nothing of a client that disconnected."""
+        """Log nothing about a client that disconnected."""
 
 
 def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) -> str:
-    """Return the name or address under which nodes of a master's graph reach this host.
+    """Return the name or address at which nodes of a master's graph reach this host.
 
-    ROS's own variables come first, then the address from which this host reaches the master.
+    ROS's environment variables take precedence over the address from which this host reaches the master.
 
     Raises:
-        RunError: the URI is none, or its host is unknown.
+        RunError: the URI is invalid, or its host is unknown.
     """
     try:
         parts = urlsplit(master_uri)
@@ -113,7 +113,7 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
 
 
 class GraphEntry(NamedTuple):
-    """What a node registers: its name, URIs of its slave API and services, topics with their types, services."""
+    """What a node registers: its name, the URIs of its slave API and services, topics with their types, services."""
 
     caller: str
     slave_uri: str
@@ -124,11 +124,11 @@ class GraphEntry(NamedTuple):
 
 
 class Registration:
-    """Keeps a node registered, in a thread of its own, from its construction to `close`.
+    """Keeps a node registered from construction until `close`, in a separate thread.
 
     Args:
-        on_publishers: called with a topic and its publishers, whenever the node has registered.
-        on_displaced: called once when another node has taken the name.
+        on_publishers: called with each subscribed topic and its publishers, whenever the node has registered.
+        on_displaced: called once if another node takes the name.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class Registration:
         self._thread.start()
 
     def close(self) -> None:
-        """Unregister, if the master is there."""
+        """Unregister, if the master can be reached."""
         self._closed.set()
         self._thread.join(2 * TIMEOUT_S)
         if not self._may_be_registered:

@@ -1,7 +1,7 @@
-"""The bridge as a process: one run's drones in the graph of a ROS 1 master; it commands, and never gates.
+"""The bridge process: presents one run's drones in the graph of a ROS 1 master; it commands, but never gates.
 
-Each drone is there as ardrone_autonomy's driver in the namespace of its name: messages, commands, cameras. Units, signs
-and frames are the driver's; its frames are those of a driver whose tf_prefix is the drone's name. Sources:
+Each drone appears like ardrone_autonomy's driver in a namespace with the drone's name: messages, commands, cameras.
+Units, signs and frames are the driver's; frames are named as if its tf_prefix were the drone's name. Sources:
 ardrone_autonomy 1.4.1, src/ardrone_driver.cpp (PublishNavdata, PublishOdometry), src/teleop_twist.cpp; REP 103 and 105.
 """
 
@@ -36,18 +36,18 @@ from zsim_bridges.vehicle_links.server import PictureServer, Say
 
 WORLD = "world"
 MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
-FIX_3D = 3  # a fix with a height, as in NMEA
-NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags that its camera recognises
+FIX_3D = 3  # fix type with a height, as in NMEA
+NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags recognised by a camera
     **dict.fromkeys(("temp", "wind_speed", "wind_angle", "wind_comp_angle", "tags_count"), 0),
     **dict.fromkeys(("motor1", "motor2", "motor3", "motor4"), 0),
     **{f"tags_{what}": np.zeros(0, np.uint32) for what in ("type", "xc", "yc", "width", "height")},
     **{f"tags_{what}": np.zeros(0, np.float32) for what in ("orientation", "distance")},
 }
 UNKNOWN = np.zeros(9)
-DRIVER_QUEUE = 200  # messages, of the driver's publishers
-CAMERA_QUEUE = 10  # pictures, of the driver's image publishers
-QUEUE = 100  # messages
-NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
+DRIVER_QUEUE = 200  # messages, as in the driver's publishers
+CAMERA_QUEUE = 10  # images, as in the driver's image publishers
+QUEUE = 100  # messages, in all other publishers
+NEARLY_ZERO = 1e-6  # magnitude below which a component of cmd_vel counts as zero; the driver's _EPS
 COMMANDABLE = ("taking_off", *AIRBORNE)
 Part = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
 Navdata = message_class("ardrone_autonomy/Navdata")
@@ -69,8 +69,8 @@ def serve(
     """Serve one run until it is over, or `stopped` returns True.
 
     Args:
-        master_uri: of the ROS master.
-        host: name or address under which ROS nodes reach this host.
+        master_uri: URI of the ROS master.
+        host: name or address at which ROS nodes reach this host.
 
     Raises:
         NodeShutdownError: ROS asked this node to stop.
@@ -135,17 +135,17 @@ class Ros1Bridge(PictureServer):
             elif message is not None:
                 try:
                     drone.publish(message)
-                except (ValueError, ArithmeticError) as error:  # finite, but beyond what a field of ROS can hold
+                except (ValueError, ArithmeticError) as error:  # finite, but out of range for a ROS field
                     self.refuse(f"{key}: {error}")
 
     def on_event(self, event: Event) -> None:
-        """Print which commands of ROS nodes the world refuses."""
+        """Print each command from a ROS node that the world refuses."""
         if (event.kind, event.source) == ("refused", self.observer.name):
             self.say_once(f"{event.subject}: {event.data.get('reason', event.text)}")
 
 
 class DriverFrames:
-    """Names of a drone's frames."""
+    """The names of a drone's frames."""
 
     def __init__(self, drone: str) -> None:
         self.base = f"{drone}/ardrone_base_link"
@@ -154,17 +154,17 @@ class DriverFrames:
 
 
 def ros1_name(name: str) -> str:
-    """Return a name of the contract as a name of ROS, which has letters, digits and _ alone."""
+    """Convert a name of the contract to a ROS name, which has only letters, digits and underscores."""
     return name.replace(".", "_").replace("-", "_")
 
 
 def camera_frame(name: str, camera: str) -> str:
-    """Return the driver's name of a camera's frame: x to the right of the picture, y down, z ahead."""
+    """Return the driver's name for a camera's frame: x to the right of the image, y down, z forward."""
     return f"{name}/ardrone_base_{camera}cam"
 
 
 class DroneTopics:
-    """Topics and services of a drone; commands are sent under the name of a process, `tf` is of all drones."""
+    """Topics and services of a drone; commands are sent in the name of `source`, `tf` is shared by all drones."""
 
     def __init__(
         self, node: Ros1Node, drone: Drone, source: str, put: Callable[[str, Any], None], tf: PublishedTopic
@@ -188,7 +188,7 @@ class DroneTopics:
         node.serve(f"/{name}/ardrone/flattrim", commands.trim_refusal)
 
     def publish(self, message: Any) -> None:
-        """Publish what follows from a message of the drone or of its estimator."""
+        """Publish the ROS messages that result from a message of the drone or of its estimator."""
         state, frames = self._state, self._frames
         message = state.update(message)
         match message:
@@ -208,7 +208,7 @@ class DroneTopics:
 
 
 class TiltCommand(NamedTuple):
-    """A cmd_vel within its limits: shares of the largest tilt, climb and yaw rate."""
+    """A cmd_vel within its limits: fractions of the maximum tilt, climb and yaw rate."""
 
     forward: float
     left: float
@@ -218,9 +218,9 @@ class TiltCommand(NamedTuple):
 
 
 class DriverCommands:
-    """Commands of ROS nodes to one drone, by the driver's rules. Pure.
+    """Commands from ROS nodes to one drone, by the driver's rules. Pure.
 
-    The driver repeats the last cmd_vel until there is another; so does this, until the drone comes down.
+    Like the driver, it repeats the last cmd_vel until another arrives, or until the drone comes down.
     """
 
     def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
@@ -230,21 +230,21 @@ class DriverCommands:
         self._status: flight_messages.Status | None = None
 
     def on_cmd_vel(self, twist: Any) -> None:
-        """Fly a geometry_msgs/Twist from the next gate on.
+        """Follow a geometry_msgs/Twist from the next gate on.
 
         Raises:
-            ValueError: it is not finite.
+            ValueError: a component is not finite.
         """
         tilt = tilt_of(twist)
         if self._status is not None and self._status.state in COMMANDABLE:
             self._tilt, self._sent_ns = tilt, None
 
     def reset(self) -> None:
-        """Stop the rotors at once; in the emergency that this is, leave it: the driver's toggle."""
+        """Stop the rotors at once, or leave the emergency that this causes, like the driver's toggle."""
         self.send_mode("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
 
     def trim_refusal(self) -> str | None:
-        """Return why the drone cannot be trimmed now; a landed one is level, so trimming has no further effect."""
+        """Return why the drone cannot be trimmed now; a landed one is level, so trimming it has no further effect."""
         state = self._status.state if self._status else "not there yet"
         return None if state == "landed" else f"the drone is {state}; must be landed"
 
@@ -264,11 +264,11 @@ class DriverCommands:
 def tilt_of(twist: Any) -> TiltCommand:
     """Return the AR.Drone's command for a geometry_msgs/Twist.
 
-    linear.x and linear.y are shares of the largest tilt, forward and to the left; linear.z of the largest climb;
-    angular.z of the largest yaw rate, counter-clockwise. All six zero is hovering in place.
+    linear.x and linear.y are fractions of the maximum tilt, forward and to the left; linear.z of the maximum climb;
+    angular.z of the maximum yaw rate, counter-clockwise. If all six are zero, the drone hovers in place.
 
     Raises:
-        ValueError: it is not finite.
+        ValueError: a component is not finite.
     """
     linear, angular = twist.linear, twist.angular
     values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
@@ -279,15 +279,15 @@ def tilt_of(twist: Any) -> TiltCommand:
 
 
 class CameraTopics:
-    """Topics of a drone's cameras, as of the driver with image_transport, and the service togglecam.
+    """Topics of a drone's cameras, like those of the driver with image_transport, and the service togglecam.
 
-    There is a topic for each camera, and one for the active camera, which the service changes. Pictures are large: a
-    camera's are read only while a node subscribes to them.
+    Each camera has its topics, and so has the active camera, which the service changes. Since images are large, those
+    of a camera are read only while a node subscribes to them.
     """
 
     def __init__(self, node: Ros1Node, name: str) -> None:
         def publishers(base: str) -> tuple[PublishedTopic, PublishedTopic]:
-            """Return the topics of pictures, and of how they are to be understood."""
+            """Return the topics of the images and of their calibration."""
             return (
                 node.publish(f"{base}/image_raw/compressed", "sensor_msgs/CompressedImage", CAMERA_QUEUE),
                 node.publish(f"{base}/camera_info", "sensor_msgs/CameraInfo", CAMERA_QUEUE),
@@ -322,7 +322,7 @@ class CameraTopics:
                 of_infos.publish(partial(camera_info, info=info, t_ns=image.t_sample_ns, frame=frame))
 
     def poses(self) -> list[Part]:
-        """Return frame, position and orientation in the body of the cameras that have said how they see."""
+        """Return frame, position and orientation in the body of each camera whose calibration is known."""
         return [
             (camera_frame(self._name, camera), info.position_m, info.orientation_wxyz)
             for camera, info in self._infos.items()
@@ -330,7 +330,7 @@ class CameraTopics:
 
 
 def ros_time(t_ns: int) -> Any:
-    """Return simulated time [ns] as ROS writes it: seconds, and nanoseconds; ROS 1 has none before 0."""
+    """Convert simulated time [ns] to ROS time; ROS 1 has no negative times, so these become 0."""
     return ros.Time(*divmod(max(t_ns, 0), ros.NS_PER_S))
 
 
@@ -339,7 +339,7 @@ def header(seq: int, t_ns: int, frame: str) -> Any:
 
 
 def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
-    """Return what the driver publishes as ardrone/navdata, at the newest status.
+    """Return ardrone/navdata as the driver publishes it, at the time of the newest status.
 
     rotX is positive to the right, rotY nose down, rotZ counter-clockwise [deg]; velocities x forward, y left,
     z up [mm/s]; accelerations [g], az 1 at rest; altd [mm]; tm since the start [us].
@@ -365,12 +365,12 @@ def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
 
 
 def imu(seq: int, sample: messages.Imu, attitude: Quaternion, frames: DriverFrames) -> Any:
-    """Return ardrone/imu: attitude, rate and specific force in B, (0, 0, 9.8) at rest."""
+    """Return ardrone/imu: attitude, rate and specific force in B, the latter (0, 0, 9.8) m/s^2 at rest."""
     return ros.imu(header(seq, sample.t_sample_ns, frames.base), sample, attitude, (UNKNOWN, UNKNOWN, UNKNOWN))
 
 
 def mag(seq: int, sample: messages.Mag, frames: DriverFrames) -> Any:
-    """Return ardrone/mag: the direction of the Earth's field in B, of length 1."""
+    """Return ardrone/mag: the direction of the Earth's magnetic field in B, a unit vector."""
     length = math.hypot(*sample.field_ut) or 1.0
     direction: Any = ros.Vector3(*(field / length for field in sample.field_ut))
     return ros1.geometry_msgs__msg__Vector3Stamped(header(seq, sample.t_sample_ns, frames.base), direction)
@@ -381,9 +381,9 @@ def fix(seq: int, sample: messages.Gps, frames: DriverFrames) -> Any:
 
 
 def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
-    """Return ardrone/odometry: what the aircraft's own velocity integrates to since the start.
+    """Return ardrone/odometry: the aircraft's own velocity, integrated since the start.
 
-    The velocity is that of navdata: along the level axes x forward, y left, z up.
+    The velocity is that of navdata, along the level axes x forward, y left, z up.
     """
     assert state.status is not None
     velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
@@ -393,7 +393,7 @@ def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
 
 
 def ground_truth(seq: int, truth: flight_messages.Truth, frames: DriverFrames) -> Any:
-    """Return the true state as Gazebo's p3d plugin does, which hector_quadrotor and tum_simulator use: all in W."""
+    """Return the true state like Gazebo's p3d plugin, used by hector_quadrotor and tum_simulator: all of it in W."""
     q = truth.orientation_wxyz
     rate = rotations.rotate(q, truth.angular_velocity_rad_s).tolist()
     head = header(seq, truth.t_ns, WORLD)
@@ -401,7 +401,7 @@ def ground_truth(seq: int, truth: flight_messages.Truth, frames: DriverFrames) -
 
 
 def transforms(seq: int, state: OnboardState, frames: DriverFrames, parts: Sequence[Part] = ()) -> Any:
-    """Return `/tf` of a drone: odom to base as integrated, world to odom as far as it is estimated, and its parts."""
+    """Return a drone's `/tf`: odom to base as integrated, world to odom if estimated, and base to its parts."""
     assert state.status is not None
     t_ns = state.status.t_ns
     poses = [ros.transform(header(seq, t_ns, frames.odom), frames.base, state.position_m, state.attitude)]

@@ -1,10 +1,10 @@
-"""A ROS 2 context on the wire of rmw_zenoh: types and their hashes, names, keys, tokens; nodes and endpoints.
+"""A ROS 2 context on the wire of rmw_zenoh: types and their hashes, names, keys and tokens; nodes and endpoints.
 
-Of ros2/rmw_zenoh as Jazzy (from 0.2.4), Kilted and Rolling ship it: `liveliness_utils.cpp` for tokens and quality of
-service, `attachment_helpers.cpp` for attachments. Humble's has neither type hashes nor this attachment. The hashes of
-types are those of REP-2011; the types used here are the same from Iron to Lyrical.
+Follows ros2/rmw_zenoh as shipped with Jazzy (from 0.2.4), Kilted and Rolling: `liveliness_utils.cpp` for tokens and
+quality of service, `attachment_helpers.cpp` for attachments. Humble's version has neither type hashes nor this
+attachment. Type hashes are those of REP-2011; the types used here are the same from Iron to Lyrical.
 
-Order of this file: the wire, which is pure; the context, whose nodes have publishers, subscriptions and services; the
+The wire comes first, which is pure; then the context, whose nodes have publishers, subscriptions and services; then the
 types: classes, CDR, and definitions that rosbags lacks.
 """
 
@@ -24,22 +24,22 @@ from rosbags.typesys.store import Typestore
 from zsim.transport.session import Query, RawSample, Session
 
 CDR = "application/cdr"
-_OTHERS = re.compile(r"[^a-z0-9]+")  # and no two underscores in a row, which ROS reserves
-TOKEN_SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
-TOKEN_PARTS = 13  # of an endpoint's token
+_OTHERS = re.compile(r"[^a-z0-9]+")  # runs become one underscore, since ROS reserves two in a row
+TOKEN_SPACE = "@ros2_lv"  # prefix of all tokens; `**` does not match it
+TOKEN_PARTS = 13  # parts of an endpoint's token
 GID_BYTES = 16
 _HEAD = struct.Struct("<qqB")  # sequence number, wall time [ns], length of the gid
 ATTACHMENT_BYTES = _HEAD.size + GID_BYTES
 
 
 def ros_name(name: str, what: str) -> str:
-    """Return the nearest name that ROS takes: `quad-1.a` is `quad_1_a`, and a drone `7` is `drone_7`."""
+    """Return the nearest name valid in ROS: `quad-1.a` becomes `quad_1_a`, and a drone `7` becomes `drone_7`."""
     bare = _OTHERS.sub("_", name)
     return f"{what}_{bare}" if bare[0].isdigit() else bare
 
 
 def ros_names(names: Iterable[str], what: str) -> dict[str, str]:
-    """Return the ROS name of each; where two would have the same, the later ones get a number."""
+    """Return the ROS name of each name; where several would be equal, the later ones get a number."""
     ros_name_of: dict[str, str] = {}
     for name in names:
         first = chosen = ros_name(name, what)
@@ -58,14 +58,14 @@ class Qos(NamedTuple):
     transient_local: bool = False
 
     def text(self) -> str:
-        """Return it as tokens have it: what is rmw_zenoh's default (reliable, volatile, keep last) is left out."""
+        """Return the text used in tokens, without rmw_zenoh's defaults (reliable, volatile, keep last)."""
         reliability = "2" if self.best_effort else ""
         durability = "1" if self.transient_local else ""
         return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
 
 
 SENSOR = Qos(depth=5, best_effort=True)  # rmw_qos_profile_sensor_data
-DEFAULT = Qos(depth=10)  # rmw_qos_profile_default, and that of services
+DEFAULT = Qos(depth=10)  # rmw_qos_profile_default, also used for services
 CLOCK = Qos(depth=1, best_effort=True)  # rclcpp::ClockQoS
 TF = Qos(depth=100)  # tf2_ros::DynamicBroadcasterQoS
 TF_STATIC = Qos(depth=1, transient_local=True)  # tf2_ros::StaticBroadcasterQoS
@@ -91,7 +91,7 @@ class Endpoint(NamedTuple):
 
 
 def dds_name(ros_type: str) -> str:
-    """Return the name of a type on the wire: `std_msgs/msg/Empty` is `std_msgs::msg::dds_::Empty_`."""
+    """Return the name of a type on the wire: `std_msgs/msg/Empty` becomes `std_msgs::msg::dds_::Empty_`."""
     package, kind, name = ros_type.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
@@ -121,7 +121,7 @@ def _mangled(name: str) -> str:
 
 
 def endpoint_of(token: str) -> Endpoint | None:
-    """Return the endpoint of a token; None where it is no endpoint's."""
+    """Return the endpoint that a token describes; None if it describes no endpoint."""
     parts = token.split("/")
     if len(parts) != TOKEN_PARTS or parts[0] != TOKEN_SPACE:
         return None
@@ -134,7 +134,7 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """The attachment of every message, request and reply: its number (from 1), its wall time, and its sender."""
+    """The attachment of every message, request and reply: sequence number (from 1), wall time [ns], and sender."""
 
     sequence: int
     wall_ns: int
@@ -145,10 +145,10 @@ class Attachment(NamedTuple):
 
 
 def attachment_of(data: bytes) -> Attachment:
-    """Return a decoded attachment.
+    """Decode an attachment.
 
     Raises:
-        ValueError: it is none of rmw_zenoh's.
+        ValueError: the data are not an attachment of rmw_zenoh.
     """
     if len(data) != ATTACHMENT_BYTES or data[_HEAD.size - 1] != GID_BYTES:
         raise ValueError(f"the attachment has {len(data)} bytes; must have {ATTACHMENT_BYTES}, of rmw_zenoh >= 0.2.4")
@@ -157,12 +157,12 @@ def attachment_of(data: bytes) -> Attachment:
 
 
 class RosContext:
-    """A context in the sense of ROS: the nodes of one process.
+    """A ROS context: the nodes of one process.
 
     Args:
-        link: a session by full keys, without a federation.
-        wall_ns: returns the time since 1970.
-        refuse: called with (name, reason) of a message that is refused, in threads of Zenoh's.
+        link: a session with full keys, without the prefix of a federation.
+        wall_ns: returns the wall time since 1970.
+        refuse: called with the name and the reason when a message is refused, in Zenoh's threads.
     """
 
     def __init__(
@@ -172,20 +172,20 @@ class RosContext:
         self.domain = domain
         self.wall_ns = wall_ns
         self.refuse = refuse
-        self.numbers = count()  # of nodes and endpoints
+        self.numbers = count()  # numbers of nodes and endpoints
         self._zid = link.zid()
 
     def node(self, namespace: str, name: str) -> "Ros2Node":
-        """Return a new node, which other nodes see from now on."""
+        """Return a new node, which is visible to other nodes from now on."""
         return Ros2Node(self, NodeId(self.domain, self._zid, next(self.numbers), namespace, name))
 
     def on_subscription(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (token, alive), in a thread of Zenoh's, for the subscriptions of all contexts."""
+        """Call back with (token, alive), in a Zenoh thread, for the subscriptions of all contexts in the domain."""
         self.link.on_token(f"{TOKEN_SPACE}/{self.domain}/*/*/*/MS/**", callback)
 
 
 class Ros2Node:
-    """A node of a context. An endpoint's token is declared once it works: others may use it at once."""
+    """A node of a context. An endpoint's token is declared only once it works, since others may use it at once."""
 
     def __init__(self, context: RosContext, identity: NodeId) -> None:
         self._context = context
@@ -200,7 +200,7 @@ class Ros2Node:
         return publisher
 
     def subscription(self, topic: str, kind: str, qos: Qos, callback: Callable[[Any], None]) -> Callable[[], None]:
-        """Call back with every message on a topic, in a thread of Zenoh's, until the returned function is called."""
+        """Call back with every message on a topic, in a Zenoh thread, until the returned function is called."""
         context = self._context
         key, token = self._endpoint("MS", topic, kind, qos)
 
@@ -216,7 +216,7 @@ class Ros2Node:
         return undeclare
 
     def service(self, name: str, kind: str, answer: Callable[[Any], Any]) -> None:
-        """Answer a service's requests, each with what `answer` returns, in a thread of Zenoh's."""
+        """Answer a service's requests with what `answer` returns for each; it is called in a Zenoh thread."""
         context = self._context
         key, token = self._endpoint("SS", name, kind, DEFAULT)
 
@@ -235,7 +235,7 @@ class Ros2Node:
         context.link.declare_token(token)
 
     def _endpoint(self, how: str, name: str, kind: str, qos: Qos) -> tuple[str, str]:
-        """Return key and token of a new endpoint."""
+        """Return the key and the token of a new endpoint."""
         endpoint = Endpoint(how, name, dds_name(kind), type_hash(kind))
         token = endpoint_token(self._identity, next(self._context.numbers), endpoint, qos)
         return data_key(self._context.domain, *endpoint[1:]), token
@@ -250,13 +250,13 @@ class Publisher:
         self._gid = gid
         self._sent = 0
         self.key = key
-        if qos.transient_local:  # later subscribers receive the last message, too
+        if qos.transient_local:  # later subscribers also receive the last message
             self._write = lambda payload, attached: context.link.put_cached(key, payload, CDR, attached)
         else:
             self._write = context.link.declare_publisher(key, CDR)
 
     def publish(self, message: Any) -> None:
-        """Send a message; a subscriber that is too slow loses it, the publisher never waits.
+        """Send a message without ever waiting; a subscriber that is too slow loses it.
 
         Raises:
             ValueError: the message does not fit its type.
@@ -319,16 +319,16 @@ float32 tm
 """
 
 MESSAGES = {"zsim_msgs/msg/ClusterState": CLUSTER_STATE, "zsim_msgs/msg/Navdata": NAVDATA}
-SERVICES = {"std_srvs/srv/Trigger": ("", "bool success\nstring message\n")}  # requests and responses
+SERVICES = {"std_srvs/srv/Trigger": ("", "bool success\nstring message\n")}  # definitions of request and response
 SERVICE_EVENT_INFO = """\
 uint8 event_type
 builtin_interfaces/Time stamp
 uint8[16] client_gid
 int64 sequence_number
 """
-"""Of service_msgs; its `char[16]` counts as uint8 in type hashes."""
+"""From service_msgs; its `char[16]` counts as uint8 in type hashes."""
 
-PACKAGE = {  # a ROS 2 package that makes ROS know MESSAGES
+PACKAGE = {  # a ROS 2 package that defines MESSAGES in ROS
     "package.xml": """\
 <?xml version="1.0"?>
 <package format="3">
@@ -368,20 +368,20 @@ for _name, _texts in SERVICES.items():
 
 
 def message_class(name: str) -> Any:
-    """Return the class of a type, by a name such as `sensor_msgs/msg/Imu` or `std_srvs/srv/Trigger_Response`."""
+    """Return the class of a type, named like `sensor_msgs/msg/Imu` or `std_srvs/srv/Trigger_Response`."""
     return _store.types[_stored(name)]
 
 
 def encode(message: Any, name: str) -> bytes:
-    """Return a message as CDR, little-endian."""
+    """Return a message in little-endian CDR."""
     return bytes(_store.serialize_cdr(message, _stored(name), little_endian=True))
 
 
 def decode(payload: bytes, name: str) -> Any:
-    """Return the message in a CDR.
+    """Return the message in a CDR payload.
 
     Raises:
-        ValueError: it is no CDR of this type.
+        ValueError: the payload is not a CDR encoding of this type.
     """
     try:
         return _store.deserialize_cdr(payload, _stored(name))
@@ -392,9 +392,9 @@ def decode(payload: bytes, name: str) -> Any:
 
 @cache
 def type_hash(name: str) -> str:
-    """Return the hash of a message type, or of a service's, by REP-2011: `RIHS01_` and 64 digits.
+    """Return the hash of a message or service type by REP-2011: `RIHS01_` and 64 hexadecimal digits.
 
-    A service is described by its request, its response, and an event that has one of each at most, as rosidl does it
+    A service is described by its request, its response, and an event with at most one of each, as in rosidl
     (rosidl_generator_type_description, `add_srv`).
     """
     if name not in SERVICES:
@@ -422,5 +422,5 @@ def type_hash(name: str) -> str:
 
 @cache
 def _stored(name: str) -> str:
-    """Return rosbags' name of a type: it keeps requests and responses among the messages."""
+    """Return rosbags' name of a type; rosbags stores requests and responses as messages."""
     return name.replace("/srv/", "/srv/msg/")

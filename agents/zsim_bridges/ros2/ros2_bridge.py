@@ -1,7 +1,7 @@
 """The bridge between a run and ROS 2: topics, and subscriptions and services for commands.
 
-A topic is converted only while a ROS node subscribes to it, and only then is its source read: a run without ROS nodes
-costs its clock alone. The bridge never makes the world wait.
+A topic's sources are read and converted only while a ROS node subscribes to it, so that without ROS nodes a run's clock
+is the only cost. The bridge never makes the world wait.
 """
 
 import math
@@ -29,11 +29,11 @@ from zsim_bridges.ros2.topics import DRIVER, DroneCameras, RosNames, Topic
 from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
 
 NODE = "zsim"
-POLL_S = 0.1  # how often a stop is checked for
+POLL_S = 0.1  # period of checking for a stop
 STATUS_S = 1.0  # time limit for a drone's state
-ATTEMPT_S = 1.0  # of connecting to ROS's router
-LAST_S = 1.0  # time limit for a last value; the world answers within milliseconds
-SAMPLES_MAX = 2000  # of a key that wait to be converted: about a tenth of a second of work
+ATTEMPT_S = 1.0  # time limit of one attempt to connect to the ROS router
+LAST_S = 1.0  # time limit for reading a last value; the world answers within milliseconds
+SAMPLES_MAX = 2000  # samples waiting to be converted, about a tenth of a second of work
 EMPTY, TRIGGER = "std_msgs/msg/Empty", "std_srvs/srv/Trigger"
 CLUSTER_SERVICES = ("takeoff", "engage", "hold", "rejoin", "land")
 Say = Callable[[str], None]
@@ -45,8 +45,8 @@ class RosNetwork(NamedTuple):
 
     Attributes:
         domain: ROS_DOMAIN_ID.
-        router: endpoint of ROS's own Zenoh router; None where the world's hub is its router.
-        identity: for the connection to that router.
+        router: endpoint of the ROS Zenoh router; None if the world's hub serves as the router.
+        identity: identity for the connection to that router.
     """
 
     domain: int
@@ -63,7 +63,7 @@ def serve(
     network: RosNetwork,
     wall_ns: Callable[[], int],
 ) -> None:
-    """Bridge one run to ROS, until it is over or `stopped` returns true.
+    """Bridge one run to ROS until it is over, or `stopped` returns True.
 
     Raises:
         SessionError: the router's endpoint is malformed.
@@ -92,7 +92,7 @@ def serve(
 
 
 class Ros2Bridge:
-    """The bridge of one run; everything but commands and services happens in the thread that calls `process`."""
+    """The bridge of one run; everything except commands and services runs in the thread that calls `process`."""
 
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, wall_ns: Callable[[], int]) -> None:
         self._link = link
@@ -115,7 +115,7 @@ class Ros2Bridge:
         self._queue.add_task(partial(self._observer.update_clock, sample.payload))
 
     def process(self, within_s: float) -> None:
-        """Execute queued tasks and convert samples; wait for some."""
+        """Execute queued tasks and convert samples; wait for the first up to `within_s`."""
         tasks, queued = self._queue.pop_all(within_s)
         start_ns = self._wall_ns()
         for task in tasks:
@@ -134,7 +134,7 @@ class Ros2Bridge:
             close()
 
     def count_refused(self, name: str, reason: str) -> None:
-        """Count a message that is refused, and report it once for each name; callable from any thread."""
+        """Count a refused message, and report it once per name; callable from any thread."""
         self._queue.add_task(partial(self._count_refused, name, reason))
 
     def _count_refused(self, name: str, reason: str) -> None:
@@ -152,7 +152,7 @@ class Ros2Bridge:
         commands = RosCommands(self._link, self._observer, self.names.drones)
         root = context.node("/", NODE)
         self._advertise(root, topics.run_topics(self.names))
-        # The frames that never move are published once for all, later subscribers too
+        # Fixed frames are published only once, also for later subscribers
         static = root.publisher("/tf_static", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF_STATIC)
         names = self.names.drones
         frames = [frame for d in self._drones for frame in topics.static_transforms(names[d.name], d.sensors)]
@@ -191,7 +191,7 @@ class Ros2Bridge:
             self._publications[topic.name] = BridgedTopic(topic, node.publisher(topic.name, topic.kind, topic.qos))
 
     def _on_subscription(self, token: str, alive: bool) -> None:
-        """Read the sources of a topic while ROS nodes subscribe to it."""
+        """Start or stop reading a topic's sources as ROS nodes subscribe or unsubscribe."""
         endpoint = rmw_zenoh.endpoint_of(token)
         publication = self._publications.get(endpoint.name) if endpoint else None
         if endpoint is None or publication is None:
@@ -207,7 +207,7 @@ class Ros2Bridge:
 
 
 class RosCommands:
-    """Sends commands in the bridge's name; called in several threads."""
+    """Sends commands in the bridge's name; called from several threads."""
 
     def __init__(self, link: Session, observer: Participant, drones: Iterable[str]) -> None:
         self._link = link
@@ -217,10 +217,10 @@ class RosCommands:
         self._lock = threading.Lock()
 
     def send_velocity(self, drone: str, twist: Any) -> None:
-        """Fly a Twist: forward, left, up [m/s] in the heading frame, and counter-clockwise [rad/s].
+        """Fly a Twist: forward, left, up [m/s] in the heading frame, and yaw rate counter-clockwise [rad/s].
 
         Raises:
-            ValueError: a number is not finite.
+            ValueError: a component is not finite.
         """
         linear, turn = twist.linear, twist.angular.z
         v = float(linear.x), float(linear.y), float(linear.z)
@@ -234,10 +234,10 @@ class RosCommands:
             self._senders[drone].mode(self._observer.now_ns, mode)
 
     def toggle_emergency(self, drone: str, _: Any) -> None:
-        """Stop the rotors at once, or reset a drone whose rotors were stopped: the aircraft's emergency button.
+        """Stop the rotors at once, or reset a drone whose rotors were stopped, like the aircraft's emergency button.
 
         Raises:
-            ValueError: the drone's state is not known.
+            ValueError: the drone's state is unknown.
         """
         key = keys.status(drone)
         sample = next(iter(self._link.get(key, timeout_s=STATUS_S)), None)
@@ -250,13 +250,13 @@ class RosCommands:
         self.send_mode("reset" if state == "emergency" else "emergency", drone)
 
     def request(self, key: str, op: str, args: dict[str, Any], _: Any) -> Any:
-        """Send a control request for a service whose own request is empty; return the response."""
+        """Send a control request on behalf of a service without arguments; return the service's response."""
         answer = self._link.request(key, op, self._observer.name, args)
         return self._response(answer.ok, answer.error)
 
 
 class CallbackQueue:
-    """From Zenoh's threads to the bridge's: all tasks, and the newest `limit` samples; filling it never waits."""
+    """A queue from Zenoh's threads to the bridge's, of all tasks and the newest `limit` samples; adding never waits."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -279,7 +279,7 @@ class CallbackQueue:
             self._arrived.notify()
 
     def pop_all(self, within_s: float) -> tuple[list[QueuedTask], list[tuple[str, bytes]]]:
-        """Return tasks and samples, waiting for some."""
+        """Return all tasks and samples, waiting up to `within_s` for the first."""
         with self._arrived:
             if not self._tasks and not self._samples:
                 self._arrived.wait(within_s)
@@ -290,7 +290,7 @@ class CallbackQueue:
 
 
 class BridgedTopic:
-    """A topic of the bridge, and the tokens of its subscribers."""
+    """A topic of the bridge, with its publisher and the tokens of its subscribers."""
 
     def __init__(self, topic: Topic, publisher: Publisher) -> None:
         self.topic = topic
@@ -299,7 +299,7 @@ class BridgedTopic:
 
 
 class SourceSubscription(NamedTuple):
-    """The subscription to a key, and its topics; samples are queued unless they are polled."""
+    """The subscription to a key, and the topics that use it; samples are queued unless they are polled."""
 
     readers: list[BridgedTopic]
     close: Callable[[], None]
@@ -307,12 +307,12 @@ class SourceSubscription(NamedTuple):
 
 
 class SourceSubscriptions:
-    """The run's keys that are read for ROS: each once, while a ROS node subscribes to a topic that is made of it.
+    """The run's keys that are read for ROS: each once, while a ROS node subscribes to a topic that uses it.
 
     Args:
-        refuse: called with (name, reason) of a message that cannot be converted.
-        prompt: whether estimates and cluster states are converted as they come, rather than with the next clock: a
-            turn for each of them costs more than to convert it, and only in realtime is a gate a long time.
+        refuse: called with the name and the reason when a message cannot be converted.
+        prompt: whether estimates and cluster states are converted on arrival, rather than with the next clock: waking
+            up for each costs more than converting it, and only in realtime does a gate take long.
     """
 
     def __init__(self, link: Session, queue: CallbackQueue, refuse: Callable[[str, str], None], prompt: bool) -> None:
@@ -330,11 +330,11 @@ class SourceSubscriptions:
             self._by_key[key].readers.append(publication)
 
     def _open_source(self, key: str) -> SourceSubscription:
-        """Subscribe to a key: the world's messages are there when its clock comes, those of others come at any time."""
+        """Subscribe to a key. The world's messages have arrived when its clock does; others arrive at any time."""
         if self._prompt and keys.leaf(key) in ("estimate", "state"):
             return SourceSubscription([], self._link.declare_subscriber(key, self._on_sample))
         subscription = self._link.subscribe(key)
-        if messages.type_of(key) is CameraInfo:  # published once, before it was subscribed to
+        if messages.type_of(key) is CameraInfo:  # published only once, before this subscription
             for sample in self._link.get(key, timeout_s=LAST_S):
                 self._queue.add_sample(sample.key, sample.payload)
         return SourceSubscription([], subscription.undeclare, subscription)
@@ -344,7 +344,7 @@ class SourceSubscriptions:
             self._queue.add_sample(sample.key, sample.payload)
 
     def remove(self, publication: BridgedTopic) -> None:
-        """Unsubscribe from keys that only this topic is made of."""
+        """Unsubscribe from the keys that only this topic uses."""
         for key in publication.topic.sources:
             source = self._by_key[key]
             source.readers.remove(publication)
@@ -357,9 +357,9 @@ class SourceSubscriptions:
             source.close()
 
     def convert_all(self, queued: Sequence[tuple[str, bytes]]) -> int:
-        """Convert and publish queued and polled samples in order of time; return how many they were.
+        """Convert and publish queued and polled samples in order of time; return their number.
 
-        Of the polled samples of a key, only the newest are converted if there are too many.
+        If there are too many polled samples of a key, only the newest are converted.
         """
         arrived = list(queued)
         for source in self._by_key.values():
@@ -374,13 +374,13 @@ class SourceSubscriptions:
                     decoded.append((key, messages.decode(key, payload)))
                 except DecodeError as error:
                     self._refuse(key, messages.fault_at(key, error))
-        decoded.sort(key=lambda entry: (entry[1].t_ns, keys.is_status(entry[0])))  # as the world: status last of a gate
+        decoded.sort(key=lambda entry: (entry[1].t_ns, keys.is_status(entry[0])))  # like the world, status last
         for key, message in decoded:
             for publication in self._by_key[key].readers:
                 try:
                     converted = publication.topic.convert(key, message)
                     if converted is not None:
                         publication.publisher.publish(converted)
-                except (ValueError, OverflowError, struct.error) as error:  # numbers beyond what the ROS type holds
+                except (ValueError, OverflowError, struct.error) as error:  # numbers out of range for the ROS type
                     self._refuse(publication.topic.name, f"{key} does not fit it ({error})")
         return len(arrived)

@@ -1,8 +1,8 @@
 """The topics of a run in ROS 2: name, type, quality of service, source keys and conversion of each. Pure.
 
-Frames as REP-103 and REP-105 have them: map is W (east, north, up); of each drone `NAME/odom`, the frame of its
-estimate (it lies on map, since the estimate is of W), `NAME/base_link` (forward, left, up), and a frame for each
-sensor. Quaternions are w first. Samples are stamped with the time for which they hold.
+Frames follow REP-103 and REP-105: map is W (east, north, up); each drone has `NAME/odom`, the frame of its estimate
+(identical to map, since estimates are in W), `NAME/base_link` (forward, left, up), and a frame for each sensor.
+Quaternions are w first. Samples are stamped with the time at which they are valid.
 """
 
 import math
@@ -36,11 +36,11 @@ from zsim_bridges.ros2.rmw_zenoh import CLOCK, DEFAULT, SENSOR, TF, Qos
 from zsim_bridges.ros_messages import NS_PER_S
 
 MAP = "map"
-DRIVER = "ardrone"  # under which ardrone_autonomy has its topics and services
-# A sonar looks along -z of its sensor frame; the x axis of a ROS range finder is its beam: turned by 90 deg about y.
+DRIVER = "ardrone"  # namespace of ardrone_autonomy's topics and services
+# A sonar looks along -z of its sensor frame, a ROS range finder along x: rotation by 90 deg about y.
 _ALONG_BEAM = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 TESLA_PER_UT = 1e-6
-NO_ATTITUDE = np.array([-1.0, *[0.0] * 8])  # of sensor_msgs/Imu without an attitude
+NO_ATTITUDE = np.array([-1.0, *[0.0] * 8])  # covariance that marks a sensor_msgs/Imu without an attitude
 ULTRASOUND = 0  # sensor_msgs/Range
 BEAM_RAD = 0.0  # the model's beam is a line
 DISCHARGING, GOOD, LIPO = 2, 1, 3  # sensor_msgs/BatteryState
@@ -50,7 +50,7 @@ ZERO = (0.0, 0.0, 0.0)
 
 
 class Topic(NamedTuple):
-    """A topic that the bridge publishes; `convert` returns the message for (key, message), None if none is due."""
+    """A topic that the bridge publishes; `convert` returns the ROS message for (key, message), None if none is due."""
 
     name: str
     kind: str
@@ -60,14 +60,14 @@ class Topic(NamedTuple):
 
 
 class RosNames(NamedTuple):
-    """Names in ROS, by the names in the contract."""
+    """Names in ROS by the names in the contract."""
 
     drones: dict[str, str]
     clusters: dict[str, str]
 
 
 def stamp(t_ns: int) -> Any:
-    """Return simulated time as ROS writes it."""
+    """Convert simulated time [ns] to ROS time."""
     return ros.Time(*divmod(t_ns, NS_PER_S))
 
 
@@ -84,7 +84,7 @@ def base(drone: str) -> str:
 
 
 def camera_frame(drone: str, camera: str) -> str:
-    """Return the frame of a camera: x to the right of the picture, y down, z ahead (REP 103)."""
+    """Return the name of a camera's frame: x to the right of the image, y down, z forward (REP 103)."""
     return f"{drone}/{camera}_camera_optical_frame"
 
 
@@ -104,7 +104,7 @@ def run_topics(names: RosNames) -> Iterator[Topic]:
 
 
 def static_transforms(drone: str, sensors: Sensors) -> Iterator[Any]:
-    """Yield the frames of a drone that never move, as TransformStamped: its odom in map, its sensors in its body."""
+    """Yield a drone's fixed frames as TransformStamped: its odom in map, its sensors in its body."""
 
     def in_body(frame: str, position_m: Vector3, q: np.ndarray) -> Any:
         return ros.transform(header(0, base(drone)), frame, position_m, _quaternion(q))
@@ -131,7 +131,7 @@ def _quaternion(q: np.ndarray) -> Quaternion:
 
 
 def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
-    """Yield a drone's topics; `name` is its name in ROS, `sensors` are for their limits and errors."""
+    """Yield a drone's topics; `name` is its name in ROS, `sensors` give the limits and errors of its sensors."""
     imu, mag, sonar = sensors.imu, sensors.mag, sensors.sonar
     of_rate = ros.diagonal(np.radians(1.0) ** 2 * variance(imu.gyro_deg_s, imu.rate_hz))
     of_force = ros.diagonal(variance(imu.accel_m_s2, imu.rate_hz))
@@ -141,7 +141,7 @@ def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
     def of_sensor(
         leaf: str, kind: str, sensor: str, convert: Callable[[Any, Any], Any], frame: str | None = None
     ) -> Topic:
-        """Return a topic of one sensor; `convert` takes header and sample."""
+        """Return the topic of one sensor; `convert` takes a header and a sample."""
         frame = frame or f"{name}/{sensor}_link"
         source = (keys.sensor(drone, sensor),)
         return Topic(f"/{name}/{leaf}", kind, SENSOR, source, lambda _, m: convert(header(m.t_sample_ns, frame), m))
@@ -152,7 +152,7 @@ def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
     )  # fmt: skip
     yield of_sensor("fix", "sensor_msgs/msg/NavSatFix", "gps", lambda head, m: ros.fix(head, m, bool(m.fix)))
     yield of_sensor(
-        "fix_velocity", "geometry_msgs/msg/TwistStamped", "gps",  # in ENU
+        "fix_velocity", "geometry_msgs/msg/TwistStamped", "gps",  # velocity in ENU
         lambda head, m: ros2_jazzy.geometry_msgs__msg__TwistStamped(head, ros.twist(m.velocity_m_s, ZERO)), MAP,
     )  # fmt: skip
     yield of_sensor(
@@ -166,7 +166,7 @@ def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
         lambda head, m: ros2_jazzy.sensor_msgs__msg__FluidPressure(head, m.pressure_pa, 0.0),
     )  # fmt: skip
     yield of_sensor(
-        "range", "sensor_msgs/msg/Range", "sonar",  # without an echo it is +Inf (REP-117)
+        "range", "sensor_msgs/msg/Range", "sonar",  # +Inf without an echo (REP-117)
         lambda head, m: ros2_jazzy.sensor_msgs__msg__Range(
             head, ULTRASOUND, BEAM_RAD, sonar.min_m, sonar.max_m, m.range_m if m.valid else math.inf, of_range
         ),
@@ -190,7 +190,7 @@ def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
 
 def variance(error: ErrorModel, rate_hz: float) -> float:
     """Return the variance of one sample about its bias, in the unit of the error squared."""
-    return noise_sigma(error, rate_hz) ** 2 + error.quantum**2 / 12.0  # a step's rounding is uniform
+    return noise_sigma(error, rate_hz) ** 2 + error.quantum**2 / 12.0  # the rounding error is uniform
 
 
 def battery(message: Status, frame: str) -> Any:
@@ -204,7 +204,7 @@ def battery(message: Status, frame: str) -> Any:
 
 
 def true_odometry(message: Truth, child: str) -> Any:
-    """Return the true state in map; twist in the body, without any uncertainty."""
+    """Return the true state in map, with the twist in the body and zero covariances."""
     q = message.orientation_wxyz
     twist = ros.twist(into_body(q, message.velocity_m_s), message.angular_velocity_rad_s)
     return ros.odometry(header(message.t_ns, MAP), child, ros.pose(message.position_m, q), twist)
@@ -216,7 +216,7 @@ def into_body(q_WB: Quaternion, v_W: Vector3) -> list[float]:
 
 
 class OdometryTopic:
-    """Converts estimates to Odometry; the rates are the mean ones since the estimate before."""
+    """Converts estimates to Odometry, with the mean angular rate since the previous estimate."""
 
     def __init__(self, frame: str, child: str) -> None:
         self._frame = frame
@@ -224,7 +224,7 @@ class OdometryTopic:
         self._before: Estimate | None = None
 
     def update(self, _: str, message: Estimate) -> Any:
-        """Return the ROS message; twist in the body. Of the attitude only the heading has an uncertainty."""
+        """Return the ROS message, with the twist in the body; the heading is the only angle with a variance."""
         before, self._before = self._before, message
         q = message.orientation_wxyz
         dt_ns = message.t_ns - before.t_ns if before else 0
@@ -240,7 +240,7 @@ class OdometryTopic:
 
 
 class OnChange:
-    """Converts a status in each simulated second, and whenever a value of it has changed."""
+    """Converts a status once in each simulated second, and whenever a value derived from it has changed."""
 
     def __init__(self, convert: Callable[[Status], Any], value: Callable[[Status], object] = lambda _: None) -> None:
         self._convert = convert
@@ -256,7 +256,7 @@ class OnChange:
 
 
 class NavdataSummary:
-    """A drone's newest samples as ardrone_autonomy's navdata, in that driver's units, with each status."""
+    """Summarises a drone's newest samples as ardrone_autonomy's navdata, in its units, whenever a status arrives."""
 
     def __init__(self, frame: str) -> None:
         self._kind = rmw_zenoh.message_class("zsim_msgs/msg/Navdata")
@@ -264,7 +264,7 @@ class NavdataSummary:
         self._last: dict[str, Any] = {}
 
     def update(self, key: str, message: Any) -> Any | None:
-        """Store a message of the drone; return the summary if it is the status."""
+        """Store a message of the drone; return the summary if the message is its status."""
         leaf = keys.leaf(key)
         if leaf != "status":
             self._last[leaf] = message
@@ -293,9 +293,9 @@ class NavdataSummary:
 
 
 class DroneCameras:
-    """The cameras of one drone: a topic for each, and one for the active camera, as ardrone_autonomy does.
+    """The cameras of one drone: topics for each, and for the active camera, as in ardrone_autonomy.
 
-    Each picture comes with how its camera sees, with the same stamp: that of the exposure.
+    Each image is accompanied by its camera's calibration with the same stamp, the time of exposure.
     """
 
     def __init__(self, drone: str, name: str) -> None:
@@ -305,7 +305,7 @@ class DroneCameras:
         self.active = CAMERAS[0]
 
     def toggle(self, _: Any) -> Any:
-        """Let the next camera be the active one, for a service of type std_srvs/Trigger."""
+        """Make the next camera the active one; return the response of a std_srvs/Trigger."""
         self.active = CAMERAS[(CAMERAS.index(self.active) + 1) % len(CAMERAS)]
         return rmw_zenoh.message_class("std_srvs/srv/Trigger_Response")(True, f"the active camera is {self.active}")
 
@@ -315,10 +315,10 @@ class DroneCameras:
         yield from self._topics(f"/{self._name}/{DRIVER}", CAMERAS)
 
     def _topics(self, topic: str, cameras: tuple[str, ...]) -> Iterator[Topic]:
-        """Yield the topics of one camera, or, of several, those of the active one."""
+        """Yield the topics of one camera, or those of the active one of several."""
 
         def header_of(camera: str, message: CameraImage) -> Any | None:
-            """Return the header of a picture; None if it is of a camera that is not active."""
+            """Return the header of an image; None if its camera is not the active one."""
             if len(cameras) > 1 and camera != self.active:
                 return None
             return header(message.t_sample_ns, camera_frame(self._name, camera))
@@ -328,7 +328,7 @@ class DroneCameras:
             return None if head is None else ros.compressed_image(head, message)
 
         def info(key: str, message: CameraImage | CameraInfo) -> Any | None:
-            """Keep how a camera sees, and return it for a picture."""
+            """Store a camera's calibration; return it whenever an image arrives."""
             camera = keys.parts(key)[2].split("/")[1]
             if isinstance(message, CameraInfo):
                 self._infos[camera] = message
@@ -371,7 +371,7 @@ def cluster_topics(cluster: str, name: str) -> Iterator[Topic]:
 
 
 def cluster_pose(message: ClusterState) -> tuple[Vector3, Quaternion]:
-    """Return position and orientation of the cluster frame C in W by the estimates; a pair has no roll."""
+    """Return the estimated position and orientation of the cluster frame C in W; a pair has no roll."""
     values = dict(zip(message.names, message.value, strict=True))
     x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
     rpy = (roll, pitch, yaw)

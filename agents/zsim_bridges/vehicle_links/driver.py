@@ -1,7 +1,7 @@
-"""The driver as a process: an aircraft at the other end of a wire is one drone of a run.
+"""The driver process: makes an aircraft at the other end of a wire one drone of a run.
 
-The session with the aircraft and the failsafe are pure and have separate files; here are the messages of the drone,
-keys, sockets, the event loop, and the options on the command line.
+The session with the aircraft and the failsafe are pure and in separate files; this one has the drone's messages, keys,
+sockets, the event loop, and the command-line options.
 """
 
 import asyncio
@@ -44,16 +44,16 @@ from zsim_bridges.vehicle_links.vehicle_session import (
 )
 
 _POSITION = re.compile(r"\s*,\s*")
-_HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?")  # a name, or an IPv4 address
+_HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?")  # a host name or an IPv4 address
 
 
 class DriverOptions(NamedTuple):
     """Options of one driver.
 
     Attributes:
-        drone: which drone of the run the aircraft is.
-        origin_m: origin of the aircraft's own frame, or its place [m; W]; None for the aircraft's or the scenario's.
-        yaw_deg: its heading at the start, counter-clockwise from east; None for its own compass.
+        drone: the drone of the run that the aircraft represents.
+        origin_m: origin of the aircraft's own frame, or its position [m; W]; None for the reported or the scenario's.
+        yaw_deg: the aircraft's heading at the start, counter-clockwise from east; None for its own compass.
     """
 
     drone: str
@@ -63,14 +63,14 @@ class DriverOptions(NamedTuple):
     yaw_deg: float | None = None
 
 
-TICK_S = 0.01  # s, wall; half of the period at which setpoints are repeated
-REPORT_S = 1.0  # s, wall; of the link's figures
-LANDING_S = 30.0  # s, wall; time to wait for the aircraft to be down before exiting
-PATIENCE_S = 5.0  # s, wall, chosen: heartbeats come once a second; then it prints possible causes
-FORMER_S = 2.0  # s, wall, chosen: a replaced driver keeps its port for some 10 ms
-AGAIN_S = 0.02  # s, wall, chosen: between two attempts to open a port
-WAITING_MAX = 4000  # readings, 10 s of an IMU at 200 Hz and all else; then the oldest are dropped
-EXTRAPOLATED_NS = 500_000_000  # chosen: an older pose is not extrapolated further
+TICK_S = 0.01  # s, wall; at most half of the period at which setpoints are repeated
+REPORT_S = 1.0  # s, wall; period of reports on the link
+LANDING_S = 30.0  # s, wall; time to wait for the aircraft to land before exiting
+PATIENCE_S = 5.0  # s, wall; silence after which possible causes are printed; chosen: heartbeats come once a second
+FORMER_S = 2.0  # s, wall; time to wait for a port; chosen: a replaced driver keeps its port for some 10 ms
+AGAIN_S = 0.02  # s, wall, chosen; pause between two attempts to open a port
+WAITING_MAX = 4000  # readings, 10 s of a 200 Hz IMU and all other sensors; beyond this, the oldest are dropped
+EXTRAPOLATED_NS = 500_000_000  # chosen; maximum time over which a pose is extrapolated
 Say = Callable[[str], None]
 SessionMaker = Callable[[Info, Scenario, DriverOptions], VehicleSession]
 
@@ -84,7 +84,7 @@ def drive(
     options: DriverOptions,
     make_session: SessionMaker,
 ) -> None:
-    """Drive one aircraft in one run until the run is over, or `stopped` returns True.
+    """Run the driver of one aircraft until the run is over, or `stopped` returns True.
 
     Raises:
         RunError: the drone is not external, or the run does not keep the pace of the wall clock.
@@ -95,7 +95,7 @@ def drive(
 
 
 class DriverProcess:
-    """One aircraft in one run."""
+    """Drives one aircraft in one run."""
 
     def __init__(
         self,
@@ -119,15 +119,15 @@ class DriverProcess:
         self._reported_s = 0.0
         self._reported: tuple[Connection, str, str] | None = None
         self._report_seq = self._ignored = 0
-        self._has_clock = False  # before the first, messages cannot be stamped
+        self._has_clock = False  # before the first clock, messages cannot be timestamped
         self._hint_s = time.monotonic() + PATIENCE_S
 
     async def run(self, stopped: Callable[[], bool]) -> None:
-        """Carry messages both ways until the run is over or a stop is requested; then land."""
+        """Exchange messages until the run is over or a stop is requested; then land."""
         loop = asyncio.get_running_loop()
 
         def in_loop(handle: Callable[[Any], None], value: Any) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed
+            with contextlib.suppress(RuntimeError):  # raised if the loop is closed
                 loop.call_soon_threadsafe(handle, value)
 
         try:
@@ -154,7 +154,7 @@ class DriverProcess:
         self._external.readings.extend(self._session.readings.take())
 
     def _on_clock(self, sample: RawSample) -> None:
-        """Publish the gate that the world has reached."""
+        """Publish the aircraft's messages for the gate that the world has reached."""
         clock = self._observer.update_clock(sample.payload)
         self._has_clock = self._has_clock or clock is not None
         if clock is None or clock.state != "running":
@@ -223,7 +223,7 @@ class DriverProcess:
             self._report(self._clock.now_ns())
 
     def _hint(self) -> None:
-        """Print possible causes if an aircraft does not appear."""
+        """Print possible causes if nothing has been received from the aircraft."""
         if self._session.state.received_ns is None:
             channel, refused = self._session.channels[0], self._session.figures().refused
             silence = self._sockets[0].fault.lower() or "nothing comes"
@@ -247,7 +247,7 @@ class DriverProcess:
         return state, self._failsafe.phase, self._failsafe.reason
 
     def _report(self, now_ns: int) -> None:
-        """Publish the state of the link; print its changes."""
+        """Publish the state of the link, and print changes of it."""
         state, phase, reason = now = self._reported_now()
         if now != self._reported:
             self._say(f"link {state}, {phase}{f' ({reason})' if reason else ''}")
@@ -270,7 +270,7 @@ class DriverProcess:
         self._link.put(keys.link(self._drone), message)
 
     async def _land_and_leave(self, interrupted: bool) -> None:
-        """Land an aircraft that this driver still flies, or finish a kill; a replacing driver takes it over."""
+        """Land an aircraft that this driver still flies, or finish a kill; a replacement driver takes over instead."""
         if self._observer.superseded:
             return
         reason = "its driver is stopped" if interrupted else self._observer.end_reason or RUN_ENDED
@@ -289,7 +289,7 @@ class DriverProcess:
 
 
 class DriverClock:
-    """The clock of the driver, which goes at the rate of the run's, and the simulated time at its times."""
+    """The driver's clock, which runs at the run's rate, and its conversion to simulated time."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -306,15 +306,15 @@ class DriverClock:
 
 
 class ExternalDrone:
-    """An aircraft's readings as the messages of one drone, gate by gate. Pure.
+    """Converts an aircraft's readings to the messages of one drone, gate by gate. Pure.
 
     Args:
-        to_simulated: returns simulated time at a time of this process's clock.
-        hover_rad_s: speed of each rotor at which the drone hovers: no wire tells how fast they turn, and others fly in
-            their downwash.
+        to_simulated: converts a time of this process's clock to simulated time.
+        hover_rad_s: speed of each rotor when hovering, published in flight because no wire reports rotor speeds and
+            other drones fly in the downwash.
 
     Attributes:
-        readings: for the next gate, to be added to.
+        readings: readings for the next gate, appended by the caller.
     """
 
     def __init__(
@@ -328,14 +328,14 @@ class ExternalDrone:
         self._gate_ns = -1
 
     def gate(self, t_ns: int, vehicle: AircraftState, commander: str | None) -> list[tuple[str, Any]]:
-        """Return keys and messages of a gate in order: samples by time, truth, and status; nothing for an old gate."""
+        """Return keys and messages of a gate in order: samples by time, truth, status; nothing for an old gate."""
         if t_ns <= self._gate_ns or vehicle.pose is None:
             return []
         self._gate_ns = t_ns
         sent: list[tuple[str, Any]] = []
         measured = [(min(t_ns, self._to_simulated(reading.taken_ns)), reading) for reading in self.readings]
         self.readings.clear()
-        for sample_ns, reading in sorted(measured, key=lambda entry: entry[0]):  # none is of the future
+        for sample_ns, reading in sorted(measured, key=lambda entry: entry[0]):  # none is later than the gate
             key = keys.sensor(self._drone, reading.sensor)
             message = STOCK[reading.sensor].message
             sent.append((key, message(t_ns, self._next(key), max(0, sample_ns), *reading.values)))
@@ -357,7 +357,7 @@ class ExternalDrone:
 
 
 def hover_speed(drone: Drone, rotors: int, gravity_m_s2: float) -> float:
-    """Return the speed [rad/s] at which each of a number of rotors carries its share of a drone."""
+    """Return the speed [rad/s] at which each of `rotors` rotors carries an equal share of the drone's weight."""
     return math.sqrt(drone.mass_kg * gravity_m_s2 / (rotors * drone.thrust_n_s2))
 
 
@@ -365,7 +365,7 @@ class AircraftSocket(asyncio.DatagramProtocol):
     """A UDP socket to one port of the aircraft.
 
     Attributes:
-        fault: why the newest datagram could not be delivered, such as that nobody listens; empty for none.
+        fault: why the newest datagram could not be delivered, for instance because nobody listens; empty for none.
     """
 
     def __init__(self, receive: Callable[[bytes], None]) -> None:
@@ -374,10 +374,10 @@ class AircraftSocket(asyncio.DatagramProtocol):
         self.fault = ""
 
     async def open(self, channel: UdpChannel) -> None:
-        """Open it.
+        """Open the socket.
 
         Raises:
-            RunError: the port here is taken, or the aircraft's address cannot be reached.
+            RunError: the local port is taken, or the aircraft's address cannot be reached.
         """
         local = ("0.0.0.0", channel.local_port) if channel.local_port else None
         until_s = time.monotonic() + FORMER_S
@@ -409,15 +409,15 @@ class AircraftSocket(asyncio.DatagramProtocol):
         self._receive(data)
 
     def error_received(self, exc: Exception) -> None:
-        """Record that no program listens there yet; due messages are repeated."""
+        """Record why a datagram was not delivered, usually because nobody listens yet; due messages are repeated."""
         self.fault = getattr(exc, "strerror", None) or str(exc)
 
 
 def udp_channel(address: str, local_port: int = 0) -> UdpChannel:
-    """Return the channel of `udp://HOST:PORT`.
+    """Return the channel of an address `udp://HOST:PORT`.
 
     Raises:
-        RunError: it has another form.
+        RunError: the address has another form.
     """
     try:
         parts = urlsplit(address)
@@ -430,10 +430,10 @@ def udp_channel(address: str, local_port: int = 0) -> UdpChannel:
 
 
 def position(text: str) -> Vector:
-    """Return the position of `X,Y,Z`.
+    """Return the position written as `X,Y,Z`.
 
     Raises:
-        RunError: it has another form.
+        RunError: the text has another form.
     """
     try:
         x, y, z = map(float, _POSITION.split(text.strip()))
@@ -448,7 +448,7 @@ def aircraft_host(text: str) -> str:
     """Return the host of an aircraft whose ports are fixed.
 
     Raises:
-        RunError: it is more than a host.
+        RunError: the text is not just a host.
     """
     if not _HOST.fullmatch(text):
         raise RunError(f"the address is {text!r}; must be that of a host, such as 192.168.1.12: the ports are fixed")
@@ -456,10 +456,10 @@ def aircraft_host(text: str) -> str:
 
 
 def check_host(host: str) -> None:
-    """Refuse an unknown host, before the driver replaces one that flies.
+    """Refuse an unknown host before this driver replaces one in flight.
 
     Raises:
-        RunError: it is unknown.
+        RunError: the host is unknown.
     """
     try:
         socket.getaddrinfo(host, None)
@@ -468,10 +468,10 @@ def check_host(host: str) -> None:
 
 
 def check_run(info: Info, process: str, drone: str) -> None:
-    """Refuse a drone that takes no driver, a process of another name, and a run without the pace of the wall clock.
+    """Check that a process can drive a drone of a run.
 
     Raises:
-        RunError: one of these.
+        RunError: the drone takes no driver, the process has another name, or the run does not follow the wall clock.
     """
     bodies = {each.name: each.body for each in info.drones}
     if drone not in bodies:

@@ -1,4 +1,4 @@
-"""A bridge's link to one drone: the commands that it sends, and the state that the drone's electronics know. Pure."""
+"""A bridge's link to one drone: the commands sent to it, and the state known to its electronics. Pure."""
 
 import math
 from collections import deque
@@ -14,15 +14,17 @@ from zsim.math.rotation import LEVEL, Vector
 from zsim.sensors.sensor import Mount
 from zsim_agents.estimation.strapdown import madgwick_step
 
-BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is little disturbed by manoeuvres
-REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
-STEP_S_MAX = 0.1  # longer gaps in the IMU's samples are not integrated over
-POSITIONS_KEPT = 32  # gates whose integrated position is remembered; an estimate is a few gates late at most
+BETA_RAD_S = 0.02  # gain of Madgwick's filter: levels within seconds, and is hardly disturbed by manoeuvres
+REPEAT_NS = (
+    100_000_000  # ns; repetition period of setpoints: a commander silent for 0.5 s counts as lost (`silence.hover_s`)
+)
+STEP_S_MAX = 0.1  # s; the filter does not integrate over longer gaps between IMU samples
+POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an estimate is at most a few gates late
 ModeName = Literal["takeoff", "land", "emergency", "reset"]
 
 
 class CommandSender:
-    """Sends commands to a drone under the name of a process, numbered by key."""
+    """Sends commands to a drone in the name of a process, numbered separately for each key."""
 
     def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
         self._source = source
@@ -45,7 +47,7 @@ class CommandSender:
         self._send("velocity", flight_messages.Velocity, t_ns, (x, y, z), yaw_rate_rad_s, frame)
 
     def tilt(self, t_ns: int, forward: float, left: float, up: float, yaw_left: float, hover: bool) -> None:
-        """Fly as the AR.Drone's own commands do: shares of its limits in [-1, 1], or hover."""
+        """Fly by commands like the AR.Drone's: fractions of its limits in [-1, 1], or hovering."""
         self._send("ardrone", flight_messages.Ardrone, t_ns, forward, left, up, yaw_left, hover)
 
     def attitude(self, t_ns: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float) -> None:
@@ -68,11 +70,11 @@ class OnboardState:
     `imu` and `mag` are the poses of these sensors in the body.
 
     Attributes:
-        imu, mag, baro, flow, status, estimate: newest, in the axes of the body; None before the first.
+        imu, mag, baro, flow, status, estimate: newest message of each kind, in body axes; None before the first.
         attitude: B to W.
-        altitude_m: over the ground, from the sonar; beyond its range, continued by the barometer.
-        position_m: integrated since the start, with the altitude.
-        origin_m: origin of the integrated position in W, by the estimator; None without an estimate.
+        altitude_m: height above ground, from the sonar; beyond its range, continued by the barometer.
+        position_m: horizontal position integrated since the start, and the altitude.
+        origin_m: origin of the integrated position in W, according to the estimator; None without an estimate.
     """
 
     def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
@@ -96,7 +98,7 @@ class OnboardState:
         self.origin_m: Vector | None = None
 
     def update(self, message: Any) -> Any:
-        """Update by a message of the drone or of its estimator; return it in the axes of the body."""
+        """Process a message of the drone or of its estimator; return it in body axes."""
         q_BS = self._q_BS.get(type(message))
         message = message if q_BS is None else _rotated(message, q_BS)
         match message:
@@ -147,17 +149,17 @@ class OnboardState:
 
 
 def has_attitude(estimate: flight_messages.Estimate) -> bool:
-    """Return whether an estimate has an attitude; an estimator of positions alone may publish zeros."""
+    """Return whether an estimate has an attitude; an estimator that has only positions may publish zeros."""
     return abs(math.hypot(*estimate.orientation_wxyz) - 1.0) <= flight_messages.UNIT_SLACK
 
 
 def warm_up() -> None:
-    """Compile, or load, the kernels before the first gate."""
+    """Compile or load the kernels before the first gate, which would otherwise wait for this."""
     madgwick_step(LEVEL, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), BETA_RAD_S, STEP_S_MAX)
 
 
 def _rotated(sample: Any, q_BS: np.ndarray) -> Any:
-    """Return a sample of the IMU or the magnetometer with its vectors in the axes of the body."""
+    """Return a sample of the IMU or the magnetometer with its vectors in body axes."""
     names = [name for name in ("accel_m_s2", "gyro_rad_s", "field_ut") if hasattr(sample, name)]
     vectors = {name: tuple(rotations.rotate(q_BS, getattr(sample, name)).tolist()) for name in names}
     return msgspec.structs.replace(sample, **vectors)

@@ -1,4 +1,4 @@
-"""Servers of vehicle wires: one run's drones as aircraft for the programs of a wire; they command, and never gate."""
+"""Servers that present one run's drones as aircraft to the programs of a wire; they command, but never gate."""
 
 import asyncio
 import contextlib
@@ -18,14 +18,14 @@ from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, ReceivedSample, Session, Unanswered
 from zsim.transport.traffic import Passed, Traffic, samples
 
-BACKLOG = 100  # arrivals, one or two seconds in realtime
+BACKLOG = 100  # batches kept for a slow reader, one or two seconds in realtime
 
 
 class TrafficIntake:
-    """Messages in the order in which they passed the world; a reader that is too slow goes on with the newest.
+    """Messages in the order in which they passed through the world; a slow reader continues with the newest.
 
-    Messages that it has not read by then are dropped: flying by old messages is worse than missing some. `news` is set
-    when there is something to read.
+    The messages that it has not yet read are dropped, since acting on old messages is worse than missing some. `news`
+    is set when there is something to read.
     """
 
     def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
@@ -35,7 +35,7 @@ class TrafficIntake:
         self._backlog: deque[Sequence[Passed]] = deque()
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
         self.news = asyncio.Event()
-        for sample in link.get(keys.CLOCK):  # a world that is stopped or has ended no longer publishes it
+        for sample in link.get(keys.CLOCK):  # a world that is stopped or has ended no longer publishes its clock
             self._backlog.append([sample])
         self.news.set()
         self._thread.start()
@@ -45,12 +45,12 @@ class TrafficIntake:
         self._thread.join(1.0)
 
     def arrivals(self) -> Iterator[list[ReceivedSample]]:
-        """Yield what has arrived so far, in the parts in which it arrived."""
+        """Yield what has arrived so far, in the batches in which it arrived."""
         self.news.clear()
         for _ in range(len(self._backlog)):
             try:
                 passed = self._backlog.popleft()
-            except IndexError:  # dropped meanwhile
+            except IndexError:  # dropped by the other thread in the meantime
                 return
             yield list(samples(passed))
 
@@ -66,18 +66,18 @@ class TrafficIntake:
                     self._backlog.clear()
                 self._health.received += 1
                 self._backlog.append(passed)
-                with contextlib.suppress(RuntimeError):  # the reader is gone
+                with contextlib.suppress(RuntimeError):  # raised if the reader's loop is closed
                     self._loop.call_soon_threadsafe(self.news.set)
 
     def _count_refused(self) -> None:
         self._health.refused += 1
 
 
-WAITING_MAX = 10  # pictures that wait for the loop; then the oldest go
+WAITING_MAX = 10  # images waiting for the loop; beyond this, the oldest are dropped
 
 
 class PictureIntake:
-    """Pictures of the cameras in use: subscriptions follow the readers."""
+    """Images of the cameras in use, with a subscription to each."""
 
     def __init__(self, link: Session, loop: asyncio.AbstractEventLoop, take: Callable[[str, bytes], None]) -> None:
         self._link = link
@@ -87,20 +87,20 @@ class PictureIntake:
         self._undeclare: dict[str, Callable[[], None]] = {}
 
     def follow(self, wanted: Iterable[str]) -> None:
-        """Subscribe to these keys, and to no others."""
+        """Subscribe to these keys, and unsubscribe from all others."""
         keys = set(wanted)
         for key in keys - set(self._undeclare):
             try:
                 self._undeclare[key] = self._link.declare_subscriber(key, self._on_picture)
-            except SessionError:  # no right to read it: as from a camera that is off, nothing comes
+            except SessionError:  # no right to read it; as with a camera that is off, nothing arrives
                 self._undeclare[key] = lambda: None
         for key in set(self._undeclare) - keys:
             self._undeclare.pop(key)()
 
     def _on_picture(self, sample: RawSample) -> None:
-        """Pass on a picture; called in a thread of Zenoh."""
+        """Pass on an image; called in a Zenoh thread."""
         self._waiting.append(sample)
-        with contextlib.suppress(RuntimeError):  # the loop is closed
+        with contextlib.suppress(RuntimeError):  # raised if the loop is closed
             self._loop.call_soon_threadsafe(self._deliver)
 
     def _deliver(self) -> None:
@@ -109,13 +109,13 @@ class PictureIntake:
             self._take(sample.key, sample.payload)
 
 
-POLL_S = 0.1  # how often a stop is checked
-REPORTED_MAX = 1000  # texts remembered, so that each is printed once
+POLL_S = 0.1  # period of checking for a stop
+REPORTED_MAX = 1000  # texts remembered, so that each is printed only once
 Say = Callable[[str], None]
 
 
 class VehicleServer(ABC):
-    """One run's drones on a wire; `options` are the wire's, and `serve` asks the world for the pace of their `rate`."""
+    """One run's drones on a wire; `options` belong to the wire, and `serve` requests the pace `options.rate`."""
 
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: Any) -> None:
         self.link = link
@@ -132,7 +132,7 @@ class VehicleServer(ABC):
         """Serve one run until it is over, or `stopped` returns True.
 
         Raises:
-            RunError: the run keeps no pace, or a port or an address cannot be had.
+            RunError: the run has no pace, or a port or an address is unavailable.
         """
         set_pace(link, info, observer.name, options.rate)
         asyncio.run(cls(link, info, observer, say, options).run(stopped))
@@ -151,25 +151,25 @@ class VehicleServer(ABC):
 
     @abstractmethod
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
-        """Open the ports, and have the stack close them."""
+        """Open the ports, and let the stack close them."""
 
     @abstractmethod
     async def on_arrivals(self, intake: TrafficIntake) -> None:
-        """Hand on the messages that have arrived."""
+        """Forward the messages that have arrived."""
 
     @abstractmethod
     def on_event(self, event: Event) -> None:
-        """Follow an event of the run."""
+        """Handle an event of the run."""
 
     def on_run(self, key: str, payload: bytes) -> None:
-        """Follow the run by its clock and events."""
+        """Handle the run's clock and events."""
         if key == keys.CLOCK:
             self.observer.update_clock(payload)
         elif key == keys.EVENT and (event := self.decoded(key, payload)) is not None:
             self.on_event(event)
 
     def decoded(self, key: str, payload: bytes) -> Any:
-        """Return a message; None, and counted, if it cannot be decoded."""
+        """Decode a message; if this fails, count it and return None."""
         try:
             return messages.decode(key, payload)
         except DecodeError:
@@ -185,7 +185,7 @@ class VehicleServer(ABC):
         self.say_once(reason)
 
     def say_once(self, text: str) -> None:
-        """Print a text once, whatever its figures."""
+        """Print a text once; texts that differ only in numbers count as equal."""
         reason = without_figures(text)
         if reason not in self._reported and len(self._reported) < REPORTED_MAX:
             self._reported.add(reason)
@@ -193,7 +193,7 @@ class VehicleServer(ABC):
 
 
 class PictureServer(VehicleServer):
-    """A server that forwards all messages in order, and the pictures of the cameras that clients watch."""
+    """A server that forwards all messages in order, and the images of the cameras that clients watch."""
 
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
         self._pictures = PictureIntake(self.link, asyncio.get_running_loop(), self.on_picture)
@@ -203,7 +203,7 @@ class PictureServer(VehicleServer):
         for arrived in intake.arrivals():
             for key, payload in arrived:
                 self.forward(key, payload)
-                if keys.is_status(key):  # a gate of a fleet takes long: what clients send meanwhile comes first
+                if keys.is_status(key):  # a gate of a large fleet takes long; let clients' commands go first
                     await asyncio.sleep(0)
             await asyncio.sleep(0)
         self._pictures.follow(self.wanted_pictures())
@@ -218,7 +218,7 @@ class PictureServer(VehicleServer):
 
     @abstractmethod
     def on_picture(self, key: str, payload: bytes) -> None:
-        """Forward a picture."""
+        """Forward an image."""
 
 
 def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
@@ -226,7 +226,7 @@ def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
 
     Raises:
         RunError: the run goes as fast as possible, or the world refuses the pace.
-        NoWorldError: the world has ended meanwhile.
+        NoWorldError: the world does not answer, usually because it has ended.
     """
     if rate is None:
         if info.mode == "lockstep" and not info.rate:

@@ -39,12 +39,12 @@ STILL: Vector = (0.0, 0.0, 0.0)
 STANDING: tuple[DroneState, ...] = ("landed", "emergency")  # states in which no rotor turns
 LOSS_WINDOW = 1000  # messages over which the loss is computed, a few seconds of telemetry
 Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
-TAKEOFF_S = 20.0  # time limit of a take-off; chosen: four times what an AR.Drone takes
-RESET_S = 2.0  # time limit of a reset; chosen: ten times what an AR.Drone takes to leave its emergency
+TAKEOFF_S = 20.0  # time limit of a take-off; chosen: four times what an AR.Drone needs
+RESET_S = 2.0  # time limit of a reset; chosen: ten times what an AR.Drone needs to leave its emergency
 LINK_LOST_S = 1.0  # silence that means a lost link; chosen: heartbeats come once a second, telemetry ten times as often
-BRAKING_M_S2 = 1.0  # chosen: half of what an AR.Drone reaches at 12 deg of tilt; limits the speed towards a fence
+BRAKING_M_S2 = 1.0  # chosen: half the acceleration of an AR.Drone at 12 deg of tilt; limits the speed towards a fence
 RETURN_M_S = 0.5  # speed of the return to the fence; chosen: slow, since nobody commanded it
-BREACH_M = 1.0  # distance outside the fence at which the aircraft lands; chosen; the fence normally stops it before
+BREACH_M = 1.0  # chosen; distance outside the fence at which the aircraft lands, though the fence should stop it before
 Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
 
 

@@ -1,14 +1,14 @@
-"""The messages of a wire protocol as a text table, and the layout of their fields in bytes.
+"""The messages of a wire protocol as a text table, and the byte layout of their fields.
 
-An entry of a table begins a line with number and name; its fields follow in the order of their definition, on as many
-indented lines as they need:
+Each entry of a table starts a line with its number and name; its fields follow in their order of definition, and may
+continue on indented lines:
 
     77 COMMAND_ACK command:H result:B | progress:B result_param2:i target_system,target_component:B
     148 EXAMPLE voltages:10H[mV]=65535 text:50c uid:18s
 
-`name:code` has the codes of the struct module, a count before the code of an array; names with commas between them are
-fields of one kind. Two codes are the table's own: `s` is an array of bytes, `c` a text. A unit may follow in brackets,
-and the value of a field that is not given (else zero) behind `=`. Fields behind `|` are extensions.
+`name:code` uses the codes of the struct module, preceded by a count for an array; names separated by commas are fields
+of the same type. Two codes have a special meaning: `s` is an array of bytes, `c` a text. A unit may follow in brackets,
+and after `=` the default of the field, otherwise zero. Fields after `|` are extensions.
 """
 
 import re
@@ -22,7 +22,7 @@ _FIELD = re.compile(r"([\w,]+):(\d*)([a-zA-Z])(?:\[[^\]]*\])?(?:=(\S+))?")
 
 
 class WireField(NamedTuple):
-    """A field: `length` is None where it is no array, `default` the value of each of its numbers."""
+    """A field: `length` is None unless it is an array, `default` is the value of each of its numbers."""
 
     name: str
     code: str
@@ -35,7 +35,7 @@ class WireField(NamedTuple):
 
     @property
     def is_array(self) -> bool:
-        """Whether the struct module has several values for it; texts and arrays of bytes are one."""
+        """Whether the struct module has several values for the field; a text or an array of bytes is one value."""
         return self.length is not None and self.code not in "cs"
 
     @property
@@ -71,12 +71,12 @@ class WireLayout:
     """The layout of fields in bytes: little-endian and packed.
 
     Args:
-        fields: in the order of their definition.
-        wire: in the order of their bytes, where that is another.
+        fields: fields in their order of definition.
+        wire: fields in wire order, if that is different.
 
     Attributes:
-        codec: of the flat values, in the order of the bytes.
-        is_flat: whether these are the fields' own values.
+        codec: codec of the flat values, in wire order.
+        is_flat: whether the flat values are the fields' own values.
     """
 
     def __init__(self, fields: Sequence[WireField], wire: Sequence[WireField] | None = None) -> None:
@@ -94,7 +94,7 @@ class WireLayout:
         self._texts = [place for place, field in enumerate(fields) if field.code == "c"]
 
     def flat(self, values: Iterable[Any]) -> Iterator[Any]:
-        """Yield the values for the codec of the fields' values, both in the order of the bytes."""
+        """Yield the codec's flat values for the fields' values, both in wire order."""
         for field, value in zip(self._wire, values, strict=True):
             if field.is_array:
                 yield from value
@@ -102,7 +102,7 @@ class WireLayout:
                 yield value.encode() if field.code == "c" else value
 
     def nested(self, flat: Sequence[Any]) -> Sequence[Any]:
-        """Return the fields' values, in the order of their definition, of what the codec returns."""
+        """Return the fields' values, in their order of definition, for the flat values of the codec."""
         values = self._pick(flat)
         if self._texts:
             values = list(values)

@@ -1,6 +1,6 @@
-"""Parts shared by web servers: listening on a separate thread, access, connections, streams of pictures.
+"""Parts shared by the web servers: listening on a separate thread, access, connections, image streams.
 
-Console and gateway use it for HTTP. This file does not import aiohttp, since other bridges use it, too.
+Console and gateway use it for HTTP. This file does not import aiohttp, since other bridges use it too.
 """
 
 from ipaddress import ip_address
@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host name or address is this machine alone."""
+    """Return whether a host name or address refers to this machine's loopback."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
@@ -16,9 +16,9 @@ def is_loopback(host: str) -> bool:
 
 
 def is_loopback_authority(authority: str) -> bool:
-    """Return whether a Host header, or the host and port of an origin, name this machine alone.
+    """Return whether a Host header, or the host and port of an origin, refers to this machine's loopback.
 
     Raises:
-        ValueError: it cannot be parsed.
+        ValueError: the text cannot be parsed.
     """
     return is_loopback(urlsplit(f"//{authority}").hostname or "")

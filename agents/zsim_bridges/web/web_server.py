@@ -1,8 +1,9 @@
 """Parts shared by the web servers of console and gateway: event loop thread, listening, access, bounded connections.
 
-aiohttp waits for the end of a request without a limit, and keeps what has arrived of its body; a thousand connections
-that never end theirs would take all the files that a process may open, and a gigabyte. A connection is a stranger until
-one of its requests has been answered without an error, or is being answered; strangers never take the places of others.
+aiohttp waits indefinitely for the end of a request, and keeps the part of its body that has arrived; a thousand
+connections with unfinished requests would take a gigabyte, and all file descriptors of the process. A connection is a
+stranger until one of its requests has been answered without an error, except while one is being answered; strangers
+never displace others.
 """
 
 import asyncio
@@ -19,18 +20,18 @@ from aiohttp import web
 from zsim.errors import RunError
 from zsim_bridges.web import is_loopback
 
-STRANGERS_MAX = 100  # connections at once; the oldest makes room for the next
-REQUEST_S = 5.0  # wall time for a request to arrive with its body; a browser on a bad link takes 1 s
-SMALL_BYTES = 16_384  # of a body that is always accepted; commands and requests have a few hundred
-BODY_BYTES_MAX = 16_000_000  # of all larger bodies at once; 16 of the largest that the gateway accepts
-CONNECTIONS_MAX = 1000  # twice the gateway's clients
-REFUSED_FROM = 400  # HTTP status
+STRANGERS_MAX = 100  # simultaneous connections of strangers; the oldest makes room for the next
+REQUEST_S = 5.0  # wall time in which a request must arrive with its body; a browser on a bad link takes 1 s
+SMALL_BYTES = 16_384  # size of a body that is always accepted; commands and requests have a few hundred bytes
+BODY_BYTES_MAX = 16_000_000  # total size of all larger bodies at once; 16 of the largest that the gateway accepts
+CONNECTIONS_MAX = 1000  # twice the gateway's maximum number of clients
+REFUSED_FROM = 400  # lowest HTTP status of an error
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-ANY_PORT = 0  # of the kernel's choice
-BACKLOG = 128  # connections that the kernel keeps until they are accepted; aiohttp's own
-READ_BYTES = 16_384  # of a body that no handler has read yet; a connection holds twice as many
+ANY_PORT = 0  # lets the kernel choose
+BACKLOG = 128  # connections that the kernel queues until they are accepted; aiohttp's default
+READ_BYTES = 16_384  # buffer for a body that no handler has read yet; a connection holds twice as much
 Resource = TypeVar("Resource")
-_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests other than HTTP are answered, not logged
+_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, but not logged
 
 
 class ServedSite(NamedTuple):
@@ -50,9 +51,9 @@ class ServedSite(NamedTuple):
 
 
 async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
-    """Serve an application on the first port that is free, ANY_PORT for any, with a bounded number of connections.
+    """Serve an application on the first free port, where ANY_PORT takes any, with a bounded number of connections.
 
-    Requests in progress may take `shutdown_s` [wall] at the end. Raises an OSError if no port can be opened.
+    At shutdown, requests in progress may take `shutdown_s` [wall]. Raises an OSError if no port can be opened.
     """
     connections = HttpConnections()
     app.middlewares.append(connections.observe)
@@ -83,7 +84,7 @@ def open_on_thread(
     enter: Callable[[], Coroutine[Any, Any, Resource]],
     leave: Callable[[Resource], Coroutine[Any, Any, None]],
 ) -> Iterator[None]:
-    """Run an event loop on a thread of its own, open a resource on it, and close both at the end.
+    """Run an event loop on a separate thread, open a resource on it, and close both on leaving the context.
 
     Exceptions of `enter`, which opens the resource, are raised here.
     """
@@ -103,7 +104,7 @@ def open_on_thread(
 
 
 async def cancel_other_tasks() -> None:
-    """Cancel all other tasks of the loop and wait for them, since asyncio warns of tasks pending at the end."""
+    """Cancel all other tasks of the loop and wait for them, since asyncio warns about tasks pending at the end."""
     others = asyncio.all_tasks() - {asyncio.current_task()}
     for task in others:
         task.cancel()
@@ -120,7 +121,7 @@ def check_token(process: str, host: str, token: str | None) -> None:
 
 
 def tokens_match(received: str, token: str) -> bool:
-    """Compare in constant time; the received one may hold any bytes of a header."""
+    """Compare two tokens in constant time; the received one may hold any bytes of a header."""
     return hmac.compare_digest(received.encode(errors="surrogatepass"), token.encode(errors="surrogatepass"))
 
 
@@ -133,10 +134,10 @@ class HttpConnections:
     """Counts the connections of a server, and closes those that must make room.
 
     Args:
-        strangers_max, connections_max: at once.
+        strangers_max, connections_max: maximum numbers of simultaneous strangers, and of all connections.
         request_s: wall time for a request to arrive, from its first byte; and for a stranger's head, from the opening
             of the connection or its last answer.
-        body_bytes_max: of all bodies beyond SMALL_BYTES at once; further ones wait within their time.
+        body_bytes_max: total size of all bodies above SMALL_BYTES at once; further ones wait, within `request_s`.
     """
 
     def __init__(
@@ -153,12 +154,12 @@ class HttpConnections:
         self._body_bytes = 0
         self._body_gone = asyncio.Condition()
         self._open: dict[asyncio.BaseTransport, HttpConnection] = {}
-        self._strangers: dict[HttpConnection, None] = {}  # an ordered set, by when they began to wait
-        self._idle: dict[HttpConnection, None] = {}  # likewise, of known ones without a request
+        self._strangers: dict[HttpConnection, None] = {}  # an ordered set, longest wait first
+        self._idle: dict[HttpConnection, None] = {}  # likewise, known connections without a request
 
     @web.middleware
     async def observe(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Keep a connection while its request is answered; to be the innermost middleware, after checks of access."""
+        """Protect a connection while its request is answered; must be the innermost middleware, after access checks."""
         connection = self._open.get(request.transport) if request.transport else None
         if connection is None:
             return await handler(request)
@@ -178,9 +179,9 @@ class HttpConnections:
     async def _receive(
         self, request: web.Request, connection: "HttpConnection", since_s: float | None, room: AsyncExitStack
     ) -> None:
-        """Receive the body of a request before the handler; `room` is kept for it until that is done.
+        """Receive the body of a request before the handler runs; `room` holds its reservation until that has finished.
 
-        Raises aiohttp's errors of a body that is too long, did not arrive in time, or had no room.
+        Raises aiohttp's errors for a body that is too long or did not arrive in time, for instance for lack of room.
         """
         if not request.can_read_body:
             return
@@ -193,12 +194,12 @@ class HttpConnections:
                     await room.enter_async_context(self._body_room(size))
                 await request.read()
         except TimeoutError:
-            connection.known = False  # its next request has the time limit of a stranger's
+            connection.known = False  # its next request has a stranger's time limit
             raise web.HTTPRequestTimeout(text=f"a request must be whole within {self._request_s:g} s") from None
 
     @asynccontextmanager
     async def _body_room(self, size: int) -> AsyncIterator[None]:
-        """Wait until a body has room beside the others, and keep it."""
+        """Wait until there is room for a body besides the others, and reserve it."""
         async with self._body_gone:
             await self._body_gone.wait_for(lambda: self._body_bytes + size <= self._body_bytes_max)
             self._body_bytes += size
@@ -210,7 +211,7 @@ class HttpConnections:
                 self._body_gone.notify_all()
 
     def enter(self, connection: "HttpConnection", transport: asyncio.Transport) -> bool:
-        """Accept a new connection; False if there is no room, since all others have a request in progress."""
+        """Accept a new connection; return False if there is no room because all others have requests in progress."""
         if len(self._open) >= self._connections_max and not self._make_room(self._strangers, self._idle):
             return False
         if len(self._strangers) >= self._strangers_max:
@@ -225,7 +226,7 @@ class HttpConnections:
         self._forget(connection)
 
     def _make_room(self, *groups: "dict[HttpConnection, None]") -> bool:
-        """Close the connection that has waited longest, of the first group that is not empty."""
+        """Close the longest-waiting connection of the first non-empty group; return False if all are empty."""
         for group in groups:
             if group:
                 next(iter(group)).cut()
@@ -233,7 +234,7 @@ class HttpConnections:
         return False
 
     def _wait(self, connection: "HttpConnection") -> None:
-        """Let a connection wait for its next request; aiohttp itself closes idle ones that are known."""
+        """Let a connection wait for its next request; aiohttp itself closes idle known connections."""
         (self._idle if connection.known else self._strangers)[connection] = None
         if not connection.known:
             connection.timer = asyncio.get_running_loop().call_later(self._request_s, connection.cut)
@@ -242,7 +243,7 @@ class HttpConnections:
         connection.is_whole = connection.has_more = False
 
     def begin(self, connection: "HttpConnection") -> None:
-        """Take the first bytes of a request on a connection that waits for one."""
+        """Start the time limit of a request when its first bytes arrive on a waiting connection."""
         if connection.since_s is not None or not (connection in self._idle or connection in self._strangers):
             return
         loop = asyncio.get_running_loop()
@@ -266,10 +267,10 @@ class HttpConnection(asyncio.Protocol):
         self._connections = connections
         self._transport: asyncio.Transport | None = None
         self.known = False  # whether one of its requests was answered without an error
-        self.is_whole = False  # whether the request in progress has arrived
-        self.has_more = False  # whether something of the next one has arrived meanwhile
-        self.since_s: float | None = None  # when the first byte of its next request arrived [of the loop]
-        self.timer: asyncio.TimerHandle | None = None  # closes it when the time for that request is over
+        self.is_whole = False  # whether the request in progress has arrived completely
+        self.has_more = False  # whether part of the next request has arrived meanwhile
+        self.since_s: float | None = None  # loop time at which the first byte of its next request arrived
+        self.timer: asyncio.TimerHandle | None = None  # closes the connection when that request's time is over
 
     @property
     def is_open(self) -> bool:
@@ -306,7 +307,7 @@ class HttpConnection(asyncio.Protocol):
         self._http.resume_writing()
 
     def cut(self) -> None:
-        """Close it at once, without an answer."""
+        """Close the connection at once, without an answer."""
         if self._transport is not None:
             transport = self._transport
             self._connections.leave(self, transport)

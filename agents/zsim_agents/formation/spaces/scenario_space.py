@@ -1,8 +1,8 @@
 """The cluster space of a scenario's cluster: a stock one, a user's class, or a cluster of clusters by its groups.
 
-Group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are position and heading of robot k of the
-parent; the rest of c_k (tilts, headings and shape) is appended to the parent's variables. The 4m variables of the
-parent and 4n_k - 4 of each group make 4n. The groups may be clusters of clusters themselves.
+A group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the position and heading of robot k of
+the parent; the rest of c_k (tilts, headings and shape) is added to the parent's variables. 4m variables of the parent
+and 4n_k - 4 of each group make 4n. The groups may be clusters of clusters themselves.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
 
 Places = NDArray[np.intp]
-BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that describe a robot of the parent
+BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that place it as a robot of the parent
 
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: the template is collinear.
+        ValueError: the places of the template are collinear.
         DocumentError: a user's class cannot be loaded; UserCodeError: it cannot be instantiated.
     """
     starts = _starts(scenario, cluster.drones)
@@ -55,7 +55,7 @@ def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
         return own(places_m)
     try:
         return checked(own.for_places(places_m))
-    except TypeError as error:  # a call with wrong arguments raises it without a frame in the user's code
+    except TypeError as error:  # includes a call with wrong arguments, whose traceback has no frame of the user's code
         failure = plugin.user_code_error(error, "")
         raise failure or UserCodeError(f"{name}.for_places raised TypeError: {error}") from error
 
@@ -85,10 +85,10 @@ class _Group(NamedTuple):
     """The indices of a group in the complete cluster.
 
     Attributes:
-        robots, rows: its robots among all robots; their 4n_k entries in r, four each.
-        body, rest: indices of BODY and of the other variables in its own c.
-        own: indices of the rest in the complete c.
-        at: indices of its body in the parent's r.
+        robots, rows: indices of its robots; of their 4n_k entries in r, four each.
+        body, rest: indices of BODY and of all other variables in its own c.
+        own: indices of the rest in the c of the whole.
+        at: indices of its body in the r of the parent.
     """
 
     space: ClusterSpace
@@ -101,10 +101,10 @@ class _Group(NamedTuple):
 
 
 class NestedCluster(ClusterSpace):
-    """c = (the parent's variables, then those of each group except x_c, y_c, z_c, yaw, as NAME.roll, NAME.pitch, ...).
+    """c = (variables of the parent, then those of each group except x_c, y_c, z_c, yaw, as NAME.roll, NAME.pitch, ...).
 
-    phi_k of the parent is the yaw of group k relative to the parent's yaw, NAME.phi_i the heading of a robot relative
-    to its group's yaw. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
+    phi_k of the parent is the yaw of group k relative to that of the parent, NAME.phi_i the heading of a robot relative
+    to the yaw of its group. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
     `groups` are names and spaces in the order of the robots, one for each robot of the parent.
     """
 
@@ -195,14 +195,14 @@ class NestedCluster(ClusterSpace):
         return min(space.spread(part) for space, part in self._pairs(c))
 
     def measures(self, c: Array) -> tuple[float, float]:
-        """Return the minimum spread and margin of parent and groups: if one is singular, the complete cluster is."""
+        """Return the minimum spread and margin of parent and groups: the whole is singular if one of them is."""
         spreads, margins = zip(*(space.measures(part) for space, part in self._pairs(c)), strict=True)
         return min(spreads), min(margins)
 
     def condition(self, c: Array) -> float:
-        """Return the largest condition number of the parent and the groups, each in its own measure.
+        """Return the maximum condition number of the parent and the groups, each in its own scaling.
 
-        J^-1 of the complete cluster is a product of theirs: if none is ill-conditioned, neither is the product.
+        J^-1 of the whole is a product of theirs: if none is ill-conditioned, neither is that of the whole.
         """
         return max(space.condition(part) for space, part in self._pairs(c))
 
