@@ -43,11 +43,11 @@ class ShapeLimits:
         share: share of the robots' speed limits that a reference may use; the rest is left to the control law.
     """
 
-    spread_min_m: float = 1.0  # chosen: five sigma of an estimated side keep the robots from being collinear
+    spread_min_m: float = 1.0  # chosen: five sigma of an estimated side, which keep the robots from being collinear
     tilt_max_rad: float = math.radians(30.0)  # chosen: far from 90 deg, where Euler angles fail
     condition_max: float = 20.0  # chosen: above it a small motion in cluster space moves a robot far
     height_min_m: float = 0.5  # chosen: five rotor radii, clear of most of the ground effect
-    share: float = 0.8  # chosen
+    share: float = 0.8
 
 
 # All limits are chosen; those of the shape keep every formation away from singularities

@@ -246,7 +246,7 @@ def put_ramped(
 
 
 def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
-    """Return the ramp from c, moving at c_dot, at start_s onto a reference in over_s; angles turn the shorter way."""
+    """Return the ramp from c, moving at c_dot, at start_s onto a reference in over_s; angles by the shorter way."""
     c_onto, c_dot_onto = onto.value(start_s)
     return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)
 

@@ -22,21 +22,21 @@ from zsim.math import linear
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
-DEGREE = 7  # of each piece, as in the files of uav_trajectories: the lowest degree that allows position, velocity,
+DEGREE = 7  # degree of a piece, as in the files of uav_trajectories: the minimum that allows position, velocity,
 # acceleration and jerk to be prescribed at both ends
 ENDS = 3  # number of derivatives prescribed at each end of a path
-BELOW, ABOVE = 11, 3  # subdiagonals and superdiagonals of the banded equations of a minimum-snap path, ordered by piece
-PEAK_SAMPLES = 64  # intervals per piece in the search for its peaks
+BELOW, ABOVE = 11, 3  # diagonals of the equations of a minimum-snap path, ordered from piece to piece
+PEAK_SAMPLES = 64  # samples per piece in the search for its maximum speed
 GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
-GOLDEN_STEPS = 40  # each reduces the interval to 0.62: to 1e-10 of a piece in all
-SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths, before refinement
-HORIZON_S = 600.0  # checked part of an endless path
-DIFFERENCE_S = 1e-4  # step of finite differences of rates: relative error 1e-7 for motions over a second
-FACTOR_DIGITS = 3  # decimal places of the time factor of a fit, rounded up
-SHARE = 0.8  # of the drone's limits that a path may use, as in formations: the rest is for the feedback
-LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: minimum (25 gates), maximum, search step
-STILL = 1e-9  # samples below it [m/s, rad/s, m/s^2] are not refined; also the minimum divisor [s]
-RAMP = 0.25  # chosen: share of a lap's period in which the speed rises from rest, and in which it falls to rest
+GOLDEN_STEPS = 40  # each leaves 0.62 of the interval: 1e-10 of a piece in all
+SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths; peaks are then refined
+HORIZON_S = 600.0  # part of an endless path that is searched for peaks
+DIFFERENCE_S = 1e-4  # of rates, for an acceleration: exact to 1e-7 of it in motions of a second
+FACTOR_DIGITS = 3  # of the factor of a fit, rounded up
+SHARE = 0.8  # share of the drone's limits, as in formations; the rest is left to the feedback
+LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: 25 gates, however short; an hour; step of the search
+STILL = 1e-9  # values below this count as standstill [m, m/s or rad/s]
+RAMP = 0.25  # of a lap's time, in which the speed along the curve rises from rest, and falls again; chosen
 Curve = Callable[[float], tuple[Array, Array]]
 """Maps the angle [rad] to the position (4,) and its derivative with respect to the angle."""
 
@@ -65,7 +65,7 @@ class Peaks(NamedTuple):
     def factor(self, limits: PathLimits) -> float:
         """Return the factor of the duration that just satisfies the limits; below 1 if the path may be faster."""
         speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
-        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # as 1 / T and 1 / T^2
+        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # speed scales as 1/t, acceleration as 1/t^2
 
 
 class PiecewisePolynomial:
@@ -108,7 +108,7 @@ class PiecewisePolynomial:
         """Return the peaks over all pieces, their times to 1e-10 of a piece."""
         greatest = [(0.0, 0.0)] * 4
         for begin_s, duration_s, own in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
-            unit = own * _powers(duration_s, len(own))[:, None]  # over local time 0 to 1, which is well scaled
+            unit = own * _powers(duration_s, len(own))[:, None]  # in local time from 0 to 1, which is well scaled
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
@@ -156,7 +156,7 @@ def _greatest(columns: Array) -> tuple[float, float]:
 
 
 class EndMotion(NamedTuple):
-    """The derivatives of a path at its start or end, each (4,)."""
+    """Derivatives of a path at its start or end, each (4,)."""
 
     velocity: Array
     acceleration: Array
@@ -170,7 +170,7 @@ def at_rest() -> EndMotion:
 def minimum_snap(
     times_s: Sequence[float], places: Array, begin: EndMotion | None = None, end: EndMotion | None = None
 ) -> PiecewisePolynomial:
-    """Return the path through positions (m, 4) at given times that minimises the integral of the squared snap.
+    """Return the path through places (m, 4) at given times with the minimum integral of the squared fourth derivative.
 
     With the derivatives up to the third prescribed at both ends, zero by default, it is the spline of degree 7:
     Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the spline.
@@ -213,7 +213,7 @@ def minimum_snap(
     for d in range(1, ENDS + 1):
         put(row + d - 1, m - 1, slopes[d])
         b[row + d - 1] = ends[1][d - 1] * el.power(spans[-1], float(d))
-    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # over local time 0 to 1, which is well scaled
+    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # in local time from 0 to 1: well scaled
     scale = np.array([_powers(span, size) for span in spans.tolist()])
     return PiecewisePolynomial(spans, unit / scale[:, :, None])
 
@@ -228,8 +228,8 @@ def move(
 ) -> PiecewisePolynomial:
     """Return the minimum-snap path from one position (4,) to another within limits.
 
-    It lasts over_s, or longer if the limits require it. It starts and ends at rest unless begin or end is given.
-    Yaw turns the shorter way.
+    It lasts over_s, or longer if the limits require. It begins and ends at rest, or in the given motions.
+    The yaw takes the shorter turn.
 
     Raises:
         TrajectoryError: no path within an hour satisfies the limits; the motion at an end is too fast.
@@ -356,7 +356,7 @@ class Laps:
         return place, slope * rate
 
     def _begun(self, t: float) -> tuple[float, float]:
-        """Return angle and rate at time t after leaving rest."""
+        """Return angle and rate, time t after starting from rest."""
         s = t / self._ramp_s
         if s >= 1.0:
             return self._rate * (t - 0.5 * self._ramp_s), self._rate

@@ -1,10 +1,10 @@
 """Cluster space: a formation of n robots described as one articulated body.
 
-Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad]; cluster space c
-has as many variables: position and attitude of the formation, relative headings of the robots, and the shape.
+Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad]. Cluster space c
+has as many variables: position and attitude of the formation, the relative heading of each robot, and the shape.
 Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
 
-The mathematics of the cluster frame C, with Z-Y-X Euler angles, is compiled, because a gate takes microseconds.
+The functions of the cluster frame C, with Z-Y-X Euler angles, are compiled, because a gate takes microseconds.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ class SingularClusterError(ValueError):
 class ClusterSpace(ABC):
     """One convention of cluster variables for n robots; every method is a pure function.
 
-    A user's space is a subclass that a scenario names. It implements `forward`, `inverse`, `jacobian`,
-    `inverse_jacobian` and `spread`, and is constructed by `for_places`.
+    A user's space is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, named by the
+    scenario and constructed by `for_places`.
 
     Args:
-        names: names of the 4 n variables, pitch among them. The stem of a name gives its kind: p, q, rho are lengths, w
-            deviations in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles that do not.
+        names: of the 4 n variables, including pitch. The beginning of a name gives its kind: p, q, rho are lengths, w
+            departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles that do not.
         spread_text: the quantity that `spread` measures, in words for messages.
 
     Attributes:
         size: number of cluster variables, 4 n.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, including those that do not wrap (pitch, beta, elevation_k).
-        period: (4n,) 2 pi for the angles that wrap, 0 for all others.
-        bounds: (4n, 2) open bounds of the values of `forward`, infinite for unbounded variables.
-        neutral: (4n,) bool, true for the variables whose default goal is zero: tilts, relative headings, deviations
-            from a template.
+        period: (4n,) 2 pi for the angles that wrap, 0 for all other variables.
+        bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is no bound.
+        neutral: (4n,) bool, true for the variables that are zero unless a goal is given: tilts, relative headings,
+            departures from a template.
         tilts: indices of roll and pitch in c.
     """
 
@@ -79,7 +79,7 @@ class ClusterSpace(ABC):
 
     @classmethod
     def for_places(cls, places_m: Array) -> ClusterSpace:
-        """Return the space of n robots with the given nominal positions (n, 3) [m]; by default cls(n).
+        """Return the space of n robots with given positions (n, 3) [m]; by default cls(n).
 
         Args:
             places_m: the cluster's `template_m`, else the start positions; x ahead, y left of the formation.
@@ -123,11 +123,11 @@ class ClusterSpace(ABC):
         """Return the smallest height of the shape [m] (see `spread_text`); 0 if the shape is singular."""
 
     def motion(self, c: Array, c_dot: Array) -> Array:
-        """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 avoid computing the matrix."""
+        """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 compute it without the matrix."""
         return linear.product(self.inverse_jacobian(c), c_dot)
 
     def specimen(self, apart_m: float) -> Array:
-        """Return c (4n,) of a level formation with robots at least apart_m from each other, for rehearsals."""
+        """Return c (4n,) of a level formation with robots at least a given distance apart, for rehearsals."""
         radius_m = self.n * apart_m
         turns = np.arange(self.n) * (TAU / self.n)
         x, y = (el.elementwise(of)(turns) for of in (el.cos, el.sin))
@@ -137,18 +137,19 @@ class ClusterSpace(ABC):
     def margin(self, c: Array) -> float:
         """Return the distance to singularity [m]: spread(c) cos(pitch).
 
-        Zero exactly where J^-1 is singular (robots 1, 2, 3 collinear or two of them coincident, a further robot on the
-        z axis through robot 1, or pitch at 90 degrees). In a level formation: how far a robot may move before that.
+        It is zero exactly where J^-1 is singular (robots 1, 2, 3 collinear or two of them coincident, another robot on
+        the z axis through robot 1, or pitch at 90 degrees); in a level formation, it is how far one robot may move
+        before that.
         """
         return self.measures(c)[1]
 
     def measures(self, c: Array) -> tuple[float, float]:
-        """Return spread(c) and margin(c) [m], with one computation of the spread."""
+        """Return spread(c) and margin(c) [m], computing the spread once."""
         spread = self.spread(c)
         return spread, spread * float(el.cos(c[self._pitch]))
 
     def condition(self, c: Array) -> float:
-        """Return the condition number of J^-1 (2-norm, metres and radians unweighted).
+        """Return the condition number of J^-1 (2-norm, in metres and radians without weights).
 
         It grows with the unit of length, so a formation larger than 4 m is scaled down to 4 m: a large formation is not
         closer to singularity than a small one of the same shape.
@@ -164,7 +165,7 @@ class ClusterSpace(ABC):
         return self.wrapped(c_to - c_from)
 
     def wrapped(self, c: Array) -> Array:
-        """Return c (4n,), or a table (m, 4n) of such rows, with angles wrapped to [-pi, pi]."""
+        """Return c (4n,), or a table (m, 4n) of them, with the angles that wrap brought into [-pi, pi]."""
         if c.ndim > 1:
             return c - self.period * np.rint(c / TAU)
         near = np.empty(self.size)
@@ -179,7 +180,7 @@ class ClusterSpace(ABC):
 
 
 def checked(space: ClusterSpace) -> ClusterSpace:
-    """Make all methods of a user's space raise UserCodeError for results that are not finite or of another shape."""
+    """Make all methods of a user's space raise UserCodeError for results of a wrong shape or not finite."""
     n, size = space.n, space.size
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
         "forward": ((size,),),
@@ -224,7 +225,7 @@ def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Arr
 
 @portable
 def put_wrapped(c: Array, period: Array, near: Array) -> None:
-    """Write c with each variable wrapped to half a period about zero; period is 2 pi, or 0 for no wrapping."""
+    """Write c with each variable wrapped to half a period about zero; a period of 0 means no wrapping."""
     for k in range(c.size):
         near[k] = c[k] - period[k] * np.rint(c[k] / TAU)
 
@@ -264,7 +265,7 @@ _BOUNDS = {
 
 
 def _stem(name: str) -> str:
-    """Return a name without its group and its number: phi for left.phi_2."""
+    """Return a name without group and number, e.g. phi for left.phi_2."""
     return name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
 
 

@@ -24,14 +24,14 @@ from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
 
 Places = NDArray[np.intp]
-BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that place it as a robot of the parent
+BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that are those of a robot of the parent
 
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: the places of the template are collinear.
+        ValueError: the positions in the template are collinear.
         DocumentError: a user's class cannot be loaded; UserCodeError: it cannot be instantiated.
     """
     starts = _starts(scenario, cluster.drones)

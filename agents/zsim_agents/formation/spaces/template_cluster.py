@@ -2,9 +2,9 @@
 
     P_i = C + R (t_i + (N w)_i)
 
-C is the centroid, t_i the template's positions, N a basis of the displacements that neither move nor rotate it, and R
-the best-fit rotation of the template to the robots. No robot is privileged, and the motion of one robot changes the
-frame only by 1/n of it.
+C is the centroid, t_i the positions in the template, N a basis of the displacements that neither move nor rotate it,
+and R the best-fit rotation of the template to the robots. No robot is privileged, and the motion of one robot changes
+the frame by only a fraction of about 1/n.
 
 Attitudes by best fit: Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc. Am. A 4
 (1987), section 4; the same rotation as Kabsch's (1976), and never a reflection. As a formation's frame: Belta, Kumar,
@@ -36,7 +36,7 @@ from zsim_agents.formation.spaces.cluster_space import (
     row,
 )
 
-INDEPENDENT_MIN = 1e-6  # minimum independent share of a direction; rounding leaves 1e-15
+INDEPENDENT_MIN = 1e-6  # minimum share of a direction outside the previous ones; rounding leaves 1e-15
 PLANES = ((0, 1), (0, 2), (1, 2))
 NO_FRAME = "the robots are in one line or one place, or too far from the template: the formation has no frame"
 HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # indices in the 7 x 7 matrix of `condition`
@@ -45,15 +45,15 @@ HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # indices in the 7 x 7 matrix
 class TemplateCluster(ClusterSpace):
     """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, w_1..w_{3n-6}); w in metres rms over the robots.
 
-    w_1 is growth: robots move outwards, by w_1 in the root mean square. The stretches and shears that the template
-    allows follow (`shape_modes`). The origin of the template's positions (n, 3), n >= 3, is arbitrary.
+    w_1 is growth: robots move outwards, by w_1 in the root mean square. Stretches and shears that the template's extent
+    permits follow (`shape_modes`). The template is given as positions (n, 3), n >= 3, from any origin.
 
     Raises:
-        ValueError: fewer than three positions, or all collinear.
+        ValueError: there are fewer than three positions, or all are collinear.
 
     Attributes:
-        t_C: (n, 3) positions of the template relative to their centroid, in C [m].
-        modes_C: (n, 3, 3n - 6) basis N.
+        t_C: (n, 3) positions in the template from their centroid, in C [m].
+        modes_C: (n, 3, 3n - 6), N.
     """
 
     def __init__(self, places_m: ArrayLike) -> None:
@@ -96,7 +96,7 @@ class TemplateCluster(ClusterSpace):
         """
         _, b_C, R_WC = self._fitted(p_W)
         n = self.n
-        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # t_i x R^T: (3, n, 3)
+        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # (3, n, 3), of t_i x R^T v_i
         turn = solve(inertia(product(b_C.T, self.t_C)), arms.reshape(3, 3 * n)).reshape(3, n, 3)
         roll, pitch, _ = euler_angles(R_WC)
         cross_C = np.array([skew(b) for b in b_C]).reshape(3 * n, 3)
@@ -142,8 +142,8 @@ class TemplateCluster(ClusterSpace):
     def spread(self, c: Array) -> float:
         """Return the root mean square distance of the robots from the line through them, measured along the template.
 
-        It is the smallest eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a
-        template of any size, and zero where another rotation fits equally well.
+        It is the minimum eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a template
+        of any size, and zero where another rotation fits equally well.
         """
         S = product(self._places_C(c).T, self.t_C)
         return float(eigen(inertia((S + S.T) / 2))[0][0]) / self._reach_m
@@ -151,15 +151,15 @@ class TemplateCluster(ClusterSpace):
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1, with the robots' velocities, headings and phi weighted by their rms.
 
-        With these weights it does not grow with the number of robots; a formation with robots farther than 4 m from
-        the centroid is scaled down to 4 m. w_k and the centroid are orthonormal in this measure; a 7 x 7 matrix is
-        left: turns, the three directions of w that they mix with, and the mean of phi.
+        With these weights it does not grow with the number of robots; a formation with robots farther than 4 m from the
+        centroid is scaled down to that. w_k and the centroid are orthonormal in these weights, which leaves a 7 x 7
+        matrix: turns, the three directions of w coupled to them, and the mean of phi.
         """
         place_C = self._places_C(c)
         scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
         axes = euler_axes_of(c).T
         squared = scale * scale
-        M = squared * product(axes.T, inertia(product(place_C.T, self.t_C)).T)  # the template is scaled alike
+        M = squared * product(axes.T, inertia(product(place_C.T, self.t_C)).T)  # template scaled likewise
         stiff = solve(squared * self._inertia, M.T)
         whole = squared * product(product(axes.T, inertia(product(place_C.T, place_C))), axes)
         G = np.eye(7)
@@ -171,11 +171,11 @@ class TemplateCluster(ClusterSpace):
         values = eigen(G)[0]
         return math.sqrt(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
-    def _places_C(self, c: Array) -> Array:  # (n, 3) [m], relative to the centroid
+    def _places_C(self, c: Array) -> Array:  # positions from the centroid (n, 3) [m]
         return self.t_C + product(self._modes, c[self._shape :]).reshape(self.n, 3)
 
     def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
-        """Return the centroid (3,), the positions relative to it in C (n, 3), and R_WC (3, 3)."""
+        """Return the centroid (3,), the positions from it in C (n, 3), and R_WC (3, 3)."""
         centre_W = np.add.reduce(p_W, axis=0) / self.n
         b_W = p_W - centre_W
         gap, R_WC = fitted_rotation(product(self.t_C.T, b_W))
@@ -185,7 +185,7 @@ class TemplateCluster(ClusterSpace):
 
 
 def _root(E: Array, n: int) -> Array:
-    """Return the symmetric square root of E / n (3, 3); E is positive semidefinite up to rounding."""
+    """Return the symmetric root of E / n (3, 3); eigenvalues of E are negative only by rounding."""
     values, vectors = eigen((E + E.T) / 2)
     return product(vectors * np.sqrt(np.maximum(values, 0.0) / n), vectors.T)
 
@@ -193,8 +193,8 @@ def _root(E: Array, n: int) -> Array:
 def fitted_rotation(H: Array) -> tuple[float, Array]:
     """Return how well the rotation is defined, and the rotation R (3, 3) that maximises the sum of b_i . R t_i.
 
-    H (3, 3) is the sum of t_i b_i^T. The first result is the gap, half the difference of the two largest eigenvalues
-    of Horn's matrix [unit of H]: the smallest eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where
+    H (3, 3) is the sum of t_i b_i^T. The first result is half the difference between the two largest eigenvalues of
+    Horn's matrix [unit of H]: the smallest eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where
     several rotations fit equally well, or H is not finite.
     """
     K = np.empty((4, 4))
@@ -206,7 +206,7 @@ def fitted_rotation(H: Array) -> tuple[float, Array]:
 
 @portable
 def put_horn_matrix(H: Array, K: Array) -> bool:
-    """Write the symmetric (4, 4) matrix whose dominant eigenvector is the quaternion, w first; return if finite."""
+    """Write Horn's matrix (4, 4), whose dominant eigenvector is the quaternion, w first; return whether finite."""
     xx, xy, xz = row(H, 0)
     yx, yy, yz = row(H, 1)
     zx, zy, zz = row(H, 2)
@@ -237,8 +237,8 @@ def shape_modes(t: Array) -> Array:
     """Return a basis (n, 3, 3n - 6) of the displacements that neither move nor turn centred points t (n, 3).
 
     Each mode moves the points by 1 m in the root mean square, and all are orthogonal to each other: N^T N = n I. The
-    first are the homogeneous ones: growth, stretches along the axes and shears in their planes, as far as the points
-    allow them; the others result from displacing single points, in order.
+    first are homogeneous: growth, stretches along the axes and shears in their planes, where the extent of the points
+    permits them; the others follow from moving single points, in order.
 
     Raises:
         ValueError: the points are collinear or coincide.
@@ -257,7 +257,7 @@ def shape_modes(t: Array) -> Array:
 
 
 def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
-    """Return unit vectors (3n,) along the independent part of each direction (n, 3), in order, orthogonal to `done`."""
+    """Return unit vectors (3n,) along the new part of each direction (n, 3), in order, orthogonal to the given ones."""
     basis: list[Array] = []
     for direction in directions:
         v = direction.ravel()
@@ -284,7 +284,7 @@ def inertia(S: Array) -> Array:
 
 @portable
 def skew(a: Array) -> Array:
-    """Return the matrix (3, 3) of the cross product a x."""
+    """Return the cross-product matrix (3, 3) of a."""
     A = np.zeros((3, 3))
     A[0, 1], A[0, 2] = -a[2], a[1]
     A[1, 0], A[1, 2] = a[2], -a[0]
@@ -314,5 +314,5 @@ def rotation_of(c: Array) -> Array:
 
 @portable
 def euler_axes_of(c: Array) -> Array:
-    """Return w_WC_C for unit rates of roll, pitch and yaw, one per row (3, 3)."""
+    """Return w_WC_C for unit rates of roll, pitch and yaw, as the rows of (3, 3)."""
     return array_of(euler_axes_C(c[3], c[4]))

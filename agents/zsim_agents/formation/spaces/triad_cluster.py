@@ -1,8 +1,8 @@
-"""Clusters of two, three (the paper's) or more robots, whose frame is defined by robots 1, 2 and 3.
+"""Clusters of two, three (the paper's) or more robots, whose frame is given by robots 1, 2 and 3.
 
-Robots 1, 2, 3 define the frame C and the triangle (p, q, beta); each further robot k adds distance rho, azimuth and
-elevation as seen from robot 1 in C. The origin is the centroid of all robots. Two robots are a rod with a direction and
-a length, without roll.
+Robots 1, 2 and 3 define the frame C and the triangle (p, q, beta); each further robot k adds its distance rho, azimuth
+and elevation from robot 1 in C. The origin is the centroid of all robots. Two robots form a rod with direction and
+length, without roll.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class TriadCluster(ClusterSpace):
             raise SingularClusterError(NO_FRAME)
         R_WC = np.array([x, y, z]).T
         d_C = linear.product(d_W, R_WC)
-        rate = np.zeros((3, self.n, 3))  # w_WC_C = sum over robots of rate[:, i] v_i
+        rate = np.zeros((3, self.n, 3))  # w_WC_C = sum over robots i of rate[:, i] v_i
         rate[0, :3] = np.outer((d_C[2, 0] - d_C[1, 0], -d_C[2, 0], d_C[1, 0]), z) / area
         rate[1, :3] = np.outer((-2.0, 1.0, 1.0), z) / h
         rate[2, :3] = np.outer((2.0, -1.0, -1.0), y) / h
@@ -110,7 +110,7 @@ class TriadCluster(ClusterSpace):
 
 @portable
 def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
-    """Write c (4n,) and return whether the robots have a frame; if not, nothing is written."""
+    """Write c (4n,) and return whether the robots have a frame; without one nothing is written."""
     n = yaw.size
     at = 6 + n  # index of p in c
     p_1 = row(p_W, 0)
@@ -132,7 +132,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
 
 @portable
 def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
-    """Write positions (n, 3) and headings (n,); return whether the shape has an extent; if not, they are invalid."""
+    """Write positions (n, 3) and headings (n,), and return whether they are valid: the shape has an extent."""
     n = c.size // 4
     put_places_C(c, p_W)
     R_WC = matrix_from_rpy(c[3], c[4], c[5])
@@ -146,10 +146,10 @@ def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
 
 @portable
 def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
-    """Write J^-1 (4n, 4n) into zeros; return whether the shape has an extent; if not, nothing is written.
+    """Write J^-1 (4n, 4n) into zeros and return whether the shape has an extent; without one nothing is written.
 
-    Robot i moves at v_c + R_WC (w_WC_C x place_i + derivatives of place_i by the shape times their rates), and turns at
-    yaw' + phi_i'.
+    Robot i moves at v_c + R_WC (w_WC_C x d_i + d_i'), d_i its position in C and d_i' its rate with the shape, and turns
+    at yaw' + phi_i'.
     """
     n = c.size // 4
     if not has_direction(c):
@@ -183,7 +183,7 @@ def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
 
 @portable
 def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
-    """Add the motion of one robot with a variable; all robots move back by its mean, so that the centroid is fixed."""
+    """Add the motion of one robot per unit of a variable; all robots move back by the mean to keep the centroid."""
     n = J_inv.shape[0] // 4
     for k in range(3):
         back = rate_W[k] / n
@@ -205,8 +205,8 @@ def triad_spread(c: Array) -> float:
 def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, float]:
     """Return the axes x, y, z of C in W, h = |d2 + d3| [m] and the area |d2 x d3| [m^2] of d2 = P2 - P1, d3 = P3 - P1.
 
-    x_C points from the middle of robots 2 and 3 to robot 1, z_C along d2 x d3; robot 2 is on the left. All
-    results are zero if the three robots are collinear or coincide.
+    x_C points from the middle of robots 2 and 3 to robot 1, z_C along d2 x d3; robot 2 is on the left. All results are
+    zero if the three robots are collinear or coincide.
     """
     m = add(d2, d3)
     normal = cross(d2, d3)
@@ -221,12 +221,12 @@ def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, f
 
 @portable
 def put_places_C(c: Array, place: Array) -> None:
-    """Write the positions of the robots relative to the centroid, in C (n, 3) [m]."""
+    """Write the positions of the robots from the centroid, in C (n, 3) [m]."""
     n = c.size // 4
     at = 6 + n
     p, q = c[at], c[at + 1]
     ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[at + 2])
-    place[:3] = 0.0  # relative to robot 1
+    place[:3] = 0.0  # positions from robot 1
     place[1, 0], place[1, 1] = -p * ca2, p * sa2
     place[2, 0], place[2, 1] = -q * ca3, -q * sa3
     for k in range(3, n):
@@ -249,7 +249,7 @@ def has_direction(c: Array) -> bool:
 def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, float, float]:
     """Return cos and sin of the angle at robot 1 from -x_C to robot 2, the same to robot 3, and h [m].
 
-    All results are zero if the x axis is undefined.
+    All results are zero if x_C is undefined.
     """
     along2, along3 = p + q * el.cos(beta), q + p * el.cos(beta)
     h = math.sqrt(max(p * along2 + q * along3, 0.0))
@@ -260,9 +260,9 @@ def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, fl
 
 @portable
 def triangle_rates(p: float, q: float, beta: float) -> tuple[Matrix, Matrix]:
-    """Return the derivatives by p, q and beta of robot 2's position relative to robot 1, in C; the same of robot 3."""
+    """Return the derivatives of P2 - P1 in C with respect to p, q and beta, then those of P3 - P1."""
     ca2, sa2, ca3, sa3, h = split_beta(p, q, beta)
-    by_p, by_q = -sa2 / h, sa3 / h  # derivatives of robot 2's angle; robot 3's have the opposite sign
+    by_p, by_q = -sa2 / h, sa3 / h  # derivatives of the angle to robot 2; that to robot 3 turns the other way
     of_2 = (
         (-ca2 + p * sa2 * by_p, sa2 + p * ca2 * by_p, 0.0),
         (p * sa2 * by_q, p * ca2 * by_q, 0.0),
@@ -290,7 +290,7 @@ def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
 
 @portable
 def spherical_rates(rho: float, azimuth: float, elevation: float) -> Matrix:
-    """Return the derivatives of (x, y, z) by distance, azimuth and elevation."""
+    """Return the derivatives of (x, y, z) with respect to distance, azimuth and elevation."""
     sa, ca, se, ce = el.sin(azimuth), el.cos(azimuth), el.sin(elevation), el.cos(elevation)
     return (
         (ce * ca, ce * sa, se),
@@ -309,7 +309,7 @@ def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
 
 
 def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
-    """Return the rows of J for rho, azimuth and elevation of robot index k, (3, n, 3).
+    """Return the rows of J for rho, azimuth and elevation of the robot with index k: (3, n, 3).
 
     In C the robot moves relative to robot 1 at R_WC^T (v_k - v_1) - w_WC_C x d_C.
     """
@@ -317,7 +317,7 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
     flat, rho = el.hypot(x, y), el.hypot(x, y, z)
     if not flat > LENGTH_MIN_M:
         raise SingularClusterError(f"robot {k + 1} is on the z axis through robot 1: it has no azimuth")
-    rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # its rows are orthogonal, of lengths 1, flat and rho
+    rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # orthogonal rows of lengths 1, flat and rho
     gradient = rates_C / np.array([(1.0,), (flat * flat,), (rho * rho,)])
     motion_C = linear.product([(0, -z, y), (z, 0, -x), (-y, x, 0)], rate.reshape(3, -1)).reshape(rate.shape)
     motion_C[:, k] += R_WC.T
@@ -326,7 +326,7 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
 
 
 class PairCluster(ClusterSpace):
-    """c = (x_c, y_c, z_c, pitch, yaw, phi_1, phi_2, p): origin in the middle, x_C towards robot 1."""
+    """c = (x_c, y_c, z_c, pitch, yaw, phi_1, phi_2, p): origin midway, x_C towards robot 1."""
 
     def __init__(self) -> None:
         super().__init__(2, ("x_c", "y_c", "z_c", "pitch", "yaw", "phi_1", "phi_2", "p"), "p")
@@ -367,7 +367,7 @@ class PairCluster(ClusterSpace):
 
 @portable
 def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
-    """Write c (8,); if its length p is zero, only p is valid."""
+    """Write c (8,); only p is valid if the length p is zero."""
     d_W = subtract(row(p_W, 0), row(p_W, 1))
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)
