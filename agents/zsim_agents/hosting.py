@@ -1,4 +1,4 @@
-"""Makes the agents of a process from names and patterns, and checks the classes and plans of a scenario."""
+"""Creates the agents of a process from names and patterns, and checks the classes and plans of a scenario."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -23,14 +23,14 @@ from zsim.scenario.scenario_file import to_text
 from zsim.schema import parameters, plugin, yaml_file
 from zsim.schema.checker import show
 
-NAMED_MAX = 10  # of the known names in a refusal
+NAMED_MAX = 10  # maximum number of known names in a refusal
 
 
 def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str]:
     """Return the known names that are listed or match a pattern such as `drone*`, in the order of `known`.
 
     Raises:
-        RunError: a pattern matches none; `what` says in the message what it is.
+        RunError: a pattern matches none; `what` names its kind in the message.
     """
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in known):
@@ -42,7 +42,7 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
 
 
 def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]:
-    """Return the process names of the agents that match, role by role, estimators first; RunError: one matches none."""
+    """Return the process names of the agents that match, by role, estimators first; RunError: no match."""
     return chosen("host: process", patterns, agent_names(scenario))
 
 
@@ -50,11 +50,11 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     """Check that the classes named in a scenario can be loaded here.
 
     Args:
-        source: name of the scenario's file, with which each fault begins.
-        elsewhere: whether the controllers run on other hosts, where alone spaces and laws are needed.
+        source: name of the scenario's file, with which each fault starts.
+        elsewhere: whether the controllers run on other hosts; only there are spaces and laws needed.
 
     Raises:
-        ScenarioError: what is wrong with each name, or with its class, a line each.
+        ScenarioError: the fault of each name or of its class, one per line.
     """
     from zsim_agents.estimation.drone_estimator import estimator_class
 
@@ -90,7 +90,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
 
 
 def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
-    """Check that the class of agents can be loaded, and its parameters by its method `flaws`, if any."""
+    """Check that the class of agents can be loaded, and check its parameters by its method `flaws`, if any."""
     kind: Any = plugin.load(own.named, f"{where}.class", Agent)
     flaws = getattr(kind, "flaws", None)
     if flaws and (found := [f"{where}.parameters.{path} {text}" for path, text in flaws(own.parameters, scenario)]):
@@ -100,10 +100,10 @@ def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
 def check_plans(scenario: Scenario, source: str) -> None:
     """Check the plans of a scenario as its controllers and pilots do: expressions, names, templates, references.
 
-    A run as processes leaves this to these, which load the mathematics anyway.
+    In a run of processes, these check the plans, as they load the mathematics anyway.
 
     Raises:
-        ScenarioError: the reasons, a line for each cluster.
+        ScenarioError: the reasons, one line per cluster.
     """
     from zsim_agents.formation.engagement_setup import check_plan
 
@@ -124,7 +124,7 @@ def check_plans(scenario: Scenario, source: str) -> None:
 
 
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
-    """Return the matching agents of all roles as one; RunError: none match, or the scenario cannot be flown."""
+    """Return the matching agents of all roles as one; RunError: none match, or the scenario is impossible."""
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
     by_role = {role: [thing for each, _, thing in split if each == role] for role in agent_roles(scenario)}
     members = [agent for role, names in by_role.items() if names for agent in make_agents(role, info, scenario, names)]
@@ -132,7 +132,7 @@ def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
 
 
 def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:
-    """Make the agents of one role for drones or clusters, or one joint agent if the role has these."""
+    """Create the agents of one role for drones or clusters, or a joint agent for roles that have one."""
     if own := scenario.own_agents.get(role):
         kind = plugin.load_any(own.named, f"agents.{role}.class", Agent)
         if own.map is False:
@@ -153,9 +153,9 @@ def make_agents(role: str, info: Info, scenario: Scenario, names: Sequence[str])
 class AgentSpec(NamedTuple):
     """A user's agent on a command line: `[NAME=]MODULE:CLASS [SETTING=VALUE]...`."""
 
-    named: str  # the class, a function that makes the agent, or the agent
+    named: str  # the class, a function that returns the agent, or the agent
     settings: dict[str, Any]  # arguments of the class
-    name: str  # of its process
+    name: str  # name of its process
 
     @classmethod
     def parse(cls, words: Sequence[str], name: str = "") -> "AgentSpec":
@@ -163,7 +163,7 @@ class AgentSpec(NamedTuple):
 
         Raises:
             RunError: a setting or a name is malformed.
-            DocumentError: there is no such class.
+            DocumentError: the class does not exist.
         """
         given, _, named = words[0].rpartition("=")
         settings: dict[str, Any] = {}
@@ -179,7 +179,7 @@ class AgentSpec(NamedTuple):
         return cls(named, settings, keys.name(name or given or process_name(made)))
 
     def words(self) -> list[str]:
-        """Return the words from which `parse` makes it."""
+        """Return the words from which `parse` creates it."""
         named = f"{self.name}={self.named}"
         return [named, *(f"{setting}={json.dumps(value)}" for setting, value in self.settings.items())]
 
@@ -189,13 +189,13 @@ class AgentSpec(NamedTuple):
 
 
 def process_name(made: Agent | Callable[..., Agent]) -> str:
-    """Return the process name of a user's agent, or of one that a class or function will make."""
+    """Return the process name of a user's agent, or of the one that a class or function will create."""
     name = getattr(made, "name", None)
     return name if isinstance(name, str) else default_name(type(made) if isinstance(made, Agent) else made)
 
 
 def without_map(info: Info, scenario: Scenario) -> tuple[Info, Scenario]:
-    """Return info and scenario without obstacles and surfaces, for an agent that is not granted the map."""
+    """Return info and scenario without obstacles and surfaces, for an agent without access to the map."""
     bare = replace(scenario, environment=replace(scenario.environment, obstacles=[], surfaces=UNSET))
     return replace(info, scenario=to_text(bare)), bare
 
@@ -222,10 +222,10 @@ def own_agent(
     """Return a user's agent, ready to join.
 
     Args:
-        made: the agent; or a class or function that makes it from `settings`, its parameters, and from `info`,
+        made: the agent; or a class or function that creates it from `settings`, its parameters, and from `info`,
             `scenario` and the name of its `drone` or `cluster`, if it takes arguments of these names.
         name: name of its process; empty for the agent's own.
-        per: "drone" or "cluster" if the name is that of an agent of one.
+        per: "drone" or "cluster" for an agent of one.
 
     Raises:
         UserCodeError: the class raised.
@@ -238,7 +238,7 @@ def own_agent(
         kind = f"{made.__module__}:{made.__qualname__}" if isinstance(made, type | FunctionType) else show(made)
         try:
             taken = signature(made)
-        except ValueError as error:  # of a partial, whose arguments it does not take
+        except ValueError as error:  # a partial whose arguments the class does not take
             raise RunError(f"{kind} cannot be made: {error}") from None
         given = {"info": info, "scenario": scenario, per: name.partition(".")[2]}
         given = {key: value for key, value in given.items() if key in taken.parameters}
@@ -266,5 +266,5 @@ def own_agent(
 
 
 def agent_class(role: str) -> Callable[..., Agent]:
-    """Return the class of a role's agents; its module is imported only here, so that hosts of other roles need not."""
+    """Return the class of a role's agents; its module is imported only here: hosts of other roles do not need it."""
     return plugin.load(AGENTS[role].agent, role, Agent)

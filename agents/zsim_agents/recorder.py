@@ -29,7 +29,7 @@ from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import Passed, Traffic, replay, samples
 
 NAME = "recorder"
-PAUSE_S = 0.01  # between two reads of the queue, since each wake-up is costly
+PAUSE_S = 0.01  # interval between reads of the queue, since each wake-up is costly
 TICK_S = 0.1  # interval of checking the open chunk's age and a requested stop
 JOIN_S = 1.0  # wall time after which a join without an event is repeated, since the world may have missed it
 SLACK_NS = 4_000_000_000  # how far the world may be ahead of the record on disk; its history has 5 s
@@ -54,7 +54,7 @@ class Recorder:
 
     Args:
         path: path of the record, which may exist.
-        stopped: tells whether the process must end.
+        stopped: returns whether the process must end.
         say: called with lines for the user.
         deserted: called at the end; True leaves without a bye, like a process that dies.
     """
@@ -100,7 +100,7 @@ class Recorder:
         """Record until the run ends; return why it ended.
 
         Raises:
-            RunError: the world has begun another run; the record is complete as far as it goes.
+            RunError: the world has started another run; the record is complete up to its end.
             RecordError: the disk is full or the file cannot be written; the record up to then is readable.
             SupersededError: another recorder of this name has taken over.
         """
@@ -223,7 +223,7 @@ class Recorder:
             self._known.add(key, payload)
 
     def _replayed(self, before: Clock | None) -> Iterator[Message]:
-        """Yield the world's replay, up to a received clock: later messages are on their way as well."""
+        """Yield the world's replay, up to a received clock: later messages are in transit as well."""
         held: list[Message] = []
         for entry in replay(self._link, NAME, -1, ["**"], REPLAY_S):
             held.append(entry)
@@ -258,7 +258,7 @@ class Recorder:
         self._traffic.wake()
 
     def _is_another_run(self) -> bool:
-        """Tell whether a restored link leads to another run; if not, fetch the missed messages."""
+        """Return whether a restored link leads to another run; if not, fetch the missed messages."""
         while self._links:
             up = self._links.popleft()
             if not up:
@@ -273,7 +273,7 @@ class Recorder:
             return True
         if self._info.mode == "lockstep":
             self._fetch_missed()
-        else:  # the world may be far ahead of the messages on their way
+        else:  # the world may be far ahead of the messages in transit
             self._quiet_since_s = time.monotonic()
             self._is_back = True
         if not self._part.superseded:  # possibly by a missed message
@@ -423,10 +423,10 @@ def is_output(key: str, payload: bytes) -> bool:
 
 
 def is_of_run(path: Path, run_id: str) -> bool:
-    """Tell whether a file is the record of a run, or a record that ends before it names its run.
+    """Return whether a file is the record of a run, or a record that ends before it names its run.
 
     Raises:
-        RecordError: it is no record.
+        RecordError: the file is not a record.
     """
     if not path.exists() or not path.stat().st_size:
         return path.exists()

@@ -33,16 +33,16 @@ from zsim_agents.cameras.detector import PIXELS_MAX, HatDetector, decoded, rehea
 from zsim_agents.cameras.renderer import Renderer
 from zsim_agents.cameras.scene import DroneStates, scene_of
 
-TICK_S = 0.1  # how often a stop is looked for while nothing arrives
+TICK_S = 0.1  # interval of checking for a stop while nothing arrives
 # gates that it may be behind the world, which may be ahead of everybody by the command delay, before it drops pictures:
 # messages that arrive in a burst are no reason yet; more than the slack of cameras that gate
 BEHIND_MAX = 5
 ANSWER_S = 0.5  # wall; the world and cameras answer in milliseconds
 OVERTAKING_S = 0.1  # wall; a bye of higher priority would pass the last pictures, and a recorder close before them
-DRAIN_S = 1.0  # wall; how long to wait for the last truths of a run
-PENDING_MAX = 64  # gates of which the truth of a drone may be missing
-ASK_S = 2.0  # wall; how often a camera is asked what its pixels mean, while that is unknown
-REPORTS_MAX = 5  # lines about refused pictures; health has the count
+DRAIN_S = 1.0  # wall time to wait for the last truths of a run
+PENDING_MAX = 64  # number of gates for which the truth of a drone may be missing
+ASK_S = 2.0  # wall time between requests for a camera's info while it is unknown
+REPORTS_MAX = 5  # maximum number of lines about refused pictures; health has the count
 
 
 class RunProcess:
@@ -63,7 +63,7 @@ class RunProcess:
         raise NotImplementedError
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Begin, and call `turn` until the run ends or the process is stopped."""
+        """Start, and call `turn` until the run ends or the process is stopped."""
         self.begin()
         while not (self._participant.end_reason or stopped()):
             self.turn()
@@ -276,7 +276,9 @@ class DetectorProcess(RunProcess):
     ) -> None:
         self._say = say
         self._drones, self._diameter_m = drones, diameter_m
-        self._pictures: OrderedDict[str, RawSample] = OrderedDict()  # the newest of each camera, longest waiting first
+        self._pictures: OrderedDict[str, RawSample] = (
+            OrderedDict()
+        )  # newest picture of each camera, longest waiting first
         self._infos: dict[str, RawSample] = {}
         self._detectors: dict[str, HatDetector] = {}  # by camera key, as the next two
         self._known: dict[str, CameraInfo] = {}
@@ -380,7 +382,7 @@ class _Eye:
         return round(number * 1e9 / self.camera.rate_hz)
 
     def last_due(self, t_ns: int) -> int:
-        """Return the number of the newest picture available at an instant; -1 before the first."""
+        """Return the number of the newest picture available at a time; -1 before the first."""
         due_ns = t_ns - self.latency_ns
         number = int(due_ns * self.camera.rate_hz / 1e9) + 1
         while number >= 0 and self.exposure_ns(number) > due_ns:
@@ -430,7 +432,7 @@ class TruthHistory:
             del self._pending[min(self._pending)]
 
     def bodies(self, t_ns: int) -> DroneStates | None:
-        """Return all drones at an instant, or None if a neighbouring gate is missing."""
+        """Return all drones at a time, or None if a neighbouring gate is missing."""
         before_ns = t_ns // self._gate_ns * self._gate_ns
         before, after = self._whole.get(before_ns), self._whole.get(before_ns + self._gate_ns)
         if before is None:

@@ -1,14 +1,14 @@
 """Finds magenta hats in a simulated or real picture: bearing and range of each, with standard deviations. Pure.
 
-How magenta a pixel is is a number that is linear where a hat mixes with grass, sky or hull, and zero for orange: the
-share of a pixel that a hat covers is that number over the hat's own. Direction and range follow from the circle of the
-hat's outline, of which rotors may hide a part: a ball of radius r at a distance d has an apparent radius a with
+The magenta level of a pixel is linear in mixtures of a hat with grass, sky or hull, and zero for orange: the share of a
+pixel that a hat covers is its level over the hat's own. Direction and range follow from the circle of the hat's
+outline, which rotors may hide in part: a ball of radius r at a distance d has an apparent radius a with
 sin a = r / d anywhere in the picture.
 
-The edge is searched from outside inwards, in directions all around a point of the ball. The best circle through half
-of the points in a row decides which others are on the same one. Circles are fitted by least squares to
+The edge is searched for from outside inwards, in directions all around a point of the ball. The best circle through a
+run of half of the points determines which other points are on it. Circles are fitted by least squares to
 x^2 + y^2 = 2 a x + 2 b y + c (I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the plane that touches the unit sphere
-at the ball: there it is a circle wherever in the picture it stands.
+at the ball: there it is a circle at any position in the picture.
 """
 
 import math
@@ -28,21 +28,21 @@ from zsim_agents.cameras.scene import View
 Picture = NDArray[np.uint8]
 Levels = NDArray[np.float32]
 
-PIXELS_MAX = 1920 * 1080 * 2  # of a picture that is decoded; twice the limit of a scenario's camera
-LEVEL_MIN = 24  # of 255, of R - G: below it is noise
-SHARE_MIN = 0.3  # of R - G over R: less is no magenta
-BLUE_SHARE = 0.2  # of B - G over R - G: less is orange or red; the paper's magenta has 0.59
+PIXELS_MAX = 1920 * 1080 * 2  # maximum of a decoded picture; twice the limit of a scenario's camera
+LEVEL_MIN = 24  # of 255; smaller R - G is noise
+SHARE_MIN = 0.3  # minimum of (R - G) / R for magenta
+BLUE_SHARE = 0.2  # minimum of (B - G) / (R - G), below it is orange or red; the paper's magenta has 0.59
 BLUE_WEIGHT = 1.5  # subtracted per unit of missing blue
 AREA_MIN_PX = 2  # at half of the resolution
-BLOBS_MAX = 100  # the largest; more are no hats
-ROOM_PX = 4  # around a blob, for its edge and the background
+BLOBS_MAX = 100  # number of largest regions that are examined
+ROOM_PX = 4  # margin around a blob, for its edge and the background
 CORE = 0.5  # of the most magenta; pixels above belong to a hat
 CORE_MIN_PX = 12  # of wholly covered pixels; with fewer the hat's own colour is computed from its blur
 POINT_BLUR_PX2 = 1.1  # px^2, variance by which lens, pixel, JPEG and a mean of nine blur a point; calibrated
 ROUND_MIN = 0.3  # of the smaller variance over the larger; less is no ball
 PIECE_GAP = 0.3  # of a ball's size, between two pieces of it; a guard in front is 0.2 wide
 SHARE_OF_EDGE_MIN = 0.3  # visible; with less the circle is unknown
-DIAMETER_MIN_PX = 4.0  # px; the range of smaller ones has a bias beyond its sigma
+DIAMETER_MIN_PX = 4.0  # px; the range of smaller hats has a bias above its sigma
 # Standard deviations, calibrated, of a centre and of a diameter: px per px of roughness of the edge, px^2 over the
 # diameter (of a centre, in proportion to the hidden part), and px^3 over its square (centre) or px (diameter).
 CENTRE = 2.0, 6.5, 8.0
@@ -57,7 +57,7 @@ EDGE_BLUR_PX2 = 1.1  # px^2, variance of what blurs an edge; a curved edge is ha
 NEAR_PX, NEAR_PX2, NEAR_NOISE = 0.2, 1.0, 6.0
 POINTS_MIN = 5  # of a circle
 REFINEMENTS = 3  # of the set of points on it
-OUTSIDE = 3.0  # cost of a point outside of a circle, over that of one inside: a ball may be hidden, but not protrude
+OUTSIDE = 3.0  # cost of a point outside of a circle over that inside: a ball may be hidden, but cannot protrude
 WHOLE_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of a ball that nothing hides
 SINGULAR = 1e-9  # of a determinant over its value for points all around
 
@@ -100,7 +100,7 @@ class _Box(NamedTuple):
     high: int
 
     def touches(self, other: "_Box") -> bool:
-        """Tell whether the other one is a piece of the same ball: the gap is small compared to this one's size."""
+        """Return whether the other box is a piece of the same ball: the gap is small compared to this box's size."""
         gap = 1 + PIECE_GAP * max(self.wide, self.high)
         across = max(self.u, other.u) - min(self.u + self.wide, other.u + other.wide)
         down = max(self.v, other.v) - min(self.v + self.high, other.v + other.high)
@@ -147,15 +147,15 @@ class HatDetector:
         return whole
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
-        """Return the hat in a box of the picture at half its resolution; None if there is none, or the edge cuts it."""
+        """Return the hat in a box of the picture at half its resolution; None: no hat, or cut by the edge."""
         u, v, wide, high = (2 * side for side in box)
         room = ROOM_PX + max(wide, high) // 6
         u0, v0, u1, v1 = u - room, v - room, u + wide + room, v + high + room
         if u <= 2 or v <= 2 or u + wide >= self._lens.width - 2 or v + high >= self._lens.height - 2:
-            return None  # a part of a hat gives neither bearing nor range
+            return None  # a partial hat gives neither bearing nor range
         part = slice(max(v0, 0), v1), slice(max(u0, 0), u1)
         blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture[part]))
-        level, bluish = red - green, blue - green  # how magenta each pixel is: R - G, less where blue is missing
+        level, bluish = red - green, blue - green  # magenta level of each pixel: R - G, reduced where blue is missing
         lack = np.maximum(np.float32(BLUE_SHARE) * level - bluish, 0) * np.float32(BLUE_WEIGHT)
         level = np.where(level > 0, np.maximum(level - lack, 0), level)
         sides = level[0], level[-1], level[1:-1, 0], level[1:-1, -1]

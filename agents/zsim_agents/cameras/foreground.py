@@ -1,6 +1,6 @@
 """The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
 
-Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look like the console's
+Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look as in the console
 (zsim_bridges.console.scene); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
 
 A ray hits a ball, such as a hat, if it passes the centre within the radius. This is exact anywhere in the picture and
@@ -67,17 +67,17 @@ THICKNESS_MAX_PX = 80
 SEEN_M = 300.0  # m; farther drones are less than a pixel
 ROOM_M = 0.5  # m; no part is farther from the middle of a drone with arms of 0.18 m
 BLURRED_PX = 2.0  # px of motion from which drones are blurred; hulls need not be as exact as hats
-EDGE_PX = 3.0  # px by which smooth edges and the blur may exceed the lines
+EDGE_PX = 3.0  # px by which antialiased edges and blur may extend beyond the lines
 Levels = NDArray[np.float32]
 AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun; chosen: matt foam outdoors
-STEPS_MAX = 6  # instants of an exposure that are drawn of a moving ball
-STEP_PX = 0.8  # px between two of them
+STEPS_MAX = 6  # maximum number of times within an exposure at which a moving ball is drawn
+STEP_PX = 0.8  # px of motion between two of these times
 ROUNDING = np.float32(0.5)
 AXIS = np.array([0.0, 0.0, 1.0])
-NEAR_M = 0.05  # nothing nearer is drawn
+NEAR_M = 0.05  # nothing closer is drawn
 FAR_PX = 16_000.0  # px; coordinates beyond are clipped: they have 32 bits with the fraction, and lines have to end
-SIDES = 24  # of a cylinder
-PIECES = 8  # of an edge that the lens bends
+SIDES = 24  # number of sides that approximate a cylinder
+PIECES = 8  # number of segments of an edge that the lens bends
 OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R, chosen: weathered wood; never magenta
 SURFACE = np.array([102.0, 116.0, 124.0])  # B, G, R, chosen: stone; never magenta
 BENT_PX = 24.0  # px, chosen: the lens bends the edges of larger triangles visibly
@@ -86,7 +86,7 @@ BENT_PX = 24.0  # px, chosen: the lens bends the edges of larger triangles visib
 class DroneImager:
     """Images of the drones of a scene in a camera on the drone `carrier`, over an exposure [s].
 
-    `brightness` is that of the light, as the sensor has it.
+    `brightness` is that of the light on the sensor.
     """
 
     def __init__(self, view: View, scene: Scene, carrier: int, exposure_s: float, brightness: float) -> None:

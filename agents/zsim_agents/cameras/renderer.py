@@ -28,8 +28,10 @@ from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, V
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 BLURRED_PX = 0.8  # px of motion from which the ground is blurred
-WIDER_MAX = 2.0  # of the pinhole picture that a lens bends, over its own; rays beyond it repeat the edge
-MARGIN = 64  # px, by which the noise is larger than the picture
+WIDER_MAX = (
+    2.0  # maximum size of the pinhole picture that a lens distorts, over the final one; beyond, the edge is repeated
+)
+MARGIN = 64  # px by which the noise image exceeds the picture
 NOISE_MAX = 48.0  # grey levels, standard deviation: the limit of the amplified noise
 FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # hats are a few pixels wide
 MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio, whose multiples spread (Knuth, TAOCP 3, 6.4)
@@ -66,7 +68,7 @@ class Renderer:
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # makes up for half of the stops below a clear day; chosen
+        gain = 1.0 / math.sqrt(scene.light)  # chosen: the exposure compensates half of the stops below a clear day
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
@@ -109,7 +111,7 @@ class Renderer:
         things += [(math.dist(place, p_W), "hat", i) for i, place in enumerate(self._scene.hats.false_m)]
         if len(self._scene.surfaces):
             things += [(distance_m, "surface", i) for distance_m, i in self._surfaces.shown(motion)]
-        for _, kind, which in sorted(things, reverse=True):  # the farthest first
+        for _, kind, which in sorted(things, reverse=True):  # farthest first
             if kind == "obstacle":
                 draw_obstacle(picture, self._view, self._scene.obstacles[which], motion, self._brightness)
             elif kind == "surface":
@@ -124,7 +126,7 @@ class Renderer:
                 for layer in drones[which][1]:
                     layer.draw(picture)
         sigma_px = self._camera.blur_px
-        if sigma_px >= 0.2:  # less is less than a pixel's own width
+        if sigma_px >= 0.2:  # shorter motions are below a pixel's width
             side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
             kernel = cv2.getGaussianKernel(side, sigma_px)
             cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)

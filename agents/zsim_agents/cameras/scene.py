@@ -32,7 +32,7 @@ SUN_W = np.array(
         math.sin(SUN_ELEVATION_RAD),
     ]
 )
-BLUR_MAX_PX = 24.0  # px of motion blur; longer motions are blurred like this
+BLUR_MAX_PX = 24.0  # px, maximum length of motion blur; longer motions are blurred by it
 SAMPLES_PER_PX = 8  # of a motion-blur kernel
 ORIGIN = np.zeros(3)
 SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel

@@ -1,7 +1,7 @@
 """The interface of estimators: one object per drone receives its sensors and returns an estimate at every gate.
 
 A scenario chooses one by `estimation: {algorithm: …}`: `ekf`, the default of this package; `paper`; or
-`package.module:Class`, a class of your own with the methods of `DroneEstimator`. It sees only plain objects: sections
+`package.module:Class`, a user's class with the methods of `DroneEstimator`. It sees only plain objects: sections
 of the scenario, messages of the contract, and numbers. For the search path of its module see `zsim.schema.plugin`.
 """
 
@@ -27,7 +27,7 @@ Numbers = Sequence[float] | NDArray[np.float64]
 
 
 class StateEstimate(NamedTuple):
-    """State of a drone at an instant."""
+    """State of a drone at one time."""
 
     position_m: Numbers  # p_WB
     velocity_m_s: Numbers  # v_WB, in W
@@ -44,7 +44,7 @@ class DroneEstimator(Protocol):
 
     A class may have three more methods, for a process that takes over from one that died. `snapshot(self)` returns the
     state of the estimator as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
-    `restore(self, state)` sets it in a new object, which then continues with the same bits. Without them
+    `restore(self, state)` sets it in a new object, which then continues bit-identically. Without them
     `warm_start(self, last)` is called, with the last `zsim.contract.flight_messages.Estimate` that was published.
 
     Args:
@@ -62,8 +62,8 @@ class DroneEstimator(Protocol):
         Readings of a gate come in order of arrival, then of name; some may be late or missing.
 
         Args:
-            sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or of your own.
-            message: message of that sensor, such as `zsim.contract.messages.Imu`; `t_sample_ns` is its instant.
+            sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or a user's sensor.
+            message: message of that sensor, such as `zsim.contract.messages.Imu`; `t_sample_ns` is when it measured.
         """
         ...
 

@@ -51,23 +51,23 @@ from zsim_agents.estimation.strapdown import (
 
 Array = NDArray[np.float64]
 
-LINK_S = 0.4  # s, chosen: what a radio and sparse telemetry add to the latency of an external drone
+LINK_S = 0.4  # s, chosen: latency that a radio and sparse telemetry add for an external drone
 LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
-CLONE_EVERY_S = 0.1  # s, chosen: process noise of half of it is small to any sensor's noise
-CLONED_FROM = 0.01  # of a reading's variance, chosen: less process noise since its instant is neglected
-COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # chosen: a worse reading is used, but not to start with
-ON_ROOF_M = 0.01  # m, chosen: so near to an obstacle a drone starts upon it
+CLONE_EVERY_S = 0.1  # s, chosen: process noise over half of it is small compared to any sensor's noise
+CLONED_FROM = 0.01  # chosen: share of a reading's variance; less process noise since its sampling is neglected
+COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # chosen: noisier readings do not initialise the heading
+ON_ROOF_M = 0.01  # m, chosen: a drone this close to an obstacle starts on it
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest, or in gentle flight
 TILT_SIGMA_RAD = 0.05  # rad: ground that is level to 3 deg
-GYRO_BIAS_MIN = math.radians(0.01)  # rad/s: bias that is allowed for where the scenario has none
-GYRO_WALK_MIN = math.radians(1e-4)  # rad/s/sqrt(s), likewise
-ACCEL_SIGMA_MIN = 0.02  # m/s^2 per sample: lost by sampling and the trapezoidal rule
-GYRO_SIGMA_MIN = 2e-4  # rad/s per sample, likewise
+GYRO_BIAS_MIN = math.radians(0.01)  # rad/s: bias assumed if the scenario has none
+GYRO_WALK_MIN = math.radians(1e-4)  # rad/s/sqrt(s): random walk assumed if the scenario has none
+ACCEL_SIGMA_MIN = 0.02  # m/s^2 per sample: error of sampling and of the trapezoidal rule
+GYRO_SIGMA_MIN = 2e-4  # rad/s per sample: the same error for the gyroscope
 JOLT_SIGMAS = 10.0  # of the accelerometer; the sum of three changes of pure noise is 3.4 on average, 1.5 in spread
-JOLT_MIN_M_S2 = 1.0  # m/s^2 from one sample to the next, beyond the rotors in flight; touching the ground has tens
-# A sensor refused for this long without a break is trusted again, its states losing their certainty [s].
-# Height and velocity are lost quickly where they are wrong; a field may be disturbed in passing.
+JOLT_MIN_M_S2 = 1.0  # m/s^2 between samples: above the rotors' vibration in flight; ground contact causes tens
+# A sensor refused continuously for this long is trusted again, after its states' variances are increased [s].
+# Wrong heights and velocities diverge quickly; a magnetic field may be disturbed temporarily.
 PATIENCE_S = {"gps": 10.0, "mag": 10.0, "baro": 5.0, "sonar": math.inf, "flow": 1.0}
 
 
@@ -75,7 +75,7 @@ class UpdateChannel(NamedTuple):
     """A quantity that an aiding sensor measures.
 
     Attributes:
-        field: of the sensor's section in a scenario, which holds the error model.
+        field: field of the sensor's section in a scenario that contains the error model.
         sigma_min: model error, so that a scenario without noise does not give infinite confidence.
     """
 
@@ -226,8 +226,8 @@ class DroneSetup:
     def _floor_m(self) -> float:
         """Return the height of the roof on which the drone starts [m], 0 on the ground.
 
-        Its first heights come from the sonar alone, and would be wrong by the height of the roof. Over other obstacles
-        the readings of the sonar are refused as outliers.
+        The first heights come from the sonar alone and would be wrong by the height of the roof. Above other obstacles,
+        sonar readings are refused as outliers.
         """
         x, y, z = self._drone.position_m
         away_m = float(Surroundings(self._environment).distances_m((x, y, z))[0])
@@ -271,7 +271,7 @@ class DroneSetup:
     def layout(self) -> list[int]:
         """Return the columns LAYOUT."""
         estimation, mag, mount = self._estimation, self._drone.sensors.mag.field_ut, self._drone.sensors.imu.mount
-        # whether one reading of the magnetometer gives a heading as good as setting the drone down by eye does
+        # whether one magnetometer reading gives a heading as accurate as setting the drone down by eye
         horizontal_ut = el.length(self._environment.magnetic_field_ut[:2])
         sideways_ut = el.hypot(HEADING_CHANNEL.sigma(self._drone.sensors), el.hypot(mag.bias, mag.correlated_sigma))
         has_compass = estimation.magnetometer and sideways_ut <= COMPASS_SIGMA_RAD * horizontal_ut

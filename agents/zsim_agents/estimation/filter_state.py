@@ -16,7 +16,7 @@ Array = np.ndarray
 IMU, GPS, MAG, BARO, SONAR, FLOW = (SENSORS.index(name) for name in ("imu", "gps", "mag", "baro", "sonar", "flow"))
 SIZES = (6, 6, 3, 1, 1, 3)  # values of a reading of each sensor
 VALUES_MAX = max(SIZES)
-CHANNELS = 4  # biases of a sensor at most: of two channels, each a constant or walking one and a Gauss-Markov process
+CHANNELS = 4  # maximum biases per sensor: two channels, each with a constant or random walk and a Gauss-Markov process
 
 _MOMENT_FIELDS = (
     Field("t", "s"),
@@ -24,11 +24,11 @@ _MOMENT_FIELDS = (
     Field("v_WB", "m/s", 3),
     Field("q_WB", "1", 4),
     Field("w_WB_B", "rad/s", 3),  # of the last sample of the IMU, without its bias
-    Field("p_corrected", "m", 3),  # by the filter, in all
+    Field("p_corrected", "m", 3),  # sum of the filter's corrections
     Field("v_corrected", "m/s", 3),
 )
 MOMENT = columns("Moment", _MOMENT_FIELDS)
-NOMINAL = columns(  # begins like a moment, so that one function reads both
+NOMINAL = columns(  # starts with the fields of a moment, so that one function reads both
     "Nominal",
     (
         *_MOMENT_FIELDS,
@@ -36,26 +36,26 @@ NOMINAL = columns(  # begins like a moment, so that one function reads both
         Field("f_B", "m/s^2", 3),  # of the last sample of the IMU, without its bias
         Field("gyro_bias", "rad/s", 3),
         Field("accel_bias", "m/s^2", 3),
-        Field("t_start", "s"),  # of the interval since the last gate, as the next four
+        Field("t_start", "s"),  # start of the interval since the last gate; the next four belong to it
         Field("v_start", "m/s", 3),
         Field("dt_squared", "s^2"),  # sum of the squared steps of the IMU
-        Field("lost_velocity", "m^2/s^2"),  # variance to add for samples that are missing
+        Field("lost_velocity", "m^2/s^2"),  # variance added for missing samples
         Field("lost_turn", "rad^2"),  # likewise
-        Field("t_first_gate", "s"),  # not a number before
-        Field("t_sample", "s", len(SENSORS)),  # last reading of each sensor
-        Field("refused_since", "s", len(SENSORS)),  # not a number while a sensor is trusted
+        Field("t_first_gate", "s"),  # NaN before the first gate
+        Field("t_sample", "s", len(SENSORS)),  # time of each sensor's last reading
+        Field("refused_since", "s", len(SENSORS)),  # NaN while a sensor is trusted
     ),
 )
 
-CLONE = columns(  # a former position and velocity whose errors stand in the error state, for readings that come late
+CLONE = columns(  # a past position and velocity with errors in the error state, for late readings
     "Clone",
     (
-        Field("t", "s"),  # not a number where there is none
-        Field("p_corrected", "m", 3),  # in all by then
+        Field("t", "s"),  # NaN for an unused clone
+        Field("p_corrected", "m", 3),  # sum of the corrections up to t
         Field("v_corrected", "m/s", 3),
     ),
 )
-CLONED = 6  # states of a clone: position and velocity, the first of the error state
+CLONED = 6  # states of a clone: position and velocity, the first states of the error state
 
 SENSOR = columns(  # settings of a sensor
     "Sensor",
@@ -74,10 +74,10 @@ SETTING = columns(
     (
         Field("gravity", "m/s^2"),
         Field("beta", "rad/s"),  # Madgwick's gain
-        Field("period", "s"),  # of the IMU
+        Field("period", "s"),  # sampling period of the IMU
         Field("coast_after", "s"),
         Field("jolt", "m/s^2"),
-        Field("age_max", "s"),  # of a reading
+        Field("age_max", "s"),  # maximum age of a reading
         Field("set_down_yaw", "rad"),
         Field("accel_variance", "m^2/s^4"),
         Field("gyro_variance", "rad^2/s^2"),
@@ -85,27 +85,27 @@ SETTING = columns(
         Field("levelling", "s"),
         Field("clone_every", "s"),
         Field("field_W", "uT", 3),
-        Field("floor", "m"),  # z of what it starts upon, over which the sonar measures
+        Field("floor", "m"),  # z of the surface under the start, above which the sonar measures
         Field("sensors", "1", len(SENSORS) * SENSOR.size),
     ),
 )
 
-BIAS = columns("Bias", (Field("state", "1"), Field("row", "1"), Field("axes", "1")))  # state is -1 where there is none
+BIAS = columns("Bias", (Field("state", "1"), Field("row", "1"), Field("axes", "1")))  # state is -1 for no bias
 
 LAYOUT = columns(
     "Layout",
     (
-        Field("states", "1"),  # of the error state, clones included
+        Field("states", "1"),  # size of the error state, clones included
         Field("clones", "1"),
-        Field("first_clone", "1"),  # its first state; clones are the last ones
-        Field("history", "1"),  # entries of the ring
+        Field("first_clone", "1"),  # index of its first state; clones are the last states
+        Field("history", "1"),  # number of entries of the ring
         Field("imu_displaced", "1"),
-        Field("accel_bias", "1"),  # whether one is estimated
-        Field("aiding_biases", "1"),  # whether there are any, or clones
-        Field("correlated", "1"),  # whether a bias is a Gauss-Markov process
-        Field("magnetometer", "1"),  # whether it is used
-        Field("compass", "1"),  # whether one reading of it gives a heading to start with
-        Field("flow", "1"),  # likewise
+        Field("accel_bias", "1"),  # whether an accelerometer bias is estimated
+        Field("aiding_biases", "1"),  # whether there are biases of aiding sensors, or clones
+        Field("correlated", "1"),  # whether any bias is a Gauss-Markov process
+        Field("magnetometer", "1"),  # whether the magnetometer is used
+        Field("compass", "1"),  # whether one of its readings can initialise the heading
+        Field("flow", "1"),  # whether optical flow is used
         Field("biases", "1", len(SENSORS) * CHANNELS * BIAS.size),
     ),
 )
@@ -113,11 +113,11 @@ LAYOUT = columns(
 COUNT = columns(
     "Count",
     (
-        Field("running", "1"),  # 0 or 1, as the next
+        Field("running", "1"),  # 0 or 1, like the next field
         Field("heading_known", "1"),
-        Field("kept", "1"),  # entries of the history
-        Field("newest", "1"),  # of them
-        Field("used", "1", len(SENSORS)),  # readings
+        Field("kept", "1"),  # number of entries of the history in use
+        Field("newest", "1"),  # index of the newest one
+        Field("used", "1", len(SENSORS)),  # used readings by sensor
         Field("refused", "1", len(SENSORS)),
         Field("sightings_used", "1"),
         Field("sightings_refused", "1"),
@@ -152,7 +152,7 @@ ESTIMATE = columns(
 Reckoning = tuple[Vector, Vector, Quaternion, Vector, Vector, Vector]
 """p_WB [m], v_WB [m/s], q_WB, a_WB [m/s^2; W]; rate [rad/s] and specific force [m/s^2] in B, bias-free."""
 Moment = tuple[float, Vector, Vector, Quaternion, Vector, Vector, Vector]
-"""t [s], p, v, q, w, and the filter's corrections of p and v in all by then."""
+"""t [s], p, v, q, w, and the sums of the filter's corrections of p and v up to t."""
 
 
 class Rows(NamedTuple):
@@ -160,20 +160,29 @@ class Rows(NamedTuple):
 
     nominal: NDArray[np.float64]  # (N, NOMINAL.size)
     counts: NDArray[np.int64]  # (N, COUNT.size)
-    covariance: NDArray[np.float64]  # (N, n, n), of the error state
-    bias: NDArray[np.float64]  # (N, n), of the aiding sensors, and what clones were corrected by since they were made
+    covariance: NDArray[np.float64]  # (N, n, n), covariance of the error state
+    bias: NDArray[np.float64]  # (N, n), biases of aiding sensors, and the corrections of clones since their creation
     history: NDArray[np.float64]  # (N, entries, MOMENT.size), a ring of past gates
-    clones: NDArray[np.float64]  # (N, most clones of a drone, CLONE.size)
+    clones: NDArray[np.float64]  # (N, maximum number of clones of a drone, CLONE.size)
     setting: NDArray[np.float64]  # (N, SETTING.size)
     layout: NDArray[np.int64]  # (N, LAYOUT.size)
-    walk: NDArray[np.float64]  # (N, n), unit^2/s
-    decay: NDArray[np.float64]  # (N, n), 1/s, of Gauss-Markov biases; zero elsewhere
-    limits: NDArray[np.float64]  # (7,), of the innovation gates by number of rows
-    joint: NDArray[np.float64]  # (N n, N n), covariance of all of them together; (0, 0) where each stands for itself
-    sighted: NDArray[np.float64]  # (N, N), when a sighting of one drone by another was used last [s]; (0, 0) likewise
+    walk: NDArray[np.float64]  # (N, n), random walks of biases [unit^2/s]
+    decay: NDArray[np.float64]  # (N, n), decay of Gauss-Markov biases [1/s]; zero elsewhere
+    limits: NDArray[np.float64]  # (7,), limits of the innovation gates by number of rows
+    joint: NDArray[np.float64]  # (N n, N n), joint covariance of all drones; (0, 0) for separate filters
+    sighted: NDArray[np.float64]  # (N, N), time of the last used sighting between two drones [s]; (0, 0) as above
 
 
-STATES = "nominal", "counts", "covariance", "bias", "history", "clones", "joint", "sighted"  # the others are settings
+STATES = (
+    "nominal",
+    "counts",
+    "covariance",
+    "bias",
+    "history",
+    "clones",
+    "joint",
+    "sighted",
+)  # the other fields are settings
 
 
 @inlined

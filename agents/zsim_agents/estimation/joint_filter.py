@@ -2,7 +2,7 @@
 
 Each estimator of such a cluster reads the sensors of all its drones and computes the same filter; it publishes the
 estimates of its own drones. For a sighting, the owner of the hat is identified, then both drones are corrected. A
-sighting is compared with the states of both drones at the instant of its picture. Errors are defined as in strapdown.
+sighting is compared with the states of both drones at the time of its picture. Errors are defined as in strapdown.
 """
 
 import math
@@ -36,7 +36,7 @@ from zsim_agents.estimation.kalman_update import (
 from zsim_agents.estimation.measurement_update import correct_all
 from zsim_agents.estimation.strapdown import ATTITUDE, POSITION, VELOCITY, move_columns, recall_known
 
-SIGHTINGS_MAX = 1000  # used per gate; more are a flood
+SIGHTINGS_MAX = 1000  # maximum number used per gate; more are a flood
 PICTURES_KEPT = 256  # the last that were used; of 12 drones at 15 Hz, those of 1.4 s
 SIGHTING = columns(  # of one hat
     "SightingColumns",
@@ -57,8 +57,8 @@ AMBIGUITY = 10.0
 # Standard deviations by which the places of two hats must differ: while the filter knows them less well, as when GPS is
 # averaged on the ground, one hat is occasionally taken for another, and stays so.
 APART = 6.0
-NEAREST_M = 0.1  # nearer, a direction is not defined
-RANGE_MAX_M = 1e4  # no hat is seen farther away
+NEAREST_M = 0.1  # closer, a direction is undefined
+RANGE_MAX_M = 1e4  # maximum distance at which a hat is seen
 SIGMA_MIN_RAD, SIGMA_MIN_M = 1e-4, 1e-3  # lost by interpolating past states
 NOBODY = -1
 
@@ -265,7 +265,7 @@ def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
 
 @portable
 def is_possible(rows: Rows, sighting: Array) -> bool:
-    """Tell whether time and values of a sighting are plausible."""
+    """Return whether time and values of a sighting are plausible."""
     i = int(sighting[SIGHTING.drone])
     age_s = sighting[SIGHTING.t_arrival] - sighting[SIGHTING.t_sample]
     good = 0.0 <= age_s <= rows.setting[i, SETTING.age_max] and rows.counts[i, COUNT.heading_known] != 0

@@ -61,21 +61,21 @@ from zsim_agents.estimation.strapdown import (
     write_minus_cross,
 )
 
-ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
-YAW = ATTITUDE + 2  # place in the error state
-VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would cost all others their digits
-SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
+ROWS_MAX = 32  # maximum rows of a stacked update; further measurements of a gate go into a second one
+YAW = ATTITUDE + 2  # indices in the error state
+VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would cost all others precision
+SQUARE_MAX = 1e8  # maximum innovation, in its unit; more would cost the covariance precision
 HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which sets the heading
 SET_DOWN_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye, where there is no magnetometer
-MOVES_SIGMAS = 2.0  # of the velocity, chosen: the estimate of a drone at rest exceeds it in 2 % of the samples
+MOVES_SIGMAS = 2.0  # of the velocity's sigma, chosen: the estimate of a drone at rest exceeds it in 2 % of the samples
 DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little meanwhile
 HEADING_WAIT_S = 1.0  # s without a reading of the magnetometer, after which the scenario's heading is used
-COSINE_MIN = 0.1  # of the sonar's ray to the vertical; beyond 84 deg it does not hit the ground below
+COSINE_MIN = 0.1  # minimum cosine of the sonar's ray to the vertical; beyond 84 deg it misses the ground below
 
 
 @inlined
 def accept(rows: Rows, i: int, reading: Array) -> bool:
-    """Tell whether to use an aiding reading at the end of the gate.
+    """Return whether to use an aiding reading at the end of the gate.
 
     A reading that is out of order, too old or not finite is counted as refused; duplicates and sonar readings without
     an echo are not counted.
@@ -264,7 +264,7 @@ def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> 
 
 @inlined
 def is_denied(rows: Rows, i: int, kind: int) -> bool:
-    """Tell whether a drone that sees or is seen by this one trusts its own sensor of a kind: then this one is wrong."""
+    """Return whether a drone seen by or seeing this one trusts its own sensor of a kind: then this sensor is wrong."""
     for j in range(rows.sighted.shape[0]):
         last_s = max(rows.sighted[i, j], rows.sighted[j, i])
         trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
@@ -275,7 +275,7 @@ def is_denied(rows: Rows, i: int, kind: int) -> bool:
 
 @portable
 def inflate(rows: Rows, i: int, P: Array, kind: int, z: Array, expected: Array, at: int) -> None:
-    """Widen the states observed by a long refused sensor to its innovation, so that it is used again."""
+    """Increase the variances of the states observed by a long-refused sensor, so that it is used again."""
     row, layout = rows.nominal[i], rows.layout[i]
     squares, total = np.zeros(VALUES_MAX), 0.0
     for k in range(SIZES[kind]):
@@ -314,7 +314,7 @@ def correct(
 ) -> Array:
     """Use a stack of measurements, (m,) each, with blocks (b, 2); return the covariance.
 
-    All are tested together; if that fails, those outside their own gates are omitted.
+    All are tested together; if that fails, those outside of their own gates are omitted.
     """
     y, distances = z - expected, np.zeros(ROWS_MAX)
     if rows.joint.shape[0]:

@@ -66,8 +66,8 @@ from zsim_agents.estimation.filter_state import (
 )
 from zsim_agents.estimation.kalman_update import predict_jointly, predicted_covariance
 
-POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # first index of each in the error state
-HORIZONTAL_MIN = 1e-6  # of a squared unit vector; nearer to the zenith a heading is not defined
+POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # first index of each error in the error state
+HORIZONTAL_MIN = 1e-6  # minimum squared horizontal part of a unit vector; closer to the zenith, a heading is undefined
 # Mean of a unit vector in the plane along a small offset e under noise s per axis: slope * e/s.
 UNIT_VECTOR_SLOPE = math.sqrt(math.pi / 8)
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -82,7 +82,7 @@ COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 @inlined
 def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
-    """Propagate to the instant of an IMU sample; ignore a duplicate, refuse and count a late or impossible sample.
+    """Propagate to the time of an IMU sample; ignore a duplicate, refuse and count a late or impossible sample.
 
     `accel` is the specific force [m/s^2], `gyro` the body rate [rad/s], both in S.
     """
@@ -117,7 +117,7 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
 
 @inlined
 def possible(accel: Vector, gyro: Vector) -> bool:
-    """Tell whether values are possible for an IMU; NaN fails each comparison."""
+    """Return whether values are possible for an IMU; NaN fails each comparison."""
     good = True
     for k in range(3):
         good = good and abs(accel[k]) < ACCEL_MAX_M_S2 and abs(gyro[k]) < GYRO_MAX_RAD_S
@@ -263,7 +263,7 @@ def clone(rows: Rows, i: int, J: Array, first: int) -> None:
 
 @inlined
 def remember(counts: Array, history: Array, longest: int, now: Moment) -> None:
-    """Add the present instant, the newest, to the history."""
+    """Add the present moment to the history as its newest entry."""
     newest = counts[COUNT.newest] + 1 if counts[COUNT.kept] else 0
     if newest == longest:
         newest = 0

@@ -166,7 +166,7 @@ class ControlLaw(ABC):
         """Return the command of this gate; arguments as in `rates`, and dt_s, the time since the last command [s].
 
         Raises:
-            UserCodeError: `rates` of a user's law returned a wrong number of rates, or a non-finite one.
+            UserCodeError: `rates` of a user's law returned an array of wrong size or a non-finite rate.
         """
         n, order = self.space.n, self._order
         r_dot = self.rates(c, p_W, v_W, c_des, c_dot_des)
@@ -228,7 +228,7 @@ LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock l
 
 
 class Map(NamedTuple):
-    """Obstacles and surfaces of the scenario in W, including those of its forest, corridor and cloud."""
+    """Obstacles and surfaces of the scenario, in W, including those of its forest, corridor and cloud."""
 
     obstacles: Sequence[Obstacle]
     surfaces: Sequence[Surface]
@@ -312,7 +312,7 @@ def grants_of(cluster: Cluster, environment: Environment) -> Grants:
 
 
 def granted(law: Any, grants: Grants) -> Any:
-    """Return a subclass of a law's class whose instances receive these grants in the constructor of `ControlLaw`."""
+    """Return a subclass of a law's class whose instances have these grants from the constructor of `ControlLaw` on."""
     own = {"_granted": grants, "__module__": law.__module__, "__qualname__": law.__qualname__, "__doc__": law.__doc__}
     return type(law.__name__, (law,), own)
 
@@ -382,7 +382,7 @@ def numbered(order: Order) -> Pairs:
 def limited(
     r_dot: Array, p_W: Array, v_W: Array, v_cmd_W: Array, yaw_rate: Array, order: Order, *limits_of: float
 ) -> tuple[float, int, int]:
-    """Write velocities (n, 3) and yaw rates (n,) of r_dot (4n,), saturated and guarded.
+    """Write the saturated and guarded velocities (n, 3) and yaw rates (n,) of r_dot (4n,).
 
     Returns the factor of the saturation, then the result of `hold_apart`. limits_of are the fields of RobotLimits:
     passing a tuple to compiled code takes longer than the computation.

@@ -30,7 +30,7 @@ class Controller(Agent):
     """Flies one cluster.
 
     Raises:
-        RunError: the scenario has no such cluster, or its plan can never be flown.
+        RunError: the scenario has no such cluster, or its plan is impossible.
     """
 
     def __init__(self, info: messages.Info, scenario: Scenario, cluster: str) -> None:

@@ -73,7 +73,7 @@ class Engagement:
         plan: requests of the scenario; a landing request drops the remaining ones.
 
     Raises:
-        ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
+        ValueError: the plan is impossible (see `FlightPlan`), or the number of names is not n.
     """
 
     def __init__(
@@ -301,7 +301,7 @@ class Engagement:
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
     def _mode_commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
-        """Return a mode command for each drone in one of the states, once per RESEND_S."""
+        """Return mode commands for drones in one of the states, at most once per RESEND_S each."""
         due = []
         for drone, state in zip(self.drones, gate.states, strict=True):
             if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= RESEND_S:
@@ -332,7 +332,7 @@ class Engagement:
         return self._output(gate, reason, command=command)
 
     def _judge(self, gate: GateInput) -> None:
-        """Set the fault of an engaged formation, or clear it after a time without faults."""
+        """Set the fault of an engaged formation, or clear it after HEAL_S without a fault."""
         fault = self._way_fault(gate) or self.check.flight_fault(gate)
         if not fault and not self._fault:  # the checks of a request cover only a limited time of the reference
             try:

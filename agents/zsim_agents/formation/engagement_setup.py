@@ -1,9 +1,9 @@
 """Builds the engagement of a scenario's cluster from space, gains, law and plan, and rehearses it before the flight.
 
-A plan is checked before the flight from the drones' start positions. A plan that the guidance would certainly refuse
-throughout the flight, or that ends before any formation could begin it, is refused here, with the factor by which its
-time must be stretched. Limits are slightly wider than in flight, since the formation is never exactly at its start
-position: cases in between are left to the guidance, which checks them again twice a second while the formation hovers.
+A plan is checked before the flight, from the drones' start positions. Refused are plans that the guidance would
+certainly refuse throughout the flight, with the factor by which their times must be stretched, and plans that end
+before any formation could start them. Limits are slightly wider than in flight, since the formation is never exactly
+at its start position; the guidance decides on cases in between, twice a second while the formation hovers.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class PlannedMotion(NamedTuple):
 
 
 def planned_motion(scenario: Scenario, cluster: Cluster) -> PlannedMotion | None:
-    """Return the target or trajectory of a flyable plan, None without one.
+    """Return the last target or trajectory of a valid plan, None if it has none.
 
     Raises:
         RunError: as in `check_plan`.

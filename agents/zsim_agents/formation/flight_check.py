@@ -119,7 +119,7 @@ class Setpoint(Struct, eq=False):
 
 
 def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | None, ...]:
-    """Return setpoints from velocities (n, 3) and yaw rates (n,), None for a drone that does not follow setpoints."""
+    """Return setpoints from velocities (n, 3) and yaw rates (n,), None for drones that do not follow them."""
     every = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
     if AIRBORNE.issuperset(gate.states):
         return tuple(every)
@@ -150,7 +150,7 @@ class GateOutput(Struct, eq=False):
 
 
 class FlightCheck:
-    """Checks the estimates and states of a gate; each check returns the fault, or None.
+    """Checks the estimates and states of a gate; each check returns a fault or None.
 
     Attributes:
         value: (4n,) cluster of the newest estimates that had a frame, zero before the first.
@@ -184,7 +184,7 @@ class FlightCheck:
             self._no_frame = str(error)
 
     def take_off_fault(self, gate: GateInput, assembles: bool = False) -> str | None:
-        """Return why the drones may not take off; the positions of drones already in flight do not matter.
+        """Return why the drones may not take off; airborne drones are not checked for their positions.
 
         `assembles`: whether they will fly to assigned positions, so that they may start in any shape.
         """

@@ -32,11 +32,11 @@ class RefusalError(ValueError):
 
 
 class PlanError(ValueError):
-    """A plan can never be flown; the message begins with the path of the wrong value, from `plan`."""
+    """An impossible plan; the message starts with the path of the wrong value, from `plan`."""
 
 
 class RequestError(ValueError):
-    """A request cannot be understood; the message names the field, finding and remedy."""
+    """A request is malformed; the message names the field, finding and remedy."""
 
 
 REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError)
@@ -121,7 +121,7 @@ class Scheduled:
 
 
 class FlightPlan:
-    """Requests in order; each waits for the previous ones, except Order.LAND, which drops them.
+    """Requests in order; each waits for the previous ones, except Order.LAND, which drops those before it.
 
     A restarted controller continues at the `resume_at` of its predecessor.
 
@@ -129,7 +129,7 @@ class FlightPlan:
         note: which step of the plan waits and why, empty if none does.
 
     Raises:
-        PlanError: a request can never be granted (unknown name, bad expression), or times decrease.
+        PlanError: a request is invalid (unknown name, bad expression), or times decrease.
     """
 
     def __init__(self, space: ClusterSpace, steps: Sequence[Scheduled] = ()) -> None:
@@ -263,7 +263,7 @@ def read_request(op: object, args: object = None) -> FlightRequest:
     """Return the request of an operation on the wire, e.g. ("target", {"values": {"z_c": 12.0}}).
 
     Raises:
-        RequestError: unknown operation or field, or a field of a wrong type.
+        RequestError: an unknown operation or field, or a field of the wrong type.
     """
     if not isinstance(op, str) or op not in OPERATIONS:
         raise RequestError(f"op {str(op)[:40]!r} is unknown; allowed: {', '.join(OPERATIONS)}")

@@ -55,7 +55,7 @@ class Guidance:
         self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last result of `value`
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        """Return c_des and its rate, each (4n,); computed once per gate."""
+        """Return c_des and its rate, each (4n,); cached per gate."""
         if self._known is None or self._known[0] is not self._flown or self._known[1] != t_s:
             self._known = (self._flown, t_s, self._flown.value(t_s))
         return self._known[2]
@@ -98,7 +98,7 @@ class Guidance:
         self._home, self.paused = home, False
 
     def pause(self, t_s: float) -> None:
-        """Come to rest near the present reference; immediately if there is no room for a ramp."""
+        """Come to rest near the present reference, or immediately if no ramp is allowed."""
         c, c_dot = self.value(t_s)
         try:
             self._flown = self._planner.ramp((c, c_dot), Hold(c), t_s)
@@ -146,7 +146,7 @@ class RampPlanner:
     def ramp(self, start: tuple[Array, Array], onto: Reference, start_s: float, over_s: float | None = None) -> Ramp:
         """Return the ramp from start (c, c_dot) onto a reference, in over_s or as fast as the limits allow.
 
-        The ramp and up to 600 s of the reference after it are checked.
+        The ramp and up to HORIZON_S of the reference are checked.
 
         Raises:
             TrajectoryError: the ramp is too fast or too long, or leads through a forbidden state.
@@ -173,7 +173,7 @@ class RampPlanner:
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
-        """Return the fastest ramp within speed limits, its path unchecked; TrajectoryError: it takes over an hour."""
+        """Return a fast ramp within the speed limits, its path unchecked; TrajectoryError: it takes over an hour."""
         over_s = RAMP_MIN_S
         while over_s <= RAMP_MAX_S:
             ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
@@ -192,7 +192,7 @@ class RampPlanner:
         return load(*robot_rates(self._space, c, c_dot), self._gains.limits)
 
     def reference_fault(self, reference: Reference, from_s: float, to_s: float) -> str | None:
-        """Return why a reference may not be flown from from_s to to_s, or None; sampled 41 to 301 times."""
+        """Return why a reference is not allowed from from_s to to_s, or None; sampled 41 to 301 times."""
         count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
         count = count if to_s > from_s else 1
         for t_s in np.linspace(from_s, to_s, count).tolist():

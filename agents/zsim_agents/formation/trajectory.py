@@ -91,7 +91,7 @@ class Shifted:
 
 
 class ExpressionTrajectory:
-    """Variables as expressions of t; variables without one stay at base (4n,).
+    """Variables as expressions of t; those without an expression stay at base (4n,).
 
     Args:
         expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4, "yaw_deg": "6*t"}.

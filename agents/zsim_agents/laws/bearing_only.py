@@ -3,10 +3,10 @@
     u_i = -k sum_{j in N_i} P(g_ij) g_ij*,    g_ij = z_ij / |z_ij|,    P(g) = I - g g^T       (1)
 
 Zhao, Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans. Automatic Control 61
-(2016), arXiv:1408.6552. The centroid and the scale s = sqrt(mean |p_i - centroid|^2) are constant, so that the figure
-attains its shape and attitude at its initial size; V = 1/2 |p - p*|^2 decreases. It must be infinitesimally bearing
-rigid: the rank of the bearing rigidity matrix is d n - d - 1. All drones need a common compass. The point-reflected
-figure is an unstable equilibrium.
+(2016), arXiv:1408.6552. The centroid and the scale s = sqrt(mean |p_i - centroid|^2) are constant, so that the
+formation attains its shape and attitude at its initial size; V = 1/2 |p - p*|^2 decreases. It must be infinitesimally
+bearing rigid: the rank of the bearing rigidity matrix is d n - d - 1. All drones need a common compass. The
+point-reflected shape is an unstable equilibrium.
 """
 
 from typing import Annotated
@@ -25,7 +25,7 @@ def bearing_only(relative: list[tuple[Array, Array]], k: float) -> Array:
     """Return u_i of (1) [m/s].
 
     Args:
-        relative: of each neighbour the bearing g_ij, and the wanted one (d,).
+        relative: bearing g_ij and desired bearing g_ij* of each neighbour, (d,) each.
         k: gain [m/s].
     """
     size = len(relative[0][0]) if relative else 2
@@ -33,7 +33,7 @@ def bearing_only(relative: list[tuple[Array, Array]], k: float) -> Array:
 
 
 def bearing_rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
-    """Return R_B (m d, n d) of places (n, d) and edges (i, j): the derivative of the bearings."""
+    """Return R_B (m d, n d) for positions (n, d) and m edges (i, j): the derivative of the bearings."""
     places = np.asarray(p, float)
     n, d = places.shape
     R = np.zeros((len(edges), d, n, d))
@@ -46,7 +46,7 @@ def bearing_rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array
 
 
 class BearingOnly(ShapePilot):
-    """By default the first two drones are informed: pinned to their places they fix the figure's size."""
+    """By default the first two drones are informed: their pinned positions determine the scale."""
 
     class Parameters(ShapeParameters):
         gain_m_s: Annotated[float, Meta(gt=0, le=20)] = 2.0

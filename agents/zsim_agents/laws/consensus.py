@@ -3,7 +3,7 @@
     u_i = k sum_{j in N_i} ((p_j - p_i) - (c_j - c_i))        (1)
 
 Olfati-Saber, Fax, Murray, Consensus and cooperation in networked multi-agent systems, Proc. IEEE 95 (2007), with the
-displacement from the own place as the agreement state. On a connected, undirected graph the errors about their mean
+displacement p_i - c_i as the agreement state. On a connected, undirected graph the errors about their mean
 decay at the rate k lambda_2 of its Laplacian, and the mean is constant.
 """
 
@@ -15,7 +15,7 @@ def consensus(relative: list[tuple[Array, Array]], k: float) -> Array:
     """Return u_i of (1) [m/s].
 
     Args:
-        relative: of each neighbour p_j - p_i and c_j - c_i (d,) [m].
+        relative: p_j - p_i and c_j - c_i of each neighbour, (d,) each [m].
         k: gain [1/s].
     """
     return k * added([z - c for z, c in relative], len(relative[0][0]) if relative else 2)

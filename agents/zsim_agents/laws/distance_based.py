@@ -3,11 +3,12 @@
     u_i = k sum_{j in N_i} (|z_ij|^2 - d_ij^2) z_ij,    z_ij = p_j - p_i       (1)
 
 Krick, Broucke, Francis, Stabilisation of infinitesimally rigid formations of multi-robot networks, Int. J. Control 82
-(2009). It is the descent of V = 1/4 sum e_ij^2, e_ij = |z_ij|^2 - d_ij^2, over the edges: dV/dt = -sum |u_i|^2 / k, and
-the centroid stays. The figure must be infinitesimally rigid: the rank of its rigidity matrix R, a row z_ij, z_ji for
-each edge, is 2 n - 3 in the plane and 3 n - 6 in space. Then errors decay near it at the rate 2 k lambda_min(R R^T),
-for as many edges as that rank. Convergence is local: collinear drones stay collinear, and a corner with two edges may
-settle on the wrong side. Inconsistent distances at the two ends of an edge make the figure drift.
+(2009). It is the gradient descent of V = 1/4 sum e_ij^2, e_ij = |z_ij|^2 - d_ij^2, over the edges:
+dV/dt = -sum |u_i|^2 / k, and the centroid is constant. The shape must be infinitesimally rigid: the rank of its
+rigidity matrix R, with a row z_ij, z_ji for each edge, is 2 n - 3 in the plane and 3 n - 6 in space. If there are as
+many edges as that, errors near the shape decay at the rate 2 k lambda_min(R R^T). Convergence is local: collinear
+drones stay collinear, and a corner with two edges may settle on the wrong side. Inconsistent distances at the two ends
+of an edge make the formation drift.
 """
 
 from typing import Annotated
@@ -24,7 +25,7 @@ def distance_based(relative: list[tuple[Array, float]], k: float) -> Array:
     """Return u_i of (1) [m/s].
 
     Args:
-        relative: of each neighbour z_ij (d,) [m] and d_ij^2 [m^2].
+        relative: z_ij (d,) [m] and d_ij^2 [m^2] of each neighbour.
         k: gain [1/(m^2 s)].
     """
     size = len(relative[0][0]) if relative else 2
@@ -32,7 +33,7 @@ def distance_based(relative: list[tuple[Array, float]], k: float) -> Array:
 
 
 def rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
-    """Return R (m, n d) of places (n, d) and edges (i, j): half the derivative of the squared lengths."""
+    """Return R (m, n d) for positions (n, d) and m edges (i, j): half the derivative of the squared lengths."""
     places = np.asarray(p, float)
     n, d = places.shape
     R = np.zeros((len(edges), n, d))
@@ -45,7 +46,7 @@ def rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
 class DistanceBased(ShapePilot):
     class Parameters(ShapeParameters):
         gain_1_s: Annotated[float, Meta(gt=0, le=5)] = 0.3
-        """Of a distance of the size of the formation: k is this over the mean squared distance of its places."""
+        """Gain for distances of the size of the formation: k is this over the mean squared distance in the shape."""
 
     invariances = ("translation", "rotation")
 

@@ -1,4 +1,4 @@
-"""Flocking by Olfati-Saber: a lattice of spacing d that stays together, moves as one, and flows around obstacles.
+"""Flocking by Olfati-Saber: a lattice of spacing d that is cohesive, aligns velocities, and splits around obstacles.
 
     u_i = c1 sum phi_alpha(|z_ij|_s) n_ij + c2 sum a_ij (v_j - v_i)                     alpha: flockmates
         + c1b sum phi_beta(|z_ik|_s) n_ik + c2b sum b_ik (v_k - v_i)                    beta: obstacles
@@ -22,13 +22,13 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema.quantities import NonNegative, Positive
 from zsim_agents.laws.pilot import Array, Heard, Pilot, PilotParameters, Sight, limited, total
 
-EPSILON = 0.1  # of the sigma-norm
-A = B = 5.0  # of phi: 0 < a <= b
-H_ALPHA, H_BETA = 0.2, 0.9  # of the bump function, for flockmates and for obstacles
+EPSILON = 0.1  # parameter of the sigma-norm
+A = B = 5.0  # parameters of phi, 0 < a <= b
+H_ALPHA, H_BETA = 0.2, 0.9  # parameter h of the bump function, for flockmates and obstacles
 
 
 def sigma_norm(z: float) -> float:
-    """Return |z|_s = (sqrt(1 + epsilon z^2) - 1) / epsilon of a length; differentiable at 0."""
+    """Return |z|_s = (sqrt(1 + epsilon z^2) - 1) / epsilon of a length; it is differentiable at 0."""
     return (math.sqrt(1.0 + EPSILON * z * z) - 1.0) / EPSILON
 
 
@@ -55,7 +55,7 @@ def phi(z: float) -> float:
 
 
 def phi_alpha(z: float, d: float, r: float) -> float:
-    """Return the force at a sigma-norm z between flockmates of spacing d and range r [m]: below 0 it repels."""
+    """Return the force at a sigma-norm z between flockmates of spacing d and range r [m]; negative: repulsion."""
     r_alpha = sigma_norm(r)
     return bump(z / r_alpha, H_ALPHA) * phi(z - sigma_norm(d))
 
@@ -80,7 +80,7 @@ def alpha_force(p: Array, v: Array, heard: list[Heard], d: float, r: float, c1: 
 def beta_force(v: Array, obstacles: list[tuple[float, Array]], d: float, c1: float) -> Array:
     """Return the obstacle term of u_i, given distance [m] and direction away of each obstacle.
 
-    The virtual agent that repels it is at the nearest point, and moves along the surface with the drone.
+    The repelling virtual agent is at the obstacle's nearest point and moves along the surface with the drone.
     """
     u = np.zeros(len(v))
     for distance, away in obstacles:
@@ -99,7 +99,7 @@ def gamma_force(p: Array, v: Array, p_r: Array, v_r: Array, c1: float) -> Array:
 
 
 def deviation_energy(p: Array, d: float, r: float) -> tuple[float, int]:
-    """Return the normalised deviation energy of places (n, dim) from a lattice [m^2], and the number of its edges.
+    """Return the normalised deviation energy of positions (n, dim) from a lattice [m^2], and the number of edges.
 
     E = sum of (|z_ij| - d)^2 over the pairs within r, each direction counted, / (pairs + 1): of the paper's section II.
     """
@@ -116,18 +116,18 @@ class OlfatiSaber(Pilot):
         range_ratio: Annotated[float, Meta(gt=1, le=10)] = 1.2
         """r / d."""
         clearance_m: Positive = 1.5
-        """Of obstacles: d'."""
+        """Distance d' from obstacles."""
         alpha_1_s2: NonNegative = 0.2
         beta_1_s2: NonNegative = 1.0
         gamma_1_s2: NonNegative = 0.1
-        """c1 of flockmates, obstacles and aim; each c2 is 2 sqrt(c1)."""
+        """c1 of the alpha, beta and gamma terms; each c2 is 2 sqrt(c1)."""
         accel_max_m_s2: Positive = 2.0
         avoid_m: NonNegative = 0.0
-        """Nearer than this, drones, obstacles and surfaces repel beside the law; 0: none does."""
+        """Drones, obstacles and surfaces closer than this repel in addition to the law; 0: no repulsion."""
 
     def begin(self, scenario: Scenario) -> None:
         self._dt = self._gate_ns / 1e9
-        self._commanded = np.zeros(2)  # the velocity of the double integrator
+        self._commanded = np.zeros(2)  # velocity of the double integrator
 
     def velocity(self, now: Sight) -> Array:
         own, v = self.parameters, self._commanded

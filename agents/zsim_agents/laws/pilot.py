@@ -1,4 +1,4 @@
-"""The base of the pilots of all formation laws: an agent per drone, which flies it by messages of the others.
+"""The base class of the pilots of all formation laws: one agent per drone, which uses the messages of the others.
 
 Each pilot sends the estimated position of its drone, receives those of others, and computes a horizontal velocity. It
 takes off, climbs, engages its law at the flight height, holds that height, and lands. Formations are therefore plane
@@ -46,13 +46,13 @@ from zsim_agents.formation.expression import Expression, ExpressionError
 
 Array = NDArray[np.float64]
 
-ENGAGE_M = 0.3  # of the height of flight: within it a drone engages its law, and stays engaged
-CLIMB_1_S = 1.0  # gain of the height
-CLIMB_MAX_M_S = 0.8  # of the 1 m/s that the AR.Drone's firmware allows
-ASK_NS = 1_000_000_000  # time between two requests to take off
-UNSTAMPED = (0, 0, "")  # t_ns, seq, source of a command, filled in where it is sent
+ENGAGE_M = 0.3  # a drone this close to its flight height engages its law, and stays engaged
+CLIMB_1_S = 1.0  # gain of the height control
+CLIMB_MAX_M_S = 0.8  # below the 1 m/s that the AR.Drone's firmware allows
+ASK_NS = 1_000_000_000  # time between two take-off commands
+UNSTAMPED = (0, 0, "")  # t_ns, seq, source of a command, filled in on sending
 AIRBORNE = ("hovering", "flying")
-TINY = 1e-9  # m: two drones in one place have no direction to each other
+TINY = 1e-9  # m: closer drones have no defined direction to each other
 
 
 class Motion(AgentMessage, frozen=True):
@@ -66,7 +66,7 @@ class Motion(AgentMessage, frozen=True):
 
 
 class Heard(NamedTuple):
-    """Another drone, from its last message."""
+    """Another drone, as in its last message."""
 
     name: str
     p_W: Array  # (2,) [m]
@@ -74,15 +74,15 @@ class Heard(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """The reference at an instant, with its rates."""
+    """The reference at one time, with its rates."""
 
-    p_W: Array  # (2,) centre [m]
+    p_W: Array  # (2,) centre [m; W]
     v_W: Array  # (2,) [m/s]
     turn: Array  # (2, 2) s R(psi)
     turn_rate: Array  # (2, 2) its derivative [1/s]
 
     def place(self, c: Array) -> tuple[Array, Array]:
-        """Return the present displacement of a place c (2,) from the centre [m; W], and its rate [m/s]."""
+        """Return the offset of a position c (2,) of the formation from the centre [m; W], and its rate [m/s]."""
         return turned(self.turn, c), turned(self.turn_rate, c)
 
 
@@ -90,9 +90,9 @@ class Sight(NamedTuple):
     """The inputs of a pilot at a gate."""
 
     t_s: float
-    p_W: Array  # (2,) of its own drone, estimated [m]
+    p_W: Array  # (2,) estimated position of its own drone [m]
     v_W: Array  # (2,) [m/s]
-    heard: list[Heard]  # by name
+    heard: list[Heard]  # sorted by name
     reference: Pose
 
 
@@ -102,17 +102,17 @@ class PilotParameters(Parameters):
     height_m: Annotated[float, Meta(gt=0, le=1000)] = 2.0
     takeoff_s: NonNegative = 2.0
     land_s: NonNegative | None = None
-    """None: it flies to the end of the run."""
+    """Time of landing; None: the drone flies to the end of the run."""
     speed_max_m_s: Annotated[float, Meta(gt=0, le=20)] = 1.5
     message_rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0
-    """At most one a gate."""
+    """At most one message is sent per gate."""
     silence_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
-    """After it, one that is not heard any more is left out; until then its last message holds."""
+    """A drone without messages for longer is ignored; until then, its last message is used."""
     centre_m: tuple[Value, Value] = (0.0, 0.0)
-    """Of the formation in W: numbers, or expressions of t, in seconds since `start_s`."""
+    """Centre of the formation in W: numbers, or expressions of t, in seconds since `start_s`."""
     start_s: NonNegative = 0.0
     avoid_m: NonNegative = 1.5
-    """Nearer than this, drones, obstacles and surfaces repel; 0: none does."""
+    """Drones, obstacles and surfaces closer than this repel; 0: no repulsion."""
     avoid_m4_s: NonNegative = 1.0
     """Gain of the repulsion."""
 
@@ -129,7 +129,7 @@ class Pilot(Agent):
     messages = (Motion,)
     reads = ("drone/{drone}/sensor/status", "drone/{drone}/estimate", Motion.of())
     invariances: tuple[str, ...] = ()
-    """Of `translation`, `rotation`, `scale`: what of a formation's places the law leaves open. Only of ShapePilots."""
+    """Which of `translation`, `rotation`, `scale` of a shape the law does not control; only for ShapePilots."""
 
     def __init__(self, drone: str, scenario: Scenario) -> None:
         super().__init__()
@@ -161,7 +161,7 @@ class Pilot(Agent):
 
     @classmethod
     def flaws(cls, parameters: Mapping[str, Any], scenario: Scenario) -> Iterator[Fault]:
-        """Yield path and text of the parameters that cannot be flown in a scenario."""
+        """Yield path and text of the parameters that are invalid in a scenario."""
         try:
             cls.reference_of(cls.Parameters(**parameters))
         except ExpressionError as error:
@@ -172,7 +172,7 @@ class Pilot(Agent):
     def receive(self, key: str, message: Any) -> None:
         if isinstance(message, Estimate):
             if message.t_ns < self._estimate_ns:
-                return  # a link that delays some more than others lets one overtake another
+                return  # on links with varying delay, messages overtake each other
             self._estimate_ns = message.t_ns
             self._p_W, self._v_W = np.array(message.position_m), np.array(message.velocity_m_s)
         elif isinstance(message, Status):
@@ -212,7 +212,7 @@ class Pilot(Agent):
         ]
         try:
             reference = self._reference.at(t_ns / 1e9)
-        except ExpressionError as error:  # a pole that is not at its start
+        except ExpressionError as error:  # a pole after the start
             raise UserCodeError(f"{type(self).__name__}: parameters.{error}, since start_s; must be finite") from None
         now = Sight(t_ns / 1e9, self._p_W[:2], self._v_W[:2], heard, reference)
         v_W = self.velocity(now) + self.avoidance(now.p_W, heard)
@@ -267,13 +267,13 @@ class Pilot(Agent):
         self._is_engaged, self._has_flown = state["is_engaged"], state["has_flown"]
 
 
-@lru_cache(maxsize=SURFACES_MAX)  # pilots of one process share it: that of 40 000 triangles is made in a second
+@lru_cache(maxsize=SURFACES_MAX)  # shared by the pilots of a process: it takes a second for 40 000 triangles
 def _sheet(surface: Surface) -> Callable[[Sequence[float], float], tuple[float, Array]]:
-    """Return a function of a point (3,) and a reach [m] that finds the surface's distance and its nearest point.
+    """Return a function of a point (3,) and a reach [m] that finds the surface's distance and nearest point.
 
-    It returns the reach and the point itself if the surface is no nearer than the reach.
+    It returns the reach and the given point if the surface is not closer than the reach.
     """
-    from zsim.scenario.surroundings import (  # here: without a surface, numba is not loaded
+    from zsim.scenario.surroundings import (  # imported here, so that numba is not loaded without a surface
         hold,
         nearest_points,
         sheet_of,
@@ -289,11 +289,11 @@ def _sheet(surface: Surface) -> Callable[[Sequence[float], float], tuple[float, 
 
 
 class FormationReference:
-    """The motion of a formation from `start_s` on; before, it rests at its start.
+    """The motion of a formation from `start_s` on; before that, it rests at its start.
 
     Args:
         centre_m: x and y in W: numbers, or expressions of t, in seconds since start_s.
-        heading_deg, scale: likewise.
+        heading_deg, scale: as centre_m.
 
     Raises:
         ExpressionError: a text is not an expression of t, or has no value at its start.
@@ -325,7 +325,7 @@ class FormationReference:
 
 
 def polygon(count: int, radius_m: float) -> Array:
-    """Return the corners (count, 2) of a regular polygon about the origin, the first one on the x axis [m]."""
+    """Return the corners (count, 2) of a regular polygon about the origin, the first on the x axis [m]."""
     angles = [2 * math.pi * i / count for i in range(count)]
     return radius_m * np.array([[el.cos(angle), el.sin(angle)] for angle in angles])
 
@@ -342,7 +342,7 @@ def repulsion(d: float, D: float, eta: float) -> float:
     """Return -dV/dd of Khatib's V = eta/2 (1/d - 1/D)^2 for d < D, else 0 (Int. J. Robotics Research 5(1), 1986)."""
     if d >= D or D <= 0.0:  # inside an obstacle d is negative
         return 0.0
-    d = max(d, 0.05)  # m: within an estimate's error of contact the speed limit has long cut it
+    d = max(d, 0.05)  # m: at distances within the error of estimates, the speed limit applies anyway
     return eta * (1.0 / d - 1.0 / D) / (d * d)
 
 
@@ -351,7 +351,7 @@ def length(v: Array) -> float:
 
 
 def unit(v: Array) -> Array:
-    """Return v / |v|; the x axis for a vector without direction."""
+    """Return v / |v|; the unit vector along x for a vector without direction."""
     size = length(v)
     return v / size if size > TINY else np.eye(len(v))[0]
 

@@ -1,12 +1,12 @@
-"""Common parts of laws whose formation is a figure: the drones' places, and the terms that tie it to the reference.
+"""Common parts of laws with a shape: the drones' positions in it, and the terms that tie it to the reference.
 
-A law of differences leaves the position of the figure undetermined, some also its rotation, one its scale. Two terms,
-the same for all laws, tie it to the reference:
+Laws of relative quantities do not control the position of the shape, some not its rotation, one not its scale. Two
+terms, common to all laws, tie it to the reference:
 
-    u_i = law + v_i*                          feed-forward, by drones that know the reference's motion
-              + b_i (p_i* - p_i)              pinning, by informed drones
+    u_i = law + v_i*                          feed-forward, for drones that know the reference's motion
+              + b_i (p_i* - p_i)              pinning, for informed drones
 
-Pinning one node of a connected, undirected graph turns the rate k lambda_2(L) of consensus, about the mean, into
+Pinning one node of a connected, undirected graph changes the rate of consensus from k lambda_2(L), about the mean, to
 lambda_min(k L + diag(b)), about the reference.
 """
 
@@ -23,26 +23,26 @@ from zsim_agents.laws.pilot import Array, FormationReference, Pilot, PilotParame
 
 
 class ShapeParameters(PilotParameters):
-    """Parameters of the laws whose formation is a figure."""
+    """Parameters of the laws with a shape."""
 
     gain_1_s: Annotated[float, Meta(gt=0, le=5)] = 0.3
     places_m: Annotated[list[tuple[Real, Real]], Meta(max_length=DRONES_MAX)] = field(default_factory=list)
-    """Of the drones, in the scenario's order; empty: the corners of a regular polygon."""
+    """Positions in the shape, in the scenario's order of drones; empty: the corners of a regular polygon."""
     radius_m: Positive = 3.0
-    """Of that polygon."""
+    """Circumradius of that polygon."""
     heading_deg: Value = 0.0
     scale: Value = 1.0
-    """With the heading, as `centre_m`: by how much the places are turned and enlarged."""
+    """Factor of the positions; `heading_deg` is their rotation. Both are given like `centre_m`."""
     feedforward: bool = True
-    """Whether all know the reference's motion; else those alone that are informed."""
+    """Whether all drones know the reference's motion; otherwise only the informed ones do."""
     informed: list[str] | None = None
-    """Drones that know where their own place is in W; None: the first one."""
+    """Drones that know their own reference position in W; None: the first one."""
     pin_1_s: NonNegative = 1.0
-    """Their gain towards it."""
+    """Gain of the informed drones towards it."""
 
 
 class ShapePilot(Pilot):
-    """Flies one drone to its place in a figure; `laws` differ in `velocity`."""
+    """Flies one drone to its position in a shape; the laws differ in `velocity`."""
 
     Parameters = ShapeParameters
 
@@ -57,7 +57,7 @@ class ShapePilot(Pilot):
         return FormationReference(own.centre_m, own.heading_deg, own.scale, own.start_s)
 
     def relative(self, now: Sight) -> list[tuple[Array, Array]]:
-        """Return z_ij = p_j - p_i [m; W] of each neighbour and its value by the places."""
+        """Return z_ij = p_j - p_i [m; W] of each neighbour, and its desired value."""
         own = now.reference.place(self._places[self._drone])[0]
         return [(each.p_W - now.p_W, now.reference.place(self._places[each.name])[0] - own) for each in now.heard]
 
@@ -67,7 +67,7 @@ class ShapePilot(Pilot):
         return now.reference.p_W + c, now.reference.v_W + c_dot
 
     def tied(self, now: Sight) -> Array:
-        """Return the terms (2,) that tie the figure to the reference [m/s; W]."""
+        """Return the terms (2,) that tie the shape to the reference [m/s; W]."""
         p_W, v_W = self.own_place(now)
         feed = v_W if self.parameters.feedforward or self._informed else np.zeros(2)
         return feed + self.parameters.pin_1_s * (p_W - now.p_W) if self._informed else feed

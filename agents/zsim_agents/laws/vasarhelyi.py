@@ -47,7 +47,7 @@ def friction(difference: Array, allowed: float, gain: float) -> Array:
 class Vasarhelyi(Pilot):
     class Parameters(PilotParameters):
         v_flock_m_s: NonNegative = 0.0
-        """Speed at which each keeps flying ahead; 0: it takes the reference's alone."""
+        """Speed that each drone keeps along its velocity; 0: only the reference's velocity is used."""
         p_rep_1_s: NonNegative = 0.4
         r0_rep_m: NonNegative = 3.5
         c_frict: Annotated[float, Meta(ge=0, le=1)] = 0.3
@@ -60,9 +60,9 @@ class Vasarhelyi(Pilot):
         a_shill_m_s2: Positive = 1.0
         r0_shill_m: NonNegative = 0.0
         arena_m: NonNegative = 8.0
-        """Side of the square about the reference; 0: there is none."""
+        """Side of the square around the reference; 0: no arena."""
         avoid_m: NonNegative = 0.0
-        """Nearer than this, drones, obstacles and surfaces repel beside the law; 0: none does."""
+        """Drones, obstacles and surfaces closer than this repel in addition to the law; 0: no repulsion."""
 
     def velocity(self, now: Sight) -> Array:
         own = self.parameters
@@ -85,7 +85,7 @@ class Vasarhelyi(Pilot):
         most, final = own.v_shill_m_s + own.speed_max_m_s, own.a_shill_m_s2 / own.p_shill_1_s
         reach = own.r0_shill_m + (most * most + final * final) / (
             2.0 * own.a_shill_m_s2
-        )  # beyond it (4) allows any speed
+        )  # beyond this distance, (4) allows any speed
         walls += [(distance, away, np.zeros(2)) for distance, away in self.obstacles_near(now.p_W, reach)]
         for axis in (0, 1) if own.arena_m else ():
             for side in (-1.0, 1.0):

@@ -1,22 +1,21 @@
-"""Flying to places: the tracking of a reference, a drone sent to places at any time, and the cruise paths it takes.
+"""Tracking of a reference, cruise paths to goals, and courses of drones that receive new goals at any time. Pure.
 
 The commanded velocity is that of the reference, advanced by the lag of the drone's velocity loop, plus a share of the
 position error. To first order this is an acceleration feed-forward without a second derivative.
 
-A cruise path leads to places at a cruise speed, from any motion, within limits of speed and acceleration.
-It has three parts. The velocity changes from v, that at the start, into q, that of the cruise, straight and at full
-acceleration a, in t1; the drone flies on at q for t2; it brakes straight, in t3 = |q| / a, and rests at the goal. From
-rest it is a straight line with the trapezoidal profile of speed: Biagiotti and Melchiorri, Trajectory Planning for
+A cruise path leads from any motion to rest at a goal at a cruise speed, within limits of speed and acceleration.
+It has three parts. At constant full acceleration a, the velocity changes from the initial v to the cruise velocity q
+in t1; the drone cruises at q for t2; it brakes along q in t3 = |q| / a and is at rest at the goal. From rest it is a
+straight line with a trapezoidal speed profile: Biagiotti and Melchiorri, Trajectory Planning for
 Automatic Machines and Robots, Springer 2008, chapter 3.
 
-With D from start to goal, D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 alone gives q: its direction, and its length, the
-cruise speed, or less where t2 would be negative: |q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves |q(t1) - v| = a t1,
-which has a solution below the greatest t1 that any q needs, because q depends continuously on it. Velocities between
-two within the limits are within them. From any state on a way, the way to its goal is what is left of it.
+With D from start to goal, D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 determines q: its direction, and its length, which
+is the cruise speed, or less where t2 would be negative: |q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves
+|q(t1) - v| = a t1, which has a solution below the maximum t1 of all q, because q is a continuous function of t1. All
+velocities between two that satisfy the limits satisfy them too. From any state on a path, the path to its goal is the
+remainder of that path.
 
-Horizontal and vertical limits differ: the lengths above are the greater one of both shares of the limits.
-
-Pure.
+Horizontal and vertical limits differ: |.| above is the larger of the horizontal and the vertical share of the limits.
 """
 
 from __future__ import annotations
@@ -34,16 +33,16 @@ from zsim.scenario.scenario import Piloted
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.references.path import DEGREE, LEAST_S, SHARE, PathLimits, PiecewisePolynomial
 
-K_YAW_1_S = 1.0  # of the heading; chosen: below the yaw loop's bandwidth by a decade
-LOST_M = 2.0  # off its way, from where a drone is sent anew; chosen: more than a way without wind is missed by
-RISE_S = 0.5  # in which climb and turn rise to their limits; chosen: above the lags of the loops of both
-HALVINGS = 60  # of the range in which t1 is looked for: to the last bit
-SHORT_S = 1e-9  # shorter parts are left out
+K_YAW_1_S = 1.0  # gain of the heading; chosen: a decade below the yaw loop's bandwidth
+LOST_M = 2.0  # deviation from which the path is planned anew; chosen: above the tracking error without wind
+RISE_S = 0.5  # time in which climb and yaw rates reach their limits; chosen: above the lags of both loops
+HALVINGS = 60  # bisection steps for t1: to the last bit
+SHORT_S = 1e-9  # shorter parts are omitted
 
 Four = Sequence[float]
 """x, y, z [m, W] and yaw [rad], or their rates."""
 Axes = tuple[float | None, float | None, float | None, float | None]
-"""The same, None where no place is given."""
+"""As `Four`, None for axes without a goal."""
 
 
 class Cruise(NamedTuple):
@@ -58,10 +57,10 @@ FREE = Cruise()
 
 
 class Course:
-    """The paths of a drone that is sent to a place, and at any time to another one.
+    """The paths of a drone that may receive a new goal at any time.
 
-    A path begins in the present state of the previous one, or at the drone if there is none or the drone is off it by
-    more than LOST_M. An axis without a place is flown at its rate; an axis with both is tracked as given.
+    A path starts in the present state of the previous path, or in that of the drone if it has no path or is more than
+    LOST_M off it. An axis without a goal follows its rate; an axis with a goal and a rate tracks both directly.
 
     Args:
         limits: limits of the drone; a path uses SHARE of the acceleration.
@@ -76,28 +75,28 @@ class Course:
         self._begun_s = 0.0
 
     def leave(self) -> None:
-        """Clear the path: the next one begins at the drone."""
+        """Clear the path: the next one starts at the drone."""
         self._goal = self._way = None
 
     def send(
         self, goal: Axes, t_s: float, here: Four, moving: Four, rate: Four = (0.0,) * 4, speeds: Cruise = FREE
     ) -> None:
-        """Send the drone, which is here and moves so at t_s, to a place."""
+        """Set the goal; `here` and `moving` are the position and rate of the drone at t_s."""
         own, own_rate = self._motion(t_s, here, moving)
         self._goal, self._rate, self._speeds = goal, rate, speeds
         self._begin(t_s, own, own_rate)
 
     def stop(self, t_s: float, here: Four, moving: Four) -> Vector:
-        """Return the place [m, W] at which the drone, which is here and moves so at t_s, can come to rest."""
+        """Return the position [m, W] where the drone can come to rest; arguments as in `send`."""
         own, rate = (np.array(each, float) for each in self._motion(t_s, here, moving))
         x, y, z = cruise_to_rest(own, self._limits, rate).value(math.inf)[0][:3].tolist()
         return x, y, z
 
     def velocity(self, t_s: float, here: Four, moving: Four) -> tuple[Vector, float]:
-        """Return the velocity [m/s, W] and yaw rate [rad/s] of the drone, which is here and moves so at t_s.
+        """Return the velocity [m/s, W] and yaw rate [rad/s] to command; arguments as in `send`.
 
         Raises:
-            RuntimeError: it has not been sent anywhere.
+            RuntimeError: no goal has been set.
         """
         goal = self._goal
         if goal is None:
@@ -117,7 +116,7 @@ class Course:
         return velocity, self._rate[3] if goal[3] is None else turn
 
     def _motion(self, t_s: float, here: Four, moving: Four) -> tuple[Four, Four]:
-        """Return place and rate of the path on its axes, and of the drone on the others."""
+        """Return position and rate: of the path on its axes, of the drone on the others."""
         own, rate = list(here), list(moving)
         if self._way is not None and not self._is_lost(t_s, here):
             place, pace = self._state(t_s)
@@ -126,7 +125,7 @@ class Course:
         return own, rate
 
     def _axes(self) -> list[int]:
-        """Return the axes of the path."""
+        """Return the axes that the path controls: those with a goal and no rate."""
         goal = self._goal or (None,) * 4
         return [k for k in range(4) if goal[k] is not None and self._rate[k] == 0.0]
 
@@ -155,11 +154,11 @@ class Course:
 def velocity_towards(
     place: Four, ahead: Four, here: Four, limits: PathLimits, law: Piloted, down_m_s: float = math.inf
 ) -> tuple[Vector, float]:
-    """Return the velocity [m/s; W] and yaw rate [rad/s] for a drone at `here` whose reference is at a place.
+    """Return the velocity [m/s; W] and yaw rate [rad/s] with which a drone at `here` tracks a reference at `place`.
 
     Args:
-        ahead: rate of the reference `law.lead_s` from now.
-        limits: limits of the result; `down_m_s` if the limit is lower downwards than upwards.
+        ahead: rate of the reference `law.lead_s` later.
+        limits: limits of the result; `down_m_s`: limit of the descent, if lower.
     """
     x, y, z = (v + law.gain_1_s * (p - own) for v, p, own in zip(ahead[:3], place[:3], here[:3], strict=True))
     speed = el.hypot(x, y)
@@ -170,7 +169,7 @@ def velocity_towards(
 
 
 class _Bounds(NamedTuple):
-    """Of velocities and accelerations along x and y together, and along z."""
+    """Limits of velocity and acceleration, horizontal (x and y together) and vertical."""
 
     speed: float
     up: float
@@ -203,12 +202,12 @@ STILL: Vector = (0.0, 0.0, 0.0)
 def cruise(
     start: Array, goal: Array, limits: PathLimits, rate: Array | None = None, speeds: Cruise = FREE
 ) -> PiecewisePolynomial:
-    """Return the path from a place (4,), with a rate (4,) that is 0 by default, to rest at another one.
+    """Return the path from a position (4,) with a rate (4,), by default 0, to rest at a goal (4,).
 
-    The yaw turns by the shorter way, independently of the translation.
+    Yaw turns the shorter way, independently of the translation.
 
     Args:
-        limits: of speeds and horizontal acceleration; climb and turn reach their limits in RISE_S.
+        limits: limits of speeds and horizontal acceleration; climb and yaw rates reach theirs in RISE_S.
     """
     vx, vy, vz, turning = (0.0, 0.0, 0.0, 0.0) if rate is None else rate.tolist()
     (x, y, z, yaw), (to_x, to_y, to_z, to_yaw) = start.tolist(), goal.tolist()
@@ -230,9 +229,9 @@ def cruise_through(
     speeds: Cruise = FREE,
     radius_m: float = 0.0,
 ) -> PiecewisePolynomial:
-    """Return the path through places (4,) to rest at the last one.
+    """Return the path through goals (4,) to rest at the last one.
 
-    Within radius_m of each other place it turns towards the next one; 0: it rests at each.
+    Within radius_m of each earlier goal it turns towards the next one; 0: it comes to rest at each.
     """
     durations: list[Array] = []
     coefficients: list[Array] = []
@@ -262,12 +261,12 @@ def cruise_to_rest(start: Array, limits: PathLimits, rate: Array) -> PiecewisePo
 
 
 def _parts(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> list[_Part]:
-    """Return the parts of a path with a duration."""
+    """Return the parts of a path, without those of zero duration."""
     x, y, z = (to - from_ for to, from_ in zip(goal, start, strict=True))
     vx, vy, vz = velocity
 
     def cruise_after(t1: float) -> tuple[Vector, float]:
-        """Return q, and the time from the middle of the first part to that of the last one."""
+        """Return q, and the time from the middle of the first part to the middle of the last."""
         along = x - vx * t1 / 2.0, y - vy * t1 / 2.0, z - vz * t1 / 2.0
         left = el.length(along)
         if left == 0.0:
@@ -285,7 +284,7 @@ def _parts(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> li
             middle = (early + t1) / 2.0
             (qx, qy, qz), _ = cruise_after(middle)
             early, t1 = (early, middle) if bounds.rise_s(qx - vx, qy - vy, qz - vz) <= middle else (middle, t1)
-    elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # of the way as a velocity; |q| t1 is its length where t2 is 0
+    elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # displacement taken as a velocity; t2 = 0: |q| t1 is its length
         t1 = min(math.sqrt(rise_s), rise_s * bounds.speed_along(x, y, z))
     (qx, qy, qz), over_s = cruise_after(t1)
     parts = []
@@ -309,7 +308,7 @@ def _moved(place: Vector, velocity: Vector, accel: Vector, t: float) -> Vector:
 
 
 def _polynomials(way: list[_Part], turn: list[_Part]) -> PiecewisePolynomial:
-    """Return a translation and a turn that begin together as one path."""
+    """Return a translation and a turn with a common start as one path."""
     begins = [_begins(way), _begins(turn)]
     times = sorted({t for each in begins for t in each})
     kept = [t for t, after in pairwise(times) if after - t > SHORT_S]
@@ -331,7 +330,7 @@ def _begins(parts: list[_Part]) -> list[float]:
 
 
 def _state(parts: list[_Part], begins: list[float], t: float) -> tuple[Vector, Vector, Vector]:
-    """Return position, velocity and acceleration from t on; at rest after the last part."""
+    """Return position, velocity and acceleration at t (the acceleration after it); at rest after the last part."""
     number = max(k for k, begin in enumerate(begins) if begin <= t)
     if number == len(parts):
         last = parts[-1]

@@ -1,8 +1,8 @@
 """The flights of a scenario's drones with their own references: take-off, approach to a path, the path. Pure.
 
 A flight is checked in advance: speeds, turns and horizontal accelerations against the drone's limits, heights, and the
-distances to other flights and to formations. The time of engagement of a formation and its paths depend on its
-estimates: its position is known from the time at which it has certainly reached its target or trajectory.
+distances to other flights and to formations. When a formation engages and how it approaches its target or trajectory
+depend on its estimates, so distances to it are checked only from the time by which it has certainly arrived there.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ from zsim_agents.references.path import (
 if TYPE_CHECKING:
     from zsim_agents.formation.engagement_setup import PlannedMotion
 
-READY_S = 4.0  # least from the order to take off to the first way: an AR.Drone takes 4 s or more
-WAY_SHARE = 0.5  # of them, for the way to a path, which nobody wants to be fast; chosen
-ROUNDING = 1.0 + 1e-9  # of a factor that just fits
-HEIGHT_MIN_M = 0.2  # over the ground, chosen: above most of the ground effect of the smallest
-SAMPLES_MAX, SAMPLE_S = 4001, 0.05  # of heights
-TOLERANCE_M = 1e-3  # of the least distance of two paths
-STEP_S = 0.05  # between the instants at which all paths are looked at
-LEAST_STEP_S = 1e-4  # to which the time between two instants is halved
+READY_S = 4.0  # minimum time from the take-off command to the first path: an AR.Drone takes 4 s or more
+WAY_SHARE = 0.5  # chosen: share of the limits on the approach to a path that starts at rest
+ROUNDING = 1.0 + 1e-9  # tolerance for a duration that just satisfies the limits
+HEIGHT_MIN_M = 0.2  # chosen: minimum height, above most of the ground effect of the smallest drones
+SAMPLES_MAX, SAMPLE_S = 4001, 0.05  # sampling of a path's heights
+TOLERANCE_M = 1e-3  # tolerance of the minimum distance between two paths
+STEP_S = 0.05  # interval between the times at which all paths are compared
+LEAST_STEP_S = 1e-4  # an interval is not halved below this
 LATE_S = 15.0  # chosen: a take-off takes up to 12 s, of which READY_S are planned, and engagement waits for estimates
-LOOK_S, FINE_S = 0.1, 0.01  # between the instants that are looked at; of those near to each other
-NEARER_M = 0.5  # chosen: by which a drone and a robot come nearer within LOOK_S at most
+LOOK_S, FINE_S = 0.1, 0.01  # sampling of a meeting: normally, and where the two are close
+NEARER_M = 0.5  # chosen: maximum decrease of the distance between a drone and a robot within LOOK_S
 PLACE_NAMES = ("x", "y", "z", "yaw")
 QUANTITIES = (
     ("horizontal speed", "m/s"),
@@ -66,7 +66,7 @@ QUANTITIES = (
 
 
 class FlightError(ValueError):
-    """A flight is not possible; `path` is the field below the reference or the exchange, which the text follows."""
+    """An impossible flight; `text` follows `path`, the field below the reference or the exchange, in the message."""
 
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path} {text}".strip())
@@ -74,7 +74,7 @@ class FlightError(ValueError):
 
 
 class Place:
-    """The variables of one drone, as those of a cluster space."""
+    """The variables of one drone's position and heading, with the interface of a cluster space."""
 
     names = PLACE_NAMES
     in_radians = np.array([False, False, False, True])
@@ -102,7 +102,7 @@ class Leg(NamedTuple):
 class Flight:
     """The reference of a drone at every simulated time [s]: a `Reference`.
 
-    Before its first leg it is at `hover` (4,), to which the take-off leads; each leg holds its end until the next.
+    Before its first leg it is at `hover` (4,), where the take-off ends; the end of a leg is held until the next leg.
     """
 
     hover: Array
@@ -123,7 +123,7 @@ class Flight:
         return (self.hover, np.zeros(4)) if leg is None else leg.path.value(t_s - leg.start_s)
 
     def phase(self, t_s: float) -> tuple[ReferencePhase, float | None]:
-        """Return the phase, and the path's own time if it is a path."""
+        """Return the phase, and in phase "path" the time since the start of the path [s]."""
         leg = self.leg_at(t_s)
         if leg is None:
             return "holding", None
@@ -133,7 +133,7 @@ class Flight:
         return leg.phase, own_s if leg.phase == "path" else None
 
     def peaks(self) -> Peaks:
-        """Return the peaks of all legs."""
+        """Return the peaks over all legs; their times are not determined (0)."""
         each = [peaks_of(leg.path) for leg in self.legs]
         speed, climb, turn, accel = np.max([[0.0] * 4, *(peaks[:4] for peaks in each)], axis=0).tolist()
         return Peaks(speed, climb, turn, accel, at_s=(0.0, 0.0, 0.0, 0.0))
@@ -153,7 +153,7 @@ def hover_of(drone: Drone) -> Array:
 
 
 def flight_of(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone with a reference or in an exchange; FlightError: it cannot be flown."""
+    """Return the flight of a drone with a reference or in an exchange; FlightError: the flight is impossible."""
     flown = scenario.piloted()[drone]
     if isinstance(flown, Exchange):
         return exchange_flights(scenario, flown)[drone]
@@ -171,7 +171,7 @@ def flight_of(scenario: Scenario, drone: str) -> Flight:
 
 
 def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion | None = None) -> PiecewisePolynomial:
-    """Return the approach from a place (4,) to the moving start of a path; FlightError: it is too fast."""
+    """Return the approach from a position (4,) to the start of a path; FlightError: the path starts too fast."""
     place, rate = path.value(0.0)
     end = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
     own = limits.share(SHARE if rate.any() else WAY_SHARE)
@@ -232,7 +232,7 @@ def _turned(at: tuple[Array, Array], yaw: float) -> tuple[Array, Array]:
 
 
 def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
-    """Return points as waypoints by the names of variables."""
+    """Return points as the waypoints of a `WaypointTrajectory`."""
     named = []
     for point in points:
         values: dict[str, float] = dict(zip(PLACE_NAMES, point.position_m, strict=False))
@@ -243,7 +243,7 @@ def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
 
 
 def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
-    """Return the minimum-snap path through points, starting at the time of the first; yaw by the shorter way."""
+    """Return the minimum-snap path through points, at rest until the time of the first; yaw turns the shorter way."""
     places = np.empty((len(points), 4))
     for row, point in zip(places, points, strict=True):
         wanted = yaw if point.yaw_deg is None else math.radians(point.yaw_deg)
@@ -275,7 +275,7 @@ def _polynomials(spec: DroneReference) -> Reference:
 def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, now: str) -> str:
     """Return a text on the quantity beyond the limits, and the factor that would satisfy them."""
     shares = [own / most for own, most in zip(peaks[:4], limits, strict=True)]
-    weighed = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # as in `Peaks.factor`, which this explains
+    weighed = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # weighted as in `Peaks.factor`
     worst = int(np.argmax(weighed))
     what, unit = QUANTITIES[worst]
     found = f"needs a {what} of {peaks[worst]:.3g} {unit} at {peaks.at_s[worst]:.2f} s"
@@ -299,10 +299,10 @@ def _check_heights(path: Reference, altitude_max_m: float) -> None:
 
 
 def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight]:
-    """Return the flights of an exchange by drone: each stage assigned, straight, with one function of time for all.
+    """Return the flights of an exchange by drone: each stage assigned, straight, in common time.
 
     Raises:
-        FlightError: a stage is too fast, too low, or begins too early.
+        FlightError: a stage is too fast, too low, or starts too early.
     """
     specs = [scenario.drone(name) for name in exchange.drones]
     gravity = scenario.environment.gravity_m_s2
@@ -343,7 +343,7 @@ def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight
     return {name: Flight(hovers[k], tuple(legs(k))) for k, name in enumerate(exchange.drones)}
 
 
-@lru_cache(maxsize=STAGES_MAX)  # each of its drones' pilots asks for the same
+@lru_cache(maxsize=STAGES_MAX)  # the pilot of each drone requests the same assignments
 def _assigned(starts_m: bytes, goals_m: tuple[tuple[float, float, float], ...]) -> NDArray[np.intp]:
     return assign(np.frombuffer(starts_m).reshape(-1, 3), np.array(goals_m))
 
@@ -352,13 +352,13 @@ def land_s_of(flown: Piloted) -> float:
     return math.inf if flown.land_s is None else flown.land_s
 
 
-# All of a scenario
+# All flights of a scenario
 
 
 def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
     """Yield path and text of the faults of all references, and of distances that are too small.
 
-    Distances are those between flights, and to formations as far as known in advance.
+    Distances are checked between flights, and to formations once these have certainly reached their planned motion.
     """
     flights: dict[str, Flight] = {}
     exchanges = [] if not isinstance(scenario.exchanges, list) else scenario.exchanges
@@ -389,7 +389,7 @@ def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
     try:
         clearance = np.array([_clearance_m(scenario, name) for name in names])
     except (NotTrustedError, DocumentError):
-        return None  # that of a user's vehicle, which is not read here
+        return None  # the clearance of a user's vehicle, whose file is not loaded here
     ends = [flight.duration_s for flight in flights.values()]
     until_s = min(max((scenario.duration_s if end is None else end for end in ends), default=0.0), scenario.duration_s)
     if len(names) < 2 or until_s <= 0.0:
@@ -404,10 +404,10 @@ def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
 
 
 def checked_flight(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone; for the first drone with one, all flights are compared with each other.
+    """Return the flight of a drone; for the first drone with one, all flights of the scenario are checked.
 
     Raises:
-        RunError: it cannot be flown.
+        RunError: the flight is impossible.
     """
     try:
         flight = flight_of(scenario, drone)
@@ -432,11 +432,11 @@ class Approach(NamedTuple):
 def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -> Approach | None:
     """Return the first pair of paths, in time, that comes closer than allowed, to a millimetre; None if none does.
 
-    Between two instants a distance falls by at most the sum of both greatest speeds times half of the time between;
-    where that is not enough, the time is halved.
+    Over an interval, the distance of a pair is at least the mean of its values at both ends less half of the interval
+    times the sum of both peak speeds; where this bound is too small, the interval is halved.
 
     Args:
-        least_m: (n,) half of the least distance of a drone to another one like it; of a pair, their sum is allowed.
+        least_m: (n,) clearance of each drone; the minimum distance of a pair is the sum of both.
     """
     from scipy.spatial import KDTree
 
@@ -461,7 +461,7 @@ def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -
 def _nearer(
     a: Reference, b: Reference, speed: float, least_m: float, from_s: float, to_s: float
 ) -> tuple[float, float] | None:
-    """Return the first distance below least_m found between two instants, and when; None if there is none."""
+    """Return the first distance below least_m found from from_s to to_s, and its time; None if none is found."""
 
     def apart(t_s: float) -> float:
         return el.distance(a.value(t_s)[0][:3].tolist(), b.value(t_s)[0][:3].tolist())
@@ -485,7 +485,7 @@ def _meetings(
     """Yield path and text of each formation's first meeting with a drone that has a reference.
 
     Args:
-        flights: of the drones by name, places (4,) at simulated time; until_s: when each of them lands.
+        flights: by drone, references (4,) over simulated time; until_s: landing times by drone.
     """
     from zsim_agents.formation.engagement_setup import planned_motion  # here, because few scenarios have both
 
@@ -494,7 +494,7 @@ def _meetings(
             planned = planned_motion(scenario, cluster)
             clearance = {name: _clearance_m(scenario, name) for name in (*flights, *cluster.drones)}
         except (NotTrustedError, DocumentError, RunError, UserCodeError):
-            continue  # told by who checks its plan, or not read here
+            continue  # reported by the check of its plan, or user code that is not loaded here
         if planned is None:
             continue
         own_m = max(clearance[name] for name in cluster.drones)
@@ -510,7 +510,7 @@ def _meetings(
 def _meeting(
     planned: PlannedMotion, flight: Reference, until_s: float, least_m: float
 ) -> tuple[float, float, int] | None:
-    """Return when a drone is first too close to a robot of a formation, the distance, and the robot; None if never."""
+    """Return when a drone is first too close to a robot, the distance and the robot's index; None if never."""
     from_s, to_s = planned.from_s + LATE_S, min(planned.until_s, until_s)
     for t_s in np.arange(from_s, to_s, LOOK_S).tolist():
         if float(_distances(planned, flight, t_s).min()) >= least_m + NEARER_M:

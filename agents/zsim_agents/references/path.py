@@ -63,7 +63,7 @@ class Peaks(NamedTuple):
     at_s: tuple[float, float, float, float]
 
     def factor(self, limits: PathLimits) -> float:
-        """Return the factor by which a path must be slowed to satisfy limits; below 1 if it may be faster."""
+        """Return the factor of the duration that just satisfies the limits; below 1 if the path may be faster."""
         speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
         return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # speed scales as 1/t, acceleration as 1/t^2
 
@@ -72,8 +72,8 @@ class PiecewisePolynomial:
     """A sequence of polynomials of local time.
 
     Args:
-        durations_s: (m,) of the pieces.
-        coefficients: (m, 8, 4) of t^0 to t^7 in x, y, z, yaw.
+        durations_s: durations of the pieces, (m,).
+        coefficients: of t^0 to t^7 in x, y, z, yaw, (m, 8, 4).
     """
 
     def __init__(self, durations_s: Array, coefficients: Array) -> None:
@@ -105,7 +105,7 @@ class PiecewisePolynomial:
         return PiecewisePolynomial(durations, self.coefficients[:count])
 
     def peaks(self) -> Peaks:
-        """Return the peaks of each piece, to 1e-10 of it."""
+        """Return the peaks over all pieces, their times to 1e-10 of a piece."""
         greatest = [(0.0, 0.0)] * 4
         for begin_s, duration_s, own in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
             unit = own * _powers(duration_s, len(own))[:, None]  # in local time from 0 to 1, which is well scaled
@@ -124,9 +124,11 @@ def _powers(x: float, count: int) -> Array:
 
 
 def _greatest(columns: Array) -> tuple[float, float]:
-    """Return the maximum sum of squares of polynomials (n, k) in [0, 1], and where: by samples and golden section.
+    """Return the maximum on [0, 1] of the sum of squares of k polynomials, coefficients (n, k), and its argument.
 
-    The derivative of such a sum has at most twelve roots, so samples show all maxima wider than their distance.
+       It is found by sampling and golden section.
+    The derivative of such a sum has at most twelve roots, so
+       only maxima narrower than the spacing of the samples can be missed.
     """
     falling = columns[::-1].T.tolist()
 
@@ -170,17 +172,17 @@ def minimum_snap(
 ) -> PiecewisePolynomial:
     """Return the path through places (m, 4) at given times with the minimum integral of the squared fourth derivative.
 
-    Among all paths with given derivatives up to the third at both ends, at rest by default, that is the spline of
-    degree 7: Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the
-    spline. From rest to rest over one second it is 35 t^4 - 84 t^5 + 70 t^6 - 20 t^7.
+    With the derivatives up to the third prescribed at both ends, zero by default, it is the spline of degree 7:
+    Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the spline.
+    From rest to rest over one second it is 35 t^4 - 84 t^5 + 70 t^6 - 20 t^7.
 
     Args:
-        times_s: (m,), rising; the first is the start of the path.
+        times_s: increasing, (m,); the first is the start of the path.
     """
     ends = begin or at_rest(), end or at_rest()
     spans = np.diff(np.asarray(times_s, float))
     m, size = len(spans), DEGREE + 1
-    slopes = np.ones((size, size))  # of t^k at 1, row by row for each derivative
+    slopes = np.ones((size, size))  # derivatives of t^k at 1, one row per derivative
     for d in range(1, size):
         slopes[d] = slopes[d - 1] * np.maximum(np.arange(size) - (d - 1.0), 0.0)
     diagonals, b = np.zeros((m * size, BELOW + 1 + ABOVE)), np.zeros((m * size, 4))
@@ -224,13 +226,13 @@ def move(
     begin: EndMotion | None = None,
     end: EndMotion | None = None,
 ) -> PiecewisePolynomial:
-    """Return the minimum-snap path from one place to another (4,), within limits.
+    """Return the minimum-snap path from one position (4,) to another within limits.
 
     It lasts over_s, or longer if the limits require. It begins and ends at rest, or in the given motions.
     The yaw takes the shorter turn.
 
     Raises:
-        TrajectoryError: the motion at an end is beyond the limits.
+        TrajectoryError: no path within an hour satisfies the limits; the motion at an end is too fast.
     """
     turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
     places = np.array([start, [*goal[:3], turned]])
@@ -238,7 +240,7 @@ def move(
         unit = minimum_snap((0.0, 1.0), places).peaks().factor(limits)
         return minimum_snap((0.0, max(over_s, LEAST_S, round_up(unit))), places)
     length_s = max(over_s, LEAST_S)
-    while length_s < MOVE_MAX_S:  # the ends do not slow down with the rest, so there is no factor
+    while length_s < MOVE_MAX_S:  # motions at the ends do not scale with the duration: there is no factor
         path = minimum_snap((0.0, length_s), places, begin, end)
         if path.peaks().factor(limits) <= 1.0:
             return path
@@ -297,7 +299,7 @@ def peaks_of(path: Reference) -> Peaks:
 
 
 def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -> tuple[float, float]:
-    """Return the maximum of a quantity near its largest sample, and when."""
+    """Return the maximum of a quantity near its largest sample, and its time."""
     from scipy.optimize import minimize_scalar
 
     best = int(np.argmax(samples))
@@ -320,7 +322,7 @@ def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
 
 
 def figure_eight(length_m: float, width_m: float) -> Curve:
-    """Return the lemniscate of Gerono along x, with a length and a width, from its crossing at the origin."""
+    """Return the lemniscate of Gerono with its length along x, starting at its crossing in the origin."""
 
     def at(angle: float) -> tuple[Array, Array]:
         x, y = length_m / 2.0, width_m / 2.0
@@ -333,7 +335,7 @@ def figure_eight(length_m: float, width_m: float) -> Curve:
 class Laps:
     """A curve flown for a number of laps of period_s each, plus a quarter of a period for start and stop.
 
-    The angle's rate follows a quintic at both ends, so that acceleration and jerk begin and end at zero too.
+    The angular rate follows a quintic at both ends, so that acceleration and jerk are zero there too.
     """
 
     def __init__(self, curve: Curve, period_s: float, laps: float) -> None:

@@ -161,7 +161,7 @@ class ClusterSpace(ABC):
         return float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
 
     def difference(self, c_to: Array, c_from: Array) -> Array:
-        """Return c_to - c_from (4n,), angles that wrap by the shorter way."""
+        """Return c_to - c_from (4n,), for angles that wrap the shorter way round."""
         return self.wrapped(c_to - c_from)
 
     def wrapped(self, c: Array) -> Array:
@@ -317,7 +317,7 @@ def euler_axes_C(roll: float, pitch: float) -> Matrix:
 
 
 def euler_rates(roll: float, pitch: float) -> Array:
-    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C; SingularClusterError: pitch is at 90 degrees."""
+    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C; SingularClusterError: pitch is 90 degrees."""
     sr, cr = el.sin(roll), el.cos(roll)
     sp, cp = el.sin(pitch), el.cos(pitch)
     if cp < LENGTH_MIN_M:

@@ -61,7 +61,7 @@ def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
 
 
 def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
-    """Return the start positions of drones (n, 3) [m]: x ahead and y left of the first drone, z up."""
+    """Return the start positions of drones (n, 3) [m] in axes along the heading of the first: x ahead, y left, z up."""
     by_name = {drone.name: drone for drone in scenario.drones}
     yaw = math.radians(by_name[drones[0]].yaw_deg)
     c, s = el.cos(yaw), el.sin(yaw)
@@ -69,7 +69,7 @@ def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
 
 
 def cluster_space(n: int) -> ClusterSpace:
-    """Return the space of n robots, 2 to 64, called triad: the paper's at n = 3, its generalisation otherwise."""
+    """Return the triad space of n robots, 2 to 64: the paper's for n = 3, otherwise its generalisation."""
     if not 2 <= n <= ROBOTS_MAX:
         raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
     return PairCluster() if n == 2 else TriadCluster(n)
@@ -82,7 +82,7 @@ STOCK: dict[str, Callable[[Array], ClusterSpace]] = {
 
 
 class _Group(NamedTuple):
-    """The indices of a group in the whole cluster.
+    """The indices of a group in the complete cluster.
 
     Attributes:
         robots, rows: indices of its robots; of their 4n_k entries in r, four each.
@@ -180,7 +180,7 @@ class NestedCluster(ClusterSpace):
         return c
 
     def parts(self, c: Array) -> list[Array]:
-        """Return the cluster of the parent (4m,), then the whole cluster of each group (4n_k,)."""
+        """Return the cluster of the parent (4m,), then the complete cluster of each group (4n_k,)."""
         parent = c[: self.parent.size]
         bodies = np.empty((self.parent.n, 4))
         bodies[:, :3], bodies[:, 3] = self.parent.inverse(parent)

@@ -1,4 +1,4 @@
-"""The cluster of many robots: a template that moves and rotates as a rigid body, and small departures from it.
+"""The cluster of many robots: a template that moves and rotates as a rigid body, and small deviations from it.
 
     P_i = C + R (t_i + (N w)_i)
 
@@ -92,7 +92,7 @@ class TemplateCluster(ClusterSpace):
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         """Return J; with b_C = R^T (P - C): w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
 
-        It follows from the sum of t_i x b_i being zero, which is what makes R the best fit.
+        It follows from sum of t_i x b_i = 0, the condition for R to be the best fit.
         """
         _, b_C, R_WC = self._fitted(p_W)
         n = self.n
@@ -140,7 +140,7 @@ class TemplateCluster(ClusterSpace):
         return c
 
     def spread(self, c: Array) -> float:
-        """Return the root mean square distance from the line through the robots, measured along the template.
+        """Return the root mean square distance of the robots from the line through them, measured along the template.
 
         It is the minimum eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a template
         of any size, and zero where another rotation fits equally well.
@@ -149,7 +149,7 @@ class TemplateCluster(ClusterSpace):
         return float(eigen(inertia((S + S.T) / 2))[0][0]) / self._reach_m
 
     def condition(self, c: Array) -> float:
-        """Return the condition number of J^-1, the robots' velocities, headings and phi weighted by their rms.
+        """Return the condition number of J^-1, with the robots' velocities, headings and phi weighted by their rms.
 
         With these weights it does not grow with the number of robots; a formation with robots farther than 4 m from the
         centroid is scaled down to that. w_k and the centroid are orthonormal in these weights, which leaves a 7 x 7
@@ -229,7 +229,7 @@ def centred(places: ArrayLike) -> Array:
 
 
 def turns(t: Array) -> Array:
-    """Return the motions e_k x t_i of centred points under a unit turn about each axis: (3, n, 3)."""
+    """Return the motions e_k x t_i of centred points under a unit rotation about each axis, (3, n, 3)."""
     return np.array([np.cross(axis, t) for axis in np.eye(3)])
 
 
