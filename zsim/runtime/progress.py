@@ -1,7 +1,4 @@
-"""Progress of a run on a terminal: a live line, and a line for each event.
-
-A world started by a launcher writes JSON lines (`JsonProgress`); otherwise a `Screen` shows the progress.
-"""
+"""Progress of a run: on a terminal a live line and a line per event (`Screen`), for a launcher JSON lines."""
 
 import json
 import math
@@ -20,27 +17,27 @@ from zsim.contract.run_messages import Waiting, waiting_text
 from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
-SLOW_S = 3.0  # wall time; what is compiled already is loaded within two, unless the machine is busy
+SLOW_S = 3.0  # wall time; code compiled earlier loads within 2 s unless the machine is busy
 SLOW_NOTICE = "loading compiled code; the first time on a machine it is compiled, which takes one to three minutes"
-REPEATED_S = 10.0  # simulated time; as often as the clock is a line where there is no live one
-REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
-DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, by people who look here
+REPEATED_S = 10.0  # simulated time over which equal events are counted; the interval of plain clock lines
+REASON_NS = 5_000_000_000  # simulated time for which a reason must last; a normal take-off has one for 3 s
+DRIVERS, COMINGS = "driver.", ("join", "leave")  # shown because people start drivers by hand and watch this screen
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
 def cell(text: str) -> Text:
-    """Return a text escaped for rich: brackets are not markup, and control codes are visible."""
+    """Return a text for rich in which brackets are not markup and control codes are visible."""
     return Text(printable(text))
 
 
 class NotebookLine:
-    """A line below a notebook's cell that is updated in place, for which rich needs ipywidgets."""
+    """A line below a notebook's cell that is updated in place; rich would need ipywidgets for it."""
 
     def __init__(self) -> None:
         self._handle: Any = None
 
     def update(self, text: str) -> None:
-        from IPython.display import Pretty, display  # there in a notebook
+        from IPython.display import Pretty, display  # present in every notebook
 
         shown = Pretty(printable(text))
         if self._handle is None:
@@ -59,7 +56,7 @@ class ProgressSink(Protocol):
 
 
 class SlowStart:
-    """Shows a line, from a separate thread, when a start takes long: usually code is being compiled."""
+    """Shows a line from another thread if a start takes longer than SLOW_S, usually because code is being compiled."""
 
     def __init__(self, say: Callable[[str], None], text: str = SLOW_NOTICE) -> None:
         self._timer = threading.Timer(SLOW_S, say, args=(text,))
@@ -71,14 +68,14 @@ class SlowStart:
 
 
 class HoldReasons:
-    """Why clusters wait: each reason is shown once, if it lasts."""
+    """The reasons for which clusters wait; a reason that lasts is shown once."""
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[str, int]] = {}
         self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
-        """Return a line with the reason of a state if that has been the same, numbers apart, for REASON_NS."""
+        """Return a line with a state's reason once it has persisted for REASON_NS, ignoring changes of its numbers."""
         shape = without_figures(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
@@ -91,10 +88,10 @@ class HoldReasons:
 
 
 class RepeatedEvents:
-    """Repeated events: the first is shown immediately, equal ones follow as one line with their count."""
+    """Merges repeated events: the first is shown immediately, further equal ones as one line with their count."""
 
     def __init__(self) -> None:
-        # by kind and text: simulated times [s] of the first and the last, and their number
+        # by kind and text: simulated times of the first and the last event [s], and their count
         self._counted: dict[tuple[str, str], tuple[float, float, int]] = {}
 
     def lines(self, t_s: float, kind: str, text: str) -> list[str]:
@@ -119,12 +116,12 @@ class JsonProgress:
 
     @staticmethod
     def read(text: str) -> tuple[str, Any]:
-        """Return kind and content of a line written by the methods; no kind if a library printed it."""
+        """Return kind and content of a line written by this class; the kind is empty for a library's output."""
         try:
             line = json.loads(text)
         except ValueError:
             return "", text
-        if not isinstance(line, dict):  # a number is JSON too
+        if not isinstance(line, dict):  # other output, such as a number, may be valid JSON
             return "", text
         return next(((kind, line[kind]) for kind in ("clock", "event", "health", "say") if kind in line), ("", text))
 
@@ -148,11 +145,11 @@ class JsonProgress:
             sys.stdout.write(json.dumps({kind: content}) + "\n")
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
-            return  # the launcher is gone; its stop channel ends this process
+            return  # the launcher has ended; its stop channel then ends this process
 
 
 class PipedConsole(Console):
-    """A console whose reader may disappear: unread output is dropped without an error."""
+    """A console that drops its output without an error once the reader has gone."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -162,9 +159,9 @@ class Screen:
     """Shows progress live on a terminal; elsewhere, events and a line every ten simulated seconds.
 
     Args:
-        duration_s: simulated time of the end.
+        duration_s: simulated time at the end.
         console: console to write to; None for stderr.
-        from_s: simulated time of the beginning, which for a replay may be within the record.
+        from_s: simulated time at the beginning; a replay may begin within the record.
     """
 
     def __init__(self, duration_s: float, console: Console | None = None, from_s: float = 0.0) -> None:
@@ -194,7 +191,7 @@ class Screen:
         self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def hang_up(self) -> None:
-        """Show only lines from now on, since the terminal is gone; draws nothing, so a signal handler may call it."""
+        """Stop live output, since the terminal has gone; draws nothing, so that a signal handler may call it."""
         self._is_live = False
         self.console.quiet = True
 
@@ -218,11 +215,11 @@ class Screen:
                 self.say(text)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Show nothing: the live line has no room for health; `zsim up` has a table."""
+        """Do nothing: the live line has no room for health, which `zsim up` shows in a table."""
 
 
 def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:
-    """Return the live line: simulated time, real-time factor, phase, and which processes are waited for."""
+    """Return the live line: simulated time, real-time factor, phase, and the processes waited for."""
     span_s = duration_s - from_s
     share = min(1.0, max(0.0, line["t_s"] - from_s) / span_s) if span_s > 0.0 else 0.0
     filled = int(20 * share)

@@ -129,8 +129,7 @@ def _powers(x: float, count: int) -> Array:
 def _greatest(columns: Array) -> tuple[float, float]:
     """Return the maximum on [0, 1] of the sum of squares of k polynomials, coefficients (n, k), and its argument.
 
-    It is found by sampling and golden section. The derivative of such a sum has at most twelve roots, so only maxima
-    narrower than the spacing of the samples can be missed.
+    It is found by sampling and golden section; only maxima narrower than the spacing of the samples can be missed.
     """
     falling = columns[::-1].T.tolist()
 
@@ -234,7 +233,7 @@ def move(
     It lasts over_s, or longer if the limits require. It begins and ends at rest or in the given motions.
 
     Raises:
-        TrajectoryError: no path within an hour satisfies the limits, since the motion at an end is too fast.
+        TrajectoryError: no path of less than an hour satisfies the limits, usually since an end's motion exceeds them.
     """
     turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
     places = np.array([start, [*goal[:3], turned]])
