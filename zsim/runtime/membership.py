@@ -1,4 +1,4 @@
-"""The messages of a process about itself: join, done and bye, on Zenoh and on the in-memory bus, and its health.
+"""The messages of a process about itself (join, done, bye and health), on Zenoh and on the in-memory bus.
 
 Also schedules garbage collection so that it does not delay gates.
 """
@@ -20,24 +20,24 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.contract.run_messages import Bye, Done, Health, Join
 from zsim.runtime.rate_limit import RateLimit
 
-PERIOD_S = 1.0  # contract: 1 Hz wall
+PERIOD_S = 1.0  # interval of health messages; contract: 1 Hz wall
 STEPS_KEPT = 1000
-READS_MAX = 8  # maximum number of expressions listed per process
-ALLOCATIONS = 50_000  # between collections, chosen: a gate allocates hundreds of objects and leaves no cycles
+READS_MAX = 8  # maximum number of key expressions listed in a health message
+ALLOCATIONS = 50_000  # allocations between collections, chosen: a gate allocates hundreds of objects, without cycles
 
 
 @dataclass
 class Membership:
     """The join, dones and bye of a process."""
 
-    name: str  # of the process, role.thing
-    host: str  # that it runs on
+    name: str  # name of the process, role.thing
+    host: str  # host on which it runs
     run_id: str
-    next_seq: Callable[[str], int]  # returns the number of its next message of a kind, from 0
+    next_seq: Callable[[str], int]  # returns the sequence number of its next message of a kind, counted from 0
     serves: tuple[str, ...] = ()  # names of the processes that it replaces
-    period_ns: int = 0  # interval of its dones; 0 for never
-    slack_ns: int = 0  # by how much the world may be ahead of the dones of one without a period; 0 for any
-    calculates: bool = True  # whether its results depend on its arithmetic; else it states no fingerprint
+    period_ns: int = 0  # interval of its dones; 0: none
+    slack_ns: int = 0  # without a period: how far the world may be ahead of its dones; 0: any time
+    calculates: bool = True  # whether its results depend on its arithmetic; otherwise it states no fingerprint
     incarnation: int = 0  # random number of the process; 0 if processes are never restarted
 
     def join(self, t_ns: int = 0) -> Join:
@@ -57,7 +57,7 @@ class Membership:
         )
 
     def done(self, t_ns: int, sent: int) -> Done:
-        """Return the done of a gate, with the number of outputs sent since the last one."""
+        """Return the done of a gate, with the number of outputs sent since the last done."""
         return Done(t_ns, self.next_seq("done"), self.run_id, self.incarnation, t_ns, sent)
 
     def bye(self, t_ns: int, reason: str, failed: bool = False) -> Bye:
@@ -76,23 +76,23 @@ class HealthMeter:
         role: str,
         wall_s: Callable[[], float] = time.monotonic,
         host: str | None = None,
-        reads: Sequence[str] = (),  # the expressions that it subscribes to, as its session keeps them
+        reads: Sequence[str] = (),  # the key expressions it subscribes to: the live list of its session
     ) -> None:
         self._role = role
         self._host = host or socket.gethostname()
         self._reads = reads
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
         self._limit = RateLimit(PERIOD_S, now=wall_s)
-        self._limit.spend()  # the first is due in a second
+        self._limit.spend()  # the first health message is due after one period
         self.received = self.refused = self.dropped = 0
-        self.lag_ns = 0  # how far the newest gate is ahead of the one just handled
-        self.link_lost = False  # whether the world cannot be reached now
+        self.lag_ns = 0  # how far the newest gate is ahead of the gate just handled
+        self.link_lost = False  # whether the world is currently unreachable
 
     def step(self, duration_ns: int) -> None:
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
-        """Whether health is due, once per wall second."""
+        """Whether a health message is due, once per wall second; the call counts as its publication."""
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:
@@ -116,14 +116,14 @@ class HealthMeter:
 def resident_bytes() -> int:
     """Return the resident memory of this process [bytes]; 0 if the system does not report it."""
     if sys.platform == "linux":
-        with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
+        with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # file descriptors may run out
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
 
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Collect garbage rarely, and never examine the objects that already exist.
+    """Within the block, collect garbage rarely and never examine the objects that already exist.
 
     By default Python collects after 700 allocations, every few gates, and occasionally examines all objects.
     """

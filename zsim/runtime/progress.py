@@ -20,11 +20,11 @@ from zsim.contract.run_messages import Waiting, waiting_text
 from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
-SLOW_S = 3.0  # wall time; what is compiled already is loaded within two, unless the machine is busy
+SLOW_S = 3.0  # wall time; compiled code loads within 2 s, unless the machine is busy
 SLOW_NOTICE = "loading compiled code; the first time on a machine it is compiled, which takes one to three minutes"
-REPEATED_S = 10.0  # simulated time; as often as the clock is a line where there is no live one
-REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
-DRIVERS, COMINGS = "driver.", ("join", "leave")  # they are started by hand, by people who look here
+REPEATED_S = 10.0  # simulated time; interval of the clock's lines where there is no live line
+REASON_NS = 5_000_000_000  # simulated time; longer than a take-off, whose reason lasts 3 s
+DRIVERS, COMINGS = "driver.", ("join", "leave")  # shown for drivers, which users start by hand while they watch
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
@@ -40,7 +40,7 @@ class NotebookLine:
         self._handle: Any = None
 
     def update(self, text: str) -> None:
-        from IPython.display import Pretty, display  # there in a notebook
+        from IPython.display import Pretty, display  # always installed in a notebook
 
         shown = Pretty(printable(text))
         if self._handle is None:
@@ -78,7 +78,7 @@ class HoldReasons:
         self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
-        """Return a line with the reason of a state if that has been the same, numbers apart, for REASON_NS."""
+        """Return a line with the state's reason, once that has been unchanged, apart from numbers, for REASON_NS."""
         shape = without_figures(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
@@ -91,10 +91,10 @@ class HoldReasons:
 
 
 class RepeatedEvents:
-    """Repeated events: the first is shown immediately, equal ones follow as one line with their count."""
+    """Repeated events: the first is shown immediately; the following are combined in one line with their number."""
 
     def __init__(self) -> None:
-        # by kind and text: simulated times [s] of the first and the last, and their number
+        # by kind and text: simulated times [s] of the first and last event, and the number of events
         self._counted: dict[tuple[str, str], tuple[float, float, int]] = {}
 
     def lines(self, t_s: float, kind: str, text: str) -> list[str]:
@@ -119,7 +119,7 @@ class JsonProgress:
 
     @staticmethod
     def read(text: str) -> tuple[str, Any]:
-        """Return kind and content of a line written by the methods; no kind if a library printed it."""
+        """Return kind and content of a line written by this class; the kind is empty for any other output."""
         try:
             line = json.loads(text)
         except ValueError:
@@ -141,7 +141,7 @@ class JsonProgress:
         self._write("say", text)
 
     def hang_up(self) -> None:
-        """Do nothing: the reader of the lines handles the loss of its terminal."""
+        """Do nothing: the reader of the lines handles the loss of the terminal."""
 
     def _write(self, kind: str, content: Any) -> None:
         try:
@@ -162,9 +162,9 @@ class Screen:
     """Shows progress live on a terminal; elsewhere, events and a line every ten simulated seconds.
 
     Args:
-        duration_s: simulated time of the end.
+        duration_s: simulated time at the end of the run.
         console: console to write to; None for stderr.
-        from_s: simulated time of the beginning, which for a replay may be within the record.
+        from_s: simulated time at the beginning, which for a replay may be within the record.
     """
 
     def __init__(self, duration_s: float, console: Console | None = None, from_s: float = 0.0) -> None:
@@ -194,7 +194,7 @@ class Screen:
         self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def hang_up(self) -> None:
-        """Show only lines from now on, since the terminal is gone; draws nothing, so a signal handler may call it."""
+        """Stop the live display, since the terminal is gone. Draws nothing, so a signal handler may call it."""
         self._is_live = False
         self.console.quiet = True
 
@@ -218,11 +218,11 @@ class Screen:
                 self.say(text)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Show nothing: the live line has no room for health; `zsim up` has a table."""
+        """Do nothing: the live line has no room for health, which `zsim up` shows in a table."""
 
 
 def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:
-    """Return the live line: simulated time, real-time factor, phase, and which processes are waited for."""
+    """Return the live line: simulated time, real-time factor, phase, and the processes that the world waits for."""
     span_s = duration_s - from_s
     share = min(1.0, max(0.0, line["t_s"] - from_s) / span_s) if span_s > 0.0 else 0.0
     filled = int(20 * share)

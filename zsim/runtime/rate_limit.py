@@ -1,12 +1,12 @@
-"""The rate limiter for requests, refusals, joins and lines on a terminal.
+"""The rate limiter for requests, refusals, joins and terminal output.
 
-Its clock is a parameter: simulated time if a rerun or resumed world must behave the same, else wall time.
+Its clock is a parameter: simulated time if a rerun or resumed world must behave the same, otherwise wall time.
 """
 
 import time
 from collections.abc import Callable
 
-SUBJECTS_MAX = 10_000  # remembered; limits the memory for invented names
+SUBJECTS_MAX = 10_000  # maximum number of subjects; limits the memory that invented names can use
 
 
 class RateLimit:
@@ -22,7 +22,7 @@ class RateLimit:
         self.period = period
         self._burst = burst
         self._now = now
-        self._spent: dict[str, tuple[float, float]] = {}  # amount spent, and when
+        self._spent: dict[str, tuple[float, float]] = {}  # by subject: amount spent, and the time of the last spending
 
     def knows(self, subject: str) -> bool:
         return subject in self._spent
@@ -32,7 +32,7 @@ class RateLimit:
 
     def spend(self, subject: str = "") -> bool:
         """Spend one; return False if none was left."""
-        now = self._now()  # not by `_counted`: some call this at each gate
+        now = self._now()  # inlines `_counted`, since this is called at each gate
         spent, at = self._spent.get(subject, (0.0, 0))
         counted = max(0.0, spent - (now - at) / self.period)
         if counted > self._burst - 1:

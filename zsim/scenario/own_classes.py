@@ -1,6 +1,6 @@
 """Users' classes in a scenario: their parameters and messages, filled in when the scenario is read.
 
-Readers of `world/info` find all parameters and messages there, without importing the classes.
+`world/info` thus contains all parameters and messages, and its readers need not import the classes.
 """
 
 import re
@@ -17,11 +17,11 @@ from zsim.schema import parameters, plugin
 from zsim.schema.checker import Fault, faults, faults_in, listed
 from zsim.sensors.sensor_catalogue import sensor_names
 
-OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are no parameters
+OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # constructor arguments of an agent that are not parameters
 
 
 class AgentMethods:
-    """The methods required of an agent's class: those of zsim.Agent, which is not loaded here."""
+    """The methods required of an agent's class; a copy of those of zsim.Agent, to avoid importing it."""
 
     def receive(self, key: str, message: Any) -> None: ...
 
@@ -29,10 +29,10 @@ class AgentMethods:
 
 
 def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
-    """Return the `agents:` of a scenario with all parameters and messages of their classes, and its faults.
+    """Return the `agents:` section with all parameters and messages of the agents' classes filled in, and its faults.
 
     Args:
-        imports: whether classes may be imported; else the section must be filled in already.
+        imports: whether classes may be imported; otherwise the section must already be filled in.
     """
     if not isinstance(section, dict):
         return section, []
@@ -69,9 +69,9 @@ def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def with_parameters(document: dict[str, Any]) -> list[Fault]:
-    """Fill in the parameters of users' spaces, laws and estimator in a raw document; return their faults.
+    """Fill in the parameters of users' spaces, laws and estimators in a raw document; return the faults found.
 
-    A class that cannot be imported here is left to the processes that need it.
+    A class that cannot be imported here is skipped; the processes that need it will check it.
     """
     wrong: list[Fault] = []
     clusters = document.get("clusters")
@@ -98,11 +98,11 @@ def with_parameters(document: dict[str, Any]) -> list[Fault]:
 
 
 def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str]) -> Iterator[Fault]:
-    """Yield the grants of a cluster to its law that the law does not read, or that none of its drones has.
+    """Yield faults in the inputs that a cluster grants its law: inputs not read by the law, or sensors on no drone.
 
     Args:
-        drones: sound drones by name.
-        unread: names of sensors missing in these because their modules could not be read.
+        drones: validated drones by name.
+        unread: names of sensors missing from `drones` because their modules could not be read.
     """
     given = [name for name in ("law_sensors", "law_map") if getattr(cluster, name)]
     if given and cluster.law in (UNSET, "proportional"):
@@ -122,7 +122,7 @@ def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str])
 
 
 def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:
-    """Return the message classes published by a class of agents; DocumentError if they are invalid."""
+    """Return the message classes that an agent class publishes; DocumentError if they are invalid."""
     classes = getattr(kind, "messages", ())
     try:
         for each in classes:
@@ -138,9 +138,9 @@ def agent_faults(agents: Any, roles: Any, clusters: bool) -> Iterator[Fault]:
     """Yield conflicts between the agents of a scenario.
 
     Args:
-        agents: sound agents by role.
-        roles: roles of zsim, which users may not use.
-        clusters: whether the scenario has any.
+        agents: validated agents by role.
+        roles: zsim's own roles, which users' agents may not take.
+        clusters: whether the scenario has clusters.
     """
     writers: dict[str, str] = {}
     for role, agent in (agents or {}).items():

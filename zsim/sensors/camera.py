@@ -1,6 +1,6 @@
-"""The camera, sighting and hat settings of a scenario.
+"""The camera, sighting and hat settings of a scenario, and the frame header of a JPEG.
 
-Defaults are those of the AR.Drone 2.0. Each exists only if the scenario has its section.
+Defaults describe the AR.Drone 2.0. Cameras, sightings and hats exist only if the scenario has their sections.
 """
 
 from typing import Annotated, Literal, NamedTuple
@@ -21,35 +21,35 @@ CameraRateHz = Annotated[float, Meta(ge=0.1, le=60)]
 
 
 class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A camera; its mount's x looks ahead, y to the left of the picture, z up in it."""
+    """A camera; its mount's x axis points along the line of sight, y to the picture's left, z to its top."""
 
     width_px: WidthPx
     height_px: HeightPx
     diagonal_deg: Annotated[float, Meta(ge=10, le=150)]
-    """Field of view across the picture's diagonal, without distortion."""
+    """Field of view along the picture's diagonal, without distortion."""
     rate_hz: CameraRateHz
     latency_ms: LatencyMs = 0.0  # from the middle of the exposure to the picture's publication
     mount: Mount
     distortion: tuple[Real, Real, Real, Real, Real] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 of Brown and Conrady, as OpenCV has them."""
+    """Brown-Conrady coefficients k1, k2, p1, p2, k3, as in OpenCV."""
     exposure_ms: Annotated[float, Meta(ge=0, le=100)] = 8.0  # chosen: daylight with a small aperture
     noise: Annotated[float, Meta(ge=0, le=64)] = 3.0  # grey levels of 255 per pixel, chosen: a small sensor outdoors
-    blur_px: Annotated[float, Meta(ge=0, le=10)] = 0.6  # of the lens, standard deviation, chosen
-    jpeg_quality: Annotated[int, Meta(ge=10, le=100)] = 75  # chosen: 18 kB a picture
+    blur_px: Annotated[float, Meta(ge=0, le=10)] = 0.6  # blur of the lens, standard deviation, chosen
+    jpeg_quality: Annotated[int, Meta(ge=10, le=100)] = 75  # chosen: 18 kB per picture
 
 
 class FrontCamera(Camera, frozen=True, kw_only=True):
-    """Ahead: the 720p camera of the AR.Drone 2.0, as its video stream has it."""
+    """The forward-looking 720p camera of the AR.Drone 2.0, at the resolution of its video stream."""
 
     width_px: WidthPx = 640
     height_px: HeightPx = 360
     diagonal_deg: Annotated[float, Meta(ge=10, le=150)] = 92.0  # deg, data sheet of the AR.Drone 2.0
-    rate_hz: CameraRateHz = 15.0  # Hz, least of the SDK's codec settings; up to 30
-    mount: Mount = Mount(position_m=(0.162, 0.0, 0.012))  # m, the lens in the nose as drawn
+    rate_hz: CameraRateHz = 15.0  # Hz, minimum of the SDK's codec settings; the maximum is 30
+    mount: Mount = Mount(position_m=(0.162, 0.0, 0.012))  # m, the lens in the nose, as in the 3D model
 
 
 class BottomCamera(Camera, frozen=True, kw_only=True):
-    """Down: the QVGA camera of the AR.Drone 2.0; the top of its picture is ahead."""
+    """The downward-looking QVGA camera of the AR.Drone 2.0; the top of its picture points ahead."""
 
     width_px: WidthPx = 320
     height_px: HeightPx = 240
@@ -59,48 +59,48 @@ class BottomCamera(Camera, frozen=True, kw_only=True):
 
 
 class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a detector of hats reports, modelled without pictures; a test compares it with rendered ones."""
+    """A model of a hat detector's reports that needs no pictures; a test compares it with rendered pictures."""
 
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
-    latency_ms: LatencyMs = 0.0  # of the detector, after the camera's
-    centre_px: ErrorPx = 0.035  # px, fitted to the detector on rendered pictures, as the next three
+    latency_ms: LatencyMs = 0.0  # latency of the detector, in addition to the camera's
+    centre_px: ErrorPx = 0.035  # px; this and the next three are fitted to the detector on rendered pictures
     """Error of a large hat's centre, standard deviation per axis."""
-    diameter_px: ErrorPx = 0.11  # error of its apparent diameter, standard deviation
+    diameter_px: ErrorPx = 0.11  # error of a large hat's apparent diameter, standard deviation
     noise_px2: NonNegative = 0.65
-    """Over the apparent diameter, added to both in quadrature; that of a clear day, more in low light."""
+    """Divided by the apparent diameter and added to both errors in quadrature; for a clear day, larger in low light."""
     blur_share: NonNegative = 0.018
-    """Of the way that a hat moves over the picture during the exposure, added to both in quadrature."""
-    diameter_min_px: Positive = 4.0  # what is measured as smaller is not seen
+    """Share of a hat's movement in the picture during the exposure, added to both errors in quadrature."""
+    diameter_min_px: Positive = 4.0  # hats measured as smaller are not reported
     misalignment_deg: Annotated[float, Meta(ge=0, le=30)] = 0.0
-    """Constant over a run, of the camera's mount, standard deviation per axis."""
-    miss: Fraction = 0.02  # probability that a hat in view is not seen in a picture
-    false_hz: Annotated[float, Meta(ge=0, le=60)] = 0.0  # rate of sightings of nothing, anywhere in the picture
+    """Misalignment of the camera's mount, constant over a run, standard deviation per axis."""
+    miss: Fraction = 0.02  # probability that a hat in view is missed in a picture
+    false_hz: Annotated[float, Meta(ge=0, le=60)] = 0.0  # rate of false sightings, anywhere in the picture
 
 
 class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The magenta markers by which drones see each other: a ball on every drone, and decoys."""
 
-    diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # chosen: a tennis cap's crown, on the AR.Drone's hull
+    diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # chosen: crown of a tennis cap on the AR.Drone's hull
     position_m: tuple[NearM, NearM, NearM] = (-0.03, 0.0, 0.11)  # in B, chosen: on top of the hull, behind the middle
     covered: Annotated[list[DroneName], Meta(max_length=1000)] = []  # drones whose hat cannot be seen
     false_m: Annotated[list[Vector3], Meta(max_length=100)] = []
     """Centres of balls as large and as magenta as a hat, in W."""
 
 
-BEGINS = b"\xff\xd8"  # start of an image; this and the other markers: ITU-T T.81, table B.1
-FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # starts of a frame, SOF0 to SOF15 but DHT, JPG and DAC
-SCAN, END = 0xDA, 0xD9  # the header is over
+BEGINS = b"\xff\xd8"  # start of image; this and the other markers are from ITU-T T.81, table B.1
+FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame: SOF0 to SOF15, without DHT, JPG and DAC
+SCAN, END = 0xDA, 0xD9  # start of scan, end of image: no frame header follows
 STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length: TEM, RST0 to RST7
-FILL = 0xFF  # any number of these may stand before a marker
+FILL = 0xFF  # fill byte, any number of which may precede a marker
 FRAME_BYTES = 9  # marker, length, precision, height, width
 
 
 class PictureError(ValueError):
-    """Bytes that are not a picture of an allowed kind and size; one line."""
+    """Bytes that are not a picture of an allowed kind and size; the text is one line."""
 
 
 class Frame(NamedTuple):
-    """The coding of a JPEG, by the marker of its frame, and its size [px]."""
+    """The frame marker of a JPEG, which identifies its coding, and the size of the picture [px]."""
 
     marker: int
     width: int
@@ -111,7 +111,7 @@ def frame_of(data: bytes) -> Frame:
     """Return the frame header of a JPEG.
 
     Raises:
-        PictureError: there is no valid one.
+        PictureError: the data have no valid frame header.
     """
     at = len(BEGINS) if data.startswith(BEGINS) else len(data)
     while at + 4 <= len(data) and data[at] == 0xFF:
@@ -126,5 +126,5 @@ def frame_of(data: bytes) -> Frame:
         if marker == FILL:
             at += 1
         else:
-            at += 2 if marker in STANDALONE else 2 + max(2, length)  # at least one byte on, so that reading ends
+            at += 2 if marker in STANDALONE else 2 + max(2, length)  # always advances, so that the loop ends
     raise PictureError(f"data ({len(data)} bytes, {data[:4].hex(' ') or 'none'} …) has no frame of a JPEG; must be one")

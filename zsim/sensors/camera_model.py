@@ -1,7 +1,7 @@
-"""The lens of a camera: points of its frame to pixels and back, by a pinhole and the distortion of Brown and Conrady.
+"""The lens of a camera: projects points to pixels and back, by a pinhole with Brown-Conrady distortion.
 
-Frame K of the camera: x to the right of the picture, y down, z ahead. Pixels (u, v) from the picture's upper left
-corner, whole numbers in the middle of a pixel, as OpenCV has them (calib3d, "Detailed description").
+Frame K of the camera: x to the right of the picture, y down, z ahead. Pixels (u, v) count from the picture's upper left
+corner, with integers at the pixel centres, as in OpenCV (calib3d, "Detailed description").
 """
 
 import math
@@ -18,10 +18,10 @@ from zsim.math.rotation import Quaternion, matrix_from_rpy
 from zsim.sensors.camera import Camera
 
 Array = NDArray[np.float64]
-Number = TypeVar("Number", float, NDArray[np.float64])  # or many of them
-R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # K's axes in the mount's: x right is -y, …
-UNDISTORT_STEPS = 12  # of Newton's method; enough for 1e-6 px in any picture that does not fold
-FOLD_GRID, FOLD_PX = 25, 1e-3  # points along each side, and of the way to each; by which one may be missed
+Number = TypeVar("Number", float, NDArray[np.float64])  # one number, or an array of them
+R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # from K to the mount's axes S
+UNDISTORT_STEPS = 12  # steps of Newton's method; enough for 1e-6 px in any picture that does not fold
+FOLD_GRID, FOLD_PX = 25, 1e-3  # points checked along each side and each ray; tolerance of a pixel's inversion
 
 
 class Lens(NamedTuple):
@@ -57,7 +57,7 @@ def lens_of(camera: Camera) -> Lens:
     half_px = el.hypot(camera.width_px, camera.height_px) / 2
     focal_px = half_px / el.tan(math.radians(camera.diagonal_deg) / 2)
     centre = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-    k1, k2, p1, p2, k3 = map(float, camera.distortion)  # what takes a lens is compiled for the types in it
+    k1, k2, p1, p2, k3 = map(float, camera.distortion)  # floats, since functions of a lens are compiled for its types
     return Lens(focal_px, focal_px, *centre, k1, k2, p1, p2, k3, camera.width_px, camera.height_px)
 
 
@@ -67,13 +67,13 @@ def camera_pose(camera: Camera) -> CameraPose:
 
 
 def camera_matrix(lens: Lens) -> Array:
-    """Return K of OpenCV, (3, 3)."""
+    """Return the intrinsic matrix as in OpenCV, (3, 3)."""
     return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
 
 
 @portable
 def distorted(lens: Lens, x: Number, y: Number) -> tuple[Number, Number]:
-    """Return the position of a ray (x, y, 1) of K in the picture plane after the lens, in focal lengths."""
+    """Return where a ray (x, y, 1) in K meets the picture plane behind the lens, in focal lengths."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     return (
@@ -84,7 +84,7 @@ def distorted(lens: Lens, x: Number, y: Number) -> tuple[Number, Number]:
 
 @portable
 def undistorted(lens: Lens, u: Number, v: Number) -> tuple[Number, Number]:
-    """Return the ray (x, y, 1) of K that falls on a pixel, by Newton's method."""
+    """Return the ray (x, y, 1) in K that falls on a pixel, by Newton's method."""
     a, b = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     x, y = a, b
     for _ in range(UNDISTORT_STEPS):
@@ -97,7 +97,7 @@ def undistorted(lens: Lens, u: Number, v: Number) -> tuple[Number, Number]:
 
 @portable
 def distortion_slopes(lens: Lens, x: Number, y: Number) -> tuple[Number, Number, Number]:
-    """Return the derivatives of `distorted`, which are symmetric: of x by x, of either by the other, of y by y."""
+    """Return the Jacobian of `distorted`, which is symmetric: d(x')/dx, d(x')/dy = d(y')/dx, d(y')/dy."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     slope = 2.0 * (lens.k1 + r2 * (2.0 * lens.k2 + 3.0 * r2 * lens.k3))
@@ -107,7 +107,7 @@ def distortion_slopes(lens: Lens, x: Number, y: Number) -> tuple[Number, Number,
 
 
 def folds(lens: Lens) -> bool:
-    """Whether the distortion folds the picture: some pixel has no ray of its own."""
+    """Whether the distortion folds the picture, so that some pixel has no unique ray."""
     u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, FOLD_GRID) for side in (lens.width, lens.height)))
     with np.errstate(all="ignore"):
         x, y = undistorted(lens, u.ravel(), v.ravel())
@@ -121,23 +121,23 @@ def folds(lens: Lens) -> bool:
 
 @portable
 def pixel(lens: Lens, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return the pixel of a point of K in front of the camera (z > 0) [px], possibly outside the picture."""
+    """Return the pixel of a point in K in front of the camera (z > 0) [px], possibly outside the picture."""
     at_x, at_y = distorted(lens, x / z, y / z)
     return lens.fx * at_x + lens.cx, lens.fy * at_y + lens.cy
 
 
-SINGULAR = 1e-9  # of a determinant, below which points do not tell a circle
+SINGULAR = 1e-9  # minimum determinant; below it the points do not determine a circle
 
 
 @portable
 def spread(n: float, x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
-    """Return the standard deviations of centre, per axis, and radius of a circle, over that of each point on its edge.
+    """Return the standard deviations of a fitted circle's centre, per axis, and radius, relative to an edge point's.
 
     Least squares: (A^T A)^-1 with a row (x, y, 1) for every point in the direction (x, y) from the centre.
 
     Args:
-        n: count of points.
-        x, y, xx, xy, yy: sums over their directions and of products of these.
+        n: number of points.
+        x, y, xx, xy, yy: sums of the points' directions and of the products of their components.
     """
     a, b, c = yy * n - y * y, xx * n - x * x, xx * yy - xy * xy
     determinant = max(xx * a - xy * (xy * n - x * y) + x * (xy * y - yy * x), SINGULAR)

@@ -1,8 +1,8 @@
-"""The definition of a sensor: message, settings, channels with errors, and, for a user's sensor, its equation.
+"""The definition of a sensor: message, settings, channels with errors and, for a user's sensor, its equation.
 
     SENSOR = SensorType(message=Airspeed, settings=AirspeedConfig, channels=(...), equation=dynamic_pressure)
 
-The scenario's section, validation, defaults, latency, noise, faults, key, schema, record and counts follow from it.
+The scenario's section, validation, defaults, latency, noise, faults, key, schema, record and counts derive from it.
 """
 
 import math
@@ -19,7 +19,7 @@ from zsim.math.linear import product
 from zsim.schema.message import FieldName, FieldType, Message, MessageName, Whole, declared_type, field_types
 from zsim.schema.quantities import Fraction, NonNegative, Vector3
 
-VALUES_MAX = 6  # numbers of one reading
+VALUES_MAX = 6  # maximum number of values in a reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
 LatencyMs = Annotated[float, Meta(ge=0, le=10_000)]
 CorrelationS = Annotated[float, Meta(ge=0, le=1e6)]
@@ -27,17 +27,17 @@ UNSENSED = ("text", "number[]")  # field types not allowed in a sensor's message
 
 
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Error of one channel, in the channel's unit; units of data sheets and of Kalibr: `sensor_catalogue`."""
+    """Error of one channel, in the channel's unit; `sensor_catalogue` converts from units of data sheets and Kalibr."""
 
-    noise: NonNegative = 0.0  # standard deviation of each sample; white, or with `correlation_s` a Gauss-Markov process
-    density: NonNegative = 0.0  # white, per sqrt(Hz): density * sqrt(rate) of each sample
+    noise: NonNegative = 0.0  # standard deviation of a sample: white, or with `correlation_s` a Gauss-Markov process
+    density: NonNegative = 0.0  # density of white noise, per sqrt(Hz): adds density * sqrt(rate) to each sample
     bias: NonNegative = 0.0  # constant over a run, standard deviation over runs, per axis
     bias_walk: NonNegative = 0.0  # random walk of the bias, per sqrt(s)
     bias_instability: NonNegative | UnsetType = UNSET
-    """Standard deviation of a Gauss-Markov process, in quadrature to a `noise` that is one; unset: none."""
+    """Standard deviation of a Gauss-Markov process, added in quadrature to a correlated `noise`; unset: none."""
     correlation_s: CorrelationS | UnsetType = UNSET
     """Correlation time of the Gauss-Markov process; unset or 0: `noise` is white."""
-    quantum: NonNegative = 0.0  # step of the converter; 0 = none
+    quantum: NonNegative = 0.0  # step of the converter; 0 = no rounding
 
     @property
     def correlation_time_s(self) -> float:
@@ -50,19 +50,19 @@ class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return el.hypot(self.noise, 0.0 if self.bias_instability is UNSET else self.bias_instability)
 
     def white_sigma(self, rate_hz: float) -> float:
-        """Return the standard deviation of white noise per sample, without the rounding of the converter."""
+        """Return the standard deviation of a sample's white noise, excluding the converter's rounding."""
         return el.hypot(0.0 if self.correlation_time_s else self.noise, self.density * math.sqrt(rate_hz))
 
 
 class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Pose of the sensor in the body, X_BS."""
+    """Pose of the sensor in the body, X_BS: position in B, and Euler angles of the rotation from S to B."""
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
 
 
 class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings of every sensor."""
+    """Settings common to all sensors."""
 
     rate_hz: RateHz
     latency_ms: LatencyMs = 0.0
@@ -71,21 +71,23 @@ class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Sample(Message, frozen=True):
-    """The first fields of every sensor's message; `t_sample_ns` is the time of the measurement."""
+    """Base of every sensor's message; `t_sample_ns` is the simulated time of the measurement."""
 
     t_sample_ns: Whole
 
 
 class Channel(Struct, frozen=True, omit_defaults=True):
-    """Numbers of a reading that share an ErrorModel.
+    """Consecutive numbers of a reading that share an ErrorModel.
 
     Attributes:
-        settings: field of the settings that has the ErrorModel.
-        unit: of the ErrorModel, and of a bias that a fault adds.
-        to_si: what a unit is in that of the equation's values, e.g. pi / 180 where settings are in deg/s and values
+        settings: field of the settings that holds the ErrorModel.
+        unit: unit of the ErrorModel, and of a bias added by a fault.
+        to_si: factor from `unit` to the unit of the equation's values, e.g. pi / 180 for settings in deg/s and values
             in rad/s.
-        part, label: first word of its fault kinds, empty for the sensor as a whole; what it is called.
-        axes, bias_max: what the bias of a fault is along, or of; largest that it may add, in each number.
+        part: first word of the channel's fault kinds; empty for the whole sensor.
+        label: name of the channel in texts.
+        axes: axes or quantity to which a fault's bias applies, in texts.
+        bias_max: maximum magnitude of each number of a fault's bias, in `unit`.
     """
 
     settings: FieldName
@@ -105,10 +107,10 @@ class SensorTruth(Struct, frozen=True):
         t_s: simulated time [s].
         p_WB, v_WB, a_WB: position [m], velocity [m/s], acceleration [m/s^2] of the centre of mass in W, (3,).
             The acceleration is that of the board's last step, at most 5 ms old.
-        R_WB: rotation, body components to world components, (3, 3).
+        R_WB: rotation matrix from body to world components, (3, 3).
         w_WB_B, alpha_B: body rate [rad/s] and its derivative [rad/s^2] in B, (3,).
-        air_W: velocity of the air at the drone in W, steady wind, gusts and the wash of others [m/s], (3,).
-        p_BS, R_BS: pose of the sensor in the body, [m] and sensor components to body components.
+        air_W: velocity of the air at the drone in W [m/s], (3,): steady wind, gusts and the wash of other drones.
+        p_BS, R_BS: pose of the sensor in the body: position [m], (3,), and rotation from S to B, (3, 3).
     """
 
     t_s: float
@@ -140,27 +142,28 @@ class SensorTruth(Struct, frozen=True):
 
     @property
     def R_WS(self) -> NDArray[np.float64]:
-        """Rotation, sensor components to world components, (3, 3)."""
+        """Rotation matrix from sensor to world components, (3, 3)."""
         return product(self.R_WB, self.R_BS)
 
 
 Equation = Callable[[SensorTruth, Any, Any], Sequence[float]]
-"""(truth, settings, environment of the scenario) -> the values of all channels in order, then those without error."""
+"""(truth, settings, environment of the scenario) -> the values of all channels in order, then the exact values."""
 Conversion = Callable[[Sequence[float], Any, Any], Sequence[Any]]
-"""(reading, settings, environment) -> the numbers of the message's fields in order."""
+"""(reading, settings, environment) -> the numbers of the message's fields, in order."""
 
 
 class SensorType(Struct, frozen=True, kw_only=True):
     """A kind of sensor.
 
     Attributes:
-        message: subclass of Sample; its own fields are numbers, tuples of numbers, whole numbers, or true and false.
+        message: subclass of Sample, whose own fields are numbers, tuples of numbers, whole numbers, or booleans.
         settings: subclass of Sensor, with an ErrorModel for each channel.
-        channels: in the order of the equation's values; `exact` ones follow, without an error of their own.
-        label: what the sensor is called in tables; empty for its name in the scenario.
-        equation, convert: of a user's sensor, the latter from the reading to the message (None: the values are the
-            message's numbers). The equations of the stock ones are compiled in zsim_world.sensors.
-        presets: of a stock sensor, its section by the name of the preset.
+        channels: channels in the order of the equation's values.
+        exact: number of further values without an error of their own, after those of the channels.
+        label: name of the sensor in tables; empty: its name in the scenario.
+        equation: equation of a user's sensor; those of stock sensors are compiled in zsim_world.sensors.
+        convert: conversion of a user's sensor from reading to message; None: the values are the message's numbers.
+        presets: settings of a stock sensor by the name of the preset.
     """
 
     message: type[Sample]
@@ -173,15 +176,15 @@ class SensorType(Struct, frozen=True, kw_only=True):
     presets: dict[str, dict[str, Any]] = {}
 
     @property
-    def width(self) -> int:  # numbers with an error of their own
+    def width(self) -> int:  # number of values with an error of their own
         return sum(channel.width for channel in self.channels)
 
     @property
-    def values(self) -> int:  # numbers of a reading
+    def values(self) -> int:  # number of values in a reading
         return self.width + self.exact
 
     def errors(self, settings: Sensor) -> list[ErrorModel]:
-        """Return the error model of every number that has one, in SI units."""
+        """Return the error model of every value of the channels, in the unit of the equation's values."""
         models = [
             (scaled(getattr(settings, channel.settings), channel.to_si), channel.width) for channel in self.channels
         ]
@@ -189,7 +192,7 @@ class SensorType(Struct, frozen=True, kw_only=True):
 
 
 class Declaration(Struct, frozen=True, omit_defaults=True):
-    """The description of a user's sensor for readers without its module; part of the resolved scenario."""
+    """The description of a user's sensor for processes without its module; part of the resolved scenario."""
 
     message: MessageName
     fields: dict[FieldName, FieldType]
