@@ -1,7 +1,4 @@
-"""Progress of a run on a terminal: a live line, and a line for each event.
-
-A world started by a launcher writes JSON lines (`JsonProgress`); otherwise a `Screen` shows the progress.
-"""
+"""Progress of a run: on a terminal a live line and a line per event (`Screen`), for a launcher JSON lines."""
 
 import json
 import math
@@ -20,27 +17,27 @@ from zsim.contract.run_messages import Waiting, waiting_text
 from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
-SLOW_S = 3.0  # wall time; compiled code loads within 2 s, unless the machine is busy
+SLOW_S = 3.0  # wall time; code compiled earlier loads within 2 s unless the machine is busy
 SLOW_NOTICE = "loading compiled code; the first time on a machine it is compiled, which takes one to three minutes"
-REPEATED_S = 10.0  # simulated time; interval of the clock's lines where there is no live line
-REASON_NS = 5_000_000_000  # simulated time; longer than a take-off, whose reason lasts 3 s
-DRIVERS, COMINGS = "driver.", ("join", "leave")  # shown for drivers, which users start by hand while they watch
+REPEATED_S = 10.0  # simulated time over which equal events are counted; the interval of plain clock lines
+REASON_NS = 5_000_000_000  # simulated time for which a reason must last; a normal take-off has one for 3 s
+DRIVERS, COMINGS = "driver.", ("join", "leave")  # shown because people start drivers by hand and watch this screen
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
 def cell(text: str) -> Text:
-    """Return a text escaped for rich: brackets are not markup, and control codes are visible."""
+    """Return a text for rich in which brackets are not markup and control codes are visible."""
     return Text(printable(text))
 
 
 class NotebookLine:
-    """A line below a notebook's cell that is updated in place, for which rich needs ipywidgets."""
+    """A line below a notebook's cell that is updated in place; rich would need ipywidgets for it."""
 
     def __init__(self) -> None:
         self._handle: Any = None
 
     def update(self, text: str) -> None:
-        from IPython.display import Pretty, display  # always installed in a notebook
+        from IPython.display import Pretty, display  # present in every notebook
 
         shown = Pretty(printable(text))
         if self._handle is None:
@@ -59,7 +56,7 @@ class ProgressSink(Protocol):
 
 
 class SlowStart:
-    """Shows a line, from a separate thread, when a start takes long: usually code is being compiled."""
+    """Shows a line from another thread if a start takes longer than SLOW_S, usually because code is being compiled."""
 
     def __init__(self, say: Callable[[str], None], text: str = SLOW_NOTICE) -> None:
         self._timer = threading.Timer(SLOW_S, say, args=(text,))
@@ -71,14 +68,14 @@ class SlowStart:
 
 
 class HoldReasons:
-    """Why clusters wait: each reason is shown once, if it lasts."""
+    """The reasons for which clusters wait; a reason that lasts is shown once."""
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[str, int]] = {}
         self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
-        """Return a line with the state's reason, once that has been unchanged, apart from numbers, for REASON_NS."""
+        """Return a line with a state's reason once it has persisted for REASON_NS, ignoring changes of its numbers."""
         shape = without_figures(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
@@ -91,10 +88,10 @@ class HoldReasons:
 
 
 class RepeatedEvents:
-    """Repeated events: the first is shown immediately; the following are combined in one line with their number."""
+    """Merges repeated events: the first is shown immediately, further equal ones as one line with their count."""
 
     def __init__(self) -> None:
-        # by kind and text: simulated times [s] of the first and last event, and the number of events
+        # by kind and text: simulated times of the first and the last event [s], and their count
         self._counted: dict[tuple[str, str], tuple[float, float, int]] = {}
 
     def lines(self, t_s: float, kind: str, text: str) -> list[str]:
@@ -119,12 +116,12 @@ class JsonProgress:
 
     @staticmethod
     def read(text: str) -> tuple[str, Any]:
-        """Return kind and content of a line written by this class; the kind is empty for any other output."""
+        """Return kind and content of a line written by this class; the kind is empty for a library's output."""
         try:
             line = json.loads(text)
         except ValueError:
             return "", text
-        if not isinstance(line, dict):  # a number is JSON too
+        if not isinstance(line, dict):  # other output, such as a number, may be valid JSON
             return "", text
         return next(((kind, line[kind]) for kind in ("clock", "event", "health", "say") if kind in line), ("", text))
 
@@ -148,11 +145,11 @@ class JsonProgress:
             sys.stdout.write(json.dumps({kind: content}) + "\n")
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
-            return  # the launcher is gone; its stop channel ends this process
+            return  # the launcher has ended; its stop channel then ends this process
 
 
 class PipedConsole(Console):
-    """A console whose reader may disappear: unread output is dropped without an error."""
+    """A console that drops its output without an error once the reader has gone."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
@@ -162,9 +159,9 @@ class Screen:
     """Shows progress live on a terminal; elsewhere, events and a line every ten simulated seconds.
 
     Args:
-        duration_s: simulated time at the end of the run.
+        duration_s: simulated time at the end.
         console: console to write to; None for stderr.
-        from_s: simulated time at the beginning, which for a replay may be within the record.
+        from_s: simulated time at the beginning; a replay may begin within the record.
     """
 
     def __init__(self, duration_s: float, console: Console | None = None, from_s: float = 0.0) -> None:
@@ -194,7 +191,7 @@ class Screen:
         self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     def hang_up(self) -> None:
-        """Stop the live display, since the terminal is gone. Draws nothing, so a signal handler may call it."""
+        """Stop live output, since the terminal has gone; draws nothing, so that a signal handler may call it."""
         self._is_live = False
         self.console.quiet = True
 
@@ -222,7 +219,7 @@ class Screen:
 
 
 def describe(line: dict[str, Any], duration_s: float, from_s: float = 0.0) -> str:
-    """Return the live line: simulated time, real-time factor, phase, and the processes that the world waits for."""
+    """Return the live line: simulated time, real-time factor, phase, and the processes waited for."""
     span_s = duration_s - from_s
     share = min(1.0, max(0.0, line["t_s"] - from_s) / span_s) if span_s > 0.0 else 0.0
     filled = int(20 * share)

@@ -1,6 +1,6 @@
 """Users' classes in a scenario: their parameters and messages, filled in when the scenario is read.
 
-`world/info` thus contains all parameters and messages, and its readers need not import the classes.
+Readers of `world/info` thus have all parameters and messages without importing the classes.
 """
 
 import re
@@ -17,11 +17,11 @@ from zsim.schema import parameters, plugin
 from zsim.schema.checker import Fault, faults, faults_in, listed
 from zsim.sensors.sensor_catalogue import sensor_names
 
-OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # constructor arguments of an agent that are not parameters
+OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's constructor that are not parameters
 
 
 class AgentMethods:
-    """The methods required of an agent's class; a copy of those of zsim.Agent, to avoid importing it."""
+    """The methods required of an agent's class: those of zsim.Agent, which is not imported here."""
 
     def receive(self, key: str, message: Any) -> None: ...
 
@@ -29,10 +29,10 @@ class AgentMethods:
 
 
 def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
-    """Return the `agents:` section with all parameters and messages of the agents' classes filled in, and its faults.
+    """Return a scenario's `agents:` section, completed with parameters and messages of the classes, and its faults.
 
     Args:
-        imports: whether classes may be imported; otherwise the section must already be filled in.
+        imports: whether classes may be imported; if not, the section must already be complete.
     """
     if not isinstance(section, dict):
         return section, []
@@ -71,7 +71,7 @@ def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
 def with_parameters(document: dict[str, Any]) -> list[Fault]:
     """Fill in the parameters of users' spaces, laws and estimators in a raw document; return the faults found.
 
-    A class that cannot be imported here is skipped; the processes that need it will check it.
+    Classes that cannot be imported here are skipped: the processes that need them report the fault.
     """
     wrong: list[Fault] = []
     clusters = document.get("clusters")
@@ -98,11 +98,11 @@ def with_parameters(document: dict[str, Any]) -> list[Fault]:
 
 
 def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str]) -> Iterator[Fault]:
-    """Yield faults in the inputs that a cluster grants its law: inputs not read by the law, or sensors on no drone.
+    """Yield the faults of a cluster's grants to its law: grants to a stock law, duplicates, sensors that no drone has.
 
     Args:
-        drones: validated drones by name.
-        unread: names of sensors missing from `drones` because their modules could not be read.
+        drones: valid parts of the drones by name.
+        unread: names of sensors absent from these because their modules could not be read.
     """
     given = [name for name in ("law_sensors", "law_map") if getattr(cluster, name)]
     if given and cluster.law in (UNSET, "proportional"):
@@ -122,7 +122,11 @@ def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str])
 
 
 def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:
-    """Return the message classes that an agent class publishes; DocumentError if they are invalid."""
+    """Return the message classes that an agent's class publishes.
+
+    Raises:
+        DocumentError: they are invalid.
+    """
     classes = getattr(kind, "messages", ())
     try:
         for each in classes:
@@ -138,8 +142,8 @@ def agent_faults(agents: Any, roles: Any, clusters: bool) -> Iterator[Fault]:
     """Yield conflicts between the agents of a scenario.
 
     Args:
-        agents: validated agents by role.
-        roles: zsim's own roles, which users' agents may not take.
+        agents: valid parts of the agents by role.
+        roles: zsim's own roles, which users must not use.
         clusters: whether the scenario has clusters.
     """
     writers: dict[str, str] = {}

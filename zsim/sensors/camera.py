@@ -1,6 +1,6 @@
-"""The camera, sighting and hat settings of a scenario, and the frame header of a JPEG.
+"""The settings of cameras, sightings and hats in a scenario, and the frame header of a JPEG.
 
-Defaults describe the AR.Drone 2.0. Cameras, sightings and hats exist only if the scenario has their sections.
+The defaults are those of the AR.Drone 2.0. A section that the scenario omits is absent.
 """
 
 from typing import Annotated, Literal, NamedTuple
@@ -21,7 +21,7 @@ CameraRateHz = Annotated[float, Meta(ge=0.1, le=60)]
 
 
 class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A camera; its mount's x axis points along the line of sight, y to the picture's left, z to its top."""
+    """A camera; in the axes of its mount, x is the viewing direction, y points left in the picture and z up."""
 
     width_px: WidthPx
     height_px: HeightPx
@@ -31,76 +31,79 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     latency_ms: LatencyMs = 0.0  # from the middle of the exposure to the picture's publication
     mount: Mount
     distortion: tuple[Real, Real, Real, Real, Real] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Brown-Conrady coefficients k1, k2, p1, p2, k3, as in OpenCV."""
-    exposure_ms: Annotated[float, Meta(ge=0, le=100)] = 8.0  # chosen: daylight with a small aperture
-    noise: Annotated[float, Meta(ge=0, le=64)] = 3.0  # grey levels of 255 per pixel, chosen: a small sensor outdoors
-    blur_px: Annotated[float, Meta(ge=0, le=10)] = 0.6  # blur of the lens, standard deviation, chosen
-    jpeg_quality: Annotated[int, Meta(ge=10, le=100)] = 75  # chosen: 18 kB per picture
+    """k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's convention."""
+    exposure_ms: Annotated[float, Meta(ge=0, le=100)] = 8.0  # typical of daylight with a small aperture
+    noise: Annotated[float, Meta(ge=0, le=64)] = (
+        3.0  # grey levels (of 255) per pixel; typical of a small sensor outdoors
+    )
+    blur_px: Annotated[float, Meta(ge=0, le=10)] = 0.6  # standard deviation of the lens blur; assumed
+    jpeg_quality: Annotated[int, Meta(ge=10, le=100)] = 75  # gives about 18 kB per picture
 
 
 class FrontCamera(Camera, frozen=True, kw_only=True):
-    """The forward-looking 720p camera of the AR.Drone 2.0, at the resolution of its video stream."""
+    """Forward-looking: the 720p camera of the AR.Drone 2.0, at the size of its video stream."""
 
     width_px: WidthPx = 640
     height_px: HeightPx = 360
     diagonal_deg: Annotated[float, Meta(ge=10, le=150)] = 92.0  # deg, data sheet of the AR.Drone 2.0
     rate_hz: CameraRateHz = 15.0  # Hz, minimum of the SDK's codec settings; the maximum is 30
-    mount: Mount = Mount(position_m=(0.162, 0.0, 0.012))  # m, the lens in the nose, as in the 3D model
+    mount: Mount = Mount(position_m=(0.162, 0.0, 0.012))  # m, lens in the nose of the drawn model
 
 
 class BottomCamera(Camera, frozen=True, kw_only=True):
-    """The downward-looking QVGA camera of the AR.Drone 2.0; the top of its picture points ahead."""
+    """Downward-looking: the QVGA camera of the AR.Drone 2.0; the top of its picture is towards the nose."""
 
     width_px: WidthPx = 320
     height_px: HeightPx = 240
     diagonal_deg: Annotated[float, Meta(ge=10, le=150)] = 64.0  # deg, data sheet of the AR.Drone 2.0
-    rate_hz: CameraRateHz = 60.0  # Hz, data sheet
-    mount: Mount = Mount(position_m=(0.0, 0.0, -0.03), rpy_deg=(0.0, 90.0, 0.0))  # m, under the main board; chosen
+    rate_hz: CameraRateHz = 60.0  # Hz, data sheet of the AR.Drone 2.0
+    mount: Mount = Mount(position_m=(0.0, 0.0, -0.03), rpy_deg=(0.0, 90.0, 0.0))  # m, assumed below the main board
 
 
 class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A model of a hat detector's reports that needs no pictures; a test compares it with rendered pictures."""
+    """A hat detector modelled without pictures; a test compares it with the detector on rendered pictures."""
 
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
     latency_ms: LatencyMs = 0.0  # latency of the detector, in addition to the camera's
-    centre_px: ErrorPx = 0.035  # px; this and the next three are fitted to the detector on rendered pictures
+    # the next four are fitted to the detector on rendered pictures
+    centre_px: ErrorPx = 0.035
     """Error of a large hat's centre, standard deviation per axis."""
     diameter_px: ErrorPx = 0.11  # error of a large hat's apparent diameter, standard deviation
     noise_px2: NonNegative = 0.65
-    """Divided by the apparent diameter and added to both errors in quadrature; for a clear day, larger in low light."""
+    """Divided by the apparent diameter, an error added to both in quadrature; for a clear day, larger in low light."""
     blur_share: NonNegative = 0.018
-    """Share of a hat's movement in the picture during the exposure, added to both errors in quadrature."""
+    """Error as a share of the hat's motion in the picture during the exposure, added to both in quadrature."""
     diameter_min_px: Positive = 4.0  # hats measured as smaller are not reported
     misalignment_deg: Annotated[float, Meta(ge=0, le=30)] = 0.0
     """Misalignment of the camera's mount, constant over a run, standard deviation per axis."""
-    miss: Fraction = 0.02  # probability that a hat in view is missed in a picture
-    false_hz: Annotated[float, Meta(ge=0, le=60)] = 0.0  # rate of false sightings, anywhere in the picture
+    miss: Fraction = 0.02  # probability that a hat in view is not detected in a picture
+    false_hz: Annotated[float, Meta(ge=0, le=60)] = 0.0  # rate of false sightings, uniform over the picture
 
 
 class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The magenta markers by which drones see each other: a ball on every drone, and decoys."""
+    """The magenta markers by which drones detect each other: a ball on every drone, and decoys."""
 
-    diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # chosen: crown of a tennis cap on the AR.Drone's hull
-    position_m: tuple[NearM, NearM, NearM] = (-0.03, 0.0, 0.11)  # in B, chosen: on top of the hull, behind the middle
+    diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # about the crown of a tennis cap on the AR.Drone's hull
+    position_m: tuple[NearM, NearM, NearM] = (-0.03, 0.0, 0.11)  # m, in B: on top of the hull, behind the middle
     covered: Annotated[list[DroneName], Meta(max_length=1000)] = []  # drones whose hat cannot be seen
     false_m: Annotated[list[Vector3], Meta(max_length=100)] = []
-    """Centres of balls as large and as magenta as a hat, in W."""
+    """Centres in W [m] of decoys: balls with the size and colour of a hat."""
 
 
-BEGINS = b"\xff\xd8"  # start of image; this and the other markers are from ITU-T T.81, table B.1
-FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # start of frame: SOF0 to SOF15, without DHT, JPG and DAC
-SCAN, END = 0xDA, 0xD9  # start of scan, end of image: no frame header follows
+BEGINS = b"\xff\xd8"  # SOI, start of image; markers are those of ITU-T T.81, table B.1
+FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15, without DHT, JPG and DAC between them
+SCAN, END = 0xDA, 0xD9  # SOS and EOI, which end the header
 STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length: TEM, RST0 to RST7
-FILL = 0xFF  # fill byte, any number of which may precede a marker
-FRAME_BYTES = 9  # marker, length, precision, height, width
+FILL = 0xFF  # fill byte; any number of them may precede a marker
+FRAME_BYTES = 9  # bytes of marker, length, precision, height and width
 
 
 class PictureError(ValueError):
-    """Bytes that are not a picture of an allowed kind and size; the text is one line."""
+    """Bytes that are not a picture of an allowed kind and size; the text has one line."""
 
 
 class Frame(NamedTuple):
-    """The frame marker of a JPEG, which identifies its coding, and the size of the picture [px]."""
+    """The frame header of a JPEG: its marker, which identifies the coding, and the size [px]."""
 
     marker: int
     width: int
@@ -111,7 +114,7 @@ def frame_of(data: bytes) -> Frame:
     """Return the frame header of a JPEG.
 
     Raises:
-        PictureError: the data have no valid frame header.
+        PictureError: there is no valid frame header.
     """
     at = len(BEGINS) if data.startswith(BEGINS) else len(data)
     while at + 4 <= len(data) and data[at] == 0xFF:
@@ -126,5 +129,5 @@ def frame_of(data: bytes) -> Frame:
         if marker == FILL:
             at += 1
         else:
-            at += 2 if marker in STANDALONE else 2 + max(2, length)  # always advances, so that the loop ends
+            at += 2 if marker in STANDALONE else 2 + max(2, length)  # always advances, so that reading ends
     raise PictureError(f"data ({len(data)} bytes, {data[:4].hex(' ') or 'none'} …) has no frame of a JPEG; must be one")

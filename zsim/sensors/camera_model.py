@@ -1,7 +1,7 @@
-"""The lens of a camera: projects points to pixels and back, by a pinhole with Brown-Conrady distortion.
+"""The camera model: projection and its inverse, with a pinhole and the distortion of Brown and Conrady.
 
-Frame K of the camera: x to the right of the picture, y down, z ahead. Pixels (u, v) count from the picture's upper left
-corner, with integers at the pixel centres, as in OpenCV (calib3d, "Detailed description").
+Camera frame K: x to the right in the picture, y down, z in the viewing direction. Pixel coordinates (u, v) start at the
+upper left of the picture, with whole numbers at pixel centres, as in OpenCV (calib3d, "Detailed description").
 """
 
 import math
@@ -18,10 +18,10 @@ from zsim.math.rotation import Quaternion, matrix_from_rpy
 from zsim.sensors.camera import Camera
 
 Array = NDArray[np.float64]
-Number = TypeVar("Number", float, NDArray[np.float64])  # one number, or an array of them
-R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # from K to the mount's axes S
-UNDISTORT_STEPS = 12  # steps of Newton's method; enough for 1e-6 px in any picture that does not fold
-FOLD_GRID, FOLD_PX = 25, 1e-3  # points checked along each side and each ray; tolerance of a pixel's inversion
+Number = TypeVar("Number", float, NDArray[np.float64])
+R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # columns: K's axes in the mount's components
+UNDISTORT_STEPS = 12  # Newton steps; enough for 1e-6 px in any picture that does not fold
+FOLD_GRID, FOLD_PX = 25, 1e-3  # grid points per side and samples per ray; maximum error of a pixel's ray [px]
 
 
 class Lens(NamedTuple):
@@ -53,11 +53,11 @@ class CameraPose(NamedTuple):
 
 
 def lens_of(camera: Camera) -> Lens:
-    """Return the lens of a camera: square pixels, the diagonal field of view, the axis in the picture's middle."""
+    """Return a lens with square pixels, the camera's diagonal field of view, and its axis in the picture's middle."""
     half_px = el.hypot(camera.width_px, camera.height_px) / 2
     focal_px = half_px / el.tan(math.radians(camera.diagonal_deg) / 2)
     centre = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-    k1, k2, p1, p2, k3 = map(float, camera.distortion)  # floats, since functions of a lens are compiled for its types
+    k1, k2, p1, p2, k3 = map(float, camera.distortion)  # compiled functions are specialised for the lens's types
     return Lens(focal_px, focal_px, *centre, k1, k2, p1, p2, k3, camera.width_px, camera.height_px)
 
 
@@ -67,13 +67,13 @@ def camera_pose(camera: Camera) -> CameraPose:
 
 
 def camera_matrix(lens: Lens) -> Array:
-    """Return the intrinsic matrix as in OpenCV, (3, 3)."""
+    """Return the camera matrix of OpenCV, (3, 3)."""
     return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
 
 
 @portable
 def distorted(lens: Lens, x: Number, y: Number) -> tuple[Number, Number]:
-    """Return where a ray (x, y, 1) in K meets the picture plane behind the lens, in focal lengths."""
+    """Return where the lens images the ray (x, y, 1) of K in the picture plane, in focal lengths."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     return (
@@ -84,7 +84,7 @@ def distorted(lens: Lens, x: Number, y: Number) -> tuple[Number, Number]:
 
 @portable
 def undistorted(lens: Lens, u: Number, v: Number) -> tuple[Number, Number]:
-    """Return the ray (x, y, 1) in K that falls on a pixel, by Newton's method."""
+    """Return x and y of the ray (x, y, 1) of K that falls on a pixel, by Newton's method."""
     a, b = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     x, y = a, b
     for _ in range(UNDISTORT_STEPS):
@@ -97,7 +97,7 @@ def undistorted(lens: Lens, u: Number, v: Number) -> tuple[Number, Number]:
 
 @portable
 def distortion_slopes(lens: Lens, x: Number, y: Number) -> tuple[Number, Number, Number]:
-    """Return the Jacobian of `distorted`, which is symmetric: d(x')/dx, d(x')/dy = d(y')/dx, d(y')/dy."""
+    """Return the Jacobian of `distorted`, which is symmetric: its elements xx, xy and yy."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     slope = 2.0 * (lens.k1 + r2 * (2.0 * lens.k2 + 3.0 * r2 * lens.k3))
@@ -107,7 +107,7 @@ def distortion_slopes(lens: Lens, x: Number, y: Number) -> tuple[Number, Number,
 
 
 def folds(lens: Lens) -> bool:
-    """Whether the distortion folds the picture, so that some pixel has no unique ray."""
+    """Whether the distortion folds the picture, so that some pixel corresponds to no unique ray."""
     u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, FOLD_GRID) for side in (lens.width, lens.height)))
     with np.errstate(all="ignore"):
         x, y = undistorted(lens, u.ravel(), v.ravel())
@@ -121,7 +121,7 @@ def folds(lens: Lens) -> bool:
 
 @portable
 def pixel(lens: Lens, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return the pixel of a point in K in front of the camera (z > 0) [px], possibly outside the picture."""
+    """Return the pixel [px], possibly outside the picture, of a point in K in front of the camera (z > 0)."""
     at_x, at_y = distorted(lens, x / z, y / z)
     return lens.fx * at_x + lens.cx, lens.fy * at_y + lens.cy
 
@@ -131,13 +131,14 @@ SINGULAR = 1e-9  # minimum determinant; below it the points do not determine a c
 
 @portable
 def spread(n: float, x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
-    """Return the standard deviations of a fitted circle's centre, per axis, and radius, relative to an edge point's.
+    """Return the standard deviations of a fitted circle's centre, per axis, and radius, relative to its edge points'.
 
-    Least squares: (A^T A)^-1 with a row (x, y, 1) for every point in the direction (x, y) from the centre.
+    From the least-squares covariance (A^T A)^-1, where A has a row (x, y, 1) for each edge point in the direction
+    (x, y) from the centre.
 
     Args:
         n: number of points.
-        x, y, xx, xy, yy: sums of the points' directions and of the products of their components.
+        x, y, xx, xy, yy: sums over the points of the direction's components and their products.
     """
     a, b, c = yy * n - y * y, xx * n - x * x, xx * yy - xy * xy
     determinant = max(xx * a - xy * (xy * n - x * y) + x * (xy * y - yy * x), SINGULAR)

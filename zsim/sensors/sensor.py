@@ -1,8 +1,9 @@
-"""The definition of a sensor: message, settings, channels with errors and, for a user's sensor, its equation.
+"""The definition of a sensor: message, settings, channels with error models, and, for a user's sensor, its equation.
 
     SENSOR = SensorType(message=Airspeed, settings=AirspeedConfig, channels=(...), equation=dynamic_pressure)
 
-The scenario's section, validation, defaults, latency, noise, faults, key, schema, record and counts derive from it.
+The sensor's scenario section, validation, defaults, latency, noise, faults, key, schema, recording and message counts
+follow from it.
 """
 
 import math
@@ -19,7 +20,7 @@ from zsim.math.linear import product
 from zsim.schema.message import FieldName, FieldType, Message, MessageName, Whole, declared_type, field_types
 from zsim.schema.quantities import Fraction, NonNegative, Vector3
 
-VALUES_MAX = 6  # maximum number of values in a reading
+VALUES_MAX = 6  # numbers in one reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
 LatencyMs = Annotated[float, Meta(ge=0, le=10_000)]
 CorrelationS = Annotated[float, Meta(ge=0, le=1e6)]
@@ -27,17 +28,17 @@ UNSENSED = ("text", "number[]")  # field types not allowed in a sensor's message
 
 
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Error of one channel, in the channel's unit; `sensor_catalogue` converts from units of data sheets and Kalibr."""
+    """Error of one channel, in its unit; `sensor_catalogue` converts the units of data sheets and of Kalibr."""
 
-    noise: NonNegative = 0.0  # standard deviation of a sample: white, or with `correlation_s` a Gauss-Markov process
-    density: NonNegative = 0.0  # density of white noise, per sqrt(Hz): adds density * sqrt(rate) to each sample
-    bias: NonNegative = 0.0  # constant over a run, standard deviation over runs, per axis
+    noise: NonNegative = 0.0  # standard deviation per sample; white, or with `correlation_s` a Gauss-Markov process
+    density: NonNegative = 0.0  # white noise per sqrt(Hz); its standard deviation per sample is density * sqrt(rate)
+    bias: NonNegative = 0.0  # standard deviation over runs, per axis, of a bias that is constant over a run
     bias_walk: NonNegative = 0.0  # random walk of the bias, per sqrt(s)
     bias_instability: NonNegative | UnsetType = UNSET
     """Standard deviation of a Gauss-Markov process, added in quadrature to a correlated `noise`; unset: none."""
     correlation_s: CorrelationS | UnsetType = UNSET
     """Correlation time of the Gauss-Markov process; unset or 0: `noise` is white."""
-    quantum: NonNegative = 0.0  # step of the converter; 0 = no rounding
+    quantum: NonNegative = 0.0  # step of the converter; 0: none
 
     @property
     def correlation_time_s(self) -> float:
@@ -50,7 +51,7 @@ class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return el.hypot(self.noise, 0.0 if self.bias_instability is UNSET else self.bias_instability)
 
     def white_sigma(self, rate_hz: float) -> float:
-        """Return the standard deviation of a sample's white noise, excluding the converter's rounding."""
+        """Return the standard deviation of the white noise per sample, excluding quantisation."""
         return el.hypot(0.0 if self.correlation_time_s else self.noise, self.density * math.sqrt(rate_hz))
 
 
@@ -62,7 +63,7 @@ class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings common to all sensors."""
+    """The settings common to all sensors."""
 
     rate_hz: RateHz
     latency_ms: LatencyMs = 0.0
@@ -80,14 +81,15 @@ class Channel(Struct, frozen=True, omit_defaults=True):
     """Consecutive numbers of a reading that share an ErrorModel.
 
     Attributes:
-        settings: field of the settings that holds the ErrorModel.
-        unit: unit of the ErrorModel, and of a bias added by a fault.
-        to_si: factor from `unit` to the unit of the equation's values, e.g. pi / 180 for settings in deg/s and values
-            in rad/s.
-        part: first word of the channel's fault kinds; empty for the whole sensor.
-        label: name of the channel in texts.
-        axes: axes or quantity to which a fault's bias applies, in texts.
-        bias_max: maximum magnitude of each number of a fault's bias, in `unit`.
+        settings: field of the sensor's settings that holds the ErrorModel.
+        unit: unit of the ErrorModel and of the bias added by a fault.
+        width: count of the numbers.
+        to_si: factor from `unit` to the unit of the equation's values, e.g. pi / 180 where settings are in deg/s and
+            values in rad/s.
+        part: first word of the channel's fault kinds; empty if they concern the whole sensor.
+        label: display name of the part.
+        axes: phrase for the axes or quantity of a fault's bias, "east, north, up" or "of height".
+        bias_max: maximum bias that a fault may add to each number, in `unit`.
     """
 
     settings: FieldName
@@ -101,16 +103,16 @@ class Channel(Struct, frozen=True, omit_defaults=True):
 
 
 class SensorTruth(Struct, frozen=True):
-    """The truth at a sensor at one time. W: world (east, north, up); B: body; S: sensor.
+    """The true state of the drone and pose of the sensor at one time. W: world (east, north, up); B: body; S: sensor.
 
     Attributes:
         t_s: simulated time [s].
         p_WB, v_WB, a_WB: position [m], velocity [m/s], acceleration [m/s^2] of the centre of mass in W, (3,).
             The acceleration is that of the board's last step, at most 5 ms old.
-        R_WB: rotation matrix from body to world components, (3, 3).
+        R_WB: rotation from body to world components, (3, 3).
         w_WB_B, alpha_B: body rate [rad/s] and its derivative [rad/s^2] in B, (3,).
-        air_W: velocity of the air at the drone in W [m/s], (3,): steady wind, gusts and the wash of other drones.
-        p_BS, R_BS: pose of the sensor in the body: position [m], (3,), and rotation from S to B, (3, 3).
+        air_W: velocity of the air at the drone in W [m/s], (3,): steady wind, gusts and other drones' wash.
+        p_BS, R_BS: position of the sensor in B [m], (3,), and rotation from sensor to body components, (3, 3).
     """
 
     t_s: float
@@ -142,7 +144,7 @@ class SensorTruth(Struct, frozen=True):
 
     @property
     def R_WS(self) -> NDArray[np.float64]:
-        """Rotation matrix from sensor to world components, (3, 3)."""
+        """Rotation from sensor to world components, (3, 3)."""
         return product(self.R_WB, self.R_BS)
 
 
@@ -156,14 +158,14 @@ class SensorType(Struct, frozen=True, kw_only=True):
     """A kind of sensor.
 
     Attributes:
-        message: subclass of Sample, whose own fields are numbers, tuples of numbers, whole numbers, or booleans.
+        message: subclass of Sample; its own fields are numbers, tuples of numbers, whole numbers or booleans.
         settings: subclass of Sensor, with an ErrorModel for each channel.
         channels: channels in the order of the equation's values.
-        exact: number of further values without an error of their own, after those of the channels.
-        label: name of the sensor in tables; empty: its name in the scenario.
-        equation: equation of a user's sensor; those of stock sensors are compiled in zsim_world.sensors.
-        convert: conversion of a user's sensor from reading to message; None: the values are the message's numbers.
-        presets: settings of a stock sensor by the name of the preset.
+        exact: count of values without error, which follow those of the channels.
+        label: name of the sensor in tables; empty for its name in the scenario.
+        equation: equation of a user's sensor; those of the stock sensors are compiled in zsim_world.sensors.
+        convert: conversion of a user's sensor from reading to message; None if the values are the message's numbers.
+        presets: sections of a stock sensor by name of the preset.
     """
 
     message: type[Sample]
@@ -176,15 +178,15 @@ class SensorType(Struct, frozen=True, kw_only=True):
     presets: dict[str, dict[str, Any]] = {}
 
     @property
-    def width(self) -> int:  # number of values with an error of their own
+    def width(self) -> int:  # count of numbers with an error model
         return sum(channel.width for channel in self.channels)
 
     @property
-    def values(self) -> int:  # number of values in a reading
+    def values(self) -> int:  # count of numbers in a reading
         return self.width + self.exact
 
     def errors(self, settings: Sensor) -> list[ErrorModel]:
-        """Return the error model of every value of the channels, in the unit of the equation's values."""
+        """Return the error model, in SI units, of each number that has one."""
         models = [
             (scaled(getattr(settings, channel.settings), channel.to_si), channel.width) for channel in self.channels
         ]
@@ -205,7 +207,7 @@ class Declaration(Struct, frozen=True, omit_defaults=True):
 
 
 def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
-    """Return an error model in SI units, given the size of its unit in them."""
+    """Return an error model converted to SI units by the factor `to_si`."""
     if to_si == 1.0:
         return model
     scales = {field: value for field, value in msgspec.structs.asdict(model).items() if field != "correlation_s"}
@@ -213,26 +215,26 @@ def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
 
 
 def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
-    """Return the standard deviation of a sample's noise, white or correlated, about its bias."""
+    """Return the standard deviation of a sample's white and correlated noise, excluding the bias."""
     white, correlated = model.white_sigma(rate_hz), model.correlated_sigma
     return el.hypot(white, correlated) if correlated else white
 
 
 def message_type(name: str, fields: Mapping[str, str], sensor: str = "") -> type[Sample]:
-    """Return the message with these fields, of a user's sensor: the same class for the same three."""
+    """Return a message class of a user's sensor; equal arguments give the same class."""
     return declared_type(name, fields, Sample, (("__sensor__", sensor),))
 
 
 def sensor_of(message: type[Struct]) -> str:
-    """Return the name of the user's sensor whose message this is; empty for any other."""
+    """Return the name of the user's sensor to which a message class belongs; empty for other messages."""
     return getattr(message, "__sensor__", "")
 
 
 def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
-    """Return a row of numbers as the values of a message's fields.
+    """Return a flat sequence of numbers grouped into the values of a message's fields.
 
     Raises:
-        ValueError: their number does not match the fields.
+        ValueError: the fields need another count of numbers.
     """
     values, at = [], 0
     for word in fields.values():

@@ -1,15 +1,15 @@
-"""The sensors of a drone: the stock ones in the contract's order, and users' sensors by the modules that define them.
+"""The sensors of a drone: the stock sensors in the contract's order, and users' sensors by their modules.
 
-A scenario may give error models with the names and units of data sheets and of Kalibr; they are converted to the
+A scenario may specify error models with the names and units of data sheets and of Kalibr; they are converted to the
 fields of `zsim.sensors.sensor.ErrorModel`, in the channel's unit:
 
     imu: {accel_m_s2: {density_ug_sqrt_hz: 175}, gyro_deg_s: {bias_instability_deg_h: 2, correlation_s: 300}}
     imu: {accelerometer_noise_density: 0.0017, gyroscope_random_walk: 2.0e-5, update_rate: 200}
 
-The density N of white noise is the Allan deviation at 1 s on the line of slope -1/2, or 60 N in the units of an angle
-or velocity random walk; a random walk K of the bias is that at 3 s on the line of slope +1/2 (IEEE Std 952-1997, annex
-C). Kalibr's
-`noise_density` and `random_walk` are these two in SI units (ethz-asl/kalibr, wiki, "IMU Noise Model").
+The density N of white noise is the Allan deviation at 1 s on the line of slope -1/2; as an angle or velocity random
+walk per sqrt(h) it is 60 N. The random walk K of the bias is the Allan deviation at 3 s on the line of slope +1/2 (IEEE
+Std 952-1997, annex C). Kalibr's `noise_density` and `random_walk` are N and K in SI units (ethz-asl/kalibr, wiki, "IMU
+Noise Model").
 """
 
 import math
@@ -45,10 +45,10 @@ STOCK: dict[str, SensorType] = {
 
 
 class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The sensors of one drone, after preset and overrides."""
+    """The sensors of one drone, after applying preset and overrides."""
 
     preset: Literal["ardrone2", "paper", "crazyflie2"]
-    as_printed: bool = False  # with `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2
+    as_printed: bool = False  # with `paper`: accelerometer noise of 0.35 g as printed, instead of 0.35 m/s^2
     imu: ImuConfig
     gps: GpsConfig
     mag: MagConfig
@@ -58,23 +58,23 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     front_camera: FrontCamera | UnsetType = UNSET
     bottom_camera: BottomCamera | UnsetType = UNSET
     sightings: SightingModel | UnsetType = UNSET
-    """The results of a detector in the cameras' pictures, computed by the world without pictures."""
+    """Detections in the cameras' pictures, computed by the world without rendering pictures."""
     range: RangeConfig | UnsetType = UNSET
     lidar: LidarConfig | UnsetType = UNSET
     depth: DepthConfig | UnsetType = UNSET
     own: dict[str, dict[str, Any]] | UnsetType = UNSET
-    """Users' sensors by name: settings with every field, `module` and `declared`. A file lists them among the other
-    sensors, see `flattened`."""
+    """Users' sensors by name: all their settings, `module` and `declared`. A file lists them among the other sensors,
+    see `flattened`."""
 
     def cameras(self) -> dict[str, Camera]:
         found = {name: getattr(self, f"{name}_camera") for name in CAMERAS}
         return {name: camera for name, camera in found.items() if camera is not UNSET}
 
     def sections(self) -> Iterator[tuple[str, SensorType, Sensor]]:
-        """Yield name, type and settings of every sensor; a user's module is imported.
+        """Yield name, type and settings of every sensor, importing users' modules.
 
         Raises:
-            DocumentError: a module is missing, or differs from the one with which the scenario was resolved.
+            DocumentError: a module is missing, or differs from the one used to resolve the scenario.
         """
         for name, kind in STOCK.items():
             yield name, kind, getattr(self, name)
@@ -98,7 +98,16 @@ AS_PRINTED = {"imu": stock_sensors.IMU_AS_PRINTED}
 
 MODULE, DECLARED = "module", "declared"  # keys of a user's sensor, in addition to its settings
 FIELDS = tuple(name for name in Sensors.__struct_fields__ if name != "own")
-RESERVED = ("status", "truth", "own", "accel", "gyro", "rotor", "link", "process")  # used in keys and fault kinds
+RESERVED = (
+    "status",
+    "truth",
+    "own",
+    "accel",
+    "gyro",
+    "rotor",
+    "link",
+    "process",
+)  # names with another meaning in keys and fault kinds
 NAME = r"[a-z][a-z0-9_]{0,31}"
 NAME_ALLOWED = f"a letter and up to 31 of a-z 0-9 _, none of {', '.join(RESERVED)}"
 
@@ -108,7 +117,7 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
     """Return the SENSOR of a user's module.
 
     Raises:
-        DocumentError: the module defines no SENSOR, or an inconsistent one; one line.
+        DocumentError: the module defines no SENSOR, or an inconsistent one; the error has one line.
     """
     sensor = plugin.load_object(module_name, where, "SENSOR", SensorType)
     try:
@@ -125,7 +134,7 @@ def _check(sensor: SensorType) -> None:
             raise TypeError(f"{part} is {show(str(kind))}; must be a subclass of {base.__name__}")
     shared, own = (get_type_hints(kind, include_extras=True) for kind in (Sensor, sensor.settings))
     for name, kind in shared.items():
-        if own[name] != kind:  # the limits of the shared settings would be lost
+        if own[name] != kind:  # another type would drop the limits of the shared setting
             what = f"settings: {sensor.settings.__name__}.{name} has a type of its own"
             raise TypeError(f"{what}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
     fields = Declaration.of(sensor).fields
@@ -151,8 +160,8 @@ def separate(
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]], list[Fault]]:
     """Return a `sensors:` section without users' sensors, the users' sensors with all settings, and their faults.
 
-    A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports`, any
-    other is a fault; one that must not be imported (`plugin.names_only`) is omitted.
+    A resolved sensor is returned unchanged, so that readers of `world/info` import nothing. Without `imports`, an
+    unresolved sensor is a fault; a sensor whose module must not be imported (`plugin.names_only`) is omitted.
     """
     rest = {name: value for name, value in section.items() if name in FIELDS}
     own: dict[str, dict[str, Any]] = {}
@@ -181,7 +190,7 @@ def separate(
 
 
 def flattened(sensors: dict[str, Any]) -> dict[str, Any]:
-    """Return a resolved `sensors:` section as in a file, with users' sensors among the others."""
+    """Return a resolved `sensors:` section in the form of a file, with users' sensors among the others."""
     rest = {name: value for name, value in sensors.items() if name != "own"}
     return rest | sensors.get("own", {})
 
@@ -195,13 +204,13 @@ def declarations(drones: Any) -> dict[str, Declaration]:
 
 
 def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
-    """Return the sections of a drone's user sensors; empty if they are faulty."""
+    """Return the sections of the users' sensors on a drone; empty if they are faulty."""
     own = drone.sensors.own if drone.sensors is not None else None
     return own if isinstance(own, dict) else {}
 
 
 def sensor_names(sensors: Any) -> list[str]:
-    """Return the names of the sensors in the sound part of a drone's `sensors:` section."""
+    """Return the names of the sensors in the valid part of a drone's `sensors:` section."""
     optional = [name for name in ("sightings", *SCANNERS) if getattr(sensors, name)]
     return [*STOCK, *optional, *(sensors.own or ())]
 
@@ -236,15 +245,15 @@ def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterat
 
 
 def _plain(value: Struct) -> dict[str, Any]:
-    """Return a struct as plain maps, lists, texts and numbers."""
+    """Return a struct as plain dicts, lists, strings and numbers."""
     return msgspec.json.decode(msgspec.json.encode(value))
 
 
 class Unit(NamedTuple):
-    """A field of the error model in another unit."""
+    """A field of the error model, and the factor that converts a value to the channel's unit."""
 
     field: str
-    factor: float  # value in the channel's unit per value in this unit
+    factor: float  # channel units per unit of the given value
 
 
 EVERY = {"noise_density": Unit("density", 1.0), "random_walk": Unit("bias_walk", 1.0)}  # for channels in SI units or uT
@@ -269,7 +278,7 @@ BY_UNIT: dict[str, dict[str, Unit]] = {  # by the channel's unit
     "m": EVERY,
     "m/s": EVERY,
 }
-KALIBR = {  # paths in the IMU's section, by key in Kalibr's imu.yaml
+KALIBR = {  # path in the IMU's section, by key of Kalibr's imu.yaml
     "accelerometer_noise_density": ("accel_m_s2", "noise_density"),
     "accelerometer_random_walk": ("accel_m_s2", "random_walk"),
     "gyroscope_noise_density": ("gyro_deg_s", "noise_density"),

@@ -1,7 +1,7 @@
 """The stock sensors: message, settings, channels and presets of each.
 
-Their equations are compiled in zsim_world.sensors. Where the paper does not specify a sensor, the `paper` preset has
-the AR.Drone's values, or values chosen as noted beside them.
+Their equations are compiled in zsim_world.sensors. For what the paper does not specify, the preset `paper` has the
+values of the AR.Drone unless a comment states another source.
 """
 
 import math
@@ -10,7 +10,7 @@ from zsim.schema.message import Count, Number, Vector3
 from zsim.schema.quantities import G_M_S2, NonNegative, Positive
 from zsim.sensors.sensor import Channel, ErrorModel, Sample, Sensor, SensorType
 
-BOARD_RATE_HZ = 200.0  # Hz, navigation board of the AR.Drone 2.0: rate of its IMU samples and firmware steps
+BOARD_RATE_HZ = 200.0  # Hz, rate of IMU samples and firmware steps on the AR.Drone 2.0's navigation board
 
 
 class Imu(Sample, frozen=True):
@@ -25,7 +25,7 @@ class ImuConfig(Sensor, frozen=True, kw_only=True):
     gyro_deg_s: ErrorModel = ErrorModel()
 
 
-# bias_max is chosen: about ten times what any such sensor can show, so that only typing errors are refused.
+# The maximum biases are about ten times what any such sensor can show, so that only mistakes are refused.
 IMU = SensorType(
     label="IMU",
     message=Imu,
@@ -45,7 +45,7 @@ IMU = SensorType(
             },
             "gyro_deg_s": {
                 "noise": 0.06,  # deg/s at 200 Hz, 100 s static
-                "bias": 0.1,  # deg/s, remaining after the drone's own offset removal at start-up
+                "bias": 0.1,  # deg/s, remaining after the drone's own offset removal at start
                 "bias_walk": 0.003,  # deg/s/sqrt(s), from an Allan minimum of 0.003-0.006 deg/s at 3-5 s
                 "quantum": 0.061,  # deg/s per LSB: 16.4 LSB/(deg/s)
             },
@@ -59,15 +59,15 @@ IMU = SensorType(
             "rate_hz": BOARD_RATE_HZ,
             "accel_m_s2": {
                 "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) (data sheet of the BMI088)
-                "bias": 0.05,  # m/s^2, remaining after calibration; chosen as for the AR.Drone
-                "bias_walk": 0.0005,  # m/s^2/sqrt(s), chosen as for the AR.Drone
-                "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits (crazyflie-firmware, sensors_bmi088_bmp3xx.c)
+                "bias": 0.05,  # m/s^2, remaining after calibration; assumed equal to the AR.Drone's
+                "bias_walk": 0.0005,  # m/s^2/sqrt(s), assumed equal to the AR.Drone's
+                "quantum": 0.0072,  # m/s^2 per LSB: ±24 g in 16 bits (crazyflie-firmware, sensors_bmi088_bmp3xx.c)
             },
             "gyro_deg_s": {
                 "density": 0.014,  # deg/s/sqrt(Hz) (data sheet of the BMI088)
-                "bias": 0.1,  # deg/s, remaining after calibration at start-up; chosen as for the AR.Drone
-                "bias_walk": 0.003,  # deg/s/sqrt(s), chosen as for the AR.Drone
-                "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits (crazyflie-firmware, same file)
+                "bias": 0.1,  # deg/s, remaining after the firmware's calibration at start; assumed as for the AR.Drone
+                "bias_walk": 0.003,  # deg/s/sqrt(s), assumed equal to the AR.Drone's
+                "quantum": 0.061,  # deg/s per LSB: ±2000 deg/s in 16 bits (crazyflie-firmware, same file)
             },
         },
     },
@@ -76,9 +76,9 @@ IMU_AS_PRINTED = {"accel_m_s2": {"noise": 0.35 * G_M_S2}}  # m/s^2, section VI: 
 
 
 class Gps(Sample, frozen=True):
-    """A fix of the antenna: position in WGS 84 (deg, m) and in W [m], velocity in W [m/s].
+    """A fix of the antenna: position in WGS 84 (deg, m) and in W [m], and velocity in W [m/s].
 
-    `sigma_m` is the standard deviation of the position per axis; `fix` is 3 for a three-dimensional fix, as in NMEA.
+    `sigma_m` is the standard deviation of the position per axis; `fix` is the NMEA fix type, 3 for a 3D fix.
     """
 
     latitude_deg: Number
@@ -107,9 +107,9 @@ GPS = SensorType(
     presets={
         "ardrone2": {
             "rate_hz": 5.0,  # Hz, Paparazzi's model of the ardrone2
-            "latency_ms": 200.0,  # ms, same source
-            "position_m": {"noise": 2.0},  # m, same source
-            "velocity_m_s": {"noise": 0.43},  # m/s, `ehve` of a real navdata packet
+            "latency_ms": 200.0,  # ms, Paparazzi's model of the ardrone2
+            "position_m": {"noise": 2.0},  # m, Paparazzi's model of the ardrone2
+            "velocity_m_s": {"noise": 0.43},  # m/s, field `ehve` of a navdata packet from a real drone
         },
         "paper": {
             "rate_hz": 5.0,  # Hz, as for the AR.Drone
@@ -117,16 +117,16 @@ GPS = SensorType(
             "velocity_m_s": {"noise": 0.43},  # m/s, as for the AR.Drone
         },
         "crazyflie2": {
-            "rate_hz": 10.0,  # Hz, chosen
-            "position_m": {"noise": 0.1},  # m, chosen: typical of ultra-wideband ranging to anchors in a room
-            "velocity_m_s": {"noise": 0.2},  # m/s, chosen
+            "rate_hz": 10.0,  # Hz, assumed
+            "position_m": {"noise": 0.1},  # m, typical of ultra-wideband ranging to anchors in a room
+            "velocity_m_s": {"noise": 0.2},  # m/s, assumed
         },
     },
 )
 
 
 class Mag(Sample, frozen=True):
-    """The Earth's magnetic field in the sensor's axes [uT]."""
+    """The Earth's magnetic field in the axes of the sensor [uT]."""
 
     field_ut: Vector3
 
@@ -135,7 +135,7 @@ class MagConfig(Sensor, frozen=True, kw_only=True):
     field_ut: ErrorModel = ErrorModel()
 
 
-_MAG_RATE_HZ = 25.0  # Hz, chosen as for the sonar; the aircraft's magnetometer is faster
+_MAG_RATE_HZ = 25.0  # Hz, chosen equal to the sonar's rate; the aircraft's magnetometer is faster
 MAG = SensorType(
     label="magnetometer",
     message=Mag,
@@ -143,7 +143,7 @@ MAG = SensorType(
     channels=(Channel("field_ut", "uT", 3, axes="in the sensor's axes", bias_max=1e4),),
     presets={
         "ardrone2": {"rate_hz": _MAG_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.3}},  # AK8975: 0.3 uT per LSB
-        # 0.94 uT: 3 deg in a horizontal field of 18 uT; chosen, since the paper gives none
+        # 0.94 uT turns a horizontal field of 18 uT by 3 deg; assumed, since the paper states none
         "paper": {"rate_hz": _MAG_RATE_HZ, "field_ut": {"noise": 0.94}},
         # AK8963 of the Crazyflie 2.0, 0.15 uT per LSB; the 2.1 has no magnetometer (crazyflie-firmware, issue 701)
         "crazyflie2": {"rate_hz": _MAG_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.15}},
@@ -163,8 +163,8 @@ class BaroConfig(Sensor, frozen=True, kw_only=True):
 
 
 _BARO_PRESET = {
-    "rate_hz": 25.0,  # Hz, chosen as for the sonar
-    "altitude_m": {"noise": 0.1},  # m, chosen: twice that of Paparazzi's ardrone2 model, to cover the rotors' wash
+    "rate_hz": 25.0,  # Hz, chosen equal to the sonar's rate
+    "altitude_m": {"noise": 0.1},  # m, twice that of Paparazzi's model of the ardrone2, to allow for rotor wash
 }
 BARO = SensorType(
     label="barometer",
@@ -190,8 +190,8 @@ class SonarConfig(Sensor, frozen=True, kw_only=True):
 
 
 _SONAR_PRESET = {
-    "rate_hz": 25.0,  # Hz, ultrasound_freq 8 in the AR.Drone's configuration
-    "range_m": {"noise": 0.01},  # m, chosen: error due to grass and tilt, beside the converter's 0.5 mm per LSB
+    "rate_hz": 25.0,  # Hz, ultrasound_freq 8 of the AR.Drone's configuration
+    "range_m": {"noise": 0.01},  # m, assumed effect of grass and tilt, far above the converter's 0.5 mm per LSB
 }
 SONAR = SensorType(
     label="sonar",
@@ -203,16 +203,16 @@ SONAR = SensorType(
         "ardrone2": _SONAR_PRESET,
         "paper": _SONAR_PRESET,
         "crazyflie2": {
-            "rate_hz": 25.0,  # Hz, chosen as for the AR.Drone
-            "range_m": {"noise": 0.02},  # m, chosen to include floor and tilt; crazyflie-firmware, zranger2.c: 2.5 mm
-            "max_m": 4.0,  # m, VL53L1x; the noise at 4 m is 0.2 m in zranger2.c
+            "rate_hz": 25.0,  # Hz, chosen equal to the AR.Drone's
+            "range_m": {"noise": 0.02},  # m, assumed, including floor and tilt; zranger2.c of its firmware has 2.5 mm
+            "max_m": 4.0,  # m, VL53L1x; zranger2.c has a standard deviation of 0.2 m there
         },
     },
 )
 
 
 class Flow(Sample, frozen=True):
-    """Velocity over the ground in the heading frame [m/s]; `quality`: share of ground in the picture, in [0, 1]."""
+    """Velocity over the ground in the heading frame [m/s], and the share of the picture that shows ground, 0 to 1."""
 
     velocity_m_s: Vector3
     quality: Number
@@ -223,8 +223,8 @@ class FlowConfig(Sensor, frozen=True, kw_only=True):
 
 
 _FLOW_PRESET = {
-    "rate_hz": 15.0,  # Hz, rate of the reduced navdata in which the drone sends its velocity
-    "velocity_m_s": {"noise": 0.1},  # m/s, chosen: no data are published for the aircraft's optical flow
+    "rate_hz": 15.0,  # Hz, rate of the reduced navdata, which contain the drone's velocity
+    "velocity_m_s": {"noise": 0.1},  # m/s, assumed: no value is published for the aircraft's optical flow
 }
 FLOW = SensorType(
     label="optical flow",
@@ -235,6 +235,6 @@ FLOW = SensorType(
     presets={
         "ardrone2": _FLOW_PRESET,
         "paper": _FLOW_PRESET,
-        "crazyflie2": {"rate_hz": 25.0, "velocity_m_s": {"noise": 0.1}},  # chosen; no data published for the deck
+        "crazyflie2": {"rate_hz": 25.0, "velocity_m_s": {"noise": 0.1}},  # assumed; no values are published
     },
 )

@@ -126,9 +126,7 @@ def _powers(x: float, count: int) -> Array:
 def _greatest(columns: Array) -> tuple[float, float]:
     """Return the maximum on [0, 1] of the sum of squares of k polynomials, coefficients (n, k), and its argument.
 
-       It is found by sampling and golden section.
-    The derivative of such a sum has at most twelve roots, so
-       only maxima narrower than the spacing of the samples can be missed.
+    It is found by sampling and golden section; only maxima narrower than the spacing of the samples can be missed.
     """
     falling = columns[::-1].T.tolist()
 
@@ -232,7 +230,7 @@ def move(
     The yaw takes the shorter turn.
 
     Raises:
-        TrajectoryError: no path within an hour satisfies the limits; the motion at an end is too fast.
+        TrajectoryError: no path of less than an hour satisfies the limits, usually since an end's motion exceeds them.
     """
     turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
     places = np.array([start, [*goal[:3], turned]])
