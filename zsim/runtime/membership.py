@@ -118,10 +118,7 @@ class HealthMeter:
 def resident_bytes() -> int:
     """Return the resident memory of this process [bytes]; 0 where it is unknown."""
     if sys.platform == "linux":
-        with (
-            suppress(OSError),
-            open("/proc/self/statm", encoding="ascii") as statm,
-        ):  # fails without free file descriptors
+        with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # file descriptors may run out
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
 
