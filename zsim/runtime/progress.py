@@ -138,7 +138,7 @@ class JsonProgress:
         self._write("say", text)
 
     def hang_up(self) -> None:
-        """Do nothing: the reader of the lines handles the loss of its terminal."""
+        """Do nothing: the reader of the lines handles the loss of the terminal."""
 
     def _write(self, kind: str, content: Any) -> None:
         try:

@@ -69,7 +69,7 @@ def _declared(entry: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def with_parameters(document: dict[str, Any]) -> list[Fault]:
-    """Fill in the parameters of users' spaces, laws and estimator in a raw document; return their faults.
+    """Fill in the parameters of users' spaces, laws and estimators in a raw document; return the faults found.
 
     Classes that cannot be imported here are skipped: the processes that need them report the fault.
     """

@@ -33,9 +33,7 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     distortion: tuple[Real, Real, Real, Real, Real] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's convention."""
     exposure_ms: Annotated[float, Meta(ge=0, le=100)] = 8.0  # typical of daylight with a small aperture
-    noise: Annotated[float, Meta(ge=0, le=64)] = (
-        3.0  # grey levels (of 255) per pixel; typical of a small sensor outdoors
-    )
+    noise: Annotated[float, Meta(ge=0, le=64)] = 3.0  # grey levels of 255 per pixel; typical of a small sensor outdoors
     blur_px: Annotated[float, Meta(ge=0, le=10)] = 0.6  # standard deviation of the lens blur; assumed
     jpeg_quality: Annotated[int, Meta(ge=10, le=100)] = 75  # gives about 18 kB per picture
 

@@ -56,7 +56,7 @@ class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Pose of the sensor in the body, X_BS."""
+    """Pose of the sensor in the body, X_BS: position in B, and Euler angles of the rotation from S to B."""
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
@@ -72,13 +72,13 @@ class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Sample(Message, frozen=True):
-    """The first fields of every sensor's message; `t_sample_ns` is the time of the measurement."""
+    """Base of every sensor's message; `t_sample_ns` is the simulated time of the measurement."""
 
     t_sample_ns: Whole
 
 
 class Channel(Struct, frozen=True, omit_defaults=True):
-    """Numbers of a reading that share an ErrorModel.
+    """Consecutive numbers of a reading that share an ErrorModel.
 
     Attributes:
         settings: field of the sensor's settings that holds the ErrorModel.
@@ -151,7 +151,7 @@ class SensorTruth(Struct, frozen=True):
 Equation = Callable[[SensorTruth, Any, Any], Sequence[float]]
 """(truth, settings, environment of the scenario) -> the values of all channels in order, then the exact values."""
 Conversion = Callable[[Sequence[float], Any, Any], Sequence[Any]]
-"""(reading, settings, environment) -> the numbers of the message's fields in order."""
+"""(reading, settings, environment) -> the numbers of the message's fields, in order."""
 
 
 class SensorType(Struct, frozen=True, kw_only=True):
@@ -194,7 +194,7 @@ class SensorType(Struct, frozen=True, kw_only=True):
 
 
 class Declaration(Struct, frozen=True, omit_defaults=True):
-    """The description of a user's sensor for readers without its module; part of the resolved scenario."""
+    """The description of a user's sensor for processes without its module; part of the resolved scenario."""
 
     message: MessageName
     fields: dict[FieldName, FieldType]

@@ -14,7 +14,7 @@ BOARD_RATE_HZ = 200.0  # Hz, rate of IMU samples and firmware steps on the AR.Dr
 
 
 class Imu(Sample, frozen=True):
-    """Specific force [m/s^2] and body rate [rad/s] at the sensor, in its own axes; at rest and level (0, 0, +9.81)."""
+    """Specific force [m/s^2] and body rate [rad/s] in the sensor's axes; the force at rest and level: (0, 0, +9.81)."""
 
     accel_m_s2: Vector3
     gyro_rad_s: Vector3
@@ -177,7 +177,7 @@ BARO = SensorType(
 
 
 class Sonar(Sample, frozen=True):
-    """Distance to the ground along the beam [m]; without an echo it is not `valid`."""
+    """Distance to the ground along the beam [m]; not `valid` without an echo."""
 
     range_m: Number
     valid: bool
