@@ -7,6 +7,6 @@ Each module uses only those below it; an object receives its dependencies throug
       ├─ faults                           injected faults
       └─ coordinator                      the part common to flights and replays: participants, requests, time
            ├─ barrier                     participants, and those that the world waits for
-           ├─ run_clock                   simulated time, its requests, figures of the run
-           └─ outbox                      messages, events and refusals to be published
+           ├─ run_clock                   simulated time, its requests, statistics of the run
+           └─ outbox                      messages, events and refusals to publish
 """

@@ -1,7 +1,7 @@
 """The participants of the lockstep, their progress, and those that the world waits for.
 
-Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs the done of
-every gating participant for t minus the command delay. It waits for nothing else.
+Pure bookkeeping without session or clock; wall times are passed in. To integrate from t on, the world needs the done of
+every gating participant for t minus the command delay. The done of a participant with slack may be older by the slack.
 """
 
 from collections.abc import Callable
@@ -23,24 +23,24 @@ class Participant:
 
     name: str
     join: Join
-    from_ns: int  # the first gate at which the world waits for it
+    from_ns: int  # first gate at which the world waits for it
     done_ns: int = -1  # newest gate that it has completed
-    surplus: int = 0  # outputs that have arrived since its last done
-    missing: int = 0  # outputs that its dones counted and that have not arrived
-    done_seq: int | None = None  # number of its newest done, None before the first of its process
-    lost_done: bool = False  # a done was lost, and with it the count of the outputs before it
+    surplus: int = 0  # number of outputs that have arrived since its last done
+    missing: int = 0  # number of outputs that its dones counted but that have not arrived
+    done_seq: int | None = None  # sequence number of its newest done, None before the first one of its process
+    lost_done: bool = False  # a done was lost, and with it the count of the preceding outputs
     was_incomplete: bool = False  # outputs were missing at the last gate, in realtime
     rejoined: bool = False  # another incarnation of this name joined before
-    repeats: bool = False  # it may publish outputs again that were already counted
+    repeats: bool = False  # it may again publish outputs that were already counted
     successor: bool = False  # it has replaced a process that was alive
     alive: bool = True
     since_wall_ns: int = 0  # when it last joined, sent a done or died
     joined_wall_ns: int = 0  # when this incarnation joined
-    deadline_misses: int = 0  # dones that were late in realtime
+    deadline_misses: int = 0  # number of dones that were late in realtime
     away: bool = False  # it has not yet rejoined a restarted world
     silent_wall_ns: int | None = None  # when its last health message arrived, if it has been silent since
-    # Its bye, if that names no incarnation and so may come from another process: it takes effect when the token is
-    # lost, and the next done cancels it.
+    # Its bye, if that names no incarnation and may therefore come from another process: it takes effect when the token
+    # is lost, and the next done cancels it
     farewell: Bye | None = None
 
     def __str__(self) -> str:
@@ -65,7 +65,7 @@ class Participant:
         return self.gating or self.join.slack_ns > 0
 
     def is_process_of(self, join: Join) -> bool:
-        """Return whether another join comes from the same process with the same kind of participation."""
+        """Return whether another join comes from the same process, in the same role."""
         fields = ("host", "pid", "role", "period_ns", "slack_ns", "serves")
         return all(getattr(self.join, name) == getattr(join, name) for name in fields)
 
@@ -75,11 +75,11 @@ class Participant:
 
     @property
     def incomplete(self) -> bool:
-        """Return whether outputs or a done of it were lost or are still on their way."""
+        """Return whether some of its outputs, or a done, were lost or are still in transit."""
         return self.missing > 0 or self.lost_done
 
     def required_ns(self, need_ns: int) -> int | None:
-        """Return the newest done required of it for `need_ns`, None if none is required yet."""
+        """Return the newest gate whose done `need_ns` requires of it, None if it requires none yet."""
         join = self.join
         if join.period_ns > 0:
             required = need_ns - need_ns % join.period_ns
@@ -90,22 +90,22 @@ class Participant:
         return required if required >= self.from_ns else None
 
     def blocks(self, need_ns: int) -> bool:
-        """Return whether its done for `need_ns`, or an output counted by a done, has not arrived."""
+        """Return whether its done for `need_ns`, or an output that a done counted, has not arrived."""
         required = self.required_ns(need_ns)
         return required is not None and (self.done_ns < required or self.incomplete)
 
     def reset_counts(self) -> int:
-        """Reset the counts once lost outputs were requested again; return how many remain missing.
+        """Reset the counts after lost outputs were requested again; return how many are still missing.
 
-        A surplus would hide the next loss: no outputs of the next done arrive while some are missing. Outputs repeated
-        after a rejoin may have been counted before; those are not missing.
+        A surplus would hide the next loss, since no outputs of the next done arrive while some are missing. Outputs
+        that are repeated after a rejoin may have been counted before, and are then not missing.
         """
         missing = 0 if self.repeats else self.missing
         self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
         return missing
 
     def waiting(self, wall_ns: int, held_by: tuple[str, ...] = (), since_ns: int | None = None) -> Waiting:
-        """Return its entry in `clock`: waited for since its last done, join or death, or since `since_ns`."""
+        """Return its entry in `clock`, waited for since its last done, join or death, or since `since_ns`."""
         since_ns = self.since_wall_ns if since_ns is None else since_ns
         return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9, held_by)
 
@@ -114,7 +114,7 @@ class Barrier:
     """The participants of a run.
 
     Args:
-        run_id: of this run; joins and dones of other runs are refused.
+        run_id: id of the run; joins and dones for other runs are refused.
         gate_ns: gate interval [ns]; every period is a multiple of it.
         expected: names of the processes required at the start.
     """
@@ -136,8 +136,8 @@ class Barrier:
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> Refusal | None:
         """Admit a participant; return the refusal, or None.
 
-        A new incarnation of a known name continues from the progress of the former one; so does a participant that does
-        all the work of dead ones, which it replaces. Repeating a join has no effect.
+        A new incarnation of a known name continues from the progress of the former one. A participant that does all the
+        work of dead ones replaces them and continues from theirs. Repeating a join has no effect.
         """
         if refusal := self.join_refusal(name, message):
             return refusal
@@ -172,7 +172,7 @@ class Barrier:
         return (former is not None and not former.is_process_of(message)) or bool(self.replaced(name, message))
 
     def replaced(self, name: str, message: Join) -> list[Participant]:
-        """Return the dead participants whose work a newcomer of another name would take over."""
+        """Return the dead participants whose work a newcomer with another name would take over."""
         served = {name, *message.serves}
         return [p for p in self.participants.values() if not p.alive and p.name != name and p.served_names <= served]
 
@@ -194,7 +194,7 @@ class Barrier:
     def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
         """Note that a participant has completed the gate `done_ns`; return the refusal, or None.
 
-        A gap in the sequence numbers shows that a done was lost. Outputs beyond the count belong to the next done.
+        A gap in the sequence numbers shows that a done was lost. Outputs beyond its count belong to the next done.
         """
         participant = self.participants.get(name)
         if participant is None:
@@ -203,7 +203,7 @@ class Barrier:
             return self._run_id_refusal(message.run_id)
         former = participant.done_seq
         if message.incarnation != participant.join.incarnation:
-            if former is not None and message.seq == former + 1:  # it was refused, not lost
+            if former is not None and message.seq == former + 1:  # a done of another incarnation is refused, not lost
                 participant.done_seq = message.seq
             return _incarnation_refusal(participant, str(message.incarnation))
         if message.done_ns > now_ns:
@@ -220,7 +220,7 @@ class Barrier:
         return None
 
     def count_output(self, name: str) -> None:
-        """Count an output that has arrived from a participant, or from a process whose work a participant does."""
+        """Count an output that has arrived from a participant, or under a name that a participant serves."""
         participant = self.participants.get(name)
         if participant is None:
             participant = next((each for each in self.participants.values() if name in each.join.serves), None)
@@ -232,9 +232,9 @@ class Barrier:
             participant.surplus += 1
 
     def give_up_late(self) -> None:
-        """At a gate in realtime, give up the outputs that were already missing at the previous gate: they are lost.
+        """At a gate in realtime, treat the outputs that were already missing at the previous gate as lost.
 
-        They are not requested again, and would make every later gate a deadline miss of their sender.
+        They are not requested again, and would otherwise make every later gate a deadline miss of their sender.
         """
         for participant in self.participants.values():
             if participant.incomplete and participant.was_incomplete:
@@ -255,7 +255,10 @@ class Barrier:
         return participant is not None and participant.farewell is not None
 
     def take_back_bye(self, name: str) -> Refusal | None:
-        """Drop the bye of a participant that continues: another process sent it. Return its refusal, or None."""
+        """Refuse the pending bye of a participant that continues, since another process sent it.
+
+        Return the refusal, None if no bye is pending.
+        """
         participant = self.participants[name]
         if participant.farewell is None:
             return None
@@ -286,10 +289,10 @@ class Barrier:
             participant.alive = participant.alive and not all_died
             participant.away = participant.is_waited_for and (participant.alive or all_died)
 
-    # Who is there, and who is waited for
+    # Who takes part, and who is waited for
 
     def is_gating(self, name: str) -> bool:
-        """Return whether a process gates, even one that is marked dead: its outputs may arrive before it rejoins."""
+        """Return whether a process gates; it may be marked dead, since outputs may arrive before it rejoins."""
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 
@@ -315,26 +318,26 @@ class Barrier:
         return [p for p in self.participants.values() if p.away]
 
     def blocking(self, need_ns: int) -> list[Participant]:
-        """Return the participants whose done for `need_ns` has not arrived."""
+        """Return the participants that block `need_ns`."""
         return [p for p in self.participants.values() if p.blocks(need_ns)]
 
     def incomplete(self) -> list[Participant]:
-        """Return the participants whose outputs or done were lost, or are still on their way."""
+        """Return the participants of which outputs or a done were lost or are still in transit."""
         return [p for p in self.participants.values() if p.incomplete]
 
     def waiting_for(
         self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool]
     ) -> tuple[Waiting, ...]:
-        """Return the processes that the world waits for, as entries of `clock`: the dead first, then by time waited.
+        """Return the processes that the world waits for as entries of `clock`: absent, then dead, then by waiting time.
 
-        `feeds(writer, reader)` tells whether the reader may be waiting for the writer's outputs.
+        `feeds(writer, reader)` returns whether the reader may be waiting for the writer's outputs.
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
         awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
         late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
         waiting = []
-        for victim in late:  # may itself be waiting for the outputs of others that are late
+        for victim in late:  # it may itself be waiting for outputs of other late processes
             read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
             others = (p for p in late if p is not victim and p.gating)
             held_by = (p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))

@@ -1,4 +1,4 @@
-"""The injected faults of a run: planned by scenario or request, begun and ended at their gates, published."""
+"""The injected faults of a run: planned by the scenario or by requests, begun and ended at their gates, published."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -21,15 +21,15 @@ from zsim_world.run.coordinator import Coordinator
 from zsim_world.run.outbox import Refusal
 from zsim_world.run.run_clock import Operation
 
-NEVER_NS = 2**63 - 1  # a gate that is never reached
+NEVER_NS = 2**63 - 1  # time of a gate that is never reached
 SELECTORS = ("id", "target", "kind")
 
 
 class FaultInjector:
     """The faults of a run, which `effects` applies to the fleet.
 
-    A requested fault begins with the next gate to be integrated, on which no process can have worked yet: so a run with
-    the same faults at the same instants gives the same bits.
+    A requested fault begins with the next gate to be integrated, on which no process can have worked yet. Therefore the
+    same faults at the same times give the same bits.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -48,7 +48,7 @@ class FaultInjector:
         self._kinds = fault_kinds.kinds_of(declarations(run.scenario.drones))
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()
-        self._over: set[int] = set()  # ended or cleared, kept for processes still working on gates in which they acted
+        self._over: set[int] = set()  # ended or cleared; kept for processes still working on gates at which they acted
         self._count = self._seq = 0
         self._of_links: tuple[Fault, ...] = ()
         self._of_links_at: dict[int, tuple[Fault, ...]] = {}  # by gate, since the last change or integrated gate
@@ -59,11 +59,11 @@ class FaultInjector:
 
     @property
     def all(self) -> tuple[Fault, ...]:
-        """Return the planned, acting and just ended faults in order of their ids."""
+        """Return the planned, acting and recently ended faults in order of their ids."""
         return tuple(self._faults[number] for number in sorted(self._faults))
 
     def of_links(self, gate_ns: int) -> tuple[Fault, ...]:
-        """Return the link and radio faults that act in a gate; called for every command."""
+        """Return the link and radio faults that act at a gate; called for every command."""
         if not self._of_links:
             return ()
         acting = self._of_links_at.get(gate_ns)
@@ -113,13 +113,13 @@ class FaultInjector:
         """Return why a fault cannot kill a process, None if it can."""
         participant = self._barrier.participants.get(process)
         if participant is None:
-            return None  # it has not joined yet, or another process does its work
+            return None  # the process has not joined yet, or another one does its work
         if not participant.gating:
             return "takes no part in the lockstep"
         return None if participant.join.fingerprint else "does not run on zsim.runtime.runner"
 
     def _late_ns(self) -> int:
-        """Return how far behind the newest gate a process may work: the command delay and one period."""
+        """Return how far behind the newest gate a process may be working [ns]: the command delay plus one period."""
         periods = (p.join.period_ns for p in self._barrier.participants.values())
         return self._clock.delay_ns + max(periods, default=0)
 
@@ -203,7 +203,7 @@ class FaultInjector:
             self._event("fault_clear", cleared, "is cleared", request.source)
         if selected:
             self._publish()
-            self._next_ns = 0  # it takes effect before the next gate
+            self._next_ns = 0  # so that it takes effect before the next gate
         return ControlAnswer(True, result={"cleared": [fault.id for fault in selected]})
 
     # Publication
@@ -211,7 +211,7 @@ class FaultInjector:
     def _publish(self) -> None:
         """Publish the list of faults before the next gate.
 
-        Faults that have not begun and differ only in their end begin together; their rank numbers them.
+        Faults of one kind and target that are to begin at the same time are numbered by their rank.
         """
         equal: Counter[tuple[str, str, int]] = Counter()
         for fault in self.all:

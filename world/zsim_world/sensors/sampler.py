@@ -1,12 +1,12 @@
-"""The samples of a fleet in a gate: rows of arrays, held back until their latency has passed.
+"""The samples of a fleet at a gate, as rows of arrays that are held back until their latency has passed.
 
-Values in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg],
-altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range [m],
-valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading, computed in Python
-after the gate from the truth that the kernel logged.
+Values are in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude
+[deg], altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range
+[m], valid (0 or 1); flow: forward, left, up [m/s], quality. The numbers of a user's sensor are computed in Python after
+the gate, from the truth that the kernel logged.
 
-Sightings and scans are computed after the gate, too, from the poses of all drones at their sampling instants
-(`Exposures`, `poses_between`), and held back (`released`).
+Sightings and scans are also computed after the gate, from the poses of all drones at the sampling times (`Exposures`,
+`poses_between`), and held back (`released`).
 """
 
 from collections.abc import Sequence
@@ -33,26 +33,26 @@ from zsim_world.sensors.noise import place, words
 from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width, read
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
-VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
+VALUE_COLUMNS = 9  # numbers of a GPS fix, the most of all sensors
 
 
 class Sampled(NamedTuple):
     """Measurements in the order of (t_ns, drone, sensor)."""
 
     whose: NDArray[np.int64]  # (M, WHOSE.size)
-    values: NDArray[np.float64]  # (M, VALUE_COLUMNS), the first ones of each kind's
+    values: NDArray[np.float64]  # (M, VALUE_COLUMNS), filled from the left with the values of the sensor
 
 
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
 
 
 class SampledLog(NamedTuple):
-    """The log of the kernel, and the data that converts it to samples."""
+    """The log of the kernel, and the data for its conversion to samples."""
 
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
     latency_ns: NDArray[np.int64]  # (N, sensors)
-    rows: NDArray[np.float64]  # these two of frames.anchor
+    rows: NDArray[np.float64]  # like place, from frames.anchor
     place: NDArray[np.float64]
 
 
@@ -74,7 +74,7 @@ class Sampler:
         self._later = NONE
 
     def due(self, logged: int, now_ns: int) -> Sampled:
-        """Return the samples due up to now, from the log and those held back.
+        """Return the samples due up to now, from the log and from those held back.
 
         Raises:
             UserCodeError: the equation of a user's sensor fails.
@@ -98,12 +98,12 @@ class Sampler:
 
 @kernel()
 def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
-    """Return index and values of Sampled for the first rows of a log.
+    """Return `whose` and `values` of a Sampled for the first rows of a log.
 
     Args:
         held: a SampledLog, by `hold`.
-        count: of rows.
-        tick_ns: between two ticks [ns].
+        count: number of rows.
+        tick_ns: interval between two ticks [ns].
     """
     whose, value, latency_ns, rows, place = held.content
     index, values = np.empty((count, WHOSE.size), np.int64), np.empty((count, VALUE_COLUMNS))
@@ -121,7 +121,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
 
 @inlined
 def _is_before(a: NDArray, b: NDArray) -> bool:
-    """Return whether a measurement does not come after another in the order of (t_ns, drone, sensor)."""
+    """Return whether a comes before b, or is equal, in the order of (t_ns, drone, sensor)."""
     if a[WHOSE.t] != b[WHOSE.t]:
         return a[WHOSE.t] < b[WHOSE.t]
     if a[WHOSE.drone] != b[WHOSE.drone]:
@@ -131,11 +131,14 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 @kernel()
 def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return measurements with others, without numbers, inserted, and the rows of the inserted ones.
+    """Insert measurements without values into others.
 
     Args:
-        whose, values: of Sampled, in its order.
-        more: in the same order, (K, WHOSE.size).
+        whose, values: fields of a Sampled, in its order.
+        more: `whose` of the measurements to insert, in the same order, (K, WHOSE.size).
+
+    Returns:
+        `whose` and `values` of all measurements, and the rows of the inserted ones.
     """
     count, extra = whose.shape[0], more.shape[0]
     index, numbers = np.empty((count + extra, WHOSE.size), np.int64), np.zeros((count + extra, VALUE_COLUMNS))
@@ -150,7 +153,7 @@ def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, 
 
 
 class UserSensors:
-    """The users' sensors of a fleet. As with stock sensors, each drone and sensor has a random stream."""
+    """The users' sensors of a fleet; as with stock sensors, each sensor of each drone has its own random stream."""
 
     SAVED: ClassVar[Saved] = {"sensors": PART}
 
@@ -169,11 +172,11 @@ class UserSensors:
 
     @property
     def sensors(self) -> list["_UserSensor"]:
-        """All of them, drone by drone."""
+        """Return all sensors, drone by drone."""
         return [*self._sensors.values()]
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without lost ones.
+        """Return `whose` (M, 3) and values (M, CHANNELS_MAX) of the exposures logged in a gate, except for lost ones.
 
         Raises:
             UserCodeError: an equation fails, or does not return a reading.
@@ -193,7 +196,7 @@ class UserSensors:
 
 
 class _UserSensor:
-    """A sensor of a drone: settings, present bias and random stream."""
+    """A user's sensor on a drone: settings, present bias and random stream."""
 
     SAVED: ClassVar[Saved] = {"bias": IN_PLACE, "stream": list[int]}
 
@@ -221,7 +224,7 @@ class _UserSensor:
         place(self.rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
-        """Return the truth at its exposure, from a row of EXPOSED."""
+        """Return the truth at an exposure from a row of EXPOSED columns."""
         state, accel = row[EXPOSED.state : EXPOSED.accel].copy(), row[EXPOSED.accel : EXPOSED.air].copy()
         return SensorTruth(
             t_s=t_s,
@@ -237,8 +240,8 @@ class _UserSensor:
         )
 
     def measure(self, truth: SensorTruth, environment: object, values: NDArray[np.float64]) -> None:
-        """Write the errorless values into a row (6,)."""
-        assert self._kind.equation is not None  # a module without one is refused
+        """Write the error-free values into a row (CHANNELS_MAX,)."""
+        assert self._kind.equation is not None  # modules without an equation are refused
         count = self._kind.values
         equation, where = self._kind.equation, f"{self._what} at {truth.t_s:.3f} s"
         name = f"{equation.__module__}:{getattr(equation, '__qualname__', type(equation).__qualname__)}"
@@ -260,7 +263,7 @@ Array = NDArray[np.float64]
 
 
 class Between(NamedTuple):
-    """The states of all drones at two gates, (N, STATE.size) each, for `poses_between`."""
+    """States of all drones at two gates, (N, STATE.size) each, as arguments of `poses_between`."""
 
     former: Array
     former_ns: int
@@ -269,7 +272,7 @@ class Between(NamedTuple):
 
 
 class Exposures:
-    """The instants n / rate of some sensors, gate by gate."""
+    """The sampling times n / rate of some sensors, gate by gate."""
 
     SAVED: ClassVar[Saved] = {
         "_counts": list[int],
@@ -282,13 +285,13 @@ class Exposures:
     def __init__(self, rates_hz: Sequence[float], gate_ns: int) -> None:
         self._rates_hz, self._gate_ns = rates_hz, gate_ns
         self._counts = [0] * len(rates_hz)
-        self._due_ns = [0] * len(rates_hz)  # the next sample of each
-        self._next_ns = 0  # the soonest of all
+        self._due_ns = [0] * len(rates_hz)  # next sample of each sensor
+        self._next_ns = 0  # earliest of the next samples
         self._former = np.empty((0, STATE.size))  # states of the last gate before a sample
         self._former_ns = 0
 
     def until(self, state: Array, now_ns: int) -> tuple[list[tuple[int, int]], Between | None]:
-        """Return instants and indices of the sensors whose samples are due by a gate, sorted, and the states.
+        """Return the times and sensors of the samples due by a gate, sorted, and the states at the gates around them.
 
         Args:
             state: states of all drones at the gate, (N, STATE.size or more).
@@ -311,7 +314,7 @@ class Exposures:
 
 
 def released(later: list[Any], now_ns: int) -> list[Any]:
-    """Remove from a list of delayed messages those that are due, by their t_ns, and return them."""
+    """Remove the messages that are due, by their t_ns, from a list of delayed ones, and return them."""
     due = [each for each in later if each.t_ns <= now_ns]
     if due:
         later[:] = [each for each in later if each.t_ns > now_ns]
@@ -320,10 +323,10 @@ def released(later: list[Any], now_ns: int) -> list[Any]:
 
 @kernel()
 def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_ns: int) -> NDArray:
-    """Return the poses of all drones at an instant between two gates, (N, STATE.size).
+    """Return the poses of all drones at a time between two gates, in rows like the states.
 
     Args:
-        former, now: states at the gates, (N, STATE.size or more), between which the other columns are interpolated.
+        former, now: states at the gates, (N, STATE.size or more); their other columns are interpolated linearly.
     """
     if t_ns >= now_ns or now_ns <= former_ns:
         return now.copy()

@@ -1,7 +1,7 @@
 """The world as a process on Zenoh: a loop that paces and gates simulated time.
 
-Order of this file: `run`, `WorldProcess` (continuing a run, the loop, queries, other threads), its inputs and outputs,
-pacing, and the watch over a loop that is stuck.
+In order: `run`, `WorldProcess` (continuing a run, the loop, queries, other threads), its inputs and outputs, pacing,
+and the watch for a stuck loop.
 """
 
 import threading
@@ -35,18 +35,18 @@ from zsim_world.server.liveliness import Admission, LivelinessMonitor, SlowReade
 from zsim_world.server.run_journal import RunJournal
 
 TICK_S = 0.1  # interval at which a waiting world checks the wall clock
-CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once per wall second while time stands still
-VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
+CLOCK_STANDING_NS = 1_000_000_000  # by the contract, the world publishes its clock once per wall second if time stops
+VIEW_PERIOD_NS = 33_333_333  # by the contract, views have at most 30 Hz in wall time
 HEALTH, OWN = keys.process(WORLD, "health"), keys.process(WORLD, "")
-BYE_S = 5.0  # contract: the world waits 5 s at most for byes
-SERVE_NS = 5_000_000  # wall time after which a world that never waits handles requests and losses
+BYE_S = 5.0  # by the contract, the world waits 5 s at most for byes
+SERVE_NS = 5_000_000  # wall time between two times that a world that never waits handles requests and losses
 RECOVERY_S = 1.0  # timeout of a request for outputs, which a living publisher answers within milliseconds
-REJOINED_NS = 10_000_000_000  # wall time after a rejoin within which a process may not answer requests yet
+REJOINED_NS = 10_000_000_000  # wall time after a rejoin within which a process may not yet answer requests
 PROCESSES, VIEWS = "process/", "view/"  # the world does not read views
-LAG_GATES = 2  # unfinished gates that the slowest agent may have when a series of gates begins
-GATES_SENT = 3  # gates sent together; more would leave agents idle
-DELAY_MAX_NS = 50_000_000  # longest delay of a gate [wall]; a slow agent then has all the gates that it may have
-STOOD_STILL_NS = 1_000_000_000  # lateness of a gate [wall] that indicates a standstill rather than slowness
+LAG_GATES = 2  # maximum number of gates that the slowest agent has not finished when a series of gates begins
+GATES_SENT = 3  # number of gates sent together; more would leave agents idle
+DELAY_MAX_NS = 50_000_000  # maximum delay of a gate in wall time, after which a slow agent gets all gates it may have
+STOOD_STILL_NS = 1_000_000_000  # delay of a gate in wall time that indicates a standstill rather than slowness
 STUCK_NS = 2_000_000_000  # wall time after which a turn of the loop is reported as stuck; a turn takes milliseconds
 STOPPED_NS = 1_000_000_000  # wall time between two checks, ten times the usual, that indicates a stopped process
 
@@ -60,10 +60,11 @@ def run(
     identity: Identity | None = None,
     journal: RunJournal | None = None,
 ) -> None:
-    """Listen on the endpoints, call `ready`, and run the world to its end, continuing its journal if it has one.
+    """Listen on the endpoints, call `ready`, and run the world to its end, continuing from its journal if it has one.
 
     Raises:
         SessionError: an endpoint is in use, or the identity is unusable.
+        RunError: as for `WorldProcess.run`.
     """
     mode: Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
     with connection.listen(endpoints, world.scenario.federation, mode, identity) as link:
@@ -76,8 +77,8 @@ class WorldProcess:
 
     Args:
         link: a listening session.
-        stopped: called at every gate and every TICK_S; a text that it returns ends the run for that reason.
-        journal: journal of the run, possibly left by a former world process, which this one continues.
+        stopped: called at every gate and every TICK_S; a text that it returns ends the run and is the reason.
+        journal: journal of the run; if a former world process left it, this one continues its run.
         health: health of this process.
     """
 
@@ -118,14 +119,14 @@ class WorldProcess:
         """Run to the end: wait for the participants, integrate, publish the end.
 
         Raises:
-            RunError: a failure has ended the run, after its end was published.
+            RunError: a failure ended the run, whose end was published, or the journal cannot be continued.
         """
         self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
         self._continue()
         if not self._history.last(keys.INFO):
             self._outputs.publish(Output(keys.INFO, self._world.info()))
         answered = [*roles.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries]
-        answered.append(answered.pop(answered.index(keys.INFO)))  # an answer there means that all are declared
+        answered.append(answered.pop(answered.index(keys.INFO)))  # the last: its answers mean that all are declared
         for expression in answered:
             self._link.declare_queryable(expression, self._on_query)
         self._tokens.watch()
@@ -152,7 +153,7 @@ class WorldProcess:
         """Apply the journal without publishing anything again, then wait for the former participants.
 
         Raises:
-            RunError: the journal belongs to another run, or its state does not fit the scenario.
+            RunError: the journal belongs to another run, or its state does not fit this version of zsim.
         """
         checkpoint, world = self._journal.open(), self._world
         is_continued = isinstance(world, World) and checkpoint is not None
@@ -214,26 +215,26 @@ class WorldProcess:
             self._outputs.publish(Output(keys.EVENT, event))
 
     def _take_in(self) -> None:
-        """Enter the messages that have arrived, and check joins for admission."""
+        """Enter the messages that have arrived into the run, and submit joins for admission."""
         for wall_ns, sample in self._inputs.drain():
             key = sample.key
-            if key.startswith(OWN):  # the world's own health, kept at its publication
+            if key.startswith(OWN):  # the world's own health, which was entered when it was published
                 continue
             self._run.enter(Taken(wall_ns, sample))
             if key.endswith("/join"):
-                with suppress(DecodeError):  # already refused
+                with suppress(DecodeError):  # it was refused when entered
                     join = messages.decode(key, sample.payload)
                     if isinstance(join, run_messages.Join):
                         self._liveliness.before_join(keys.thing(key), join)
                         self._admission.take(keys.thing(key), join, wall_ns)
 
     def _advance(self, wall_ns: int, late_ns: int) -> None:
-        """Advance to the next gate; publish it and the views that are due, and journal a checkpoint if due."""
+        """Advance to the next gate, publish it and due views, and add a checkpoint to the journal if one is due."""
         world = self._world
         late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
         self._run.enter(Advanced(wall_ns, late))
         self._outputs.gather()
-        if isinstance(world, World) and self._journal.is_due(world.now_ns, wall_ns):  # nothing is pending now
+        if isinstance(world, World) and self._journal.is_due(world.now_ns, wall_ns):  # the outbox is empty now
             state = {"world": world.checkpoint(), "last": self._history.last_values}
             self._journal.add_checkpoint(state, world.now_ns, wall_ns)
         if not self._pipelining.continues():
@@ -246,7 +247,7 @@ class WorldProcess:
         self.health.step(time.monotonic_ns() - wall_ns)
 
     def _stand_still(self, wall_ns: int) -> None:
-        """Publish the clock once a second while time stands still, and wait for an input."""
+        """While time stands still, publish the clock once a second, and wait for an input."""
         self._outputs.flush()
         self._pipelining.pause(wall_ns)
         self._publish_clock(wall_ns, self._world.waiting_for)
@@ -257,7 +258,7 @@ class WorldProcess:
         self._served_wall_ns = 0
 
     def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
-        """Publish the processes that the world waits for once a second."""
+        """Publish the clock, with the processes that the world waits for, once a second."""
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
             self._outputs.publish(Output(keys.CLOCK, self._world.clock_message(waiting_for(wall_ns))))
 
@@ -271,7 +272,7 @@ class WorldProcess:
     def _end(self) -> None:
         """Publish the end, then wait until all participants have left, BYE_S at most.
 
-        A world restarted after the end of its run first waits until the former participants have rejoined.
+        A world that was restarted after the end of its run first waits until the former participants have rejoined.
         """
         world, away = self._world, self._world.barrier.away
         while away() and self._stopped() is None:
@@ -314,13 +315,14 @@ class WorldProcess:
     def _serve(self, query: Query) -> None:
         """Answer a query with last values, a page of the history, or the answer to a request.
 
-        Requests arrive on `world/control`; replays also on the process's own key, which access control can restrict.
+        Requests arrive on `world/control`; requests for a replay also on a key of the process, which access control can
+        restrict.
         """
         expression = query.expression
         process = keys.thing(expression) if keys.matches(keys.replay("*"), expression) else None
         if expression in self._world.refused_queries:
             reason = self._world.refusal_at(expression)
-            if reason is None:  # another process answers it
+            if reason is None:  # another process answers
                 query.end()
             else:
                 query.answer(ControlAnswer(ok=False, error=reason))
@@ -357,7 +359,7 @@ class WorldProcess:
             self._inputs.wake()
 
     def _tick(self) -> None:
-        """Wake the loop, and show a stuck put in the terminal, since no message could be published."""
+        """Wake the loop, and report a stuck put in the terminal, since no message can be published."""
         watch = TurnWatch(time.monotonic_ns())
         while not self._over.wait(TICK_S):
             self._inputs.wake()
@@ -369,14 +371,14 @@ class WorldProcess:
 
 
 class DirectInputs:
-    """Reads on the loop's own thread, waiting on the last subscription: fastest without pacing."""
+    """Reads on the loop's own thread, waiting on the last subscription, which is fastest without pacing."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._subscriptions = subscriptions
         self._received: list[ReceivedSample] = []
 
     def wait(self, timeout_s: float | None) -> None:
-        """Return when something has arrived, or after timeout_s; without a limit, return occasionally."""
+        """Wait for a message, or for timeout_s if that is shorter than a tick; may return without a message."""
         if timeout_s is not None and timeout_s < TICK_S:
             time.sleep(timeout_s)
             return
@@ -385,7 +387,7 @@ class DirectInputs:
             self._received.append(sample)
 
     def wait_for(self, wanted: set[str]) -> None:
-        """Wait until something has arrived on each wanted key, or anything other than a done."""
+        """Wait for a message on each of the wanted keys, or for any message other than a done."""
         while True:
             sample = self._subscriptions[-1].receive()
             if sample is None:
@@ -413,7 +415,7 @@ class DirectInputs:
 
 
 class TimedInputs:
-    """Reads on separate threads, so that arrivals are stamped while the loop waits for its next gate."""
+    """Reads on separate threads, so that messages are stamped on arrival while the loop waits for its next gate."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._fresh = threading.Event()
@@ -458,14 +460,14 @@ class TimedInputs:
 def open_inputs(link: Session, realtime: bool) -> DirectInputs | TimedInputs:
     """Subscribe to the messages of other processes.
 
-    Outputs are drained first, dones last: a process publishes its outputs before its done, on the same link.
+    Dones are drained after outputs: a process publishes its outputs before its done, on the same link.
     """
     subscriptions = [link.subscribe_remote((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
     return TimedInputs(subscriptions) if realtime else DirectInputs(subscriptions)
 
 
 def recover_lost(link: Session, run: Run) -> None:
-    """Request outputs that a participant counted and that have not arrived, for example after a cut link."""
+    """Request outputs that a participant counted but that have not arrived, for example after a cut link."""
     world = run.world
     for participant in world.barrier.incomplete():
         if participant.away:
@@ -484,7 +486,7 @@ def recover_lost(link: Session, run: Run) -> None:
             lost = []
         age_ns = time.monotonic_ns() - participant.joined_wall_ns
         if lost is None and participant.rejoined and age_ns < REJOINED_NS:
-            continue  # it may not answer requests yet
+            continue  # the process may not yet answer requests
         for sample in lost or ():
             run.enter(Taken(time.monotonic_ns(), sample))
         run.call("give_up_outputs", participant.name)
@@ -494,8 +496,8 @@ class WorldOutputs:
     """Publishes the outbox of a world.
 
     Args:
-        on_message: called with every key and message except the messages of a gate.
-        journal: written before anything is published.
+        on_message: called with the key and message of every publication except gates.
+        journal: journal of the run, committed before anything is published.
     """
 
     def __init__(self, link: Session, run: Run, on_message: Callable[[str, Any], None], journal: RunJournal) -> None:
@@ -507,7 +509,7 @@ class WorldOutputs:
         self._gate_keys = [keys.gate(name) for name in run.world.names]
 
     def gather(self) -> None:
-        """Encode the outbox for `send`; a gate as a whole and per drone, if subscribed, and as single messages."""
+        """Encode the outbox for `send`; a gate as single messages and, where subscribed, as a whole and per drone."""
         outbox = self._run.world.take_outbox()
         if not outbox:
             return
@@ -525,7 +527,7 @@ class WorldOutputs:
                 encoded += message.pairs
             else:
                 pair = (key, messages.encode(message))
-                if keys.is_picture(key):  # of a replay; not kept or batched, since pictures are large
+                if keys.is_picture(key):  # pictures of a replay are too large to keep or batch
                     self._unsent.append(pair)
                     continue
                 encoded.append(pair)
@@ -537,7 +539,7 @@ class WorldOutputs:
                 self._on_message(key, message)
 
     def send(self) -> None:
-        """Publish the gathered messages together: readers wake once, and the transport sends few packets."""
+        """Publish the gathered messages together, so that readers wake once and the transport sends few packets."""
         self._journal.commit()
         unsent, self._unsent = self._unsent, []
         self._link.put_all(unsent)
@@ -548,7 +550,7 @@ class WorldOutputs:
         self.send()
 
     def publish(self, output: Output) -> None:
-        """Publish one message without the outbox."""
+        """Publish one message, bypassing the outbox."""
         message: Any = output.message
         payload = messages.encode(message)
         self._run.enter(Published(output.key, message.seq, payload))
@@ -558,7 +560,7 @@ class WorldOutputs:
         self._on_message(output.key, message)
 
     def put_batch(self) -> None:
-        """Send all messages since the last call to the recorders, if any."""
+        """Send all messages since the last call to the recorders, if there are any."""
         history = self._run.history
         passed, history.passed = history.passed, []
         if self._link.has_subscribers(keys.BATCH):
@@ -566,21 +568,24 @@ class WorldOutputs:
                 self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))
 
     def forget(self) -> None:
-        """Drop the gathered messages, which the former world process has published."""
+        """Drop the gathered messages, since the former world process published them."""
         self._unsent, self._run.history.passed = [], []
 
 
 class Pacer:
-    """Computes when gates are due by the wall clock, at the rate of the run's clock."""
+    """Computes the wall times at which gates are due, at the rate of the run's clock."""
 
     def __init__(self, clock: RunClock) -> None:
         self._clock = clock
-        self._pace = (0.0, 0)  # rate and number of jumps of time; the next two are its start
+        self._pace = (0.0, 0)  # rate and number of time jumps; started at the next two
         self._start_wall_ns = 0
         self._start_sim_ns = 0
 
     def due_ns(self, wall_ns: int) -> int:
-        """Return the wall time of the next gate [ns]; the pace restarts after a change of rate or a standstill."""
+        """Return the wall time of the next gate [ns].
+
+        The pace restarts after a change of rate, a time jump or, in lockstep, a standstill.
+        """
         clock = self._clock
         if clock.rate <= 0 or clock.state != "running":
             self._pace = (0.0, 0)
@@ -601,9 +606,9 @@ class Pacer:
 class Pipelining:
     """Delays gates so that several are sent together and processes wake up less often.
 
-    If agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up; then gates
-    follow one another until its done is required again. No agent idles meanwhile: the first of these gates arrives
-    while agents still work on earlier ones. Only a world in lockstep without pacing is delayed.
+    If agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up. Then gates
+    follow one another until its done is required again. Agents do not idle, since the first of these gates arrives
+    while they still work on earlier ones. Only a world in lockstep without pacing is delayed.
     """
 
     def __init__(self, world: Coordinator) -> None:
@@ -620,7 +625,7 @@ class Pipelining:
         return self._ahead_ns > 0 and self._clock.mode == "lockstep" and self._clock.rate <= 0
 
     def delays(self, wall_ns: int) -> bool:
-        """Return whether to delay the next gate although it may come."""
+        """Return whether to delay the next gate, although it may come."""
         if self._continues or not self._enabled:
             return False
         late = wall_ns - self._delayed_wall_ns > DELAY_MAX_NS
@@ -628,12 +633,12 @@ class Pipelining:
         return not self._continues
 
     def continues(self) -> bool:
-        """Return, after a gate, whether the next one follows immediately, so that both can be sent together."""
+        """Return, after a gate, whether the next one follows immediately and can be sent together with it."""
         self._gates = (self._gates + 1) % GATES_SENT
         return self._gates > 0 and self._continues and self._enabled and self._world.may_advance()
 
     def pause(self, wall_ns: int) -> None:
-        """Note that the next gate may not come yet."""
+        """Note that the next gate must not come yet."""
         if self._continues:
             self._continues, self._delayed_wall_ns = False, wall_ns
 
@@ -645,7 +650,7 @@ class Pipelining:
 class TurnWatch:
     """Distinguishes a stuck turn of the loop (a put that does not return) from a stopped process.
 
-    It is called on a separate thread, which a put does not block. Times are monotonic.
+    It is called on a separate thread, which a stuck put does not block. Times are monotonic.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -654,10 +659,10 @@ class TurnWatch:
         self._reported_ns = 0
 
     def stuck_s(self, now_ns: int, turn_ns: int) -> float | None:
-        """Return how long a turn has been stuck [s], at most once every STUCK_NS; None if there is nothing to report.
+        """Return how long a turn has been stuck [s], once every STUCK_NS at most; None if there is nothing to report.
 
         Args:
-            turn_ns: when the turn began, 0 outside a turn.
+            turn_ns: time when the turn began; 0 outside a turn.
         """
         if now_ns - self._looked_ns > STOPPED_NS:
             self._stopped_until_ns = now_ns
