@@ -1,6 +1,7 @@
-"""The world of a flight: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
+"""The world of a flight: integrates all drones, owns simulated time, applies commands and faults.
 
-Participants and requests, which flights and replays share, are in `zsim_world.run.coordinator`.
+It has neither session nor wall clock. `zsim_world.run.coordinator` has what flights and replays share: participants and
+requests.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -37,9 +38,9 @@ class World(Coordinator):
 
     Args:
         mode: "lockstep" or "realtime".
-        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
-        run_id: set by a launcher, and by tests that compare records.
-        changed: overrides of the scenario file as `a.b.c=value`, None if unknown.
+        rate: real-time factor, simulated seconds per wall second; 0 = as fast as possible.
+        run_id: set by a launcher, and by tests that compare records; None: random.
+        changed: overrides of the scenario file as `a.b.c=value`; None if unknown.
 
     Raises:
         ScenarioError: the scenario has external drones and the mode is "lockstep".
@@ -77,7 +78,7 @@ class World(Coordinator):
     ) -> None:
         check_pace(scenario, mode)
         super().__init__(scenario, mode, rate, wall_ns, run_id, expected_processes(scenario))
-        if scenario.own_messages():  # what is published at a gate is read at the next one
+        if scenario.own_messages():  # agents read at a gate what others published at the previous one
             self.clock.ahead_ns = 0
         self._changed = UNSET if changed is None else tuple(changed)
         self.fleet = Fleet(scenario)
@@ -133,7 +134,7 @@ class World(Coordinator):
     # State
 
     def checkpoint(self) -> State:
-        """Return the state from which the run continues to the same bits, without the hash of its truth.
+        """Return the state from which the run continues to the same bits, without the truth hash.
 
         The outbox must be empty.
         """
@@ -141,7 +142,7 @@ class World(Coordinator):
         return saved_state(self)
 
     def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
-        """Copy the input of the truth hash to `copy` from now on; `hashed` is its input before."""
+        """Copy all further input of the truth hash to `copy`; `hashed` is its input so far."""
         self.truth_hash.resume(hashed, copy)
 
     # Inputs
@@ -162,10 +163,10 @@ class World(Coordinator):
     # Time
 
     def advance(self, wall_ns: int) -> None:
-        """Go to the next gate (or publish gate 0) and put all its messages into the outbox.
+        """Advance to the next gate, or publish gate 0, and put all its messages into the outbox.
 
-        Commands and faults are applied before the fleet is integrated. A state that is no longer finite, or a failing
-        user's sensor, ends the run at the previous gate; see `failure`.
+        Commands and faults are applied before the fleet is integrated. A state that is no longer finite, or a user's
+        sensor that fails, ends the run at the previous gate and sets `failure`.
         """
         clock, fleet, statistics, now_ns = self.clock, self.fleet, self.statistics, self.clock.now_ns
         is_first = clock.state == "waiting"
@@ -197,7 +198,7 @@ class World(Coordinator):
             self._publish_incidents()
         state = fleet.bodies.state
         self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
-        if self._radio is not None:  # before the gate, on which agents start to work
+        if self._radio is not None:  # before the gate, since agents start to work when that arrives
             position_m, seq = state[:, STATE.p_WB : STATE.p_WB + 3], self.outbox.next_seq(keys.RADIO)
             acting = self.faults.of_links(clock.now_ns)
             self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, seq, position_m, acting))
@@ -220,7 +221,7 @@ class World(Coordinator):
             self.outbox.notice(each.kind, self.names[each.drone], each.text, data)
 
     def result(self) -> dict[str, Any]:
-        """Return the figures of the run so far."""
+        """Return the statistics of the run so far."""
         return {
             "reason": self.ended,
             "last_ns": self.now_ns,
