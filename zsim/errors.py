@@ -1,4 +1,4 @@
-"""The errors of zsim, each one line (where, found, allowed, remedy), and texts derived from errors."""
+"""The errors of zsim, with one line per fault (where, found, allowed, remedy), and texts derived from errors."""
 
 import os
 import re
@@ -10,18 +10,18 @@ from pathlib import Path
 from types import TracebackType
 
 PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_api", "zsim_deploy"})
-"""Of zsim: none of these is a user's."""
+"""The packages of zsim; modules outside them are users' or libraries'."""
 
 
 class ZsimError(Exception):
     """Base of all errors that a user can cause; the command line prints them without a traceback."""
 
     def _render_traceback_(self) -> list[str]:
-        """Return the traceback shown by IPython, which calls this: the user's frames only, and the lines."""
+        """Return the traceback for IPython, which calls this: only the user's frames, and the error's text."""
         from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
 
         frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))
-        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # through which zsim calls itself
+        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # standard library between zsim's own calls
             frames.pop()
         way: TracebackType | None = None
         for each in reversed(frames):
@@ -45,7 +45,7 @@ def _package(entry: TracebackType) -> str:
 
 
 class DocumentError(ZsimError):
-    """A document with faults; `faults` holds a line for each."""
+    """A faulty document; `faults` has a line for each fault."""
 
     def __init__(self, faults: list[str]) -> None:
         super().__init__("\n".join(faults))
@@ -53,19 +53,19 @@ class DocumentError(ZsimError):
 
 
 class NotTrustedError(DocumentError):
-    """A document names its own code, which this command may not import."""
+    """A document names user code that this command must not import."""
 
 
 class ScenarioError(DocumentError):
-    """A scenario, or an override of one, with faults."""
+    """A faulty scenario or override of a scenario."""
 
 
 class InventoryError(DocumentError):
-    """An inventory of hosts with faults."""
+    """A faulty inventory of hosts."""
 
 
 class DecodeError(ZsimError):
-    """A payload refused on decode; the text names key, field, found and allowed."""
+    """A payload that cannot be decoded; the text states key, field, and the values found and allowed."""
 
 
 class BadNameError(ZsimError):
@@ -77,7 +77,7 @@ class SessionError(ZsimError):
 
 
 class NoWorldError(SessionError):
-    """No world answers `world/info` within the time limit."""
+    """No world answered a query within the time limit, or its answer was unusable."""
 
 
 class RunError(ZsimError):
@@ -85,11 +85,11 @@ class RunError(ZsimError):
 
 
 class SupersededError(RunError):
-    """Another process of the same name has taken over."""
+    """Another process with the same name has replaced this one."""
 
 
 class BehindError(RunError):
-    """A participant needs messages that are no longer kept; a new incarnation of it can continue."""
+    """A participant needs messages that are no longer kept; a new incarnation can continue."""
 
 
 class RequestRefusedError(RunError):
@@ -101,7 +101,7 @@ class RunFailedError(RunError):
 
 
 class UserCodeError(RunFailedError):
-    """A user's class raised, or returned an invalid value.
+    """A user's class raised an exception or returned an invalid value.
 
     Args:
         text: class and method, and the line in the user's file or the value.
@@ -118,7 +118,7 @@ class UserCodeError(RunFailedError):
 
 
 class HostsError(ZsimError):
-    """A host that cannot be reached or lacks what it needs: host, what failed, what to do; a line per host."""
+    """Hosts that cannot be reached or lack a requirement; a line per host with the failure and its remedy."""
 
 
 class RecordError(ZsimError):
@@ -126,7 +126,7 @@ class RecordError(ZsimError):
 
 
 class ReportError(ZsimError):
-    """A report that cannot be made or written."""
+    """A report that cannot be created or written."""
 
 
 OTHER_OUT = "give --out another folder"  # remedy
@@ -134,38 +134,38 @@ OTHER_OUT = "give --out another folder"  # remedy
 
 @contextmanager
 def file_fault(path: Path, fault: str, remedy: str, kind: type[ZsimError] = RunError) -> Iterator[None]:
-    """Turn an OSError on a file into an error of one line: `PATH: FAULT (REASON); REMEDY`."""
+    """Convert an OSError on a file to an error of one line: `PATH: FAULT (REASON); REMEDY`."""
     try:
         yield
     except OSError as error:
         raise kind(f"{path}: {fault} ({error.strerror}); {remedy}") from error
 
 
-# C0, C1, bidirectional
+# control codes C0 (without tab and line feed) and C1, and bidirectional controls
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
 def printable(text: str) -> str:
-    """Return a text for a terminal, with control codes, which network data may contain, made visible."""
+    """Return a text for a terminal in which control codes, which network data may contain, are escaped."""
     return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
-_FIGURE = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number by itself
-REASON_MAX = 300  # characters of a reason
+_FIGURE = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number that is not part of a name
+REASON_MAX = 300  # characters
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the message of an exception in one line, with the type of an exception that is not zsim's."""
+    """Return the message of an exception on one line, preceded by its type unless it is zsim's."""
     text = " ".join(str(error).split())[:REASON_MAX]
     return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
 
 
 def without_figures(text: str) -> str:
-    """Return a reason without its numbers, so that reasons differing only in a figure are equal; names keep theirs."""
+    """Return a reason with its numbers replaced by #, except in names, to compare reasons that differ only in these."""
     return _FIGURE.sub("#", text)
 
 
-# Extra of pyproject.toml that brings a module, by the name that is imported; of several the smallest.
+# The smallest extra of pyproject.toml that installs a module, by the module's import name.
 EXTRA_OF = {
     "aiohttp": "gateway",
     "asyncssh": "hosts",
@@ -196,7 +196,7 @@ EXTRA_OF = {
 
 
 def install_command(extras: Iterable[str]) -> str:
-    """Return the command that installs extras of pyproject.toml from the checkout; zsim is not on a package index."""
+    """Return the command that installs extras from the checkout, since zsim is not on a package index."""
     names = ",".join(sorted(set(extras)))
     checkout = Path(__file__).parents[1]
     if not (checkout / "pyproject.toml").exists():
@@ -207,7 +207,7 @@ def install_command(extras: Iterable[str]) -> str:
 
 
 def missing(error: ModuleNotFoundError) -> str | None:
-    """Return a line on a missing module with the command that installs it; None if no extra brings it."""
+    """Return a line about a missing module with the command that installs it; None if no extra does."""
     module = (error.name or "").partition(".")[0]
     extra = EXTRA_OF.get(module)
     return f"{module} is not installed; {install_command([extra])}" if extra else None
@@ -215,7 +215,7 @@ def missing(error: ModuleNotFoundError) -> str | None:
 
 @contextmanager
 def what_is_missing() -> Iterator[None]:
-    """Turn a missing module that an extra brings into a RunError with the command that installs it."""
+    """Convert the error on a missing module to a RunError with the command that installs it, if an extra does."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -1,7 +1,7 @@
-"""Output folders of commands, temporary folders, and the record in the folder of a run.
+"""Output folders of commands, temporary folders, and the record in a run's folder.
 
-A command does not write among foreign files without being told to. Locks prevent two processes from writing into one
-folder; some file systems have none (Lustre, some of NFS, FUSE).
+A command writes into a folder with foreign files only if forced. Locks prevent two processes from writing into the same
+folder; some file systems do not support them (Lustre, some NFS and FUSE).
 """
 
 import os
@@ -20,13 +20,13 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-OTHERS_NAMED = 3  # in a refusal
+OTHERS_NAMED = 3  # foreign files named in an error
 
 
 def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
     """Lock an open file until it is closed or the process ends; return False if another process holds the lock.
 
-    On a file system without locks it returns True; see `no_locks`.
+    Always True on a file system without locks, see `no_locks`.
     """
     if fcntl is None:
         return True
@@ -34,20 +34,20 @@ def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
         fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # ENOLCK, ENOSYS, EOPNOTSUPP: what a file system answers differs
+    except OSError:  # without locks, file systems return ENOLCK, ENOSYS or EOPNOTSUPP
         return True
     return True
 
 
 def wait_for_lock(file: IO[Any]) -> None:
-    """Wait for the lock of an open file and hold it until the file is closed; no effect without file system locks."""
+    """Wait for the lock of an open file, held until it is closed; no effect on a file system without locks."""
     if fcntl is not None:
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def no_locks(folder: Path) -> str | None:
-    """Return a warning if the file system of a folder has no locks, so that `take_lock` has no effect."""
+    """Return a warning if the file system of a folder does not support locks; else None."""
     if fcntl is None:
         return None
     try:
@@ -60,14 +60,15 @@ def no_locks(folder: Path) -> str | None:
 
 @contextmanager
 def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use: str, others: str) -> Iterator[None]:
-    """Create a folder, and lock it against other processes for the duration of the block.
+    """Create a folder and lock it against other processes for the duration of the block.
 
     Args:
-        mark: file that identifies a folder of this command; others are checked by `refuse_others`.
-        others: for the error if it is locked: "another hunt is at work".
+        mark: file that identifies a folder of this command; `refuse_others` checks a folder without it.
+        own, force, use: as for `refuse_others`.
+        others: start of the error if the folder is locked: "another hunt is at work".
 
     Raises:
-        RunError: the folder has other content, is locked, or cannot be created.
+        RunError: the folder has foreign content, is locked, or cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -86,12 +87,12 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
     """Refuse a folder that contains files other than the command's own.
 
     Args:
-        own: names that the command may overwrite.
-        force: accept it nevertheless; the files are kept.
-        use: use of the folder, for the error: "fly into".
+        own: names of files that the command may overwrite.
+        force: whether to accept other files, which are kept.
+        use: intended use of the folder, for the error: "fly into".
 
     Raises:
-        RunError: there are other files, which it names.
+        RunError: there are other files; the error names some.
         OSError: the folder cannot be read.
     """
     others = sorted(each.name for each in folder.iterdir() if each.name not in own)
@@ -100,34 +101,34 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
         raise RunError(f"{folder}: holds {named}; give --out an empty folder, or --force to {use} this one")
 
 
-TEMPORARY = "zsim-temporary-"  # begins the names of folders that a process has locked while it lives
+TEMPORARY = "zsim-temporary-"  # prefix of folders that a process keeps locked until it ends
 
 
 def temporary_folder(prefix: str) -> Path:
-    """Return a new folder, removed when this process ends, or, if it is killed, by the next process that calls this.
+    """Create a folder that is removed when this process ends, or, if it is killed, by the next process that calls this.
 
     Args:
-        prefix: beginning of its name.
+        prefix: beginning of the folder's name.
     """
     return Path(mkdtemp(prefix=prefix, dir=_own_temporary(os.getpid())))
 
 
 @cache
 def _own_temporary(_pid: int) -> Path:
-    """Return the parent folder of this process's temporary folders; a forked child has its own."""
-    from multiprocessing.util import Finalize  # also of a process that multiprocessing has started, unlike atexit
+    """Return the parent folder of a process's temporary folders; the argument gives a forked child its own."""
+    from multiprocessing.util import Finalize  # unlike atexit, also runs in children started by multiprocessing
 
     _remove_left()
     made = Path(mkdtemp(prefix="zsim-unlocked-"))
     if fcntl is not None:
-        take_lock(os.open(made, os.O_RDONLY))  # which is never closed
+        take_lock(os.open(made, os.O_RDONLY))  # left open, so that the lock lasts
     folder = made.rename(made.with_name(made.name.replace("zsim-unlocked-", TEMPORARY)))
-    Finalize(None, shutil.rmtree, (folder, True), exitpriority=-100)  # once the children have ended
+    Finalize(None, shutil.rmtree, (folder, True), exitpriority=-100)  # after multiprocessing has joined the children
     return folder
 
 
 def _remove_left() -> None:
-    """Remove temporary folders of killed processes, which are not locked."""
+    """Remove temporary folders of killed processes: those that are not locked."""
     place = Path(gettempdir())
     if fcntl is None or no_locks(place):
         return
@@ -146,10 +147,10 @@ RECORD = "run.mcap"  # in the folder of a run
 
 
 def record_in(folder: Path) -> Path:
-    """Return the record in a run's folder.
+    """Return the path of the record in a run's folder.
 
     Raises:
-        RunError: there is none.
+        RunError: the folder contains no record.
     """
     record = folder / RECORD
     if not record.is_file():
@@ -158,5 +159,5 @@ def record_in(folder: Path) -> Path:
 
 
 def record_at(place: Path) -> Path:
-    """Return the record that is a file, or in a run's folder (see `record_in`)."""
+    """Return the path of a record, given that path or a run's folder (see `record_in`)."""
     return place if place.is_file() else record_in(place)

@@ -1,9 +1,9 @@
-"""Presentation of tables and drones: tables that fit a terminal, and a colour for each drone.
+"""Tables that fit a terminal, and a colour for each drone.
 
-On a narrow terminal a table omits columns instead of breaking names, units and figures. The colour of a
-drone is the same in reports, the console and exports, distinct with every kind of colour vision. Few drones have the
-colours of Okabe and Ito (2008); more have those of viridis (van der Walt, Smith 2015) from the first drone of the
-scenario to the last, without its yellow, which is hard to see on white paper.
+On a narrow terminal a table omits columns instead of breaking names, units and numbers. A drone has the same colour in
+reports, the console and exports, and colours are distinguishable with every kind of colour vision. Few drones have the
+colours of Okabe and Ito (2008); more have those of viridis (van der Walt, Smith 2015) in the order of the scenario,
+without yellow, which is hard to see on white paper.
 """
 
 import os
@@ -20,20 +20,20 @@ from rich.text import Text
 from zsim.errors import printable
 from zsim.runtime.progress import PipedConsole
 
-NAME_WHOLE = 22  # characters of a name for whose sake columns are left out
-WORD_WHOLE = 40  # characters of a word in a text for whose sake columns are left out
-TEXT_LEAST = 18  # characters of a line of text that no column of figures takes away
-UNLIMITED = 10_000  # columns; wider than any table
-NAME_MIN = 12  # columns that a name keeps where the table is too wide: `…ator.drone12`
+NAME_WHOLE = 22  # characters; columns are omitted so that a name keeps this width
+WORD_WHOLE = 40  # characters; columns are omitted so that words of text up to this width are not broken
+TEXT_LEAST = 18  # characters; columns are omitted so that text keeps this width
+UNLIMITED = 10_000  # characters; wider than any table
+NAME_MIN = 12  # characters that a name keeps in a table that is too wide: `…tor.drone12`
 
 
 class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        header: header, whose lines are never broken; a table with only empty headers has no head.
-        kind: of its cells: without room a name keeps its end, a text wraps between words, a figure stays whole.
-        worth: columns of least worth are omitted first without room; None: never omitted.
+        header: header, whose lines are never broken; a table with only empty headers has no header row.
+        kind: kind of the cells; without room a name keeps its end, text wraps between words, a figure is not broken.
+        worth: priority; columns of the lowest worth are omitted first; None: never omitted.
         right: whether cells are right-aligned.
     """
 
@@ -44,13 +44,13 @@ class Column(NamedTuple):
 
 
 class FittedTable:
-    """Rows of text under columns; control codes are made visible.
+    """A table that omits columns to fit the terminal; control codes are escaped.
 
     Args:
         rows: rows with a cell for each column.
-        title, caption: above and below the table.
-        one_line: limits a row to one line, truncating what does not fit.
-        lines: lines around the cells.
+        title, caption: texts above and below the table.
+        one_line: whether a row is limited to one line, truncating what does not fit.
+        lines: lines drawn around the cells; None for no lines.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class FittedTable:
         self._one_line, self._lines = one_line, lines
 
     def left_out(self, width: int) -> list[str]:
-        """Return the headers of the columns that do not fit a terminal of a width."""
+        """Return the headers of the columns that are omitted at a width [characters]."""
         shown = self._shown(Console(width=width), width)
         return [" ".join(each.header.split()) for i, each in enumerate(self.columns) if i not in shown]
 
@@ -79,7 +79,7 @@ class FittedTable:
             yield Text(printable(self._caption), style="table.caption")
 
     def _shown(self, console: Console, width: int) -> list[int]:
-        """Return the indices of the columns that fit a width."""
+        """Return the indices of the columns shown at a width [characters]."""
         shown = list(range(len(self.columns)))
         wide = console.options.update(width=UNLIMITED)
         while True:
@@ -120,7 +120,7 @@ class FittedTable:
         return Table(box=self._lines, pad_edge=self._lines is not None, show_header=has_head)
 
     def _least(self, place: int) -> int:
-        """Return the width of a column below which others are omitted."""
+        """Return the width of a column [characters] below which other columns are omitted."""
         column = self.columns[place]
         header = max(map(len, column.header.split("\n")))
         cells = [printable(row[place]) for row in self._rows]
@@ -131,7 +131,7 @@ class FittedTable:
 
 
 def print_table(table: FittedTable) -> None:
-    """Print a table on the terminal; into a file or pipe one row per line, with all columns."""
+    """Print a table to a terminal, or, with all columns and one row per line, to a file or pipe."""
     console = PipedConsole()
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console.width = UNLIMITED
@@ -144,9 +144,9 @@ def shortened(name: str, width: int) -> str:
 
 
 class NameCell(NamedTuple):
-    """A cell with a name, truncated at the beginning: the end distinguishes names such as `estimator.drone2`.
+    """A name, truncated at its beginning because the end distinguishes names such as `estimator.drone2`.
 
-    All characters of a name are one column wide.
+    All characters of names are assumed to be one cell of the terminal wide.
     """
 
     name: str
@@ -159,7 +159,17 @@ class NameCell(NamedTuple):
 
 
 FEW = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-MANY = ("#440154", "#482475", "#414487", "#355f8d", "#2a788e", "#21918c", "#22a884", "#44bf70", "#7ad151")  # 0 to 0.8
+MANY = (
+    "#440154",
+    "#482475",
+    "#414487",
+    "#355f8d",
+    "#2a788e",
+    "#21918c",
+    "#22a884",
+    "#44bf70",
+    "#7ad151",
+)  # viridis at 0 to 0.8
 
 
 @lru_cache
@@ -177,11 +187,11 @@ def drone_colours(count: int) -> tuple[str, ...]:
 
 
 def colours_of(drones: Collection[str]) -> dict[str, str]:
-    """Return the colour of each drone by its name; they are in the order of the scenario."""
+    """Return the colour of each drone by name, given the names in the order of the scenario."""
     return dict(zip(drones, drone_colours(len(drones)), strict=True))
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """Return red, green and blue, 0 to 255, of `#rrggbb`."""
+    """Return red, green and blue, each 0 to 255, of a colour `#rrggbb`."""
     red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
     return red, green, blue

@@ -1,7 +1,7 @@
-"""Completeness of a record: every gate, every sequence number of the world's keys, and the end of the run.
+"""Completeness of a record: every gate, every sequence number on the world's keys, and the end of the run.
 
-The world numbers its messages without gaps, so the record shows which are missing. Messages of other processes are not
-counted: one that never reached the world is not missing from the record.
+The world numbers its messages without gaps, so that the record shows which are missing. Messages of other processes are
+not counted: those that never reached the world do not belong in the record.
 """
 
 from collections.abc import Callable, Container
@@ -19,7 +19,7 @@ from zsim.record.record_reader import MessageSpans, RecordReader, shown
 
 
 class GateGap(Struct, frozen=True):
-    """Consecutive missing gates: their number, and the first and last of them [ns]."""
+    """Consecutive missing gates: their count, and the times of the first and the last [ns]."""
 
     gates: int
     from_ns: int
@@ -32,21 +32,22 @@ class GateGap(Struct, frozen=True):
 
 
 class GateCount:
-    """Counts the gates of a run by its clocks, in the order in which the world published them.
+    """Counts the gates of a run by its clock messages, in the order in which the world published them.
 
-    `after`: the clock after which counting begins; the start of the run by default.
+    Args:
+        after: clock message after which counting begins; None for the start of the run.
     """
 
     def __init__(self, after: run_messages.Clock | None = None) -> None:
         self.gates = 0  # number of gates so far
         self.gaps: list[GateGap] = []  # gaps so far
-        self.ended = False  # whether the clock has stopped
+        self.ended = False  # whether the last clock message stated the end of the run
         self._step, self._seq = (after.step, after.seq) if after else (-1, -1)
 
     def add(self, clock: run_messages.Clock) -> GateGap | None:
-        """Count the gate of a clock message; return the gates missing between the last one and this one.
+        """Count the gate of a clock message; return the gates missing before it, or None.
 
-        None are missing before a clock with the next number, even if a replay has moved the time.
+        None are missing if its sequence number is the next one, even if a replay has jumped in time.
         """
         gap, missing = None, clock.step - self._step - 1
         if missing > 0 and clock.seq != self._seq + 1:
@@ -63,14 +64,14 @@ class GateCount:
 
 
 class Completeness(Struct, frozen=True):
-    """The contents of a record, and its gaps."""
+    """What a record contains and what it lacks."""
 
-    gates: int = 0  # on record
-    gaps: tuple[GateGap, ...] = ()  # gates that are missing
-    messages_missing: int = 0  # of the world, by their numbers; those of missing gates among them
-    ended: bool = True  # the end of the run is on record
-    closed: bool = True  # its writer has closed it
-    last_ns: int = 0  # its last gate [ns]
+    gates: int = 0  # gates on record
+    gaps: tuple[GateGap, ...] = ()  # missing gates
+    messages_missing: int = 0  # missing messages of the world by sequence number, including those of missing gates
+    ended: bool = True  # whether the end of the run is on record
+    closed: bool = True  # whether its writer has closed it
+    last_ns: int = 0  # time of the last gate
     damaged: tuple[str, ...] = ()  # unreadable parts with their positions
 
     @property
@@ -104,18 +105,18 @@ class _Numbered(Struct):
     seq: int
 
 
-UNREAD = -1  # marks a number that is not encoded as by our own encoder
-_WIDTH = np.full(256, -1, dtype=np.int64)  # bytes of an unsigned integer behind its first byte, by that (MessagePack)
+UNREAD = -1  # in place of a sequence number that is not encoded as zsim's encoder does
+_WIDTH = np.full(256, -1, dtype=np.int64)  # bytes after the first of a MessagePack unsigned integer, by its first byte
 _WIDTH[:0x80] = 0
 _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8
 _T_NS, _SEQ = (np.frombuffer(msgspec.msgpack.encode(name), np.uint8) for name in ("t_ns", "seq"))
-_MAP_16 = 0xDE  # of more than 15 fields
+_MAP_16 = 0xDE  # first byte of a map of more than 15 fields
 SECOND_NS = 1_000_000_000
-_LOOKED_AT = 1 << 5  # bytes from the beginning of a message in which both of its first fields end
+_LOOKED_AT = 1 << 5  # bytes of padding; the first two fields of a message always end within so many
 
 
 def sequence_numbers(spans: MessageSpans) -> NDArray[np.int64]:
-    """Return `seq` of each message (M,) that begins with `t_ns` and `seq`; UNREAD for any other."""
+    """Return `seq` of each message, (M,); UNREAD for messages that do not begin with `t_ns` and `seq`."""
     data = np.frombuffer(spans.content + bytes(_LOOKED_AT), np.uint8)
     start = spans.start
     first = start + np.where(data[start] == _MAP_16, 3, 1)
@@ -145,7 +146,7 @@ class _Numbers:
 
     def add(self, spans: MessageSpans, rows: NDArray[np.bool_]) -> None:
         read = np.where(rows, sequence_numbers(spans), 0)
-        for m in np.flatnonzero(read < 0).tolist():  # by another encoder, or garbage, which has no number
+        for m in np.flatnonzero(read < 0).tolist():  # from another encoder, or garbage without a number
             with suppress(*messages.REFUSALS, OverflowError):
                 read[m] = self._decode(spans.content[spans.start[m] : spans.end[m]]).seq
         rows = rows & (read >= 0)
@@ -167,17 +168,17 @@ class _Numbers:
 
 def completeness(
     reader: RecordReader,
-    keys_beside: Container[str] = (),  # of messages that are wanted as well, which saves reading the record twice
-    # of messages of which the first in every simulated second and the last are wanted; there may be more
+    keys_beside: Container[str] = (),  # keys whose messages are passed to `take`, which saves reading the record twice
+    # keys of which at least the first message in every simulated second and the last are passed to `take`
     keys_sampled: Container[str] = (),
-    # called with key and payload of each of these, in the order in which they were written
+    # called with key and payload of each of these messages, in the order in which they were written
     take: Callable[[str, bytes], None] = lambda key, payload: None,
 ) -> Completeness:
-    """Return the gaps of a record; it is read entirely, and every checksum is verified."""
+    """Return the completeness of a record, reading all of it and verifying every checksum."""
     info: messages.Info | None = None
     with suppress(DecodeError):
         info = messages.decode(keys.INFO, last.payload) if (last := reader.last(keys.INFO)) else None
-    # a replay has clocks of its own, and numbers of the run that it played
+    # the record of a replay has the replay's clock messages, and sequence numbers of the replayed run
     is_replay = info is not None and bool(info.replay_of)
     external = {drone.name for drone in (info.drones if info else ()) if drone.body is not msgspec.UNSET}
     names = reader.channels()
@@ -195,7 +196,7 @@ def completeness(
         for m in wanted[np.argsort(spans.start[wanted])].tolist():
             take(names[spans.channel.item(m)], spans.content[spans.start.item(m) : spans.end.item(m)])
         for start, end in zip(spans.start[is_clock].tolist(), spans.end[is_clock].tolist(), strict=True):
-            with suppress(*messages.REFUSALS):  # garbage from another program, recorded as received
+            with suppress(*messages.REFUSALS):  # another program's garbage is recorded as received
                 clocks.append(decode(spans.content[start:end]))
     gates = GateCount()
     for clock in sorted(clocks, key=lambda clock: (clock.seq if is_replay else clock.t_ns, clock.seq)):
@@ -212,9 +213,9 @@ def completeness(
 
 
 def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool_]:
-    """Return which messages (M,) are the first of their channel in a second, or its first or last here."""
+    """Return which messages, (M,), are the first of their channel in a second, or its first or last in these spans."""
     second, last = spans.t_ns // SECOND_NS, len(spans.channel) - 1
-    changes = np.ones(last + 2, bool)  # before each message, and behind all
+    changes = np.ones(last + 2, bool)  # whether the channel changes before each message, and after the last
     changes[1:-1] = spans.channel[1:] != spans.channel[:-1]
     begins = changes[:-1].copy()
     begins[1:] |= second[1:] != second[:-1]
@@ -222,7 +223,11 @@ def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool
 
 
 def record_completeness(path: Path) -> Completeness:
-    """Return the gaps of the record at a path; RecordError if there is none, or it cannot be read."""
+    """Return the completeness of the record at a path.
+
+    Raises:
+        RecordError: the record is missing or cannot be read.
+    """
     with RecordReader(path) as reader:
         return completeness(reader)
 

@@ -1,9 +1,10 @@
-"""The layout of a record in its file: https://mcap.dev/spec.
+"""The layout of a record as an MCAP file: https://mcap.dev/spec.
 
     magic  header  { schemas and channels new in the next chunk   chunk   its message indexes }*
-    data end  summary  footer  magic                             (absent where the writer died)
+    data end  summary  footer  magic                             (absent if the writer was killed)
 
-The mcap library packs and unpacks all records except messages and chunks, for which it is too slow.
+Elsewhere in this package a record is the file of a run; the records of MCAP are the parts of that file. The mcap
+library packs and unpacks all parts except messages and chunks, for which it is too slow.
 """
 
 import struct
@@ -28,9 +29,9 @@ from numpy.typing import NDArray
 from zsim import __version__
 from zsim.errors import RecordError
 
-HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+HEAD = struct.Struct("<BQ")  # opcode, length of the body
 MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time; then the payload
-MESSAGE_HEAD = np.dtype(  # MESSAGE, as numpy has it
+MESSAGE_HEAD = np.dtype(  # MESSAGE as a numpy type
     [
         ("opcode", "u1"),
         ("length", "<u8"),
@@ -40,30 +41,30 @@ MESSAGE_HEAD = np.dtype(  # MESSAGE, as numpy has it
         ("publish_time", "<u8"),
     ]
 )
-CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain CRC, bytes of name
-SIZE = struct.Struct("<Q")  # of a chunk's content, behind the name
-ZSTD = b"zstd"  # the name of our compression
-SIZE_UNSTATED = -1  # as zstandard has it
-LIBRARY = len(MAGIC) + HEAD.size + 8  # bytes before the name of who wrote a file: its length, and an empty profile
+CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time, uncompressed size and CRC, length of compression's name
+SIZE = struct.Struct("<Q")  # size of a chunk's compressed content, after the compression's name
+ZSTD = b"zstd"  # name of the compression that zsim uses
+SIZE_UNSTATED = -1  # zstandard's value for a frame without its size
+LIBRARY = len(MAGIC) + HEAD.size + 8  # offset of the writer's name, after an empty profile and the name's length
 OURS = b"zsim "
 CUT_HEAD = CHUNK_HEAD.size + len(ZSTD) + SIZE.size  # bytes of a chunk before its content
 INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
-INDEX_ENTRY = 16  # bytes: log time, place in the chunk
+INDEX_ENTRY = 16  # bytes: log time, offset in the chunk
 FOOTER_SIZE = HEAD.size + 20
-CHUNK_MAX = 1 << 27  # bytes of a chunk's content; ours have a megabyte and a message, which has at most 16 on the wire
+CHUNK_MAX = 1 << 27  # bytes of a chunk's content; zsim's has 1 MB and one message of at most 16 MB
 SMALL_MAX = 1 << 20  # bytes of a schema, a channel or a part of the summary; statistics of 65 535 channels take 0.7 MB
-LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # bytes that are always read
+LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # minimum length of a body
 
-PIECE_BYTES = 1 << 24  # of a file that are mapped at most while all of it is read, chosen: they count as memory in use
+PIECE_BYTES = 1 << 24  # maximum bytes mapped while reading a whole file; they count as memory in use
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
 
 _STANDARD = frozenset(range(Opcode.HEADER, Opcode.DATA_END + 1))
-_ANY_SIZE = frozenset({Opcode.MESSAGE, Opcode.ATTACHMENT})  # of other tools, outside of chunks
+_ANY_SIZE = frozenset({Opcode.MESSAGE, Opcode.ATTACHMENT})  # written outside chunks by other tools
 
 
 class _Zstd(threading.local):
-    """Compressor per thread: zstandard's objects crash when used by two threads at once."""
+    """Compressor and decompressor per thread: zstandard's objects crash if two threads use them at once."""
 
     def __init__(self) -> None:
         self.compress = zstandard.ZstdCompressor(level=-1).compress
@@ -74,7 +75,7 @@ _zstd = _Zstd()
 
 
 class RecordSpan(NamedTuple):
-    """The position of a whole record in the file, including its head."""
+    """The position of a complete record in the file, including its head."""
 
     opcode: int
     start: int
@@ -86,26 +87,26 @@ class RecordSpan(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    """The head of a chunk, before its content."""
+    """The fields of a chunk before its content; `size` and `crc` are of the uncompressed content."""
 
     first_ns: int
     last_ns: int
     size: int
     crc: int
     compression: str
-    content: int  # where the compressed content starts in the file; behind the chunk's end if the head is damaged
+    content: int  # offset of the compressed content in the file; beyond the chunk's end if the head is damaged
 
 
 class Index(NamedTuple):
-    """One channel's part in a chunk."""
+    """The message index of one channel in a chunk."""
 
     channel: int
-    messages: int
-    start: int  # of the message index record in the file
+    messages: int  # count of its messages in the chunk
+    start: int  # offset of the message index record in the file
 
 
 class RecordGroup(NamedTuple):
-    """A relevant record of the data section; a chunk with its message indexes."""
+    """A schema, channel or chunk of the data section; a chunk with its message indexes."""
 
     place: RecordSpan
     indexes: tuple[Index, ...]
@@ -123,7 +124,7 @@ def packed(record: McapRecord) -> bytes:
 
 
 def unpacked(kind: type[Known], source: Source, place: RecordSpan) -> Known:
-    """Return the schema or channel at a place; RecordError if it is damaged."""
+    """Return the schema or channel at a position; RecordError if it is damaged."""
     try:
         return kind.read(ReadDataStream(BytesIO(source[place.body : place.end])))
     except (struct.error, McapError, UnicodeDecodeError) as error:
@@ -132,7 +133,7 @@ def unpacked(kind: type[Known], source: Source, place: RecordSpan) -> Known:
 
 
 def places(source: Source) -> Iterator[RecordSpan]:
-    """Yield the whole records of a file up to its footer, its cut, or an invalid length."""
+    """Yield the complete records of a file up to its footer, a truncated record, or an invalid opcode or length."""
     at, size = len(MAGIC), len(source)
     while at + HEAD.size <= size:
         opcode, length = HEAD.unpack_from(source, at)
@@ -146,7 +147,7 @@ def places(source: Source) -> Iterator[RecordSpan]:
 
 
 def is_cut(source: Source, at: int) -> bool:
-    """Whether the bytes after the last whole record are the beginning of another one.
+    """Whether the bytes after the last complete record are the beginning of another.
 
     Otherwise they are damaged: a wrong length makes everything after it unreadable.
     """
@@ -160,7 +161,7 @@ def is_cut(source: Source, at: int) -> bool:
         return opcode in _ANY_SIZE or length <= SMALL_MAX
     if left < CUT_HEAD:
         return True
-    place = RecordSpan(opcode, at, len(source))  # of a chunk or message index, whose length follows from sizes inside
+    place = RecordSpan(opcode, at, len(source))  # a chunk or message index, whose length follows from its fields
     if opcode == Opcode.MESSAGE_INDEX:
         return length == INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, place.body)[1]
     content = chunk_head(source, place).content
@@ -170,9 +171,10 @@ def is_cut(source: Source, at: int) -> bool:
 def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterator[RecordGroup]:
     """Yield schemas, channels and chunks of the data section in order.
 
-    `found`: positions of the records, if already known.
+    Args:
+        found: positions of the records, if already known.
     """
-    last: RecordSpan | None = None  # whose message indexes may follow
+    last: RecordSpan | None = None  # the record whose message indexes may follow
     indexes: list[Index] = []
     end = 0
     for place in found or places(source):
@@ -197,7 +199,7 @@ def is_complete(source: Source) -> bool:
 
 
 def chunk(content: bytes | memoryview, first_ns: int, last_ns: int) -> list[bytes]:
-    """Return the parts of a chunk record that holds a run of message records, given their first and last log time."""
+    """Return the parts of a chunk record with message records as its content, given their first and last log times."""
     data = _zstd.compress(content)
     head = CHUNK_HEAD.pack(first_ns, last_ns, len(content), zlib.crc32(content), len(ZSTD))
     length = len(head) + len(ZSTD) + SIZE.size + len(data)
@@ -211,9 +213,10 @@ def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
 
 
 def content_of(source: Source, place: RecordSpan) -> bytes | None:
-    """Return the message records of the chunk at a position, None if it is damaged or larger than any of ours.
+    """Return the message records of the chunk at a position; None if it is damaged or larger than CHUNK_MAX.
 
-    RecordError if its compression is not supported.
+    Raises:
+        RecordError: its compression is not supported.
     """
     head = chunk_head(source, place)
     if head.content > place.end or head.size > CHUNK_MAX:
@@ -224,16 +227,16 @@ def content_of(source: Source, place: RecordSpan) -> bytes | None:
     if head.compression:
         try:
             if zstandard.frame_content_size(content) not in (SIZE_UNSTATED, head.size):
-                return None  # whatever limit is given, the frame's own size would be made room for
+                return None  # zstandard would allocate the size that the frame states, whatever the limit
             content = _zstd.decompress(content, max_output_size=head.size)
-        except (zstandard.ZstdError, MemoryError, OverflowError):  # the latter two of a damaged size
+        except (zstandard.ZstdError, MemoryError, OverflowError):  # the latter two if the size is damaged
             return None
-    unchecked = head.crc == 0 and not is_ours(source)  # MCAP has 0 where a tool computes none
+    unchecked = head.crc == 0 and not is_ours(source)  # 0 in MCAP: no CRC was computed
     return content if unchecked or head.crc == zlib.crc32(content) else None
 
 
 def write_all(file: FileIO, data: bytes) -> None:
-    """Write all data; an unbuffered file may write it in parts when the disk is nearly full."""
+    """Write all data; an unbuffered file may write only part of it at a time when the disk is nearly full."""
     view = memoryview(data)
     while view:
         view = view[file.write(view) or 0 :]
@@ -250,19 +253,19 @@ def crc_until(source: Source, end: int) -> int:
 
 def unmap(source: Source) -> None:
     """Release the pages of a mapped file that were read; they are reloaded when needed."""
-    if isinstance(source, mmap) and hasattr(source, "madvise"):  # Windows has none
+    if isinstance(source, mmap) and hasattr(source, "madvise"):  # absent on Windows
         from mmap import MADV_DONTNEED
 
         source.madvise(MADV_DONTNEED)
 
 
 def is_ours(source: Source) -> bool:
-    """Whether zsim wrote a record, given its first bytes; zsim gives every chunk a checksum."""
+    """Whether zsim wrote a record, given its first bytes; then every chunk has a checksum."""
     return source[LIBRARY : LIBRARY + len(OURS)] == OURS
 
 
 def indexes_of(content: bytes) -> dict[int, list[int]]:
-    """Return the log times and positions of the messages of each channel of a chunk, one after the other."""
+    """Return, by channel, log time and position of each of its messages in a chunk's content, alternating."""
     indexes: dict[int, list[int]] = defaultdict(list)
     at, end, unpack = 0, len(content) - MESSAGE.size, MESSAGE.unpack_from
     while at <= end:
@@ -274,12 +277,12 @@ def indexes_of(content: bytes) -> dict[int, list[int]]:
 
 
 def heads_at(content: bytes, places: NDArray[np.int64]) -> NDArray:
-    """Return the heads of the messages at positions of a chunk's content, as MESSAGE_HEAD."""
+    """Return the heads, of type MESSAGE_HEAD, of the messages at positions of a chunk's content."""
     return np.ndarray(max(0, len(content) - MESSAGE.size + 1), MESSAGE_HEAD, content, strides=(1,))[places]
 
 
 def index_record(channel: int, entries: bytes) -> bytes:
-    """Return a message index record; its entries are log times and positions."""
+    """Return a message index record of packed entries: log times and positions."""
     size = len(entries)
     return HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size + size) + INDEX_HEAD.pack(channel, size) + entries
 

@@ -1,6 +1,6 @@
-"""The messages of a process about itself (join, done, bye and health), on Zenoh and on the in-memory bus.
+"""The messages of a process about itself: join, done, bye and health, on Zenoh and on the in-memory bus.
 
-Also schedules garbage collection so that it does not delay gates.
+Also makes garbage collections rare, so that they do not delay gates.
 """
 
 import gc
@@ -20,25 +20,25 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.contract.run_messages import Bye, Done, Health, Join
 from zsim.runtime.rate_limit import RateLimit
 
-PERIOD_S = 1.0  # interval of health messages; contract: 1 Hz wall
+PERIOD_S = 1.0  # wall time between health messages, set by the contract
 STEPS_KEPT = 1000
-READS_MAX = 8  # maximum number of key expressions listed in a health message
-ALLOCATIONS = 50_000  # allocations between collections, chosen: a gate allocates hundreds of objects, without cycles
+READS_MAX = 8  # key expressions listed per process
+ALLOCATIONS = 50_000  # between collections; a gate allocates hundreds of objects and leaves no cycles
 
 
 @dataclass
 class Membership:
     """The join, dones and bye of a process."""
 
-    name: str  # name of the process, role.thing
-    host: str  # host on which it runs
+    name: str  # name of the process, "role.thing"
+    host: str  # name of its host
     run_id: str
-    next_seq: Callable[[str], int]  # returns the sequence number of its next message of a kind, counted from 0
+    next_seq: Callable[[str], int]  # returns the next sequence number of a kind of message, from 0
     serves: tuple[str, ...] = ()  # names of the processes that it replaces
-    period_ns: int = 0  # interval of its dones; 0: none
-    slack_ns: int = 0  # without a period: how far the world may be ahead of its dones; 0: any time
-    calculates: bool = True  # whether its results depend on its arithmetic; otherwise it states no fingerprint
-    incarnation: int = 0  # random number of the process; 0 if processes are never restarted
+    period_ns: int = 0  # interval of its dones; 0: sends none
+    slack_ns: int = 0  # lead that the world may have over the dones of a process without a period; 0: any
+    calculates: bool = True  # whether results depend on its arithmetic; if not, its join has no fingerprint
+    incarnation: int = 0  # random number of this start of the process; 0 if processes are never restarted
 
     def join(self, t_ns: int = 0) -> Join:
         return Join(
@@ -57,7 +57,7 @@ class Membership:
         )
 
     def done(self, t_ns: int, sent: int) -> Done:
-        """Return the done of a gate, with the number of outputs sent since the last done."""
+        """Return the done of a gate, with the number of outputs sent since the previous done."""
         return Done(t_ns, self.next_seq("done"), self.run_id, self.incarnation, t_ns, sent)
 
     def bye(self, t_ns: int, reason: str, failed: bool = False) -> Bye:
@@ -68,7 +68,9 @@ class HealthMeter:
     """Counters of one process.
 
     Attributes:
-        received, refused, dropped: messages received, undecodable messages, and gates stepped incomplete.
+        received: messages received.
+        refused: messages that could not be decoded.
+        dropped: inputs lost: dropped messages and skipped pictures, or gates stepped without all their inputs.
     """
 
     def __init__(
@@ -76,23 +78,23 @@ class HealthMeter:
         role: str,
         wall_s: Callable[[], float] = time.monotonic,
         host: str | None = None,
-        reads: Sequence[str] = (),  # the key expressions it subscribes to: the live list of its session
+        reads: Sequence[str] = (),  # its subscribed key expressions; the session extends this list
     ) -> None:
         self._role = role
         self._host = host or socket.gethostname()
         self._reads = reads
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
         self._limit = RateLimit(PERIOD_S, now=wall_s)
-        self._limit.spend()  # the first health message is due after one period
+        self._limit.spend()  # so that the first is due after a period
         self.received = self.refused = self.dropped = 0
-        self.lag_ns = 0  # how far the newest gate is ahead of the gate just handled
+        self.lag_ns = 0  # lead of the newest gate over the one last handled
         self.link_lost = False  # whether the world is currently unreachable
 
     def step(self, duration_ns: int) -> None:
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
-        """Whether a health message is due, once per wall second; the call counts as its publication."""
+        """Whether health is due, once per wall second."""
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:
@@ -114,7 +116,7 @@ class HealthMeter:
 
 
 def resident_bytes() -> int:
-    """Return the resident memory of this process [bytes]; 0 if the system does not report it."""
+    """Return the resident memory of this process [bytes]; 0 where it is unknown."""
     if sys.platform == "linux":
         with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # file descriptors may run out
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -123,9 +125,9 @@ def resident_bytes() -> int:
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Within the block, collect garbage rarely and never examine the objects that already exist.
+    """Collect garbage rarely within the block, and exempt the objects that already exist.
 
-    By default Python collects after 700 allocations, every few gates, and occasionally examines all objects.
+    By default Python collects after 700 allocations, which is every few gates, and sometimes examines all objects.
     """
     gc.collect()
     gc.freeze()

@@ -1,20 +1,20 @@
-"""The rate limiter for requests, refusals, joins and terminal output.
+"""The rate limiter of requests, refusals, joins and lines on a terminal.
 
-Its clock is a parameter: simulated time if a rerun or resumed world must behave the same, otherwise wall time.
+Its clock is a parameter: simulated time where a rerun or a resumed world must behave identically, else wall time.
 """
 
 import time
 from collections.abc import Callable
 
-SUBJECTS_MAX = 10_000  # maximum number of subjects; limits the memory that invented names can use
+SUBJECTS_MAX = 10_000  # subjects remembered; bounds the memory that invented names can occupy
 
 
 class RateLimit:
-    """A token bucket per subject: `burst` at once, then one per `period`.
+    """A token bucket per subject: `burst` tokens at first, then one more per `period`.
 
     Args:
-        period: interval at which one more is allowed, in the clock's unit.
-        burst: number allowed at once.
+        period: interval at which a token is added, in the clock's unit.
+        burst: capacity of the bucket.
         now: the clock; by default monotonic wall time [s].
     """
 
@@ -22,7 +22,7 @@ class RateLimit:
         self.period = period
         self._burst = burst
         self._now = now
-        self._spent: dict[str, tuple[float, float]] = {}  # by subject: amount spent, and the time of the last spending
+        self._spent: dict[str, tuple[float, float]] = {}  # by subject: tokens spent, and the time of the last
 
     def knows(self, subject: str) -> bool:
         return subject in self._spent
@@ -31,8 +31,8 @@ class RateLimit:
         return self._counted(subject) <= self._burst - 1
 
     def spend(self, subject: str = "") -> bool:
-        """Spend one; return False if none was left."""
-        now = self._now()  # inlines `_counted`, since this is called at each gate
+        """Spend a token; return False if none is left."""
+        now = self._now()  # repeats `_counted` for speed: some callers do this at each gate
         spent, at = self._spent.get(subject, (0.0, 0))
         counted = max(0.0, spent - (now - at) / self.period)
         if counted > self._burst - 1:
@@ -43,7 +43,7 @@ class RateLimit:
         return True
 
     def wait(self, subject: str = "") -> float:
-        """Return the time until a subject may spend one more; 0 if it may now."""
+        """Return the time until a subject has a token, in the clock's unit; 0 if it has one now."""
         return max(0.0, self._counted(subject) - (self._burst - 1)) * self.period
 
     def _counted(self, subject: str) -> float:

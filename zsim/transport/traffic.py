@@ -1,7 +1,7 @@
-"""All traffic through the hub, received by one subscription or replayed; batches are unpacked only here.
+"""All traffic through the hub, received by one subscription or requested as a replay.
 
 traffic = Traffic(link, run_key_table(info))
-for entry in traffic.receive(): ...     ReceivedSample(key, payload), or GateMessages of the world's drones
+for entry in traffic.receive(): ...  # ReceivedSample(key, payload), or GateMessages of the world's drones
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,8 +18,8 @@ class Traffic:
     """All messages except views, in the order in which they passed the hub.
 
     Args:
-        table: keys of the world's messages about the drones of the run, see `run_key_table`.
-        refused: called for each batch, or gate within one, that cannot be decoded.
+        table: keys of the world's messages about the run's drones, see `run_key_table`.
+        refused: called for each batch, or gate in a batch, that cannot be decoded.
     """
 
     def __init__(self, link: Session, table: tuple[str, ...], refused: Callable[[], None] = lambda: None) -> None:
@@ -36,9 +36,10 @@ class Traffic:
         self._subscription.undeclare()
 
     def receive(self) -> list[Passed]:
-        """Wait for the next messages; return none when woken by `wake`.
+        """Wait for the next messages; return an empty list when woken by `wake`.
 
-        SessionError if the session, or this subscription, was closed meanwhile.
+        Raises:
+            SessionError: the session or this subscription was closed meanwhile.
         """
         sample = self._subscription.receive()
         return list(self._opened(sample.payload)) if sample is not None else []
@@ -79,15 +80,16 @@ def replay(
 ) -> Iterator[tuple[str, bytes]]:
     """Yield (key, payload) of the messages stamped after `from_ns`, in the order in which they passed the world.
 
-    The world keeps the last seconds, and answers page by page.
+    The world keeps the messages of the last seconds and answers page by page.
 
     Args:
-        from_ns: simulated time [ns]; -1 for everything that the world still has.
-        expressions: wanted keys.
-        timeout_s: timeout of each page.
+        process: name of the requesting process.
+        from_ns: simulated time [ns]; -1 for all messages that the world still has.
+        expressions: key expressions of the requested messages.
+        timeout_s: wall time to wait for each page [s].
 
     Raises:
-        NoWorldError: the world does not answer, or not with a replay; messages already yielded are valid.
+        NoWorldError: the world does not answer with a replay; messages already yielded are valid.
     """
     page: int | None = 0
     while page is not None:

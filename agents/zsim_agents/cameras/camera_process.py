@@ -1,6 +1,6 @@
-"""The processes of cameras and of detectors: one renders pictures from the truth, the other finds hats in pictures.
+"""The processes of cameras and detectors: the former render pictures from the truth, the latter find hats in them.
 
-A process that is too slow drops and counts pictures; if cameras gate in the scenario, the run waits.
+A process that is too slow drops pictures and counts them; if cameras gate in the scenario, the run waits for them.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ from zsim_agents.cameras.detector import PIXELS_MAX, HatDetector, decoded, rehea
 from zsim_agents.cameras.renderer import Renderer
 from zsim_agents.cameras.scene import DroneStates, scene_of
 
-TICK_S = 0.1  # interval of checking for a stop while nothing arrives
-# gates that it may be behind the world, which may be ahead of everybody by the command delay, before it drops pictures:
-# messages that arrive in a burst are no reason yet; more than the slack of cameras that gate
+TICK_S = 0.1  # interval of checks for a stop while no message arrives
+# Number of gates, beyond the command delay, that cameras may be behind the world before they drop pictures: tolerates
+# messages that arrive in bursts, and exceeds the slack of cameras that gate
 BEHIND_MAX = 5
-ANSWER_S = 0.5  # wall; the world and cameras answer in milliseconds
-OVERTAKING_S = 0.1  # wall; a bye of higher priority would pass the last pictures, and a recorder close before them
-DRAIN_S = 1.0  # wall time to wait for the last truths of a run
-PENDING_MAX = 64  # number of gates for which the truth of a drone may be missing
-ASK_S = 2.0  # wall time between requests for a camera's info while it is unknown
-REPORTS_MAX = 5  # maximum number of lines about refused pictures; health has the count
+ANSWER_S = 0.5  # timeout of queries, which the world and cameras answer within milliseconds
+OVERTAKING_S = 0.1  # delay of the bye: of higher priority, it would reach recorders before the last pictures
+DRAIN_S = 1.0  # maximum wall time to wait for the last truths of a run
+PENDING_MAX = 64  # maximum number of gates that are kept although the truth of a drone is missing
+ASK_S = 2.0  # minimum wall time between requests for an unknown camera info
+REPORTS_MAX = 5  # maximum number of lines about refused messages; health has their count
 
 
 class RunProcess:
-    """A process that waits for messages from Zenoh's threads, and handles them in `turn`."""
+    """A process that waits for messages, which Zenoh's threads receive, and handles them in `turn`."""
 
     def __init__(self, link: Session, participant: Participant) -> None:
         self._link, self._participant = link, participant
         self._wake_event = threading.Event()
         self._was_lost = False
-        self._is_back = False  # whether a lost link has been restored
+        self._is_back = False  # a lost link has been restored
         link.declare_subscriber(keys.CLOCK, self._on_clock)
         link.on_link(self._on_link)
 
@@ -63,7 +63,7 @@ class RunProcess:
         raise NotImplementedError
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Start, and call `turn` until the run ends or the process is stopped."""
+        """Begin, then call `turn` until the run ends or the process is stopped."""
         self.begin()
         while not (self._participant.end_reason or stopped()):
             self.turn()
@@ -72,7 +72,7 @@ class RunProcess:
         self._wake_event.set()
 
     def wait(self) -> None:
-        """Return when a message has arrived, or after a tick."""
+        """Wait for a message, TICK_S at most."""
         self._wake_event.wait(TICK_S)
         self._wake_event.clear()
         self._participant.tick()
@@ -89,7 +89,7 @@ class RunProcess:
 
 
 class CameraProcess(RunProcess):
-    """The cameras of some drones in one run."""
+    """Publishes the pictures of some drones' cameras."""
 
     def __init__(
         self, link: Session, info: Info, participant: Participant, scenario: Scenario, drones: Sequence[str]
@@ -130,9 +130,9 @@ class CameraProcess(RunProcess):
             self._finish()
 
     def join(self) -> None:
-        """Join, so that the world waits for this process.
+        """Join, so that the world waits for this process, and catch up with a run that has begun.
 
-        Replies to a query may overtake earlier publications: a run that has not begun is not queried.
+        A run that has not begun need not be queried; replies to a query may overtake earlier publications.
         """
         has_begun = bool(self._link.get(keys.truth("*"), timeout_s=ANSWER_S))
         self._participant.announce()
@@ -148,7 +148,7 @@ class CameraProcess(RunProcess):
         self._draw()
 
     def _finish(self) -> None:
-        """Publish the pictures due by the end of the run, whose truth may not have arrived yet."""
+        """Publish the pictures due by the end of the run, once its last truth has arrived."""
         end_s = time.monotonic() + DRAIN_S
         self._draw()
         while self._truths.newest_ns < self._participant.now_ns and time.monotonic() < end_s:
@@ -157,7 +157,7 @@ class CameraProcess(RunProcess):
         time.sleep(OVERTAKING_S)
 
     def _catch_up(self) -> None:
-        """Request the newest truth if the world waits for this process: it may have been published before."""
+        """Request the newest truth if the world waits for this process, which may have missed its publication."""
         if self._participant.gates:
             self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=ANSWER_S))
             self.wake()
@@ -197,9 +197,10 @@ class CameraProcess(RunProcess):
                 self._truths.add(number, truth)
 
     def _due(self) -> list[tuple[_Eye, int]]:
-        """Return the due pictures, one camera after the other; pictures that are too old are counted as dropped.
+        """Return the due pictures as cameras and numbers, and count pictures that are too old as dropped.
 
-        The camera whose last picture is oldest comes first: a process that is too slow drops some of each.
+        The cameras take turns, starting with the one whose last picture is oldest, so that a process that is too slow
+        drops pictures of all of them.
         """
         newest_ns = self._truths.newest_ns
         if newest_ns < 0:
@@ -216,7 +217,7 @@ class CameraProcess(RunProcess):
         return [(eye, number) for _, number, eye in sorted(due, key=lambda each: (each[0], each[2].last))]
 
     def _expose(self, eye: _Eye, number: int) -> None:
-        """Render and publish a picture unless it is too late."""
+        """Render and publish a picture, or drop it if it is too late."""
         start_ns = time.perf_counter_ns()
         t_sample_ns = eye.exposure_ns(number)
         health = self._participant.health
@@ -264,7 +265,7 @@ class CameraProcess(RunProcess):
 
 
 class DetectorProcess(RunProcess):
-    """Publishes the hats, of a diameter [m], in the pictures of some drones' cameras."""
+    """Publishes the hats of a given diameter [m] in the pictures of some drones' cameras."""
 
     def __init__(
         self,
@@ -276,11 +277,10 @@ class DetectorProcess(RunProcess):
     ) -> None:
         self._say = say
         self._drones, self._diameter_m = drones, diameter_m
-        self._pictures: OrderedDict[str, RawSample] = (
-            OrderedDict()
-        )  # newest picture of each camera, longest waiting first
+        # newest picture of each camera; the one that has waited longest comes first
+        self._pictures: OrderedDict[str, RawSample] = OrderedDict()
         self._infos: dict[str, RawSample] = {}
-        self._detectors: dict[str, HatDetector] = {}  # by camera key, as the next two
+        self._detectors: dict[str, HatDetector] = {}  # by the key of the camera, like the next two
         self._known: dict[str, CameraInfo] = {}
         self._asked_s: dict[str, float] = {}
         self._seq: defaultdict[str, int] = defaultdict(int)
@@ -288,14 +288,14 @@ class DetectorProcess(RunProcess):
         super().__init__(link, participant)
 
     def begin(self) -> None:
-        """Subscribe to pictures and camera infos, for known names only, since any program could invent others."""
+        """Subscribe to pictures and camera infos under known names only, since any program could invent others."""
         rehearse()
         for drone, name in product(self._drones, CAMERAS):
             self._link.declare_subscriber(keys.camera_info(drone, name), self._on_info)
             self._link.declare_subscriber(keys.camera(drone, name), self._on_picture)
 
     def turn(self) -> None:
-        """Search the newest picture of each camera, the longest waiting first."""
+        """Search the newest picture of each camera, starting with the one that has waited longest."""
         self.wait()
         while self._infos:
             self._learn(self._infos.popitem()[1])
@@ -368,7 +368,7 @@ class DetectorProcess(RunProcess):
 
 
 class _Eye:
-    """A camera of a drone: its renderer, and the next picture."""
+    """A camera of a drone: its renderer, and the number of its next picture."""
 
     def __init__(self, drone: str, name: str, camera: Camera, renderer: Renderer) -> None:
         self.key, self.info_key = keys.camera(drone, name), keys.camera_info(drone, name)
@@ -376,13 +376,13 @@ class _Eye:
         self.latency_ns = round(camera.latency_ms * 1e6)
         self.next = 0
         self.seq = 0
-        self.last = -1  # number of its last picture among those of all cameras
+        self.last = -1  # number of its last picture among the pictures of all cameras
 
-    def exposure_ns(self, number: int) -> int:  # its middle
+    def exposure_ns(self, number: int) -> int:  # middle of the exposure
         return round(number * 1e9 / self.camera.rate_hz)
 
     def last_due(self, t_ns: int) -> int:
-        """Return the number of the newest picture available at a time; -1 before the first."""
+        """Return the number of the newest picture available at t_ns; -1 before the first."""
         due_ns = t_ns - self.latency_ns
         number = int(due_ns * self.camera.rate_hz / 1e9) + 1
         while number >= 0 and self.exposure_ns(number) > due_ns:
@@ -391,13 +391,13 @@ class _Eye:
 
 
 class TruthHistory:
-    """The true states of every simulated drone at the last gates, with interpolation between gates. Pure.
+    """The true states of all drones at the last gates, with interpolation between gates. Pure.
 
     External drones, whose drivers may skip gates, are extrapolated from their last pose.
 
     Args:
-        span_ns: minimum time that it covers [ns].
-        external: start state of each external drone by index, valid until its driver publishes.
+        span_ns: minimum time span that the history covers [ns].
+        external: initial state of each external drone by index, valid until its driver publishes.
     """
 
     def __init__(self, drones: int, gate_ns: int, span_ns: int, external: Mapping[int, Truth] = {}) -> None:
@@ -413,7 +413,7 @@ class TruthHistory:
         t_ns = truth.t_ns
         if drone in self._external:
             if truth_fault(truth, len(self._external[drone].rotor_rad_s)):
-                return  # the world refuses it too
+                return  # as the world does
             self._external[drone] = max(self._external[drone], truth, key=attrgetter("t_ns"))
         if t_ns <= self.newest_ns:
             return
@@ -432,7 +432,7 @@ class TruthHistory:
             del self._pending[min(self._pending)]
 
     def bodies(self, t_ns: int) -> DroneStates | None:
-        """Return all drones at a time, or None if a neighbouring gate is missing."""
+        """Return all drones at t_ns, or None if a neighbouring gate is missing."""
         before_ns = t_ns // self._gate_ns * self._gate_ns
         before, after = self._whole.get(before_ns), self._whole.get(before_ns + self._gate_ns)
         if before is None:
@@ -466,7 +466,11 @@ def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence
 
 
 def _detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:
-    """Return a camera's detector; PictureError: its pictures are too large, or its intrinsics invalid."""
+    """Return the detector for a camera.
+
+    Raises:
+        PictureError: the camera's pictures are too large, or its intrinsics are invalid.
+    """
     if info.width * info.height > PIXELS_MAX:
         raise PictureError(f"{info.width} x {info.height} are too many pixels; must be at most {PIXELS_MAX}")
     fx, skew, cx, _, fy, cy, *_ = info.K

@@ -1,14 +1,14 @@
 """Finds magenta hats in a simulated or real picture: bearing and range of each, with standard deviations. Pure.
 
 The magenta level of a pixel is linear in mixtures of a hat with grass, sky or hull, and zero for orange: the share of a
-pixel that a hat covers is its level over the hat's own. Direction and range follow from the circle of the hat's
-outline, which rotors may hide in part: a ball of radius r at a distance d has an apparent radius a with
+pixel that a hat covers is the pixel's level divided by the hat's own. Direction and range follow from the circle of the
+hat's outline, which rotors may partly hide: a ball of radius r at a distance d has an apparent radius a with
 sin a = r / d anywhere in the picture.
 
-The edge is searched for from outside inwards, in directions all around a point of the ball. The best circle through a
-run of half of the points determines which other points are on it. Circles are fitted by least squares to
-x^2 + y^2 = 2 a x + 2 b y + c (I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the plane that touches the unit sphere
-at the ball: there it is a circle at any position in the picture.
+The edge is searched for inwards from outside, in directions all around a point of the ball. The best circle through
+half of the edge points, consecutive ones, determines which other points are on it. Circles are fitted by least squares
+to x^2 + y^2 = 2 a x + 2 b y + c (I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the tangent plane of the unit sphere
+at the ball, where the outline is a circle at any position in the picture.
 """
 
 import math
@@ -28,49 +28,50 @@ from zsim_agents.cameras.scene import View
 Picture = NDArray[np.uint8]
 Levels = NDArray[np.float32]
 
-PIXELS_MAX = 1920 * 1080 * 2  # maximum of a decoded picture; twice the limit of a scenario's camera
-LEVEL_MIN = 24  # of 255; smaller R - G is noise
-SHARE_MIN = 0.3  # minimum of (R - G) / R for magenta
-BLUE_SHARE = 0.2  # minimum of (B - G) / (R - G), below it is orange or red; the paper's magenta has 0.59
-BLUE_WEIGHT = 1.5  # subtracted per unit of missing blue
-AREA_MIN_PX = 2  # at half of the resolution
-BLOBS_MAX = 100  # number of largest regions that are examined
-ROOM_PX = 4  # margin around a blob, for its edge and the background
-CORE = 0.5  # of the most magenta; pixels above belong to a hat
-CORE_MIN_PX = 12  # of wholly covered pixels; with fewer the hat's own colour is computed from its blur
-POINT_BLUR_PX2 = 1.1  # px^2, variance by which lens, pixel, JPEG and a mean of nine blur a point; calibrated
-ROUND_MIN = 0.3  # of the smaller variance over the larger; less is no ball
-PIECE_GAP = 0.3  # of a ball's size, between two pieces of it; a guard in front is 0.2 wide
-SHARE_OF_EDGE_MIN = 0.3  # visible; with less the circle is unknown
-DIAMETER_MIN_PX = 4.0  # px; the range of smaller hats has a bias above its sigma
-# Standard deviations, calibrated, of a centre and of a diameter: px per px of roughness of the edge, px^2 over the
-# diameter (of a centre, in proportion to the hidden part), and px^3 over its square (centre) or px (diameter).
+PIXELS_MAX = 1920 * 1080 * 2  # maximum size of a decoded picture; twice the limit of a scenario's camera
+LEVEL_MIN = 24  # minimum R - G of magenta, out of 255; smaller differences are noise
+SHARE_MIN = 0.3  # minimum (R - G) / R of magenta
+BLUE_SHARE = 0.2  # minimum (B - G) / (R - G) of magenta, 0.59 for the paper's; lower values are orange or red
+BLUE_WEIGHT = 1.5  # reduction of the magenta level per unit of missing blue
+AREA_MIN_PX = 2  # minimum area of a region at half the resolution
+BLOBS_MAX = 100  # maximum number of regions to examine, the largest first
+ROOM_PX = 4  # margin around a region, for its edge and the background
+CORE = 0.5  # minimum level of a hat's pixels, as a fraction of the maximum level
+CORE_MIN_PX = 12  # minimum number of fully covered pixels that give a hat's own level; it is otherwise found from blur
+POINT_BLUR_PX2 = 1.1  # variance by which lens, pixel, JPEG and the mean of nine pixels blur a point [px^2]; calibrated
+ROUND_MIN = 0.3  # minimum ratio of the smaller to the larger variance of a ball
+PIECE_GAP = 0.3  # maximum gap between two pieces of a ball over its size; a guard in front is 0.2 wide
+SHARE_OF_EDGE_MIN = 0.3  # minimum visible share of the edge that determines a circle
+DIAMETER_MIN_PX = 4.0  # minimum diameter of a hat [px]; the bias in the range of smaller ones exceeds its sigma
+# Calibrated standard deviations of a centre and of a diameter: px per px of roughness of the edge; px^2 over the
+# diameter (for a centre, in proportion to the hidden part); px^3 over the squared diameter (centre) or px (diameter).
 CENTRE = 2.0, 6.5, 8.0
 DIAMETER = 2.0, 4.6, 0.1
 SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
 
 DIRECTIONS = 32
-STEP_PX = 0.5  # along a direction
-EDGE = 0.5  # of a pixel, covered by the ball
-EDGE_BLUR_PX2 = 1.1  # px^2, variance of what blurs an edge; a curved edge is half covered inside of it; calibrated
-# px, px^2 over the radius, px over the noise of the share: tolerance of an edge point to its circle; calibrated
+STEP_PX = 0.5  # step of the search along a direction
+EDGE = 0.5  # covered share of a pixel at the edge of a ball
+EDGE_BLUR_PX2 = 1.1  # variance of the blur of an edge [px^2], which moves a curved edge inwards; calibrated
+# Tolerance of an edge point's distance from its circle: px, px^2 over the radius, px over the noise of the share;
+# calibrated
 NEAR_PX, NEAR_PX2, NEAR_NOISE = 0.2, 1.0, 6.0
-POINTS_MIN = 5  # of a circle
-REFINEMENTS = 3  # of the set of points on it
-OUTSIDE = 3.0  # cost of a point outside of a circle over that inside: a ball may be hidden, but cannot protrude
-WHOLE_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of a ball that nothing hides
-SINGULAR = 1e-9  # of a determinant over its value for points all around
+POINTS_MIN = 5  # minimum number of points on a circle
+REFINEMENTS = 3  # number of refinements of the set of points on a circle
+OUTSIDE = 3.0  # relative cost of a point outside the circle: part of a ball may be hidden, but none protrudes
+WHOLE_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of an unobstructed ball
+SINGULAR = 1e-9  # maximum determinant of collinear points over the squared sum of their variances
 
 EDGE_POINT = columns("EdgePointColumns", (Field("x", "px"), Field("y", "px"), Field("on", "1")))
 
 _x = np.linspace(1e-3, 60, 6000)
-_PEAK = (1 - np.exp(-_x)) / _x  # of a blurred disc's middle over its own colour, times 1 / x, by x = r^2 / 2 s^2
+_PEAK = (1 - np.exp(-_x)) / _x  # peak of a blurred disc over its own level, divided by x = r^2 / 2 s^2, for each x
 
 
 def decoded(data: bytes, width: int, height: int) -> Picture:
-    """Return a JPEG as B, G, R, (height, width, 3).
+    """Return a decoded JPEG, (height, width, 3), in B, G, R.
 
-    Its size is read from the header before decoding, so that an untrusted picture takes bounded memory.
+    Its size is read from the header before decoding, to bound the memory that an untrusted picture takes.
 
     Raises:
         PictureError: it is not a JPEG, differs from the announced size, or has too many pixels.
@@ -92,7 +93,7 @@ def decoded(data: bytes, width: int, height: int) -> Picture:
 
 
 class _Box(NamedTuple):
-    """A part of a picture: its upper left corner and its size [px]."""
+    """A rectangular part of a picture: upper left corner and size [px]."""
 
     u: int
     v: int
@@ -100,21 +101,21 @@ class _Box(NamedTuple):
     high: int
 
     def touches(self, other: "_Box") -> bool:
-        """Return whether the other box is a piece of the same ball: the gap is small compared to this box's size."""
+        """Return whether the gap to another box is so small for this box's size that both are pieces of one ball."""
         gap = 1 + PIECE_GAP * max(self.wide, self.high)
         across = max(self.u, other.u) - min(self.u + self.wide, other.u + other.wide)
         down = max(self.v, other.v) - min(self.v + self.high, other.v + other.high)
         return max(across, down) <= gap
 
     def united(self, other: "_Box") -> "_Box":
-        """Return the smallest box around both."""
+        """Return the smallest box that contains both."""
         u, v = min(self.u, other.u), min(self.v, other.v)
         right, low = max(self.u + self.wide, other.u + other.wide), max(self.v + self.high, other.v + other.high)
         return _Box(u, v, right - u, low - v)
 
 
 class HatDetector:
-    """Finds hats of a diameter [m] in the pictures of one camera."""
+    """Finds hats of a given diameter [m] in the pictures of one camera."""
 
     def __init__(self, lens: Lens, pose: CameraPose, diameter_m: float) -> None:
         self._lens, self._R_BK, self._radius_m = lens, pose.R_BK, diameter_m / 2
@@ -122,12 +123,12 @@ class HatDetector:
         self._half = max(1, lens.width // 2), max(1, lens.height // 2)
 
     def seen(self, picture: Picture) -> tuple[Seen, ...]:
-        """Return the hats in a picture of B, G, R, (height, width, 3) as the camera's, the largest first."""
+        """Return the hats in a picture of the camera, (height, width, 3) in B, G, R, the largest first."""
         found = [self._hat(picture, box) for box in self._boxes(picture)]
         return tuple(hat for hat in found if hat is not None)
 
     def _boxes(self, picture: Picture) -> list[_Box]:
-        """Return magenta regions of the picture at half its resolution, the largest first."""
+        """Return boxes around magenta regions at half the resolution, the largest first."""
         blue, green, red = cv2.split(cv2.resize(picture, self._half, interpolation=cv2.INTER_AREA))
         level = cv2.subtract(red, green)
         strong = cv2.addWeighted(level, 1.0, red, -SHARE_MIN, 0.5 - LEVEL_MIN)
@@ -136,7 +137,7 @@ class HatDetector:
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         boxes = [_Box(*cv2.boundingRect(contour)) for contour in contours]
         large = [box for box in boxes if box.wide * box.high >= AREA_MIN_PX]
-        whole: list[_Box] = []  # with the pieces of one ball, which a rotor guard crosses, as one
+        whole: list[_Box] = []  # the pieces of a ball that a rotor guard divides are united
         for box in sorted(large, key=lambda box: (-box.wide * box.high, box))[:BLOBS_MAX]:
             for i, other in enumerate(whole):
                 if other.touches(box):
@@ -147,20 +148,20 @@ class HatDetector:
         return whole
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
-        """Return the hat in a box of the picture at half its resolution; None: no hat, or cut by the edge."""
+        """Return the hat in a box at half the resolution; None if there is no hat, or the picture's edge cuts it."""
         u, v, wide, high = (2 * side for side in box)
         room = ROOM_PX + max(wide, high) // 6
         u0, v0, u1, v1 = u - room, v - room, u + wide + room, v + high + room
         if u <= 2 or v <= 2 or u + wide >= self._lens.width - 2 or v + high >= self._lens.height - 2:
-            return None  # a partial hat gives neither bearing nor range
+            return None  # a cut hat gives neither bearing nor range
         part = slice(max(v0, 0), v1), slice(max(u0, 0), u1)
         blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture[part]))
-        level, bluish = red - green, blue - green  # magenta level of each pixel: R - G, reduced where blue is missing
+        level, bluish = red - green, blue - green  # the magenta level is R - G, reduced where blue is missing
         lack = np.maximum(np.float32(BLUE_SHARE) * level - bluish, 0) * np.float32(BLUE_WEIGHT)
         level = np.where(level > 0, np.maximum(level - lack, 0), level)
         sides = level[0], level[-1], level[1:-1, 0], level[1:-1, -1]
         behind = float(np.median(np.concatenate(sides)))
-        noise = min(_deviation(side) for side in sides)  # of those that no hull crosses
+        noise = min(_deviation(side) for side in sides)  # a hull may cross some sides, not all
         level -= np.float32(behind)
         outlined = _outlined(level, noise, self._rays[part], self._lens.fx)
         if outlined is None:
@@ -180,7 +181,7 @@ class HatDetector:
 
 
 def _deviation(values: Levels) -> float:
-    """Return the standard deviation of normally distributed values with outliers."""
+    """Return a robust estimate of the standard deviation of normally distributed values with outliers."""
     return 1.48 * float(np.median(np.abs(values - np.median(values))))
 
 
@@ -188,11 +189,11 @@ class Outline(NamedTuple):
     """The circle of a ball on the sphere of directions.
 
     Attributes:
-        ray: to its centre, a unit vector of K.
-        radius_rad: its apparent radius; NaN where there is no circle.
+        ray: unit vector to its centre, in K.
+        radius_rad: its apparent radius; NaN if there is no circle.
         share: visible share of its edge.
-        rough_px: root mean square distance of edge points from it.
-        centre, radius: standard deviations of the centre, per axis, and of the radius over that of an edge point.
+        rough_px: root mean square distance of the edge points from the circle.
+        centre, radius: standard deviations of the centre, per axis, and of the radius, over that of an edge point.
     """
 
     ray: Vector
@@ -204,27 +205,27 @@ class Outline(NamedTuple):
 
 
 def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tuple[Outline, float] | None:
-    """Return the circle of a hat from the levels above the background, (h, w), and pixels per radian there."""
+    """Return the circle of a hat from the levels above the background, (h, w), and the pixels per radian there."""
     mean = cv2.blur(level, (3, 3), borderType=cv2.BORDER_REPLICATE)
     v, u = divmod(int(np.argmax(mean)), level.shape[1])
     peak = float(mean[v, u])
-    if peak < max(LEVEL_MIN / 2, 2 * noise / 3):  # the mean of nine has a third of the noise
+    if peak < max(LEVEL_MIN / 2, 2 * noise / 3):  # the mean of nine pixels has a third of the noise
         return None
     cosine = float(rays[v, u, 2])
     core = (level > CORE * peak).astype(np.uint8)
     near = cv2.dilate(core, SQUARE_5).astype(np.uint8)
     covered = _covered(level, core, near, peak)
-    oblique = cosine * cosine  # variance of a round one in the plane of the picture: cos^2 off the axis
+    oblique = cosine * cosine  # ratio of the variances of a ball's image off the optical axis: cos^2 of the angle
     if _roundness(covered) / oblique < ROUND_MIN:
         return None
-    scale = focal_px / (cosine * math.sqrt(cosine))  # between those along and across the way to the middle
-    circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # as rehearsed
+    scale = focal_px / (cosine * math.sqrt(cosine))  # geometric mean of the radial and tangential scales
+    circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # same array layout as in `rehearse`
     is_known = circle.share >= SHARE_OF_EDGE_MIN and 2 * circle.radius_rad * scale >= DIAMETER_MIN_PX
     return (circle, scale) if is_known else None
 
 
 def _covered(level: Levels, core: Picture, near: Picture, peak: float) -> Levels:
-    """Return the covered share of each pixel: its level over the hat's own there, which varies with the shading."""
+    """Return the covered share of each pixel: its level over the hat's own, which varies locally with the shading."""
     inner = cv2.erode(core, SQUARE_3)
     count = int(inner.sum())
     own: Levels | float
@@ -241,7 +242,7 @@ def _covered(level: Levels, core: Picture, near: Picture, peak: float) -> Levels
 
 
 def _roundness(covered: Levels) -> float:
-    """Return the smaller variance of what is covered over the larger; 0 for nothing."""
+    """Return the ratio of the smaller to the larger variance of the covered area; 0 if nothing is covered."""
     moments = cv2.moments(covered)
     area = moments["m00"]
     if area < 1:
@@ -252,11 +253,11 @@ def _roundness(covered: Levels) -> float:
 
 
 NONE = Outline((0.0, 0.0, 1.0), math.nan, 0.0, 0.0, 0.0, 0.0)
-Circle = tuple[float, float, float]  # middle and radius [px]
+Circle = tuple[float, float, float]  # x and y of the centre, radius [px]
 
 
 def rehearse() -> None:
-    """Load or compile the kernels with an empty picture, so that the first hat does not wait for them."""
+    """Load or compile the kernels with an empty picture, so that the first hat is not delayed."""
     outline(np.zeros((3, 3), np.float32), 0.0, np.ones((3, 3, 3), np.float32), 1.0)
 
 
@@ -267,8 +268,8 @@ def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outl
     Args:
         covered: share of each pixel that the ball covers, float32 (h, w).
         noise: standard deviation of that share.
-        rays: unit vectors of K through the pixels, float32 (h, w, 3).
-        scale: pixels per radian there.
+        rays: unit vectors through the pixels, in K, float32 (h, w, 3).
+        scale: pixels per radian at the ball.
     """
     u, v = _middle(covered)
     ahead = _ray(rays, u, v)
@@ -315,7 +316,7 @@ def _middle(covered: NDArray) -> tuple[float, float]:
 
 @portable
 def _between(picture: NDArray, u: float, v: float) -> float:
-    """Return the value of a picture (h, w) between its pixels, 0 outside."""
+    """Return the bilinearly interpolated value of a picture (h, w), 0 outside."""
     if u < 0.0 or v < 0.0 or u >= picture.shape[1] - 1 or v >= picture.shape[0] - 1:
         return 0.0
     i, j = int(u), int(v)
@@ -326,7 +327,7 @@ def _between(picture: NDArray, u: float, v: float) -> float:
 
 @portable
 def _ray(rays: NDArray, u: float, v: float) -> Vector:
-    """Return the unit vector through a point between pixels, clamped to the picture."""
+    """Return the interpolated unit vector through a point, which is clamped to the picture."""
     u = min(max(u, 0.0), rays.shape[1] - 1.001)
     v = min(max(v, 0.0), rays.shape[0] - 1.001)
     ray = _between(rays[:, :, 0], u, v), _between(rays[:, :, 1], u, v), _between(rays[:, :, 2], u, v)
@@ -335,7 +336,7 @@ def _ray(rays: NDArray, u: float, v: float) -> Vector:
 
 @portable
 def _edge(covered: NDArray, u: float, v: float, cosine: float, sine: float) -> float:
-    """Return the distance of the edge from a point, coming from outside [px]; 0 without an edge."""
+    """Return the distance from a point to the outermost edge in a direction [px]; 0 without an edge."""
     steps = int(math.hypot(float(covered.shape[0]), float(covered.shape[1])) / STEP_PX)
     outer = 0.0
     for step in range(steps, -1, -1):
@@ -349,7 +350,7 @@ def _edge(covered: NDArray, u: float, v: float, cosine: float, sine: float) -> f
 
 @portable
 def _fitted(points: NDArray, first: int, count: int) -> Circle:
-    """Return the circle fitted to the marked ones of `count` consecutive points from `first` on."""
+    """Return the circle fitted to the marked points among `count` consecutive ones from `first` on."""
     n, mx, my = 0.0, 0.0, 0.0
     for k in range(count):
         x, y, on = points[(first + k) % len(points)]
@@ -371,13 +372,13 @@ def _fitted(points: NDArray, first: int, count: int) -> Circle:
 
 @portable
 def _near_px(r: float, noise: float) -> float:
-    """Return the tolerance of an edge point to a circle of radius r."""
+    """Return the maximum distance of an edge point from its circle of radius r [px]."""
     return NEAR_PX + NEAR_PX2 / r + NEAR_NOISE * noise
 
 
 @portable
 def _cost(points: NDArray, circle: Circle, noise: float) -> float:
-    """Return the cost of explaining all points by a circle."""
+    """Return the cost of a circle as an explanation of all points."""
     x, y, r = circle
     if r <= 0.0:
         return math.inf
@@ -390,7 +391,7 @@ def _cost(points: NDArray, circle: Circle, noise: float) -> float:
 
 @portable
 def _choose(points: NDArray, noise: float) -> bool:
-    """Mark the points on the circle that most of them share; False if there are too few."""
+    """Mark the points on the circle that explains all points best; return False if there are too few."""
     count = len(points)
     least, best = math.inf, (0.0, 0.0, 0.0)
     for first in range(count):
@@ -416,7 +417,7 @@ def _choose(points: NDArray, noise: float) -> bool:
 
 @portable
 def _spread(points: NDArray, x: float, y: float, r: float) -> tuple[float, float, float]:
-    """Return the standard deviations of centre and radius over that of an edge point, and the roughness [px]."""
+    """Return `centre`, `radius` and `rough_px` of an `Outline`."""
     n, sx, sy, sxx, sxy, syy, rough = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(points)):
         if points[k, EDGE_POINT.on] != 0.0:

@@ -1,11 +1,12 @@
 """The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
 
-Drones are hulls, arms, motors, rotors as their blades sweep, and hats; they look as in the console
-(zsim_bridges.console.scene); lengths are the AR.Drone's, scaled by the arms. All of a picture are computed together.
+A drone consists of hull, arms, motors, the sweeps of its rotor blades, and a hat. It looks as in the console
+(zsim_bridges.console.scene), with the AR.Drone's dimensions scaled by the arms. All drones of a picture are computed
+together.
 
 A ray hits a ball, such as a hat, if it passes the centre within the radius. This is exact anywhere in the picture and
-for any lens, and antialiased over one pixel at the edge, so that the drawn centre is the projected centre. Faces of
-obstacles are clipped in front of the camera, curved by the lens, and shaded by the sun.
+for any lens; the edge is antialiased over one pixel, so that the drawn centre is the projected centre. Faces of
+obstacles are clipped in front of the camera, distorted by the lens, and shaded by the sun.
 """
 
 from __future__ import annotations
@@ -39,54 +40,54 @@ from zsim_agents.cameras.scene import (
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 Fixed = NDArray[np.int32]
-Colour = tuple[float, float, float, float]  # B, G, R, and an opaque fourth
+Colour = tuple[float, float, float, float]  # B, G, R and opacity
 
 MAGENTA = np.array([134.0, 0.0, 226.0])  # B, G, R of the paper's marker
-COLOURS = {  # B, G, R; those of the console, the lower side of the hull in its own shade
+COLOURS = {  # B, G, R, as in the console, except for the darker underside of the hull
     "cross": np.array([48.0, 44.0, 42.0]),
     "hull": np.array([96.0, 88.0, 84.0]),
     "hull_low": np.array([62.0, 57.0, 54.0]),
     "nose": np.array([24.0, 108.0, 240.0]),
     "rotor": np.array([30.0, 28.0, 28.0]),
 }
-RING = 1.31  # rotor radii, outer radius of a hull ring
+RING = 1.31  # outer radius of a hull ring over the rotor radius
 RING_POINTS = 16
-RING_Z_M, RING_HIGH_M = 0.022, 0.042  # m, middle and height of a ring
-ARM_Z_M, ARM_WIDE_M = 0.004, 0.014  # m
-ROTOR_Z_M, ROTOR_CHORD_M = 0.030, 0.016  # m
-LENS_M = 0.013  # m, radius
-MOTOR_WIDE_M = 0.034  # m
-REACH_M = 0.36  # m, farthest point of the AR.Drone from its middle, rotors and hull
+RING_Z_M, RING_HIGH_M = 0.022, 0.042  # z of a ring's middle, and its height
+ARM_Z_M, ARM_WIDE_M = 0.004, 0.014
+ROTOR_Z_M, ROTOR_CHORD_M = 0.030, 0.016
+LENS_M = 0.013  # radius
+MOTOR_WIDE_M = 0.034
+REACH_M = 0.36  # distance from the AR.Drone's centre to the farthest point of its rotors and hull
 BODY_POINTS, NOSE_POINTS = 40, 20
-SECTOR = 5  # points of a blade's sweep along the circle
+SECTOR = 5  # points along the arc of a blade's sweep
 BLADES = 2
-BLADE_RAD = 0.3  # rad of the circle that a blade covers, at two thirds of its radius
-OPACITY = 0.16, 0.9  # of a blade's sweep, least and most; chosen
-DETAIL_PX = 14.0  # across; smaller drones are drawn without lens, motors and rotors
+BLADE_RAD = 0.3  # angle that a blade covers at two thirds of its radius
+OPACITY = 0.16, 0.9  # minimum and maximum opacity of a blade's sweep, a matter of appearance
+DETAIL_PX = 14.0  # minimum width of a drone that is drawn with lens, motors and rotors
 THICKNESS_MAX_PX = 80
-SEEN_M = 300.0  # m; farther drones are less than a pixel
-ROOM_M = 0.5  # m; no part is farther from the middle of a drone with arms of 0.18 m
-BLURRED_PX = 2.0  # px of motion from which drones are blurred; hulls need not be as exact as hats
-EDGE_PX = 3.0  # px by which antialiased edges and blur may extend beyond the lines
+SEEN_M = 300.0  # distance beyond which drones are smaller than a pixel
+ROOM_M = 0.5  # distance from the centre of a drone with arms of 0.18 m that none of its parts exceeds
+BLURRED_PX = 2.0  # motion from which drones are blurred; hulls need not be as exact as hats
+EDGE_PX = 3.0  # distance to which antialiased edges and blur may extend beyond the lines
 Levels = NDArray[np.float32]
-AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun; chosen: matt foam outdoors
+AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun, for matt foam outdoors
 STEPS_MAX = 6  # maximum number of times within an exposure at which a moving ball is drawn
-STEP_PX = 0.8  # px of motion between two of these times
+STEP_PX = 0.8  # motion between two of these times
 ROUNDING = np.float32(0.5)
 AXIS = np.array([0.0, 0.0, 1.0])
-NEAR_M = 0.05  # nothing closer is drawn
-FAR_PX = 16_000.0  # px; coordinates beyond are clipped: they have 32 bits with the fraction, and lines have to end
+NEAR_M = 0.05  # depth below which nothing is drawn
+FAR_PX = 16_000.0  # limit that coordinates are clipped to: they have 32 bits in all, and long lines take long to draw
 SIDES = 24  # number of sides that approximate a cylinder
 PIECES = 8  # number of segments of an edge that the lens bends
-OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R, chosen: weathered wood; never magenta
-SURFACE = np.array([102.0, 116.0, 124.0])  # B, G, R, chosen: stone; never magenta
-BENT_PX = 24.0  # px, chosen: the lens bends the edges of larger triangles visibly
+OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R of weathered wood, far from magenta
+SURFACE = np.array([102.0, 116.0, 124.0])  # B, G, R of stone, far from magenta
+BENT_PX = 24.0  # size of a triangle above which the lens visibly bends its edges
 
 
 class DroneImager:
-    """Images of the drones of a scene in a camera on the drone `carrier`, over an exposure [s].
+    """Makes the images of a scene's drones in a camera on drone number `carrier`, over an exposure [s].
 
-    `brightness` is that of the light on the sensor.
+    `brightness` is the brightness of the light on the sensor.
     """
 
     def __init__(self, view: View, scene: Scene, carrier: int, exposure_s: float, brightness: float) -> None:
@@ -94,7 +95,7 @@ class DroneImager:
         self._exposure_s, self._brightness = exposure_s, brightness
         self._models = [_model(look, brightness) for look in scene.drones]
         self._hat, self._radius_m = np.array(scene.hats.position_m), scene.hats.diameter_m / 2
-        self._kinds: list[int] = []  # for each drone, the first one that looks the same
+        self._kinds: list[int] = []  # for each drone, the index of the first one that looks the same
         firsts: dict[tuple[bytes, bytes, float], int] = {}
         for i, look in enumerate(scene.drones):
             key = look.hubs_B.tobytes(), look.turns.tobytes(), look.radius_m
@@ -107,11 +108,11 @@ class DroneImager:
     def images(
         self, motion: CameraMotion, t_s: float, bodies: DroneStates, R_WB: Array
     ) -> dict[int, tuple[float, list[BallImage | DroneImage]]]:
-        """Return the drones that may be in the picture over an exposure about t_s [s], by their index.
+        """Return the drones that may be in the picture during an exposure around t_s [s], by their index.
 
         Returns:
-            The distance from the camera [m], and the images of the drone (if it is wholly in front of the camera) and
-            of its hat (if visible), in drawing order.
+            The distance from the camera [m], and the images of the drone (if entirely in front of the camera) and of
+            its hat (if visible), in drawing order.
         """
         R_KB = motion.R_WK.T @ R_WB
         centres = motion.points_K(bodies.p_WB)
@@ -123,7 +124,7 @@ class DroneImager:
         near = np.abs(centres[:, 0]) - 2 * room < self._across * ahead
         near &= np.abs(centres[:, 1]) - 2 * room < self._down * ahead
         near &= (distances < SEEN_M) & (ahead > 0)
-        near[self._carrier] = False  # its own parts are not in its picture
+        near[self._carrier] = False  # no part of the carrier appears in its own picture
         in_view: list[int] = np.flatnonzero(near).tolist()
         kinds: defaultdict[int, list[int]] = defaultdict(list)
         for i in in_view:
@@ -144,14 +145,14 @@ class DroneImager:
         return images
 
     def hats(self, centres_K: Array, ways_K: Array, motion: CameraMotion) -> dict[int, BallImage]:
-        """Return the images of hats in front of the camera by their index; arguments as of `ball_images`."""
+        """Return the images of hats in front of the camera, by their index; for the arguments see `ball_images`."""
         colour = self._brightness * MAGENTA
         return ball_images(self._view, centres_K, ways_K, self._radius_m, colour, SUN_W @ motion.R_WK)
 
     def _images(
         self, kind: int, which: list[int], poses: _Poses, t_s: float, bodies: DroneStates
     ) -> dict[int, DroneImage]:
-        """Return the images of drones of one look, of those that are wholly in front of the camera."""
+        """Return the images of those drones of one look that are entirely in front of the camera."""
         look, model = self._looks[kind], self._models[kind]
         speeds = np.array([bodies.rotors[i] for i in which], float)
         blades = _blade_points(look, model.size, t_s, self._exposure_s, speeds)
@@ -165,7 +166,7 @@ class DroneImager:
         pixels = fixed(self._view.pixels(points[whole].transpose(0, 2, 1)))
         ways_px = self._view.flow_px(poses.centres[near], poses.ways[near])
         scales = self._view.lens.fx * model.size / poses.centres[near, 2]
-        turned = np.abs(speeds[whole]) * self._exposure_s  # rad, of each rotor
+        turned = np.abs(speeds[whole]) * self._exposure_s  # angle [rad] of each rotor
         blurs: list[Kernel | None] = [None] * len(near)
         moved = np.flatnonzero(np.hypot(*ways_px.T) > BLURRED_PX).tolist()
         for i, kernel in zip(moved, motion_blur_kernels(ways_px[moved]) if moved else [], strict=True):
@@ -184,7 +185,7 @@ class DroneImager:
         return {i: DroneImage(model, *row) for i, row in zip(near.tolist(), rows, strict=True) if has_pixels(row[0])}
 
     def _boxes(self, pixels: Fixed, ways_px: Array, scales: Array) -> list[list[int]]:
-        """Return the parts of the picture that contain drones, by the pixels of all their points in sixteenths."""
+        """Return the parts of the picture that contain drones, whose points are given in sixteenths of a pixel."""
         u, v, wide, high = np.array([cv2.boundingRect(each) for each in pixels]).T / (1 << SHIFT)
         lowest, highest = np.stack([u, v], axis=-1), np.stack([u + wide, v + high], axis=-1)
         half_way = np.minimum(np.abs(ways_px), BLUR_MAX_PX) / 2
@@ -193,7 +194,10 @@ class DroneImager:
 
 
 class _Poses(NamedTuple):
-    """All drones in K: rotations B to K (N, 3, 3), centres and their motion over the exposure [m; K], cameras in B."""
+    """All drones in K: rotations B to K (N, 3, 3), centres and their motion during the exposure, (N, 3) each [m; K].
+
+    `cameras_B` has the position of the camera relative to each drone, (N, 3) [m; B].
+    """
 
     R_KB: Array
     centres: Array
@@ -202,7 +206,7 @@ class _Poses(NamedTuple):
 
 
 class _DroneModel(NamedTuple):
-    """Points (P, 3) [m; B] of a drone part by part, its size relative to the AR.Drone, and its colours in the light."""
+    """Points of a drone, part by part, (P, 3) [m; B], its size relative to the AR.Drone, and its lit colours."""
 
     points: Array
     parts: dict[str, slice]
@@ -233,21 +237,21 @@ def _model(look: DroneLook, brightness: float) -> _DroneModel:
 
 
 def _ellipsoid(middle: float, length: float, width: float, height: float, points: int) -> Array:
-    """Return points of an ellipsoid that give its outline from any direction."""
+    """Return points of an ellipsoid that outline it from any direction."""
     k = np.arange(points) + 0.5
-    z = 1 - 2 * k / points  # Fibonacci's lattice
+    z = 1 - 2 * k / points  # Fibonacci lattice
     r, angle = np.sqrt(1 - z * z), math.pi * (3 - math.sqrt(5)) * k
     unit = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1)
     return unit * (length / 2, width / 2, height / 2) + (middle, 0.0, 0.012)
 
 
 def _blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, speeds: Array) -> Array:
-    """Return the sweeps of blades over an exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then the arc.
+    """Return the sweeps of blades during an exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then the arc.
 
-    The truth has no rotor angles: speed times time is used, which cannot be distinguished.
+    The truth has no rotor angles, so speed times time is used; no one can see the difference.
 
     Args:
-        speeds: of the rotors, (..., R) [rad/s].
+        speeds: speeds of the rotors, (..., R) [rad/s].
     """
     middle = np.remainder(-look.turns * speeds * t_s, 2 * math.pi)
     sweep = np.clip(np.abs(speeds) * exposure_s, 2 * ROTOR_CHORD_M * size / look.radius_m, math.pi)
@@ -265,12 +269,15 @@ class DroneImage(NamedTuple):
     """A drone to be drawn.
 
     Attributes:
-        box: the part of the picture that contains it, u0, v0, u1, v1.
-        pixels: of the model's points, then of its blades' sweeps, in sixteenths, (P + R BLADES (SECTOR + 1), 2).
-        scale: px/m of the AR.Drone.
-        blur: kernel of its motion during the exposure; None if it does not move.
-        from_above: whether the camera is above its rotors; shows_lens: in front of it.
-        opacity: of a blade's sweep; whole_turns: whether the blades of each rotor cover its whole circle.
+        box: the part of the picture that contains it: u0, v0, u1, v1.
+        pixels: coordinates of the model's points, then of its blades' sweeps, in sixteenths of a pixel,
+            (P + R BLADES (SECTOR + 1), 2).
+        scale: px per m of the AR.Drone.
+        blur: kernel of its motion during the exposure; None if it hardly moves.
+        from_above: whether the camera is above its rotors.
+        shows_lens: whether the camera is in front of it.
+        opacity: opacity of a blade's sweep.
+        whole_turns: whether the blades of each rotor cover the full circle.
     """
 
     model: _DroneModel
@@ -284,14 +291,14 @@ class DroneImage(NamedTuple):
     whole_turns: bool
 
     def draw(self, picture: Picture) -> None:
-        """Draw the drone without its hat; a moving one in a separate layer, so that the background stays sharp."""
+        """Draw the drone without its hat, on a separate layer if it is blurred, so that the background stays sharp."""
         u0, v0, u1, v1 = self.box
         part = picture[v0:v1, u0:u1]
         pixels = self.pixels - np.array([u0, v0], np.int32) * (1 << SHIFT)
         if self.blur is None:
             self._draw(part, pixels)
             return
-        layer = np.zeros((*part.shape[:2], 4), np.uint8)  # the fourth channel is what the drone covers
+        layer = np.zeros((*part.shape[:2], 4), np.uint8)  # the fourth channel is the coverage by the drone
         self._draw(layer, pixels)
         cv2.filter2D(layer, -1, self.blur, dst=layer, borderType=cv2.BORDER_REPLICATE)
         passes = cv2.bitwise_not(cv2.extractChannel(layer, 3))
@@ -341,9 +348,9 @@ class BallImage(NamedTuple):
     """A ball in a part of the picture.
 
     Attributes:
-        box: the part, u0, v0, u1, v1.
-        light: from the ball, plus a half for rounding, (h, w, 3).
-        passes: the share of light from behind, (h, w, 1).
+        box: the part: u0, v0, u1, v1.
+        light: light from the ball, plus a half for rounding, (h, w, 3).
+        passes: share of the light from behind that passes the ball, (h, w, 1).
     """
 
     box: list[int]
@@ -359,14 +366,14 @@ class BallImage(NamedTuple):
 def ball_images(
     view: View, centres_K: Array, ways_K: Array, radius_m: float, colour: Array, sun_K: Array
 ) -> dict[int, BallImage]:
-    """Return the images over an exposure of those balls that are in the picture, by their index.
+    """Return the images of those balls that are in the picture during an exposure, by their index.
 
-    All pixels that may be covered are computed in one array, at the instants of the ball that moves most, because balls
-    are many and small.
+    Since balls are many and small, all pixels that may be covered are computed in one array, at as many times as the
+    fastest ball in the picture requires.
 
     Args:
         centres_K, ways_K: centres and their motion during the exposure, (M, 3) [m; K].
-        radius_m: of all balls.
+        radius_m: radius of all balls.
         colour: B, G, R of all balls, (3,).
         sun_K: unit vector to the sun, (3,).
     """
@@ -388,7 +395,7 @@ def ball_images(
     pixels = _Pixels(along, to_way, to_sun, to_axis, [len(part) for part in parts])
     steps = min(STEPS_MAX, max(1, math.ceil(ways_px[shown].max() / STEP_PX)))
     covered = _covered(pixels, centres, ways, radius_m, view.lens.fx, steps)
-    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # brightness: 1 directly under the sun
+    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # for the shade, 1 facing the sun
     meets = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + rest, 0))
     cosine = (meets * pixels.to_sun - pixels.of_ball(centres @ sun_K)) * np.float32(DIFFUSE / radius_m)
     shade = np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))
@@ -414,7 +421,7 @@ def _boxes(view: View, centres_K: Array, ways_px: Array, radius_m: float) -> dic
 
 
 class _Pixels(NamedTuple):
-    """Components of the rays of all balls' pixels, one ball after the other, along four vectors, (P,) each."""
+    """Components along four vectors, (P,) each, of the rays through the pixels of one ball after another."""
 
     along: Levels
     to_way: Levels
@@ -423,19 +430,19 @@ class _Pixels(NamedTuple):
     counts: list[int]
 
     def of_ball(self, values: Array) -> Levels:
-        """Return values of the balls (..., M) for each pixel, (..., P)."""
+        """Return values of the balls (..., M), repeated for each pixel, (..., P)."""
         return np.repeat(values.astype(np.float32), self.counts, axis=-1)
 
 
 def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_px: float, steps: int) -> Levels:
-    """Return the share of each pixel that is covered: how far its ray passes within the radius, averaged over time."""
-    shares = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # of the exposure, from its middle
+    """Return the covered share of each pixel, averaged over time, from how far its ray passes within the radius."""
+    shares = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # in exposures, from the middle
     moved = centres + shares[..., None] * ways
     away2 = (moved * moved).sum(axis=-1)
     along = pixels.along + shares.astype(np.float32) * pixels.to_way
     beside2 = pixels.of_ball(away2) - along * along
     px_per_m = pixels.of_ball(focal_px / np.sqrt((centres * centres).sum(axis=-1)))
-    px_per_m /= pixels.to_axis * np.sqrt(pixels.to_axis)  # mean of both directions
+    px_per_m /= pixels.to_axis * np.sqrt(pixels.to_axis)  # geometric mean of the radial and tangential scales
     within = (np.float32(radius) - np.sqrt(np.maximum(beside2, 0))) * px_per_m
     return np.minimum(np.maximum(within + ROUNDING, 0), 1).mean(axis=0)
 
@@ -443,7 +450,7 @@ def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_
 def draw_obstacle(
     picture: Picture, view: View, row: tuple[float, ...], motion: CameraMotion, brightness: float
 ) -> None:
-    """Draw an obstacle, a row of zsim.scenario.surroundings."""
+    """Draw an obstacle, given as a row as in zsim.scenario.surroundings."""
     if row[SHAPE] == SPHERE:
         centre_K = motion.points_K(np.array([row[CENTRE : CENTRE + 3]]))
         if centre_K[0, 2] > 0:
@@ -459,7 +466,7 @@ def draw_obstacle(
 
 @lru_cache(maxsize=1000)
 def _faces(row: tuple[float, ...]) -> tuple[tuple[Array, Array], ...]:
-    """Return the upright faces and the top of a box or cylinder: corners (M, 3) and normal (3,) in W."""
+    """Return the top and the upright faces of a box or cylinder: corners (M, 3) [m; W] and normal (3,) [W]."""
     if row[SHAPE] == BOX:
         outline = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)]) * row[HALF : HALF + 2]
     else:
@@ -481,7 +488,7 @@ def fill_face(picture: Picture, view: View, corners_K: Array, colour: Array) -> 
     seen = _in_front(corners_K)
     if len(seen) < 3:
         return
-    if view.distorts:  # edges are curves
+    if view.distorts:  # straight edges become curves
         steps = (np.roll(seen, -1, axis=0) - seen)[:, None]
         seen = (seen[:, None] + np.arange(PIECES)[:, None] / PIECES * steps).reshape(-1, 3)
     outline = view.pixels(seen)
@@ -507,21 +514,21 @@ def _in_front(corners: Array) -> Array:
 
 
 def fixed(pixels: Array) -> NDArray[np.int32]:
-    """Return pixels as OpenCV's fixed-point numbers with SHIFT fractional bits."""
+    """Return pixel coordinates as fixed-point numbers for OpenCV, with SHIFT fractional bits."""
     return np.rint(np.clip(pixels, -FAR_PX, FAR_PX) * (1 << SHIFT)).astype(np.int32)
 
 
 def bgr(colour: Array) -> tuple[float, float, float]:
-    """Return a colour as OpenCV's scalar."""
+    """Return a colour (3,) as a scalar of OpenCV."""
     b, g, r = colour.tolist()
     return round(b), round(g), round(r)
 
 
 class SurfaceImager:
-    """The surfaces before one camera, (T, 9) as in zsim.scenario.surroundings: of one shade, seen from both sides.
+    """Draws surfaces for one camera: triangles (T, 9) as in zsim.scenario.surroundings, visible from both sides.
 
-    They are drawn from the farthest to the nearest by their middles, among drones and obstacles, without smoothed
-    edges, so that no gap shows between neighbours.
+    They have a uniform colour and are drawn in order of the distance to their centres, among drones and obstacles;
+    their edges are not antialiased, so that no gap shows between neighbours.
     """
 
     def __init__(self, view: View, triangle: Array, brightness: float) -> None:
@@ -533,7 +540,7 @@ class SurfaceImager:
         self._brightness = brightness
 
     def shown(self, motion: CameraMotion) -> list[tuple[float, int]]:
-        """Return distance [m] and number of each triangle of which something may be in the picture, and keep them."""
+        """Return distance [m] and number of each triangle that may be visible, and keep their data for `draw`."""
         self._points_K = motion.points_K(self._corners_W)
         z = self._points_K[..., 2]
         ahead = (z > NEAR_M).all(axis=1)
@@ -547,7 +554,7 @@ class SurfaceImager:
         self._is_plain = inside & ~bent
         chosen = np.flatnonzero(inside | (~ahead & (z > NEAR_M).any(axis=1)))
         away = self._middles_W[chosen] - motion.p_WK
-        faces = np.where((self._normals_W[chosen] * away).sum(axis=1) > 0.0, -1.0, 1.0)  # the side that is seen
+        faces = np.where((self._normals_W[chosen] * away).sum(axis=1) > 0.0, -1.0, 1.0)  # the visible side
         lit = np.maximum(faces * (self._normals_W[chosen] @ SUN_W), 0.0)
         self._shade = np.zeros(len(z))
         self._shade[chosen] = self._brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * lit)
@@ -555,7 +562,7 @@ class SurfaceImager:
         return list(zip(distance.tolist(), chosen.tolist(), strict=True))
 
     def draw(self, picture: NDArray[np.uint8], number: int) -> None:
-        """Draw one of the triangles that are shown."""
+        """Draw one of the triangles returned by `shown`."""
         colour = self._shade[number] * SURFACE
         if self._is_plain[number]:
             cv2.fillConvexPoly(picture, fixed(self._pixels[number]), bgr(colour), cv2.LINE_8, SHIFT)

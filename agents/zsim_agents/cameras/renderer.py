@@ -1,8 +1,8 @@
 """Renders the picture of a drone's camera from the true poses of all drones. Pure: equal inputs give equal bits.
 
-The backdrop, ground and sky, is one grey picture, which a map converts to colours: warping one channel costs a third of
-three. Greys up to 150 are ground, from HAZE on sky. The ground is a repeated square tile around W's origin, in levels
-of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
+The backdrop of ground and sky is a grey picture, which a map converts to colours: warping one channel costs a third of
+warping three. Greys up to 150 are ground, and greys from HAZE on are sky. The ground repeats a square tile around W's
+origin, in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
 """
 
 from __future__ import annotations
@@ -27,27 +27,25 @@ from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, V
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-BLURRED_PX = 0.8  # px of motion from which the ground is blurred
-WIDER_MAX = (
-    2.0  # maximum size of the pinhole picture that a lens distorts, over the final one; beyond, the edge is repeated
-)
-MARGIN = 64  # px by which the noise image exceeds the picture
-NOISE_MAX = 48.0  # grey levels, standard deviation: the limit of the amplified noise
+BLURRED_PX = 0.8  # motion from which the ground is blurred
+WIDER_MAX = 2.0  # maximum size of the undistorted picture over that of the final one, where its edge is then repeated
+MARGIN = 64  # pixels by which the noise image exceeds the picture
+NOISE_MAX = 48.0  # maximum standard deviation of the amplified noise, in grey levels
 FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # hats are a few pixels wide
-MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio, whose multiples spread (Knuth, TAOCP 3, 6.4)
+MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio: its multiples mod 2^64 are evenly spread (Knuth, TAOCP 3, 6.4)
 view_of = cache(View)
 Grey = NDArray[np.uint8]
 Points = list[tuple[float, float]]
-TEXEL_M = 0.02  # m, of the finest level, chosen: a blade of grass is not seen, a line of 6 cm is
-TILE = 1000  # texels of a side: 20 m, so that lines every metre go on over the seam
-FACTORS = (1, 4, 20, 100)  # of the texels of each level over the finest
-WINDOW = (3000, 2000, 1500, 1000)  # texels of a side that are kept of each level: 60 m, 160 m, 600 m, 2 km
-MINIFIED_MAX = 2.0  # texels that a pixel may be deep on the ground before a coarser level is drawn
-HEIGHT_MIN_M = 0.03  # m, of a camera over the ground
-HAZE = 176  # grey
-ZENITH = 0.6  # sine of the elevation from which on the sky is the bluest; chosen
-SKY_SLOPE = (255 - HAZE) / ZENITH  # greys of the sky for a sine of 1
-COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
+TEXEL_M = 0.02  # side of a texel of the finest level, which shows a line of 6 cm but no blade of grass
+TILE = 1000  # texels along a side of the tile: 20 m, so that lines every metre continue across the seam
+FACTORS = (1, 4, 20, 100)  # size of the texels of each level over that of the finest
+WINDOW = (3000, 2000, 1500, 1000)  # texels along a side of each level's ground: 60 m, 160 m, 600 m, 2 km
+MINIFIED_MAX = 2.0  # maximum depth of a pixel on the ground, in texels, before a coarser level is drawn
+HEIGHT_MIN_M = 0.03  # minimum height of the camera above the ground
+HAZE = 176  # grey of the horizon
+ZENITH = 0.6  # sine of the elevation from which the sky is bluest, a matter of appearance
+SKY_SLOPE = (255 - HAZE) / ZENITH  # increase of the sky's grey per sine of the elevation
+COLOURS = {  # B, G, R by grey: dry grass, white lines, a hazy blue sky
     0: (24, 36, 30),
     60: (52, 104, 92),
     100: (84, 138, 134),
@@ -58,17 +56,17 @@ COLOURS = {  # B, G, R by grey; chosen: dry grass, white lines, a hazy blue sky
 
 
 class Renderer:
-    """One camera of one drone, the scene's `carrier`.
+    """Renders the pictures of a camera on drone number `carrier` of a scene.
 
     Args:
-        seed, name: of the noise's random stream, e.g. "drone1/front".
-        ground: None for a meadow with lines every metre.
+        seed, name: seed and name, e.g. "drone1/front", of the random stream of the noise.
+        ground: the ground; None for a meadow with lines every metre.
     """
 
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # chosen: the exposure compensates half of the stops below a clear day
+        gain = 1.0 / math.sqrt(scene.light)  # the exposure makes up for half of the missing stops
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
@@ -86,17 +84,17 @@ class Renderer:
         self._backdrop = Backdrop(flat, ground or meadow())
 
     def jpeg(self, number: int, t_s: float, bodies: DroneStates) -> bytes:
-        """Return the picture of an exposure as JPEG; see `picture`."""
+        """Return `picture` as a JPEG."""
         options = [cv2.IMWRITE_JPEG_QUALITY, self._camera.jpeg_quality, *FULL_COLOUR]
         return cv2.imencode(".jpg", self.picture(number, t_s, bodies), options)[1].tobytes()
 
     def picture(self, number: int, t_s: float, bodies: DroneStates) -> Picture:
-        """Return the picture of an exposure as B, G, R, (height, width, 3).
+        """Return the picture of an exposure, (height, width, 3), in B, G, R.
 
         Args:
-            number: of the picture; selects its noise.
-            t_s: the middle of the exposure [s].
-            bodies: all drones at that time, in the scene's order.
+            number: number of the picture, which selects its noise.
+            t_s: middle of the exposure [s].
+            bodies: all drones at t_s, in the scene's order.
         """
         R_WB = rotation_matrix(bodies.q_WB)
         motion = camera_motion(self._pose, bodies, R_WB[self._carrier], self._carrier)
@@ -126,7 +124,7 @@ class Renderer:
                 for layer in drones[which][1]:
                     layer.draw(picture)
         sigma_px = self._camera.blur_px
-        if sigma_px >= 0.2:  # shorter motions are below a pixel's width
+        if sigma_px >= 0.2:  # a smaller blur is invisible
             side = 3 if sigma_px <= 0.7 else 2 * math.ceil(2.5 * sigma_px) + 1
             kernel = cv2.getGaussianKernel(side, sigma_px)
             cv2.sepFilter2D(picture, -1, kernel, kernel, dst=picture, borderType=cv2.BORDER_REPLICATE)
@@ -135,9 +133,9 @@ class Renderer:
         return picture
 
     def _blur_ground(self, grey: Picture, motion: CameraMotion) -> None:
-        """Blur the ground by the motion at the centre of the picture's lower half over the exposure.
+        """Blur the ground by its motion during the exposure at the centre of the picture's lower half.
 
-        The sky is smooth: its rows are skipped, except those near the horizon.
+        The rows of the sky are skipped, since it is smooth, except those near the horizon.
         """
         ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
         down = -float(motion.R_WK[2] @ ray_K)
@@ -152,7 +150,7 @@ class Renderer:
 
 
 class _Noise:
-    """The noise of a sensor, made once and added to each picture at another offset; sigma in grey levels."""
+    """Noise of an image sensor, drawn once and added to each picture at a different offset; sigma in grey levels."""
 
     def __init__(self, seed: int, name: str, shape: tuple[int, int], sigma: float) -> None:
         height, width = shape
@@ -175,7 +173,7 @@ class _Noise:
 
 
 def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
-    """Return a view without distortion that covers the lens's field of view, and the map that distorts its picture."""
+    """Return an undistorted view that covers the lens's field of view, and the map that distorts its picture."""
     lens = view.lens
     half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
     most = np.array([lens.width, lens.height]) * WIDER_MAX / 2
@@ -186,9 +184,9 @@ def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
 
 
 class Level(NamedTuple):
-    """A level of the ground: its texels, the side of one, and how far it is drawn [m].
+    """A level of the ground: its texels, the side of a texel [m], and the distance up to which it can be drawn [m].
 
-    `place` is the homography (3, 3) from (x, y, 1) of W [m] to texels, whose centres are at whole numbers.
+    `place` is the homography (3, 3) from (x, y, 1) [m; W] to texels, whose centres have integer coordinates.
     """
 
     texels: Grey
@@ -198,11 +196,11 @@ class Level(NamedTuple):
 
 
 class Ground:
-    """A ground in levels.
+    """A ground in levels of decreasing resolution.
 
     Args:
-        tile: greys up to 150, a square whose side is a multiple of 100; its middle is W's origin, its top north.
-        texel_m: the side of one of its texels.
+        tile: square of greys up to 150, its side a multiple of 100 texels; its centre is W's origin, its top is north.
+        texel_m: side of a texel.
     """
 
     def __init__(self, tile: Grey, texel_m: float = TEXEL_M) -> None:
@@ -221,7 +219,7 @@ class Ground:
 
 @cache
 def meadow() -> Ground:
-    """Return a meadow with a line every metre, a wider one every fifth."""
+    """Return a meadow with a line every metre, every fifth one wider."""
     rng = np.random.default_rng(1)
     patches = sum(_patches(rng, cells) * share for cells, share in ((10, 12.0), (50, 10.0), (250, 8.0), (1000, 9.0)))
     tile = np.clip(70.0 + patches, 15, 110)
@@ -234,7 +232,7 @@ def meadow() -> Ground:
 
 
 def _patches(rng: np.random.Generator, cells: int) -> Array:
-    """Return smooth periodic noise of unit variance over the tile."""
+    """Return smooth, periodic noise of unit variance for a tile, made of `cells` per side."""
     coarse = np.pad(rng.standard_normal((cells, cells)), 2, mode="wrap")
     wide = TILE // cells
     fine = coarse if wide == 1 else cv2.resize(coarse, None, fx=wide, fy=wide, interpolation=cv2.INTER_CUBIC)
@@ -243,14 +241,14 @@ def _patches(rng: np.random.Generator, cells: int) -> Array:
 
 
 def colour_map(brightness: float) -> Grey:
-    """Return B, G, R of each grey, (256, 1, 3)."""
+    """Return the B, G, R of each grey, (256, 1, 3)."""
     at = np.arange(256)
     channels = [np.interp(at, list(COLOURS), [colour[k] for colour in COLOURS.values()]) for k in range(3)]
     return np.rint(brightness * np.stack(channels, axis=-1)).astype(np.uint8)[:, None, :]
 
 
 class Backdrop:
-    """Draws ground and sky as a pinhole camera sees them; `view` is without distortion."""
+    """Draws ground and sky as a pinhole camera sees them, through an undistorted view."""
 
     def __init__(self, view: View, ground: Ground) -> None:
         lens = view.lens
@@ -267,18 +265,18 @@ class Backdrop:
         self._mask = np.empty_like(self.grey)
 
     def draw(self, motion: CameraMotion) -> Grey:
-        """Return the picture, owned by this object."""
+        """Return the picture, which the next call overwrites."""
         height_m = max(float(motion.p_WK[2]), HEIGHT_MIN_M)
-        to_W = motion.R_WK @ self._K_inv  # a pixel (u, v, 1) to its ray in W
-        down = (-to_W[2]).tolist()  # descent of a ray with z = 1 in K
+        to_W = motion.R_WK @ self._K_inv  # from a pixel (u, v, 1) to its ray in W
+        down = (-to_W[2]).tolist()  # descent [W] of a ray with z = 1 in K
         limits = [math.inf]
-        for level in self._ground.levels:  # a pixel at distance s covers a depth of s^2 / (f h) on the ground
+        for level in self._ground.levels:  # a pixel at distance s is s^2 / (f h) deep on the ground
             reach_m = math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m)
             limits.append(height_m / min(reach_m, 0.7 * level.reach_m))
         least, most = _extremes(self._size, down)
         first = next((i for i, limit in enumerate(limits[1:]) if least >= limit), None)
         if first is None:
-            a, b, c = (-SKY_SLOPE * each for each in down)  # the sky, bluer the higher
+            a, b, c = (-SKY_SLOPE * each for each in down)  # the higher, the bluer
             rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
             if rows is not None:
                 upwards = np.float32(b) * self._row_numbers[slice(*rows)] + np.float32(c + HAZE)
@@ -287,10 +285,10 @@ class Backdrop:
             if len(ground) >= 3:
                 cv2.fillConvexPoly(self.grey, fixed(np.array(ground)), self._ground.mean, cv2.LINE_AA, SHIFT)
             first = len(self._ground.levels) - 1
-        # homography from pixels to (x, y, 1) on the ground [m], in the nearest of the repeated tiles
+        # homography from pixels to (x, y, 1) on the ground [m], relative to the nearest repetition of the tile
         x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in motion.p_WK[:2].tolist())
         to_ground = np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]]) @ to_W
-        for i in range(first, -1, -1):  # limits of `down` for a level and for the finer one
+        for i in range(first, -1, -1):  # limits of `down` for this level and the finer one
             if most > limits[i + 1]:
                 self._draw_level(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
         return self.grey
@@ -302,7 +300,7 @@ class Backdrop:
         return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
 
     def _draw_level(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
-        """Draw a level in the rows near enough for it and not entirely near enough for a finer one."""
+        """Draw a level in the rows that are near enough for it but not entirely near enough for a finer one."""
         part = half_plane(self._size, down, least)
         rows = _rows(part, self._size)
         coarse = _rows(half_plane(self._size, [-each for each in down], -most), self._size) if most < math.inf else rows
@@ -326,7 +324,7 @@ class Backdrop:
 
 
 def _rows(part: Points, size: tuple[int, int]) -> tuple[int, int] | None:
-    """Return the first row of a part of the picture, and the one after its last."""
+    """Return the first row of a part of the picture, and the row after its last one."""
     if len(part) < 3:
         return None
     heights = [v for _, v in part]
@@ -338,14 +336,14 @@ def _rectangle(width: int, height: int) -> Points:
 
 
 def _extremes(size: tuple[int, int], linear: Sequence[float]) -> tuple[float, float]:
-    """Return the least and the greatest a u + b v + c in a picture."""
+    """Return the minimum and maximum of a u + b v + c in a picture."""
     a, b, c = linear
     at_corners = [a * u + b * v + c for u, v in _rectangle(*size)]
     return min(at_corners), max(at_corners)
 
 
 def half_plane(size: tuple[int, int], linear: Sequence[float], least: float) -> Points:
-    """Return the part of a picture where a u + b v + c >= least as a polygon, empty with fewer than three points."""
+    """Return the polygon where a u + b v + c >= least in a picture; with fewer than three points it is empty."""
     a, b, c = linear
     corners = _rectangle(*size)
     over = [a * u + b * v + c - least for u, v in corners]

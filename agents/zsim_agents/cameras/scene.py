@@ -1,6 +1,6 @@
-"""The scene of a picture, the motion of the camera, and the lens that projects one into the other. Pure.
+"""The scene of a picture, and the motion and the lens of the camera. Pure.
 
-W: world (east, north, up); B: body of a drone; K: camera (x right, y down, z ahead).
+Frames: W, world (east, north, up); B, body of a drone; K, camera (x right, y down, z ahead).
 """
 
 import math
@@ -19,12 +19,12 @@ from zsim.sensors.camera import Hats
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, undistorted
 from zsim.vehicles.vehicle import cross_layout
 
-cv2.setNumThreads(1)  # other cores belong to the world and the agents; one thread gives the same bits everywhere
+cv2.setNumThreads(1)  # leaves the other cores to the world and the agents, and gives the same bits everywhere
 Array = NDArray[np.float64]
 Kernel = NDArray[np.float32]
-ARM_M = 0.1785  # m, of the AR.Drone, for records whose drones name no rotors
-ROTOR_RADIUS_M = 0.10  # m, 8 inch propellers of the AR.Drone
-SUN_AZIMUTH_RAD, SUN_ELEVATION_RAD = math.radians(215.0), math.radians(50.0)  # chosen: a noon in winter
+ARM_M = 0.1785  # arm of the AR.Drone, for records that do not give the rotors of a drone
+ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
+SUN_AZIMUTH_RAD, SUN_ELEVATION_RAD = math.radians(215.0), math.radians(50.0)  # a noon in winter
 SUN_W = np.array(
     [
         math.cos(SUN_ELEVATION_RAD) * math.cos(SUN_AZIMUTH_RAD),
@@ -32,14 +32,14 @@ SUN_W = np.array(
         math.sin(SUN_ELEVATION_RAD),
     ]
 )
-BLUR_MAX_PX = 24.0  # px, maximum length of motion blur; longer motions are blurred by it
-SAMPLES_PER_PX = 8  # of a motion-blur kernel
+BLUR_MAX_PX = 24.0  # maximum length of motion blur, also for longer motions
+SAMPLES_PER_PX = 8  # samples of a motion per pixel of its blur kernel
 ORIGIN = np.zeros(3)
-SHIFT = 4  # fractional bits of OpenCV's coordinates: sixteenths of a pixel
+SHIFT = 4  # fractional bits of coordinates for OpenCV: sixteenths of a pixel
 
 
 class DroneLook(NamedTuple):
-    """Appearance of a drone: hubs (R, 2), directions (R,) and radius of its rotors [m; B], whether its hat shows."""
+    """Appearance of a drone: hubs (R, 2) [m; B], directions of rotation (R,) and radius of its rotors; visible hat."""
 
     hubs_B: Array
     turns: Array
@@ -51,9 +51,9 @@ NO_TRIANGLE = np.empty((0, TRIANGLE))
 
 
 class Scene(NamedTuple):
-    """The constant scene of a run.
+    """The constant parts of a run's scene.
 
-    Obstacles and surfaces are rows of zsim.scenario.surroundings; light 1 is a clear day.
+    Obstacles and surfaces are rows as in zsim.scenario.surroundings; a clear day has light 1.
     """
 
     drones: tuple[DroneLook, ...]
@@ -64,9 +64,9 @@ class Scene(NamedTuple):
 
 
 class DroneStates(NamedTuple):
-    """N drones at an instant: position [m; W], velocity [m/s; W], attitude B to W (N, 4), rate [rad/s; B], (N, 3) each.
+    """States of N drones at one time: position [m; W], velocity [m/s; W] and angular velocity [rad/s; B], (N, 3) each.
 
-    `rotors` has the speeds of each drone's rotors [rad/s].
+    `q_WB` is the attitude, B to W, (N, 4); `rotors` has the speeds of each drone's rotors [rad/s].
     """
 
     p_WB: Array
@@ -77,7 +77,7 @@ class DroneStates(NamedTuple):
 
 
 def scene_of(info: Info, scenario: Scenario) -> Scene:
-    """Return the scene of a run, its drones in the order of `info`."""
+    """Return the scene of a run, with the drones in the order of `info`."""
     environment = scenario.environment
     hats = Hats() if environment.hats is UNSET else environment.hats
     light = 1.0 if environment.light is UNSET else environment.light
@@ -98,7 +98,7 @@ def _look(drone: DroneInfo, has_hat: bool) -> DroneLook:
 
 
 class CameraMotion(NamedTuple):
-    """Position and velocity of a camera [m, m/s; W], its rate [rad/s; K], and its rotation K to W (3, 3)."""
+    """Position and velocity of a camera [m, m/s; W], angular velocity [rad/s; K] and rotation K to W (3, 3)."""
 
     p_WK: Array
     v_WK: Array
@@ -106,11 +106,11 @@ class CameraMotion(NamedTuple):
     R_WK: Array
 
     def points_K(self, points_W: Array) -> Array:
-        """Return points (..., 3) of W in K."""
+        """Return points (..., 3), given in W, in K."""
         return (points_W - self.p_WK) @ self.R_WK
 
     def rates_K(self, points_K: Array, velocities_W: Array) -> Array:
-        """Return the velocities in K of points (..., 3) that have velocities in W [m/s]."""
+        """Return the velocities relative to the camera [m/s; K] of points (..., 3) with given velocities [m/s; W]."""
         return (velocities_W - self.v_WK) @ self.R_WK + points_K @ skew(self.w_WK_K)
 
 
@@ -121,7 +121,7 @@ def skew(a: Array) -> Array:
 
 
 def camera_motion(pose: CameraPose, bodies: DroneStates, R_WB: Array, carrier: int) -> CameraMotion:
-    """Return pose and motion of a camera on one of the drones, whose attitude is R_WB (3, 3)."""
+    """Return the motion of a camera on drone number `carrier`, whose attitude is R_WB (3, 3)."""
     w_WB_B = bodies.w_WB_B[carrier]
     p_WK = bodies.p_WB[carrier] + R_WB @ pose.p_BK
     v_WK = bodies.v_WB[carrier] - R_WB @ (w_WB_B @ skew(pose.p_BK).T)
@@ -149,7 +149,7 @@ class View:
         self.rays: NDArray[np.float32] = np.ascontiguousarray(whole, np.float32)
 
     def pixels(self, points_K: Array) -> Array:
-        """Return the pixels (..., 2) of points (..., 3) in front of the camera."""
+        """Return the pixel coordinates (..., 2) of points (..., 3) [m; K] in front of the camera."""
         lens = self.lens
         if not self.distorts:
             x, y, z = np.moveaxis(points_K, -1, 0)
@@ -158,12 +158,12 @@ class View:
         return np.asarray(flat, float).reshape(*points_K.shape[:-1], 2)
 
     def flow_px(self, points_K: Array, rates_K: Array) -> Array:
-        """Return the optical flow of points [px/s], (..., 2), without the lens's distortion."""
+        """Return the optical flow of moving points [px/s], (..., 2), ignoring the lens's distortion."""
         z = points_K[..., 2:]
         return self.lens.fx * (rates_K[..., :2] - points_K[..., :2] / z * rates_K[..., 2:]) / z
 
     def boxes(self, lowest_px: Array, highest_px: Array) -> list[list[int]]:
-        """Return the boxes u0, v0, u1, v1 of the picture that contain rectangles given by their corners (M, 2)."""
+        """Return boxes (u0, v0, u1, v1) of the picture around rectangles given by opposite corners, (M, 2) each."""
         size = self.lens.width, self.lens.height
         ends = np.concatenate([np.floor(lowest_px), np.ceil(highest_px) + 1], axis=1)
         return np.clip(ends, 0, size * 2).astype(int).tolist()
@@ -174,14 +174,14 @@ def has_pixels(box: list[int]) -> bool:
 
 
 def motion_blur_kernels(ways_px: Array) -> list[Kernel]:
-    """Return the blur kernels of motions (N, 2) [px] over an exposure: the share of the time in each pixel."""
+    """Return the blur kernels of motions during an exposure, (N, 2) [px]: the share of the time spent in each pixel."""
     lengths = np.hypot(*ways_px.T)
     ways = ways_px * np.minimum(1.0, BLUR_MAX_PX / np.maximum(lengths, 1e-9))[:, None]
     count = max(2, math.ceil(min(lengths.max(), BLUR_MAX_PX) * SAMPLES_PER_PX))
     at = ways[:, :, None] * ((np.arange(count) + 0.5) / count - 0.5)  # (N, 2, count)
     halves = [math.ceil(way / 2) + 1 for way in np.abs(ways).max(axis=1).tolist()]
     most = max(halves)
-    shares = np.maximum(1 - np.abs(np.arange(-most, most + 1) - at[..., None]), 0)  # of a point, in a column or row
+    shares = np.maximum(1 - np.abs(np.arange(-most, most + 1) - at[..., None]), 0)  # by column and by row
     kernels = (shares[:, 1].transpose(0, 2, 1) @ shares[:, 0] / count).astype(np.float32)
     inner = [slice(most - half, most + half + 1) for half in halves]
     return [kernel[part, part] for kernel, part in zip(kernels, inner, strict=True)]

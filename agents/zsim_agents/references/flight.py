@@ -1,8 +1,8 @@
-"""The flights of a scenario's drones with their own references: take-off, approach to a path, the path. Pure.
+"""The flights of drones with their own references: take-off, approach to a path, and the path. Pure.
 
-A flight is checked in advance: speeds, turns and horizontal accelerations against the drone's limits, heights, and the
+A flight is checked in advance: speeds, yaw rates and horizontal accelerations against the drone's limits, heights, and
 distances to other flights and to formations. When a formation engages and how it approaches its target or trajectory
-depend on its estimates, so distances to it are checked only from the time by which it has certainly arrived there.
+depend on its estimates, so distances to it are checked only from the time by which it has certainly arrived.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ from zsim_agents.references.path import (
 if TYPE_CHECKING:
     from zsim_agents.formation.engagement_setup import PlannedMotion
 
-READY_S = 4.0  # minimum time from the take-off command to the first path: an AR.Drone takes 4 s or more
-WAY_SHARE = 0.5  # chosen: share of the limits on the approach to a path that starts at rest
-ROUNDING = 1.0 + 1e-9  # tolerance for a duration that just satisfies the limits
-HEIGHT_MIN_M = 0.2  # chosen: minimum height, above most of the ground effect of the smallest drones
+READY_S = 4.0  # minimum time from the take-off command to the first path; the take-off of an AR.Drone takes 4 s or more
+WAY_SHARE = 0.5  # usable share of the limits on the approach to a path that starts at rest, where there is no hurry
+ROUNDING = 1.0 + 1e-9  # tolerance for durations that just satisfy the limits
+HEIGHT_MIN_M = 0.2  # minimum height of a path, above most of the ground effect of the smallest drones
 SAMPLES_MAX, SAMPLE_S = 4001, 0.05  # sampling of a path's heights
 TOLERANCE_M = 1e-3  # tolerance of the minimum distance between two paths
-STEP_S = 0.05  # interval between the times at which all paths are compared
-LEAST_STEP_S = 1e-4  # an interval is not halved below this
-LATE_S = 15.0  # chosen: a take-off takes up to 12 s, of which READY_S are planned, and engagement waits for estimates
-LOOK_S, FINE_S = 0.1, 0.01  # sampling of a meeting: normally, and where the two are close
-NEARER_M = 0.5  # chosen: maximum decrease of the distance between a drone and a robot within LOOK_S
+STEP_S = 0.05  # interval between comparisons of all paths
+LEAST_STEP_S = 1e-4  # minimum length of an interval that is halved
+LATE_S = 15.0  # maximum delay of a formation: take-off takes up to 12 s (READY_S planned), engagement awaits estimates
+LOOK_S, FINE_S = 0.1, 0.01  # interval between comparisons with a formation: normally, and at close distances
+NEARER_M = 0.5  # distance by which a drone and a robot approach within LOOK_S at most
 PLACE_NAMES = ("x", "y", "z", "yaw")
 QUANTITIES = (
     ("horizontal speed", "m/s"),
@@ -66,7 +66,7 @@ QUANTITIES = (
 
 
 class FlightError(ValueError):
-    """An impossible flight; `text` follows `path`, the field below the reference or the exchange, in the message."""
+    """A flight is impossible; the message is `path`, the field within the reference or exchange, then `text`."""
 
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path} {text}".strip())
@@ -74,7 +74,7 @@ class FlightError(ValueError):
 
 
 class Place:
-    """The variables of one drone's position and heading, with the interface of a cluster space."""
+    """The position and heading of one drone as variables, with the interface of a cluster space."""
 
     names = PLACE_NAMES
     in_radians = np.array([False, False, False, True])
@@ -91,7 +91,7 @@ class Place:
 
 
 class Leg(NamedTuple):
-    """A part of a flight: a path that starts at simulated time start_s."""
+    """A part of a flight: a path that starts at the simulated time start_s."""
 
     start_s: float
     path: Reference
@@ -100,9 +100,9 @@ class Leg(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """The reference of a drone at every simulated time [s]: a `Reference`.
+    """The `Reference` of a drone over simulated time [s].
 
-    Before its first leg it is at `hover` (4,), where the take-off ends; the end of a leg is held until the next leg.
+    Before the first leg it is `hover` (4,), where the take-off ends; the end of a leg is held until the next leg.
     """
 
     hover: Array
@@ -123,7 +123,7 @@ class Flight:
         return (self.hover, np.zeros(4)) if leg is None else leg.path.value(t_s - leg.start_s)
 
     def phase(self, t_s: float) -> tuple[ReferencePhase, float | None]:
-        """Return the phase, and in phase "path" the time since the start of the path [s]."""
+        """Return the phase and, in the phase "path", the time since the start of the path [s]."""
         leg = self.leg_at(t_s)
         if leg is None:
             return "holding", None
@@ -133,27 +133,31 @@ class Flight:
         return leg.phase, own_s if leg.phase == "path" else None
 
     def peaks(self) -> Peaks:
-        """Return the peaks over all legs; their times are not determined (0)."""
+        """Return the peaks over all legs, with times of 0."""
         each = [peaks_of(leg.path) for leg in self.legs]
         speed, climb, turn, accel = np.max([[0.0] * 4, *(peaks[:4] for peaks in each)], axis=0).tolist()
         return Peaks(speed, climb, turn, accel, at_s=(0.0, 0.0, 0.0, 0.0))
 
 
 def limits_of(drone: Drone, gravity_m_s2: float) -> PathLimits:
-    """Return the path limits of a drone: the limits of its firmware, with the tilt as an acceleration."""
+    """Return the path limits of a drone: those of its firmware, with the tilt converted to an acceleration."""
     own = drone.limits
     accel = gravity_m_s2 * el.tan(math.radians(own.tilt_deg))
     return PathLimits(own.horizontal_speed_m_s, own.vertical_speed_m_s, math.radians(own.yaw_rate_deg_s), accel)
 
 
 def hover_of(drone: Drone) -> Array:
-    """Return where a drone hovers after its take-off (4,)."""
+    """Return the position [m; W] and yaw [rad] at which a drone hovers after its take-off, (4,)."""
     x, y, z = drone.position_m
     return np.array([x, y, z + drone.takeoff_height_m, math.radians(drone.yaw_deg)])
 
 
 def flight_of(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone with a reference or in an exchange; FlightError: the flight is impossible."""
+    """Return the flight of a drone with a reference or in an exchange.
+
+    Raises:
+        FlightError: the flight is impossible.
+    """
     flown = scenario.piloted()[drone]
     if isinstance(flown, Exchange):
         return exchange_flights(scenario, flown)[drone]
@@ -171,7 +175,11 @@ def flight_of(scenario: Scenario, drone: str) -> Flight:
 
 
 def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion | None = None) -> PiecewisePolynomial:
-    """Return the approach from a position (4,) to the start of a path; FlightError: the path starts too fast."""
+    """Return the approach from a position and yaw (4,) to the start of a path.
+
+    Raises:
+        FlightError: the motion at an end is too fast.
+    """
     place, rate = path.value(0.0)
     end = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
     own = limits.share(SHARE if rate.any() else WAY_SHARE)
@@ -182,10 +190,10 @@ def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion |
 
 
 def fitted_path(spec: DroneReference, limits: PathLimits, yaw: float, altitude_max_m: float) -> Reference:
-    """Return the path of a reference at its own speed, or slowed to the limits if `fit` is set.
+    """Return the path of a reference at its own speed or, if `fit` is set, slowed to satisfy the limits.
 
     Raises:
-        FlightError: the path is invalid, too fast, too low or too high; names the field.
+        FlightError: the path is invalid, too fast, too low or too high; the error names the field.
     """
     (kind,) = spec.paths()
     try:
@@ -206,7 +214,7 @@ def fitted_path(spec: DroneReference, limits: PathLimits, yaw: float, altitude_m
 
 
 def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Reference]]:
-    """Return the constructors of the kinds of path; `yaw` is the default heading [rad]."""
+    """Return the constructor for each kind of path; `yaw` is the default heading [rad]."""
     base = np.array([0.0, 0.0, 0.0, yaw])
 
     def expressions() -> Reference:
@@ -232,7 +240,7 @@ def _turned(at: tuple[Array, Array], yaw: float) -> tuple[Array, Array]:
 
 
 def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
-    """Return points as the waypoints of a `WaypointTrajectory`."""
+    """Return points in the form that `WaypointTrajectory` takes."""
     named = []
     for point in points:
         values: dict[str, float] = dict(zip(PLACE_NAMES, point.position_m, strict=False))
@@ -243,7 +251,7 @@ def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
 
 
 def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
-    """Return the minimum-snap path through points, at rest until the time of the first; yaw turns the shorter way."""
+    """Return the minimum-snap path through points, at rest until the time of the first, turning the shorter way."""
     places = np.empty((len(points), 4))
     for row, point in zip(places, points, strict=True):
         wanted = yaw if point.yaw_deg is None else math.radians(point.yaw_deg)
@@ -273,7 +281,7 @@ def _polynomials(spec: DroneReference) -> Reference:
 
 
 def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, now: str) -> str:
-    """Return a text on the quantity beyond the limits, and the factor that would satisfy them."""
+    """Return the error text on the quantity that exceeds its limit most."""
     shares = [own / most for own, most in zip(peaks[:4], limits, strict=True)]
     weighed = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # weighted as in `Peaks.factor`
     worst = int(np.argmax(weighed))
@@ -299,7 +307,9 @@ def _check_heights(path: Reference, altitude_max_m: float) -> None:
 
 
 def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight]:
-    """Return the flights of an exchange by drone: each stage assigned, straight, in common time.
+    """Return the flights of an exchange by drone.
+
+    In each stage the drones, assigned to the goals, fly straight lines that start and end at the same times.
 
     Raises:
         FlightError: a stage is too fast, too low, or starts too early.
@@ -356,7 +366,7 @@ def land_s_of(flown: Piloted) -> float:
 
 
 def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Yield path and text of the faults of all references, and of distances that are too small.
+    """Yield the path and text of each fault of a reference, and of each distance that is too small.
 
     Distances are checked between flights, and to formations once these have certainly reached their planned motion.
     """
@@ -384,12 +394,12 @@ def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
 
 
 def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
-    """Return the pair of drones whose flights come too close, None if none do."""
+    """Return a text on the first pair of drones whose flights come too close, None if none do."""
     names = [*flights]
     try:
         clearance = np.array([_clearance_m(scenario, name) for name in names])
     except (NotTrustedError, DocumentError):
-        return None  # the clearance of a user's vehicle, whose file is not loaded here
+        return None  # the clearance of a user's vehicle is unknown, since its file is not loaded here
     ends = [flight.duration_s for flight in flights.values()]
     until_s = min(max((scenario.duration_s if end is None else end for end in ends), default=0.0), scenario.duration_s)
     if len(names) < 2 or until_s <= 0.0:
@@ -404,10 +414,10 @@ def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
 
 
 def checked_flight(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone; for the first drone with one, all flights of the scenario are checked.
+    """Return the flight of a drone, checked; for the first drone that has one, all flights of the scenario are checked.
 
     Raises:
-        RunError: the flight is impossible.
+        RunError: a flight is impossible, or two come too close.
     """
     try:
         flight = flight_of(scenario, drone)
@@ -421,7 +431,7 @@ def checked_flight(scenario: Scenario, drone: str) -> Flight:
 
 
 class Approach(NamedTuple):
-    """Two paths that come too close: their indices in the list, the distance [m], and when [s]."""
+    """Two paths that come too close: their indices, the distance [m], and its time [s]."""
 
     first: int
     second: int
@@ -430,13 +440,13 @@ class Approach(NamedTuple):
 
 
 def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -> Approach | None:
-    """Return the first pair of paths, in time, that comes closer than allowed, to a millimetre; None if none does.
+    """Return the first pair of paths in time that comes closer than allowed, to within a millimetre; None if none does.
 
-    Over an interval, the distance of a pair is at least the mean of its values at both ends less half of the interval
-    times the sum of both peak speeds; where this bound is too small, the interval is halved.
+    In an interval, the distance between two paths is at least the mean of its values at both ends minus half the
+    interval times the sum of the peak speeds; where this bound is too small, the interval is halved.
 
     Args:
-        least_m: (n,) clearance of each drone; the minimum distance of a pair is the sum of both.
+        least_m: clearance of each drone, (n,); the minimum distance of a pair is the sum of its clearances.
     """
     from scipy.spatial import KDTree
 
@@ -461,7 +471,7 @@ def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -
 def _nearer(
     a: Reference, b: Reference, speed: float, least_m: float, from_s: float, to_s: float
 ) -> tuple[float, float] | None:
-    """Return the first distance below least_m found from from_s to to_s, and its time; None if none is found."""
+    """Return the first distance below least_m between from_s and to_s, and its time; None if there is none."""
 
     def apart(t_s: float) -> float:
         return el.distance(a.value(t_s)[0][:3].tolist(), b.value(t_s)[0][:3].tolist())
@@ -482,19 +492,20 @@ def _nearer(
 def _meetings(
     scenario: Scenario, flights: Mapping[str, Reference], until_s: Mapping[str, float]
 ) -> Iterator[tuple[str, str]]:
-    """Yield path and text of each formation's first meeting with a drone that has a reference.
+    """Yield the path and text of each formation's first meeting with a drone that has a reference.
 
     Args:
-        flights: by drone, references (4,) over simulated time; until_s: landing times by drone.
+        flights: flights by drone.
+        until_s: landing times by drone.
     """
-    from zsim_agents.formation.engagement_setup import planned_motion  # here, because few scenarios have both
+    from zsim_agents.formation.engagement_setup import planned_motion  # imported here because few scenarios have both
 
     for index, cluster in enumerate(scenario.clusters if flights else ()):
         try:
             planned = planned_motion(scenario, cluster)
             clearance = {name: _clearance_m(scenario, name) for name in (*flights, *cluster.drones)}
         except (NotTrustedError, DocumentError, RunError, UserCodeError):
-            continue  # reported by the check of its plan, or user code that is not loaded here
+            continue  # reported by the check of the plan, or due to user code that is not loaded here
         if planned is None:
             continue
         own_m = max(clearance[name] for name in cluster.drones)
@@ -510,7 +521,7 @@ def _meetings(
 def _meeting(
     planned: PlannedMotion, flight: Reference, until_s: float, least_m: float
 ) -> tuple[float, float, int] | None:
-    """Return when a drone is first too close to a robot, the distance and the robot's index; None if never."""
+    """Return the time when a drone is first too close to a robot, their distance and the robot; None if never."""
     from_s, to_s = planned.from_s + LATE_S, min(planned.until_s, until_s)
     for t_s in np.arange(from_s, to_s, LOOK_S).tolist():
         if float(_distances(planned, flight, t_s).min()) >= least_m + NEARER_M:

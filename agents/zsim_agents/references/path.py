@@ -1,9 +1,10 @@
 """Paths of one drone: position and rate over time, their peaks, and the duration that satisfies limits. Pure.
 
-Minimum-snap polynomials; and circle, helix and figure-8, flown in laps that begin and end at rest on the curve.
+Paths are minimum-snap polynomials, or a circle, helix or figure-8 flown in laps that begin and end at rest on the
+curve.
 
-A path is a `Reference` of four variables, x, y, z [m, W] and yaw [rad, not wrapped]; time is in seconds from its start,
-and outside [0, duration_s] it stands still at the nearest end.
+A path is a `Reference` of four variables, x, y, z [m; W] and yaw [rad, not wrapped]. Time is in seconds from its start;
+outside [0, duration_s] it stays at its nearer end.
 """
 
 from __future__ import annotations
@@ -22,27 +23,29 @@ from zsim.math import linear
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
-DEGREE = 7  # degree of a piece, as in the files of uav_trajectories: the minimum that allows position, velocity,
-# acceleration and jerk to be prescribed at both ends
+# Degree of a piece, as in the files of uav_trajectories: the minimum that allows position, velocity, acceleration and
+# jerk to be prescribed at both ends
+DEGREE = 7
 ENDS = 3  # number of derivatives prescribed at each end of a path
-BELOW, ABOVE = 11, 3  # diagonals of the equations of a minimum-snap path, ordered from piece to piece
-PEAK_SAMPLES = 64  # samples per piece in the search for its maximum speed
+BELOW, ABOVE = 11, 3  # diagonals below and above the main one in the equations of a minimum-snap path, piece by piece
+PEAK_SAMPLES = 64  # samples per piece in the search for its peaks
 GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
-GOLDEN_STEPS = 40  # each leaves 0.62 of the interval: 1e-10 of a piece in all
-SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths; peaks are then refined
+GOLDEN_STEPS = 40  # steps of a golden-section search; each leaves 0.62 of the interval, all leave 1e-10 of a piece
+SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths, before peaks are refined
 HORIZON_S = 600.0  # part of an endless path that is searched for peaks
-DIFFERENCE_S = 1e-4  # of rates, for an acceleration: exact to 1e-7 of it in motions of a second
-FACTOR_DIGITS = 3  # of the factor of a fit, rounded up
-SHARE = 0.8  # share of the drone's limits, as in formations; the rest is left to the feedback
-LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1  # of a move: 25 gates, however short; an hour; step of the search
-STILL = 1e-9  # values below this count as standstill [m, m/s or rad/s]
-RAMP = 0.25  # of a lap's time, in which the speed along the curve rises from rest, and falls again; chosen
+DIFFERENCE_S = 1e-4  # step of central differences of rates; relative error 1e-7 in motions with time scales of 1 s
+FACTOR_DIGITS = 3  # decimals of the factor of a fitted path, which is rounded up
+SHARE = 0.8  # usable share of the drone's limits, as in formations; the feedback has the rest
+# Minimum duration of a move (25 gates), maximum duration, and growth of the duration in the search between
+LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1
+STILL = 1e-9  # value below which a quantity counts as zero
+RAMP = 0.25  # duration of speeding up from rest, or of slowing down, over that of a lap
 Curve = Callable[[float], tuple[Array, Array]]
 """Maps the angle [rad] to the position (4,) and its derivative with respect to the angle."""
 
 
 class PathLimits(NamedTuple):
-    """Limits of a path: horizontal and vertical speed, turn rate, horizontal acceleration."""
+    """Limits of a path: horizontal speed, vertical speed, yaw rate and horizontal acceleration."""
 
     speed_m_s: float
     climb_m_s: float
@@ -54,7 +57,7 @@ class PathLimits(NamedTuple):
 
 
 class Peaks(NamedTuple):
-    """The maximum of each quantity of `PathLimits` on a path, and when it is reached [s]."""
+    """The maximum of each quantity of `PathLimits` on a path, and the time when it is reached [s]."""
 
     speed_m_s: float
     climb_m_s: float
@@ -63,17 +66,17 @@ class Peaks(NamedTuple):
     at_s: tuple[float, float, float, float]
 
     def factor(self, limits: PathLimits) -> float:
-        """Return the factor of the duration that just satisfies the limits; below 1 if the path may be faster."""
+        """Return the factor by which to stretch the duration to just satisfy the limits; below 1: it may shrink."""
         speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
-        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # speed scales as 1/t, acceleration as 1/t^2
+        return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # acceleration scales as 1/t^2
 
 
 class PiecewisePolynomial:
-    """A sequence of polynomials of local time.
+    """A sequence of polynomials in local time.
 
     Args:
         durations_s: durations of the pieces, (m,).
-        coefficients: of t^0 to t^7 in x, y, z, yaw, (m, 8, 4).
+        coefficients: coefficients of t^0 to t^7 for x, y, z and yaw, (m, 8, 4).
     """
 
     def __init__(self, durations_s: Array, coefficients: Array) -> None:
@@ -88,7 +91,7 @@ class PiecewisePolynomial:
         piece = bisect.bisect_right(self._begins, clamped) - 1
         local = clamped - self._begins[piece]
         place, rate = [], []
-        for highest, *others in self._axes[piece]:  # plain floats: numpy takes five times as long
+        for highest, *others in self._axes[piece]:  # plain floats, since numpy takes five times as long
             value, slope = highest, 0.0
             for coefficient in others:
                 slope = slope * local + value
@@ -98,17 +101,17 @@ class PiecewisePolynomial:
         return np.array(place), np.array(rate) if clamped == t_s else np.zeros(4)
 
     def until(self, end_s: float) -> PiecewisePolynomial:
-        """Return the part before end_s > 0."""
+        """Return the part of the path before end_s > 0."""
         count = bisect.bisect_left(self._begins, end_s)
         durations = self.durations_s[:count].copy()
         durations[-1] = min(durations[-1], end_s - self._begins[count - 1])
         return PiecewisePolynomial(durations, self.coefficients[:count])
 
     def peaks(self) -> Peaks:
-        """Return the peaks over all pieces, their times to 1e-10 of a piece."""
+        """Return the peaks over all pieces, with times accurate to 1e-10 of a piece."""
         greatest = [(0.0, 0.0)] * 4
         for begin_s, duration_s, own in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
-            unit = own * _powers(duration_s, len(own))[:, None]  # in local time from 0 to 1, which is well scaled
+            unit = own * _powers(duration_s, len(own))[:, None]  # in local time from 0 to 1, for good scaling
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
@@ -168,14 +171,15 @@ def at_rest() -> EndMotion:
 def minimum_snap(
     times_s: Sequence[float], places: Array, begin: EndMotion | None = None, end: EndMotion | None = None
 ) -> PiecewisePolynomial:
-    """Return the path through places (m, 4) at given times with the minimum integral of the squared fourth derivative.
+    """Return the path through positions at given times with the minimum integral of the squared fourth derivative.
 
-    With the derivatives up to the third prescribed at both ends, zero by default, it is the spline of degree 7:
-    Mellinger and Kumar, ICRA 2011, for the cost; Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947, for the spline.
-    From rest to rest over one second it is 35 t^4 - 84 t^5 + 70 t^6 - 20 t^7.
+    With the first three derivatives prescribed at both ends, zero by default, it is the spline of degree 7. The cost is
+    that of Mellinger and Kumar, ICRA 2011; for the spline see Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947. From 0
+    to 1 in one second, at rest at both ends, it is 35 t^4 - 84 t^5 + 70 t^6 - 20 t^7.
 
     Args:
-        times_s: increasing, (m,); the first is the start of the path.
+        times_s: increasing times, (m,), of which the first is the start of the path.
+        places: x, y, z [m; W] and yaw [rad], (m, 4).
     """
     ends = begin or at_rest(), end or at_rest()
     spans = np.diff(np.asarray(times_s, float))
@@ -186,7 +190,7 @@ def minimum_snap(
     diagonals, b = np.zeros((m * size, BELOW + 1 + ABOVE)), np.zeros((m * size, 4))
 
     def put(row: int, piece: int, values: Array, first: int = 0) -> None:
-        """Write the entries of a row for a piece's coefficients from t^first on."""
+        """Write a row's entries for the coefficients of a piece from t^first on."""
         at = piece * size + first - row + BELOW
         diagonals[row, at : at + len(values)] = values
 
@@ -211,7 +215,7 @@ def minimum_snap(
     for d in range(1, ENDS + 1):
         put(row + d - 1, m - 1, slopes[d])
         b[row + d - 1] = ends[1][d - 1] * el.power(spans[-1], float(d))
-    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # in local time from 0 to 1: well scaled
+    unit = linear.solve_banded(diagonals, BELOW, b).reshape(m, size, 4)  # in local time from 0 to 1, as in `peaks`
     scale = np.array([_powers(span, size) for span in spans.tolist()])
     return PiecewisePolynomial(spans, unit / scale[:, :, None])
 
@@ -224,10 +228,9 @@ def move(
     begin: EndMotion | None = None,
     end: EndMotion | None = None,
 ) -> PiecewisePolynomial:
-    """Return the minimum-snap path from one position (4,) to another within limits.
+    """Return the minimum-snap path from one position and yaw (4,) to another within limits, turning the shorter way.
 
-    It lasts over_s, or longer if the limits require. It begins and ends at rest, or in the given motions.
-    The yaw takes the shorter turn.
+    It lasts over_s, or longer if the limits require. It begins and ends at rest or in the given motions.
 
     Raises:
         TrajectoryError: no path of less than an hour satisfies the limits, usually since an end's motion exceeds them.
@@ -238,7 +241,7 @@ def move(
         unit = minimum_snap((0.0, 1.0), places).peaks().factor(limits)
         return minimum_snap((0.0, max(over_s, LEAST_S, round_up(unit))), places)
     length_s = max(over_s, LEAST_S)
-    while length_s < MOVE_MAX_S:  # motions at the ends do not scale with the duration: there is no factor
+    while length_s < MOVE_MAX_S:  # no factor exists: the motions at the ends do not scale
         path = minimum_snap((0.0, length_s), places, begin, end)
         if path.peaks().factor(limits) <= 1.0:
             return path
@@ -253,7 +256,7 @@ def round_up(factor: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A path flown `factor` times as slowly, displaced by an origin (4,)."""
+    """A path flown `factor` times as slowly and shifted to an origin (4,)."""
 
     of: Reference
     factor: float
@@ -276,7 +279,7 @@ class Scaled:
 
 
 def peaks_of(path: Reference) -> Peaks:
-    """Return the peaks of any path: exact for polynomials, refined between samples for others."""
+    """Return the peaks of a path: its own if it has any, or else found by sampling and refinement."""
     own: Callable[[], Peaks] | None = getattr(path, "peaks", None)
     if own is not None:
         return own()
@@ -297,7 +300,7 @@ def peaks_of(path: Reference) -> Peaks:
 
 
 def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -> tuple[float, float]:
-    """Return the maximum of a quantity near its largest sample, and its time."""
+    """Return the maximum of a quantity near its largest sample, and the time of the maximum [s]."""
     from scipy.optimize import minimize_scalar
 
     best = int(np.argmax(samples))
@@ -310,7 +313,7 @@ def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -
 
 
 def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
-    """Return a circle around the origin, counter-clockwise from (radius, 0), with a climb per lap."""
+    """Return a circle around the origin, counter-clockwise from (radius, 0), which climbs by climb_m per lap."""
 
     def at(angle: float) -> tuple[Array, Array]:
         c, s, rise = radius_m * el.cos(angle), radius_m * el.sin(angle), climb_m / math.tau
@@ -320,7 +323,7 @@ def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
 
 
 def figure_eight(length_m: float, width_m: float) -> Curve:
-    """Return the lemniscate of Gerono with its length along x, starting at its crossing in the origin."""
+    """Return the lemniscate of Gerono with its length along x, starting at its crossing, the origin."""
 
     def at(angle: float) -> tuple[Array, Array]:
         x, y = length_m / 2.0, width_m / 2.0
@@ -331,9 +334,9 @@ def figure_eight(length_m: float, width_m: float) -> Curve:
 
 
 class Laps:
-    """A curve flown for a number of laps of period_s each, plus a quarter of a period for start and stop.
+    """A curve flown for a number of laps of period_s each, from rest to rest; RAMP adds a quarter of a period.
 
-    The angular rate follows a quintic at both ends, so that acceleration and jerk are zero there too.
+    The angular rate follows a quintic at both ends, so that acceleration and jerk are zero there as well.
     """
 
     def __init__(self, curve: Curve, period_s: float, laps: float) -> None:
@@ -354,7 +357,7 @@ class Laps:
         return place, slope * rate
 
     def _begun(self, t: float) -> tuple[float, float]:
-        """Return angle and rate, time t after starting from rest."""
+        """Return the angle [rad] and angular rate [rad/s] at a time t [s] after the start from rest."""
         s = t / self._ramp_s
         if s >= 1.0:
             return self._rate * (t - 0.5 * self._ramp_s), self._rate

@@ -3,10 +3,10 @@
 The flight is a function of simulated time and of the newest request on `drone/{d}/control`:
 
 takeoff, land
-hold: come to rest and stay there
-goto {position_m, yaw_deg, speed_m_s}: fly there at a cruise speed, by default as fast as the limits allow, and stop
-goto {places_m, yaw_deg, speed_m_s, radius_m}: fly through positions, each passed within radius_m; 0: stop at each
-goto {position_m, yaw_deg, over_s}: fly there in over_s, on a minimum-snap path
+hold: come to rest and hover
+goto {position_m, yaw_deg, speed_m_s}: fly to a position at a cruise speed (default: the limits) and stop there
+goto {places_m, yaw_deg, speed_m_s, radius_m}: fly through positions, passing each within radius_m; 0: stop at each
+goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path that takes over_s
 follow {minimum_snap: [...], fit: true, ...}: fly to the start of a path, then along it; fields: FOLLOWED
 """
 
@@ -45,11 +45,11 @@ from zsim_agents.references.flight import (
 )
 from zsim_agents.references.path import EndMotion, PathLimits, move
 
-REQUESTS_MAX = 1000  # maximum number between two gates, as for a controller
+REQUESTS_MAX = 1000  # maximum number of requests between two gates, as for a controller
 PLAIN = ("takeoff", "land", "hold")
 OPERATIONS = (*PLAIN, "goto", "follow")
 OF_EXPRESSIONS = ("constants", "duration_s")
-FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # others are for a scenario's flight
+FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # a reference's other fields are for scenarios
 
 
 class ReferencePilot(Agent):
@@ -72,7 +72,7 @@ class ReferencePilot(Agent):
         self._reference_key, self._request_key = keys.reference(drone), keys.drone_request(drone)
         self.writes, self.repeats = (self._reference_key,), (self._request_key,)
         self._flight = checked_flight(scenario, drone)
-        self._asked: tuple[float, str, dict[str, Any], list[float], list[float]] | None = None  # last granted
+        self._asked: tuple[float, str, dict[str, Any], list[float], list[float]] | None = None  # last request granted
         self._takeoff_s, self._land_s = self._settings.takeoff_s, land_s_of(self._settings)
         self._has_flown = self._is_over = False
         self._mode_ns = -round(RESEND_S * 1e9)
@@ -92,7 +92,7 @@ class ReferencePilot(Agent):
         if self._state in AIRBORNE:
             self._has_flown = self._has_flown or not self._is_over
         elif self._has_flown and self._state in ("landed", "emergency"):
-            self._is_over = True  # also after a landing by another commander: the drone stays down until a request
+            self._is_over = True  # whoever landed the drone: it takes off again only on request
         if not self._is_over:
             outputs += self._commands(t_ns, t_s)
         place, rate = self._flight.value(t_s)
@@ -129,12 +129,12 @@ class ReferencePilot(Agent):
             return self._mode(t_ns, "land")
         estimate = self._estimate
         if estimate is None or t_ns - estimate.t_ns > AGE_MAX_S * 1e9:
-            return []  # without commands the firmware soon holds its position
+            return []  # without commands the firmware soon holds the drone's position
         velocity, yaw_rate = self._velocity(t_s, estimate, (t_ns - estimate.t_ns) * 1e-9)
         return [self.command(t_ns, self._drone, Velocity(0, 0, "", velocity, yaw_rate, "world"))]
 
     def _velocity(self, t_s: float, estimate: Estimate, age_s: float) -> tuple[tuple[float, float, float], float]:
-        """Return the velocity [m/s; W] and yaw rate [rad/s] that track the reference, within the drone's limits."""
+        """Return the velocity [m/s; W] and yaw rate [rad/s] that track the reference within the drone's limits."""
         place, _ = self._flight.value(t_s)
         _, ahead = self._flight.value(t_s + self._settings.lead_s)
         x, y, z = (at + moving * age_s for at, moving in zip(estimate.position_m, estimate.velocity_m_s, strict=True))
@@ -142,7 +142,7 @@ class ReferencePilot(Agent):
         return velocity_towards(place.tolist(), ahead.tolist(), here, self._limits, self._settings)
 
     def _mode(self, t_ns: int, mode: Any) -> list[Output]:
-        """Return a mode command, repeated every RESEND_S until it has an effect."""
+        """Return a mode command, or nothing within RESEND_S of the last one."""
         if t_ns - self._mode_ns < RESEND_S * 1e9:
             return []
         self._mode_ns = t_ns
@@ -154,7 +154,7 @@ class ReferencePilot(Agent):
         return (keys.drone_control(self._drone),)
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
-        """Handle a request; it takes effect from the next gate on."""
+        """Handle a request, which takes effect at the next gate."""
         if len(self._answered) >= REQUESTS_MAX:
             return ControlAnswer(ok=False, error=f"{key}: {REQUESTS_MAX} requests wait for the next gate; ask after it")
         try:
@@ -247,11 +247,11 @@ def _vector(place: Array) -> tuple[float, float, float]:
 
 
 class DroneRequestError(ValueError):
-    """A request that is invalid or cannot be carried out now; the text names the field, finding and remedy."""
+    """A request that is invalid or cannot be carried out now; the text names the field, the finding and the remedy."""
 
 
 class Goto(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A position in W to fly to, or several in sequence."""
+    """A position [m; W] to fly to, or several in sequence."""
 
     position_m: Position | None = None
     places_m: Annotated[list[Position], Meta(max_length=POINTS_MAX)] = []
@@ -268,7 +268,11 @@ Asked = Literal["takeoff", "land", "hold"] | Goto | DroneReference
 
 
 def read_request(op: str, args: Mapping[str, Any]) -> Asked:
-    """Return the request; DroneRequestError: `op` is not in OPERATIONS, or its arguments are not allowed."""
+    """Return a request from its operation and arguments.
+
+    Raises:
+        DroneRequestError: `op` is not in OPERATIONS, or its arguments are not allowed.
+    """
     if op not in OPERATIONS:
         raise DroneRequestError(f"is unknown; allowed: {', '.join(OPERATIONS)}")
     if op in PLAIN:
@@ -296,7 +300,7 @@ def read_request(op: str, args: Mapping[str, Any]) -> Asked:
 
 
 def _unused(asked: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a fault for each field that a request may not have."""
+    """Yield the faults of the fields that are not allowed in a request."""
     for name, value in args.items():
         if name not in FOLLOWED:
             yield f"{name} is {show(value)}; must be left out of a request"
@@ -305,7 +309,11 @@ def _unused(asked: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
 
 
 def requested_flight(asked: Any, t_s: float, place: Array, rate: Array, drone: Drone, limits: PathLimits) -> Flight:
-    """Return the flight requested at t_s from a position and rate, both (4,); FlightError: the flight is impossible."""
+    """Return the flight requested at t_s, which begins with the present position and its rate, both (4,).
+
+    Raises:
+        FlightError: the flight is impossible.
+    """
     begin = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
     if isinstance(asked, DroneReference):
         path = fitted_path(asked, limits, float(place[3]), drone.limits.altitude_m)
