@@ -1,6 +1,6 @@
 """The participants of the lockstep, their progress, and those that the world waits for.
 
-Pure bookkeeping without session or clock; wall times are passed in. To integrate from t on, the world needs the done of
+Pure bookkeeping without session or clock: wall times are passed in. To integrate from t, the world needs the done of
 every gating participant for t minus the command delay. The done of a participant with slack may be older by the slack.
 """
 
@@ -25,22 +25,22 @@ class Participant:
     join: Join
     from_ns: int  # first gate at which the world waits for it
     done_ns: int = -1  # newest gate that it has completed
-    surplus: int = 0  # number of outputs that have arrived since its last done
-    missing: int = 0  # number of outputs that its dones counted but that have not arrived
-    done_seq: int | None = None  # sequence number of its newest done, None before the first one of its process
+    surplus: int = 0  # outputs that have arrived since its last done
+    missing: int = 0  # outputs that its dones counted but that have not arrived
+    done_seq: int | None = None  # sequence number of its newest done; None before its process's first
     lost_done: bool = False  # a done was lost, and with it the count of the preceding outputs
     was_incomplete: bool = False  # outputs were missing at the last gate, in realtime
     rejoined: bool = False  # another incarnation of this name joined before
-    repeats: bool = False  # it may again publish outputs that were already counted
-    successor: bool = False  # it has replaced a process that was alive
+    repeats: bool = False  # it may republish outputs that were already counted
+    successor: bool = False  # it replaced a living process
     alive: bool = True
     since_wall_ns: int = 0  # when it last joined, sent a done or died
     joined_wall_ns: int = 0  # when this incarnation joined
     deadline_misses: int = 0  # number of dones that were late in realtime
     away: bool = False  # it has not yet rejoined a restarted world
     silent_wall_ns: int | None = None  # when its last health message arrived, if it has been silent since
-    # Its bye, if that names no incarnation and may therefore come from another process: it takes effect when the token
-    # is lost, and the next done cancels it
+    # A bye that names no incarnation and so may come from another process: it takes effect when the token is lost, and
+    # the next done cancels it.
     farewell: Bye | None = None
 
     def __str__(self) -> str:
@@ -48,12 +48,12 @@ class Participant:
 
     @property
     def place(self) -> dict[str, Any]:
-        """Return the host and process id, for the data of an event."""
+        """The host and process id, for the data of an event."""
         return {"host": self.join.host, "pid": self.join.pid}
 
     @property
     def is_missed(self) -> bool:
-        """Return whether it is dead, silent or away."""
+        """Whether it is dead, silent or away."""
         return not self.alive or self.away or self.silent_wall_ns is not None
 
     @property
@@ -75,11 +75,11 @@ class Participant:
 
     @property
     def incomplete(self) -> bool:
-        """Return whether some of its outputs, or a done, were lost or are still in transit."""
+        """Whether outputs or a done of it were lost or are still in transit."""
         return self.missing > 0 or self.lost_done
 
     def required_ns(self, need_ns: int) -> int | None:
-        """Return the newest gate whose done `need_ns` requires of it, None if it requires none yet."""
+        """Return the newest done that `need_ns` requires of it; None if none is required yet."""
         join = self.join
         if join.period_ns > 0:
             required = need_ns - need_ns % join.period_ns
@@ -97,15 +97,15 @@ class Participant:
     def reset_counts(self) -> int:
         """Reset the counts after lost outputs were requested again; return how many are still missing.
 
-        A surplus would hide the next loss, since no outputs of the next done arrive while some are missing. Outputs
-        that are repeated after a rejoin may have been counted before, and are then not missing.
+        A remaining surplus would hide the next loss: no outputs of the next done arrive while some are missing.
+        Outputs repeated after a rejoin may have been counted before; those are not missing.
         """
         missing = 0 if self.repeats else self.missing
         self.missing, self.surplus, self.lost_done, self.repeats = 0, 0, False, False
         return missing
 
     def waiting(self, wall_ns: int, held_by: tuple[str, ...] = (), since_ns: int | None = None) -> Waiting:
-        """Return its entry in `clock`, waited for since its last done, join or death, or since `since_ns`."""
+        """Return its entry in `clock`, waited for since `since_ns`, by default since its last done, join or death."""
         since_ns = self.since_wall_ns if since_ns is None else since_ns
         return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9, held_by)
 
@@ -114,7 +114,7 @@ class Barrier:
     """The participants of a run.
 
     Args:
-        run_id: id of the run; joins and dones for other runs are refused.
+        run_id: id of this run; joins and dones of other runs are refused.
         gate_ns: gate interval [ns]; every period is a multiple of it.
         expected: names of the processes required at the start.
     """
@@ -136,8 +136,8 @@ class Barrier:
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> Refusal | None:
         """Admit a participant; return the refusal, or None.
 
-        A new incarnation of a known name continues from the progress of the former one. A participant that does all the
-        work of dead ones replaces them and continues from theirs. Repeating a join has no effect.
+        A new incarnation of a known name continues from the progress of the former one; likewise, a participant that
+        does all the work of dead participants replaces them and continues from theirs. Repeating a join has no effect.
         """
         if refusal := self.join_refusal(name, message):
             return refusal
@@ -177,7 +177,7 @@ class Barrier:
         return [p for p in self.participants.values() if not p.alive and p.name != name and p.served_names <= served]
 
     def join_refusal(self, name: str, message: Join) -> Refusal | None:
-        """Return the refusal of a join that does not fit the run, or None."""
+        """Return the refusal of a join that does not fit this run, or None."""
         if name == WORLD or not keys.PROCESS_NAME.fullmatch(name):
             return Refusal("name", repr(name[:60]), f"must be a role, a dot and a name of a-z 0-9 _ . -, not {WORLD!r}")
         if message.run_id != self._run_id:
@@ -192,7 +192,7 @@ class Barrier:
     # Dones, outputs and byes
 
     def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
-        """Note that a participant has completed the gate `done_ns`; return the refusal, or None.
+        """Note that a participant has completed the gate `done_ns` of its message; return the refusal, or None.
 
         A gap in the sequence numbers shows that a done was lost. Outputs beyond its count belong to the next done.
         """
@@ -203,7 +203,7 @@ class Barrier:
             return self._run_id_refusal(message.run_id)
         former = participant.done_seq
         if message.incarnation != participant.join.incarnation:
-            if former is not None and message.seq == former + 1:  # a done of another incarnation is refused, not lost
+            if former is not None and message.seq == former + 1:  # this done was refused, not lost
                 participant.done_seq = message.seq
             return _incarnation_refusal(participant, str(message.incarnation))
         if message.done_ns > now_ns:
@@ -220,7 +220,7 @@ class Barrier:
         return None
 
     def count_output(self, name: str) -> None:
-        """Count an output that has arrived from a participant, or under a name that a participant serves."""
+        """Count an output from a participant, or from a process whose work a participant does."""
         participant = self.participants.get(name)
         if participant is None:
             participant = next((each for each in self.participants.values() if name in each.join.serves), None)
@@ -232,9 +232,9 @@ class Barrier:
             participant.surplus += 1
 
     def give_up_late(self) -> None:
-        """At a gate in realtime, treat the outputs that were already missing at the previous gate as lost.
+        """At a gate in realtime, give up outputs that were already missing at the previous gate: they are lost.
 
-        They are not requested again, and would otherwise make every later gate a deadline miss of their sender.
+        They are not requested again; still expecting them would make every later gate a deadline miss of their sender.
         """
         for participant in self.participants.values():
             if participant.incomplete and participant.was_incomplete:
@@ -255,10 +255,7 @@ class Barrier:
         return participant is not None and participant.farewell is not None
 
     def take_back_bye(self, name: str) -> Refusal | None:
-        """Refuse the pending bye of a participant that continues, since another process sent it.
-
-        Return the refusal, None if no bye is pending.
-        """
+        """Drop the bye of a participant that continues, since another process sent it; return its refusal, or None."""
         participant = self.participants[name]
         if participant.farewell is None:
             return None
@@ -266,7 +263,7 @@ class Barrier:
         return _incarnation_refusal(participant, "missing")
 
     def remove(self, name: str) -> None:
-        """Remove a participant that has said bye or is dropped; it is no longer expected."""
+        """Remove a participant that has said bye or is dropped, and stop expecting it."""
         removed = self.participants.pop(name, None)
         gone = (name, *(removed.join.serves if removed else ()))
         self._expected = [expected for expected in self._expected if expected not in gone]
@@ -283,27 +280,27 @@ class Barrier:
         return participant
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
-        """Wait until all participants have rejoined a restarted world."""
+        """In a restarted world, mark participants as away until they rejoin, or as dead if all died with the world."""
         for participant in self.participants.values():
             participant.since_wall_ns = participant.joined_wall_ns = wall_ns
             participant.alive = participant.alive and not all_died
             participant.away = participant.is_waited_for and (participant.alive or all_died)
 
-    # Who takes part, and who is waited for
+    # Presence and waiting
 
     def is_gating(self, name: str) -> bool:
-        """Return whether a process gates; it may be marked dead, since outputs may arrive before it rejoins."""
+        """Return whether a process gates, even if it is marked dead: its outputs may arrive before it rejoins."""
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 
     def substitute(self, name: str) -> Participant | None:
-        """Return a living participant that also does all the work of another, or None."""
+        """Return a living participant that also does all the work of this one, or None."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return next((p for p in others if served <= p.served_names), None)
 
     def duplicates(self, name: str) -> dict[str, set[str]]:
-        """Return, by living participant, the names that it serves in common with this one."""
+        """Return the names that other living participants serve in common with this one, by participant."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return {p.name: both for p in others if (both := served & p.served_names)}
@@ -318,7 +315,7 @@ class Barrier:
         return [p for p in self.participants.values() if p.away]
 
     def blocking(self, need_ns: int) -> list[Participant]:
-        """Return the participants that block `need_ns`."""
+        """Return the participants whose done for `need_ns`, or an output counted by a done, has not arrived."""
         return [p for p in self.participants.values() if p.blocks(need_ns)]
 
     def incomplete(self) -> list[Participant]:
@@ -328,16 +325,17 @@ class Barrier:
     def waiting_for(
         self, need_ns: int, wall_ns: int, start_wall_ns: int, feeds: Callable[[str, str], bool]
     ) -> tuple[Waiting, ...]:
-        """Return the processes that the world waits for as entries of `clock`: absent, then dead, then by waiting time.
+        """Return the processes that the world waits for, as entries of `clock`.
 
-        `feeds(writer, reader)` returns whether the reader may be waiting for the writer's outputs.
+        Absent ones come first, then the dead, then the others, longest waited for first. `feeds(writer, reader)`
+        returns whether the reader may be waiting for the writer's outputs.
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
         awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
         late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
         waiting = []
-        for victim in late:  # it may itself be waiting for outputs of other late processes
+        for victim in late:  # which may itself be waiting for outputs of other late participants
             read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
             others = (p for p in late if p is not victim and p.gating)
             held_by = (p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))

@@ -1,8 +1,8 @@
 """Commands from arrival to firmware: checked, delayed by their link, queued, applied, published as events.
 
-The first source that sends a setpoint to a drone without a commander becomes its commander, until it releases the
-drone, leaves or dies. Commands that take effect at the same time are ordered by (priority of the source, source, seq);
-the last one wins.
+The first source to send a setpoint to a drone without a commander becomes its commander, until it releases the drone,
+leaves or dies. Commands that take effect at the same time are ordered by (priority of the source, source, seq): the
+last wins.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from zsim_world.run.outbox import Refusal, too_many
 from zsim_world.run.run_clock import Operation, number, refused_argument
 
 MISSION_STATES = ("active", "finished", "aborted")
-MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # far more items than autopilots store; one line of text
-PROGRAM = 0  # priority of a program by the contract
-RECENT_PER_DRONE = 32  # commands kept to recognise duplicates; after a rejoin a process repeats those of two gates
+MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # chosen: far more items than autopilots store; one line
+PROGRAM = 0  # priority of a program, by the contract
+RECENT_PER_DRONE = 32  # commands remembered to recognise duplicates; after a rejoin, those of two gates are repeated
 
 
 class CommandIntake:
@@ -34,8 +34,8 @@ class CommandIntake:
 
     Args:
         run: the run whose participants send commands.
-        drivers: drivers of the external drones of the fleet.
-        faults_at: returns the link and radio faults that act at a gate.
+        drivers: drivers of the fleet's external drones.
+        faults_at: returns the link and radio faults that act in a gate.
 
     Attributes:
         queue: pending commands and the commander of each drone.
@@ -57,7 +57,7 @@ class CommandIntake:
     def accept(self, drone: str, kind: str, message: Any) -> bool:
         """Queue a command, or refuse it; return False for a duplicate."""
         source = message.source
-        gating = self._barrier.is_gating(source)  # the name of a participant was checked when it joined
+        gating = self._barrier.is_gating(source)  # the name of such a source was checked when it joined
         if not gating and not keys.PROCESS_NAME.fullmatch(source):
             refusal = Refusal("source", repr(source[:48]), "must be 1 to 48 of a-z 0-9 _ . -")
             return self._refuse("somebody", drone, kind, refusal)
@@ -70,9 +70,9 @@ class CommandIntake:
         gate_ns = message.t_ns if gating else self._clock.next_ns
         late_ns = self._link_delay_ns(drone, kind, message, gate_ns)
         if late_ns is None:
-            return True  # a command that the link loses was sent, so it counts as an output
+            return True  # the link loses it, but it was sent and so counts as an output
         external, delay_ns = index in self._drivers, self._clock.delay_ns
-        if external:  # the real link of an external drone already delays commands
+        if external:  # the drone's real link already delays commands
             gate_ns, delay_ns = min(gate_ns, self._clock.now_ns), 0
         apply_ns = gate_ns + delay_ns + late_ns
         if not gating:  # a rerun repeats these commands from their events
@@ -102,7 +102,7 @@ class CommandIntake:
         return None
 
     def _link_delay_ns(self, drone: str, kind: str, message: Any, gate_ns: int) -> int | None:
-        """Return the delay of a command by link faults [ns], rounded up to whole gates; None if the command is lost.
+        """Return the delay due to faults of the link to the world [ns], in whole gates; None if the command is lost.
 
         `gate_ns` is the gate that the command belongs to.
         """
@@ -134,17 +134,17 @@ class CommandIntake:
         return total_delay_ns(radios, self._scenario.seed, WORLD, key, command.message, distance_m) is NEVER
 
     def _sender(self, drone: str, source: str) -> str:
-        """Return the sender of a command: the drone's controller if the source serves for it, or else the source."""
+        """Return the sender of a command: the source, or the drone's controller if the source hosts it."""
         controller = f"controller.{self._cluster_of.get(drone)}"
         participant = self._barrier.participants.get(source)
         return controller if participant is not None and controller in participant.join.serves else source
 
     def _position_m(self, drone: str) -> list[float] | None:
-        """Return the true position of a drone [m; W], None for an unknown drone."""
+        """Return the true position of a drone [m; W]; None for an unknown drone."""
         i = self._index.get(drone)
         return self._fleet.bodies.state[i, :3].tolist() if i is not None else None
 
-    # When they take effect
+    # Application
 
     def apply(self, t_ns: int) -> None:
         """Pass the commands that take effect at t_ns to the firmware."""
@@ -192,7 +192,7 @@ class CommandIntake:
         return refusal
 
     def _hand_on(self, command: QueuedCommand) -> str | None:
-        """Publish a command for the driver of an external drone; return why it is refused, None if it is accepted."""
+        """Publish a command for the driver of an external drone; return why it is refused, or None."""
         refusal = self._drivers.command_refusal(command.drone, command.kind, command.message)
         if refusal is None:
             self._put_accepted(command.drone, command.kind, command.message)
@@ -211,7 +211,7 @@ class CommandIntake:
             self._fleet.release(i)
 
     def release_all(self, source: str) -> None:
-        """Release the drones commanded by a process that has left or died, so that they hover."""
+        """Release the drones commanded by a process that has left or died; they hover."""
         for i in self.queue.remove_source(source):
             self._release_drone(i)
             self._outbox.event("release", self._fleet.names[i], f"{source} flies it no longer", source=source)
@@ -241,7 +241,7 @@ class CommandIntake:
         return self.queue.acquire(index, request.source, int(priority))
 
     def _report_mission(self, request: ControlRequest, drone: str) -> Refusal | None:
-        """Publish the reported progress of a drone's mission."""
+        """Publish the progress of the mission that a drone's commander reports."""
         args = request.args
         if args.get("state") not in MISSION_STATES:
             return refused_argument(request, "state", f"one of {', '.join(MISSION_STATES)}")
@@ -257,13 +257,13 @@ class CommandIntake:
 
 
 class QueuedCommand(NamedTuple):
-    """A command that takes effect at `apply_ns`; commands are sorted by all fields except the message."""
+    """A command that takes effect at `apply_ns`. Commands are sorted by all fields except the message."""
 
     apply_ns: int
     priority: int
     source: str
     seq: int
-    drone: int  # with kind, makes the order independent of arrival
+    drone: int  # with `kind`, makes the order independent of the arrival
     kind: str
     message: Any
 
@@ -290,16 +290,16 @@ class CommandQueue:
         self._commanders: list[Commander | None] = [None] * len(drones)
         self._priorities: dict[tuple[int, str], int] = {}
         self._queued: dict[int, list[QueuedCommand]] = {}  # by the time at which they take effect
-        self._recent: dict[tuple[int, str, int, str, int], Any] = {}  # by fields that are quick to compare
+        self._recent: dict[tuple[int, str, int, str, int], Any] = {}  # messages by fields that are quick to compare
 
     def restored(self) -> None:
-        """Convert the messages, which are maps in a saved state, to their types."""
+        """Convert the messages, which a saved state stores as maps, to their types."""
         for t_ns, queued in self._queued.items():
             self._queued[t_ns] = [each._replace(message=_command(each.kind, each.message)) for each in queued]
         self._recent = {mark: _command(mark[1], message) for mark, message in self._recent.items()}
 
     def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> bool:
-        """Queue a command that takes effect at apply_ns; return False for a duplicate."""
+        """Queue a command to take effect at `apply_ns`; return False for a duplicate."""
         mark = (drone, kind, apply_ns, message.source, message.seq)
         if self._recent.get(mark) == message:
             return False
@@ -312,7 +312,7 @@ class CommandQueue:
         return True
 
     def pop(self, t_ns: int, drones: Container[int] | None = None) -> list[QueuedCommand]:
-        """Remove and return the commands to all or some drones that take effect up to t_ns, in order of effect."""
+        """Remove and return the commands, of all or some drones, that take effect up to t_ns, in order of effect."""
         instants = sorted([instant for instant in self._queued if instant <= t_ns])
         due = [command for instant in instants for command in sorted(self._queued.pop(instant), key=_order)]
         if drones is None:
@@ -327,7 +327,7 @@ class CommandQueue:
         return [commander.source if commander else None for commander in self._commanders]
 
     def refusal(self, command: QueuedCommand) -> Refusal | None:
-        """Return why the source may not command the drone now, None if it may."""
+        """Return why the source may not command the drone now; None if it may."""
         commander = self._commanders[command.drone]
         if commander is None or commander.source == command.source:
             return None
@@ -337,14 +337,14 @@ class CommandQueue:
         return Refusal(self._names[command.drone], state, "acquire it with a higher priority through world/control")
 
     def claim(self, drone: int, source: str) -> bool:
-        """Make the source the commander if the drone has none; return whether the commander changed."""
+        """Make the source the commander if the drone has none; return whether it became commander."""
         if self._commanders[drone] is not None:
             return False
         self._commanders[drone] = Commander(source, self._priorities.get((drone, source), PROGRAM))
         return True
 
     def acquire(self, drone: int, source: str, priority: int) -> Refusal | None:
-        """Make the source the commander; return the refusal if the present commander has at least its priority."""
+        """Make the source the commander; return the refusal if the present commander's priority is not lower."""
         commander = self._commanders[drone]
         if commander is not None and commander.source != source and priority <= commander.priority:
             state = f"flown by {commander.source!r} with priority {commander.priority}"
@@ -362,11 +362,11 @@ class CommandQueue:
             return Refusal(self._names[drone], state, "only its commander can release it")
         self._commanders[drone] = None
         self._priorities.pop((drone, source), None)
-        self._drop_setpoints(source, [drone])  # a queued setpoint would make the source the commander again
+        self._drop_setpoints(source, [drone])  # a setpoint still queued would make the source the commander again
         return None
 
     def remove_source(self, source: str) -> list[int]:
-        """Remove a source that has left, with its priorities; return the indices of the drones that it commanded."""
+        """Remove a source that has left, with its priorities; return the indices of the drones it commanded."""
         drones = [i for i, commander in enumerate(self._commanders) if commander and commander.source == source]
         for drone in drones:
             self._commanders[drone] = None

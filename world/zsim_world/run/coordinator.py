@@ -1,8 +1,8 @@
 """The part common to a flight (World) and a replay (Playback): participants, requests and the advance of time.
 
-It handles processes that join, report, leave or die. It has neither a session nor a clock: the caller passes in every
-input with its monotonic wall time, checks whether the next gate may come (`may_advance`), advances (`advance`) and
-publishes the outbox.
+It handles processes that join, report, leave or die, without a session or wall clock: the caller passes in every input
+with its monotonic wall time, asks whether time may advance (`may_advance`), advances (`advance`) and publishes the
+outbox.
 """
 
 import math
@@ -27,28 +27,28 @@ from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal,
 from zsim_world.run.run_clock import Operation, RunClock, RunStatistics, number
 
 RECORDER = "recorder"  # name and role
-START_TIMEOUT_S = 60.0  # wall time for expected processes that the launcher does not start
-START_TIMEOUT_OWN_S = 600.0  # wall time for processes that the launcher starts; compiling may take minutes
-FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
-ARGS_BYTES_MAX = 4000  # maximum size of arguments that an event repeats unchanged; every operation needs far less
+START_TIMEOUT_S = 60.0  # wall time, chosen; for expected processes that the launcher does not start
+START_TIMEOUT_OWN_S = 600.0  # wall time, chosen; for processes that the launcher starts: compiling may take minutes
+FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # operations that change a flight
+ARGS_BYTES_MAX = 4000  # maximum size of arguments that an event repeats in full; all operations need far less
 
 
 class Coordinator(ABC):
     """A run from its participants' point of view.
 
     Args:
-        rate: pace in simulated seconds per wall second; 0 = as fast as possible.
-        run_id: set by a launcher, and by tests that compare records.
+        rate: real-time factor, simulated seconds per wall second; 0 = as fast as possible.
+        run_id: set by a launcher, and by tests that compare records; None: random.
         expected: names of the processes required at the start.
 
     Attributes:
         needs_participants: whether the loss of a participant affects the run; False for a replay.
-        refused_queries: keys besides `world/control` on which requests are refused.
+        refused_queries: further keys, beside `world/control`, on which requests are refused.
         external: names of the drones whose drivers publish sensors, truth and status.
         unpaced: names of the processes that step when a driver publishes, not at every gate.
         is_launched: whether a launcher started the run; otherwise users start each process.
-        failure: error to raise once the end is published; None for a run that ended well.
-        left_early: a line for each process that left before the end although the run needed it.
+        failure: the error to raise once the end is published; None while the run has not failed.
+        left_early: a line for each process that the run needed and that left before the end.
         requests: number of requests on `world/control`.
     """
 
@@ -90,7 +90,7 @@ class Coordinator(ABC):
 
     @abstractmethod
     def advance(self, wall_ns: int) -> None:
-        """Advance to the next gate, at first gate 0, and put all its messages into the outbox."""
+        """Advance to the next gate, or publish gate 0, and put all its messages into the outbox."""
 
     @abstractmethod
     def views(self, seq: int) -> Sequence[Output]:
@@ -105,24 +105,24 @@ class Coordinator(ABC):
         """Handle a command to a drone; return False for a duplicate."""
 
     def take_of_driver(self, drone: str, message: Any) -> str | None:
-        """Handle a message of an external drone's driver; return why it is refused, None if it is accepted."""
+        """Handle a message of an external drone's driver; return why it is refused, or None."""
         return None
 
-    def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has none
+    def release_drones(self, name: str) -> None:  # noqa: B027 - a replay has no commanders
         """Release the drones commanded by a process that has left or died."""
 
     def refusal_at(self, key: str) -> str | None:
-        """Return why requests on one of `refused_queries` are refused, None if another process answers them."""
+        """Return why requests on one of `refused_queries` are refused, or None if another process answers them."""
         return f"{key}: is not answered here"
 
     @property
     def now_ns(self) -> int:
-        """Return the time of the newest gate; 0 before the start."""
+        """The newest gate [ns]; also 0 before the start."""
         return self.clock.now_ns
 
     @property
     def ended(self) -> str | None:
-        """Return why the run has ended, None if it has not."""
+        """Why the run has ended; None while it continues."""
         return self.clock.ended
 
     def fail(self, reason: str) -> None:
@@ -155,14 +155,14 @@ class Coordinator(ABC):
         self.barrier.count_output(source)
 
     def give_up_outputs(self, name: str) -> None:
-        """Stop waiting for the lost outputs of a participant."""
+        """Stop waiting for a participant's lost outputs."""
         missing = self.barrier.participants[name].reset_counts()
         if missing:
             text = f"{name}: {missing} of its outputs did not come"
             self.outbox.notice("outputs_missing", name, text, {"missing": missing})
 
     def join(self, name: str, message: Join, wall_ns: int) -> None:
-        """Admit or refuse a process; no budget limits the joins of a process that blocks the clock."""
+        """Admit or refuse a process; its joins are not limited while it blocks the clock."""
         barrier, outbox, counted = self.barrier, self.outbox, f"process/{name}"
         changes, strangers = self.budgets.changes, self.budgets.strangers
         former, replaced = barrier.participants.get(name), barrier.replaced(name, message)
@@ -204,7 +204,7 @@ class Coordinator(ABC):
             outbox.event("doubled", name, text, {"other": other})
 
     def _take_bye(self, name: str, message: Bye, wall_ns: int) -> None:
-        """Remove a participant that says bye; a bye without an incarnation takes effect once the token is lost."""
+        """Remove a participant that says bye; a bye without incarnation takes effect once the token is lost."""
         participant = self.barrier.participants.get(name)
         if participant is None:
             return
@@ -220,8 +220,8 @@ class Coordinator(ABC):
     def _leave(self, participant: Participant, bye: Bye, wall_ns: int) -> None:
         """Handle the bye of a participant that has left or cannot continue.
 
-        An early departure is reported if the scenario needs the participant and no other process does its work. A
-        user's own program may leave when it has finished; a recorder that leaves ends the run.
+        The run fails if the scenario needs the participant and no other process does its work. A user's own program
+        may leave when it has finished; a recorder that leaves ends the run.
         """
         name, role, barrier = participant.name, participant.join.role, self.barrier
         if bye.failed is True and self.clock.ended is None:
@@ -273,7 +273,7 @@ class Coordinator(ABC):
     # Losses
 
     def died(self, name: str, wall_ns: int) -> None:
-        """Handle the loss of a token: its process has left if it said bye, and died otherwise."""
+        """Handle the loss of a token: the process has died, or has left if it said bye."""
         if self._has_left(name, wall_ns):
             return
         participant = self.barrier.mark_dead(name, wall_ns)
@@ -305,7 +305,7 @@ class Coordinator(ABC):
         return roles.on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
     def _may_return(self, participant: Participant) -> bool:
-        """Return whether the run waits for the return of a process that died."""
+        """Return whether the run waits for a dead process to return."""
         return self._on_death(participant) in ("restart", "wait")
 
     def _drop(self, name: str, is_news: bool = True) -> None:
@@ -317,7 +317,7 @@ class Coordinator(ABC):
             self.outbox.event("drop", name, f"{name} is waited for no longer", data)
 
     def overdue(self, wall_ns: int) -> str | None:
-        """Return a process that has not joined, or returned after its death or silence, in time; None if none."""
+        """Return a process that has not joined, or not returned after death or silence, in time; None if none."""
         if self.clock.state == "waiting":
             waited_s = (wall_ns - self.start_wall_ns) / 1e9
             for name in self.barrier.absent():
@@ -335,7 +335,7 @@ class Coordinator(ABC):
         return None
 
     def _start_timeout_s(self, name: str) -> float:
-        """Return how long a run waits for an expected process at its start [s], wall time."""
+        """Return how long a run waits at its start for an expected process [s, wall time]."""
         program = self.scenario.own_programs.get(name)
         for section in (program, self.scenario.processes):
             if section is not None and section.start_timeout_s is not UNSET:
@@ -367,7 +367,7 @@ class Coordinator(ABC):
             self.fail(text)
 
     def silence_changed(self, name: str, since_wall_ns: int | None) -> None:
-        """Note that a process has been silent since its last health message, or publishes health again (None)."""
+        """Note that a process has been silent since its last health message at `since_wall_ns`; None: it is back."""
         participant = self.barrier.participants.get(name)
         if participant is None or not participant.alive:
             return
@@ -379,14 +379,14 @@ class Coordinator(ABC):
             self.outbox.event("silent", name, text, participant.place)
 
     def reader_closed(self, text: str, data: dict[str, Any]) -> None:
-        """Report a reader whose link was closed because it read nothing; the run does not wait for it."""
+        """Report a reader whose link was closed because it stopped reading; the run does not wait for it."""
         if self.budgets.strangers.spend("slow_reader"):
             self.outbox.event("slow_reader", data["address"], text, data)
 
     def falsely_joined(self, name: str, join: Join, fault: str) -> None:
-        """Report a withheld join without a process behind it; a present participant of that name stays.
+        """Report a withheld join without a process behind it; an existing participant of that name stays.
 
-        Joins beyond the budget for events are only counted as refusals.
+        It is published as an event within the budget; beyond it, it is only counted as a refusal.
         """
         if not self.budgets.strangers.spend("no_show"):
             self.outbox.refusals.count += 1
@@ -397,7 +397,7 @@ class Coordinator(ABC):
         self.outbox.event("no_show", name, text, data)
 
     def not_shown(self, name: str, fault: str, wall_ns: int) -> None:
-        """Undo the join of a participant that has given no proof of its existence."""
+        """Undo the join of a participant that has not proved its existence."""
         participant = self.barrier.participants.get(name)
         if participant is None or not participant.alive or self._has_left(name, wall_ns):
             return
@@ -409,10 +409,10 @@ class Coordinator(ABC):
         self._expect_again(participant)
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
-        """In a restarted world, stop time until the participants have rejoined or died.
+        """In a restarted world, stop time until each participant has rejoined or died.
 
         Args:
-            all_died: whether the participants must be restarted as well.
+            all_died: whether all participants died with the world and must be restarted.
         """
         self.statistics.rate.stand_still(wall_ns)
         self.barrier.await_return(wall_ns, all_died)
@@ -422,8 +422,8 @@ class Coordinator(ABC):
     def control(self, request: ControlRequest) -> ControlAnswer:
         """Answer a request on `world/control` and publish it as an event, within the budget of its source.
 
-        Beyond the budget, a request that changes the flight is refused instead of being left out of the events, since a
-        rerun repeats such requests from their events. The event contains the arguments, shortened if too long.
+        Beyond the budget, a request that changes the flight is refused, since a rerun must be able to repeat it from
+        its event. The event has the arguments, shortened if too long.
         """
         self.requests += 1
         op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
@@ -461,7 +461,7 @@ class Coordinator(ABC):
     # Time
 
     def may_advance(self) -> bool:
-        """Return whether the world may advance to the next gate, regardless of pacing."""
+        """Return whether the world may advance to the next gate, apart from pacing."""
         clock = self.clock
         if clock.is_halted or self.barrier.away():
             return False
@@ -474,32 +474,32 @@ class Coordinator(ABC):
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 
     def blocking_clock(self) -> list[Participant]:
-        """Return the participants that block the clock in lockstep, if nothing else stops it."""
+        """Return the participants that block the clock if nothing else does; none outside lockstep."""
         clock = self.clock
         waits = clock.mode == "lockstep" and clock.state == "running" and not clock.is_halted
         return self.blocking() if waits else []
 
     def must_wait_for(self, participant: Participant) -> bool:
-        """Return whether the scenario needs a participant, whose first step may therefore take any time."""
+        """Return whether the scenario needs a participant, so that its first step may take any time."""
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
 
     def waiting_for(self, wall_ns: int) -> tuple[Waiting, ...]:
-        """Return the processes that the world waits for now."""
+        """Return the processes that the world is waiting for."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
             return self.missed(wall_ns)
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self.start_wall_ns, self._data_flow.feeds)
 
     def missed(self, wall_ns: int) -> tuple[Waiting, ...]:
-        """Return the dead, silent and away participants in realtime, in which the world waits for no process."""
+        """Return, in realtime, the participants that are dead, silent or away; the world does not wait for them."""
         if self.clock.mode != "realtime":
             return ()
         missed = (p for p in self.barrier.participants.values() if p.is_missed)
         return tuple(p.waiting(wall_ns, since_ns=p.silent_wall_ns if p.alive else None) for p in missed)
 
     def waiting_to_leave(self, since_end_ns: int = 0) -> tuple[Waiting, ...]:
-        """Return the participants that have not left, and a dead recorder that should return to write the rest."""
+        """Return the participants that have not left, and a dead recorder expected back to finish the record."""
         participants = self.barrier.participants.values()
         waited = [p for p in participants if p.alive or (p.join.slack_ns > 0 and self._may_return(p))]
         return tuple(Waiting(p.name, p.join.host, since_end_ns / 1e9) for p in waited)
@@ -536,7 +536,7 @@ class Coordinator(ABC):
 
 
 class DataFlow:
-    """Which processes read which others' outputs, by the rights of their roles; unknown roles read nothing."""
+    """Which processes read which processes' outputs, by the rights of their roles; unknown roles read nothing."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -544,7 +544,7 @@ class DataFlow:
         self._known: dict[tuple[str, str], bool] = {}
 
     def feeds(self, writer: str, reader: str) -> bool:
-        """Return whether the reader reads outputs of the writer, but not vice versa."""
+        """Return whether `reader` reads outputs of `writer`, and not also the reverse."""
         return self._writes_for(writer, reader) and not self._writes_for(reader, writer)
 
     def _writes_for(self, writer: str, reader: str) -> bool:
@@ -554,6 +554,6 @@ class DataFlow:
                 if name not in self._rights:
                     self._rights[name] = roles.rights_for(name, self._scenario)
             reads, writes = self._rights[reader], self._rights[writer]
-            read = {*reads.reads} - {*reads.writes}  # a process may read its own last values
+            read = {*reads.reads} - {*reads.writes}  # keys that it also writes are read for their last values only
             self._known[pair] = any(roles.permits(read, key) for key in writes.writes if "*" not in key)
         return self._known[pair]

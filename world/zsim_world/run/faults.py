@@ -1,4 +1,4 @@
-"""The injected faults of a run: planned by the scenario or by requests, begun and ended at their gates, published."""
+"""The injected faults of a run: planned by scenario or request, begun and ended at gates, published."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -28,8 +28,8 @@ SELECTORS = ("id", "target", "kind")
 class FaultInjector:
     """The faults of a run, which `effects` applies to the fleet.
 
-    A requested fault begins with the next gate to be integrated, on which no process can have worked yet. Therefore the
-    same faults at the same times give the same bits.
+    A requested fault begins with the next gate to be integrated, on which no process can have worked yet, so that a run
+    with the same faults at the same times gives the same bits.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -48,10 +48,10 @@ class FaultInjector:
         self._kinds = fault_kinds.kinds_of(declarations(run.scenario.drones))
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()
-        self._over: set[int] = set()  # ended or cleared; kept for processes still working on gates at which they acted
+        self._over: set[int] = set()  # ended or cleared, kept for processes still working on earlier gates
         self._count = self._seq = 0
         self._of_links: tuple[Fault, ...] = ()
-        self._of_links_at: dict[int, tuple[Fault, ...]] = {}  # by gate, since the last change or integrated gate
+        self._of_links_at: dict[int, tuple[Fault, ...]] = {}  # cache by gate, emptied at every change and gate
         for planned in run.scenario.faults:
             self._plan(planned, "scenario")
         self._next_ns = self._next_change_ns()
@@ -59,7 +59,7 @@ class FaultInjector:
 
     @property
     def all(self) -> tuple[Fault, ...]:
-        """Return the planned, acting and recently ended faults in order of their ids."""
+        """The planned, acting and recently ended faults, in order of their ids."""
         return tuple(self._faults[number] for number in sorted(self._faults))
 
     def of_links(self, gate_ns: int) -> tuple[Fault, ...]:
@@ -84,10 +84,10 @@ class FaultInjector:
         self._effects.blow(now_ns, next_ns)
 
     def _begin_and_end(self, now_ns: int) -> None:
-        """Begin and end faults, and remove those that ended before any gate that a process may still work on."""
+        """Begin and end faults, and remove those that ended before every gate that may still be worked on."""
         for fault in self.all:
             kind = fault_kinds.KINDS.get(fault.kind)
-            is_instant = kind is not None and kind.lasts == "once"  # ends when it begins
+            is_instant = kind is not None and kind.lasts == "once"  # begins and ends at the same gate
             if fault.id not in self._begun and fault.from_ns <= now_ns:
                 self._begun.add(fault.id)
                 text = "begins"
@@ -110,16 +110,16 @@ class FaultInjector:
         self._next_ns = self._next_change_ns()
 
     def _immunity(self, process: str) -> str | None:
-        """Return why a fault cannot kill a process, None if it can."""
+        """Return why a fault cannot kill a process; None if it can."""
         participant = self._barrier.participants.get(process)
         if participant is None:
-            return None  # the process has not joined yet, or another one does its work
+            return None  # the process has not joined yet, or another process does its work
         if not participant.gating:
             return "takes no part in the lockstep"
         return None if participant.join.fingerprint else "does not run on zsim.runtime.runner"
 
     def _late_ns(self) -> int:
-        """Return how far behind the newest gate a process may be working [ns]: the command delay plus one period."""
+        """Return how far a process may be behind the newest gate: the command delay plus one period [ns]."""
         periods = (p.join.period_ns for p in self._barrier.participants.values())
         return self._clock.delay_ns + max(periods, default=0)
 
@@ -147,7 +147,7 @@ class FaultInjector:
         return ControlAnswer(True, result={"id": fault.id, "from_ns": fault.from_ns, "until_ns": fault.until_ns})
 
     def _refusal(self, args: Mapping[str, Any]) -> Refusal | str | None:
-        """Return why a requested fault is refused, None if it is accepted."""
+        """Return why a requested fault is refused; None if it is accepted."""
         scenario = self._scenario
         drones = tuple(drone.name for drone in scenario.drones)
         clusters = tuple(cluster.name for cluster in scenario.clusters)
@@ -203,7 +203,7 @@ class FaultInjector:
             self._event("fault_clear", cleared, "is cleared", request.source)
         if selected:
             self._publish()
-            self._next_ns = 0  # so that it takes effect before the next gate
+            self._next_ns = 0  # so that the change takes effect before the next gate
         return ControlAnswer(True, result={"cleared": [fault.id for fault in selected]})
 
     # Publication
@@ -211,7 +211,7 @@ class FaultInjector:
     def _publish(self) -> None:
         """Publish the list of faults before the next gate.
 
-        Faults of one kind and target that are to begin at the same time are numbered by their rank.
+        Faults that have not begun and have the same kind, target and start are numbered by their rank.
         """
         equal: Counter[tuple[str, str, int]] = Counter()
         for fault in self.all:
@@ -226,7 +226,7 @@ class FaultInjector:
         self._seq += 1
 
     def restored(self) -> None:
-        """Select the link faults."""
+        """Derive the link faults, which are not saved, from the list of faults."""
         self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
         self._of_links_at.clear()
 

@@ -1,6 +1,7 @@
 """The world of a flight: integrates all drones, owns simulated time, applies commands and faults.
 
-It has neither a session nor a wall clock. `zsim_world.run.coordinator` has the part common to flights and replays.
+It has neither session nor wall clock. `zsim_world.run.coordinator` has what flights and replays share: participants and
+requests.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -37,9 +38,9 @@ class World(Coordinator):
 
     Args:
         mode: "lockstep" or "realtime".
-        rate: pace in simulated seconds per wall second; 0 = as fast as possible.
-        run_id: set by a launcher, and by tests that compare records.
-        changed: overrides of the scenario file in the form `a.b.c=value`, None if unknown.
+        rate: real-time factor, simulated seconds per wall second; 0 = as fast as possible.
+        run_id: set by a launcher, and by tests that compare records; None: random.
+        changed: overrides of the scenario file as `a.b.c=value`; None if unknown.
 
     Raises:
         ScenarioError: the scenario has external drones and the mode is "lockstep".
@@ -77,7 +78,7 @@ class World(Coordinator):
     ) -> None:
         check_pace(scenario, mode)
         super().__init__(scenario, mode, rate, wall_ns, run_id, expected_processes(scenario))
-        if scenario.own_messages():  # messages between agents are read at the gate after their publication
+        if scenario.own_messages():  # agents read at a gate what others published at the previous one
             self.clock.ahead_ns = 0
         self._changed = UNSET if changed is None else tuple(changed)
         self.fleet = Fleet(scenario)
@@ -133,7 +134,7 @@ class World(Coordinator):
     # State
 
     def checkpoint(self) -> State:
-        """Return the state, except for the truth hash, from which the run continues to the same bits.
+        """Return the state from which the run continues to the same bits, without the truth hash.
 
         The outbox must be empty.
         """
@@ -141,7 +142,7 @@ class World(Coordinator):
         return saved_state(self)
 
     def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
-        """Resume the truth hash after its former input `hashed`, and pass all further input to `copy` as well."""
+        """Copy all further input of the truth hash to `copy`; `hashed` is its input so far."""
         self.truth_hash.resume(hashed, copy)
 
     # Inputs
@@ -162,10 +163,10 @@ class World(Coordinator):
     # Time
 
     def advance(self, wall_ns: int) -> None:
-        """Advance to the next gate, at first gate 0, and put all its messages into the outbox.
+        """Advance to the next gate, or publish gate 0, and put all its messages into the outbox.
 
-        Commands and faults are applied before the fleet is integrated. A state that is no longer finite, or a failure
-        of a user's sensor, ends the run at the previous gate; see `failure`.
+        Commands and faults are applied before the fleet is integrated. A state that is no longer finite, or a user's
+        sensor that fails, ends the run at the previous gate and sets `failure`.
         """
         clock, fleet, statistics, now_ns = self.clock, self.fleet, self.statistics, self.clock.now_ns
         is_first = clock.state == "waiting"
@@ -197,7 +198,7 @@ class World(Coordinator):
             self._publish_incidents()
         state = fleet.bodies.state
         self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
-        if self._radio is not None:  # precedes the gate, at which agents start to work
+        if self._radio is not None:  # before the gate, since agents start to work when that arrives
             position_m, seq = state[:, STATE.p_WB : STATE.p_WB + 3], self.outbox.next_seq(keys.RADIO)
             acting = self.faults.of_links(clock.now_ns)
             self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, seq, position_m, acting))

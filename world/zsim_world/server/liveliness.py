@@ -1,4 +1,4 @@
-"""Detects processes that have died, are silent, or do not read from their links, and decides on admission.
+"""Detection of processes that have died, are silent or do not read from their links, and admission of newcomers.
 
 The loss of a liveliness token is verified before it counts as a death.
 """
@@ -19,15 +19,15 @@ from zsim.transport.session import Session
 from zsim_world.run.barrier import Participant
 from zsim_world.run.inputs import Run
 
-BYE_NS = 100_000_000  # wall time within which a bye may follow the loss of a process's token
-RETURN_NS = 5_000_000_000  # wall time within which a process rejoins a restarted world; 1 s measured
-START_NS = 60_000_000_000  # wall time within which a restarted process joins; a small computer needs 20 s
+BYE_NS = 100_000_000  # wall time by which a bye may arrive after the loss of its process's token
+RETURN_NS = 5_000_000_000  # wall time in which a process rejoins a restarted world; 1 s measured
+START_NS = 60_000_000_000  # wall time in which a restarted process joins; a small computer needs 20 s
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
-SILENT_NS = 1_800_000_000  # wall time without health, due every second, that counts as silence; reported within 2 s
-DEAD_NS = 10_000_000_000  # wall time without health after which a process that only reads is dead; its link is closed
-STALL_NS = 300_000_000  # wall time between two checks that indicates that the world or its machine was stopped
-SHOWN = 5  # maximum number of key expressions shown of a process
+SILENT_NS = 1_800_000_000  # wall time without health, published once a second; silence is thus reported within 2 s
+DEAD_NS = 10_000_000_000  # wall time without health after which a process that only reads is dead, its link closed
+STALL_NS = 300_000_000  # wall time between two checks beyond which the world itself, or its machine, was stopped
+SHOWN = 5  # maximum number of key expressions shown per closed link
 _decode_health = msgspec.msgpack.Decoder(Health).decode
 TOKEN_NS = 3_000_000_000  # wall time limit for a token to appear; behind routers it takes up to 1 s (measured)
 SHOWN_NS = 10_000_000_000  # wall time limit for a first done as proof; first steps take 1 s
@@ -51,7 +51,7 @@ class LivelinessMonitor:
 
     Args:
         link: the listening session.
-        take_in: enters the messages that have arrived, which may include a bye.
+        take_in: enters the messages that have arrived, among which may be a bye.
     """
 
     def __init__(self, link: Session, run: Run, take_in: Callable[[], None]) -> None:
@@ -64,21 +64,21 @@ class LivelinessMonitor:
         self._health = HealthWatch(lambda name, since_ns: run.call("silence_changed", name, since_ns))
 
     def token_lost(self, name: str) -> None:
-        """Note, from any thread, the loss of a token; the bye of its process may still follow."""
+        """Note the loss of a token, whose process's bye may still follow; callable from any thread."""
         self._lost.append(name)
 
     def health_received(self, name: str) -> None:
         self._health.received(name, time.monotonic_ns())
 
     def check_all(self) -> None:
-        """Schedule a check of all former participants of a restarted world, once they have had time to rejoin."""
+        """In a restarted world, schedule a check of all former participants after the time that a rejoin takes."""
         for name, participant in self._barrier.participants.items():
             wait_ns = RETURN_NS if participant.alive else START_NS
             if participant.away or participant.alive:
                 self._checks[name] = _Check(time.monotonic_ns() + wait_ns, again=False)
 
     def before_join(self, name: str, join: Join) -> None:
-        """Before a join, report the death of a former process of that name whose token is lost."""
+        """Before a join is handled, report the death of a former process of that name whose token is lost."""
         self._take_lost()
         former = self._barrier.participants.get(name)
         if name in self._checks and former and former.alive and not former.is_process_of(join):
@@ -88,10 +88,10 @@ class LivelinessMonitor:
     def check_due(self) -> None:
         """Check the processes whose check is due.
 
-        A process without a token is dead, unless its token may be too new to be known. Such a process is checked again,
-        as is a process with a token. A process that only reads also counts as dead after a long time without health,
-        since Zenoh does not always report that it has closed the full link of a stopped process. A gating process
-        blocks the clock instead, and `clock` names it.
+        A process without a token is dead, unless its token may be too new to be known; in that case it is checked
+        again, as is a process that has a token. A process that only reads also counts as dead after a long time
+        without health, since Zenoh does not always report that it has closed the full link of a stopped process. A
+        gating process instead blocks the clock and is named in `clock`.
         """
         self._take_lost()
         now_ns = time.monotonic_ns()
@@ -105,11 +105,11 @@ class LivelinessMonitor:
             self._take_in()
             participant = self._barrier.participants.get(name)
             check = self._checks.pop(name, None)
-            if participant is None or check is None:  # a message just taken in settled it
+            if participant is None or check is None:  # settled by a message just taken in
                 continue
-            participant.away = False  # the process is dead, or alive without having rejoined
+            participant.away = False  # it is dead, or alive without having rejoined
             if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=TOKENS_S):
-                if check.again:  # the token may be a successor's, or Zenoh may not have forgotten it yet
+                if check.again:  # the token may be a successor's, or not yet forgotten by Zenoh
                     self._checks[name] = _Check(now_ns + NEW_TOKEN_NS, again=False)
             elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token may not be known yet
                 self._checks[name] = _Check(participant.joined_wall_ns + NEW_TOKEN_NS, check.again)
@@ -131,8 +131,8 @@ class HealthWatch:
     """Tracks when each process last published its health.
 
     Args:
-        handle_silence: called with the name and the wall time of the last health when a process falls silent, and with
-            the name and None when its health resumes.
+        handle_silence: called with a process's name and the wall time of its last health message when it falls silent,
+            and with its name and None when its health resumes.
     """
 
     def __init__(self, handle_silence: Callable[[str, int | None], object]) -> None:
@@ -148,12 +148,12 @@ class HealthWatch:
             self._handle_silence(name, None)
 
     def forget(self, name: str) -> None:
-        """Stop expecting the health of a process that has left or died."""
+        """Stop expecting health messages of a process that has left or died."""
         self._last_wall_ns.pop(name, None)
         self._silent.discard(name)
 
     def look(self, wall_ns: int) -> dict[str, int]:
-        """Report silent processes; return the time since the last health of each expected process [ns].
+        """Report silent processes; return the time since the last health message [ns] by process.
 
         Must be called frequently.
         """
@@ -169,15 +169,15 @@ class HealthWatch:
 
 
 class SlowReaders:
-    """Reports links that were closed because their readers are slow, and the link that blocks the world.
+    """Reports closed links as events, and names the link that blocks the world.
 
     Args:
         link: the listening session.
         tokens: tokens of all processes.
-        run: the run; its history has the health of the readers that publish any.
+        run: the run, whose history contains health messages of readers.
 
     Attributes:
-        watch: closes the links.
+        watch: closes the links of readers that do not keep up.
     """
 
     def __init__(self, link: Session, tokens: SessionTokens, run: Run) -> None:
@@ -186,12 +186,12 @@ class SlowReaders:
         self.watch = LinkWatch(link, tokens, self._awaited)
 
     def _awaited(self) -> list[Awaited]:
-        """Return the processes that must not lose any message; called by another thread."""
+        """Return the processes that must not lose any message; called from another thread."""
         participants = list(self._run.world.barrier.participants.values())
         return [Awaited((p.name, *p.join.serves), p.join.pid) for p in participants if p.is_waited_for]
 
     def report(self) -> None:
-        """Report the links closed since the last call, with the keys that their processes read according to health."""
+        """Report the links closed since the last call, with the keys read according to the processes' health."""
         while self.watch.closed:
             closed = self.watch.closed.popleft()
             host = self._own_host if closed.process else closed.address.rpartition(":")[0].strip("[]")
@@ -216,11 +216,11 @@ class SlowReaders:
 
 @dataclass
 class _Withheld:
-    """A join that awaits a proof, the wall time since when its name has, and whether a done has followed it."""
+    """A join that awaits a proof."""
 
     join: Join
-    since_ns: int
-    has_done: bool = False
+    since_ns: int  # wall time at which the first join of that name was withheld
+    has_done: bool = False  # whether a done has followed the join
 
 
 class Admission:
@@ -228,8 +228,8 @@ class Admission:
 
     A newcomer, or a process that replaces a living one, must prove that it exists, since any program can publish a join
     under any name. The proof is a liveliness token of its own session or, for a program without a token, the done that
-    follows its join. The world never waits for an unknown process without a token, since joins under ever new names
-    could otherwise stop time for good.
+    follows its join. Time never waits for an unknown process without a token, since joins under ever new names could
+    otherwise stop it for good.
 
     Args:
         tokens: tokens of all processes.
@@ -274,7 +274,7 @@ class Admission:
         self._look_wall_ns = wall_ns
         for name in list(self._withheld):
             self._check(name, wall_ns)
-        for name in list(self._standing_ns):  # forget proved processes, report those that never had a token
+        for name in list(self._standing_ns):  # forget proved processes, and report those that never had a token
             participant = self._barrier.participants.get(name)
             if participant is None or not participant.alive:
                 del self._standing_ns[name]
@@ -288,7 +288,7 @@ class Admission:
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
     def _needs_no_proof(self, name: str, join: Join) -> bool:
-        """Return whether a join needs no proof, as it neither replaces a process nor makes time wait for a stranger."""
+        """Return whether a join needs no proof: it replaces no process, and is not that of a stranger."""
         return not (self._barrier.would_replace(name, join) or self._is_stranger(name, join))
 
     def _is_stranger(self, name: str, join: Join) -> bool:
@@ -310,7 +310,7 @@ class Admission:
             self._standing_ns[name] = 0
 
     def _check(self, name: str, wall_ns: int) -> None:
-        """Admit a withheld join once it is proved, or reject it after its time limit."""
+        """Admit a withheld join once it is proved; reject it after its time limit."""
         withheld = self._withheld[name]
         join = withheld.join
         if self._needs_no_proof(name, join) or self._may_replace(name, withheld, wall_ns):
@@ -322,7 +322,7 @@ class Admission:
             self._run.call("falsely_joined", name, join, reason)
 
     def _may_replace(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
-        """Return whether the process behind a join is proved to exist, or the process that it replaces is gone."""
+        """Return whether a join may replace a process: it is proved to be real, or that process is gone or stuck."""
         if self._is_stranger(name, withheld.join):
             return False
         if self._trusts or withheld.has_done or self._tokens.sessions(name) - self._sessions.get(name, Sessions()):
@@ -336,8 +336,8 @@ class Admission:
     def _count_standing(self, passed_ns: int, wall_ns: int) -> None:
         """Count how long participants have owed their first done, and report those that exceed the limit.
 
-        In lockstep, time counts only while the world waits for no other process, which may be the cause; in realtime,
-        it counts whenever a done is due and time runs.
+        In lockstep, only while time waits for no other process, since that may be the cause; in realtime, whenever a
+        done is due and time runs.
         """
         clock = self._world.clock
         if clock.mode == "realtime":

@@ -1,12 +1,12 @@
 """The journal of a run on disk: all inputs of its world, in order, and checkpoints of its state.
 
 A world is a function of its scenario and its inputs, so a restarted world continues to the same bits from a checkpoint
-and the inputs after it. An entry is written to the file, without a sync to disk, before any message that follows from
-it is published, so that killing the process loses none.
+and the inputs since. An entry is written to the file (not synced to disk) before any message that follows from it is
+published, so killing the process loses no entry.
 
-The folder contains, with n counting from 0, `n.entries`, frames of entries; `n.checkpoint`, the state before them,
-absent for 0; and `truth`, the input of the truth hash. A frame consists of the length and CRC-32 of its content
-(little-endian, 32 bits each) and the content in msgpack.
+The folder contains, with n counting from 0: `n.entries`, frames of entries; `n.checkpoint`, the state before those
+entries, absent for n = 0; `truth`, the input of the truth hash. A frame is the length and CRC-32 of its content
+(little-endian, 32 bits each), then the content in MessagePack.
 """
 
 import os
@@ -28,9 +28,9 @@ from zsim_world.run import inputs
 from zsim_world.run.inputs import Entry
 
 VERSION = 4  # format of the files and of the states in them
-CHECKPOINT_NS = 5_000_000_000  # simulated time between checkpoints, as long as the message history
-CHECKPOINT_WALL_NS = 1_000_000_000  # minimum wall time between checkpoints, which take 20 MB for 1000 drones
-CHECKPOINTS_KEPT = 3  # the newest one may not be on disk yet, and the second may be younger than the message history
+CHECKPOINT_NS = 5_000_000_000  # simulated time between checkpoints; equals the length of the message history
+CHECKPOINT_WALL_NS = 1_000_000_000  # minimum wall time between checkpoints, which have 20 MB for 1000 drones
+CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the second is more recent than the message history
 HASHED_BYTES = 1 << 20  # bytes of the truth hash's input per read
 _FRAME = struct.Struct("<II")
 
@@ -47,17 +47,17 @@ class _Head(msgspec.Struct, array_like=True):
 
 
 class Checkpoint(NamedTuple):
-    """A state of the world, None at the start of its run, and the size of the truth hash's input up to it."""
+    """A checkpoint of the world."""
 
-    state: State | None
-    truth_bytes: int
+    state: State | None  # None at the start of the run
+    truth_bytes: int  # size of the truth hash's input up to the checkpoint
 
 
 class RunJournal:
-    """Reads and writes the journal of one run; does nothing without a folder.
+    """Reads and writes the journal of one run; without a folder, has no effect.
 
     Args:
-        folder: folder for this run alone, created if missing.
+        folder: folder for this run alone; created if missing.
         say: shows a line if the journal can no longer be written.
         all_died: whether all participants of a continued run must be restarted.
     """
@@ -85,7 +85,7 @@ class RunJournal:
     # Writing
 
     def note(self, entry: Entry) -> None:
-        """Add an entry, which `commit` writes."""
+        """Add an entry, to be written by `commit`."""
         if self._is_kept:
             self._entries.append(entry)
 
@@ -105,7 +105,7 @@ class RunJournal:
         return due and (self._written is None or self._written.done())
 
     def add_checkpoint(self, state: State, now_ns: int, wall_ns: int) -> None:
-        """Begin the next part of the journal with a state, which another thread writes to disk."""
+        """Begin the next part of the journal with a state, which a separate thread writes."""
         self._due_ns, self._due_wall_ns = now_ns + CHECKPOINT_NS, wall_ns + CHECKPOINT_WALL_NS
         self.commit()
 
@@ -172,9 +172,9 @@ class RunJournal:
     # Reading
 
     def open(self) -> Checkpoint | None:
-        """Create or open the journal; return the checkpoint to continue from, None for a new run.
+        """Create or open the journal; return the checkpoint to continue from, or None for a new run.
 
-        It is the second newest complete checkpoint, so that the inputs after it (`entries`) refill the message history.
+        It is the second newest checkpoint, so that the inputs since then (`entries`) refill the message history.
 
         Raises:
             RunError: the journal belongs to another run, is in use, or cannot be read or kept.
@@ -201,7 +201,7 @@ class RunJournal:
         return found
 
     def _checkpoint(self, number: int) -> Checkpoint | None:
-        """Return a checkpoint, None if it is incomplete."""
+        """Return a checkpoint; None if it is incomplete."""
         with suppress(OSError, DecodeError):
             frames = list(self._frames(self._folder / f"{number}.checkpoint"))
             if frames:
@@ -210,13 +210,16 @@ class RunJournal:
         return None
 
     def entries(self) -> Iterator[Entry]:
-        """Yield the inputs since the checkpoint, except for an incomplete last one, from which no message followed."""
+        """Yield the inputs since the checkpoint.
+
+        An incomplete entry at the end is dropped: no message that follows from it was published.
+        """
         for number in range(self._first, self._number + 1):
             for frame in self._frames(self._folder / f"{number}.entries"):
                 yield from inputs.decode(frame)
 
     def truth(self, size: int) -> Iterator[bytes]:
-        """Drop the truth hash's input after `size` bytes, which the world will append again, and yield the rest."""
+        """Yield the first `size` bytes of the truth hash's input; drop the rest, which the world will append again."""
         os.ftruncate(self._truth, size)
         os.lseek(self._truth, 0, os.SEEK_SET)
         while data := os.read(self._truth, HASHED_BYTES):
@@ -245,7 +248,7 @@ class RunJournal:
 
 
 def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
-    """Yield the content and end offset of each complete frame at the beginning of a file."""
+    """Yield content and end offset of each complete frame from the beginning of a file."""
     at = 0
     while len(data) - at >= _FRAME.size:
         size, check = _FRAME.unpack_from(data, at)
@@ -256,7 +259,7 @@ def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
 
 
 def journaled_run(folder: Path) -> str | None:
-    """Return the id of the run whose journal is in a folder, None if there is no journal."""
+    """Return the id of the run whose journal is in a folder; None if the folder has no journal."""
     for place in sorted(folder.glob("*.entries")):
         with suppress(OSError, *REFUSALS):
             return msgspec.msgpack.decode(next(_whole_frames(place.read_bytes()))[0], type=_Head).run_id

@@ -1,7 +1,7 @@
 """The world as a process on Zenoh: a loop that paces and gates simulated time.
 
-In order: `run`, `WorldProcess` (continuing a run, the loop, queries, other threads), its inputs and outputs, pacing,
-and the watch for a stuck loop.
+This file defines, in order: `run`; `WorldProcess` (continuation of a run, the loop, queries, calls by other threads);
+its inputs and outputs; pacing; detection of a stuck loop.
 """
 
 import threading
@@ -35,20 +35,20 @@ from zsim_world.server.liveliness import Admission, LivelinessMonitor, SlowReade
 from zsim_world.server.run_journal import RunJournal
 
 TICK_S = 0.1  # interval at which a waiting world checks the wall clock
-CLOCK_STANDING_NS = 1_000_000_000  # by the contract, the world publishes its clock once per wall second if time stops
-VIEW_PERIOD_NS = 33_333_333  # by the contract, views have at most 30 Hz in wall time
+CLOCK_STANDING_NS = 1_000_000_000  # contract: `clock` is published once per wall second while time stands still
+VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 HEALTH, OWN = keys.process(WORLD, "health"), keys.process(WORLD, "")
-BYE_S = 5.0  # by the contract, the world waits 5 s at most for byes
-SERVE_NS = 5_000_000  # wall time between two times that a world that never waits handles requests and losses
+BYE_S = 5.0  # contract: the world waits at most 5 s for byes
+SERVE_NS = 5_000_000  # wall time after which a world that never waits handles requests and losses
 RECOVERY_S = 1.0  # timeout of a request for outputs, which a living publisher answers within milliseconds
-REJOINED_NS = 10_000_000_000  # wall time after a rejoin within which a process may not yet answer requests
+REJOINED_NS = 10_000_000_000  # wall time after a rejoin within which a process may be unable to answer requests
 PROCESSES, VIEWS = "process/", "view/"  # the world does not read views
-LAG_GATES = 2  # maximum number of gates that the slowest agent has not finished when a series of gates begins
-GATES_SENT = 3  # number of gates sent together; more would leave agents idle
-DELAY_MAX_NS = 50_000_000  # maximum delay of a gate in wall time, after which a slow agent gets all gates it may have
-STOOD_STILL_NS = 1_000_000_000  # delay of a gate in wall time that indicates a standstill rather than slowness
+LAG_GATES = 2  # unfinished gates that the slowest agent may have when a series of gates begins
+GATES_SENT = 3  # gates sent together; more would leave agents idle
+DELAY_MAX_NS = 50_000_000  # maximum delay of a gate [wall]; by then even a slow agent has every gate it may receive
+STOOD_STILL_NS = 1_000_000_000  # lateness of a gate [wall] that indicates a standstill rather than a slow world
 STUCK_NS = 2_000_000_000  # wall time after which a turn of the loop is reported as stuck; a turn takes milliseconds
-STOPPED_NS = 1_000_000_000  # wall time between two checks, ten times the usual, that indicates a stopped process
+STOPPED_NS = 1_000_000_000  # wall time between two checks that indicates a stopped process; ten times the usual
 
 
 def run(
@@ -77,8 +77,8 @@ class WorldProcess:
 
     Args:
         link: a listening session.
-        stopped: called at every gate and every TICK_S; a text that it returns ends the run and is the reason.
-        journal: journal of the run; if a former world process left it, this one continues its run.
+        stopped: called at every gate and every TICK_S; a returned text ends the run and is the reason.
+        journal: journal of the run; if a former world process left one, this process continues its run.
         health: health of this process.
     """
 
@@ -126,7 +126,7 @@ class WorldProcess:
         if not self._history.last(keys.INFO):
             self._outputs.publish(Output(keys.INFO, self._world.info()))
         answered = [*roles.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries]
-        answered.append(answered.pop(answered.index(keys.INFO)))  # the last: its answers mean that all are declared
+        answered.append(answered.pop(answered.index(keys.INFO)))  # last: an answer there implies that all are declared
         for expression in answered:
             self._link.declare_queryable(expression, self._on_query)
         self._tokens.watch()
@@ -150,7 +150,7 @@ class WorldProcess:
             raise self._world.failure
 
     def _continue(self) -> None:
-        """Apply the journal without publishing anything again, then wait for the former participants.
+        """Apply the journal without republishing anything, then wait for the former participants.
 
         Raises:
             RunError: the journal belongs to another run, or its state does not fit this version of zsim.
@@ -205,7 +205,7 @@ class WorldProcess:
             self._stand_still(wall_ns)
 
     def _report_standstill(self, stood_ns: int) -> None:
-        """In realtime, restart the pacing after a standstill instead of catching up with the wall clock in a burst."""
+        """In realtime, restart the pacing after a standstill rather than catch up with the wall clock in a burst."""
         if self._clock.mode == "realtime" and self._clock.state == "running":
             self._pacer.restart()
             why = "this process or its machine was stopped, or nothing could be published"
@@ -218,7 +218,7 @@ class WorldProcess:
         """Enter the messages that have arrived into the run, and submit joins for admission."""
         for wall_ns, sample in self._inputs.drain():
             key = sample.key
-            if key.startswith(OWN):  # the world's own health, which was entered when it was published
+            if key.startswith(OWN):  # the world's own health was entered when it was published
                 continue
             self._run.enter(Taken(wall_ns, sample))
             if key.endswith("/join"):
@@ -229,7 +229,7 @@ class WorldProcess:
                         self._admission.take(keys.thing(key), join, wall_ns)
 
     def _advance(self, wall_ns: int, late_ns: int) -> None:
-        """Advance to the next gate, publish it and due views, and add a checkpoint to the journal if one is due."""
+        """Advance to the next gate, and publish it; also publish the views and journal the checkpoint that are due."""
         world = self._world
         late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
         self._run.enter(Advanced(wall_ns, late))
@@ -258,7 +258,7 @@ class WorldProcess:
         self._served_wall_ns = 0
 
     def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
-        """Publish the clock, with the processes that the world waits for, once a second."""
+        """Publish `clock` with the processes that the world waits for, once a second."""
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
             self._outputs.publish(Output(keys.CLOCK, self._world.clock_message(waiting_for(wall_ns))))
 
@@ -270,7 +270,7 @@ class WorldProcess:
             self._run.progress("event", message, self._run.phase)
 
     def _end(self) -> None:
-        """Publish the end, then wait until all participants have left, BYE_S at most.
+        """Publish the end, then wait at most BYE_S until all participants have left.
 
         A world that was restarted after the end of its run first waits until the former participants have rejoined.
         """
@@ -315,14 +315,14 @@ class WorldProcess:
     def _serve(self, query: Query) -> None:
         """Answer a query with last values, a page of the history, or the answer to a request.
 
-        Requests arrive on `world/control`; requests for a replay also on a key of the process, which access control can
+        Requests arrive on `world/control`; replay requests also on the process's own key, which access control can
         restrict.
         """
         expression = query.expression
         process = keys.thing(expression) if keys.matches(keys.replay("*"), expression) else None
         if expression in self._world.refused_queries:
             reason = self._world.refusal_at(expression)
-            if reason is None:  # another process answers
+            if reason is None:  # another process answers the query
                 query.end()
             else:
                 query.answer(ControlAnswer(ok=False, error=reason))
@@ -359,7 +359,7 @@ class WorldProcess:
             self._inputs.wake()
 
     def _tick(self) -> None:
-        """Wake the loop, and report a stuck put in the terminal, since no message can be published."""
+        """Wake the loop; show a stuck put only in the terminal, since no message about it could be published."""
         watch = TurnWatch(time.monotonic_ns())
         while not self._over.wait(TICK_S):
             self._inputs.wake()
@@ -371,14 +371,14 @@ class WorldProcess:
 
 
 class DirectInputs:
-    """Reads on the loop's own thread, waiting on the last subscription, which is fastest without pacing."""
+    """Reads on the loop's own thread and waits on the last subscription: fastest for an unpaced run."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._subscriptions = subscriptions
         self._received: list[ReceivedSample] = []
 
     def wait(self, timeout_s: float | None) -> None:
-        """Wait for a message, or for timeout_s if that is shorter than a tick; may return without a message."""
+        """Return when something has arrived, or after timeout_s; without a timeout, also return occasionally."""
         if timeout_s is not None and timeout_s < TICK_S:
             time.sleep(timeout_s)
             return
@@ -467,7 +467,7 @@ def open_inputs(link: Session, realtime: bool) -> DirectInputs | TimedInputs:
 
 
 def recover_lost(link: Session, run: Run) -> None:
-    """Request outputs that a participant counted but that have not arrived, for example after a cut link."""
+    """Request the outputs that a participant has counted but that have not arrived, e.g. after a link was cut."""
     world = run.world
     for participant in world.barrier.incomplete():
         if participant.away:
@@ -486,7 +486,7 @@ def recover_lost(link: Session, run: Run) -> None:
             lost = []
         age_ns = time.monotonic_ns() - participant.joined_wall_ns
         if lost is None and participant.rejoined and age_ns < REJOINED_NS:
-            continue  # the process may not yet answer requests
+            continue  # the participant may be unable to answer requests yet
         for sample in lost or ():
             run.enter(Taken(time.monotonic_ns(), sample))
         run.call("give_up_outputs", participant.name)
@@ -496,7 +496,7 @@ class WorldOutputs:
     """Publishes the outbox of a world.
 
     Args:
-        on_message: called with the key and message of every publication except gates.
+        on_message: called with each key and message, except the messages of a gate.
         journal: journal of the run, committed before anything is published.
     """
 
@@ -509,7 +509,7 @@ class WorldOutputs:
         self._gate_keys = [keys.gate(name) for name in run.world.names]
 
     def gather(self) -> None:
-        """Encode the outbox for `send`; a gate as single messages and, where subscribed, as a whole and per drone."""
+        """Encode the outbox for `send`: a gate whole and per drone, if anyone subscribes, and as single messages."""
         outbox = self._run.world.take_outbox()
         if not outbox:
             return
@@ -527,7 +527,7 @@ class WorldOutputs:
                 encoded += message.pairs
             else:
                 pair = (key, messages.encode(message))
-                if keys.is_picture(key):  # pictures of a replay are too large to keep or batch
+                if keys.is_picture(key):  # published by a replay; not kept or batched, since pictures are large
                     self._unsent.append(pair)
                     continue
                 encoded.append(pair)
@@ -568,16 +568,16 @@ class WorldOutputs:
                 self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))
 
     def forget(self) -> None:
-        """Drop the gathered messages, since the former world process published them."""
+        """Drop the gathered messages, which the former world process has already published."""
         self._unsent, self._run.history.passed = [], []
 
 
 class Pacer:
-    """Computes the wall times at which gates are due, at the rate of the run's clock."""
+    """Computes when gates are due on the wall clock, at the rate of the run's clock."""
 
     def __init__(self, clock: RunClock) -> None:
         self._clock = clock
-        self._pace = (0.0, 0)  # rate and number of time jumps; started at the next two
+        self._pace = (0.0, 0)  # rate and number of time jumps for which the next two, the start of the pace, are valid
         self._start_wall_ns = 0
         self._start_sim_ns = 0
 
@@ -606,9 +606,9 @@ class Pacer:
 class Pipelining:
     """Delays gates so that several are sent together and processes wake up less often.
 
-    If agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up. Then gates
-    follow one another until its done is required again. Agents do not idle, since the first of these gates arrives
-    while they still work on earlier ones. Only a world in lockstep without pacing is delayed.
+    If agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up; then gates
+    follow one another until its done is required again. No agent idles meanwhile, since the first of these gates
+    arrives while agents still work on earlier ones. Only an unpaced world in lockstep is delayed.
     """
 
     def __init__(self, world: Coordinator) -> None:
@@ -621,11 +621,11 @@ class Pipelining:
 
     @property
     def _enabled(self) -> bool:
-        """Return whether agents may lag and gates are not paced."""
+        """Whether agents may lag and gates are not paced."""
         return self._ahead_ns > 0 and self._clock.mode == "lockstep" and self._clock.rate <= 0
 
     def delays(self, wall_ns: int) -> bool:
-        """Return whether to delay the next gate, although it may come."""
+        """Return whether to delay the next gate although the world may advance."""
         if self._continues or not self._enabled:
             return False
         late = wall_ns - self._delayed_wall_ns > DELAY_MAX_NS
@@ -633,24 +633,24 @@ class Pipelining:
         return not self._continues
 
     def continues(self) -> bool:
-        """Return, after a gate, whether the next one follows immediately and can be sent together with it."""
+        """Return, after a gate, whether the next one follows immediately and can be sent with it."""
         self._gates = (self._gates + 1) % GATES_SENT
         return self._gates > 0 and self._continues and self._enabled and self._world.may_advance()
 
     def pause(self, wall_ns: int) -> None:
-        """Note that the next gate must not come yet."""
+        """Note that the world may not advance to the next gate yet."""
         if self._continues:
             self._continues, self._delayed_wall_ns = False, wall_ns
 
     def blocking(self) -> list[Participant]:
-        """Return the participants that block the clock, or else those that delay it."""
+        """Return the participants that block the clock; if there are none, those that delay it."""
         return self._world.blocking() or self._world.blocking(self._ahead_ns)
 
 
 class TurnWatch:
     """Distinguishes a stuck turn of the loop (a put that does not return) from a stopped process.
 
-    It is called on a separate thread, which a stuck put does not block. Times are monotonic.
+    Called on a separate thread, which a put does not block. Times are monotonic wall times.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -662,7 +662,7 @@ class TurnWatch:
         """Return how long a turn has been stuck [s], once every STUCK_NS at most; None if there is nothing to report.
 
         Args:
-            turn_ns: time when the turn began; 0 outside a turn.
+            turn_ns: when the present turn began; 0 outside a turn.
         """
         if now_ns - self._looked_ns > STOPPED_NS:
             self._stopped_until_ns = now_ns
