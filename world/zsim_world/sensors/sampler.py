@@ -1,11 +1,11 @@
 """The samples of a fleet in a gate: rows of arrays, held back until their latency has passed.
 
-Values in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg],
-altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range [m],
-valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading, computed in Python
-after the gate from the truth that the kernel logged.
+Values are in the order of the contract's fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude,
+longitude [deg], altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m];
+sonar: range [m], valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading,
+computed in Python after the gate from the truth that the kernel logged.
 
-Sightings and scans are computed after the gate, too, from the poses of all drones at their sampling instants
+Sightings and scans are also computed after the gate, from the poses of all drones at their sampling times
 (`Exposures`, `poses_between`), and held back (`released`).
 """
 
@@ -33,26 +33,26 @@ from zsim_world.sensors.noise import place, words
 from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width, read
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
-VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
+VALUE_COLUMNS = 9  # number of values of a GPS fix, the longest sample
 
 
 class Sampled(NamedTuple):
     """Measurements in the order of (t_ns, drone, sensor)."""
 
     whose: NDArray[np.int64]  # (M, WHOSE.size)
-    values: NDArray[np.float64]  # (M, VALUE_COLUMNS), the first ones of each kind's
+    values: NDArray[np.float64]  # (M, VALUE_COLUMNS); each sensor uses the first columns
 
 
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
 
 
 class SampledLog(NamedTuple):
-    """The log of the kernel, and the data that converts it to samples."""
+    """The kernel's log, and the data needed to convert it to samples."""
 
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
     latency_ns: NDArray[np.int64]  # (N, sensors)
-    rows: NDArray[np.float64]  # these two of frames.anchor
+    rows: NDArray[np.float64]  # this and `place` are the results of frames.anchor
     place: NDArray[np.float64]
 
 
@@ -98,12 +98,12 @@ class Sampler:
 
 @kernel()
 def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
-    """Return index and values of Sampled for the first rows of a log.
+    """Return `whose` and `values` of Sampled for the first rows of a log.
 
     Args:
-        held: a SampledLog, by `hold`.
-        count: of rows.
-        tick_ns: between two ticks [ns].
+        held: a SampledLog, held by `hold`.
+        count: number of rows.
+        tick_ns: interval between two ticks [ns].
     """
     whose, value, latency_ns, rows, place = held.content
     index, values = np.empty((count, WHOSE.size), np.int64), np.empty((count, VALUE_COLUMNS))
@@ -121,7 +121,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
 
 @inlined
 def _is_before(a: NDArray, b: NDArray) -> bool:
-    """Return whether a measurement does not come after another in the order of (t_ns, drone, sensor)."""
+    """Return whether `a` comes before `b`, or with it, in the order of (t_ns, drone, sensor)."""
     if a[WHOSE.t] != b[WHOSE.t]:
         return a[WHOSE.t] < b[WHOSE.t]
     if a[WHOSE.drone] != b[WHOSE.drone]:
@@ -131,11 +131,11 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 @kernel()
 def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return measurements with others, without numbers, inserted, and the rows of the inserted ones.
+    """Insert rows without values into measurements; return `whose`, `values` and the positions of the inserted rows.
 
     Args:
-        whose, values: of Sampled, in its order.
-        more: in the same order, (K, WHOSE.size).
+        whose, values: fields of Sampled, in its order.
+        more: rows to insert, in the same order, (K, WHOSE.size).
     """
     count, extra = whose.shape[0], more.shape[0]
     index, numbers = np.empty((count + extra, WHOSE.size), np.int64), np.zeros((count + extra, VALUE_COLUMNS))
@@ -150,7 +150,7 @@ def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, 
 
 
 class UserSensors:
-    """The users' sensors of a fleet. As with stock sensors, each drone and sensor has a random stream."""
+    """The users' sensors of a fleet. As with stock sensors, each sensor of each drone has its own random stream."""
 
     SAVED: ClassVar[Saved] = {"sensors": PART}
 
@@ -169,11 +169,11 @@ class UserSensors:
 
     @property
     def sensors(self) -> list["_UserSensor"]:
-        """All of them, drone by drone."""
+        """All users' sensors, drone by drone."""
         return [*self._sensors.values()]
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without lost ones.
+        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without lost samples.
 
         Raises:
             UserCodeError: an equation fails, or does not return a reading.
@@ -193,7 +193,7 @@ class UserSensors:
 
 
 class _UserSensor:
-    """A sensor of a drone: settings, present bias and random stream."""
+    """A user's sensor of one drone: settings, current bias and random stream."""
 
     SAVED: ClassVar[Saved] = {"bias": IN_PLACE, "stream": list[int]}
 
@@ -221,7 +221,7 @@ class _UserSensor:
         place(self.rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
-        """Return the truth at its exposure, from a row of EXPOSED."""
+        """Return the truth at an exposure of the sensor, from a row of EXPOSED."""
         state, accel = row[EXPOSED.state : EXPOSED.accel].copy(), row[EXPOSED.accel : EXPOSED.air].copy()
         return SensorTruth(
             t_s=t_s,
@@ -237,8 +237,8 @@ class _UserSensor:
         )
 
     def measure(self, truth: SensorTruth, environment: object, values: NDArray[np.float64]) -> None:
-        """Write the errorless values into a row (6,)."""
-        assert self._kind.equation is not None  # a module without one is refused
+        """Write the values without errors into a row (6,)."""
+        assert self._kind.equation is not None  # modules without an equation are refused
         count = self._kind.values
         equation, where = self._kind.equation, f"{self._what} at {truth.t_s:.3f} s"
         name = f"{equation.__module__}:{getattr(equation, '__qualname__', type(equation).__qualname__)}"
@@ -269,7 +269,7 @@ class Between(NamedTuple):
 
 
 class Exposures:
-    """The instants n / rate of some sensors, gate by gate."""
+    """The sampling times n / rate of some sensors, gate by gate."""
 
     SAVED: ClassVar[Saved] = {
         "_counts": list[int],
@@ -282,16 +282,17 @@ class Exposures:
     def __init__(self, rates_hz: Sequence[float], gate_ns: int) -> None:
         self._rates_hz, self._gate_ns = rates_hz, gate_ns
         self._counts = [0] * len(rates_hz)
-        self._due_ns = [0] * len(rates_hz)  # the next sample of each
-        self._next_ns = 0  # the soonest of all
-        self._former = np.empty((0, STATE.size))  # states of the last gate before a sample
+        self._due_ns = [0] * len(rates_hz)  # time of each sensor's next sample
+        self._next_ns = 0  # time of the next sample of any sensor
+        self._former = np.empty((0, STATE.size))  # states at the last gate before the next sample
         self._former_ns = 0
 
     def until(self, state: Array, now_ns: int) -> tuple[list[tuple[int, int]], Between | None]:
-        """Return instants and indices of the sensors whose samples are due by a gate, sorted, and the states.
+        """Return the sorted samples due by a gate, as (time [ns], index of the sensor), and the states around them.
 
         Args:
             state: states of all drones at the gate, (N, STATE.size or more).
+            now_ns: time of the gate [ns].
         """
         due, between = [], None
         if self._next_ns <= now_ns:
@@ -311,7 +312,7 @@ class Exposures:
 
 
 def released(later: list[Any], now_ns: int) -> list[Any]:
-    """Remove from a list of delayed messages those that are due, by their t_ns, and return them."""
+    """Remove the messages that are due by their t_ns from a list of delayed messages, and return them."""
     due = [each for each in later if each.t_ns <= now_ns]
     if due:
         later[:] = [each for each in later if each.t_ns > now_ns]
@@ -320,10 +321,11 @@ def released(later: list[Any], now_ns: int) -> list[Any]:
 
 @kernel()
 def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_ns: int) -> NDArray:
-    """Return the poses of all drones at an instant between two gates, (N, STATE.size).
+    """Return the states of all drones at a time t_ns between two gates, (N, STATE.size); other columns are linear.
 
     Args:
-        former, now: states at the gates, (N, STATE.size or more), between which the other columns are interpolated.
+        former, now: states at the gates, (N, STATE.size or more).
+        former_ns, now_ns: times of the gates [ns].
     """
     if t_ns >= now_ns or now_ns <= former_ns:
         return now.copy()
