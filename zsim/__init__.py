@@ -1,8 +1,8 @@
-"""What every process of a federation shares: frames, keys, messages, scenario, record, session, agent.
+"""The code shared by all processes of a federation: frames, keys, messages, scenario, record, session, agent.
 
-Rooms from the ground up: errors; math and schema; sensors; contract; vehicles; record, scenario and transport, which do
-not import each other; runtime; presentation. A room imports those below it. Nothing here imports another package of the
-product: what users call as `zsim.run` and so on is `zsim_api`'s, imported when it is first asked for.
+Packages from the bottom up: errors; math and schema; sensors; contract; vehicles; record, scenario and transport, which
+do not import each other; runtime; presentation. Each imports those below it, and none imports another package of the
+product: what users call as `zsim.run` etc. belongs to `zsim_api`, which is imported when first used.
 """
 
 import importlib
@@ -12,26 +12,26 @@ from typing import Any
 
 RELEASE = "0.2.0"  # as in pyproject.toml
 CONTRACT = 1
-COMMIT_FILE = "commit.txt"  # of an archive that git has made, of an sdist and of a wheel
-DIGITS = 8  # of a commit in a version: none of two in a repository of this size are alike
+COMMIT_FILE = "commit.txt"  # file with the commit in git archives, sdists and wheels
+DIGITS = 8  # digits of a commit in the version; enough to be unique in a repository of this size
 
 
 def commit(package: Path = Path(__file__).parent) -> str:
-    """Return the commit of a package `zsim` in hex digits, from git's files or from the build; empty if neither has it.
+    """Return the commit of a package `zsim` in hex digits, from git's files or the build; empty if neither states it.
 
-    No program is started for it: it is read at every start of every process.
+    It does not run git, since every process reads the commit when it starts.
     """
     with suppress(OSError):
         if found := _checked_out(package.parent / ".git"):
             return found
     with suppress(OSError):
         found = (package / COMMIT_FILE).read_text().strip()
-        return "" if "$" in found else found  # a checkout has the placeholder that `git archive` fills
+        return "" if "$" in found else found  # in a checkout, the placeholder that `git archive` replaces
     return ""
 
 
 def _checked_out(git: Path) -> str:
-    """Return the commit of a checkout, whose `.git` is a folder, or a file in a worktree (gitrepository-layout(5))."""
+    """Return the commit of a checkout. `.git` is a folder, or a file in a worktree (gitrepository-layout(5))."""
     if git.is_file():
         git = git.parent / git.read_text().removeprefix("gitdir:").strip()
     head = (git / "HEAD").read_text().strip()
@@ -51,11 +51,11 @@ def _checked_out(git: Path) -> str:
 
 __version__ = f"{RELEASE}+g{found[:DIGITS]}" if (found := commit()) else RELEASE
 
-_LIBRARY = "zsim_api"  # imported when one of its names is first asked for; type checkers read __init__.pyi
+_LIBRARY = "zsim_api"  # imported when one of its names is first used; type checkers read __init__.pyi
 
 
 def __getattr__(name: str) -> Any:
-    """Return a name of the library for Python."""
+    """Return a public name of `zsim_api`, importing it if necessary."""
     if not name.startswith("_") and name in (library := importlib.import_module(_LIBRARY)).__all__:
         globals()[name] = found = getattr(library, name)
         return found

@@ -1,4 +1,4 @@
-"""For type checkers and editors: beside its own names, `zsim` passes on those of `zsim_api` when they are asked for."""
+"""For type checkers and editors: beside its own names, `zsim` provides those of `zsim_api`."""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
-"""The recorder as a process: every message of every key into `run.mcap`.
+"""The recorder as a process: writes every message on every key to `run.mcap`.
 
-The run does not wait for it gate by gate, but the world is never farther ahead of the record on disk than its history
-reaches back: a recorder that rejoins, or replaces a dead one, continues without a gap.
+The run does not wait for it gate by gate, but the world is never further ahead of the record on disk than its history
+reaches back. A recorder that rejoins, or replaces a dead one, therefore continues without a gap.
 """
 
 import contextlib
@@ -30,19 +30,19 @@ from zsim.transport.traffic import Passed, Traffic, replay, samples
 
 NAME = "recorder"
 PAUSE_S = 0.01  # interval between reads of the queue, since each wake-up is costly
-TICK_S = 0.1  # interval of checking the open chunk's age and a requested stop
-JOIN_S = 1.0  # wall time after which a join without an event is repeated, since the world may have missed it
-SLACK_NS = 4_000_000_000  # how far the world may be ahead of the record on disk; its history has 5 s
-DRAIN_S = 1.0  # waiting time for the byes of other processes after `stopped`
-STOP_DRAIN_S = 0.5  # waiting time for the end of the run after a requested stop: both may be stopped together
-QUIET_S = 1.5  # a world whose time stands still publishes its clock once a second
-REPLAY_S = 5.0  # a hub answers within milliseconds
+TICK_S = 0.1  # interval between checks of the open chunk's age and for a requested stop
+JOIN_S = 1.0  # wall time after which a join is repeated if no event confirms it, since the world may have missed it
+SLACK_NS = 4_000_000_000  # maximum lead of the world over the record on disk; the world's history covers 5 s
+DRAIN_S = 1.0  # time to wait for the byes of other processes after the clock has stopped
+STOP_DRAIN_S = 0.5  # time to wait for the end of the run after a requested stop, since both may be stopped together
+QUIET_S = 1.5  # time without a clock that indicates a missed one; when time stands still, it comes once a second
+REPLAY_S = 5.0  # timeout of queries, which a hub answers within milliseconds
 FLUSH_NS = 1_000_000_000  # simulated time between writes to disk
-REPEATED_NS = 1_000_000_000  # simulated time after catching up in which other processes may repeat messages
+REPEATED_NS = 1_000_000_000  # simulated time after catching up within which other processes may repeat messages
 OUTPUTS = (Command, *messages.RELAYED)
-KNOWN_MAX = 2_000_000  # messages remembered: 7 s of 1000 drones
-TAIL_NS = 7_000_000_000  # simulated, at the end of a record; the world's history has 5 s
-Message = tuple[str, bytes]  # key, payload
+KNOWN_MAX = 2_000_000  # maximum number of messages to remember: 7 s of 1000 drones
+TAIL_NS = 7_000_000_000  # simulated time remembered from the end of a record; the world's history covers 5 s
+Message = tuple[str, bytes]  # key and payload
 
 
 class _Head(msgspec.Struct):
@@ -53,10 +53,10 @@ class Recorder:
     """Records a run until it ends.
 
     Args:
-        path: path of the record, which may exist.
+        path: path of the record, which may already exist.
         stopped: returns whether the process must end.
         say: called with lines for the user.
-        deserted: called at the end; True leaves without a bye, like a process that dies.
+        deserted: called at the end; if it returns True, the recorder leaves without a bye, like a process that dies.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Recorder:
         self._part = Participant(link, info, NAME, slack_ns=SLACK_NS, calculates=False)
         self.health = self._part.health
         self._joined_s = 0.0
-        self._others: dict[str, int] = {}  # incarnations that have joined and not left, by name
+        self._others: dict[str, int] = {}  # incarnations of the processes that have joined and not left, by name
         self._links: deque[bool] = deque()
         self._link_lost = False
         self._must_look = False
@@ -90,9 +90,9 @@ class Recorder:
         self._over = threading.Event()
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
-        self._held: list[Passed] = []  # received, to be written after missed messages
-        self._is_back = False  # after a lost link in realtime, until the missed messages are known
-        self._quiet_since_s: float | None = None  # since when no clock has come, after a lost link in realtime
+        self._held: list[Passed] = []  # received messages, to be written after missed ones
+        self._is_back = False  # in realtime, a lost link is restored and missed messages are not fetched yet
+        self._quiet_since_s: float | None = None  # since when no clock has arrived after a lost link in realtime
         self._on_disk_ns = 0  # simulated time of the last write to disk
         self._left_out = 0
 
@@ -100,8 +100,8 @@ class Recorder:
         """Record until the run ends; return why it ended.
 
         Raises:
-            RunError: the world has started another run; the record is complete up to its end.
-            RecordError: the disk is full or the file cannot be written; the record up to then is readable.
+            RunError: the world has started another run; the record has no gap.
+            RecordError: the disk is full or the file cannot be written; the record is readable up to there.
             SupersededError: another recorder of this name has taken over.
         """
         self._traffic = Traffic(self._link, run_key_table(self._info), self._on_refused)
@@ -113,7 +113,7 @@ class Recorder:
             if self._writer.has_former:
                 self._resume()
                 self._print(f"{NAME}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
-            else:  # last values that a replay may no longer have
+            else:  # a replay may no longer contain these last values
                 lasting = {keys.INFO: messages.encode(self._info)}
                 for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
                     lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
@@ -124,7 +124,7 @@ class Recorder:
             reason = self._loop()
             self._write_held()
             self._writer.close()
-        except RecordError as error:  # also while it joins; without a bye the world would wait for its restart
+        except RecordError as error:  # without a bye, the world would wait for a restart
             self._part.leave(str(error))
             raise
         finally:
@@ -148,11 +148,11 @@ class Recorder:
             arrived = self._traffic.receive()
             time.sleep(PAUSE_S)
             arrived += self._traffic.drain()
-            if self._is_another_run():  # before the received messages, which may be later than missed ones
+            if self._is_another_run():  # first, since received messages may be later than missed ones
                 return ANOTHER_RUN
             self._write_arrived(arrived)
             if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
-                # messages without a successor, such as the end of the run, passed before the link was restored
+                # the last messages, such as the end of the run, were published before the link was restored
                 self._quiet_since_s, self._is_back = None, False
                 self._fetch_missed()
                 self._write_held()
@@ -169,7 +169,7 @@ class Recorder:
                 return "superseded"
             if self._ended_s is None and self._stopped():
                 self._stopped_s = self._stopped_s or time.monotonic()
-                if time.monotonic() - self._stopped_s > STOP_DRAIN_S:  # and the run has not ended meanwhile
+                if time.monotonic() - self._stopped_s > STOP_DRAIN_S:  # the run has not ended in the meantime
                     return "stopped"
             if self._ended_s is not None and (not self._others or time.monotonic() - self._ended_s > DRAIN_S):
                 return run_messages.RUN_ENDED
@@ -180,7 +180,7 @@ class Recorder:
         self._part.done(t_ns)
 
     def _join(self, again: bool = False) -> None:
-        """Join; from then on the world is at most SLACK_NS ahead of the record on disk."""
+        """Join, so that the world is at most SLACK_NS ahead of the record on disk from now on."""
         self._part.join(again)
         self._joined_s = time.monotonic()
         self._put_on_disk()
@@ -205,7 +205,7 @@ class Recorder:
     def _catch_up(self, before: Clock | None = None) -> None:
         """Write the messages published in the absence of this process, from the world's history.
 
-        The request is repeated until the world answers; a message received twice is written once.
+        The request is repeated until the world answers; a message that is received twice is written once.
         """
         self._caught_up = False
         while True:
@@ -223,7 +223,7 @@ class Recorder:
             self._known.add(key, payload)
 
     def _replayed(self, before: Clock | None) -> Iterator[Message]:
-        """Yield the world's replay, up to a received clock: later messages are in transit as well."""
+        """Yield the world's replay up to a received clock, if given, since later messages are in transit."""
         held: list[Message] = []
         for entry in replay(self._link, NAME, -1, ["**"], REPLAY_S):
             held.append(entry)
@@ -236,18 +236,18 @@ class Recorder:
                 held.clear()
 
     def _fetch_missed(self, before: Clock | None = None) -> None:
-        """Write the messages since the newest one on record, or up to a clock, as far as the world still has them."""
+        """Write the messages since the newest one on record, up to a clock if given, that the world still has."""
         self._writer.flush()
         self._known.add_tail(self._writer.path)
         self._catch_up(before)
 
     def _pauses(self) -> bool:
-        """Wait for a tick; return False if the process must stop."""
+        """Wait for a tick; return whether the process may continue."""
         self._over.wait(TICK_S)
         return not self._stopped()
 
     def _world_info(self) -> messages.Info | None:
-        """Return the world's `world/info`, waiting for a world that has just been restarted."""
+        """Return `world/info`, waiting up to REPLAY_S for a world that has just been restarted; None if unanswered."""
         until_s = time.monotonic() + REPLAY_S
         while (info := read_info(self._link)) is None and time.monotonic() < until_s and self._pauses():
             pass
@@ -276,16 +276,16 @@ class Recorder:
         else:  # the world may be far ahead of the messages in transit
             self._quiet_since_s = time.monotonic()
             self._is_back = True
-        if not self._part.superseded:  # possibly by a missed message
+        if not self._part.superseded:  # which a missed message may have revealed
             self._join(again=True)
         return False
 
     def _write_arrived(self, arrived: Iterable[Passed]) -> None:
-        """Write received messages; if clocks are missing before them, the world's history since then first.
+        """Write received messages and, before them, those from the world's history that a gap in the clocks reveals.
 
-        Messages before a clock are held until that clock is checked, since they may be later than missing ones. After a
-        lost link in realtime, where the world does not wait for this process, clocks need not be among the missed
-        messages: they are then fetched at the first clock after the process's own join.
+        Messages are held until the next clock is checked, since they may be later than missing ones. After a lost link
+        in realtime, in which the world does not wait for this process, the missed messages need not include a clock;
+        they are then fetched at the first clock after the process's own join.
         """
         for passed in arrived:
             self._held.append(passed)
@@ -326,7 +326,7 @@ class Recorder:
             t_ns = max(0, min(self._head.decode(payload).t_ns, 2**62))
         except messages.REFUSALS:
             self.health.refused += 1
-            t_ns = self._part.now_ns  # a message without a time is recorded at the world's
+            t_ns = self._part.now_ns  # a message without a time is recorded at the world's time
         self._writer.add(key, payload, messages.encoding(key), t_ns, time.time_ns())
         if key == keys.CLOCK:
             self._part.now_ns = t_ns
@@ -340,11 +340,11 @@ class Recorder:
             self._note_process(key, payload)
 
     def _note_process(self, key: str, payload: bytes) -> None:
-        """Track the other processes that have joined and not left."""
+        """Track which other processes have joined and not left."""
         name, kind = keys.thing(key), messages.type_of(key)
         if name == NAME or kind not in (run_messages.Join, run_messages.Bye):
             return
-        with contextlib.suppress(DecodeError):  # invalid message of another process, recorded as received
+        with contextlib.suppress(DecodeError):  # an invalid message is recorded as received
             passed = messages.decode(key, payload)
             if isinstance(passed, run_messages.Join):
                 self._others[name] = passed.incarnation
@@ -352,7 +352,7 @@ class Recorder:
                 self._others.pop(name, None)
 
     def _clock_in(self, payload: bytes) -> Clock | None:
-        """Return the clock of this run; None for any other message on `clock`."""
+        """Return the decoded clock of this run, None for any other message."""
         try:
             clock = self._clock.decode(payload)
         except messages.REFUSALS:
@@ -373,11 +373,11 @@ class Recorder:
         elif self._caught_up and clock.t_ns > self._known_until_ns:
             self._known.clear()
         elif self._caught_up:
-            self._known.keep_outputs()  # messages after a clock that was not replayed were not replayed either
+            self._known.keep_outputs()  # this clock was not replayed, so later messages were not either
 
 
 class KnownMessages:
-    """Written messages, so that none is written twice; beyond KNOWN_MAX the oldest are forgotten."""
+    """The KNOWN_MAX messages written last, so that none is written twice."""
 
     def __init__(self) -> None:
         self._known: dict[Message, None] = {}
@@ -405,7 +405,7 @@ class KnownMessages:
         return last
 
     def keep_outputs(self) -> None:
-        """Keep only outputs of participants, which repeat them after a rejoin; any other message is new."""
+        """Keep only outputs, which participants repeat after a rejoin; messages of other kinds are not repeated."""
         if not self._outputs_only:
             self._known = {entry: None for entry in self._known if is_output(*entry)}
             self._outputs_only = True
@@ -423,7 +423,7 @@ def is_output(key: str, payload: bytes) -> bool:
 
 
 def is_of_run(path: Path, run_id: str) -> bool:
-    """Return whether a file is the record of a run, or a record that ends before it names its run.
+    """Return whether a file is a record of the run, or empty.
 
     Raises:
         RecordError: the file is not a record.

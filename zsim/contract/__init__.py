@@ -1,5 +1,5 @@
-"""The contract: what travels on which key, how it is encoded, and what makes runs comparable.
+"""The contract: which messages are published on which keys, how they are encoded, and what makes runs comparable.
 
-`keys` and the declarations of `flight_messages` and `run_messages` are the whole of it; `messages` encodes and decodes.
-Imports sensors and schema.
+`keys`, `flight_messages` and `run_messages` declare it completely; `messages` encodes and decodes. Imports sensors and
+schema.
 """

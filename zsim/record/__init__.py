@@ -2,11 +2,11 @@
 
     RecordWriter(path).add(key, payload, encoding, t_ns, wall_ns)   tick(wall_ns)   close()
     RecordReader(path).messages()   topics()   last(key)
-    completeness(reader)            says which gates are missing
-    repair(path)                    finishes a file whose writer died
+    completeness(reader)            returns the gaps of a record
+    repair(path)                    completes a file whose writer died
 
 Topic = key without the federation's prefix, message encoding `msgpack`, log time = simulated time, publish
-time = wall clock of the recorder. Other MCAP tools open it. Imports contract.
+time = wall clock of the recorder. Other MCAP tools can open the file. Imports contract.
 """
 
 from zsim.record.completeness import Completeness, completeness

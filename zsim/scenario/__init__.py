@@ -1,4 +1,4 @@
-"""The scenario of a run and what follows from it: its fields, files and checks, the processes, the faults to inject.
+"""The scenario of a run: its fields, files and checks, and the processes and injected faults that follow from it.
 
 Imports vehicles, contract, sensors and schema.
 """

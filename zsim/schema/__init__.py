@@ -1,1 +1,1 @@
-"""Documents that people write: read with limits, checked against types, with modules of the user's. Imports errors."""
+"""Handwritten documents: read within limits, checked against types, naming users' modules. Imports errors."""

@@ -1,5 +1,5 @@
-"""Vehicles as data: `vehicle` has their parameters and finds one by the name of its model; a file per stock vehicle.
+"""Vehicles as data: `vehicle` defines their parameters and finds a vehicle by the name of its model.
 
-That file states numbers with unit and source, and nothing else; the equations that use them are in zsim_world.
-Imports schema.
+Each stock vehicle has a file, which only states numbers with unit and source; the equations that use them are in
+zsim_world. Imports schema.
 """

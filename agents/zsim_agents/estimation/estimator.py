@@ -1,4 +1,4 @@
-"""The estimator of one drone, or of several, as an agent: sensors in, an estimate of each drone out at every gate."""
+"""The estimator of one or several drones as an agent: takes sensor messages, publishes estimates at every gate."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,12 +22,12 @@ from zsim_agents.estimation.joint_filter import ClusterBanks
 
 
 class Estimator(Agent):
-    """Feeds the scenario's estimators from `drone/{d}/sensor/*`: an EstimatorBank, or objects of a class.
+    """Passes the messages on `drone/{d}/sensor/*` to the scenario's estimators: a bank, or objects of a class.
 
-    It is named after the first of its drones and serves for the estimators of the others too.
+    The agent is named after the first of its drones and also serves as the estimator of the others.
 
     Raises:
-        RunError: the scenario has no such drone, or none is named.
+        RunError: the scenario lacks one of the drones, or none is given.
         DocumentError: the class that the scenario names cannot be loaded here.
     """
 
@@ -55,7 +55,7 @@ class Estimator(Agent):
         read = names
         if isinstance(self._estimators, ClusterBanks):
             read = tuple(self._estimators.drones)
-            specs = [scenario.drone(drone) for drone in read]  # whose sightings the world does not compute: detectors'
+            specs = [scenario.drone(drone) for drone in read]  # detectors find the sightings that the world does not
             detected = (each.name for each in specs if each.sensors.sightings is UNSET or each.is_external)
             self.uncounted = tuple(map(keys.detections, detected))
         self.gate_keys = tuple(keys.status(drone) for drone in read)
@@ -63,8 +63,8 @@ class Estimator(Agent):
         if own_class:
             self.reads = tuple(keys.sensors(drone) for drone in read)
         else:
-            # One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once. Users'
-            # sensors are read because status counts them.
+            # One subscription per sensor lets the process sleep until `status`, the last message of a gate, and wake
+            # up once. Users' sensors are read because `status` counts them.
             kinds = (*keys.SENSORS, *info.sensors_beside, "status")
             self.reads = (*(keys.sensor(drone, kind) for drone in read for kind in kinds), *self.uncounted)
         self._last: dict[str, flight_messages.Estimate] = {}
@@ -86,7 +86,7 @@ class Estimator(Agent):
             return
         _, drone, what = keys.parts(key)
         if drone in self._index:
-            # over a slow link it has not arrived before the last gate, whatever its stamp
+            # a message over a slow link has arrived since the last gate, whatever its stamp
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
             self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)
 
@@ -97,10 +97,10 @@ class Estimator(Agent):
     def step(self, t_ns: int) -> list[Output]:
         estimates = self._estimators.estimate(t_ns * 1e-9)
         named = zip(self._names, self.writes, estimates, strict=True)
-        if self._external:  # no estimate of a drone whose driver has been silent since the last gate
+        if self._external:  # a drone whose driver has been silent since the last gate has no estimate
             named = [each for each in named if each[0] not in self._silent]
             self._silent = set(self._external)
-        make: Any = flight_messages.Estimate  # the type of an estimate does not say how long its sequences are
+        make: Any = flight_messages.Estimate  # the fields of a StateEstimate have sequences of unspecified length
         source, self._last, outputs = self.source, {}, []
         for drone, key, estimate in named:
             self._last[drone] = message = make(t_ns, self.next_seq(key), *estimate, source=source)

@@ -1,7 +1,7 @@
-"""The estimators of many drones as rows of arrays: sensors in, a compiled step for all of them, estimates out.
+"""The estimators of many drones as rows of arrays, with one compiled step from sensor readings to estimates.
 
-Readings are stored on arrival. At the end of the gate every drone's IMU propagates its nominal state (strapdown) and
-covariance, and its other readings are tested and used (measurement_update).
+Readings are stored on arrival. At the end of a gate, each drone's nominal state and covariance are propagated with its
+IMU (strapdown), and its other readings are tested and used (measurement_update).
 """
 
 import struct
@@ -50,24 +50,24 @@ from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, se
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, acceleration, heading_and_sigma, rotation_vector_quaternion
 
 _READING = struct.Struct(f"{READING.size}d")
-_ROOM = 256  # readings of a gate, initially
+_ROOM = 256  # initial capacity for the readings of a gate
 _YAW, _YAW_SIGMA = ESTIMATE.yaw, ESTIMATE.yaw_sigma
-_COVARIANCE = slice(ESTIMATE.covariance, _YAW_SIGMA)  # the next field
+_COVARIANCE = slice(ESTIMATE.covariance, _YAW_SIGMA)  # up to the next field
 _p_WB, _v_WB, _gyro_bias = (
     itemgetter(first, first + 1, first + 2) for first in (ESTIMATE.p_WB, ESTIMATE.v_WB, ESTIMATE.gyro_bias)
 )
 _q_WB = itemgetter(*range(ESTIMATE.q_WB, ESTIMATE.q_WB + 4))
-_REFUSED = len(SENSORS)  # offset of a sensor's count of refused readings from that of used ones
+_REFUSED = len(SENSORS)  # offset from a sensor's count of used readings to that of refused ones
 
 NOBODY = -1
 NS_S = 1e-9  # s/ns
 BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # positions among the floats of these messages
 GPS_FIX, SONAR_VALID = 3, 3  # positions among the integers
-RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # of keys in the order in which runners deliver
+RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # positions of sensors in the order of delivery, by key
 
 read = inlined(framing.read)
 
-_VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra of a reading
+_VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # columns `values` and `extra` of a reading
     "imu": lambda m: (*m.accel_m_s2, *m.gyro_rad_s, 0.0, 0.0),
     "gps": lambda m: (*m.position_m, *m.velocity_m_s, m.sigma_m, m.fix),
     "mag": lambda m: (*m.field_ut, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -78,13 +78,13 @@ _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra o
 
 
 class EstimatorBank:
-    """Fuses the sensors of several drones; `i` is the index in the order given.
+    """Fuses the sensors of several drones; `i` is the index of a drone in the given order.
 
-    Sensors may come in any order between two gates. Duplicates are ignored; readings older than the sensor's last one,
-    not finite, or outside their innovation gate are refused and counted.
+    The sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the last
+    one of the sensor, not finite, or outside their innovation gate are refused and counted.
 
     Attributes:
-        counted: sensors in the order of publication, and the columns of their used and refused counts.
+        counted: sensors in the order of publication, with the columns of their counts of used and refused readings.
     """
 
     counted = (*((name, k, _REFUSED + k) for k, name in enumerate(SENSORS) if k != IMU), ("imu", IMU, _REFUSED + IMU))
@@ -99,7 +99,7 @@ class EstimatorBank:
         self._reader = GateReader([drone.name for drone in drones])
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
-        """Receive a message that arrived at `t_arrival_s`; sensors other than SENSORS are ignored."""
+        """Store a message that arrived at `t_arrival_s` [s]; messages of sensors outside SENSORS are ignored."""
         if sensor not in _VALUES:
             return
         if self._count == len(self._readings):
@@ -110,7 +110,7 @@ class EstimatorBank:
         self._count += 1
 
     def receive_gate(self, gate: GateMessages) -> bool:
-        """Receive all sensors of a gate; return False, and take none, if one of its messages must be decoded."""
+        """Store all sensor messages of a gate; return False, and store none, if one of them must be decoded."""
         while self._count + len(gate) > len(self._readings):
             self._make_room(2 * len(self._readings))
         count = self._reader.take(gate, self._readings, self._count)
@@ -119,7 +119,7 @@ class EstimatorBank:
         return count >= 0
 
     def estimate(self, t_s: float, wanted: Sequence[int] | None = None) -> list[StateEstimate]:
-        """Use the readings since the last gate and return the estimates for `t_s` of some drones, or of all."""
+        """Use the readings since the last gate; return the estimates of all drones, or those wanted, for `t_s` [s]."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
         rows, counts = self._estimates.tolist(), self.rows.counts[:, COUNT.used :].tolist()
@@ -140,16 +140,16 @@ class EstimatorBank:
         ]
 
     def use(self, t_s: float, readings: Array) -> Array:
-        """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
+        """Use readings (M, READING.size) and return the estimates for `t_s` [s], (N, ESTIMATE.size)."""
         if self._held_rows is not self.rows:
             self._held, self._held_rows = hold(self.rows), self.rows
         step(self._held, t_s, readings, self._estimates)
         return self._estimates
 
     def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
-        """Continue from a published estimate; call before the first reading.
+        """Continue from a published estimate; must precede the first reading.
 
-        Tilt and biases, whose covariance is not published, start as in a cold start.
+        The covariances of tilt and biases, which are not published, remain those of a cold start.
         """
         w, x, y, z = (float(part) for part in last.orientation_wxyz)
         row, setting, P = self.rows.nominal[i], self.rows.setting[i], self.rows.covariance[i]
@@ -167,7 +167,11 @@ class EstimatorBank:
         return {name: getattr(self.rows, name) for name in STATES}
 
     def restore(self, state: State) -> None:
-        """Take over the rows of another bank of the same drones; KeyError, ValueError: the shapes differ."""
+        """Continue from the state of a bank for the same drones.
+
+        Raises:
+            KeyError, ValueError: an array is missing or has another shape.
+        """
         for name in STATES:
             rows = getattr(self.rows, name)
             if state[name].shape != rows.shape:
@@ -182,12 +186,12 @@ class EstimatorBank:
 
 @portable
 def step(held: Held, t_s: float, readings: Array, estimates: Array) -> None:
-    """Use the readings of a gate of all drones and write their estimates for `t_s`.
+    """Use the readings of all drones in a gate, and write the estimates for `t_s` [s].
 
     Args:
-        held: the Rows of N drones, by `hold`; changed.
-        readings: (M, READING.size), each drone's in the order of their arrival.
-        estimates: (N, ESTIMATE.size), written.
+        held: the Rows of N drones, by `hold`, which are updated.
+        readings: readings, (M, READING.size), those of each drone in order of arrival.
+        estimates: receives the estimates, (N, ESTIMATE.size).
     """
     rows = held.content
     count = rows.nominal.shape[0]
@@ -200,12 +204,12 @@ def step(held: Held, t_s: float, readings: Array, estimates: Array) -> None:
 
 @portable
 def sort_readings(rows: Rows, readings: Array, first: Array, after: Array) -> None:
-    """Propagate every drone by its IMU, and chain the aiding readings to be used.
+    """Propagate the nominal state of each drone with its IMU, and chain the aiding readings to be used.
 
     Args:
-        readings: (M, READING.size).
-        first: the first of each drone, (N,); comes in as -1 for none.
-        after: of each reading, the next one of the same drone, (M,); comes in as -1.
+        readings: readings, (M, READING.size).
+        first: receives the index of each drone's first aiding reading, (N,); must be filled with -1, for none.
+        after: receives, for each reading, the index of the next one of the same drone, (M,); must be filled with -1.
     """
     last = np.full(rows.nominal.shape[0], -1)
     for m in range(readings.shape[0]):
@@ -239,9 +243,10 @@ def _step_one(rows: Rows, i: int, t_s: float, readings: Array, first: int, after
 
 @portable
 def write_estimate(row: Array, setting: Array, P: Array, t_s: float, estimate: Array) -> None:
-    """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,).
+    """Write the estimate of a drone for `t_s` [s], (ESTIMATE.size,).
 
-    Until then it is extrapolated with the acceleration of the last sample, its noise and possible manoeuvres.
+    Beyond the last IMU sample it is extrapolated with that sample's acceleration; its noise and possible manoeuvres add
+    to the covariance.
     """
     p, v, q, a_W, w, _ = reckoning(row)
     ahead = t_s - row[NOMINAL.t]
@@ -269,17 +274,17 @@ def write_estimate(row: Array, setting: Array, P: Array, t_s: float, estimate: A
 
 
 class ReaderTables(NamedTuple):
-    """The layout of the messages of a gate for compiled code, and buffers for one of them."""
+    """The layout of the messages of a gate for compiled code, and buffers for one message."""
 
     program: Program
-    owner: Array  # (keys, 2): drone and sensor of each key of the table, or NOBODY
+    owner: Array  # drone and sensor of each key of the table, or NOBODY, (keys, 2)
     ints: Array
     floats: Array
-    bits: Array  # of the floats
+    bits: Array  # view of the floats as integers
 
 
 class GateReader:
-    """Reads the sensors of drones, in the order of the bank, out of gates."""
+    """Reads the sensor messages of drones, which are in the order of the bank, from gates."""
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._whose = {
@@ -294,9 +299,10 @@ class GateReader:
         self._held = hold(self._tables)
 
     def take(self, gate: GateMessages, readings: Array, count: int) -> int:
-        """Write the readings of a gate from row `count` on, for all of which `readings` (M, READING.size) has room.
+        """Write the readings of a gate to rows of `readings` (M, READING.size) from `count` on; they must all fit.
 
-        Returns the new count, -1 if a message has to be decoded.
+        Returns:
+            The new count, or -1 if a message must be decoded.
         """
         if gate.table is not self._table:
             self._table = gate.table
@@ -305,13 +311,13 @@ class GateReader:
         data = np.frombuffer(gate.buffer, dtype=np.uint8)
         if gate.which.flags.writeable:
             for array in (gate.which, gate.ends, data):
-                array.setflags(write=False)  # as off the wire: writeable arrays are compiled separately
+                array.setflags(write=False)  # as received; code for writeable arrays would be compiled separately
         return collect(self._held, gate.which, gate.ends, data, readings, count)
 
 
 @portable
 def collect(held: Held, which: Array, ends: Array, data: Array, readings: Array, count: int) -> int:
-    """Write the sensor messages of a gate as readings, of each drone by time and name; see GateReader.take."""
+    """Write the sensor messages of a gate as readings, sorted by time and name per drone; see `GateReader.take`."""
     program, owner, ints, floats, bits = held.content
     start, first = 0, count
     marks = np.empty(which.shape[0], np.int64)

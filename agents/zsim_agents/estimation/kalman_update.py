@@ -1,8 +1,8 @@
-"""Linear algebra of the filter: prediction of a covariance, innovation gates, and updates with a stack of measurements.
+"""Linear algebra of the filter: prediction of a covariance, innovation gates, and updates with stacked measurements.
 
-Compiled. The equations of prediction and update are those of filterpy's ExtendedKalmanFilter (Joseph form), which the
-tests compare them with. A joint covariance J is (D, D) with D = N n: the error states of N drones one after the other,
-n each (filter_setup).
+All functions are compiled. The prediction and the update follow filterpy's ExtendedKalmanFilter (Joseph form), with
+which the tests compare them. A joint covariance J is (D, D) with D = N n, for the error states of N drones one after
+another, n each (filter_setup).
 """
 
 import math
@@ -13,8 +13,8 @@ from zsim.math.compiled import portable
 from zsim.math.linear import product_with
 
 Array = np.ndarray
-DOF_MAX = 6  # rows of the largest block, GPS with position and velocity
-JOSEPH_MAX = 24  # states, chosen: with more, of clones, its products of n^3 would cost more than all else
+DOF_MAX = 6  # rows of the largest block, a GPS fix with position and velocity
+JOSEPH_MAX = 24  # maximum number of states for the Joseph form: with more (clones), its n^3 products would dominate
 
 
 @portable
@@ -23,10 +23,11 @@ def stacked_update(
 ) -> tuple[bool, Array, Array, Array]:
     """Test the innovations y (m,) of a stack and, if all are within their gates, use them; P (n, n) is not changed.
 
-    H is the Jacobian, (m, n), `variance` that of each row's white noise, (m,); for the others see `within_gates`.
+    H is the Jacobian, (m, n), and `variance` the white-noise variance of each row, (m,); for the other arguments see
+    `within_gates`.
 
     Returns:
-        Whether they were used; the state's correction K y, (n,); the new covariance; S, (m, m).
+        Whether the innovations were used, the correction K y of the state, (n,), the new covariance, and S, (m, m).
     """
     PHt = np.zeros((P.shape[0], H.shape[0]))
     S = innovation_covariance(P, H, variance, PHt)
@@ -42,15 +43,16 @@ def stacked_update(
 
 @portable
 def within_gates(S: Array, y: Array, blocks: Array, limits: Array, distances: Array) -> bool:
-    """Write y^T S^-1 y of each separate block of innovations; return whether all are within their limits.
+    """Write y^T S^-1 y of each block of innovations on its own; return whether all are within their limits.
 
-    By the block's Cholesky factor; infinite where S is not positive definite or the innovation is NaN.
+    It is computed with the Cholesky factor of the block's covariance, and is infinite if that is not positive definite
+    or an innovation is NaN.
 
     Args:
-        S, y: covariance (m, m) of all innovations (m,).
+        S, y: covariance (m, m) of all innovations, and the innovations (m,).
         blocks: first row and number of rows of each block, (k, 2).
-        limits: by number of rows, (DOF_MAX + 1,).
-        distances: the result, (k,) or longer.
+        limits: limit by number of rows, (DOF_MAX + 1,).
+        distances: receives the result, (k,) or longer.
     """
     L = np.zeros((DOF_MAX, DOF_MAX))
     u = np.zeros(DOF_MAX)
@@ -80,7 +82,7 @@ def within_gates(S: Array, y: Array, blocks: Array, limits: Array, distances: Ar
 
 @portable
 def predicted_covariance(P: Array, F: Array, Q: Array) -> Array:
-    """Return F P F^T + Q, (n, n), for a transition F that is the unit matrix but for few entries."""
+    """Return F P F^T + Q, (n, n), for a transition matrix F that differs from the identity in few entries."""
     n = P.shape[0]
     FP = np.zeros((n, n))
     for i in range(n):
@@ -101,7 +103,7 @@ def predicted_covariance(P: Array, F: Array, Q: Array) -> Array:
 
 @portable
 def predict_jointly(J: Array, i: int, F: Array, Q: Array) -> None:
-    """Propagate the i-th n errors of J by F and Q, (n, n), and their covariance with all others."""
+    """Propagate the errors of drone i in J, and their covariance with all others, by F and Q, (n, n)."""
     n, size = F.shape[0], J.shape[0]
     first = i * n
     former = J[first : first + n].copy()
@@ -122,7 +124,7 @@ def predict_jointly(J: Array, i: int, F: Array, Q: Array) -> None:
                 if f != 0.0:
                     total += own[r, k] * f
             J[first + r, first + c] = J[first + c, first + r] = total
-    for d in range(size):  # the columns of others mirror these rows
+    for d in range(size):  # J is symmetric
         if d < first or d >= first + n:
             for r in range(n):
                 J[d, first + r] = J[first + r, d]
@@ -130,7 +132,7 @@ def predict_jointly(J: Array, i: int, F: Array, Q: Array) -> None:
 
 @portable
 def innovation_covariance(P: Array, H: Array, variance: Array, PHt: Array) -> Array:
-    """Return S = H P H^T + R, (m, m), and write P H^T, (n, m); `variance` is the diagonal of R, (m,)."""
+    """Return S = H P H^T + R, (m, m), and write P H^T, (n, m); R is diagonal with `variance`, (m,)."""
     m, n = H.shape
     S = np.zeros((m, m))
     PHt[:, :] = 0.0
@@ -225,13 +227,13 @@ def put_block(J: Array, i: int, P: Array) -> None:
 
 @portable
 def block(J: Array, i: int, n: int) -> Array:
-    """Return a drone's own covariance, (n, n)."""
+    """Return a copy of the covariance of drone i, (n, n)."""
     return J[i * n : i * n + n, i * n : i * n + n].copy()
 
 
 @portable
 def add_projection(J: Array, H: Array, first: int, HJ: Array) -> None:
-    """Add H J to HJ, (m, D), for a Jacobian H by the errors from `first` on, (m, n), mostly zeros."""
+    """Add H J to HJ, (m, D), for a sparse Jacobian H, (m, n), with respect to the n errors from `first` on."""
     for j in range(H.shape[0]):
         for k in range(H.shape[1]):
             h = H[j, k]
@@ -253,7 +255,7 @@ def add_innovation_covariance(HJ: Array, H: Array, first: int, S: Array) -> None
 
 @portable
 def whiten(S: Array, HJ: Array, y: Array) -> None:
-    """Replace HJ by W = L^-1 HJ and y by u = L^-1 y, with S = L L^T: then J^+ = J - W^T W, and x = W^T u."""
+    """Replace HJ by W = L^-1 HJ and y by u = L^-1 y, with S = L L^T, so that J^+ = J - W^T W and x = W^T u."""
     L = cholesky(S)
     for i in range(L.shape[0]):
         for k in range(i):

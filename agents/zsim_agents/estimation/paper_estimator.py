@@ -1,11 +1,11 @@
-"""The paper's estimator: Madgwick's attitude, and an extended Kalman filter that fuses dead reckoning with GPS.
+"""The paper's estimator: Madgwick's attitude filter, and an extended Kalman filter for dead reckoning and GPS.
 
-I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: gyroscopes and
-accelerometers give the attitude by Madgwick's filter; the position is that of dead reckoning and a GPS receiver, fused
-by an extended Kalman filter "due to the non-linear dynamics". The heading is not measured: it starts at the scenario's
-value, and only the fixes of a moving drone correct it.
+I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: Madgwick's
+filter computes the attitude from gyroscopes and accelerometers; an extended Kalman filter, used "due to the non-linear
+dynamics", fuses dead reckoning and a GPS receiver to a position. The heading is not measured: it starts at the
+scenario's value, and only GPS fixes of a moving drone correct it.
 
-Dead reckoning integrates the velocity u measured by the aircraft in its heading frame:
+Dead reckoning integrates the velocity u that the aircraft measures in its heading frame:
 
     x = (p_WB, yaw)      p' = Rz(yaw) u      yaw' = rate of Madgwick's heading      z = p_WB
 """
@@ -27,12 +27,12 @@ from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.kalman_update import joseph
 from zsim_agents.estimation.strapdown import madgwick_step
 
-YAW = 3  # place in the state
-POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
-YAW_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye
-DRIFT_S = 1.0  # s during which the gyroscope's bias is assumed constant; it is not estimated
-SPEED_SIGMA_M_S = 1.0  # m/s, of a drone whose own velocity is not known
-IMU_GAP_MAX_S = 0.1  # s; over a longer one no rate is integrated
+YAW = 3  # index in the state
+POSITION_SIGMA_M = 100.0  # initial standard deviation, for a start anywhere on the field
+YAW_SIGMA_RAD = 0.05  # initial standard deviation: the accuracy of setting a drone down by eye
+DRIFT_S = 1.0  # time over which the gyroscope's bias, which is not estimated, is assumed constant
+SPEED_SIGMA_M_S = 1.0  # standard deviation per axis of an unknown velocity
+IMU_GAP_MAX_S = 0.1  # interval from which on only one IMU period is integrated
 
 
 class PaperEstimator:
@@ -58,7 +58,7 @@ class PaperEstimator:
         self._filter = DeadReckoningFilter(yaw)
 
     def receive(self, sensor: str, message: Any) -> None:
-        """Receive a reading of the IMU, the GPS receiver or the aircraft's own velocity; ignore others."""
+        """Receive a reading of the IMU, the GPS receiver or the aircraft's velocity sensor; others are ignored."""
         if sensor in self._used:
             self._used[sensor] += 1
         if sensor == "imu":
@@ -69,11 +69,11 @@ class PaperEstimator:
             self._fix = message
 
     def estimate(self, t_s: float) -> StateEstimate:
-        """Predict to the end of the gate, correct by a fix, and return the estimate."""
+        """Predict to the end of the gate, `t_s` [s], correct with a fix if one has arrived, and return the estimate."""
         dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
         self._t_s = t_s
         yaw = float(frames.heading(self._q))
-        position = self._velocity_variance() * self._flow_period_s * dt  # each error is held for its period
+        position = self._velocity_variance() * self._flow_period_s * dt  # an error persists for a sensor period
         drift = (el.square(self._gyro_sigma) * self._imu_period_s + el.square(self._gyro_bias) * DRIFT_S) * dt
         noise = np.diag([position, position, position, drift])
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, noise, dt)
@@ -97,7 +97,7 @@ class PaperEstimator:
         )
 
     def snapshot(self) -> State:
-        """Return the state; a fix is used at the end of its gate and not kept."""
+        """Return the state, which contains no fix, since fixes are used at the end of their gate."""
         filter_ = {"x": self._filter.x, "P": self._filter.P}
         times = {"t_imu_s": self._t_imu_s, "t_s": self._t_s}
         return {**filter_, **times, "q": self._q, "velocity": self._velocity, "used": self._used}
@@ -125,12 +125,12 @@ class PaperEstimator:
         return x, y, z
 
     def _velocity_variance(self) -> float:
-        """Return the variance per axis of the velocity used by dead reckoning [m^2/s^2]."""
+        """Return the variance per axis of the velocity that dead reckoning uses [m^2/s^2]."""
         return el.square(self._speed_sigma if self._velocity else SPEED_SIGMA_M_S)
 
 
 class DeadReckoningFilter:
-    """Position and heading, x = (p_WB, yaw) with covariance P (4, 4), by dead reckoning and fixes.
+    """Estimates x = (p_WB, yaw), with covariance P (4, 4), from dead reckoning and GPS fixes.
 
     The equations are those of filterpy's ExtendedKalmanFilter, in Joseph form.
     """
@@ -140,7 +140,10 @@ class DeadReckoningFilter:
         self.P = np.diag([el.square(POSITION_SIGMA_M)] * 3 + [el.square(YAW_SIGMA_RAD)])
 
     def reckon(self, u: Vector, yaw: float, Q: NDArray[np.float64], dt: float) -> None:
-        """Move for `dt` [s] with the velocity u [m/s; heading frame], to a heading [rad] known from its rate."""
+        """Move for `dt` [s] with the velocity u [m/s; heading frame], to a heading [rad] that Madgwick's filter gives.
+
+        Q is the covariance of the process noise, (4, 4).
+        """
         step = linear.product(rotation_z(yaw), u) * dt
         self.x = np.append(self.x[:3] + step, yaw)
         F = np.eye(4)
@@ -148,19 +151,20 @@ class DeadReckoningFilter:
         self.P = linear.product(linear.product(F, self.P), F.T) + Q
 
     def correct(self, fix: Gps, variance_factor: float) -> None:
-        """Use a fix of the GPS receiver, its variance multiplied by a factor."""
+        """Use a GPS fix, with its variance multiplied by a factor."""
         H, variance = np.eye(3, 4), np.full(3, el.square(fix.sigma_m) * variance_factor)
-        K = linear.solve(self.P[:3, :3] + np.diag(variance), self.P[:3]).T  # P H^T S^-1, of symmetric P and S
+        K = linear.solve(self.P[:3, :3] + np.diag(variance), self.P[:3]).T  # P H^T S^-1 for symmetric P and S
         self.x = self.x + linear.product(K, np.array(fix.position_m) - self.x[:3])
         self.P = joseph(self.P, H, variance, K)
 
 
 def correlation_factor(error: ErrorModel, rate_hz: float) -> float:
-    """Return the factor by which correlation raises the variance of a mean: (1 + a)/(1 - a), a of neighbours.
+    """Return the factor by which the correlation of an error raises the variance of a mean of samples.
 
-    The variance of a mean of n samples of a Gauss-Markov process is this factor times sigma^2/n (G. V. Bayley, J. M.
-    Hammersley, "The 'effective' number of independent observations in an autocorrelated time series", Supplement to the
-    Journal of the Royal Statistical Society 8, 1946).
+    The mean of n samples of a Gauss-Markov process has the variance sigma^2/n times (1 + a)/(1 - a), where a is the
+    correlation of successive samples (G. V. Bayley, J. M. Hammersley, "The 'effective' number of independent
+    observations in an autocorrelated time series", Supplement to the Journal of the Royal Statistical Society 8, 1946).
+    White noise in the error lowers the factor.
     """
     if not error.correlated_sigma:
         return 1.0

@@ -1,1 +1,1 @@
-"""All drones, one gate at a time: the kernel, injected faults, and the messages of a gate. Imports vehicles."""
+"""The fleet of all drones, one gate at a time: kernel, injected faults, messages of a gate. Imports vehicles."""

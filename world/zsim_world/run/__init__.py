@@ -1,4 +1,4 @@
-"""The rules of a run, without session and wall clock: participants, time, commands, faults, requests, refusals.
+"""The rules of a run, without session or wall clock: participants, time, commands, faults, requests, refusals.
 
 Each module uses only those below it; an object receives its dependencies through its constructor.
 
@@ -7,6 +7,6 @@ Each module uses only those below it; an object receives its dependencies throug
       ├─ faults                           injected faults
       └─ coordinator                      the part common to flights and replays: participants, requests, time
            ├─ barrier                     participants, and those that the world waits for
-           ├─ run_clock                   simulated time, its requests, statistics of the run
-           └─ outbox                      messages, events and refusals to publish
+           ├─ run_clock                   simulated time, requests that control it, statistics of the run
+           └─ outbox                      messages, events and refusals to be published
 """

@@ -280,7 +280,7 @@ class Barrier:
         return participant
 
     def await_return(self, wall_ns: int, all_died: bool) -> None:
-        """In a restarted world, mark participants as away until they rejoin, or as dead if all died with the world."""
+        """In a restarted world, mark awaited participants as away until they rejoin; with `all_died`, all are dead."""
         for participant in self.participants.values():
             participant.since_wall_ns = participant.joined_wall_ns = wall_ns
             participant.alive = participant.alive and not all_died

@@ -1,12 +1,12 @@
 """The samples of a fleet at a gate, as rows of arrays that are held back until their latency has passed.
 
-Values are in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude
-[deg], altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range
-[m], valid (0 or 1); flow: forward, left, up [m/s], quality. The numbers of a user's sensor are computed in Python after
-the gate, from the truth that the kernel logged.
+Values are in the order of the contract's fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude,
+longitude [deg], altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m];
+sonar: range [m], valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading,
+computed in Python after the gate from the truth that the kernel logged.
 
-Sightings and scans are also computed after the gate, from the poses of all drones at the sampling times (`Exposures`,
-`poses_between`), and held back (`released`).
+Sightings and scans are also computed after the gate, from the poses of all drones at their sampling times
+(`Exposures`, `poses_between`), and held back (`released`).
 """
 
 from collections.abc import Sequence
@@ -33,26 +33,26 @@ from zsim_world.sensors.noise import place, words
 from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width, read
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
-VALUE_COLUMNS = 9  # numbers of a GPS fix, the most of all sensors
+VALUE_COLUMNS = 9  # number of values of a GPS fix, the longest sample
 
 
 class Sampled(NamedTuple):
     """Measurements in the order of (t_ns, drone, sensor)."""
 
     whose: NDArray[np.int64]  # (M, WHOSE.size)
-    values: NDArray[np.float64]  # (M, VALUE_COLUMNS), filled from the left with the values of the sensor
+    values: NDArray[np.float64]  # (M, VALUE_COLUMNS); each sensor uses the first columns
 
 
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
 
 
 class SampledLog(NamedTuple):
-    """The log of the kernel, and the data for its conversion to samples."""
+    """The kernel's log, and the data needed to convert it to samples."""
 
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
     latency_ns: NDArray[np.int64]  # (N, sensors)
-    rows: NDArray[np.float64]  # like place, from frames.anchor
+    rows: NDArray[np.float64]  # this and `place` are the results of frames.anchor
     place: NDArray[np.float64]
 
 
@@ -98,10 +98,10 @@ class Sampler:
 
 @kernel()
 def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
-    """Return `whose` and `values` of a Sampled for the first rows of a log.
+    """Return `whose` and `values` of Sampled for the first rows of a log.
 
     Args:
-        held: a SampledLog, by `hold`.
+        held: a SampledLog, held by `hold`.
         count: number of rows.
         tick_ns: interval between two ticks [ns].
     """
@@ -121,7 +121,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
 
 @inlined
 def _is_before(a: NDArray, b: NDArray) -> bool:
-    """Return whether a comes before b, or is equal, in the order of (t_ns, drone, sensor)."""
+    """Return whether `a` comes before `b`, or with it, in the order of (t_ns, drone, sensor)."""
     if a[WHOSE.t] != b[WHOSE.t]:
         return a[WHOSE.t] < b[WHOSE.t]
     if a[WHOSE.drone] != b[WHOSE.drone]:
@@ -131,14 +131,11 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 @kernel()
 def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Insert measurements without values into others.
+    """Insert rows without values into measurements; return `whose`, `values` and the positions of the inserted rows.
 
     Args:
-        whose, values: fields of a Sampled, in its order.
-        more: `whose` of the measurements to insert, in the same order, (K, WHOSE.size).
-
-    Returns:
-        `whose` and `values` of all measurements, and the rows of the inserted ones.
+        whose, values: fields of Sampled, in its order.
+        more: rows to insert, in the same order, (K, WHOSE.size).
     """
     count, extra = whose.shape[0], more.shape[0]
     index, numbers = np.empty((count + extra, WHOSE.size), np.int64), np.zeros((count + extra, VALUE_COLUMNS))
@@ -153,7 +150,7 @@ def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, 
 
 
 class UserSensors:
-    """The users' sensors of a fleet; as with stock sensors, each sensor of each drone has its own random stream."""
+    """The users' sensors of a fleet. As with stock sensors, each sensor of each drone has its own random stream."""
 
     SAVED: ClassVar[Saved] = {"sensors": PART}
 
@@ -172,11 +169,11 @@ class UserSensors:
 
     @property
     def sensors(self) -> list["_UserSensor"]:
-        """Return all sensors, drone by drone."""
+        """All users' sensors, drone by drone."""
         return [*self._sensors.values()]
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return `whose` (M, 3) and values (M, CHANNELS_MAX) of the exposures logged in a gate, except for lost ones.
+        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without lost samples.
 
         Raises:
             UserCodeError: an equation fails, or does not return a reading.
@@ -196,7 +193,7 @@ class UserSensors:
 
 
 class _UserSensor:
-    """A user's sensor on a drone: settings, present bias and random stream."""
+    """A user's sensor of one drone: settings, current bias and random stream."""
 
     SAVED: ClassVar[Saved] = {"bias": IN_PLACE, "stream": list[int]}
 
@@ -224,7 +221,7 @@ class _UserSensor:
         place(self.rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
-        """Return the truth at an exposure from a row of EXPOSED columns."""
+        """Return the truth at an exposure of the sensor, from a row of EXPOSED."""
         state, accel = row[EXPOSED.state : EXPOSED.accel].copy(), row[EXPOSED.accel : EXPOSED.air].copy()
         return SensorTruth(
             t_s=t_s,
@@ -240,7 +237,7 @@ class _UserSensor:
         )
 
     def measure(self, truth: SensorTruth, environment: object, values: NDArray[np.float64]) -> None:
-        """Write the error-free values into a row (CHANNELS_MAX,)."""
+        """Write the values without errors into a row (6,)."""
         assert self._kind.equation is not None  # modules without an equation are refused
         count = self._kind.values
         equation, where = self._kind.equation, f"{self._what} at {truth.t_s:.3f} s"
@@ -285,16 +282,17 @@ class Exposures:
     def __init__(self, rates_hz: Sequence[float], gate_ns: int) -> None:
         self._rates_hz, self._gate_ns = rates_hz, gate_ns
         self._counts = [0] * len(rates_hz)
-        self._due_ns = [0] * len(rates_hz)  # next sample of each sensor
-        self._next_ns = 0  # earliest of the next samples
-        self._former = np.empty((0, STATE.size))  # states of the last gate before a sample
+        self._due_ns = [0] * len(rates_hz)  # time of each sensor's next sample
+        self._next_ns = 0  # time of the next sample of any sensor
+        self._former = np.empty((0, STATE.size))  # states at the last gate before the next sample
         self._former_ns = 0
 
     def until(self, state: Array, now_ns: int) -> tuple[list[tuple[int, int]], Between | None]:
-        """Return the times and sensors of the samples due by a gate, sorted, and the states at the gates around them.
+        """Return the sorted samples due by a gate, as (time [ns], index of the sensor), and the states around them.
 
         Args:
             state: states of all drones at the gate, (N, STATE.size or more).
+            now_ns: time of the gate [ns].
         """
         due, between = [], None
         if self._next_ns <= now_ns:
@@ -314,7 +312,7 @@ class Exposures:
 
 
 def released(later: list[Any], now_ns: int) -> list[Any]:
-    """Remove the messages that are due, by their t_ns, from a list of delayed ones, and return them."""
+    """Remove the messages that are due by their t_ns from a list of delayed messages, and return them."""
     due = [each for each in later if each.t_ns <= now_ns]
     if due:
         later[:] = [each for each in later if each.t_ns > now_ns]
@@ -323,10 +321,11 @@ def released(later: list[Any], now_ns: int) -> list[Any]:
 
 @kernel()
 def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_ns: int) -> NDArray:
-    """Return the poses of all drones at a time between two gates, in rows like the states.
+    """Return the states of all drones at a time t_ns between two gates, (N, STATE.size); other columns are linear.
 
     Args:
-        former, now: states at the gates, (N, STATE.size or more); their other columns are interpolated linearly.
+        former, now: states at the gates, (N, STATE.size or more).
+        former_ns, now_ns: times of the gates [ns].
     """
     if t_ns >= now_ns or now_ns <= former_ns:
         return now.copy()
