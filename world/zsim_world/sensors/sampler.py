@@ -324,7 +324,7 @@ def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_
     """Return the poses of all drones at t_ns between two gates, as rows like `former`.
 
     Args:
-        former, now: states at the gates, (N, STATE.size or more); columns other than the pose are interpolated linearly.
+        former, now: states at the gates, (N, STATE.size or more); other columns are interpolated linearly.
         former_ns, now_ns: times of the gates [ns].
     """
     if t_ns >= now_ns or now_ns <= former_ns:

@@ -26,7 +26,7 @@ NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new toke
 TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
 SILENT_NS = 1_800_000_000  # wall time without health, published once a second; silence is thus reported within 2 s
 DEAD_NS = (
-    10_000_000_000  # wall time without health after which a process that only reads is dead; its link is closed by then
+    10_000_000_000  # wall time without health after which a process that only reads is dead; its link is then closed
 )
 STALL_NS = 300_000_000  # wall time between two checks that indicates that the world or its machine was stopped
 SHOWN = 5  # maximum number of key expressions shown per closed link
