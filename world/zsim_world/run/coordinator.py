@@ -220,8 +220,8 @@ class Coordinator(ABC):
     def _leave(self, participant: Participant, bye: Bye, wall_ns: int) -> None:
         """Handle the bye of a participant that has left or cannot continue.
 
-        An early departure is reported if the scenario needs the participant and no other process does its work. A
-        user's own program may leave when it has finished; a recorder that leaves ends the run.
+        The run continues but counts as failed if the scenario needs the participant and no other process does its work.
+        A user's own program may leave when it has finished; a recorder that leaves ends the run.
         """
         name, role, barrier = participant.name, participant.join.role, self.barrier
         if bye.failed is True and self.clock.ended is None:
