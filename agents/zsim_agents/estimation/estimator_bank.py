@@ -62,7 +62,7 @@ _REFUSED = len(SENSORS)  # offset from a sensor's count of used readings to that
 NOBODY = -1
 NS_S = 1e-9  # s/ns
 BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # positions among the floats of these messages
-GPS_FIX, SONAR_VALID = 3, 3  # positions among the integers
+GPS_FIX, SONAR_VALID = 3, 3  # positions among the integers of these messages
 RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # positions of sensors in the order of delivery, by key
 
 read = inlined(framing.read)

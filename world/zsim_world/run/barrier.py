@@ -39,8 +39,8 @@ class Participant:
     deadline_misses: int = 0  # number of dones that were late in realtime
     away: bool = False  # it has not yet rejoined a restarted world
     silent_wall_ns: int | None = None  # when its last health message arrived, if it has been silent since
-    # A bye that names no incarnation and so may come from another process: it takes effect when the token is lost, and
-    # the next done cancels it.
+    # A bye that names no incarnation and may therefore come from another process: it takes effect when the token is
+    # lost, and the next done cancels it
     farewell: Bye | None = None
 
     def __str__(self) -> str:
@@ -75,7 +75,7 @@ class Participant:
 
     @property
     def incomplete(self) -> bool:
-        """Whether outputs or a done of it were lost or are still in transit."""
+        """Whether some of its outputs, or a done, were lost or are still in transit."""
         return self.missing > 0 or self.lost_done
 
     def required_ns(self, need_ns: int) -> int | None:
@@ -232,7 +232,7 @@ class Barrier:
             participant.surplus += 1
 
     def give_up_late(self) -> None:
-        """At a gate in realtime, give up outputs that were already missing at the previous gate: they are lost.
+        """At a gate in realtime, treat outputs that were already missing at the previous gate as lost.
 
         They are not requested again; still expecting them would make every later gate a deadline miss of their sender.
         """

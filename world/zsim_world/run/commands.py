@@ -24,7 +24,7 @@ from zsim_world.run.outbox import Refusal, too_many
 from zsim_world.run.run_clock import Operation, number, refused_argument
 
 MISSION_STATES = ("active", "finished", "aborted")
-MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # chosen: far more items than autopilots store; one line
+MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # far more items than autopilots store; one line of text
 PROGRAM = 0  # priority of a program, by the contract
 RECENT_PER_DRONE = 32  # commands remembered to recognise duplicates; after a rejoin, those of two gates are repeated
 
@@ -35,7 +35,7 @@ class CommandIntake:
     Args:
         run: the run whose participants send commands.
         drivers: drivers of the fleet's external drones.
-        faults_at: returns the link and radio faults that act in a gate.
+        faults_at: returns the link and radio faults that act at a gate.
 
     Attributes:
         queue: pending commands and the commander of each drone.
@@ -241,7 +241,7 @@ class CommandIntake:
         return self.queue.acquire(index, request.source, int(priority))
 
     def _report_mission(self, request: ControlRequest, drone: str) -> Refusal | None:
-        """Publish the progress of the mission that a drone's commander reports."""
+        """Publish the reported progress of a drone's mission."""
         args = request.args
         if args.get("state") not in MISSION_STATES:
             return refused_argument(request, "state", f"one of {', '.join(MISSION_STATES)}")

@@ -27,8 +27,8 @@ from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal,
 from zsim_world.run.run_clock import Operation, RunClock, RunStatistics, number
 
 RECORDER = "recorder"  # name and role
-START_TIMEOUT_S = 60.0  # wall time, chosen; for expected processes that the launcher does not start
-START_TIMEOUT_OWN_S = 600.0  # wall time, chosen; for processes that the launcher starts: compiling may take minutes
+START_TIMEOUT_S = 60.0  # wall time for expected processes that the launcher does not start
+START_TIMEOUT_OWN_S = 600.0  # wall time for processes that the launcher starts; compiling may take minutes
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # operations that change a flight
 ARGS_BYTES_MAX = 4000  # maximum size of arguments that an event repeats in full; all operations need far less
 
@@ -43,12 +43,12 @@ class Coordinator(ABC):
 
     Attributes:
         needs_participants: whether the loss of a participant affects the run; False for a replay.
-        refused_queries: further keys, beside `world/control`, on which requests are refused.
+        refused_queries: further keys, besides `world/control`, on which requests are refused.
         external: names of the drones whose drivers publish sensors, truth and status.
         unpaced: names of the processes that step when a driver publishes, not at every gate.
         is_launched: whether a launcher started the run; otherwise users start each process.
         failure: the error to raise once the end is published; None while the run has not failed.
-        left_early: a line for each process that the run needed and that left before the end.
+        left_early: a line for each process that left before the end although the run needed it.
         requests: number of requests on `world/control`.
     """
 
@@ -220,8 +220,8 @@ class Coordinator(ABC):
     def _leave(self, participant: Participant, bye: Bye, wall_ns: int) -> None:
         """Handle the bye of a participant that has left or cannot continue.
 
-        The run fails if the scenario needs the participant and no other process does its work. A user's own program
-        may leave when it has finished; a recorder that leaves ends the run.
+        An early departure is reported if the scenario needs the participant and no other process does its work. A
+        user's own program may leave when it has finished; a recorder that leaves ends the run.
         """
         name, role, barrier = participant.name, participant.join.role, self.barrier
         if bye.failed is True and self.clock.ended is None:
@@ -544,7 +544,7 @@ class DataFlow:
         self._known: dict[tuple[str, str], bool] = {}
 
     def feeds(self, writer: str, reader: str) -> bool:
-        """Return whether `reader` reads outputs of `writer`, and not also the reverse."""
+        """Return whether `reader` reads outputs of `writer`, but not vice versa."""
         return self._writes_for(writer, reader) and not self._writes_for(reader, writer)
 
     def _writes_for(self, writer: str, reader: str) -> bool:

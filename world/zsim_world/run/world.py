@@ -1,7 +1,6 @@
 """The world of a flight: integrates all drones, owns simulated time, applies commands and faults.
 
-It has neither session nor wall clock. `zsim_world.run.coordinator` has what flights and replays share: participants and
-requests.
+It has neither a session nor a wall clock. `zsim_world.run.coordinator` has the part common to flights and replays.
 """
 
 from collections.abc import Callable, Iterable, Sequence

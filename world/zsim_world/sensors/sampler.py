@@ -2,8 +2,8 @@
 
 Values are in the order of the contract's fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude,
 longitude [deg], altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m];
-sonar: range [m], valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading,
-computed in Python after the gate from the truth that the kernel logged.
+sonar: range [m], valid (0 or 1); flow: forward, left, up [m/s], quality. The numbers of a user's sensor are computed in
+Python after the gate, from the truth that the kernel logged.
 
 Sightings and scans are also computed after the gate, from the poses of all drones at their sampling times
 (`Exposures`, `poses_between`), and held back (`released`).
@@ -321,10 +321,10 @@ def released(later: list[Any], now_ns: int) -> list[Any]:
 
 @kernel()
 def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_ns: int) -> NDArray:
-    """Return the states of all drones at a time t_ns between two gates, (N, STATE.size); other columns are linear.
+    """Return the poses of all drones at t_ns between two gates, as rows like `former`.
 
     Args:
-        former, now: states at the gates, (N, STATE.size or more).
+        former, now: states at the gates, (N, STATE.size or more); other columns are interpolated linearly.
         former_ns, now_ns: times of the gates [ns].
     """
     if t_ns >= now_ns or now_ns <= former_ns:

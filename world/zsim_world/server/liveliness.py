@@ -25,8 +25,10 @@ START_NS = 60_000_000_000  # wall time in which a restarted process joins; a sma
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
 SILENT_NS = 1_800_000_000  # wall time without health, published once a second; silence is thus reported within 2 s
-DEAD_NS = 10_000_000_000  # wall time without health after which a process that only reads is dead, its link closed
-STALL_NS = 300_000_000  # wall time between two checks beyond which the world itself, or its machine, was stopped
+DEAD_NS = (
+    10_000_000_000  # wall time without health after which a process that only reads is dead; its link is then closed
+)
+STALL_NS = 300_000_000  # wall time between two checks that indicates that the world or its machine was stopped
 SHOWN = 5  # maximum number of key expressions shown per closed link
 _decode_health = msgspec.msgpack.Decoder(Health).decode
 TOKEN_NS = 3_000_000_000  # wall time limit for a token to appear; behind routers it takes up to 1 s (measured)
@@ -336,8 +338,8 @@ class Admission:
     def _count_standing(self, passed_ns: int, wall_ns: int) -> None:
         """Count how long participants have owed their first done, and report those that exceed the limit.
 
-        In lockstep, only while time waits for no other process, since that may be the cause; in realtime, whenever a
-        done is due and time runs.
+        In lockstep, time counts only while the world waits for no other process, which may be the cause; in realtime,
+        it counts whenever a done is due and time runs.
         """
         clock = self._world.clock
         if clock.mode == "realtime":

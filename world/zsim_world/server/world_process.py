@@ -36,15 +36,15 @@ from zsim_world.server.run_journal import RunJournal
 
 TICK_S = 0.1  # interval at which a waiting world checks the wall clock
 CLOCK_STANDING_NS = 1_000_000_000  # contract: `clock` is published once per wall second while time stands still
-VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
+VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 views per wall second
 HEALTH, OWN = keys.process(WORLD, "health"), keys.process(WORLD, "")
 BYE_S = 5.0  # contract: the world waits at most 5 s for byes
-SERVE_NS = 5_000_000  # wall time after which a world that never waits handles requests and losses
+SERVE_NS = 5_000_000  # interval [wall] at which a world that never waits handles requests and losses
 RECOVERY_S = 1.0  # timeout of a request for outputs, which a living publisher answers within milliseconds
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin within which a process may be unable to answer requests
 PROCESSES, VIEWS = "process/", "view/"  # the world does not read views
-LAG_GATES = 2  # unfinished gates that the slowest agent may have when a series of gates begins
-GATES_SENT = 3  # gates sent together; more would leave agents idle
+LAG_GATES = 2  # maximum number of gates that the slowest agent has yet to finish when a series of gates begins
+GATES_SENT = 3  # number of gates sent together; more would leave agents idle
 DELAY_MAX_NS = 50_000_000  # maximum delay of a gate [wall]; by then even a slow agent has every gate it may receive
 STOOD_STILL_NS = 1_000_000_000  # lateness of a gate [wall] that indicates a standstill rather than a slow world
 STUCK_NS = 2_000_000_000  # wall time after which a turn of the loop is reported as stuck; a turn takes milliseconds
@@ -229,7 +229,7 @@ class WorldProcess:
                         self._admission.take(keys.thing(key), join, wall_ns)
 
     def _advance(self, wall_ns: int, late_ns: int) -> None:
-        """Advance to the next gate, and publish it; also publish the views and journal the checkpoint that are due."""
+        """Advance to the next gate, publish it and due views, and add a checkpoint to the journal if one is due."""
         world = self._world
         late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
         self._run.enter(Advanced(wall_ns, late))
@@ -638,7 +638,7 @@ class Pipelining:
         return self._gates > 0 and self._continues and self._enabled and self._world.may_advance()
 
     def pause(self, wall_ns: int) -> None:
-        """Note that the world may not advance to the next gate yet."""
+        """Note that the world must not advance to the next gate yet."""
         if self._continues:
             self._continues, self._delayed_wall_ns = False, wall_ns
 
@@ -650,7 +650,7 @@ class Pipelining:
 class TurnWatch:
     """Distinguishes a stuck turn of the loop (a put that does not return) from a stopped process.
 
-    Called on a separate thread, which a put does not block. Times are monotonic wall times.
+    It is called on a separate thread, which a stuck put does not block. Times are monotonic wall times.
     """
 
     def __init__(self, now_ns: int) -> None:
