@@ -132,13 +132,13 @@ class Recorder:
             if ticker.is_alive():
                 ticker.join()
         if self._left_out:
-            why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
-            self._print(f"{NAME}: {self._left_out} messages are not on record: {why}")
+            why = f"a record holds {CHANNELS_MAX} keys, and these are on further keys"
+            self._print(f"{NAME}: {self._left_out} messages are missing from the record: {why}")
         if self._part.superseded:
             why = self._part.end_reason
-            raise SupersededError(f"{NAME}: {why}; this one ends, its record is {self._writer.path}")
+            raise SupersededError(f"{NAME}: {why}; this recorder ends; its record is {self._writer.path}")
         if reason == ANOTHER_RUN:
-            raise RunError(f"{NAME}: {reason}; the record {self._writer.path} is complete as far as it goes")
+            raise RunError(f"{NAME}: {reason}; the record {self._writer.path} is complete up to the end of that run")
         if not self._deserted():
             self._part.leave(reason)
         return reason
@@ -365,7 +365,7 @@ class Recorder:
         if clock is None:
             return
         if gap := self._gates.add(clock):
-            self._print(f"{NAME}: gates are missing on record, the world has them no longer: {gap}")
+            self._print(f"{NAME}: gates are missing from the record, and the world no longer has them: {gap}")
         if self._quiet_since_s is not None:
             self._quiet_since_s = time.monotonic()
         if clock.state == "stopped" and self._ended_s is None:

@@ -1,7 +1,8 @@
 """Frames: the world's tangent plane on the Earth, and attitude as quaternion, matrix, heading and Euler angles.
 
-World W is ENU (x east, y north, z up) at an origin given in WGS 84; body B is FLU. Quaternions are Hamilton,
-w first, and turn body components into world components. Functions of ArrayLike take any leading shape.
+World W is ENU (x east, y north, z up) at an origin given in WGS 84; body B is FLU (x forward, y left, z up).
+Quaternions are Hamilton, w first, and turn body components into world components. Functions of ArrayLike accept any
+leading shape.
 """
 
 import math
@@ -21,17 +22,17 @@ WGS84_F = 1.0 / 298.257223563  # flattening, WGS 84 (NIMA TR8350.2, table 3.1)
 _E2 = WGS84_F * (2.0 - WGS84_F)
 _B_M = WGS84_A_M * (1.0 - WGS84_F)
 _CURVATURE_M = (WGS84_A_M * WGS84_A_M - _B_M * _B_M) / _B_M
-_STEPS = 4  # each gains a factor of about 300: 1e-15 rad after four for heights below 1000 km
+_STEPS = 4  # each reduces the error by a factor of about 300: 1e-15 rad after four for heights below 1000 km
 
 
 def geodetic_to_enu(geodetic: ArrayLike, origin: tuple[float, float, float]) -> Array:
-    """Return p_W [m] of points given as latitude_deg, longitude_deg, height_m, shape (..., 3)."""
+    """Return p_W [m] of points (latitude_deg, longitude_deg, height_m), shape (..., 3), with the origin given alike."""
     d = (geodetic_to_ecef(geodetic) - geodetic_to_ecef(origin))[..., None, :]
     return (d * enu_rows(origin[0], origin[1])).sum(axis=-1)
 
 
 def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
-    """Return Earth-centred, Earth-fixed coordinates [m] of (latitude_deg, longitude_deg, height_m)."""
+    """Return the Earth-centred, Earth-fixed coordinates [m] of points (latitude_deg, longitude_deg, height_m)."""
     lat_deg, lon_deg, height = np.moveaxis(np.asarray(geodetic, dtype=float), -1, 0)
     lat, lon = np.radians(lat_deg), np.radians(lon_deg)
     sine = _sin(lat)
@@ -42,7 +43,7 @@ def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
 
 
 def enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
-    """Return the unit vectors east, north, up as rows in Earth-fixed components."""
+    """Return the unit vectors east, north and up as rows in Earth-fixed components, (3, 3)."""
     (ns, nc), (es, ec) = el.sin_cos(math.radians(latitude_deg)), el.sin_cos(math.radians(longitude_deg))
     return np.array(
         [
@@ -54,7 +55,7 @@ def enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
 
 
 def anchor(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[Array, Array]:
-    """Return east, north, up of W as rows in Earth-fixed components, (3, 3), and W's origin there [m], (3,)."""
+    """Return W's east, north and up as rows in Earth-fixed components, (3, 3), and W's origin in them [m], (3,)."""
     return enu_rows(latitude_deg, longitude_deg), geodetic_to_ecef((latitude_deg, longitude_deg, height_m))
 
 
@@ -67,7 +68,7 @@ def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
 
     Args:
         position_m: p_W, (n, 3).
-        rows, place_m: what `anchor` returns.
+        rows, place_m: the results of `anchor`.
     """
     coordinates = np.empty(position_m.shape)
     for i in range(position_m.shape[0]):
@@ -94,7 +95,7 @@ def wrap_angle(angle_rad: ArrayLike) -> Array:
 
 
 def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
-    """Return the Hamilton product p q (first q, then p), shape (..., 4)."""
+    """Return the Hamilton product p q (rotation by q, then by p), shape (..., 4)."""
     pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
     qw, qx, qy, qz = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
     return np.stack(
@@ -113,7 +114,7 @@ def quaternion_conjugate(q: ArrayLike) -> Array:
 
 
 def rotation_matrix(q: ArrayLike) -> Array:
-    """Return R of unit quaternions, shape (..., 3, 3): v_W = R v_B."""
+    """Return the rotation matrices R of unit quaternions, shape (..., 3, 3): v_W = R v_B."""
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -124,9 +125,9 @@ def rotation_matrix(q: ArrayLike) -> Array:
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Array:
-    """Return the unit quaternions of rotation matrices (..., 3, 3), either of their two signs.
+    """Return the unit quaternions of rotation matrices (..., 3, 3), with either sign.
 
-    By the largest part, which is never small (Shepperd, J. Guidance and Control 1 (1978) 223-224).
+    Divides by the largest component, which is never small (Shepperd, J. Guidance and Control 1 (1978) 223-224).
     """
     R = np.asarray(R, dtype=float)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(R, (-2, -1), (0, 1))
@@ -145,7 +146,7 @@ def quaternion_from_matrix(R: ArrayLike) -> Array:
 def principal_axes(covariance: ArrayLike) -> tuple[Array, Array]:
     """Return the standard deviations (..., 3) of covariances (..., 3, 3) along their axes, and the axes' quaternions.
 
-    The quaternions turn components along the axes into those in which the covariances are given.
+    The quaternions turn components along the axes into components in the frame of the covariances.
     """
     variances, axes = np.linalg.eigh(np.asarray(covariance, dtype=float))  # noqa: TID251 - it is only displayed
     axes[..., :, 0] *= np.where(np.linalg.det(axes) < 0, -1.0, 1.0)[..., None]  # noqa: TID251
@@ -187,13 +188,13 @@ def heading(q: ArrayLike) -> Array:
 
 
 def turned_about_up(v: tuple[float, float, float], angle_rad: float) -> tuple[float, float, float]:
-    """Return a vector turned about z, counter-clockwise seen from above; by a heading: heading frame to W."""
+    """Return a vector turned about z, counter-clockwise seen from above; a heading turns the heading frame to W."""
     c, s = el.cos(angle_rad), el.sin(angle_rad)
     return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
 
 
 def quaternion_from_heading(heading_rad: ArrayLike) -> Array:
-    """Return the quaternion of a level body with that heading."""
+    """Return the quaternion of a level body with a heading [rad]."""
     half = 0.5 * np.asarray(heading_rad, dtype=float)
     zero = np.zeros_like(half)
     return np.stack([_cos(half), zero, zero, _sin(half)], axis=-1)

@@ -1,6 +1,6 @@
 """Random streams and single draws by name, and the normal and chi-square distributions: the same bits everywhere.
 
-Adding a drone or a sensor changes no other's draws. Why not scipy's distributions: see `zsim.math.elementary`.
+Adding a drone or sensor does not change the draws of others. `zsim.math.elementary` explains why scipy is not used.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from zsim.math.compiled import deferred
 def stream(seed: int, name: str) -> np.random.Generator:
     """Return the generator with SeedSequence(seed, spawn_key = first 16 bytes of SHA-256(name)).
 
-    That key is stable over processes and versions, unlike `hash()`.
+    Unlike `hash()`, this key is the same in all processes and versions.
     """
     digest = hashlib.sha256(name.encode()).digest()[:16]
     key = tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
@@ -24,24 +24,24 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 def uniform(*what: object) -> float:
-    """Return the number in [0, 1) that is drawn for something by what it is, whenever and wherever.
+    """Return a random number in [0, 1) that depends only on the arguments.
 
-    The first 53 bits of BLAKE2b of the texts of its parts: as even as a double can be, and the same on every machine.
+    The first 53 bits of BLAKE2b of their texts: uniform to the resolution of a double, and the same on every machine.
     """
     digest = hashlib.blake2b("|".join(map(str, what)).encode(), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
 
 
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
-_FARTHEST = 38.0  # standard deviations; the density beyond is no double
+_FARTHEST = 38.0  # standard deviations; beyond, the density is below the smallest double
 
 
 @deferred(makes_arrays=False)
 def normal_probability(x: float) -> float:
-    """Return the probability of a standard normal number below x, within 1e-15.
+    """Return the probability that a standard normal variable is below x, within 1e-15.
 
-    G. Marsaglia, Evaluating the normal distribution, J. Statistical Software 11 (2004) 4: 1/2 + density times
-    x + x^3/3 + x^5/(3 5) + ..., of which all terms have one sign.
+    1/2 + density times (x + x^3/3 + x^5/(3 5) + ...), a series whose terms all have the same sign (G. Marsaglia,
+    Evaluating the normal distribution, J. Statistical Software 11 (2004) 4).
     """
     if not abs(x) < _FARTHEST:
         return math.nan if math.isnan(x) else 1.0 if x > 0.0 else 0.0
@@ -54,19 +54,19 @@ def normal_probability(x: float) -> float:
 
 
 def normal_quantile(probability: float) -> float:
-    """Return the number below which a standard normal one lies with a probability in [0, 1]."""
+    """Return the value below which a standard normal variable lies with a probability in [0, 1]."""
     if not 0.0 < probability < 1.0:
         return -math.inf if probability == 0.0 else math.inf if probability == 1.0 else math.nan
     return _bisected(normal_probability, probability, -_FARTHEST, _FARTHEST)
 
 
 def chi_square_probability(x: float, dof: int) -> float:
-    """Return the probability of a chi-square number of `dof` degrees of freedom below x >= 0.
+    """Return the probability that a chi-square variable with `dof` degrees of freedom is below x >= 0.
 
-    The series of the incomplete gamma function, with terms of one sign (Abramowitz and Stegun, 6.5.29).
+    The series of the incomplete gamma function, whose terms have the same sign (Abramowitz and Stegun, 6.5.29).
     """
     a, half = 0.5 * dof, 0.5 * x
-    gamma = 1.0 if dof % 2 == 0 else math.sqrt(math.pi)  # of 1 or 1/2, and then of a + 1
+    gamma = 1.0 if dof % 2 == 0 else math.sqrt(math.pi)  # gamma(1) or gamma(1/2), raised below to gamma(a + 1)
     at = 1.0 if dof % 2 == 0 else 0.5
     while at <= a:
         gamma *= at
@@ -82,12 +82,12 @@ def chi_square_probability(x: float, dof: int) -> float:
 
 
 def chi_square_quantile(probability: float, dof: int) -> float:
-    """Return the number below which a chi-square one lies with a probability in [0, 1)."""
+    """Return the value below which a chi-square variable lies with a probability in [0, 1)."""
     return _bisected(lambda x: chi_square_probability(x, dof), probability, 0.0, 700.0)
 
 
 def _bisected(function: Callable[[float], float], value: float, low: float, high: float) -> float:
-    """Return where an increasing function has a value, to the last bit that halving gives."""
+    """Return where an increasing function reaches a value, by bisection to the last bit."""
     while True:
         middle = 0.5 * (low + high)
         if not low < middle < high:

@@ -1,7 +1,7 @@
 """Vectors and quaternions as tuples of floats, for compiled code: no allocation, a fixed order of operations.
 
 A vector is (x, y, z). A quaternion is Hamilton (w, x, y, z) and turns body components into world components, as does
-a rotation matrix, which is given by its rows.
+a rotation matrix, a tuple of its rows.
 """
 
 import math
@@ -12,9 +12,9 @@ from zsim.math.compiled import inlined, portable
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
-LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)  # no turn at all
+LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)  # the identity rotation
 _SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
-COSINE_MAX = 0.9995  # of half the angle between two attitudes; nearer ones are mixed, which errs by 1e-7 rad at most
+COSINE_MAX = 0.9995  # of half the angle between attitudes; above it, linear interpolation errs by at most 1e-7 rad
 
 
 @inlined
@@ -76,7 +76,7 @@ def rotate_back(q: Quaternion, a: Vector) -> Vector:
 
 @inlined
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return the Hamilton product p q: first q, then p."""
+    """Return the Hamilton product p q: rotation by q, then by p."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -93,7 +93,7 @@ def normalised(q: Quaternion) -> Quaternion:
 
 @inlined
 def from_rotation_vector(r: Vector) -> Quaternion:
-    """Return the quaternion of a turn by |r| radians about r."""
+    """Return the quaternion of a rotation by |r| radians about r."""
     angle = norm(r)
     half = 0.5 * angle
     return turn_about(r, angle, el.sin(half), el.cos(half))
@@ -101,7 +101,7 @@ def from_rotation_vector(r: Vector) -> Quaternion:
 
 @inlined
 def turn_about(r: Vector, angle: float, sine: float, cosine: float) -> Quaternion:
-    """Return the quaternion of a turn by |r| = angle about r, from sine and cosine of half the angle."""
+    """Return the quaternion of a rotation by |r| = angle about r, given the sine and cosine of half the angle."""
     s = 0.5 if angle < _SMALL_ANGLE else sine / angle
     return (cosine, s * r[0], s * r[1], s * r[2])
 
@@ -123,7 +123,7 @@ def heading(q: Quaternion) -> float:
 
 @inlined
 def forwards(q: Quaternion) -> tuple[float, float]:
-    """Return how far the body's x axis points north, and east."""
+    """Return the north and east components of the body's x axis."""
     w, x, y, z = q
     return 2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)
 
@@ -135,7 +135,7 @@ def about_z(angle: float) -> Quaternion:
 
 @inlined
 def level(own: Quaternion, q_WB: Quaternion) -> Quaternion:
-    """Return q_HB, the attitude over the heading frame, tilt without heading; own = about_z(heading(q_WB))."""
+    """Return q_HB, the attitude relative to the heading frame (the tilt), given own = about_z(heading(q_WB))."""
     return multiply((own[0], 0.0, 0.0, -own[3]), q_WB)
 
 
@@ -182,7 +182,7 @@ def product(R: Matrix, a: Vector) -> Vector:
 
 @inlined
 def column(R: Matrix, k: int) -> Vector:
-    """Return a column of R: the k-th axis of the body in world components."""
+    """Return column k of R: the body's k-th axis in world components."""
     return (R[0][k], R[1][k], R[2][k])
 
 
@@ -193,7 +193,7 @@ def transposed(R: Matrix) -> Matrix:
 
 @inlined
 def composed(A: Matrix, B: Matrix) -> Matrix:
-    """Return A B: first B, then A."""
+    """Return A B: rotation by B, then by A."""
     x, y, z = transposed(B)
     return (
         (dot(A[0], x), dot(A[0], y), dot(A[0], z)),
@@ -204,7 +204,7 @@ def composed(A: Matrix, B: Matrix) -> Matrix:
 
 @portable
 def position_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1: Vector) -> tuple[float, float, float]:
-    """Return the position at share s of an interval of dt seconds: the cubic with these ends and slopes (Hermite)."""
+    """Return the position at fraction s of an interval dt [s]: the cubic with these end points and slopes (Hermite)."""
     a, b = s * s * (3.0 - 2.0 * s), dt * s * (1.0 - s) * (1.0 - s)
     c = dt * s * s * (s - 1.0)
     x = p0[0] + a * (p1[0] - p0[0]) + b * v0[0] + c * v1[0]
@@ -215,7 +215,7 @@ def position_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1
 
 @portable
 def velocity_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1: Vector) -> tuple[float, float, float]:
-    """Return the velocity along the cubic of `position_between`."""
+    """Return the velocity at fraction s along the cubic of `position_between`."""
     if dt <= 0.0:
         return v1[0], v1[1], v1[2]
     a, b, c = 6.0 * s * (1.0 - s) / dt, (1.0 - s) * (1.0 - 3.0 * s), s * (3.0 * s - 2.0)
@@ -227,7 +227,7 @@ def velocity_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1
 
 @portable
 def attitude_between(s: float, q0: Quaternion, q1: Quaternion) -> Quaternion:
-    """Return the attitude at share s of the way from q0 to q1: a turn about a fixed axis at a constant rate (slerp)."""
+    """Return the attitude at fraction s from q0 to q1, turning about a fixed axis at a constant rate (slerp)."""
     cosine = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
     sign = 1.0 if cosine >= 0.0 else -1.0
     cosine *= sign
@@ -242,7 +242,7 @@ def attitude_between(s: float, q0: Quaternion, q1: Quaternion) -> Quaternion:
 def pose_between(
     t: float, t0: float, p0: Vector, v0: Vector, q0: Quaternion, t1: float, p1: Vector, v1: Vector, q1: Quaternion
 ) -> tuple[Vector, Vector, Quaternion]:
-    """Return position, velocity and attitude at an instant t in [t0, t1] [s]."""
+    """Return position, velocity and attitude at a time t in [t0, t1] [s]."""
     s = (t - t0) / (t1 - t0) if t1 > t0 else 1.0
     v = velocity_between(s, t1 - t0, p0, v0, p1, v1)
     return position_between(s, t1 - t0, p0, v0, p1, v1), v, attitude_between(s, q0, q1)

@@ -1,10 +1,10 @@
 """Parrot AR.Drone 2.0 with its indoor hull.
 
 Sources:
-    Li      Q. Li, Grey-Box System Identification of a Quadrotor Unmanned Aerial Vehicle, MSc thesis, TU Delft 2014,
-            as used by AuRoRA
-    OpenMAS weighed and measured aircraft
-    tum_ardrone  flight-fitted model of the ROS package
+    Li           Q. Li, Grey-Box System Identification of a Quadrotor Unmanned Aerial Vehicle, MSc thesis, TU Delft
+                 2014, as used by AuRoRA
+    OpenMAS      weighed and measured aircraft
+    tum_ardrone  model of the ROS package, fitted to flights
 """
 
 from zsim.vehicles.vehicle import Airframe, Battery, Firmware, Limits, Vehicle, cross_layout
@@ -17,13 +17,13 @@ VEHICLE = Vehicle(
     arm_m=ARM_M,
     thrust_n_s2=8.048e-6,  # N s^2 (Li)
     torque_nm_s2=2.423e-7,  # N m s^2 (Li)
-    rotor_time_constant_s=0.030,  # s, with the lag of the loops it gives tum_ardrone's fitted 0.143 s of tilt
+    rotor_time_constant_s=0.030,  # s; with the lag of the loops it gives tum_ardrone's fitted tilt lag of 0.143 s
     rotor_min_rad_s=126.0,  # rad/s, idle (Li)
     rotor_max_rad_s=503.0,  # rad/s (Li)
     drag_n_s_m=0.249,  # N s/m, fitted in flight (tum_ardrone)
-    battery_mah=1000.0,  # mAh, the battery that it is sold with
-    takeoff_height_m=1.0,  # m, as the aircraft does
-    limits=Limits(),  # of its SDK
+    battery_mah=1000.0,  # mAh, the battery supplied with it
+    takeoff_height_m=1.0,  # m, as the real aircraft
+    limits=Limits(),  # the defaults are those of its SDK
     sensor_preset="ardrone2",
     rotors=cross_layout(ARM_M),  # the first and third turn clockwise (Paparazzi, airframe ardrone2)
     rotor_radius_m=0.1,  # m, 0.2 m propeller
@@ -37,28 +37,28 @@ VEHICLE = Vehicle(
         friction=0.6,  # foam on a hard floor, typical
         rim_xy_m=0.18,  # m, 0.26 m / sqrt(2)
         rim_height_m=0.03,  # m
-        reach_m=0.27,  # m, 0.2563 m to a corner of the rim, and room
-        hull_frequency_rad_s=80.0,  # rad/s, chosen: 3 m/s dent 4 cm of foam
-        hull_damping_ratio=0.3,  # rebound at about 0.4 of the speed of approach
-        clearance_m=0.3,  # m, the hull and room
+        reach_m=0.27,  # m, 0.2563 m to a corner of the rim, plus margin
+        hull_frequency_rad_s=80.0,  # rad/s, chosen: an impact at 3 m/s dents the foam by 4 cm
+        hull_damping_ratio=0.3,  # rebound at about 0.4 of the approach speed
+        clearance_m=0.3,  # m, the hull plus margin
     ),
     battery=Battery(
         voltage_v=11.1,  # V, three lithium-polymer cells, nominal
         efficiency=0.9,  # set so that a full 1000 mAh hovers for 12 min (10-12 min published)
-        electronics_w=4.6,  # W, main board, camera and radio; set with the efficiency
+        electronics_w=4.6,  # W, main board, camera and radio; set together with the efficiency
     ),
     firmware=Firmware(
-        lag_lead=0.5,  # 15 ms left of the rotors' lag
-        rate_per_lag=0.42,  # damping 0.77 of rate loop and rotors together; 28 1/s here
+        lag_lead=0.5,  # leaves 15 ms of the rotors' lag
+        rate_per_lag=0.42,  # damping ratio 0.77 of rate loop and rotors together; a gain of 28 1/s here
         lag_min_s=0.015,  # s, three control steps
-        loop_ratio=3.1,  # tilt 9 1/s: closed loop about 0.12 s, inside the 0.143 s that tum_ardrone fitted
-        yaw_share=1 / 3.5,  # the rotors' own inertia makes yaw quicker: 0.04 s as tum_ardrone fitted
+        loop_ratio=3.1,  # tilt gain 9 1/s: closed loop of about 0.12 s, within the 0.143 s that tum_ardrone fitted
+        yaw_share=1 / 3.5,  # the rotors' own inertia makes yaw faster: 0.04 s, as tum_ardrone fitted
         body_rate_max_rad_s=5.0,  # rad/s, chosen
-        climb_share=1 / 7,  # 4 1/s: thrust needs no tilt first
+        climb_share=1 / 7,  # climb gain 4 1/s: unlike horizontal motion, climbing needs no prior tilt
         hold_1_s=0.8,  # 1/s, below the velocity loop's 2.9 1/s
-        height_1_s=1.5,  # 1/s, below the climb's 4 1/s
+        height_1_s=1.5,  # 1/s, below the climb loop's 4 1/s
         brake_s=0.6,  # s, about the stopping distance over speed
-        tilt_cut_cosine=0.25,  # beyond 75 deg the motors are cut, as the aircraft does when it is overturned
+        tilt_cut_cosine=0.25,  # beyond 75 deg the motors are cut, as in the real aircraft when overturned
         lift_share_min=0.15,  # chosen
         spin_up_s=0.5,  # s, chosen
         takeoff_m_s=0.6,  # m/s, chosen
@@ -74,8 +74,8 @@ VEHICLE = Vehicle(
         low_battery_percent=5.0,  # %, about half a minute of hover remains
         disturbance_walk=0.2,  # m/s^2/sqrt(s): gusts of 0.5 m/s over 5 s on a drag of 0.58 1/s give 0.18
         lift_walk=0.4,  # m/s^2/sqrt(s): ground effect and downwash come faster than gusts
-        tilt_walk=6e-4,  # rad/sqrt(s): vibration, rounding, and what a turn leaves
+        tilt_walk=6e-4,  # rad/sqrt(s): vibration, rounding, and residual errors after turns
         bias_walk=2e-5,  # rad/s/sqrt(s): a bias of 0.1 deg/s is found within a minute
-        lift_bias_walk=3e-3,  # m/s^2/sqrt(s): what the board's temperature does to its accelerometer
+        lift_bias_walk=3e-3,  # m/s^2/sqrt(s): effect of the board's temperature on its accelerometer
     ),
 )

@@ -7,8 +7,8 @@ Sources:
     cf2x       gym-pybullet-drones (J. Panerati et al., IROS 2021), assets/cf2x.urdf, after Landry (MIT 2015)
     RotorPy    S. Folk et al. 2023, rotorpy/vehicles/crazyflie_params.py
     Bitcraze   data sheet of the Crazyflie 2.1, and "Measuring propeller RPM: part 3" (2015)
-Its firmware has the structure of the AR.Drone's here; the gains follow from the motors' lag, which is longer: rate
-16.7 1/s, tilt 5.4 1/s, velocity 1.7 1/s, climb 2.4 1/s. At 5 % of the battery about twenty seconds of hover remain.
+Here its firmware has the structure of the AR.Drone's; the gains follow from the longer lag of the motors: rate
+16.7 1/s, tilt 5.4 1/s, velocity 1.7 1/s, climb 2.4 1/s. At 5 % battery, about twenty seconds of hover remain.
 """
 
 from msgspec.structs import replace
@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Airframe, Battery, Limits, Vehicle, cross_layout
 
-ARM_M = 0.0397  # m, centre to rotor (cf2x); 92 mm over all are with the motor mounts (Bitcraze)
+ARM_M = 0.0397  # m, centre to rotor (cf2x); the overall 92 mm include the motor mounts (Bitcraze)
 THRUST_N_S2 = 2.8816e-8  # N s^2: 3.16e-10 N per (rev/min)^2 (cf2x)
 
 VEHICLE = Vehicle(
@@ -24,45 +24,45 @@ VEHICLE = Vehicle(
     inertia_kg_m2=(16.571710e-6, 16.655602e-6, 29.261652e-6),  # kg m^2; products up to 1.8e-6 left out (Förster)
     arm_m=ARM_M,
     thrust_n_s2=THRUST_N_S2,
-    torque_nm_s2=0.005964552 * THRUST_N_S2,  # N m s^2: 5.96 mm of torque per thrust (Förster)
+    torque_nm_s2=0.005964552 * THRUST_N_S2,  # N m s^2: torque per thrust of 5.96 mm (Förster)
     rotor_time_constant_s=0.072,  # s (RotorPy); 0 to 25 000 rev/min within about 0.18 s (Bitcraze)
-    rotor_min_rad_s=300.0,  # rad/s, chosen: a twenty-fifth of the hover's thrust
-    rotor_max_rad_s=2273.0,  # rad/s: thrust over weight 2.25 (cf2x)
-    drag_n_s_m=6.2e-3,  # N s/m: 1.025e-6 kg/rad (RotorPy, after Förster) at the four rotors' 1516 rad/s of hover
+    rotor_min_rad_s=300.0,  # rad/s, chosen: a twenty-fifth of the hover thrust
+    rotor_max_rad_s=2273.0,  # rad/s: thrust-to-weight ratio of 2.25 (cf2x)
+    drag_n_s_m=6.2e-3,  # N s/m: 1.025e-6 kg/rad (RotorPy, after Förster) with four rotors at 1516 rad/s in hover
     battery_mah=250.0,  # mAh (Bitcraze)
-    takeoff_height_m=0.5,  # m, as Bitcraze's examples
-    limits=Limits(horizontal_speed_m_s=2.0),  # m/s, chosen: a room's size; the others as the AR.Drone's
+    takeoff_height_m=0.5,  # m, as in Bitcraze's examples
+    limits=Limits(horizontal_speed_m_s=2.0),  # m/s, chosen for the size of a room; the others as for the AR.Drone
     sensor_preset="crazyflie2",
     rotors=cross_layout(ARM_M),
     rotor_radius_m=0.0231,  # m (cf2x, 2.31348e-2 in its later versions)
-    rotor_inertia_kg_m2=5e-8,  # kg m^2, a rod of 46 mm and 0.3 g; estimated
+    rotor_inertia_kg_m2=5e-8,  # kg m^2, estimated: a rod of 46 mm and 0.3 g
     airframe=Airframe(
         hull_radius_m=0.062,  # m, arm and propeller; the collision cylinder of cf2x has 0.06 m
         foot_xy_m=0.028,  # m, legs under the motors
-        foot_depth_m=0.020,  # m, height of the centre of mass over the floor (Förster)
-        foot_sag_m=0.001,  # m, chosen: 99 rad/s, an integrator's step of 2.5 ms follows it
+        foot_depth_m=0.020,  # m, height of the centre of mass above the floor (Förster)
+        foot_sag_m=0.001,  # m, chosen: 99 rad/s, which an integration step of 2.5 ms can follow
         foot_damping_ratio=0.4,  # chosen
         friction=0.5,  # plastic on a hard floor, typical
         rim_xy_m=0.044,  # m, 0.062 m / sqrt(2)
-        rim_height_m=0.009,  # m, 29 mm of height in all (Bitcraze)
-        reach_m=0.065,  # m, 0.0629 m to a corner of the rim, and room
-        hull_frequency_rad_s=80.0,  # rad/s, chosen as the AR.Drone's
-        hull_damping_ratio=0.3,  # chosen as the AR.Drone's
+        rim_height_m=0.009,  # m, from the overall height of 29 mm (Bitcraze)
+        reach_m=0.065,  # m, 0.0629 m to a corner of the rim, plus margin
+        hull_frequency_rad_s=80.0,  # rad/s, chosen as for the AR.Drone
+        hull_damping_ratio=0.3,  # chosen as for the AR.Drone
         clearance_m=0.1,  # m, chosen
     ),
     battery=Battery(
         voltage_v=3.7,  # V, one lithium-polymer cell, nominal
         efficiency=0.322,  # brushed motors; set so that a full battery hovers for 7 min (Bitcraze)
-        electronics_w=0.5,  # W, board and radio; estimated, set with the efficiency
+        electronics_w=0.5,  # W, board and radio; estimated, set together with the efficiency
     ),
-    firmware=replace(  # what is not said is chosen as the AR.Drone's
+    firmware=replace(  # everything else is chosen as for the AR.Drone
         ARDRONE2.firmware,
-        lag_lead=0.35,  # 25 ms left of the motors' lag; thrust over weight of 2.25 leaves room for it
-        hold_1_s=0.5,  # 1/s, below the velocity loop as much as the AR.Drone's
-        height_1_s=0.9,  # 1/s, below the climb as much as the AR.Drone's
-        brake_s=0.8,  # s, longer as the velocity loop is slower
+        lag_lead=0.35,  # leaves 25 ms of the motors' lag; the thrust-to-weight ratio of 2.25 permits it
+        hold_1_s=0.5,  # 1/s, in the same ratio to the velocity loop as for the AR.Drone
+        height_1_s=0.9,  # 1/s, in the same ratio to the climb loop as for the AR.Drone
+        brake_s=0.8,  # s, longer since the velocity loop is slower
         takeoff_m_s=0.3,  # m/s, chosen: half of its height in a second
-        descent_m_s=0.3,  # m/s, chosen: softer, for its feet are hard
+        descent_m_s=0.3,  # m/s, chosen: gentler, since its feet are hard
         flare_m=1.0,  # m, chosen
     ),
 )

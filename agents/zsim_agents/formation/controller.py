@@ -154,7 +154,8 @@ class Controller(Agent):
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
         if len(self._answered) >= REQUESTS_MAX:
-            return ControlAnswer(ok=False, error=f"{key}: {REQUESTS_MAX} requests wait for the next gate; ask after it")
+            error = f"{key}: {REQUESTS_MAX} requests already wait for the next gate; ask again after it"
+            return ControlAnswer(ok=False, error=error)
         try:
             refusal = self._engagement.request(read_request(request.op, request.args))
             self._seat(self._engagement.drones)

@@ -156,7 +156,8 @@ class ReferencePilot(Agent):
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
         """Handle a request, which takes effect at the next gate."""
         if len(self._answered) >= REQUESTS_MAX:
-            return ControlAnswer(ok=False, error=f"{key}: {REQUESTS_MAX} requests wait for the next gate; ask after it")
+            error = f"{key}: {REQUESTS_MAX} requests already wait for the next gate; ask again after it"
+            return ControlAnswer(ok=False, error=error)
         try:
             result, error = self._take(request), ""
         except (DroneRequestError, FlightError) as fault:

@@ -281,7 +281,7 @@ def serve_runs(
                             raise
                         say(str(error))
                     if participant.superseded and thing != ANY:
-                        raise SupersededError(f"{name}: {participant.end_reason}; this one ends")
+                        raise SupersededError(f"{name}: {participant.end_reason}; this process ends")
                     if participant.superseded:  # two processes may have chosen the same free number
                         own_name, served = f"{role}.{int(participant.name.rpartition('.')[2]) + 1}", ""
                 else:
