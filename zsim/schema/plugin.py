@@ -1,10 +1,10 @@
 """User code named in a document: `package.module`, `package.module:Class` or `package.module:function`.
 
 Modules are found as usual in Python: installed, or on PYTHONPATH. The folder of the document is searched last
-(`search`), so a module in the scenario's folder needs no installation on that machine, and hides no installed module.
-On other hosts the module must be installed.
+(`search`), so that modules in the scenario's folder need no installation on that machine and hide no installed ones.
+On other hosts they must be installed.
 
-Importing a module runs it: fly other people's scenarios only if you trust their modules. Commands that only read
+Importing a module runs it: run other people's scenarios only if you trust their modules. Commands that only read
 documents look up names without importing anything (`names_only`).
 """
 
@@ -33,12 +33,12 @@ from zsim.errors import PACKAGES, DocumentError, NotTrustedError, UserCodeError,
 from zsim.schema.checker import show
 
 Object = TypeVar("Object")
-FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes search there too
-IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value that forbids imports
+FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes inherit the folders
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # inherited environment variable, and its value to forbid imports
 NO_LOOKUP = "unseen"  # value that also forbids looking up names
 WHERE = "install it, or put it on PYTHONPATH or in the scenario's folder"
 
-MADE = "zsim_own_"  # prefix of modules generated for code in notebooks and scripts: zsim_api.own_code
+MADE = "zsim_own_"  # prefix of modules that zsim_api.own_code generates for code in notebooks and scripts
 LIBRARIES = tuple(f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib"))
 
 MODULE_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z"
@@ -46,12 +46,12 @@ CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(*places: Path) -> None:
-    """Search for modules in the folder of the current document, in this process and its child processes.
+    """Search these folders for modules, in this process and its child processes.
 
-    Former folders are replaced, so that the environment of a program that reads many documents does not grow.
+    Earlier folders are replaced, so that the environment of a program that reads many documents does not grow.
 
     Args:
-        places: folders, that of the document first; missing ones are ignored.
+        places: folders, the document's first; missing ones are ignored.
     """
     found = dict.fromkeys(str(place.resolve()) for place in places if place.is_dir())
     os.environ[FOLDERS] = json.dumps([*found])  # a folder's name may contain any separator
@@ -62,7 +62,7 @@ def folders() -> tuple[Path, ...]:
 
 
 def beside(name: str) -> Path:
-    """Return the path of a file named in a scenario: in the folders of its modules or the working directory."""
+    """Return the path of a file named in a scenario, in the folders of its modules or the working directory."""
     places = [folder / name for folder in (*folders(), Path())]
     return next((place for place in places if place.is_file()), places[0])
 
@@ -72,11 +72,11 @@ def names_only(wanted: bool = True, looked_up: bool = True) -> Iterator[list[str
     """Prevent imports of modules named in documents, in this process and its children, unless `wanted` is False.
 
     Args:
-        wanted: whether to prevent them.
-        looked_up: whether an unknown name is a fault, as with imports.
+        wanted: whether to prevent imports.
+        looked_up: whether an unknown name is a fault, as it is with imports.
 
     Yields:
-        names in documents that were not imported; empty if imports are allowed.
+        Names in documents that were not imported, extended during the block; empty if imports are allowed.
     """
     former, _SKIPPED[:] = os.environ.get(IMPORTS), []
     if wanted:
@@ -94,16 +94,16 @@ def may_import() -> bool:
 
 
 def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Callable[..., Any]:
-    """Return the class of a name `package.module:Class`.
+    """Return the class named `package.module:Class`.
 
     Args:
-        where: file and path of the field that names it, for the error.
-        kind: class or Protocol whose public methods it must have.
-        is_constructed: whether its constructor must take the arguments of that of `kind`.
+        where: file and path of the field that names the class, for the error.
+        kind: class or Protocol whose public methods the class must have.
+        is_constructed: whether its constructor must accept the arguments of the constructor of `kind`.
 
     Raises:
-        DocumentError: the module or class does not exist, or a method is missing or takes other arguments; one line.
-        NotTrustedError: it exists, but must not be imported.
+        DocumentError: the module or class does not exist, or a method is missing or takes other arguments.
+        NotTrustedError: the class exists but must not be imported.
     """
     loaded = _attribute(name, where, "Class", isclass)
     methods = [method for method in dir(kind) if not method.startswith("_") and callable(getattr(kind, method))]
@@ -121,7 +121,7 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
 
 
 def load_function(name: str, where: str) -> Callable[..., Any]:
-    """Return the function of a name `package.module:function`; arguments and errors as for `load`."""
+    """Return the function named `package.module:function`; arguments and errors as for `load`."""
     return _attribute(name, where, "function", callable)
 
 
@@ -145,7 +145,7 @@ def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Ob
 
 
 def is_own(kind: type) -> bool:
-    """Whether a class is a user's."""
+    """Whether a class is defined outside zsim's packages."""
     return kind.__module__.partition(".")[0] not in PACKAGES
 
 
@@ -159,24 +159,24 @@ def full_name(kind: type) -> str:
 
 
 RAISED = (Exception, SystemExit)
-"""Exceptions of user code that end a run with an error; an exit would otherwise go unreported."""
+"""Exceptions of user code that end a run with an error; SystemExit would otherwise go unreported."""
 
 
 def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
-    """Return an exception of user code as an error that names class, method, file and line; None for other exceptions.
+    """Return an exception of user code as an error with class, method, file and line; None for other exceptions.
 
     Args:
         error: exception whose traceback begins in zsim, where it was caught.
         where: process and simulated time.
     """
     if isinstance(error, UserCodeError):
-        return UserCodeError(error.text, error.where or where)  # a new one, to be raised from it
+        return UserCodeError(error.text, error.where or where)  # a new error, to be raised from the given one
     walked = list(walk_tb(error.__traceback__))
     frames = [(frame, line) for frame, line in walked if is_user_frame(frame)]
     if not frames:
         return None
     if isinstance(error, SystemExit) and walked[-1][0].f_globals.get("__name__", "").partition(".")[0] in PACKAGES:
-        return None  # raised by a signal handler meanwhile
+        return None  # zsim's signal handler raised it while user code ran
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -199,7 +199,7 @@ def is_user_frame(frame: FrameType) -> bool:
 
 
 def numbers(returned: Any) -> NDArray[np.float64]:
-    """Return a result of user code as an array; ValueError if it is not a regular array of real numbers."""
+    """Return a result of user code as an array of floats; ValueError unless it is a regular array of real numbers."""
     array = np.asarray(returned)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"not real numbers: {array.dtype}")
@@ -207,9 +207,9 @@ def numbers(returned: Any) -> NDArray[np.float64]:
 
 
 def raised_by_user(failure: UserCodeError) -> BaseException | None:
-    """Return the exception raised by user code, with its traceback cut to begin there; None if no code raised.
+    """Return the exception raised by user code, its traceback cut to begin there; None if user code raised none.
 
-    Only for a failure already caught: the traceback of the returned exception is changed.
+    This changes the traceback of the returned exception, so call it only for failures that are no longer propagating.
     """
     raised: BaseException | None = failure
     while raised is not None:
@@ -249,7 +249,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
     module = _imported(module_name, f"{where} is {show(name)}", attribute)
     found = getattr(module, attribute, None)
     if not is_kind(found):
-        if module_name.startswith(MADE):  # given as an object in Python
+        if module_name.startswith(MADE):  # the user passed an object, not a name
             raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name module:{kind}"])
         is_one = isfunction if kind == "function" else isclass
         own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
@@ -301,7 +301,7 @@ def located(name: str, what: str) -> ModuleSpec:
 
 
 def _find(name: str, what: str, attribute: str) -> None:
-    """Find a module without running it; DocumentError if it does not exist or its source does not bind the name."""
+    """Check, without running it, that a module exists and its source binds the attribute; else DocumentError."""
     spec = located(name, what)
     if not attribute or not (spec.origin or "").endswith(".py"):
         return
@@ -337,10 +337,10 @@ def _imported_names(tree: ast.AST) -> set[str]:
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
-    """Return the parameters of a method and those expected if it cannot be called like that of `kind`; else None."""
+    """Return a method's parameters and the expected ones if it cannot be called like that of `kind`; else None."""
     wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
     if not (isfunction(wanted) and isfunction(own)) or wanted is own:
-        return None  # of a builtin, or a descriptor of another kind
+        return None  # builtins and other descriptors are not checked
     positional, required = Parameter.POSITIONAL_OR_KEYWORD, Parameter.empty
     parameters = signature(wanted).parameters.items()
     given = [name for name, each in parameters if each.default is required and each.kind is positional]

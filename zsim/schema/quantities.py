@@ -1,10 +1,10 @@
-"""The numbers that typed documents hold, with their limits, and constants of nature by which they are given."""
+"""The number types of documents, with their limits, and the physical constants used to convert them."""
 
 from typing import Annotated
 
 from msgspec import Meta
 
-# LARGE keeps squares and products of what is given finite; it is beyond any quantity of a flight in SI units.
+# Exceeds any quantity of a flight in SI units, and keeps squares and products of such numbers finite.
 LARGE = 1e9
 Real = Annotated[float, Meta(ge=-LARGE, le=LARGE)]
 Positive = Annotated[float, Meta(gt=0, le=LARGE)]

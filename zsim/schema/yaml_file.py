@@ -1,4 +1,4 @@
-"""Handwritten YAML documents, read with limits: no aliases, no tags, words as in YAML 1.2, one line per fault."""
+"""Handwritten YAML documents, read with limits: no aliases, no tags, scalars as in YAML 1.2, one line per fault."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -13,16 +13,16 @@ from zsim.errors import DocumentError
 from zsim.schema.checker import show
 
 FILE_SIZE_MAX = 4_000_000  # bytes; a resolved scenario of 1000 drones has 2.2 million
-VALUES_MAX = 400_000  # keys and values of a document; a resolved scenario of 1000 drones has 280 000, read in 1 s
-DEPTH_MAX = 50  # of maps and lists; a scenario has 6
+VALUES_MAX = 400_000  # keys and values in a document; a resolved scenario of 1000 drones has 280 000, read in 1 s
+DEPTH_MAX = 50  # nesting of maps and lists; a scenario has 6 levels
 
 
 def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
-    """Return the map that a YAML file holds.
+    """Return the map in a YAML file.
 
     Args:
-        example: a file of that kind, named in errors.
-        refuse: the error class to raise, with a line for each fault.
+        example: path of an example of such a file, named in errors.
+        refuse: class of the error raised, which has a line for each fault.
     """
     try:
         with path.open("rb") as file:
@@ -41,7 +41,7 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
 
 
 def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
-    """Return the map in a YAML text; `source` begins the lines of the faults."""
+    """Return the map in a YAML text; the lines of the error begin with `source`; other arguments as for `read`."""
     try:
         document = value(text)
     except ValueError as error:
@@ -57,16 +57,16 @@ def dump(plain: Any) -> str:
 
 
 def value(text: str) -> Any:
-    """Return the content of a YAML text; ValueError, a line long, if it is not YAML."""
+    """Return the content of a YAML text; ValueError with one line if it is not valid or not allowed."""
     try:
         return _Reader(text).document()
     except RecursionError:
         raise ValueError("is nested too deep") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
-        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml ends behind the last line
+        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml may mark a later line
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        if "nesting depth" in problem:  # PyYAML from 6.0.4 on has a limit of its own
+        if "nesting depth" in problem:  # PyYAML has its own limit from 6.0.4
             raise ValueError("is nested too deep") from None
         raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
@@ -75,21 +75,21 @@ _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # l
 
 
 class _Reader:
-    """Builds values from YAML events, stopping at the first refused one.
+    """Builds values from YAML events, stopping at the first that is not allowed.
 
-    It refuses aliases, which can expand without end, tags, directives, duplicate keys, and excessive depth or numbers
-    of values, which the C library does not limit. Words follow the core schema of YAML 1.2 (section 10.3.2): 1e3 and
-    010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
+    It refuses aliases, which can expand without end, tags, directives, duplicate keys, and excessive depth or counts of
+    values, which the C library does not limit. Scalars follow the core schema of YAML 1.2 (section 10.3.2): 1e3 and 010
+    are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
     """
 
     def __init__(self, text: str) -> None:
-        if _DIRECTIVE.search(text):  # libyaml compares each with all before
+        if _DIRECTIVE.search(text):  # libyaml compares each directive with all earlier ones
             raise ValueError("directives are not allowed")
         self._events: Iterator[Any] = yaml.parse(text, Loader=_Base)
         self._count = 0
 
     def document(self) -> Any:
-        """Return the content of the only document; None of an empty text."""
+        """Return the content of the only document; None for an empty text."""
         content, event = None, self._after(events.StreamStartEvent)
         if isinstance(event, events.DocumentStartEvent):
             content = self._node(next(self._events), 0)
@@ -153,17 +153,17 @@ def _whole(text: str) -> int:
 
 
 def _real(text: str) -> float:
-    """Return a number; YAML writes .inf and .nan for Python's inf and nan."""
+    """Return a YAML number, in which .inf and .nan are Python's inf and nan."""
     return float(text.replace(".", "", 1) if text[-1] in "fFnN" else text)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes texts that `_word` would read as another type."""
+    """A dumper that quotes texts which `_word` would read as another type."""
 
 
 _DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)
 _FLOAT = r"^[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
-# kind, form, the characters with which it begins, and what it means; the first that fits counts
+# tag, pattern, possible first characters, and conversion; the first matching entry applies
 _WORDS: tuple[tuple[str, re.Pattern[str], list[str], Callable[[str], Any]], ...] = (
     ("null", re.compile(r"^(~|null|Null|NULL|)$"), [*"~nN", ""], lambda text: None),
     ("bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), [*"tTfF"], lambda text: text.lower() == "true"),

@@ -169,9 +169,7 @@ class DepthConfig(Scanner, frozen=True, kw_only=True):
     rows: Annotated[int, Meta(ge=1, le=2160)] = 45
     min_m: Positive = 0.3  # m, about the minimum of a D435 at 848 columns
     max_m: Positive = 10.0
-    noise_1_m: NonNegative = (
-        0.0038  # 1/m, s / (f B): disparity error s 0.08 px, baseline B 0.05 m, f of 848 px over 90 deg
-    )
+    noise_1_m: NonNegative = 0.0038  # 1/m, s / (f B): disparity error s 0.08 px, B 0.05 m and 848 px over 90 deg
 
 
 SCANNERS: dict[str, type[Sample]] = {"range": Range, "lidar": Lidar, "depth": Depth}

@@ -98,16 +98,7 @@ AS_PRINTED = {"imu": stock_sensors.IMU_AS_PRINTED}
 
 MODULE, DECLARED = "module", "declared"  # keys of a user's sensor, in addition to its settings
 FIELDS = tuple(name for name in Sensors.__struct_fields__ if name != "own")
-RESERVED = (
-    "status",
-    "truth",
-    "own",
-    "accel",
-    "gyro",
-    "rotor",
-    "link",
-    "process",
-)  # names with another meaning in keys and fault kinds
+RESERVED = ("status", "truth", "own", "accel", "gyro", "rotor", "link", "process")  # taken in keys and fault kinds
 NAME = r"[a-z][a-z0-9_]{0,31}"
 NAME_ALLOWED = f"a letter and up to 31 of a-z 0-9 _, none of {', '.join(RESERVED)}"
 
