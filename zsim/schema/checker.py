@@ -1,7 +1,4 @@
-"""Checks a document against a typed description and reports all faults.
-
-msgspec stops at the first fault; a user correcting a scenario needs all of them.
-"""
+"""Checks a document against a typed description and reports all faults, whereas msgspec stops at the first."""
 
 import math
 import re
@@ -19,8 +16,8 @@ from msgspec import inspect as types
 from zsim.errors import DocumentError
 
 SHOWN_MAX = 60  # characters of a value shown in an error
-FAULTS_MAX = 100  # lines; further faults are counted
-COUNTED_MAX = 10_000  # further faults counted: a document of 1 MB can have many more, and each takes time
+FAULTS_MAX = 100  # faults listed; further ones are only counted
+COUNTED_MAX = 10_000  # maximum count of further faults: a document of 1 MB can have many more, and each takes time
 NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # limits of the representation
 
 Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the document itself is empty
@@ -32,7 +29,7 @@ def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
 
 
 def faults_in(error: DocumentError) -> list[Fault]:
-    """Return the faults in the lines of an error."""
+    """Return the faults stated by the lines of an error."""
     return [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
 
 
@@ -41,7 +38,7 @@ def first_fault(value: Any, description: Any) -> Fault | None:
 
 
 def first_lines(lines: Iterable[str]) -> list[str]:
-    """Return the first FAULTS_MAX lines, and a line with the number of further ones."""
+    """Return the first FAULTS_MAX lines, followed by a line with the number of further ones."""
     rest = iter(lines)
     first = list(islice(rest, FAULTS_MAX))
     more = sum(1 for _ in islice(rest, COUNTED_MAX))
@@ -49,7 +46,7 @@ def first_lines(lines: Iterable[str]) -> list[str]:
 
 
 def sound(value: Any, description: Any) -> Any:
-    """Return the sound parts of a faulty document.
+    """Return the valid parts of a faulty document.
 
     Structs become namespaces with the same fields: given values, defaults, or None if missing or faulty. Lists keep
     their length. Valid values are returned unchanged.
@@ -214,7 +211,7 @@ def suggestion(name: Any, known: Iterable[str]) -> str:
 
 
 def field_path(path: str, name: Any) -> str:
-    """Return the path of a field below another, printable on one line for any name."""
+    """Return the path of a field within another; it is printable and short for any name."""
     text = str(name)
     text = text if text.isprintable() and len(text) <= SHOWN_MAX else show(text)
     return f"{path}.{text}" if path else text

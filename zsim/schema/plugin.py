@@ -1,8 +1,8 @@
 """User code named in a document: `package.module`, `package.module:Class` or `package.module:function`.
 
 Modules are found as usual in Python: installed, or on PYTHONPATH. The folder of the document is searched last
-(`search`), so a module in the scenario's folder needs no installation on that machine, and hides no installed module.
-On other hosts the module must be installed.
+(`search`), so that a module there needs no installation on that machine and cannot hide an installed module. On other
+hosts the module must be installed.
 
 Importing a module runs it: fly other people's scenarios only if you trust their modules. Commands that only read
 documents look up names without importing anything (`names_only`).
@@ -34,7 +34,7 @@ from zsim.schema.checker import show
 
 Object = TypeVar("Object")
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes search there too
-IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value that forbids imports
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, also for children; value to forbid imports
 NO_LOOKUP = "unseen"  # value that also forbids looking up names
 WHERE = "install it, or put it on PYTHONPATH or in the scenario's folder"
 
@@ -46,12 +46,12 @@ CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(*places: Path) -> None:
-    """Search for modules in the folder of the current document, in this process and its child processes.
+    """Search for modules in the folders of the current document, in this process and its child processes.
 
     Former folders are replaced, so that the environment of a program that reads many documents does not grow.
 
     Args:
-        places: folders, that of the document first; missing ones are ignored.
+        places: folders, the document's first; missing folders are ignored.
     """
     found = dict.fromkeys(str(place.resolve()) for place in places if place.is_dir())
     os.environ[FOLDERS] = json.dumps([*found])  # a folder's name may contain any separator
@@ -62,7 +62,7 @@ def folders() -> tuple[Path, ...]:
 
 
 def beside(name: str) -> Path:
-    """Return the path of a file named in a scenario: in the folders of its modules or the working directory."""
+    """Return the path of a file named in a scenario, in a folder of its modules or in the working directory."""
     places = [folder / name for folder in (*folders(), Path())]
     return next((place for place in places if place.is_file()), places[0])
 
@@ -72,11 +72,11 @@ def names_only(wanted: bool = True, looked_up: bool = True) -> Iterator[list[str
     """Prevent imports of modules named in documents, in this process and its children, unless `wanted` is False.
 
     Args:
-        wanted: whether to prevent them.
-        looked_up: whether an unknown name is a fault, as with imports.
+        wanted: whether to prevent imports.
+        looked_up: whether names are looked up, so that an unknown name is a fault, as with imports.
 
     Yields:
-        names in documents that were not imported; empty if imports are allowed.
+        the names that were not imported; empty if imports are allowed.
     """
     former, _SKIPPED[:] = os.environ.get(IMPORTS), []
     if wanted:
@@ -94,16 +94,16 @@ def may_import() -> bool:
 
 
 def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Callable[..., Any]:
-    """Return the class of a name `package.module:Class`.
+    """Return the class named `package.module:Class`.
 
     Args:
-        where: file and path of the field that names it, for the error.
-        kind: class or Protocol whose public methods it must have.
-        is_constructed: whether its constructor must take the arguments of that of `kind`.
+        where: file and path of the field that names the class, for the error.
+        kind: class or Protocol whose public methods the class must have.
+        is_constructed: whether its constructor must take the same arguments as that of `kind`.
 
     Raises:
         DocumentError: the module or class does not exist, or a method is missing or takes other arguments; one line.
-        NotTrustedError: it exists, but must not be imported.
+        NotTrustedError: the class exists but must not be imported.
     """
     loaded = _attribute(name, where, "Class", isclass)
     methods = [method for method in dir(kind) if not method.startswith("_") and callable(getattr(kind, method))]
@@ -121,7 +121,7 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
 
 
 def load_function(name: str, where: str) -> Callable[..., Any]:
-    """Return the function of a name `package.module:function`; arguments and errors as for `load`."""
+    """Return the function named `package.module:function`; arguments and errors as for `load`."""
     return _attribute(name, where, "function", callable)
 
 
@@ -145,7 +145,7 @@ def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Ob
 
 
 def is_own(kind: type) -> bool:
-    """Whether a class is a user's."""
+    """Whether a class belongs to a user, not to zsim."""
     return kind.__module__.partition(".")[0] not in PACKAGES
 
 
@@ -163,20 +163,20 @@ RAISED = (Exception, SystemExit)
 
 
 def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
-    """Return an exception of user code as an error that names class, method, file and line; None for other exceptions.
+    """Return an exception of user code as an error that names method, file and line; None for other exceptions.
 
     Args:
         error: exception whose traceback begins in zsim, where it was caught.
         where: process and simulated time.
     """
     if isinstance(error, UserCodeError):
-        return UserCodeError(error.text, error.where or where)  # a new one, to be raised from it
+        return UserCodeError(error.text, error.where or where)  # a new error, to be raised from `error`
     walked = list(walk_tb(error.__traceback__))
     frames = [(frame, line) for frame, line in walked if is_user_frame(frame)]
     if not frames:
         return None
     if isinstance(error, SystemExit) and walked[-1][0].f_globals.get("__name__", "").partition(".")[0] in PACKAGES:
-        return None  # raised by a signal handler meanwhile
+        return None  # raised by zsim's signal handler during a user's call
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -184,7 +184,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
 
 def innermost_line(frame: FrameType | None) -> str:
-    """Return file and line of the innermost user code in a frame's stack, in parentheses; empty if there is none."""
+    """Return file and line of the innermost user code on a frame's stack, in parentheses; empty if there is none."""
     while frame and not is_user_frame(frame):
         frame = frame.f_back
     return f" ({_place(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
@@ -207,9 +207,9 @@ def numbers(returned: Any) -> NDArray[np.float64]:
 
 
 def raised_by_user(failure: UserCodeError) -> BaseException | None:
-    """Return the exception raised by user code, with its traceback cut to begin there; None if no code raised.
+    """Return the exception that user code raised, with its traceback cut to begin there; None if there is none.
 
-    Only for a failure already caught: the traceback of the returned exception is changed.
+    For caught failures only, since it changes the traceback of the returned exception.
     """
     raised: BaseException | None = failure
     while raised is not None:
@@ -226,7 +226,7 @@ _CELL = re.compile(r".*ipykernel_\d+[/\\]\d+\.py|<ipython-input-(\d+)-.*>")
 
 
 def _place(path: str, line: int) -> str:
-    """Return file and line, or cell and line of a notebook."""
+    """Return file and line, or a notebook's cell and line, as text."""
     cell = _CELL.fullmatch(path)
     if cell is None:
         return f"{path.removeprefix(f'{os.getcwd()}{os.sep}')}:{line}"
@@ -249,7 +249,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
     module = _imported(module_name, f"{where} is {show(name)}", attribute)
     found = getattr(module, attribute, None)
     if not is_kind(found):
-        if module_name.startswith(MADE):  # given as an object in Python
+        if module_name.startswith(MADE):  # the user passed an object in Python, not a name
             raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name module:{kind}"])
         is_one = isfunction if kind == "function" else isclass
         own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
@@ -260,7 +260,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
 
 
 def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
-    """Import a module if allowed; otherwise check that it exists and that its source defines the attribute."""
+    """Import a module if allowed; otherwise check that it exists and that its source defines `attribute`."""
     package = name.partition(".")[0]
     if not may_import() and package not in PACKAGES:
         if os.environ[IMPORTS] != NO_LOOKUP:
@@ -301,7 +301,7 @@ def located(name: str, what: str) -> ModuleSpec:
 
 
 def _find(name: str, what: str, attribute: str) -> None:
-    """Find a module without running it; DocumentError if it does not exist or its source does not bind the name."""
+    """Check, without running a module, that it exists and binds `attribute`; DocumentError if not."""
     spec = located(name, what)
     if not attribute or not (spec.origin or "").endswith(".py"):
         return
@@ -316,7 +316,7 @@ def _find(name: str, what: str, attribute: str) -> None:
 
 
 def _bound(body: ast.AST) -> set[str]:
-    """Return the names that a module's source binds, also in branches; `*` for a star import."""
+    """Return the names that a module's source binds, including in branches; `*` for a star import."""
     names: set[str] = set()
     for node in ast.iter_child_nodes(body):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):
@@ -337,10 +337,10 @@ def _imported_names(tree: ast.AST) -> set[str]:
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
-    """Return the parameters of a method and those expected if it cannot be called like that of `kind`; else None."""
+    """Return the actual and expected parameters of a method that cannot be called like that of `kind`; else None."""
     wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
     if not (isfunction(wanted) and isfunction(own)) or wanted is own:
-        return None  # of a builtin, or a descriptor of another kind
+        return None  # a builtin or another kind of descriptor, whose arguments are unknown
     positional, required = Parameter.POSITIONAL_OR_KEYWORD, Parameter.empty
     parameters = signature(wanted).parameters.items()
     given = [name for name, each in parameters if each.default is required and each.kind is positional]

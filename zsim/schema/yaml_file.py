@@ -1,4 +1,4 @@
-"""Handwritten YAML documents, read with limits: no aliases, no tags, words as in YAML 1.2, one line per fault."""
+"""Handwritten YAML documents, read with limits: no aliases, no tags, scalars as in YAML 1.2, one line per fault."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -14,14 +14,14 @@ from zsim.schema.checker import show
 
 FILE_SIZE_MAX = 4_000_000  # bytes; a resolved scenario of 1000 drones has 2.2 million
 VALUES_MAX = 400_000  # keys and values of a document; a resolved scenario of 1000 drones has 280 000, read in 1 s
-DEPTH_MAX = 50  # of maps and lists; a scenario has 6
+DEPTH_MAX = 50  # nesting depth of maps and lists; a scenario has 6
 
 
 def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
-    """Return the map that a YAML file holds.
+    """Return the map that a YAML file contains.
 
     Args:
-        example: a file of that kind, named in errors.
+        example: an example of such a file, named in errors.
         refuse: the error class to raise, with a line for each fault.
     """
     try:
@@ -41,7 +41,7 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
 
 
 def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
-    """Return the map in a YAML text; `source` begins the lines of the faults."""
+    """Return the map that a YAML text contains; errors begin with `source`."""
     try:
         document = value(text)
     except ValueError as error:
@@ -57,16 +57,16 @@ def dump(plain: Any) -> str:
 
 
 def value(text: str) -> Any:
-    """Return the content of a YAML text; ValueError, a line long, if it is not YAML."""
+    """Return the content of a YAML text; ValueError with one line of text if it is not YAML."""
     try:
         return _Reader(text).document()
     except RecursionError:
         raise ValueError("is nested too deep") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
-        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml ends behind the last line
+        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml may name one line too many
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        if "nesting depth" in problem:  # PyYAML from 6.0.4 on has a limit of its own
+        if "nesting depth" in problem:  # PyYAML has its own limit since 6.0.4
             raise ValueError("is nested too deep") from None
         raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
@@ -77,19 +77,19 @@ _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # l
 class _Reader:
     """Builds values from YAML events, stopping at the first refused one.
 
-    It refuses aliases, which can expand without end, tags, directives, duplicate keys, and excessive depth or numbers
-    of values, which the C library does not limit. Words follow the core schema of YAML 1.2 (section 10.3.2): 1e3 and
-    010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
+    It refuses aliases, which can expand without limit, tags, directives, duplicate keys, and excessive depths or
+    numbers of values, which the C library does not limit. Plain scalars follow the core schema of YAML 1.2 (section
+    10.3.2): 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
     """
 
     def __init__(self, text: str) -> None:
-        if _DIRECTIVE.search(text):  # libyaml compares each with all before
+        if _DIRECTIVE.search(text):  # libyaml compares each with all previous ones
             raise ValueError("directives are not allowed")
         self._events: Iterator[Any] = yaml.parse(text, Loader=_Base)
         self._count = 0
 
     def document(self) -> Any:
-        """Return the content of the only document; None of an empty text."""
+        """Return the content of the only document; None for an empty text."""
         content, event = None, self._after(events.StreamStartEvent)
         if isinstance(event, events.DocumentStartEvent):
             content = self._node(next(self._events), 0)
@@ -153,7 +153,7 @@ def _whole(text: str) -> int:
 
 
 def _real(text: str) -> float:
-    """Return a number; YAML writes .inf and .nan for Python's inf and nan."""
+    """Return a number; Python's inf and nan are .inf and .nan in YAML."""
     return float(text.replace(".", "", 1) if text[-1] in "fFnN" else text)
 
 
@@ -163,7 +163,7 @@ class _Dumper(yaml.SafeDumper):
 
 _DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)
 _FLOAT = r"^[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
-# kind, form, the characters with which it begins, and what it means; the first that fits counts
+# tag, pattern, possible first characters, and conversion of each kind of scalar; the first match applies
 _WORDS: tuple[tuple[str, re.Pattern[str], list[str], Callable[[str], Any]], ...] = (
     ("null", re.compile(r"^(~|null|Null|NULL|)$"), [*"~nN", ""], lambda text: None),
     ("bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), [*"tTfF"], lambda text: text.lower() == "true"),
