@@ -65,7 +65,7 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
     try:
         declared = parameters_type(kind, filled)
         wrong: list[Fault] = [*faults(given, declared, where)]
-    except (TypeError, NameError, NotImplementedError) as error:  # an annotation undefined or not storable
+    except (TypeError, NameError, NotImplementedError) as error:  # an annotation undefined or unsupported
         raise DocumentError([f"{where}: {error}"]) from error
     if wrong:
         raise DocumentError([f"{path} {text}" for path, text in wrong])
