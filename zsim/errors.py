@@ -21,7 +21,7 @@ class ZsimError(Exception):
         from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
 
         frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))
-        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # standard library between zsim's own calls
+        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # by which zsim calls itself
             frames.pop()
         way: TracebackType | None = None
         for each in reversed(frames):

@@ -65,6 +65,7 @@ def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use:
     Args:
         mark: file that identifies a folder of this command; `refuse_others` checks a folder without it.
         own, force, use: as for `refuse_others`.
+        others: for the error if the folder is locked, e.g. "another hunt is at work".
         others: start of the error if the folder is locked: "another hunt is at work".
 
     Raises:
@@ -89,6 +90,7 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
     Args:
         own: names of files that the command may overwrite.
         force: whether to accept other files, which are kept.
+        use: intended use of the folder, for the error, e.g. "fly into".
         use: intended use of the folder, for the error: "fly into".
 
     Raises:

@@ -79,6 +79,8 @@ def bound(kind: Any, given: Any, where: str) -> Any:
 
     A class without `Parameters` is returned unchanged.
 
+    Without `Parameters`, the class itself is returned.
+
     Raises:
         DocumentError: as for `resolved`, or parameters are given to a class without `Parameters`.
     """

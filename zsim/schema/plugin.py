@@ -184,7 +184,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
 
 def innermost_line(frame: FrameType | None) -> str:
-    """Return file and line of the innermost user code in a frame's stack, in parentheses; empty if there is none."""
+    """Return file and line of the innermost user code on a frame's stack, in parentheses; empty if there is none."""
     while frame and not is_user_frame(frame):
         frame = frame.f_back
     return f" ({_place(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
@@ -226,7 +226,7 @@ _CELL = re.compile(r".*ipykernel_\d+[/\\]\d+\.py|<ipython-input-(\d+)-.*>")
 
 
 def _place(path: str, line: int) -> str:
-    """Return file and line, or cell and line of a notebook."""
+    """Return file and line, or a notebook's cell and line, as text."""
     cell = _CELL.fullmatch(path)
     if cell is None:
         return f"{path.removeprefix(f'{os.getcwd()}{os.sep}')}:{line}"
@@ -260,7 +260,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
 
 
 def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
-    """Import a module if allowed; otherwise check that it exists and that its source defines the attribute."""
+    """Import a module if allowed; otherwise check that it exists and that its source defines `attribute`."""
     package = name.partition(".")[0]
     if not may_import() and package not in PACKAGES:
         if os.environ[IMPORTS] != NO_LOOKUP:
@@ -316,7 +316,7 @@ def _find(name: str, what: str, attribute: str) -> None:
 
 
 def _bound(body: ast.AST) -> set[str]:
-    """Return the names that a module's source binds, also in branches; `*` for a star import."""
+    """Return the names that a module's source binds, including in branches; `*` for a star import."""
     names: set[str] = set()
     for node in ast.iter_child_nodes(body):
         if isinstance(node, ast.ClassDef | ast.FunctionDef):

@@ -14,4 +14,4 @@ Vector3 = tuple[Real, Real, Real]
 
 G_M_S2 = 9.80665  # m/s^2, standard gravity, ISO 80000-3
 SEA_LEVEL_KG_M3 = 1.225  # kg/m^3, density of the standard atmosphere at sea level and 15 deg C, ISO 2533
-COULOMB_PER_MAH = 3.6  # C per mAh: 3600 s to the hour
+COULOMB_PER_MAH = 3.6  # C per mAh: 3600 s per hour

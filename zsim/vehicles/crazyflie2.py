@@ -21,7 +21,7 @@ THRUST_N_S2 = 2.8816e-8  # N s^2: 3.16e-10 N per (rev/min)^2 (cf2x)
 
 VEHICLE = Vehicle(
     mass_kg=0.027,  # kg (cf2x, Bitcraze)
-    inertia_kg_m2=(16.571710e-6, 16.655602e-6, 29.261652e-6),  # kg m^2; products up to 1.8e-6 left out (Förster)
+    inertia_kg_m2=(16.571710e-6, 16.655602e-6, 29.261652e-6),  # kg m^2; products of up to 1.8e-6 omitted (Förster)
     arm_m=ARM_M,
     thrust_n_s2=THRUST_N_S2,
     torque_nm_s2=0.005964552 * THRUST_N_S2,  # N m s^2: torque per thrust of 5.96 mm (Förster)
