@@ -1,7 +1,4 @@
-"""Validation of a document against a type, reporting all faults.
-
-msgspec stops at the first fault, but a user correcting a scenario needs all of them.
-"""
+"""Checks a document against a typed description and reports all faults, whereas msgspec stops at the first."""
 
 import math
 import re
@@ -19,9 +16,9 @@ from msgspec import inspect as types
 from zsim.errors import DocumentError
 
 SHOWN_MAX = 60  # characters of a value shown in an error
-FAULTS_MAX = 100  # faults reported; further ones are only counted
-COUNTED_MAX = 10_000  # further faults counted; a document of 1 MB can have many more, and each takes time
-NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # limits of number types, omitted in errors
+FAULTS_MAX = 100  # faults listed; further ones are only counted
+COUNTED_MAX = 10_000  # maximum count of further faults: a document of 1 MB can have many more, and each takes time
+NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # limits of the number types
 
 Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the document itself is empty
 
@@ -32,7 +29,7 @@ def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
 
 
 def faults_in(error: DocumentError) -> list[Fault]:
-    """Return the faults from which the lines of an error were made."""
+    """Return the faults stated by the lines of an error."""
     return [(path, text) for path, _, text in (line.partition(" ") for line in error.faults)]
 
 
@@ -41,7 +38,7 @@ def first_fault(value: Any, description: Any) -> Fault | None:
 
 
 def first_lines(lines: Iterable[str]) -> list[str]:
-    """Return the first FAULTS_MAX lines, and a line with the count of any others."""
+    """Return the first FAULTS_MAX lines, followed by a line with the number of further ones."""
     rest = iter(lines)
     first = list(islice(rest, FAULTS_MAX))
     more = sum(1 for _ in islice(rest, COUNTED_MAX))
@@ -52,7 +49,7 @@ def sound(value: Any, description: Any) -> Any:
     """Return the valid parts of a faulty document.
 
     Structs become namespaces with the same fields: given values, defaults, or None if missing or faulty. Lists keep
-    their length. Other valid values are returned unchanged.
+    their length. Valid values are returned unchanged.
     """
     return _sound(value, _type_info(description))
 
@@ -208,13 +205,13 @@ def _sound(value: Any, info: types.Type) -> Any:
 
 
 def suggestion(name: Any, known: Iterable[str]) -> str:
-    """Return "did you mean NAME? " with the most similar known name; empty if none is similar."""
+    """Return "did you mean NAME? " with the known name most similar to an unknown one; "" if none is similar."""
     close = get_close_matches(str(name)[:SHOWN_MAX], known, 1)
     return f"did you mean {close[0]}? " if close else ""
 
 
 def field_path(path: str, name: Any) -> str:
-    """Return the path of a field in a parent's path, printable on one line for any name."""
+    """Return the path of a field within another; it is printable and short for any name."""
     text = str(name)
     text = text if text.isprintable() and len(text) <= SHOWN_MAX else show(text)
     return f"{path}.{text}" if path else text
@@ -226,7 +223,7 @@ def show(value: Any) -> str:
     try:
         text = repr(value) if isinstance(value, str | bytes | float) else _as_json(value)
     except ValueError:
-        text = "a number of more than 4300 digits"  # CPython does not convert such numbers to text
+        text = "a number of more than 4300 digits"  # CPython refuses to convert it
     except RecursionError:
         text = f"a {'map' if isinstance(value, dict) else 'list'} nested too deep"
     return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 3]}..."

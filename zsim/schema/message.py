@@ -1,6 +1,6 @@
-"""Messages: field types, common first fields, and declarations of users' messages.
+"""Messages: field types, the first fields of all messages, and declarations by users.
 
-Declarations state types as language-independent words: number, number[3], whole, flag, text.
+Declarations name types independently of any programming language: number, number[3], whole, flag, text.
 
     field_types(State, Message)  →  {"position_m": "number[3]", "leader": "flag"}
     declared_type("State", {"position_m": "number[3]", "leader": "flag"}, Message)
@@ -17,19 +17,19 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec import inspect as types
 
-# Limits that exclude NaN and infinities but no finite number; msgspec checks them while decoding.
+# Limits satisfied by every finite number but not by NaN and infinities, so that msgspec refuses these on decoding.
 Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Vector3 = tuple[Number, Number, Number]
-COUNT_MAX = 16  # numbers in a field of fixed length; enough for a 4 x 4 matrix
-TEXT_MAX = 10_000  # characters, or numbers of a field of variable length
+COUNT_MAX = 16  # maximum fixed number of numbers in a field, as for a 4 x 4 matrix
+TEXT_MAX = 10_000  # maximum number of characters in a text, or of numbers in a `number[]`
 if TYPE_CHECKING:
     FieldType = str
 else:
     SEVERAL = [f"number[{count}]" for count in range(1, COUNT_MAX + 1)]
     FieldType = Literal["number", "whole", "flag", "text", "number[]", *SEVERAL]
-"""Type of a field: a finite number, a whole number, a flag, text, or a list of numbers of variable or fixed length."""
+"""Type of a field: a finite number, a whole number, a flag, text, any number of numbers, or a fixed number of them."""
 FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
 MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
 _WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag", types.StrType: "text"}
@@ -43,9 +43,9 @@ _TYPES: dict[str, Any] = {
 
 
 class Message(Struct, frozen=True, gc=False):
-    """The first fields of every message: simulated time of publication [ns], and a sequence number per key from 0.
+    """Base of all messages: the simulated time of publication, and a sequence number per key, from 0.
 
-    A class may have a method `fault`, which returns a fault that the types of its fields cannot exclude, or None.
+    A class may define a method `fault`, which returns a fault that types cannot express, or None.
     """
 
     t_ns: Count
@@ -53,10 +53,10 @@ class Message(Struct, frozen=True, gc=False):
 
 
 def field_types(message: type[Struct], base: type[Struct], but: Collection[str] = ()) -> dict[FieldName, FieldType]:
-    """Return the types of a message's own fields, excluding those of its base.
+    """Return the types of a message's fields, except those of its base.
 
     Args:
-        but: words of types that are not allowed.
+        but: names of types that are not allowed.
 
     Raises:
         TypeError: a field has a type not allowed in users' messages.
@@ -90,10 +90,9 @@ def _word(kind: Any) -> FieldType | None:
 def declared_type(
     name: str, fields: Mapping[str, str], base: type[Struct], namespace: tuple[tuple[str, Any], ...] = ()
 ) -> Any:
-    """Return a message class with these fields after those of its base; equal arguments give the same class.
+    """Return a message class with these fields after those of its base; the same class for the same arguments.
 
-    Args:
-        namespace: attributes of the class.
+    `namespace`: further attributes of the class.
     """
     return _declared_type(name, tuple(fields.items()), base, namespace)
 

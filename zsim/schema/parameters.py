@@ -1,6 +1,4 @@
-"""Parameters of users' classes: a struct whose fields have units in their names, defaults and limits.
-
-The scenario sets the values.
+"""Parameters of users' classes: a struct with units in its names, defaults and limits, filled in from the scenario.
 
 class Pilot(zsim.Agent):
     class Parameters(zsim.Parameters):
@@ -21,20 +19,20 @@ from zsim.errors import DocumentError
 from zsim.schema.checker import Fault, faults, show
 from zsim.schema.quantities import Real
 
-COUNT_MAX = 100  # parameters per class
+COUNT_MAX = 100  # maximum number of parameters of a class
 Given = Annotated[dict[str, Any], Meta(max_length=COUNT_MAX)]
-"""The parameters of a class in a scenario, by name; in a resolved scenario, all of them."""
+"""Parameters of a class in a scenario, by name; in a resolved scenario, all of them."""
 
 
 class Parameters(Struct, kw_only=True, forbid_unknown_fields=True):
-    """Base class of the parameters of a user's class, whose instances have them as `parameters`."""
+    """Base of the parameters of a user's class, whose instances have them as `parameters`."""
 
 
 def parameters_type(kind: Callable[..., Any], filled: tuple[str, ...] = ()) -> type[Struct]:
     """Return the struct of a class's parameters: its `Parameters`, or the arguments of its constructor.
 
     Args:
-        filled: names of the constructor's arguments that are not parameters.
+        filled: arguments of the constructor that zsim supplies, which are not parameters.
 
     Raises:
         TypeError: its `Parameters` is not a subclass of `zsim.Parameters`.
@@ -54,12 +52,12 @@ def _arguments(kind: Callable[..., Any], filled: tuple[str, ...]) -> Iterator[An
         if each.name in filled or each.kind in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD):
             continue
         hint = hints.get(each.name, Any)
-        hint = Real if hint is float else hint  # with the limits of all numbers in a scenario
+        hint = Real if hint is float else hint  # limited like all numbers of a scenario
         yield (each.name, hint) if each.default is Parameter.empty else (each.name, hint, each.default)
 
 
 def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return all parameters of a class by name, given or by default, as plain values for a file.
+    """Return all parameters of a class by name, given or default, as plain values for a file.
 
     Raises:
         DocumentError: a line for each unknown, missing or invalid parameter.
@@ -67,7 +65,7 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
     try:
         declared = parameters_type(kind, filled)
         wrong: list[Fault] = [*faults(given, declared, where)]
-    except (TypeError, NameError, NotImplementedError) as error:  # undefined or unsupported annotation
+    except (TypeError, NameError, NotImplementedError) as error:  # an annotation undefined or unsupported
         raise DocumentError([f"{where}: {error}"]) from error
     if wrong:
         raise DocumentError([f"{path} {text}" for path, text in wrong])
@@ -75,14 +73,12 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
 
 
 def bound(kind: Any, given: Any, where: str) -> Any:
-    """Return a subclass of the class that has these parameters as a class attribute, available to its constructor.
-
-    A class without `Parameters` is returned unchanged.
+    """Return a subclass whose instances have these parameters, set before the constructor is called.
 
     Without `Parameters`, the class itself is returned.
 
     Raises:
-        DocumentError: as for `resolved`, or parameters are given to a class without `Parameters`.
+        DocumentError: as for `resolved`; or parameters are given, and the class has no `Parameters`.
     """
     if not has_parameters(kind):
         if given:

@@ -1,10 +1,10 @@
 """User code named in a document: `package.module`, `package.module:Class` or `package.module:function`.
 
 Modules are found as usual in Python: installed, or on PYTHONPATH. The folder of the document is searched last
-(`search`), so that modules in the scenario's folder need no installation on that machine and hide no installed ones.
-On other hosts they must be installed.
+(`search`), so that a module there needs no installation on that machine and cannot hide an installed module. On other
+hosts the module must be installed.
 
-Importing a module runs it: run other people's scenarios only if you trust their modules. Commands that only read
+Importing a module runs it: fly other people's scenarios only if you trust their modules. Commands that only read
 documents look up names without importing anything (`names_only`).
 """
 
@@ -33,12 +33,12 @@ from zsim.errors import PACKAGES, DocumentError, NotTrustedError, UserCodeError,
 from zsim.schema.checker import show
 
 Object = TypeVar("Object")
-FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes inherit the folders
-IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # inherited environment variable, and its value to forbid imports
+FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes search there too
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, also for children; value to forbid imports
 NO_LOOKUP = "unseen"  # value that also forbids looking up names
 WHERE = "install it, or put it on PYTHONPATH or in the scenario's folder"
 
-MADE = "zsim_own_"  # prefix of modules that zsim_api.own_code generates for code in notebooks and scripts
+MADE = "zsim_own_"  # prefix of modules generated for code in notebooks and scripts: zsim_api.own_code
 LIBRARIES = tuple(f"{sysconfig.get_path(part)}{os.sep}" for part in ("stdlib", "purelib", "platlib"))
 
 MODULE_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z"
@@ -46,12 +46,12 @@ CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(*places: Path) -> None:
-    """Search these folders for modules, in this process and its child processes.
+    """Search for modules in the folders of the current document, in this process and its child processes.
 
-    Earlier folders are replaced, so that the environment of a program that reads many documents does not grow.
+    Former folders are replaced, so that the environment of a program that reads many documents does not grow.
 
     Args:
-        places: folders, the document's first; missing ones are ignored.
+        places: folders, the document's first; missing folders are ignored.
     """
     found = dict.fromkeys(str(place.resolve()) for place in places if place.is_dir())
     os.environ[FOLDERS] = json.dumps([*found])  # a folder's name may contain any separator
@@ -62,7 +62,7 @@ def folders() -> tuple[Path, ...]:
 
 
 def beside(name: str) -> Path:
-    """Return the path of a file named in a scenario, in the folders of its modules or the working directory."""
+    """Return the path of a file named in a scenario, in a folder of its modules or in the working directory."""
     places = [folder / name for folder in (*folders(), Path())]
     return next((place for place in places if place.is_file()), places[0])
 
@@ -73,10 +73,10 @@ def names_only(wanted: bool = True, looked_up: bool = True) -> Iterator[list[str
 
     Args:
         wanted: whether to prevent imports.
-        looked_up: whether an unknown name is a fault, as it is with imports.
+        looked_up: whether names are looked up, so that an unknown name is a fault, as with imports.
 
     Yields:
-        Names in documents that were not imported, extended during the block; empty if imports are allowed.
+        the names that were not imported; empty if imports are allowed.
     """
     former, _SKIPPED[:] = os.environ.get(IMPORTS), []
     if wanted:
@@ -99,10 +99,10 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
     Args:
         where: file and path of the field that names the class, for the error.
         kind: class or Protocol whose public methods the class must have.
-        is_constructed: whether its constructor must accept the arguments of the constructor of `kind`.
+        is_constructed: whether its constructor must take the same arguments as that of `kind`.
 
     Raises:
-        DocumentError: the module or class does not exist, or a method is missing or takes other arguments.
+        DocumentError: the module or class does not exist, or a method is missing or takes other arguments; one line.
         NotTrustedError: the class exists but must not be imported.
     """
     loaded = _attribute(name, where, "Class", isclass)
@@ -145,7 +145,7 @@ def load_object(name: str, where: str, attribute: str, kind: type[Object]) -> Ob
 
 
 def is_own(kind: type) -> bool:
-    """Whether a class is defined outside zsim's packages."""
+    """Whether a class belongs to a user, not to zsim."""
     return kind.__module__.partition(".")[0] not in PACKAGES
 
 
@@ -159,24 +159,24 @@ def full_name(kind: type) -> str:
 
 
 RAISED = (Exception, SystemExit)
-"""Exceptions of user code that end a run with an error; SystemExit would otherwise go unreported."""
+"""Exceptions of user code that end a run with an error; an exit would otherwise go unreported."""
 
 
 def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
-    """Return an exception of user code as an error with class, method, file and line; None for other exceptions.
+    """Return an exception of user code as an error that names method, file and line; None for other exceptions.
 
     Args:
         error: exception whose traceback begins in zsim, where it was caught.
         where: process and simulated time.
     """
     if isinstance(error, UserCodeError):
-        return UserCodeError(error.text, error.where or where)  # a new error, to be raised from the given one
+        return UserCodeError(error.text, error.where or where)  # a new error, to be raised from `error`
     walked = list(walk_tb(error.__traceback__))
     frames = [(frame, line) for frame, line in walked if is_user_frame(frame)]
     if not frames:
         return None
     if isinstance(error, SystemExit) and walked[-1][0].f_globals.get("__name__", "").partition(".")[0] in PACKAGES:
-        return None  # zsim's signal handler raised it while user code ran
+        return None  # raised by zsim's signal handler during a user's call
     (called, _), (deepest, line) = frames[0], frames[-1]
     method = f"{called.f_globals.get('__name__', '')}:{called.f_code.co_qualname}"
     raised = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
@@ -199,7 +199,7 @@ def is_user_frame(frame: FrameType) -> bool:
 
 
 def numbers(returned: Any) -> NDArray[np.float64]:
-    """Return a result of user code as an array of floats; ValueError unless it is a regular array of real numbers."""
+    """Return a result of user code as an array; ValueError if it is not a regular array of real numbers."""
     array = np.asarray(returned)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"not real numbers: {array.dtype}")
@@ -207,9 +207,9 @@ def numbers(returned: Any) -> NDArray[np.float64]:
 
 
 def raised_by_user(failure: UserCodeError) -> BaseException | None:
-    """Return the exception raised by user code, its traceback cut to begin there; None if user code raised none.
+    """Return the exception that user code raised, with its traceback cut to begin there; None if there is none.
 
-    This changes the traceback of the returned exception, so call it only for failures that are no longer propagating.
+    For caught failures only, since it changes the traceback of the returned exception.
     """
     raised: BaseException | None = failure
     while raised is not None:
@@ -249,7 +249,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
     module = _imported(module_name, f"{where} is {show(name)}", attribute)
     found = getattr(module, attribute, None)
     if not is_kind(found):
-        if module_name.startswith(MADE):  # the user passed an object, not a name
+        if module_name.startswith(MADE):  # the user passed an object in Python, not a name
             raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name module:{kind}"])
         is_one = isfunction if kind == "function" else isclass
         own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
@@ -301,7 +301,7 @@ def located(name: str, what: str) -> ModuleSpec:
 
 
 def _find(name: str, what: str, attribute: str) -> None:
-    """Check, without running it, that a module exists and its source binds the attribute; else DocumentError."""
+    """Check, without running a module, that it exists and binds `attribute`; DocumentError if not."""
     spec = located(name, what)
     if not attribute or not (spec.origin or "").endswith(".py"):
         return
@@ -337,10 +337,10 @@ def _imported_names(tree: ast.AST) -> set[str]:
 
 
 def _other_arguments(loaded: type, kind: type, method: str) -> tuple[str, str] | None:
-    """Return a method's parameters and the expected ones if it cannot be called like that of `kind`; else None."""
+    """Return the actual and expected parameters of a method that cannot be called like that of `kind`; else None."""
     wanted, own = getattr_static(kind, method), getattr_static(loaded, method)
     if not (isfunction(wanted) and isfunction(own)) or wanted is own:
-        return None  # builtins and other descriptors are not checked
+        return None  # a builtin or another kind of descriptor, whose arguments are unknown
     positional, required = Parameter.POSITIONAL_OR_KEYWORD, Parameter.empty
     parameters = signature(wanted).parameters.items()
     given = [name for name, each in parameters if each.default is required and each.kind is positional]

@@ -1,10 +1,10 @@
-"""The number types of documents, with their limits, and the physical constants used to convert them."""
+"""Types of the numbers in typed documents, with their limits, and physical constants for stating their values."""
 
 from typing import Annotated
 
 from msgspec import Meta
 
-# Exceeds any quantity of a flight in SI units, and keeps squares and products of such numbers finite.
+# LARGE keeps squares and products of given numbers finite; it exceeds any quantity of a flight in SI units.
 LARGE = 1e9
 Real = Annotated[float, Meta(ge=-LARGE, le=LARGE)]
 Positive = Annotated[float, Meta(gt=0, le=LARGE)]

@@ -13,16 +13,16 @@ from zsim.errors import DocumentError
 from zsim.schema.checker import show
 
 FILE_SIZE_MAX = 4_000_000  # bytes; a resolved scenario of 1000 drones has 2.2 million
-VALUES_MAX = 400_000  # keys and values in a document; a resolved scenario of 1000 drones has 280 000, read in 1 s
-DEPTH_MAX = 50  # nesting of maps and lists; a scenario has 6 levels
+VALUES_MAX = 400_000  # keys and values of a document; a resolved scenario of 1000 drones has 280 000, read in 1 s
+DEPTH_MAX = 50  # nesting depth of maps and lists; a scenario has 6
 
 
 def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
-    """Return the map in a YAML file.
+    """Return the map that a YAML file contains.
 
     Args:
-        example: path of an example of such a file, named in errors.
-        refuse: class of the error raised, which has a line for each fault.
+        example: an example of such a file, named in errors.
+        refuse: the error class to raise, with a line for each fault.
     """
     try:
         with path.open("rb") as file:
@@ -41,7 +41,7 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
 
 
 def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> dict[str, Any]:
-    """Return the map in a YAML text; the lines of the error begin with `source`; other arguments as for `read`."""
+    """Return the map that a YAML text contains; errors begin with `source`."""
     try:
         document = value(text)
     except ValueError as error:
@@ -57,16 +57,16 @@ def dump(plain: Any) -> str:
 
 
 def value(text: str) -> Any:
-    """Return the content of a YAML text; ValueError with one line if it is not valid or not allowed."""
+    """Return the content of a YAML text; ValueError with one line of text if it is not YAML."""
     try:
         return _Reader(text).document()
     except RecursionError:
         raise ValueError("is nested too deep") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
-        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml may mark a later line
+        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml may name one line too many
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        if "nesting depth" in problem:  # PyYAML has its own limit from 6.0.4
+        if "nesting depth" in problem:  # PyYAML has its own limit since 6.0.4
             raise ValueError("is nested too deep") from None
         raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
@@ -75,15 +75,15 @@ _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # l
 
 
 class _Reader:
-    """Builds values from YAML events, stopping at the first that is not allowed.
+    """Builds values from YAML events, stopping at the first refused one.
 
-    It refuses aliases, which can expand without end, tags, directives, duplicate keys, and excessive depth or counts of
-    values, which the C library does not limit. Scalars follow the core schema of YAML 1.2 (section 10.3.2): 1e3 and 010
-    are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
+    It refuses aliases, which can expand without limit, tags, directives, duplicate keys, and excessive depths or
+    numbers of values, which the C library does not limit. Plain scalars follow the core schema of YAML 1.2 (section
+    10.3.2): 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
     """
 
     def __init__(self, text: str) -> None:
-        if _DIRECTIVE.search(text):  # libyaml compares each directive with all earlier ones
+        if _DIRECTIVE.search(text):  # libyaml compares each with all previous ones
             raise ValueError("directives are not allowed")
         self._events: Iterator[Any] = yaml.parse(text, Loader=_Base)
         self._count = 0
@@ -153,17 +153,17 @@ def _whole(text: str) -> int:
 
 
 def _real(text: str) -> float:
-    """Return a YAML number, in which .inf and .nan are Python's inf and nan."""
+    """Return a number; Python's inf and nan are .inf and .nan in YAML."""
     return float(text.replace(".", "", 1) if text[-1] in "fFnN" else text)
 
 
 class _Dumper(yaml.SafeDumper):
-    """A dumper that quotes texts which `_word` would read as another type."""
+    """Quotes texts that `_word` would read as another type."""
 
 
 _DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)
 _FLOAT = r"^[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
-# tag, pattern, possible first characters, and conversion; the first matching entry applies
+# tag, pattern, possible first characters, and conversion of each kind of scalar; the first match applies
 _WORDS: tuple[tuple[str, re.Pattern[str], list[str], Callable[[str], Any]], ...] = (
     ("null", re.compile(r"^(~|null|Null|NULL|)$"), [*"~nN", ""], lambda text: None),
     ("bool", re.compile(r"^(true|True|TRUE|false|False|FALSE)$"), [*"tTfF"], lambda text: text.lower() == "true"),
