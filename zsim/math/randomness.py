@@ -33,7 +33,7 @@ def uniform(*what: object) -> float:
 
 
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
-_FARTHEST = 38.0  # standard deviations; beyond, the density is below the smallest double
+_FARTHEST = 38.0  # standard deviations; beyond this, the density is below the smallest double
 
 
 @deferred(makes_arrays=False)

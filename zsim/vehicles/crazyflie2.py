@@ -55,7 +55,7 @@ VEHICLE = Vehicle(
         efficiency=0.322,  # brushed motors; set so that a full battery hovers for 7 min (Bitcraze)
         electronics_w=0.5,  # W, board and radio; estimated, set together with the efficiency
     ),
-    firmware=replace(  # everything else is chosen as for the AR.Drone
+    firmware=replace(  # all other values are those of the AR.Drone
         ARDRONE2.firmware,
         lag_lead=0.35,  # leaves 25 ms of the motors' lag; the thrust-to-weight ratio of 2.25 permits it
         hold_1_s=0.5,  # 1/s, in the same ratio to the velocity loop as for the AR.Drone
