@@ -26,7 +26,7 @@ _STEPS = 4  # each reduces the error by a factor of about 300: 1e-15 rad after f
 
 
 def geodetic_to_enu(geodetic: ArrayLike, origin: tuple[float, float, float]) -> Array:
-    """Return p_W [m] of points (latitude_deg, longitude_deg, height_m), shape (..., 3), with the origin given alike."""
+    """Return p_W [m] of points, shape (..., 3); points and origin are (latitude_deg, longitude_deg, height_m)."""
     d = (geodetic_to_ecef(geodetic) - geodetic_to_ecef(origin))[..., None, :]
     return (d * enu_rows(origin[0], origin[1])).sum(axis=-1)
 

@@ -14,9 +14,7 @@ Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)  # the identity rotation
 _SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
-COSINE_MAX = (
-    0.9995  # cosine of half the angle between attitudes; above it, linear interpolation errs by 1e-7 rad at most
-)
+COSINE_MAX = 0.9995  # cosine of half the angle between attitudes; above it, linear interpolation errs by <= 1e-7 rad
 
 
 @inlined
