@@ -31,7 +31,7 @@ if sys.platform == "linux":
 
 LOOK_S = 0.05  # wall time between checks
 # The Zenoh thread that closes links also forwards the participants' messages. Once a full link blocks it, that link
-# stays for HUB_CLOSE_AFTER_US: so it must be closed earlier, while the kernel still accepts data.
+# remains open for HUB_CLOSE_AFTER_US: so it must be closed earlier, while the kernel still accepts data.
 STALL_BYTES = 1 << 16  # unacknowledged bytes from which a link is watched; the kernel accepts 0.4 MB or more (measured)
 STALL_S = 0.1  # wall time within which a live far end acknowledges something, in addition to …
 ROUND_TRIPS = 3.0  # … this many of its round trips
@@ -135,7 +135,7 @@ class LinkWatch:
         return lines
 
     def _holds_up(self, address: str, held_bytes: int, now_s: float) -> bool:
-        """Whether a link acknowledges nothing, or never catches up."""
+        """Whether the far end of a link acknowledges nothing, or never catches up."""
         if held_bytes < STALL_BYTES:
             self._backlogs.pop(address, None)
             return False
@@ -189,7 +189,7 @@ Sessions = frozenset[str]  # Zenoh's identifiers, in hexadecimal
 
 
 class SessionTokens:
-    """The sessions of each process, known by liveliness tokens and updated in threads of Zenoh.
+    """The sessions of each process, known from liveliness tokens and updated in threads of Zenoh.
 
     A token `process/{p}` shows that a process is alive, but not its session: Zenoh does not name the holder, and a
     query of its admin space, which does, can block a router forever (eclipse-zenoh/zenoh#2619). So each process also
@@ -334,7 +334,7 @@ def owner(inode: str) -> str:
     for pid in filter(str.isdigit, os.listdir("/proc")) if inode else ():
         with suppress(OSError), os.scandir(f"/proc/{pid}/fd") as files:
             for file in files:
-                with suppress(OSError):  # closed meanwhile
+                with suppress(OSError):  # the file may have been closed in the meantime
                     if os.readlink(file.path) == f"socket:[{inode}]":
                         return pid
     return ""

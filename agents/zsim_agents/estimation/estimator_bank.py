@@ -50,7 +50,7 @@ from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, se
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, acceleration, heading_and_sigma, rotation_vector_quaternion
 
 _READING = struct.Struct(f"{READING.size}d")
-_ROOM = 256  # initial capacity for the readings of a gate
+_ROOM = 256  # initial capacity, in readings per gate
 _YAW, _YAW_SIGMA = ESTIMATE.yaw, ESTIMATE.yaw_sigma
 _COVARIANCE = slice(ESTIMATE.covariance, _YAW_SIGMA)  # up to the next field
 _p_WB, _v_WB, _gyro_bias = (
@@ -61,8 +61,8 @@ _REFUSED = len(SENSORS)  # offset from a sensor's count of used readings to that
 
 NOBODY = -1
 NS_S = 1e-9  # s/ns
-BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # positions among the floats of these messages
-GPS_FIX, SONAR_VALID = 3, 3  # positions among the integers of these messages
+BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # indices among the floats of these messages
+GPS_FIX, SONAR_VALID = 3, 3  # indices among the integers of these messages
 RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # positions of sensors in the order of delivery, by key
 
 read = inlined(framing.read)
@@ -78,7 +78,7 @@ _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # columns `values` a
 
 
 class EstimatorBank:
-    """Fuses the sensors of several drones; `i` is the index of a drone in the given order.
+    """Fuses the sensors of several drones; `i` is a drone's index in the given order.
 
     The sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the last
     one of the sensor, not finite, or outside their innovation gate are refused and counted.
@@ -189,7 +189,7 @@ def step(held: Held, t_s: float, readings: Array, estimates: Array) -> None:
     """Use the readings of all drones in a gate, and write the estimates for `t_s` [s].
 
     Args:
-        held: the Rows of N drones, by `hold`, which are updated.
+        held: the Rows of N drones, as returned by `hold`; updated in place.
         readings: readings, (M, READING.size), those of each drone in order of arrival.
         estimates: receives the estimates, (N, ESTIMATE.size).
     """

@@ -21,7 +21,7 @@ from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.flight_check import GateInput
 from zsim_agents.formation.flight_plan import RequestError, read_request
 
-REQUESTS_MAX = 1000  # maximum between two gates, e.g. while the run is paused; the next gate publishes them
+REQUESTS_MAX = 1000  # maximum number between two gates, e.g. while paused; the next gate publishes them
 
 _variances_of = itemgetter(0, 7, 14)  # variances of position in the row-major 6 x 6 covariance
 
@@ -78,7 +78,7 @@ class Controller(Agent):
         self._seat(self._engagement.drones)
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
-        for request, answer in answered:  # published at the gate, which a re-run repeats them before
+        for request, answer in answered:  # published at the gate: a re-run repeats the requests before it
             key, of_request = self._request_key, (request.op, request.args, request.source)
             message = run_messages.ClusterRequest(
                 t_ns, self.next_seq(key), *of_request, answer.ok, answer.error, source

@@ -2,7 +2,8 @@
 
 `Aircraft` is the session of one aircraft between a run and pilots' programs: its configuration, watchdogs and state.
 `Pilot` carries out their REF and PCMD: it requests modes until they are entered, and repeats a setpoint while it is in
-force; `SetpointSender` converts it for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; clients' datagrams.
+force; `SetpointSender` converts setpoints for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; clients'
+datagrams.
 """
 
 import math
@@ -49,7 +50,7 @@ FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 the same wi
 NEXT_CHANNEL = 4
 AGAIN_NS = 500_000_000  # ns, chosen; a mode not yet entered is requested again, as a pilot's program repeats REF
 ASKED_MAX = 3  # chosen; requests for a mode before it is abandoned
-PER_GATE = 3  # chosen; setpoints sent immediately within a gate, since the world takes one per gate
+PER_GATE = 3  # chosen; maximum number of setpoints sent immediately within a gate; the world uses only one per gate
 IN_THE_AIR = ("taking_off", *AIRBORNE)
 NO_ALTITUDE_LIMIT_MM = 100_000  # altitude_max that stands for no limit (ARDroneLib)
 CLIMB_1_S = 1.5  # climb rate per metre left to the maximum height [1/s], as in zsim's firmware
@@ -245,7 +246,7 @@ class TiltSetpoint(NamedTuple):
     Attributes:
         hover: whether to hover in place, ignoring the fractions.
         right, back, up, clockwise: fractions in [-1, 1].
-        pilot_heading_rad: clockwise from north, if right and back are relative to the pilot; None for the drone.
+        pilot_heading_rad: clockwise from north, if right and back are relative to the pilot; None if to the drone.
     """
 
     hover: bool
@@ -263,7 +264,7 @@ class Pilot:
     """The pilot of one drone.
 
     Attributes:
-        setpoint: the setpoint in force; None for none.
+        setpoint: the setpoint in force; None if there is none.
         has_flown: whether this pilot has flown the drone since it last stood; stopped_by_pilot: whether it caused the
             emergency.
     """
@@ -471,7 +472,7 @@ class SetpointSender:
         self.heading_rad = 0.0
 
     def repeat_ns(self, setpoint: TiltSetpoint) -> int:
-        """Return the period of repeating a setpoint; 0, for every gate, if it depends on height or heading."""
+        """Return the period at which a setpoint is repeated; 0 (every gate) if it depends on height or heading."""
         if setpoint.pilot_heading_rad is not None:
             return 0
         climb_m_s = self._configuration.number("control:control_vz_max") / 1e3 if setpoint.up > 0.0 else -math.inf

@@ -35,14 +35,14 @@ from zsim_bridges.console.scene import ChosenRing, draw_ground
 from zsim_bridges.console.view_buffer import ALL, KINDS, EventRow, chosen_rows
 
 PANEL_PX = 350
-ROWS_SHOWN = 60  # number of events
+ROWS_SHOWN = 60  # maximum number of events shown
 SWITCHES = {
     "ghosts": "Ghosts: the desired formation",
     "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
     "trails": "Trails",
 }
 MANY = 12  # number of drones; more do not fit on a page, so the worst come first by default
-FILTER_MAX = 80  # characters of the filter's text
+FILTER_MAX = 80  # maximum length of the filter's text
 SEVERITIES = ("red", "amber", None)
 SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
     "as in the scenario": lambda _: (),
@@ -235,7 +235,7 @@ class PageForms:
         server.on_client_disconnect(self._remove)
 
     def close(self) -> None:
-        """Add nothing to later pages."""
+        """Add no controls to pages that are opened later."""
         self._closed = True
 
     def choose(self, client_id: int | None, drone: str) -> None:
@@ -281,7 +281,7 @@ class PageForms:
         self._update(show)
 
     def refresh(self, run: RunCondition, formation: str) -> None:
-        """Disable what would be refused; show who controls the formation that is shown, and the run."""
+        """Disable controls whose requests would be refused; show who controls the shown formation and the run."""
 
         def refresh(form: _PageForm) -> None:
             form.drone.refresh(run)
@@ -339,7 +339,7 @@ class DroneForm:
     """Modes of one drone, or of all that are selected, on one page.
 
     Args:
-        may: returns why this page may not let a drone take off or reset it; with `use` true, it takes control first.
+        may: returns why this page may not let a drone take off or reset it; if `use` is true, it takes control first.
         request_return: returns drones to their starts, and lands them.
     """
 
@@ -395,7 +395,7 @@ class DroneForm:
         self._rename()
 
     def refresh(self, run: RunCondition) -> None:
-        """Disable what all of the drones would refuse."""
+        """Disable the buttons whose commands all of the drones would refuse."""
         self._run = run
         refusals = [offered(run, partial(drone_refusals, drone=drone)) for drone in self.targets]
         for drone, each in zip(self.targets, refusals, strict=True):

@@ -49,12 +49,12 @@ from zsim_bridges.console.run_monitor import KEPT_S, RecordPlayer, RunMonitor, T
 from zsim_bridges.console.scene import RunScene
 from zsim_bridges.console.view_buffer import ViewBuffer
 
-REASON_S = 0.1  # wall; between two checks whether there is a reason to end
-OFFER_S = 20.0  # wall; how long pages may take to copy the files of a run: 100 MB over 40 Mbit/s Wi-Fi
-TABLE_S = 0.5  # wall; period of tables, plots and trails: people read no faster
-STAMPS_PER_AGE = 5.0  # a command's maximum age over that of a new stamp, which grows older in transit
-REFUSAL_S = 2.0  # wall; between two notifications of a page: a dragged slider is refused many times
-NOTICE_S = 8.0  # wall; how long a notification stays in the corner
+REASON_S = 0.1  # wall time between two checks for a reason to end
+OFFER_S = 20.0  # wall time; how long pages may take to copy the files of a run: 100 MB over 40 Mbit/s Wi-Fi
+TABLE_S = 0.5  # wall time; period of tables, plots and trails: people cannot read faster
+STAMPS_PER_AGE = 5.0  # a command's maximum age divided by that of a new stamp, since stamps age in transit
+REFUSAL_S = 2.0  # wall time; between two notifications of a page: a dragged slider is refused many times
+NOTICE_S = 8.0  # wall time; how long a notification stays in the corner
 EVENTS_MAX = 20  # number of events in `state`
 SILENT = "silent"  # replaces the clock's state while the world does not answer
 FEW_DRONES = 20  # drones; from this number on the picture rate is halved
@@ -67,7 +67,7 @@ class Console:
 
     Args:
         token: the operators' token; None if only this machine can connect.
-        rate_hz: pictures a second; None: by the number of drones and the rate of the run.
+        rate_hz: pictures a second; None: chosen from the number of drones and the rate of the run.
         world: description of where the console looks for a run.
         folder: where the shown run is recorded, if known.
 
@@ -176,7 +176,7 @@ class RunPage:
 
     Args:
         server: viser's server; the controls and nodes of another run are removed from it.
-        rate_hz: pictures a second; None: by the number of drones and the rate of the run.
+        rate_hz: pictures a second; None: chosen from the number of drones and the rate of the run.
         world: description of where the run is.
 
     Raises:
@@ -279,7 +279,7 @@ class RunPage:
             self._update_tables(time.monotonic())
 
     def end(self, reason: str) -> None:
-        """Show that the run is over, after `run`, which may not have noticed."""
+        """Show that the run is over; called after `run`, which may not have noticed."""
         self._monitor.end(reason)
         self._monitor.update(time.monotonic())
         with self._server.atomic():
