@@ -1,4 +1,4 @@
-"""The camera model: projection and its inverse, with a pinhole and the distortion of Brown and Conrady.
+"""The camera model: projection by a pinhole camera with Brown-Conrady distortion, and its inverse.
 
 Camera frame K: x to the right in the picture, y down, z in the viewing direction. Pixel coordinates (u, v) start at the
 upper left of the picture, with whole numbers at pixel centres, as in OpenCV (calib3d, "Detailed description").
@@ -53,11 +53,11 @@ class CameraPose(NamedTuple):
 
 
 def lens_of(camera: Camera) -> Lens:
-    """Return a lens with square pixels, the camera's diagonal field of view, and its axis in the picture's middle."""
+    """Return a lens with square pixels, the camera's diagonal field of view, and a centred optical axis."""
     half_px = el.hypot(camera.width_px, camera.height_px) / 2
     focal_px = half_px / el.tan(math.radians(camera.diagonal_deg) / 2)
     centre = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-    k1, k2, p1, p2, k3 = map(float, camera.distortion)  # compiled functions are specialised for the lens's types
+    k1, k2, p1, p2, k3 = map(float, camera.distortion)  # floats: compiled functions specialise by type
     return Lens(focal_px, focal_px, *centre, k1, k2, p1, p2, k3, camera.width_px, camera.height_px)
 
 
@@ -133,8 +133,8 @@ SINGULAR = 1e-9  # minimum determinant; below it the points do not determine a c
 def spread(n: float, x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
     """Return the standard deviations of a fitted circle's centre, per axis, and radius, relative to its edge points'.
 
-    From the least-squares covariance (A^T A)^-1, where A has a row (x, y, 1) for each edge point in the direction
-    (x, y) from the centre.
+    They follow from the least-squares covariance (A^T A)^-1, where A has a row (x, y, 1) for each edge point in the
+    direction (x, y) from the centre.
 
     Args:
         n: number of points.

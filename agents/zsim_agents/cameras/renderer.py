@@ -1,4 +1,6 @@
-"""Renders the picture of a drone's camera from the true poses of all drones. Pure: equal inputs give equal bits.
+"""Renders the picture of a drone's camera from the true poses of all drones.
+
+Pure: equal inputs give bit-identical pictures.
 
 The backdrop of ground and sky is a grey picture, which a map converts to colours: warping one channel costs a third of
 warping three. Greys up to 150 are ground, and greys from HAZE on are sky. The ground repeats a square tile around W's
@@ -27,16 +29,16 @@ from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, V
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-BLURRED_PX = 0.8  # motion from which the ground is blurred
+BLURRED_PX = 0.8  # minimum motion for which the ground is blurred
 WIDER_MAX = 2.0  # maximum size of the undistorted picture over that of the final one, where its edge is then repeated
 MARGIN = 64  # pixels by which the noise image exceeds the picture
 NOISE_MAX = 48.0  # maximum standard deviation of the amplified noise, in grey levels
-FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # hats are a few pixels wide
+FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # keeps the colour of small hats
 MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio: its multiples mod 2^64 are evenly spread (Knuth, TAOCP 3, 6.4)
 view_of = cache(View)
 Grey = NDArray[np.uint8]
 Points = list[tuple[float, float]]
-TEXEL_M = 0.02  # side of a texel of the finest level, which shows a line of 6 cm but no blade of grass
+TEXEL_M = 0.02  # side of a texel of the finest level, which shows a line 6 cm wide but no blade of grass
 TILE = 1000  # texels along a side of the tile: 20 m, so that lines every metre continue across the seam
 FACTORS = (1, 4, 20, 100)  # size of the texels of each level over that of the finest
 WINDOW = (3000, 2000, 1500, 1000)  # texels along a side of each level's ground: 60 m, 160 m, 600 m, 2 km
@@ -44,7 +46,7 @@ MINIFIED_MAX = 2.0  # maximum depth of a pixel on the ground, in texels, before 
 HEIGHT_MIN_M = 0.03  # minimum height of the camera above the ground
 HAZE = 176  # grey of the horizon
 ZENITH = 0.6  # sine of the elevation from which the sky is bluest, a matter of appearance
-SKY_SLOPE = (255 - HAZE) / ZENITH  # increase of the sky's grey per sine of the elevation
+SKY_SLOPE = (255 - HAZE) / ZENITH  # increase of the sky's grey per unit of the sine of the elevation
 COLOURS = {  # B, G, R by grey: dry grass, white lines, a hazy blue sky
     0: (24, 36, 30),
     60: (52, 104, 92),
@@ -66,7 +68,7 @@ class Renderer:
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # the exposure makes up for half of the missing stops
+        gain = 1.0 / math.sqrt(scene.light)  # compensates for half of the stops by which a clear day is brighter
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
@@ -232,7 +234,7 @@ def meadow() -> Ground:
 
 
 def _patches(rng: np.random.Generator, cells: int) -> Array:
-    """Return smooth, periodic noise of unit variance for a tile, made of `cells` per side."""
+    """Return smooth, periodic noise of unit variance for a tile, with `cells` cells per side."""
     coarse = np.pad(rng.standard_normal((cells, cells)), 2, mode="wrap")
     wide = TILE // cells
     fine = coarse if wide == 1 else cv2.resize(coarse, None, fx=wide, fy=wide, interpolation=cv2.INTER_CUBIC)
@@ -270,13 +272,13 @@ class Backdrop:
         to_W = motion.R_WK @ self._K_inv  # from a pixel (u, v, 1) to its ray in W
         down = (-to_W[2]).tolist()  # descent [W] of a ray with z = 1 in K
         limits = [math.inf]
-        for level in self._ground.levels:  # a pixel at distance s is s^2 / (f h) deep on the ground
+        for level in self._ground.levels:  # a pixel at distance s covers s^2 / (f h) of ground in depth
             reach_m = math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m)
             limits.append(height_m / min(reach_m, 0.7 * level.reach_m))
         least, most = _extremes(self._size, down)
         first = next((i for i, limit in enumerate(limits[1:]) if least >= limit), None)
         if first is None:
-            a, b, c = (-SKY_SLOPE * each for each in down)  # the higher, the bluer
+            a, b, c = (-SKY_SLOPE * each for each in down)  # the sky: bluer with elevation
             rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
             if rows is not None:
                 upwards = np.float32(b) * self._row_numbers[slice(*rows)] + np.float32(c + HAZE)

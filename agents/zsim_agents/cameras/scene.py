@@ -1,4 +1,4 @@
-"""The scene of a picture, and the motion and the lens of the camera. Pure.
+"""The scene of a picture, and the motion and the lens of the camera. All functions are pure.
 
 Frames: W, world (east, north, up); B, body of a drone; K, camera (x right, y down, z ahead).
 """
@@ -23,8 +23,8 @@ cv2.setNumThreads(1)  # leaves the other cores to the world and the agents, and 
 Array = NDArray[np.float64]
 Kernel = NDArray[np.float32]
 ARM_M = 0.1785  # arm of the AR.Drone, for records that do not give the rotors of a drone
-ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
-SUN_AZIMUTH_RAD, SUN_ELEVATION_RAD = math.radians(215.0), math.radians(50.0)  # a noon in winter
+ROTOR_RADIUS_M = 0.10  # 8-inch propellers of the AR.Drone
+SUN_AZIMUTH_RAD, SUN_ELEVATION_RAD = math.radians(215.0), math.radians(50.0)  # from east; afternoon, in the south-west
 SUN_W = np.array(
     [
         math.cos(SUN_ELEVATION_RAD) * math.cos(SUN_AZIMUTH_RAD),
@@ -32,14 +32,14 @@ SUN_W = np.array(
         math.sin(SUN_ELEVATION_RAD),
     ]
 )
-BLUR_MAX_PX = 24.0  # maximum length of motion blur, also for longer motions
+BLUR_MAX_PX = 24.0  # maximum length of motion blur; longer motions are blurred by this length
 SAMPLES_PER_PX = 8  # samples of a motion per pixel of its blur kernel
 ORIGIN = np.zeros(3)
 SHIFT = 4  # fractional bits of coordinates for OpenCV: sixteenths of a pixel
 
 
 class DroneLook(NamedTuple):
-    """Appearance of a drone: hubs (R, 2) [m; B], directions of rotation (R,) and radius of its rotors; visible hat."""
+    """Appearance of a drone: hubs (R, 2) [m; B], directions of rotation (R,), rotor radius, and whether it has a hat."""
 
     hubs_B: Array
     turns: Array
@@ -106,7 +106,7 @@ class CameraMotion(NamedTuple):
     R_WK: Array
 
     def points_K(self, points_W: Array) -> Array:
-        """Return points (..., 3), given in W, in K."""
+        """Convert points (..., 3) from W to K."""
         return (points_W - self.p_WK) @ self.R_WK
 
     def rates_K(self, points_K: Array, velocities_W: Array) -> Array:
@@ -181,7 +181,7 @@ def motion_blur_kernels(ways_px: Array) -> list[Kernel]:
     at = ways[:, :, None] * ((np.arange(count) + 0.5) / count - 0.5)  # (N, 2, count)
     halves = [math.ceil(way / 2) + 1 for way in np.abs(ways).max(axis=1).tolist()]
     most = max(halves)
-    shares = np.maximum(1 - np.abs(np.arange(-most, most + 1) - at[..., None]), 0)  # by column and by row
+    shares = np.maximum(1 - np.abs(np.arange(-most, most + 1) - at[..., None]), 0)  # per sample, by column and row
     kernels = (shares[:, 1].transpose(0, 2, 1) @ shares[:, 0] / count).astype(np.float32)
     inner = [slice(most - half, most + half + 1) for half in halves]
     return [kernel[part, part] for kernel, part in zip(kernels, inner, strict=True)]

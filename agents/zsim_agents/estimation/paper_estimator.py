@@ -32,7 +32,7 @@ POSITION_SIGMA_M = 100.0  # initial standard deviation, for a start anywhere on 
 YAW_SIGMA_RAD = 0.05  # initial standard deviation: the accuracy of setting a drone down by eye
 DRIFT_S = 1.0  # time over which the gyroscope's bias, which is not estimated, is assumed constant
 SPEED_SIGMA_M_S = 1.0  # standard deviation per axis of an unknown velocity
-IMU_GAP_MAX_S = 0.1  # interval from which on only one IMU period is integrated
+IMU_GAP_MAX_S = 0.1  # after a gap of this length or longer, only one IMU period is integrated
 
 
 class PaperEstimator:
@@ -45,7 +45,7 @@ class PaperEstimator:
         self._fix_variance_factor = correlation_factor(drone.sensors.gps.position_m, drone.sensors.gps.rate_hz)
         self._imu_period_s = 1.0 / drone.sensors.imu.rate_hz
         beta = estimation.madgwick_beta
-        self._beta = math.sqrt(0.75) * (self._gyro_sigma + self._gyro_bias) if beta is None else beta  # Madgwick (50)
+        self._beta = math.sqrt(0.75) * (self._gyro_sigma + self._gyro_bias) if beta is None else beta  # Madgwick eq. 50
         self._q_BS = frames.quaternion_from_rpy(np.radians(drone.sensors.imu.mount.rpy_deg))
         self._speed_sigma, self._flow_period_s = noise_sigma(flow.velocity_m_s, flow.rate_hz), 1.0 / flow.rate_hz
         yaw = math.radians(drone.yaw_deg)
@@ -73,7 +73,7 @@ class PaperEstimator:
         dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
         self._t_s = t_s
         yaw = float(frames.heading(self._q))
-        position = self._velocity_variance() * self._flow_period_s * dt  # an error persists for a sensor period
+        position = self._velocity_variance() * self._flow_period_s * dt  # a velocity error lasts one flow sensor period
         drift = (el.square(self._gyro_sigma) * self._imu_period_s + el.square(self._gyro_bias) * DRIFT_S) * dt
         noise = np.diag([position, position, position, drift])
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, noise, dt)

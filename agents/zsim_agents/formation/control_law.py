@@ -39,7 +39,7 @@ RATES = ("vx", "vy", "vz", "yaw rate")  # components of a robot's velocity, in t
 NEAR_M = 1e-6  # distance below which the direction between two robots is undefined
 SETTLED_M_S = 1e-9  # smaller deficits of the separation rate are ignored
 LOAD_MIN = 1e-9  # avoids division by zero
-GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three close together need a few
+GUARD_SWEEPS = 4  # passes over all pairs: one is enough for two robots; three close together need a few
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class FormationGains:
     """Parameters of the law, validated with the scenario. For those not listed here see `RobotLimits`.
 
     Attributes:
-        k_1_s: proportional gain [1/s]; 0.5 to 0.8 works well, from about 2 a drone's velocity loop makes it unstable.
+        k_1_s: proportional gain [1/s]; 0.5 to 0.8 works well; above about 2 a drone's velocity loop makes it unstable.
         integral_1_s2: integral gain [1/s^2]; removes the offset due to wind; 0 switches it off.
         integral_max_m_s, integral_max_rad_s: limits of the integral term for lengths and for angles.
         separation_min_m: minimum distance between two robots, for references and for the guard.
@@ -60,7 +60,7 @@ class FormationGains:
     speed_max_m_s: float = 2.0  # limit of velocityXY in the paper's base simulator, hector_quadrotor
     climb_max_m_s: float = 1.0  # control_vz_max of the AR.Drone SDK outdoors, 1000 mm/s
     yaw_rate_max_rad_s: float = 1.75  # control_yaw of the AR.Drone SDK
-    separation_min_m: float = 2.0  # four widths of the drone with its hull, 0.52 m
+    separation_min_m: float = 2.0  # four times the width of the drone with its hull, 0.52 m
     separation_alarm_m: float = 1.5
     guard_horizon_s: float = 1.0
     response_s: float = 0.3
@@ -113,10 +113,10 @@ class ControlLaw(ABC):
 
     @abstractmethod
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
-        """Return the desired r_dot (4n,): (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, W.
+        """Return the desired r_dot (4n,): (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, in W.
 
         Args:
-            c: (4n,) cluster of the estimates; p_W, v_W: the estimates, (n, 3) [m, m/s; W].
+            c: (4n,) cluster variables of the estimates; p_W, v_W: the estimates, (n, 3) [m, m/s; W].
             c_des, c_dot_des: (4n,) reference and its rate.
         """
 
@@ -437,7 +437,7 @@ def near_pairs(p_W: Array, within_m: float) -> PairTable:
 def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
     """Change commands in place until every pair separates at least at its required rate (see `guard`).
 
-    Returns the numbers of changed pairs and of pairs closer than the alarm threshold. Into order (n, n) it numbers the
+    Returns the numbers of changed pairs and of pairs closer than the alarm threshold. In order (n, n) it numbers the
     former from 1 above the diagonal and the latter below it; all other entries are zero.
     """
     limits = RobotLimits(*limits_of)

@@ -6,8 +6,8 @@
 
 Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic Control 51 (2006),
 Algorithms 2 and 3. u is an acceleration; the pilot integrates it to the commanded velocity. Each drone receives the
-messages of others within r; the last term is its own knowledge of the objective. Several lattices are possible: the
-quality measure is the deviation from d of the distances within r.
+messages of others within r; the last term uses the drone's own knowledge of the objective. Since several
+lattices are possible, the quality measure is the deviation from d of the distances within r.
 """
 
 import math
@@ -61,7 +61,7 @@ def phi_alpha(z: float, d: float, r: float) -> float:
 
 
 def phi_beta(z: float, d: float) -> float:
-    """Return the force at a sigma-norm z from an obstacle that is kept d away [m]; never above 0."""
+    """Return the force at a sigma-norm z from an obstacle to be kept at distance d [m]; never above 0."""
     d_beta = sigma_norm(d)
     return bump(z / d_beta, H_BETA) * (sigma_1(z - d_beta) - 1.0)
 
@@ -78,7 +78,7 @@ def alpha_force(p: Array, v: Array, heard: list[Heard], d: float, r: float, c1: 
 
 
 def beta_force(v: Array, obstacles: list[tuple[float, Array]], d: float, c1: float) -> Array:
-    """Return the obstacle term of u_i, given distance [m] and direction away of each obstacle.
+    """Return the obstacle term of u_i, given the distance [m] of each obstacle and the direction away from it.
 
     The repelling virtual agent is at the obstacle's nearest point and moves along the surface with the drone.
     """
@@ -101,7 +101,8 @@ def gamma_force(p: Array, v: Array, p_r: Array, v_r: Array, c1: float) -> Array:
 def deviation_energy(p: Array, d: float, r: float) -> tuple[float, int]:
     """Return the normalised deviation energy of positions (n, dim) from a lattice [m^2], and the number of edges.
 
-    E = sum of (|z_ij| - d)^2 over the pairs within r, each direction counted, / (pairs + 1): of the paper's section II.
+    E = sum of (|z_ij| - d)^2 over the pairs within r, counting both directions, divided by (pairs + 1);
+    section II of the paper.
     """
     z = p[:, None] - p[None]
     lengths = np.sqrt(np.sum(z * z, axis=2))[np.triu_indices(len(p), 1)]
@@ -123,7 +124,7 @@ class OlfatiSaber(Pilot):
         """c1 of the alpha, beta and gamma terms; each c2 is 2 sqrt(c1)."""
         accel_max_m_s2: Positive = 2.0
         avoid_m: NonNegative = 0.0
-        """Drones, obstacles and surfaces closer than this repel in addition to the law; 0: no repulsion."""
+        """Drones, obstacles and surfaces closer than this repel the drone, in addition to the law; 0: no repulsion."""
 
     def begin(self, scenario: Scenario) -> None:
         self._dt = self._gate_ns / 1e9

@@ -1,7 +1,7 @@
 """Common parts of laws with a shape: the drones' positions in it, and the terms that tie it to the reference.
 
-Laws of relative quantities do not control the position of the shape, some not its rotation, one not its scale. Two
-terms, common to all laws, tie it to the reference:
+Laws based on relative quantities do not control the position of the shape; some do not control its rotation either, and
+one does not control its scale. Two terms, common to all laws, tie it to the reference:
 
     u_i = law + v_i*                          feed-forward, for drones that know the reference's motion
               + b_i (p_i* - p_i)              pinning, for informed drones
@@ -32,13 +32,13 @@ class ShapeParameters(PilotParameters):
     """Circumradius of that polygon."""
     heading_deg: Value = 0.0
     scale: Value = 1.0
-    """Factor of the positions; `heading_deg` is their rotation. Both are given like `centre_m`."""
+    """Factor applied to the positions, which `heading_deg` rotates. Both take the same forms as `centre_m`."""
     feedforward: bool = True
     """Whether all drones know the reference's motion; otherwise only the informed ones do."""
     informed: list[str] | None = None
     """Drones that know their own reference position in W; None: the first one."""
     pin_1_s: NonNegative = 1.0
-    """Gain of the informed drones towards it."""
+    """Gain with which informed drones approach their reference positions."""
 
 
 class ShapePilot(Pilot):

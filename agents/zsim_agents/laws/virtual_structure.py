@@ -1,4 +1,4 @@
-"""Virtual structure: the formation is a rigid body that moves, turns and scales by a plan known to every drone.
+"""Virtual structure: the formation is a rigid body that moves, turns and scales as planned; every drone knows the plan.
 
     p_i* = p_c + s R(psi) c_i,    u_i = dp_i*/dt + k (p_i* - p_i)      (1)
 

@@ -4,7 +4,7 @@ Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headi
 has as many variables: position and attitude of the formation, the relative heading of each robot, and the shape.
 Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
 
-The functions of the cluster frame C, with Z-Y-X Euler angles, are compiled, because a gate takes microseconds.
+The functions of the cluster frame C, with Z-Y-X Euler angles, are compiled, because a gate must take only microseconds.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ class ClusterSpace(ABC):
     scenario and constructed by `for_places`.
 
     Args:
-        names: of the 4 n variables, including pitch. The beginning of a name gives its kind: p, q, rho are lengths, w
-            departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles that do not.
+        names: of the 4 n variables, including pitch. The beginning of a name gives its kind: p, q, rho are lengths;
+            w, departures in metres; roll, yaw, phi, azimuth, angles that wrap; pitch, beta, elevation, angles that do
+            not.
         spread_text: the quantity that `spread` measures, in words for messages.
 
     Attributes:
@@ -104,7 +105,7 @@ class ClusterSpace(ABC):
 
     @abstractmethod
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
-        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, W.
+        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, in W.
 
         Raises:
             SingularClusterError: as in `forward`.
@@ -139,7 +140,7 @@ class ClusterSpace(ABC):
 
         It is zero exactly where J^-1 is singular (robots 1, 2, 3 collinear or two of them coincident, another robot on
         the z axis through robot 1, or pitch at 90 degrees); in a level formation, it is how far one robot may move
-        before that.
+        before J^-1 becomes singular.
         """
         return self.measures(c)[1]
 
@@ -161,7 +162,7 @@ class ClusterSpace(ABC):
         return float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
 
     def difference(self, c_to: Array, c_from: Array) -> Array:
-        """Return c_to - c_from (4n,), for angles that wrap the shorter way round."""
+        """Return c_to - c_from (4n,), taking the shorter way round for angles that wrap."""
         return self.wrapped(c_to - c_from)
 
     def wrapped(self, c: Array) -> Array:
@@ -180,7 +181,7 @@ class ClusterSpace(ABC):
 
 
 def checked(space: ClusterSpace) -> ClusterSpace:
-    """Make all methods of a user's space raise UserCodeError for results of a wrong shape or not finite."""
+    """Make all methods of a user's space raise UserCodeError for results that have a wrong shape or are not finite."""
     n, size = space.n, space.size
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
         "forward": ((size,),),
