@@ -92,7 +92,7 @@ class Recorder:
         self._stopped_s: float | None = None
         self._held: list[Passed] = []  # received messages, to be written after missed ones
         self._is_back = False  # in realtime, a lost link is restored and missed messages are not fetched yet
-        self._quiet_since_s: float | None = None  # wall time since which no clock has come after a lost link
+        self._quiet_since_s: float | None = None  # since when no clock has arrived after a lost link in realtime
         self._on_disk_ns = 0  # simulated time of the last write to disk
         self._left_out = 0
 
