@@ -39,7 +39,7 @@ SHIFT = 4  # fractional bits of coordinates for OpenCV: sixteenths of a pixel
 
 
 class DroneLook(NamedTuple):
-    """Appearance of a drone: hubs (R, 2) [m; B], directions of rotation (R,), rotor radius, and whether it has a hat."""
+    """Appearance of a drone: hubs (R, 2) [m; B], directions of rotation (R,), rotor radius, whether it has a hat."""
 
     hubs_B: Array
     turns: Array
