@@ -60,8 +60,8 @@ class Clock(Message, frozen=True):
     waiting_for: tuple[Waiting, ...] = ()
 
 
-ADMISSIONS = ("join", "restart", "superseded")  # events of a process that takes part, or does so again
-INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery")  # events of a drone in need of help
+ADMISSIONS = ("join", "restart", "superseded")  # kinds of events of a process that has joined or rejoined
+INCIDENTS = ("emergency", "flip", "impact", "touchdown", "battery")  # kinds of events of a drone that fails in flight
 EVENT_KINDS = (
     *ADMISSIONS, "doubled", "no_show", "slow_reader", "silent", "silent_end", "standstill", "leave", "death", "drop",
     "failure", "overdue", "fingerprint", "commander", "release", "mode", "command", "control", "refused",
