@@ -1,4 +1,4 @@
-"""3DR Iris, `model: iris`, with the parameters of RotorS; the front rotors are farther from the centre than the rear ones.
+"""3DR Iris, `model: iris`, with the parameters of RotorS; its front rotors are farther out than its rear ones.
 
 Sources: RotorS (Furrer et al. 2016), rotors_gazebo/resource/iris.yaml (mass, inertia, rotors) and
 rotors_description/urdf/iris.xacro (motors, rotor drag); 3D Robotics' data sheet (battery).
