@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import CameraInfo
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, SessionError
+from zsim.errors import DecodeError, NoListenerError
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport import connection
@@ -79,9 +79,7 @@ def serve(
                     ros_link = stack.enter_context(
                         connection.connect(network.router, "", wait_s=ATTEMPT_S, reader=True, identity=network.identity)
                     )
-                except SessionError as error:
-                    if "nobody listens" not in str(error):
-                        raise
+                except NoListenerError:
                     waits = f"no router of ROS on {network.router} yet, waiting for it; start rmw_zenohd there"
                     bridge.report_once("router", waits)
             if ros_link is not None and not entered:
