@@ -1,12 +1,14 @@
 """Observations and actions of policies, the same in a training environment and in a process of a flight.
 
-class Trained(zsim.PolicyAgent):
-    observe, action, step_s = "estimate", "velocity", 0.1
+A trained policy flies as an agent:
 
-    def policy(self, observations):
-        return {drone: model.predict(seen)[0] for drone, seen in observations.items()}
+    class Trained(zsim.PolicyAgent):
+        observe, action, step_s = "estimate", "velocity", 0.1
 
-zsim.run(env.scenario, agents=[Trained])    # or: zsim agent MODULE:Trained, on any host
+        def policy(self, observations):
+            return {drone: model.predict(seen)[0] for drone, seen in observations.items()}
+
+    zsim.run(env.scenario, agents=[Trained])    # or: zsim agent MODULE:Trained, on any host
 """
 
 from collections.abc import Mapping, Sequence

@@ -219,7 +219,7 @@ def launch_of(folder: Path) -> Launch:
 
 
 def reopen_record(folder: Path) -> None:
-    """Truncate an interrupted run's record before its `end` event; RecordError if another process is writing it."""
+    """Cut an interrupted run's record before its `end` event; raise RecordError if another process is writing it."""
 
     def is_end(payload: bytes) -> bool:
         try:

@@ -89,7 +89,7 @@ class Scenario:
 
     @cached_property
     def resolved(self) -> Resolved:
-        """The scenario with all defaults, as it is flown; ScenarioError with a line for every fault."""
+        """The scenario with all defaults, as it is flown; raises ScenarioError with a line for every fault."""
         self.search()
         scenario = scenario_file.resolve(self._document, self.source)
         check_classes(scenario, self.source)
