@@ -1,12 +1,14 @@
 """Observations and actions of policies, the same in a training environment and in a process of a flight.
 
-class Trained(zsim.PolicyAgent):
-    observe, action, step_s = "estimate", "velocity", 0.1
+A trained policy flies as an agent:
 
-    def policy(self, observations):
-        return {drone: model.predict(seen)[0] for drone, seen in observations.items()}
+    class Trained(zsim.PolicyAgent):
+        observe, action, step_s = "estimate", "velocity", 0.1
 
-zsim.run(env.scenario, agents=[Trained])    # or: zsim agent MODULE:Trained, on any host
+        def policy(self, observations):
+            return {drone: model.predict(seen)[0] for drone, seen in observations.items()}
+
+    zsim.run(env.scenario, agents=[Trained])    # or: zsim agent MODULE:Trained, on any host
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,8 +59,8 @@ class Flown(Protocol):
 class Interface:
     """Observations and commands of an environment's agents: drones, or clusters if `action` is "cluster".
 
-    An observation (K,) of "truth" or "estimate" holds, for each drone of the agent, position [m], velocity [m/s] in W
-    and orientation (w, x, y, z, B to W), for "truth" also the angular velocity in B [rad/s]; then, for each other
+    An observation (K,) of "truth" or "estimate" holds, for each drone of the agent, position [m] and velocity
+    [m/s] in W, orientation (w, x, y, z; B to W) and, for "truth", angular velocity in B [rad/s]; then, for each other
     drone, position and velocity relative to the agent's first drone, in W. An observation of "sensors" holds the newest
     sample of every sensor, in the order of the contract; 0 before the first one.
 

@@ -67,9 +67,9 @@ if TYPE_CHECKING:
 Table = dict[str, NDArray[Any]]  # columns of equal length (K,), ordered by simulated time
 INDEX = "t_s"
 STAMPS = ("t_ns", "seq", "wall_ns")  # metadata columns of a message
-SHOWN = 12  # most names listed in an error
-ROWS_MAX = 200_000  # most rows read at once for several drones; that many estimates take 100 MB
-NOTES = 3  # most shortfalls shown when a notebook displays a run
+SHOWN = 12  # maximum number of names listed in an error
+ROWS_MAX = 200_000  # maximum number of rows read at once for several drones; that many estimates take 100 MB
+NOTES = 3  # maximum number of shortfalls shown when a notebook displays a run
 ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # named as in tables of estimates
 Window = tuple[float, float]
 
@@ -122,26 +122,26 @@ class Run:
     # Tables
 
     def truth(self, drone: str) -> "DataFrame":
-        """Return a drone's true motion at every gate (W and B: docs/conventions.md); RunError if none is on record."""
+        """Return the true motion of a drone at every gate, in W and B; raise RunError if there is none."""
         return self._of("drone", drone, "truth")
 
     def estimate(self, drone: str) -> "DataFrame":
-        """Return the estimates of a drone's motion, with their covariance; RunError if none are on record."""
+        """Return the estimates of a drone's motion, with their covariance; raise RunError if there are none."""
         return self._of("drone", drone, "estimate")
 
     def sensor(self, drone: str, sensor: str) -> "DataFrame":
-        """Return samples of a sensor: imu, gps, mag, baro, sonar, flow, or your own; RunError if none are on record.
+        """Return the samples of imu, gps, mag, baro, sonar, flow, or your own sensor; raise RunError if there are none.
 
         `t_sample_ns` is the time at which a sample was taken; the index is the time of its delivery.
         """
         return self._of("drone", drone, f"sensor/{sensor}")
 
     def status(self, drone: str) -> "DataFrame":
-        """Return the state of a drone's firmware and battery at every gate; RunError if none is on record."""
+        """Return the state of a drone's firmware and battery at every gate; raise RunError if there is none."""
         return self._of("drone", drone, "sensor/status")
 
     def commands(self, drone: str, kind: str = "velocity") -> "DataFrame":
-        """Return all commands sent to a drone, with their `source`; RunError if none are on record.
+        """Return all commands sent to a drone, with their `source`; raise RunError if there are none.
 
         Args:
             drone: name.
@@ -289,7 +289,7 @@ class Run:
 
     @property
     def summary(self) -> RunSummary:
-        """The content of summary.json; RecordError if no truth is on record."""
+        """The content of summary.json; raises RecordError if no truth is on record."""
         return self._judged[2]
 
     @property
