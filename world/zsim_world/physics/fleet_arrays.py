@@ -94,7 +94,7 @@ CLOCK = columns(
 SPAN = columns(
     "SpanColumns", (Field("dt", "s"), Field("hover", "s"), Field("land", "s"))
 )  # length of a tick; silence until hovering, then until landing
-PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W's origin over sea level
+PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W above sea level
 EXPOSED = columns(  # truth that a user's sensor measures; accel as in Bodies
     "ExposedColumns", (Field("state", "STATE", 13), Field("accel", "m/s^2, rad/s^2", 6), Field("air", "m/s", 3))
 )

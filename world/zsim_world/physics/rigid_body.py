@@ -161,7 +161,7 @@ def step(
 ) -> None:
     """Advance one drone's state (STATE.size + R,) by dt [s] in place under rotor commands (R,) [rad/s].
 
-    The rotors' lag is integrated exactly, also within the step; air velocity and other drones' forces are held constant.
+    The rotors' lag is integrated exactly, also within the step; air velocity and other drones' forces stay constant.
     """
     decay = half_decay(row[VEHICLE.rotor_lag], dt)
     speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)

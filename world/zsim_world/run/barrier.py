@@ -195,7 +195,7 @@ class Barrier:
     def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
         """Note that a participant has completed the gate `done_ns` of its message; return the refusal, or None.
 
-        A gap in the sequence numbers shows that a done was lost. Outputs beyond the message's count belong to the next done.
+        A gap in the sequence numbers shows that a done was lost. Outputs beyond its `sent` belong to the next done.
         """
         participant = self.participants.get(name)
         if participant is None:
@@ -256,7 +256,7 @@ class Barrier:
         return participant is not None and participant.farewell is not None
 
     def take_back_bye(self, name: str) -> Refusal | None:
-        """Drop the bye of a participant that continues, which another process must have sent; return its refusal, or None."""
+        """Drop the bye of a participant that continues, which another process has sent; return its refusal, or None."""
         participant = self.participants[name]
         if participant.farewell is None:
             return None
