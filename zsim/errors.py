@@ -76,6 +76,10 @@ class SessionError(ZsimError):
     """A Zenoh session cannot be opened or used."""
 
 
+class NoListenerError(SessionError):
+    """No process listens on an endpoint yet; connecting may succeed later."""
+
+
 class NoWorldError(SessionError):
     """No world answered a query within the time limit, or its answer was unusable."""
 

@@ -1,4 +1,4 @@
-"""Messages common to ROS 1 and ROS 2, converted from zsim's; each bridge adds its own headers. Pure.
+"""Messages common to ROS 1 and ROS 2, converted from zsim's; each bridge adds its own headers. No I/O.
 
 ROS has the same W (east, north, up) and B (forward, left, up) as zsim (REP 103, REP 105), and SI units; its quaternions
 end with w. Covariances are row-major; unknown ones are zero, unless the message defines another value for them.
@@ -32,7 +32,7 @@ TFMessage = ros.tf2_msgs__msg__TFMessage
 
 
 def by_axis(pattern: str, axes: str, values: Sequence[float]) -> dict[str, float]:
-    """Return a vector as the fields of a message, one per axis."""
+    """Return a vector as message fields, one per axis."""
     return {pattern.format(axis): value for axis, value in zip(axes, values, strict=True)}
 
 
@@ -71,7 +71,7 @@ def transform(head: Any, child: str, position_m: Vector, q: Quaternion) -> Any:
 def odometry(
     head: Any, child: str, pose: Any, twist: Any, of_pose: Array | None = None, of_twist: Array | None = None
 ) -> Any:
-    """Return an Odometry with covariances (36,) of pose and twist; None if these are unknown, or zero."""
+    """Return an Odometry with the covariances (36,) of pose and twist; None for unknown or zero ones."""
     nothing = np.zeros(36)
     return ros.nav_msgs__msg__Odometry(
         head,

@@ -1,4 +1,4 @@
-"""Assertions about a run for tests: its errors, no collisions, and bit-identity with another run."""
+"""Assertions about a run, for tests: bounds on its errors, no collisions, and bit-identity with another run."""
 
 from abc import ABC, abstractmethod
 from itertools import zip_longest
@@ -18,11 +18,11 @@ from zsim_analysis.rerun import TruthComparison
 if TYPE_CHECKING:
     from zsim_api.recorded import Run
 
-NAMED_MAX = 3  # most collisions listed
+NAMED_MAX = 3  # most collisions listed in a failure
 
 
 class Assertions(ABC):
-    """Assertions about a run, each of which first lets it fly to its end."""
+    """Assertions about a run; each of them first lets the run fly to its end."""
 
     @abstractmethod
     def run(self) -> "Run":
@@ -36,11 +36,11 @@ class Assertions(ABC):
         Args:
             window: start and end [s]; None: that of the report.
             cluster: name; None: the first.
-            rms: the largest RMS allowed by cluster variable [m, rad], such as p=0.3.
+            rms: largest allowed RMS of each cluster variable [m, rad], such as p=0.3.
 
         Raises:
-            AssertionError: with a line for each RMS that is larger or unknown, with the largest error and its time; or
-                the formation was not engaged throughout the window.
+            AssertionError: an RMS is larger or unknown (one line for each, with the largest error and its time), the
+                run ended before the window did, or the formation was not engaged throughout the window.
         """
         __tracebackhide__ = True  # pytest then shows the line of the test, not this function
         run = self.run()
@@ -71,7 +71,7 @@ class Assertions(ABC):
             raise AssertionError("\n".join([*faults, f"the record is {run.record}"]))
 
     def assert_no_collision(self) -> None:
-        """Assert that no drone collided with another one or an obstacle; AssertionError says which did, and when."""
+        """Assert that no drone collided with another one or an obstacle; the AssertionError says which, and when."""
         __tracebackhide__ = True
         run = self.run()
         with RecordReader(run.record) as reader:
@@ -83,13 +83,13 @@ class Assertions(ABC):
             raise AssertionError("\n".join([*lines, *more, f"the record is {run.record}"]))
 
     def assert_same_bits(self, other: "Assertions | Run | str | Path") -> None:
-        """Assert that the truth of another run is identical to the bit.
+        """Assert that the truth of another run is bit-identical to that of this run.
 
         Args:
             other: another federation, a run, or the path of one.
 
         Raises:
-            AssertionError: with drone, time and size of the first difference.
+            AssertionError: with the drone, time and size of the first difference.
         """
         __tracebackhide__ = True
         from zsim_api.recorded import Run

@@ -1,7 +1,7 @@
 """Control of drones from Python: commands, and requests to the pilot of a drone that flies a reference.
 
-Commands are for `Simulation.step` and for agents: messages of the contract in SI units, in which the publisher fills in
-stamp, number and source. Requests are for a drone that flies on its own: `sim.drone("drone1").goto((1, 2, 3))`.
+Commands are passed to `Simulation.step` or sent by agents: messages of the contract in SI units; the publisher fills in
+stamp, number and source. Requests go to a drone that flies on its own: `sim.drone("drone1").goto((1, 2, 3))`.
 """
 
 import math
@@ -15,10 +15,10 @@ from zsim.contract.flight_messages import Ardrone, Attitude, Mode, RotorSpeeds, 
 from zsim.errors import RunError
 
 Command = Velocity | Attitude | RotorSpeeds | Ardrone | Mode
-"""A command to a drone, as the functions of this module return it."""
+"""A command to a drone, as returned by the functions of this module."""
 _UNSTAMPED = (0, 0, "")  # t_ns, seq, source
 Ask = Callable[..., dict[str, Any]]
-"""`ask` of a `Simulation` or a `Federation`, with key, op and arguments; raises RequestRefusedError."""
+"""The method `ask` of a `Simulation` or a `Federation`: takes key, op and arguments; raises RequestRefusedError."""
 
 
 def velocity(
@@ -28,7 +28,7 @@ def velocity(
     yaw_rate_rad_s: float = 0.0,
     frame: Literal["heading", "world"] = "heading",
 ) -> Velocity:
-    """Return a command to fly a velocity [m/s]: x forward, y left, z up; in the frame "world" east, north, up.
+    """Return a command to fly at a velocity [m/s]: x forward, y left, z up; in the frame "world" east, north, up.
 
     Raises:
         RunError: a number is not finite, or the frame is unknown.
@@ -40,7 +40,7 @@ def velocity(
 
 
 def attitude(orientation_wxyz: Sequence[float] | np.ndarray, thrust_n: float, yaw_rate_rad_s: float = 0.0) -> Attitude:
-    """Return a command to fly a tilt (B to W, w first, heading ignored), with a thrust [N] and a yaw rate [rad/s].
+    """Return a command to hold a tilt (B to W, w first; heading ignored), a thrust [N] and a yaw rate [rad/s].
 
     Raises:
         RunError: a number is not finite, or the orientation does not have four numbers.
@@ -52,12 +52,12 @@ def attitude(orientation_wxyz: Sequence[float] | np.ndarray, thrust_n: float, ya
 
 
 def rotors(speed_rad_s: Sequence[float] | np.ndarray) -> RotorSpeeds:
-    """Return a command of rotor speeds (R,) [rad/s], in the order of `world/info`."""
+    """Return a command to turn the rotors at speeds (R,) [rad/s], in the order of `world/info`."""
     return RotorSpeeds(*_UNSTAMPED, _finite("rotors", speed_rad_s))
 
 
 def ardrone(forward: float, left: float, up: float, yaw_left: float, hover: bool = False) -> Ardrone:
-    """Return a command in the AR.Drone's terms: tilts, climb and yaw rate in [-1, 1] of their limits, or hover."""
+    """Return an AR.Drone command: tilts, climb and yaw rate in [-1, 1], scaled to their limits, or hover."""
     return Ardrone(*_UNSTAMPED, *_finite("ardrone", (forward, left, up, yaw_left)), hover=hover)
 
 
@@ -113,7 +113,7 @@ class PilotedDrone:
             yaw_deg: heading there; None: the present heading.
             over_s: duration of a flight to one position, which is lengthened if the drone's limits require it. With the
                 same duration, all drones follow the same function of time.
-            speed_m_s: cruise speed; None, or more than the drone's limits allow: as fast as these allow.
+            speed_m_s: cruise speed; None, or beyond the drone's limits: as fast as these allow.
             radius_m: distance from a position within which the drone turns towards the next one; None or 0: it rests at
                 each position.
         """

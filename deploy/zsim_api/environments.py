@@ -32,7 +32,7 @@ SEEDS = 2**31
 
 
 def never(sim: Simulation, agent: str) -> bool:
-    """Let every episode last until the scenario's end."""
+    """Terminate no episode before the scenario's end."""
     return False
 
 
@@ -50,7 +50,7 @@ def flipped(sim: Simulation, agent: str) -> bool:
 
 
 def far_away(distance_m: float) -> Ended:
-    """Return a condition that ends the episode of a drone farther than this from its initial position [m]."""
+    """Return a condition that ends the episode of an agent with a drone farther than this from its initial position."""
 
     def is_far(sim: Simulation, agent: str) -> bool:
         places = [sim.names.index(drone) for drone in _drones(sim, agent)]
@@ -61,7 +61,7 @@ def far_away(distance_m: float) -> Ended:
 
 
 def any_of(*conditions: Ended) -> Ended:
-    """Return a condition that holds if any of these does."""
+    """Return a condition that holds if any of `conditions` holds."""
     return lambda sim, agent: any(each(sim, agent) for each in conditions)
 
 
@@ -71,7 +71,7 @@ def _drones(sim: Simulation, agent: str) -> Sequence[str]:
 
 
 class _Episodes:
-    """Episodes of a scenario, which all kinds of environments step; arguments as in `parallel_env`."""
+    """Episodes of a scenario, shared by all kinds of environments; arguments as in `parallel_env`."""
 
     def __init__(
         self,
@@ -101,10 +101,10 @@ class _Episodes:
             self.observation_spaces[agent] = Box(-FARTHEST, FARTHEST, (size,), np.float32)
 
     def begin(self, rng: np.random.Generator) -> dict[str, Floats]:
-        """Fly until all drones are in the air; return the observations.
+        """Start an episode by flying until all drones are in the air; return the observations.
 
         Raises:
-            RunError: the scenario ends before they are.
+            RunError: the scenario ends before all drones are in the air.
         """
         drawn = self._randomise(rng) if self._randomise else {}
         self.sim.source = self.scenario.changed(seed=int(rng.integers(SEEDS)), set=drawn)
@@ -232,7 +232,7 @@ def parallel_env(scenario: AnyScenario, **settings: Any) -> FormationEnv:
     """Return a PettingZoo environment for a scenario.
 
     The scenario's controllers do not take part; its estimators do if estimates are observed. `env.scenario` is the
-    scenario that flies: `zsim.run(env.scenario, agents=[MyPolicy])` flies a `zsim.PolicyAgent` bit-identically,
+    scenario that is flown: `zsim.run(env.scenario, agents=[MyPolicy])` flies a `zsim.PolicyAgent` bit-identically,
     anywhere.
 
     Args:
@@ -242,10 +242,10 @@ def parallel_env(scenario: AnyScenario, **settings: Any) -> FormationEnv:
             returns fields of an episode's scenario by path, drawn from a numpy Generator; `observe`: "truth",
             "estimate" or "sensors"; `action`: "velocity", "attitude", "rotors", or "cluster", for which the agents are
             clusters; `step_s`: time between two actions, one gate by default; `duration_s` and `set` as in `zsim.run`.
-            For both spaces, see `zsim.Interface`.
+            For the spaces of observations and actions, see `zsim.Interface`.
 
     Raises:
-        ScenarioError: with one line for every fault of the scenario.
+        ScenarioError: with one line for every fault in the scenario.
         RunError: the settings do not fit each other or the scenario.
     """
     return FormationEnv(scenario, **_checked(settings))
@@ -259,12 +259,12 @@ def gym_env(scenario: AnyScenario, **settings: Any) -> FlightEnv:
 def vector_env(
     scenario: AnyScenario, num_envs: int, processes: bool = False, **settings: Any
 ) -> VectorEnv[Any, Any, Any]:
-    """Return several Gymnasium environments as one; each begins its next episode with the step after the last one.
+    """Return several Gymnasium environments as one; each begins its next episode at the step after its last one.
 
     Args:
         scenario: as in `parallel_env`.
         num_envs: number of environments.
-        processes: whether each has its own process.
+        processes: whether each environment has its own process.
         settings: as in `parallel_env`.
     """
     make = partial(gym_env, scenario, **_checked(settings))

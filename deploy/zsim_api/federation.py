@@ -1,4 +1,4 @@
-"""A flight under test: real processes and the user's own programs, in which a test observes and intervenes.
+"""A flight under test: real processes and the user's own programs, with a test that observes and intervenes.
 
     with zsim.Federation("step.yaml", duration=40, programs=["python my_controller.py --connect {endpoint}"]) as flight:
         flight.wait_until("engaged")
@@ -7,8 +7,8 @@
         flight.assert_errors(p=0.3, window=(20, 40))
 
 The test takes part in the lockstep as `test.federation`: simulated time stands still unless the test waits for
-something, so its actions take effect at the same gate each time. The fixture `federation` of the pytest plugin creates
-these objects.
+something, so its actions take effect at the same gate in every run. The fixture `federation` of the pytest plugin
+creates these objects.
 """
 
 import os
@@ -53,8 +53,8 @@ PATIENCE_S = 300.0  # wall time; the first run on a machine compiles for one to 
 PROGRAM_END_S = 5.0  # wall time for programs to notice the end of the run
 KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has no SIGKILL
 HARMLESS = {getattr(signal, name, None) for name in ("SIGSTOP", "SIGCONT")}  # signals that do not end a process
-LAST_LINES = 40  # last lines shown of a log with a failure
-ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # in the launcher's log
+LAST_LINES = 40  # number of last lines shown of a log that may explain a failure
+ENDED = re.compile(r"^(\S+)(?: \(pid \d+\))? ended: ", re.MULTILINE)  # line in the launcher's log
 
 
 class Moment(NamedTuple):
@@ -64,7 +64,7 @@ class Moment(NamedTuple):
         t_s: simulated time.
         states: the newest received states of the clusters by name, which are two gates old.
         truth: the true motion of the drones by name, except external ones.
-        events: those since the last `wait_until`.
+        events: events since the last `wait_until`.
     """
 
     t_s: float
@@ -83,10 +83,10 @@ class Federation(Assertions):
         scenario: path, `zsim.Scenario`, or a mapping as in YAML.
         duration: simulated time of the flight [s]; None: that of the scenario.
         seed, set, law, estimator, out: as in `zsim.run`; an earlier run in `out` is replaced.
-        agents: your own, as in `zsim.run`, or as texts for `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
+        agents: your own agents, as in `zsim.run`, or as texts for `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
         programs: command lines of your own programs, in any language, each a text or a list of words. `{endpoint}`,
             `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION.
-            Simulated time does not start before every named program has joined, as in "ground.main=python ground.py".
+            Simulated time starts only once every program with a name ("ground.main=python ground.py") has joined.
             A program that ends with a code other than 0 fails the flight.
         options: further options of `zsim run`, such as "--hosted", or "--rate" and "1".
         modules: further folders with the modules of named classes, beside those of the scenario.
@@ -140,7 +140,7 @@ class Federation(Assertions):
             raise
         self._watch = _Watch()
         self._known = {*expected, WORLD, RECORDER}
-        self._has_others = bool(named or options) or any(not name for name, _ in started)  # whose names are unknown
+        self._has_others = bool(named or options) or any(not name for name, _ in started)  # of unknown names
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
@@ -180,7 +180,7 @@ class Federation(Assertions):
         return moment.t_s if moment else 0.0
 
     def wait_until(self, what: str | float | Condition, within_s: float = PATIENCE_S) -> Moment:
-        """Let time pass until a condition is met, and stop it there; in realtime it continues.
+        """Let simulated time pass until a condition is met, and stop it there; in realtime, it continues.
 
         Args:
             what: a phase that every cluster must be in, such as "engaged" (met at once if all already are, even just
@@ -215,7 +215,7 @@ class Federation(Assertions):
         raise RunFailedError(f"{self.folder.name}: waiting for {text} from {self.t_s:.2f} s on: {fault}")
 
     def run(self, within_s: float = PATIENCE_S) -> "Run":
-        """Let time pass until the end of the run; return the recorded run, as `zsim.load` does.
+        """Let simulated time pass until the end of the run; return the recorded run, as `zsim.load` does.
 
         Args:
             within_s: limit in wall time.
@@ -244,7 +244,9 @@ class Federation(Assertions):
     # Interventions
 
     def ask(self, key: str, op: str, within_s: float = PATIENCE_S, **args: Any) -> Any:
-        """Ask the world or a controller, as `zsim ask` does: `ask("cluster/main/control", "target", values={…})`.
+        """Send a request to the world or a controller, as `zsim ask` does.
+
+        For example, `ask("cluster/main/control", "target", values={…})`.
 
         Args:
             key: `world/control` or `cluster/NAME/control`.
@@ -281,8 +283,8 @@ class Federation(Assertions):
         """Send a signal to a process of the run, SIGKILL by default; return its process id.
 
         Args:
-            process: name, such as "estimator.drone2", "world", or that of a program of yours, "ground.main".
-            number: the signal, such as SIGSTOP, which stops the process until SIGCONT.
+            process: its name, such as "estimator.drone2" or "world", or "ground.main" for a program of yours.
+            number: number of the signal, such as SIGSTOP, which stops the process until SIGCONT.
             within_s: wall time to wait until the process has joined.
 
         Raises:
@@ -320,15 +322,15 @@ class Federation(Assertions):
         self._start(program, former.words)
 
     def _check_name(self, process: str, within_s: float) -> None:
-        """Raise RunError for a name that no process of the run has or is expected to have."""
+        """Raise RunError unless a process of the run has, or is expected to have, the name."""
         if process in self._known:
             return
         watch = self._watch
         with watch.news:
-            if self._has_others:  # at the first gate all expected processes have joined
+            if self._has_others:  # by the first gate, all expected processes have joined
                 watch.news.wait_for(lambda: watch.moment is not None or self._fault is not None, within_s)
             link = self._link
-        for sample in link.get(keys.process("*", "join")) if link else ():  # those that joined before this test
+        for sample in link.get(keys.process("*", "join")) if link else ():  # processes that joined before this test
             self._take_process(sample)
         allowed = sorted({*self._known, *self._pids} - {PROCESS})
         if process not in allowed:
@@ -343,7 +345,7 @@ class Federation(Assertions):
             return self._link
 
     def _await(self, is_met: Callable[[], bool], until_s: float, failure: str) -> None:
-        """Wait for news until a condition is met; RunFailedError once the run is over or the time has passed."""
+        """Wait until a condition is met; raise RunFailedError once the run is over or the time has passed."""
         while not is_met():
             if self._fault is not None or not self._watch.news.wait(max(0.0, until_s - time.monotonic())):
                 raise RunFailedError(f"{self.folder.name}: {self._fault or failure}")
@@ -351,7 +353,7 @@ class Federation(Assertions):
     # End
 
     def close(self) -> None:
-        """End all processes of the flight; the record contains everything up to then."""
+        """End all processes of the flight; the record contains everything up to that point."""
         self._over = True
         self._watch.finish()
         self._launcher.close()
@@ -368,7 +370,7 @@ class Federation(Assertions):
         self.close()
 
     def diagnosis(self) -> str:
-        """Describe the progress of the run, the processes that it waits for, and the last lines of the logs.
+        """Return a text on the progress of the run, the processes that it waits for, and the last lines of the logs.
 
         The logs of failed and awaited processes come first, then the launcher's; then one line of each other log.
         """
@@ -435,7 +437,7 @@ class Federation(Assertions):
             self._watch.news.notify_all()
 
     def _take_part(self) -> None:
-        """Take part in the run from its start to its end; the world waits for this participant."""
+        """Take part in the run from start to end; the world waits for this participant."""
 
         def is_over() -> bool:
             return self._over or self._launcher.code is not None
@@ -476,9 +478,9 @@ class _Watch(Agent):
     """The test's participant in the lockstep, which completes a gate only once the test lets time pass.
 
     Attributes:
-        news: guards the other attributes, and signals changes.
+        news: condition variable that guards the other attributes and signals their changes.
         wanted: the condition that the test waits for; None while simulated time stands still.
-        moment: the newest gate; None before the first.
+        moment: the moment of the newest gate; None before the first.
         raised: the exception that the condition raised.
         left: whether the participant has left the run.
         ahead_s: time after the newest gate that the world cannot have computed yet [s]; None in realtime.
@@ -512,14 +514,14 @@ class _Watch(Agent):
         self.ahead_s = (info.command_delay_ns + info.gate_ns) / 1e9 if self._holds else None
 
     def begin(self, condition: Condition) -> None:
-        """Let time pass until a condition is met; `news` must be held."""
+        """Let simulated time pass until a condition is met; the caller must hold `news`."""
         self._events = [event for event in self._events if event.t_ns >= self._now_ns]
         self.moment = self.moment and self.moment._replace(events=())
         self.raised, self.wanted = None, condition
         self.news.notify_all()
 
     def finish(self) -> None:
-        """Let time pass until the end of the run."""
+        """Let simulated time pass until the end of the run."""
         with self.news:
             self.begin(lambda _: False)
 
@@ -553,7 +555,7 @@ class _Watch(Agent):
 
 
 def _condition(what: str | float | Condition) -> tuple[Condition, str]:
-    """Return the argument of `wait_until` as a function of a moment, and as a text."""
+    """Return the argument of `wait_until` as a function of a moment, with a text that describes it."""
     if callable(what):
         return what, getattr(what, "__name__", repr(what))
     phases = get_args(Phase)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 COMMAND = (sys.executable, "-P", "-m", "zsim_deploy")
-LAUNCHER = "zsim-run"  # log of the launcher's output if that is not shown, beside the logs of the processes
+LAUNCHER = "zsim-run"  # name of the log for output of the launcher that is not shown
 INTERRUPTED = 130  # exit code of `zsim run` after Ctrl-C
 
 
@@ -50,27 +50,27 @@ def run(
 ) -> "Run":
     """Fly a scenario to its end, record it, and return the run, as `zsim.load` does.
 
-    Classes and functions may be defined anywhere, also in a notebook's cell or in a script.
+    Classes and functions may be defined anywhere, including a notebook cell or a script.
 
     Args:
         scenario: path of a YAML file, `zsim.Scenario`, or a mapping as in YAML.
         seed, duration_s: replace those of the scenario.
         set: replaces fields of the scenario by path, as in `{"environment.wind.gust_m_s": 1.0}`.
         agents: your own agents, beside the estimators and controllers of the scenario: subclasses of `zsim.Agent`, or
-            their instances, which keep their state after the run, except as processes. The run waits for them, and
-            ends if one fails.
+            instances of them, which keep their state after the run unless they fly as processes. The run waits for
+            them, and ends if one fails.
         law, estimator: classes that replace those of all clusters and drones; see docs/extending.md.
-        processes: fly it as real processes on this machine, as `zsim run` does; bit-identical, but slower.
-        options: options of `zsim run`, for processes: `["--hosted"]`, `["--realtime", "--console"]`.
+        processes: fly the scenario as real processes on this machine, as `zsim run` does; bit-identical, but slower.
+        options: options of `zsim run`, only with `processes`: `["--hosted"]`, `["--realtime", "--console"]`.
         out: folder of the run; None: `runs/NAME-TIME`.
         force: replace an earlier run in that folder.
-        progress: show a bar and the events.
+        progress: show a progress bar and the events.
 
     Raises:
-        ScenarioError: with one line for every fault of the scenario; nothing was flown.
-        RunFailedError: a failure ended the run; its record holds everything up to then.
-        KeyboardInterrupt: the run was interrupted; its record holds everything up to then. A second Ctrl-C ends it at
-            once.
+        ScenarioError: with one line for every fault in the scenario; nothing was flown.
+        RunFailedError: a failure ended the run; its record holds everything up to that point.
+        KeyboardInterrupt: the run was interrupted; its record holds everything up to that point. A second Ctrl-C ends
+            it at once.
         Exception: raised by one of your classes, with its own traceback, after a line on stderr that says where.
     """
     source = scenario_of(scenario).changed(seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator)
@@ -125,7 +125,7 @@ def _fly_as_processes(
     folder: Path,
     screen: Screen | None,
 ) -> None:
-    """Fly by `zsim run`, which shows its own progress on a terminal; in a notebook, it is shown here."""
+    """Fly by means of `zsim run`, which shows its own progress on a terminal; in a notebook, show it here."""
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     log.parent.mkdir(exist_ok=True)
     drawn_here = isinstance(screen, NotebookScreen)
@@ -165,7 +165,7 @@ def command_of(
 ) -> tuple[list[str], dict[str, str]]:
     """Return the command line of the `zsim run` that flies a scenario as processes, and its environment.
 
-    A separate launcher has signals and children of its own.
+    The launcher is a separate process, so that it has signals and children of its own.
     """
     command = [*COMMAND, "run", str(_file_of(source, folder)), "--out", str(folder), "--force", "--no-report"]
     command += [word for change in source.changes or () for word in ("--set", change)]
@@ -190,7 +190,7 @@ def _file_of(source: Scenario, folder: Path) -> Path:
 
 
 def raise_failure(folder: Path, code: int) -> None:
-    """Raise RunFailedError with what ended a run's processes, unless it was flown to its end, though not as planned."""
+    """Raise RunFailedError with the failure of a run's processes; return if it flew to its end, if not as planned."""
     record = folder / RECORD
     if not record.exists():
         raise RunFailedError(f"{folder}: nothing was recorded: {_last_line(folder, code)}")
@@ -214,7 +214,7 @@ def _last_line(folder: Path, code: int | None) -> str:
 
 
 def calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
-    """Call a function that calls users' classes; re-raise their exceptions, after a line that says where they arose."""
+    """Call a function that runs a user's classes; re-raise their exceptions after a line that says where they arose."""
     try:
         return call()
     except UserCodeError as error:
@@ -227,7 +227,7 @@ def calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
 
 
 class _StopRequest:
-    """Whether Ctrl-C was pressed."""
+    """The reason to end a flight; None until Ctrl-C is pressed."""
 
     reason: str | None = None
 
@@ -274,7 +274,7 @@ class NotebookScreen(Screen):
 
 
 def fly_as_processes(scenario: Resolved, folder: Path) -> None:
-    """Fly a resolved scenario as processes on this machine, into the new folder of a run.
+    """Fly a resolved scenario as processes on this machine, into a new run folder.
 
     Raises:
         RunError: nothing was recorded; the error has the last line that `zsim run` printed.

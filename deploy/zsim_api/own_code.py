@@ -1,8 +1,9 @@
-"""Names `module:Name` for classes and functions of a notebook or script, by which a scenario can refer to them.
+"""Names `module:Name` by which a scenario can refer to classes and functions of a notebook or script.
 
-An object that other processes cannot import gets its own module, a file `zsim_own_HASH.py`, with its source for readers
-and the object itself, pickled by value by cloudpickle, which the module unpickles. In this process, the module has the
-original object. The same class, defined again in the same way, gets the same name, here and in later processes.
+An object that other processes cannot import gets a module of its own, a file `zsim_own_HASH.py`. The file contains the
+source, for readers, and the object itself, pickled by value with cloudpickle, which the module unpickles. In this
+process, the module holds the original object. A class that is defined again in the same way gets the same name, here
+and in later processes.
 """
 
 import base64
@@ -31,26 +32,26 @@ from zsim import __version__
 from zsim.errors import PACKAGES, RunError, reason_of
 from zsim.schema import plugin
 
-PICKLED = "PICKLED"  # name of the pickle in a module
+PICKLED = "PICKLED"  # name of the pickle in a generated module
 NAME = re.compile(r"[^\W\d]\w*")
-DEPTH_MAX = 8  # nesting down to which parts are searched for one that cannot be pickled
+DEPTH_MAX = 8  # depth to which nested parts are searched for one that cannot be pickled
 _PYTHON = sys.version_info[:2]
 
 
 def name_of(obj: object, folder: Path, name: str | None = None) -> str:
     """Return the name `module:Name` under which this process and others find a class, a function or an instance.
 
-    It is in the object's own module if other processes can import it from there. Otherwise a module `zsim_own_HASH.py`
-    is written into the folder, which must be searched for modules (`plugin.search`), as must those of `module_folders`.
+    The module is the object's own if other processes can import the object from there. Otherwise, it is a new module
+    `zsim_own_HASH.py` in the folder, which must be searched for modules (`plugin.search`), as must `module_folders`.
 
     Args:
         obj: a class, a function or an instance.
         folder: created if it does not exist.
-        name: name of the object in that module; None: its own, or that of its class for an instance.
+        name: name of the object in that module; None: its own name, or, for an instance, that of its class.
 
     Raises:
-        RunError: the object cannot be pickled, in one line that names the class and the attribute; or the file cannot
-            be written.
+        RunError: the object cannot be pickled (the message names the class and the attribute), or the file cannot be
+            written.
     """
     kind: Any = obj if hasattr(obj, "__qualname__") else type(obj)  # a class or function, or the class of an instance
     if kind is obj and name in (None, kind.__qualname__) and _is_found(kind):
@@ -98,9 +99,9 @@ if sys.version_info[:2] != {python}:
 
 
 def module_folders(names: Iterable[str]) -> list[Path]:
-    """Return the folders of a script's own modules that other processes need to import what `name_of` has named.
+    """Return the folders of modules that other processes need in order to import what `name_of` has named.
 
-    They are those of modules beside the script or notebook, not those of installed packages.
+    They contain modules beside the script or notebook; installed packages are left out.
     """
     needed: dict[str, None] = {}
     for name in (each.partition(":")[0] for each in names):
@@ -121,7 +122,7 @@ def module_folders(names: Iterable[str]) -> list[Path]:
 
 
 def _is_found(own: Any) -> bool:
-    """Return whether other processes get this very object by its own module and name."""
+    """Return whether other processes find this very object under its own module and name."""
     module = sys.modules.get(own.__module__ or "")
     if module is None or module.__name__ == "__main__" or getattr(module, own.__qualname__, None) is not own:
         return False
@@ -141,7 +142,7 @@ def _is_importable(module: ModuleType) -> bool:
 
 
 def _pickled(obj: object, kind: Any) -> tuple[bytes, set[str]]:
-    """Pickle an object by value, with all that it uses of its own module; return the pickle, and the files of its code.
+    """Pickle an object by value, with all that it uses from its own module; return the pickle and its code's files.
 
     Raises:
         RunError: the object cannot be pickled.
@@ -152,7 +153,7 @@ def _pickled(obj: object, kind: Any) -> tuple[bytes, set[str]]:
             pickler = _Pickler(file)
             pickler.dump(obj)
             return file.getvalue(), pickler.files
-        except Exception as error:  # of any type, since the pickled objects raise it
+        except Exception as error:  # any type, since the pickled objects raise it
             part = " of ".join([*reversed(_unpicklable(obj)), _shown(kind)])
             must = "create it in the method that first needs it"
             raise RunError(f"{part} cannot be pickled ({reason_of(error)}); {must}") from error
@@ -160,7 +161,7 @@ def _pickled(obj: object, kind: Any) -> tuple[bytes, set[str]]:
 
 @contextmanager
 def _by_value(kind: Any) -> Iterator[None]:
-    """Pickle the contents of the same module by value if other processes cannot import it."""
+    """Let the contents of the module of `kind` be pickled by value if other processes cannot import it."""
     module = sys.modules.get(kind.__module__ or "")
     wanted = module is not None and module.__name__ != "__main__" and not _is_importable(module)
     if wanted:
@@ -173,7 +174,7 @@ def _by_value(kind: Any) -> Iterator[None]:
 
 
 class _Pickler(cloudpickle.Pickler):
-    """Keeps the files or cells of code, for tracebacks, and collects them in `files`."""
+    """Pickler that keeps the names of the files or cells of code, for tracebacks, and collects them in `files`."""
 
     def __init__(self, file: io.BytesIO) -> None:
         self.files: set[str] = set()
@@ -188,10 +189,10 @@ class _Pickler(cloudpickle.Pickler):
 
 
 def _tokens(pickled: bytes, files: set[str]) -> Iterator[str]:
-    """Yield a pickle's content, equal for equal objects: without files and the random identifiers of a process."""
+    """Yield a pickle's content without files and the random identifiers of a process: the same for equal objects."""
     drawn: dict[str, str] = {}
     for opcode, arg, _ in pickletools.genops(pickled):
-        if not isinstance(arg, str):  # a frame's argument is a size in bytes, that of an array's content a bytearray
+        if not isinstance(arg, str):  # a frame's argument is its size in bytes; that of array content, a bytearray
             yield "" if opcode.name == "FRAME" else f"{arg!r}\n"
         elif arg in cloudpickle_parts._DYNAMIC_CLASS_TRACKER_BY_ID:
             yield drawn.setdefault(arg, f"class {len(drawn)}\n")
@@ -202,7 +203,7 @@ def _tokens(pickled: bytes, files: set[str]) -> Iterator[str]:
 def _source(kind: Any) -> str:
     """Return the source of a class or function; empty if it is unknown."""
     functions = [each for each in (kind, *getattr(kind, "__dict__", {}).values()) if isinstance(each, FunctionType)]
-    for path in dict.fromkeys(each.__code__.co_filename for each in functions):  # cells have no file
+    for path in dict.fromkeys(each.__code__.co_filename for each in functions):  # notebook cells have lines but no file
         lines = linecache.getlines(path)
         with suppress(SyntaxError):
             for node in walk(parse("".join(lines))):
@@ -215,7 +216,7 @@ def _source(kind: Any) -> str:
 
 
 def _unpicklable(obj: Any, depth: int = 0) -> list[str]:
-    """Return the path of names to a part that cannot be pickled: attributes, and names that methods use."""
+    """Return the names that lead to a part that cannot be pickled: attributes, and names that methods use."""
     if isinstance(obj, FunctionType):
         used = inspect.getclosurevars(obj)
         parts = {**used.globals, **used.nonlocals}
@@ -227,12 +228,12 @@ def _unpicklable(obj: Any, depth: int = 0) -> list[str]:
         part = getattr(part, "__func__", part)  # the function of a static or class method
         try:
             cloudpickle.dumps(part)
-        except Exception:  # of any type, as in _pickled
+        except Exception:  # any type, as in _pickled
             return [name, *(_unpicklable(part, depth + 1) if depth < DEPTH_MAX else ())]
     return []
 
 
-_OF_PYTHON = (GetSetDescriptorType, MemberDescriptorType)  # attributes of classes that are never pickled
+_OF_PYTHON = (GetSetDescriptorType, MemberDescriptorType)  # types of class attributes that are never pickled
 
 
 def _shown(kind: Any) -> str:

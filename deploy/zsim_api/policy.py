@@ -1,12 +1,14 @@
 """Observations and actions of policies, the same in a training environment and in a process of a flight.
 
-class Trained(zsim.PolicyAgent):
-    observe, action, step_s = "estimate", "velocity", 0.1
+A trained policy flies as an agent:
 
-    def policy(self, observations):
-        return {drone: model.predict(seen)[0] for drone, seen in observations.items()}
+    class Trained(zsim.PolicyAgent):
+        observe, action, step_s = "estimate", "velocity", 0.1
 
-zsim.run(env.scenario, agents=[Trained])    # or: zsim agent MODULE:Trained, on any host
+        def policy(self, observations):
+            return {drone: model.predict(seen)[0] for drone, seen in observations.items()}
+
+    zsim.run(env.scenario, agents=[Trained])    # or: zsim agent MODULE:Trained, on any host
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +38,7 @@ from zsim_api.simulation import Estimates, Samples, Truth, estimates_of
 Observe = Literal["truth", "estimate", "sensors"]
 Action = Literal["velocity", "attitude", "rotors", "cluster"]
 Floats = NDArray[np.float32]
-FARTHEST = 1e6  # bound of observations in their units; beyond any flight
+FARTHEST = 1e6  # bound on observations, in their units; beyond the reach of any flight
 AIRBORNE = ("hovering", "flying")
 
 
@@ -55,16 +57,16 @@ class Flown(Protocol):
 
 
 class Interface:
-    """Observations and commands of the agents of an environment: drones, or clusters if actions are of clusters.
+    """Observations and commands of an environment's agents: drones, or clusters if `action` is "cluster".
 
-    An observation (K,) of "truth" or "estimate" has, for each drone of the agent, position [m] and velocity [m/s] in W
+    An observation (K,) of "truth" or "estimate" holds, for each drone of the agent, position [m], velocity [m/s] in W
     and orientation (w, x, y, z, B to W), for "truth" also the angular velocity in B [rad/s]; then, for each other
-    drone, position and velocity relative to the agent's first drone, in W. An observation of "sensors" has the newest
+    drone, position and velocity relative to the agent's first drone, in W. An observation of "sensors" holds the newest
     sample of every sensor, in the order of the contract; 0 before the first one.
 
-    An action (A,) has values from -1 to 1, scaled to the limits of the drone's firmware and rotors, see `bounds`. For
-    each drone of the agent, it has, for "velocity": forward, left, up [m/s], yaw rate [rad/s]; for "attitude": roll and
-    pitch [rad], thrust [N], yaw rate [rad/s]; for "rotors": their speeds [rad/s]. For "cluster", it has the rates of
+    An action (A,) has values from -1 to 1, scaled to the limits of the drone's firmware and rotors (see `bounds`). For
+    each drone of the agent, these are, for "velocity": forward, left, up [m/s], yaw rate [rad/s]; for "attitude": roll,
+    pitch [rad], thrust [N], yaw rate [rad/s]; for "rotors": their speeds [rad/s]. For "cluster", they are the rates of
     all variables of the cluster's space [m/s, rad/s].
 
     Args:
@@ -111,7 +113,7 @@ class Interface:
         return own * (13 if self.observe == "truth" else 10) + 6 * others
 
     def bounds(self, agent: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the commands (A,) that correspond to actions of -1 and of 1, in the units of the class's docstring."""
+        """Return the commands (A,) that correspond to actions of -1 and of 1, in the units of the class docstring."""
         low: list[float] = []
         high: list[float] = []
         for drone in (self._drones[name] for name in self._members[agent]):
@@ -178,7 +180,7 @@ class Interface:
         """Return the commands by drone for the actions of agents; an agent without an action sends none.
 
         Raises:
-            UserCodeError: an action has an unknown agent or the wrong shape, or is not finite; `by` names its source.
+            UserCodeError: an action is of an unknown agent or the wrong shape, or is not finite; `by` names its source.
         """
         commands: dict[str, Command] = {}
         for agent, given in actions.items():
@@ -208,10 +210,10 @@ class Interface:
             return velocity(*action.tolist())
         roll, pitch, thrust_n, yaw_rate = action.tolist()
         (sr, sp), (cr, cp) = np.sin([roll / 2, pitch / 2]), np.cos([roll / 2, pitch / 2])
-        return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # pitch and roll
+        return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # the product q_pitch ⊗ q_roll
 
     def _of_cluster(self, cluster: str, flown: Flown, c_dot: NDArray[np.float64]) -> dict[str, Command]:
-        """Return the velocities of the drones of a cluster; zero if its shape is singular."""
+        """Return velocity commands for the drones of a cluster; zero if the cluster's shape is singular."""
         of = flown.truth if self.observe == "truth" else flown.estimates
         places, space = self._places[cluster], self._spaces[cluster]
         w, x, y, z = of.orientation_wxyz[places].T
@@ -234,7 +236,7 @@ class Interface:
 
 
 def _readings(drone: Drone) -> list[tuple[str, str, int]]:
-    """Return sensor, field and width of all numeric fields that a drone's sensors measure."""
+    """Return the sensor, field and width of every numeric field that a drone's sensors measure."""
     found = []
     for name, kind, settings in drone.sensors.sections():
         if getattr(settings, "rate_hz", 1.0) == 0:
@@ -258,7 +260,7 @@ def _bounded(numbers: NDArray[np.float64]) -> Floats:
 
 
 class PolicyAgent(Agent):
-    """A policy as an agent of a flight, which lets the drones take off, and acts once all are in the air.
+    """A policy as an agent of a flight; it lets the drones take off, and acts once all are in the air.
 
     Attributes:
         observe, action, step_s: those of the environment in which the policy was trained.
@@ -273,7 +275,7 @@ class PolicyAgent(Agent):
         raise NotImplementedError
 
     def bind(self, info: Info, name: str = "", radio: Radio | None = None) -> None:
-        """Prepare for the run of `world/info`."""
+        """Prepare for the run that `world/info` describes."""
         scenario = scenario_file.from_text(info.scenario)
         self.interface = Interface(scenario, self.observe, self.action, self.step_s)
         drones = self.interface.names
@@ -294,7 +296,7 @@ class PolicyAgent(Agent):
         self._flown.put(key, message)
 
     def step(self, t_ns: int) -> list[Output]:
-        """Return the commands of a gate."""
+        """Return the commands at a gate."""
         begin = None if self._is_begun else self.interface.begin(self._flown)
         if begin is None:
             self._is_begun = True

@@ -1,15 +1,16 @@
 """Child programs that never outlive this process: `zsim run`, and the user's own.
 
-Each is run by a keeper in a session of its own, which ends it and its descendants once this process is gone, even by
-kill -9. Ctrl-C in a terminal therefore reaches a program only through this process. The keeper is this file, run by
-path:
+Each is run by a keeper in a session of its own. The keeper ends the program and its descendants once this process is
+gone, even by kill -9. Because of the session, Ctrl-C in a terminal reaches a program only through this process. The
+keeper is this file, run by path:
 
     python -I -S programs.py GRACE_S WORD...
 
-Standard input of the keeper is a pipe from its caller, which closes when the caller ends: then the program receives
-SIGTERM, and is killed if it has not ended within the grace period. Signals are forwarded to its process group; SIGUSR1
-kills it and its descendants. Descendants that outlive the program are killed after the same grace period. The exit code
-is the program's, 128 + N for a signal, as in shells, or 127 if it cannot be started.
+Standard input of the keeper is a pipe from its caller, which closes when the caller ends: the program then receives
+SIGTERM, and is killed if it has not ended within the grace period. Signals to the keeper are forwarded to the program's
+process group, except SIGUSR1, which kills the program and its descendants. Descendants that outlive the program are
+killed after the same grace period. The exit code is the program's, 128 + N for a signal, as in shells, or 127 if the
+program cannot be started.
 
 Only the standard library is imported here, so that a keeper starts within milliseconds.
 """
@@ -51,7 +52,7 @@ class Program:
         folder: Path | None = None,
     ) -> None:
         self.words = tuple(words)
-        self.asked = False  # whether this process has requested its end
+        self.asked = False  # whether this process has requested the program's end
         self._lock = threading.Lock()
         environment = {**os.environ, **(environment or {})}
         if output is not None:
@@ -116,7 +117,7 @@ def filled(words: Sequence[str], values: Mapping[str, str]) -> list[str]:
 
 
 def environment_of(endpoint: str, federation: str) -> dict[str, str]:
-    """Return the environment variables for programs of a run, whose `python` and `zsim` are those of this process."""
+    """Return environment variables for programs of a run; their `python` and `zsim` are those of this process."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     return {"ZSIM_CONNECT": endpoint, "ZSIM_FEDERATION": federation, "PATH": path}
 
@@ -174,7 +175,7 @@ def keep(grace_s: float, words: list[str]) -> int:
 
 
 def _kill_children() -> None:
-    """Kill all children (known only on Linux), and then theirs, which in turn become children of this process."""
+    """Kill all children (known only on Linux), then their children, which in turn become children of this process."""
     while children := [pid for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]:
         for pid in children:
             with suppress(ProcessLookupError):

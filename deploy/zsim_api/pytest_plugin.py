@@ -1,6 +1,6 @@
-"""The pytest plugin of zsim: the fixture `federation`, and in reports of failed tests, which processes were awaited.
+"""The pytest plugin of zsim: the fixture `federation`, and reports of failed tests that show the awaited processes.
 
-Every pytest run in an environment with zsim loads it, so it imports nothing else before a test flies.
+Every pytest run in an environment with zsim loads this module, so it imports nothing else of zsim before a test flies.
 """
 
 import re
@@ -34,7 +34,7 @@ class Federations:
         return self.made[-1]
 
     def kept(self, made: "Federation") -> Path:
-        """Return the path at which a run's folder is kept if the test has failed."""
+        """Return the path to which a run's folder is copied if the test has failed."""
         return self._kept / made.folder.name
 
     def close(self) -> None:
@@ -57,7 +57,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def federation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Federations]:
     """Start flights as real processes, with programs of your own: `federation("step.yaml", duration=40)`.
 
-    It takes the arguments of `zsim.Federation`, and returns one: `wait_until`, `inject`, `kill`, `ask`, `run`,
+    It takes the arguments of `zsim.Federation`, and returns one, with `wait_until`, `inject`, `kill`, `ask`, `run`,
     `assert_errors`, `assert_no_collision`, `assert_same_bits`. Each federation has its own free port and name, so tests
     can run in parallel (pytest-xdist). No process outlives the test. If the test fails, the report shows which
     processes were awaited, and the last lines of the logs, beginning with failed and awaited processes; records and

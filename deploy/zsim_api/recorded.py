@@ -68,8 +68,8 @@ Table = dict[str, NDArray[Any]]  # columns of equal length (K,), ordered by simu
 INDEX = "t_s"
 STAMPS = ("t_ns", "seq", "wall_ns")  # metadata columns of a message
 SHOWN = 12  # most names listed in an error
-ROWS_MAX = 200_000  # most rows of several drones read at once; as many estimates take 100 MB
-NOTES = 3  # most shortfalls in a notebook's display of a run
+ROWS_MAX = 200_000  # most rows read at once for several drones; that many estimates take 100 MB
+NOTES = 3  # most shortfalls shown when a notebook displays a run
 ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # named as in tables of estimates
 Window = tuple[float, float]
 
@@ -122,26 +122,26 @@ class Run:
     # Tables
 
     def truth(self, drone: str) -> "DataFrame":
-        """Return the true motion of a drone at every gate, in W and B of docs/conventions.md; RunError without any."""
+        """Return the true motion of a drone at every gate, in W and B; raise RunError if there is none."""
         return self._of("drone", drone, "truth")
 
     def estimate(self, drone: str) -> "DataFrame":
-        """Return the estimates of a drone's motion, with their covariance; RunError without any."""
+        """Return the estimates of a drone's motion, with their covariance; raise RunError if there are none."""
         return self._of("drone", drone, "estimate")
 
     def sensor(self, drone: str, sensor: str) -> "DataFrame":
-        """Return the samples of a sensor: imu, gps, mag, baro, sonar, flow, or your own; RunError without any.
+        """Return the samples of imu, gps, mag, baro, sonar, flow, or your own sensor; raise RunError if there are none.
 
         `t_sample_ns` is the time at which a sample was taken; the index is the time of its delivery.
         """
         return self._of("drone", drone, f"sensor/{sensor}")
 
     def status(self, drone: str) -> "DataFrame":
-        """Return the state of a drone's firmware and battery, at every gate; RunError without any."""
+        """Return the state of a drone's firmware and battery at every gate; raise RunError if there is none."""
         return self._of("drone", drone, "sensor/status")
 
     def commands(self, drone: str, kind: str = "velocity") -> "DataFrame":
-        """Return all commands sent to a drone, with their `source`; RunError without any.
+        """Return all commands sent to a drone, with their `source`; raise RunError if there are none.
 
         Args:
             drone: name.
@@ -166,7 +166,7 @@ class Run:
         Messages of a program of your own have a column for each field.
 
         Args:
-            key: without the federation's name, and without wildcards; `run.keys` has those on record.
+            key: without the federation's name and without wildcards; `run.keys` lists the keys on record.
 
         Raises:
             RunError: the record has no message of this key.
@@ -175,7 +175,7 @@ class Run:
 
     @property
     def events(self) -> "DataFrame":
-        """Events, with kind, source, subject, text, and data as JSON text."""
+        """The events, with kind, source, subject, text, and data as JSON text."""
         return self._plain(keys.EVENT)
 
     # Errors
@@ -210,7 +210,7 @@ class Run:
         """Return estimate − truth of a drone over time: position in W and heading, the σ of each as stated by the
         estimator (`sigma_position_m_x`), and `nees`, which is 6 on average for a consistent estimator.
 
-        If there are more than 200 000 estimates of all drones, only every n-th is compared.
+        If there are more than 200 000 estimates in all, only every n-th is compared.
 
         Raises:
             RunError: no such drone, or truth and estimate are not both on record.
@@ -225,7 +225,7 @@ class Run:
     def errors(
         self, window: Window | None = None, of: Literal["formations", "estimates"] = "formations"
     ) -> "DataFrame":
-        """Return statistics of errors, a row for each variable with its unit; the report's table.
+        """Return error statistics as in the report's tables, with a row for each variable and its unit.
 
         For formations, by cluster and variable, over the part of the window in which it was engaged: `est_…` is
         estimate − desired, as the controller saw it, `true_…` is truth − desired. For estimates, by drone and variable:
@@ -234,7 +234,7 @@ class Run:
 
         Args:
             window: start and end [s]; None: the report's, `run.summary.window_s`.
-            of: formations, or estimates.
+            of: "formations" or "estimates".
 
         Raises:
             RunError: the window's end is not after its start.
@@ -289,7 +289,7 @@ class Run:
 
     @property
     def summary(self) -> RunSummary:
-        """The content of summary.json; RecordError if no truth is on record."""
+        """The content of summary.json; raises RecordError if no truth is on record."""
         return self._judged[2]
 
     @property
@@ -310,7 +310,7 @@ class Run:
 
     @property
     def complete(self) -> bool:
-        """Whether every message of the world and the end are on record; `summary.record.state` says what is missing."""
+        """Whether all messages of the world and the run's end are on record; `summary.record.state` names any gaps."""
         try:
             return self.summary.record.complete
         except RecordError:  # the record contains no truth
@@ -333,7 +333,7 @@ class Run:
 
         Args:
             name: errors, position, orientation, shape, plan_view, distances, drones, estimates or velocities; for
-                further clusters with the cluster's name, `shape_side`.
+                clusters after the first, with the cluster's name: `shape_side`.
 
         Raises:
             RunError: the record has no such figure.
@@ -355,7 +355,7 @@ class Run:
         raise RunError(f"{self.record}: has no figure {name!r}; {_choices(name, known)}")
 
     def report(self, formats: Sequence[str] = ()) -> Path:
-        """Write the report into the run's folder, as `zsim report` does; return its page.
+        """Write the report into the run's folder, as `zsim report` does; return the path of its page.
 
         Args:
             formats: further formats of the figures: "pdf", "svg".
@@ -419,20 +419,20 @@ class Run:
         if key not in self._tables:
             fleet = self._of_all_drones(key)
             missing = [each for each in fleet if each not in self._tables]
-            # whoever reads a second drone usually reads all, and a pass over the record costs more than decoding a key
+            # a user who reads a second drone usually reads all, and one more pass takes longer than decoding a key
             is_second = len(fleet) - len(missing) > 0
             at_once = is_second and sum(self.keys[each] for each in missing) <= ROWS_MAX
             self._read(missing if at_once else [key])
         return self._tables[key]
 
     def _of_all_drones(self, key: str) -> list[str]:
-        """Return the keys that match a drone's key, of all drones; for any other key, that key alone."""
+        """Return the keys of all drones that correspond to a drone's key; for any other key, that key alone."""
         kind, _, what = keys.parts(key)
         alike = [f"drone/{drone}/{what}" for drone in self.drones] if kind == "drone" else [key]
         return [each for each in alike if each in self.keys]
 
     def _read(self, wanted: Sequence[str]) -> None:
-        """Read the tables of some keys in one pass over the record."""
+        """Read the tables of the `wanted` keys in one pass over the record."""
         if not wanted:
             return
         with plugin.names_only(not self._trust, looked_up=False):
@@ -471,14 +471,14 @@ class Run:
         return self._known("cluster", self.clusters[0] if name is None else name, self.clusters)
 
     def _untrusted(self, cluster: str) -> str:
-        """Name the space of a cluster if it was not imported."""
+        """Return the end of an error that names the space of a cluster; empty if the space was imported."""
         scenario = None if self._trust else self._judged[0].scenario
         own = cluster_of(scenario, cluster)
         names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
         return f"; its space {names[0]} is imported only by zsim.load(…, trust=True)" if names else ""
 
     def judged_formation(self, cluster: str | None = None) -> Formation:
-        """Return the content of `formation` as arrays; raises the same errors."""
+        """Return the content of `formation` as arrays; errors as there."""
         name = self._cluster(cluster)
         found = next((each for each in self._judged[1] if each.name == name), None)
         if found is None:
@@ -497,7 +497,7 @@ def _checked(window: Window) -> Window:
 
 
 def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:
-    """Return unit, standard deviation, root mean square, mean and share inside of each error within a window."""
+    """Return the unit, standard deviation, RMS, mean and share inside for each error within a window."""
     rows = (errors.t_s >= window[0]) & (errors.t_s <= window[1])
     inside = errors.share_inside(rows) if rows.any() else [None] * len(ERROR_COLUMNS)
     moments = {}
@@ -549,7 +549,7 @@ def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def read_tables(record: Path, wanted: Collection[str]) -> dict[str, Table]:
-    """Return all messages of some keys, by key, in one pass over the record.
+    """Return all messages of the `wanted` keys, by key, in one pass over the record.
 
     Columns are those of the export, without `name`, which is the same in all rows. Messages of a key outside the
     contract, and pictures, have a column for each field, or for each element of a field that is a list of numbers.

@@ -1,6 +1,6 @@
 """The folder of a run: a new one, or one without files that a run would replace or be confused with.
 
-It records how the run was launched, beside the journal of its world, so that an interrupted run can be continued.
+Beside the journal of the world, it records how the run was launched, so that an interrupted run can be continued.
 """
 
 import json
@@ -29,7 +29,7 @@ from zsim.schema import plugin
 LOGS, SCENARIO, FIGURES = "logs", "scenario.yaml", "figures"
 JOURNAL = "journal"  # folder of the world's journal
 LAUNCH = "launch.json"  # in the journal's folder
-LEFT = (SCENARIO, "run.log", "up.log")  # left by a run that never flew, beside empty logs and journal
+LEFT = (SCENARIO, "run.log", "up.log")  # files left by a run that never flew, beside empty logs and journal
 WRITTEN = (RECORD, "summary.json", "report.html", *LEFT)  # files removed when a run is replaced
 WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes of a run's files, by folder
 
@@ -56,7 +56,7 @@ def run_directory(out: Path | None, scenario: Scenario, force: bool = False) -> 
 
 
 def make_directory(out: Path | None, scenario: Scenario, force: bool = False) -> Path:
-    """Return the folder of `run_directory` for a run that another process flies, which locks it."""
+    """Return the folder of `run_directory`, unlocked, for a run by another process, which locks it itself."""
     with run_directory(out, scenario, force) as folder:
         return folder
 
@@ -110,12 +110,12 @@ _MADE: set[Path] = set()  # folders that this process has created
 
 
 def _remove_run(folder: Path) -> None:
-    """Remove the files of a run of zsim and its report; all other files, including exports, stay."""
+    """Remove the files of a zsim run and of its report; all other files, including exports, stay."""
     record, journal = folder / RECORD, folder / JOURNAL
     if record.exists():
         with record.open("rb") as file:
             opening = file.read(LIBRARY + len(OURS))
-        if opening and not is_ours(opening):  # an empty record is of a run that was killed at its start
+        if opening and not is_ours(opening):  # an empty record was left by a run killed at its start
             raise RunError(f"{record}: is not a record of zsim and is not removed; give --out another folder")
     journaled = (journal / LAUNCH).exists() or any(journal.glob("*.entries"))
     failed = (folder / SCENARIO).exists() and (folder / LOGS / "world.log").exists()
@@ -136,7 +136,7 @@ def _remove_run(folder: Path) -> None:
 
 
 def _modules(folder: Path) -> Iterator[Path]:
-    """Yield the modules that were generated for a run's classes from a notebook or a script."""
+    """Yield the modules generated for a run's classes that were defined in a notebook or script."""
     return folder.glob(f"{plugin.MADE}*.py")
 
 
@@ -163,7 +163,7 @@ def new_launch(**how: Any) -> Launch:
 def prepare(
     folder: Path, scenario: Scenario, launch: Launch, say: Callable[[str], None], continued: bool = False
 ) -> None:
-    """Write scenario and launch into the run's folder, unless the run is `continued`; and announce the run.
+    """Write scenario and launch into the run's folder, unless the run is `continued`, and announce the run.
 
     Raises:
         RunError: the folder cannot be written.
@@ -207,7 +207,7 @@ def left_only_if_flown(folder: Path) -> Iterator[None]:
 
 
 def launch_of(folder: Path) -> Launch:
-    """Return the launch of an interrupted run; RunError if the run is over, or the folder has none."""
+    """Return the launch of an interrupted run; raise RunError if the run is over, or the folder holds none."""
     place = folder / JOURNAL / LAUNCH
     try:
         return msgspec.convert(json.loads(place.read_bytes()), Launch)
@@ -219,7 +219,7 @@ def launch_of(folder: Path) -> Launch:
 
 
 def reopen_record(folder: Path) -> None:
-    """Remove the end of an interrupted run from its record; RecordError if another process is writing it."""
+    """Cut an interrupted run's record before its `end` event; raise RecordError if another process is writing it."""
 
     def is_end(payload: bytes) -> bool:
         try:

@@ -1,4 +1,4 @@
-"""A scenario in Python: the same document as in YAML, changed by path or with classes, checked by the same rules."""
+"""A scenario in Python: the document as in YAML, changed by path or with classes, and checked by the same rules."""
 
 import copy
 import json
@@ -29,18 +29,18 @@ class Scenario:
     It is checked as a whole when it is flown, or by `resolved`.
 
     Args:
-        fields: top-level fields, in maps and lists as in YAML; docs/scenario.md has them all.
+        fields: top-level fields, in maps and lists as in YAML; docs/scenario.md lists them all.
     """
 
     def __init__(self, **fields: Any) -> None:
         self._document: dict[str, Any] = copy.deepcopy(fields)
-        self.source = "scenario"  # where it is from, for messages about faults
+        self.source = "scenario"  # its origin, as named in error messages
         self.folders: tuple[Path, ...] = (Path.cwd(),)  # folders searched for modules that it names
-        self.changes: tuple[str, ...] | None = None  # overrides `a.b.c=value` of its file
+        self.changes: tuple[str, ...] | None = None  # overrides `a.b.c=value` of its file; None without a file
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Return the scenario of a YAML file; ScenarioError if it cannot be read."""
+        """Return the scenario in a YAML file; raise ScenarioError if it cannot be read."""
         path = Path(path)
         made = cls(**yaml_file.read(path, scenario_file.EXAMPLE, ScenarioError))
         made.source, made.folders, made.changes = path.name, (path.parent,), ()
@@ -50,7 +50,7 @@ class Scenario:
         """Return the scenario with other values.
 
         Args:
-            set: values by path, `{"drones.drone2.mass_kg": 0.5}`; where a class is named, the value may be the class.
+            set: values by path, `{"drones.drone2.mass_kg": 0.5}`; where a class is named, the class itself will do.
             fields: top-level fields.
 
         Raises:
@@ -78,7 +78,7 @@ class Scenario:
         law: type | None = None,
         estimator: type | None = None,
     ) -> Self:
-        """Return the scenario with the changes of `zsim.run`'s arguments."""
+        """Return the scenario as changed by these arguments of `zsim.run`."""
         values = dict(set or {})
         values |= {k: v for k, v in (("seed", seed), ("duration_s", duration_s)) if v is not None}
         if estimator is not None:
@@ -89,7 +89,7 @@ class Scenario:
 
     @cached_property
     def resolved(self) -> Resolved:
-        """The scenario with all defaults, as it is flown; ScenarioError with a line for every fault."""
+        """The scenario with all defaults, as it is flown; raises ScenarioError with a line for every fault."""
         self.search()
         scenario = scenario_file.resolve(self._document, self.source)
         check_classes(scenario, self.source)
@@ -97,11 +97,11 @@ class Scenario:
         return scenario
 
     def search(self) -> None:
-        """Let modules that the scenario names be found, in this process and in those that it starts."""
+        """Search the scenario's folders for modules, in this process and in those that it starts."""
         plugin.search(*self.folders)
 
     def keep_modules(self, folder: Path) -> None:
-        """Copy modules of notebook classes that the scenario names to a run's folder, where `zsim rerun` finds them."""
+        """Copy the modules of notebook classes that the scenario names to a run's folder, for `zsim rerun`."""
         for name in self.resolved.own_code():
             file = scratch_folder() / f"{name.partition(':')[0]}.py"
             if file.exists():
@@ -121,7 +121,7 @@ class Scenario:
         return copy.deepcopy(values[path])
 
     def _ipython_key_completions_(self) -> list[str]:
-        """Return all paths, by which notebooks complete `scenario["…`."""
+        """Return all paths, with which notebooks complete `scenario["…`."""
         return [*_by_path(self._whole)]
 
     @property
@@ -151,7 +151,7 @@ class Scenario:
         return f"<Scenario {self._document.get('name')!r} of {self.source}, {count} drones>"
 
     def named(self, value: Any) -> Any:
-        """Return a value with names in place of classes and functions, and let these be found."""
+        """Return a value with names in place of classes and functions; add their modules' folders to `folders`."""
         if callable(value):
             from zsim_api.own_code import module_folders, name_of
 
@@ -166,7 +166,7 @@ class Scenario:
 
 
 def _by_path(values: Any, path: str = "") -> dict[str, Any]:
-    """Return values by path, in which named entries of a list have their names."""
+    """Return all values by path; list entries that have a name are listed under it."""
     found = {path: values} if path else {}
     parts: dict[str, Any] = values if isinstance(values, dict) else {}
     if isinstance(values, list):

@@ -37,7 +37,7 @@ from zsim_api.scenarios import AnyScenario, scenario_of
 from zsim_world.physics.fleet_arrays import STATE
 
 Array = NDArray[np.float64]
-GATES_HELD = 64  # gates of sensor messages that are kept undecoded; chosen: 0.3 MB for three drones
+GATES_HELD = 64  # most gates whose sensor messages are kept undecoded; design choice: 0.3 MB for 3 drones
 
 
 class Truth(NamedTuple):
@@ -90,7 +90,7 @@ class Simulation:
         record: folder for the record, which `zsim.load` reads; None: no record.
 
     Raises:
-        ScenarioError: with one line for every fault of the scenario.
+        ScenarioError: with one line for every fault in the scenario.
         RunError: the scenario cannot be flown in one process, or the folder of the record is not empty.
 
     Attributes:
@@ -127,11 +127,11 @@ class Simulation:
     def reset(self, seed: int | None = None, set: Mapping[str, Any] | None = None) -> Truth:
         """Start a new flight; return its initial state.
 
-        Agents given as objects start with the attributes that they had initially.
+        Agents given as objects get back the attributes that they had initially.
 
         Args:
             seed: for this and later flights; None: as before.
-            set: fields of the scenario that change for this and later flights.
+            set: fields of the scenario by path, for this and later flights; None: as before.
         """
         if seed is not None or set:
             self.source = self.source.changed(seed=seed, set=set)
@@ -201,7 +201,7 @@ class Simulation:
 
         Args:
             commands: one or several by drone, created by `zsim.velocity` and the like; see the class for their timing.
-                A drone without a command keeps its last one for `silence.hover_s`, then it hovers.
+                A drone without a command keeps its last one for `silence.hover_s`, then hovers.
 
         Raises:
             RunError: the flight is over, or there is no drone of that name; nothing was sent.
@@ -228,9 +228,9 @@ class Simulation:
         return self.ended
 
     def ask(self, key: str, op: str, **args: Any) -> dict[str, Any]:
-        """Ask the world or a controller, as `zsim ask` does: `sim.ask("cluster/main/control", "target", values={…})`.
+        """Send a request to the world or a controller: `sim.ask("cluster/main/control", "target", values={…})`.
 
-        It takes effect between this gate and the next.
+        As with `zsim ask`; the request takes effect between this gate and the next.
 
         Raises:
             RequestRefusedError: the request was refused, for the reason given.
@@ -264,7 +264,7 @@ class Simulation:
         return (self.source, self._flight.snapshot(), dict(self._last_estimates), dict(self.clusters))
 
     def restore(self, snapshot: Any) -> Truth:
-        """Continue from a snapshot, bit-identically; RunError if the flight is recorded."""
+        """Continue from a snapshot, bit-identically; raise RunError if the flight is recorded."""
         source, flight, estimates, clusters = snapshot
         if self._writer is not None:
             raise RunError("restore: this simulation is recorded, and a record cannot go back; use a new Simulation")
@@ -339,7 +339,7 @@ class Sensors(Mapping[str, "Samples"]):
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
         self._gates: list[GateMessages] = []
-        self._newest: dict[str, tuple[GateMessages, int]] = {}  # by key, not yet decoded
+        self._newest: dict[str, tuple[GateMessages, int]] = {}  # by key, undecoded: gate and index in it
         self._samples: dict[str, Samples] = {}
 
     def add(self, gate: GateMessages) -> None:
@@ -422,7 +422,7 @@ class Samples:
 
 
 def _copied(agent: Agent) -> dict[str, Any]:
-    """Return a copy of the attributes of an agent; RunError if they cannot be copied."""
+    """Return a copy of the attributes of an agent; raise RunError if they cannot be copied."""
     try:
         return copy.deepcopy(vars(agent))
     except Exception as error:

@@ -80,18 +80,18 @@ def sweep(
         client: a `distributed.Client`, whose workers are used instead.
         out: folder of the sweep, which `zsim report` reads; an unfinished sweep is continued. None: a folder that is
             removed when this process ends.
-        keep_records: whether the record of every run is kept, in `runs/` of the folder.
+        keep_records: whether the record of every run is kept, in the subfolder `runs`.
         progress: whether progress is shown.
 
     Returns:
-        A frame by number of the run: `seed`, the values by path, `failure` (why the run did not end well, NaN if it
+        A frame indexed by run number: `seed`, the values by path, `failure` (why the run did not end well, NaN if it
         did), `metrics.NAME`, errors, and the other columns of docs/sweep.md. Missing texts and numbers are NaN, missing
         flags NA. A class appears by its name, a second one of the same name as `Law-2`. `attrs["folder"]` is the folder
         of the sweep, `attrs["summary"]` the content of summary.json of `zsim report`: means and intervals of each
         combination.
 
     Raises:
-        ScenarioError: with one line for every fault of the values and of the scenarios.
+        ScenarioError: with one line for every fault in the values and in the scenarios.
         RunError: the folder holds something else, workers cannot start, or pandas is not installed.
     """
     with what_is_missing():
@@ -140,7 +140,7 @@ def planned(
     console: Console,
     faults: Sequence[str] = (),
 ) -> SweepPlan:
-    """Return the plan of a sweep as by `make_plan`, showing which combination is being checked."""
+    """Return the plan of a sweep from `make_plan`, showing meanwhile which combination is being checked."""
     status = console.status("checking every combination …") if console.is_terminal else None
     with status or nullcontext():
 
@@ -176,7 +176,7 @@ _DTYPES: dict[Any, Any] = {str: str, str | None: str, bool | None: "boolean", in
 
 
 def _frame(rows: Sequence[Row], varied: Collection[str]) -> "pd.DataFrame":
-    """Return rows as a frame by number of the run; missing texts and numbers are NaN, missing flags NA."""
+    """Return rows as a frame indexed by run number; missing texts and numbers are NaN, missing flags NA."""
     import pandas as pd
 
     columns: dict[str, pd.Series] = {}
@@ -189,7 +189,7 @@ def _frame(rows: Sequence[Row], varied: Collection[str]) -> "pd.DataFrame":
 
 
 def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
-    """Return the names of the classes and functions among values, by their names in the scenario."""
+    """Return labels for the classes and functions among values, by their names in the scenario."""
     given = [] if isinstance(values, str) else [*values]
     texts = [text_of(scenario.named(value)) for value in given]
     made = {place: value.__name__ for place, value in enumerate(given) if hasattr(value, "__name__")}
@@ -198,5 +198,5 @@ def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
 
 
 def _in_python(line: str) -> str:
-    """Return a line about a sweep with the names of its arguments in Python."""
+    """Return an error line with arguments named as in Python, not as options."""
     return re.sub(r"--(?=(vary|runs|out|set)\b)", "", line)

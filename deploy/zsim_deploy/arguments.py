@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_VARIABLE = "ZSIM_CONNECT"  # environment variable: default of --connect
-RUN_ID = "{run}"  # placeholder for the run's id in the folder of a record, by which a restarted recorder finds it again
+RUN_ID = "{run}"  # stands for the run's id in the name of a record's folder; a restarted recorder finds it by that
 CONSOLE_PORT = 8080  # TCP port of the console's page
 PORT_MAX = 65535
 REALTIME = "--realtime"  # option of the world, and of routers, whose lease it shortens
@@ -98,7 +98,7 @@ def check_range(from_: float | None, to: float | None) -> None:
 
 
 def endpoint_origin(text: str, arguments: Sequence[str], environment: Mapping[str, str]) -> str:
-    """Return the text of an error; if it names the endpoint of CONNECT_VARIABLE, say so."""
+    """Return an error text, with a note if the endpoint that it names is from CONNECT_VARIABLE."""
     value = environment.get(CONNECT_VARIABLE)
     is_given = any(each.partition("=")[0] == "--connect" for each in arguments)
     return f"{text} ({value} is from {CONNECT_VARIABLE})" if value and value in text and not is_given else text
@@ -150,7 +150,7 @@ Recorded = Annotated[Path, Argument(metavar="DIR", help="Folder of a run, or its
 
 
 def figure_formats(text: str | None) -> tuple[str, ...]:
-    """Return the formats in a value of --format; BadParameter for an unknown one."""
+    """Return the formats in a value of --format; raise BadParameter for an unknown one."""
     formats = tuple(text.split(",")) if text else ()
     if not set(formats) <= set(FORMATS):
         raise BadParameter(f"--format is {text!r}; must be {' or '.join(FORMATS)}, or both separated by a comma")
@@ -158,7 +158,7 @@ def figure_formats(text: str | None) -> tuple[str, ...]:
 
 
 def process_option(default: str) -> Any:
-    """Return the option for the name of a process; `default`: the name that it has without a certificate."""
+    """Return the option for the name of a process; `default`: the process's name without a certificate."""
     return Option(help=f"Process name (default {default}, or the certificate's).")
 
 
@@ -187,7 +187,7 @@ def load_scenario(
 ) -> Any:
     """Load a scenario with the overrides of the command line.
 
-    `elsewhere`: it is flown on other hosts; `modules`: further folders with modules that it names.
+    `elsewhere`: the scenario is flown on other hosts; `modules`: further folders with modules that it names.
     """
     from zsim.scenario import scenario_file
     from zsim_agents.hosting import check_classes
@@ -245,7 +245,7 @@ class FlightOptions(NamedTuple):
 class WorldAccess(NamedTuple):
     """How to reach a world, and the identity of the process that connects."""
 
-    endpoint: str  # on which the world or a router listens
+    endpoint: str  # endpoint on which the world or a router listens
     federation: str
     wait_s: float | None  # how long to wait for a world; None: indefinitely
     tls: Path | None  # folder of the process's certificate
@@ -259,7 +259,7 @@ class WorldAccess(NamedTuple):
 
 
 def option_group(argument: str, make: Callable[..., Any], options: Mapping[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Return a decorator that replaces one argument of a command by options.
+    """Return a decorator that replaces one argument of a command with options.
 
     `make` builds that argument from the values of the options, in their order; `options`: annotation and default of
     each, by name.

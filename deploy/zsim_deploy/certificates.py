@@ -1,11 +1,11 @@
 """The certificate authority of a federation: certificates of its processes on its hosts, and their access rights.
 
 certs/ca.pem, certs/ca.key                             the authority; the key stays on the machine where it was made
-certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem    those of one process on one host; folder for --tls
+certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem    files of one process on one host; the folder is for --tls
 certs/HOST/PROCESS.access.json                         access control of a listening process
 
 Zenoh enforces access control at the listening process (the world or a router), by the common name in the peer's
-certificate, in both directions. A key expression is allowed if that of a rule includes it.
+certificate, in both directions. A key expression is allowed if a rule's expression includes it.
 Source: docs.rs/zenoh-config, AclConfig.
 """
 
@@ -34,13 +34,13 @@ from zsim.transport.tls import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
 from zsim_deploy import inventory as inv
 from zsim_deploy.inventory import InventoryFile
 
-AUTHORITY_DAYS = 1825  # lifetime, 5 years; the key never leaves the machine where it was made
+AUTHORITY_DAYS = 1825  # lifetime of an authority, 5 years; its key never leaves the machine where it was made
 AUTHORITY_KEY = "ca.key"
-BACK = timedelta(days=1)  # certificates are back-dated by this, because clocks of hosts in the field are hours off
-EXPIRED = "expired on"  # begins a fault; a date follows
+BACK = timedelta(days=1)  # certificates are back-dated by this, because clocks of hosts in the field may be hours off
+EXPIRED = "expired on"  # start of a fault text; a date follows
 OPERATORS = "operators"  # folder, in place of HOST, for operators without a host in the inventory
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-SHOWN_MAX = 4  # number of names in a fault; usually all certificates are missing at once
+SHOWN_MAX = 4  # most names listed in a fault; usually all certificates are missing at once
 READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH
 
 Root = x509.Certificate
@@ -50,9 +50,9 @@ Root = x509.Certificate
 class CertificateRequest(NamedTuple):
     """A required certificate."""
 
-    host: str  # name in the inventory, and of the folder
+    host: str  # name of the host in the inventory, and of its folder
     process: str  # name of the process, which is the common name
-    addresses: tuple[str, ...] = ()  # of the host, IP addresses or DNS names
+    addresses: tuple[str, ...] = ()  # addresses of the host: IP addresses or DNS names
 
 
 class CertificateStatus(NamedTuple):
@@ -80,8 +80,8 @@ def init_command(placed: InventoryFile, renew: bool = False) -> str:
 def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
     """Return the authority in a folder, created if the folder has none.
 
-    `force`: create a new one, which invalidates all earlier certificates. RunError if the authority is incomplete, has
-    expired, or cannot be read or written.
+    `force`: create a new one, which invalidates all earlier certificates. Raise RunError if the authority is
+    incomplete, has expired, or cannot be read or written.
     """
     place, key_place = folder / AUTHORITY, folder / AUTHORITY_KEY
     existing = [path for path in (place, key_place) if path.exists()]
@@ -184,7 +184,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def root(folder: Path) -> Root:
-    """Return the certificate of the authority in a folder; RunError if it cannot be read."""
+    """Return the certificate of the authority in a folder; raise RunError if it cannot be read."""
     return _load(folder / AUTHORITY)
 
 
@@ -198,7 +198,7 @@ def show(folder: Path, now: datetime) -> list[CertificateStatus]:
 
 
 def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
-    """Yield the operators who have a certificate in a folder, as NAME or, if at one of the hosts, as NAME@HOST."""
+    """Yield the operators with a certificate in a folder, as NAME or, if at one of the hosts, as NAME@HOST."""
     for host in (OPERATORS, *hosts):
         for path in sorted((folder / host).glob(f"{OPERATOR}.*/{CERTIFICATE}")):
             name = path.parent.name.removeprefix(f"{OPERATOR}.")
@@ -206,7 +206,7 @@ def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
 
 
 def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
-    """Return why a certificate must be made; None if a valid one exists, with its key."""
+    """Return why a certificate must be made; None if a valid one and its key exist."""
     place = folder / wanted.host / wanted.process
     if not all((place / name).exists() for name in CERTIFICATES):
         return "new"
@@ -298,7 +298,7 @@ def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, 
 
 
 def exposed_keys(placed: InventoryFile) -> str | None:
-    """Return a warning about private keys that other users can read; None without such keys."""
+    """Return a warning about private keys that other users can read; None if there are none."""
     if placed.inventory.security.insecure:
         return None
     folder = folder_of(placed)
@@ -321,7 +321,7 @@ def enrolment(
 
     Args:
         operators: people and programs that observe and command, each as NAME or NAME@HOST; at a host they connect as
-            its roles do: through its router if it has one, otherwise to the world. One may be at several hosts.
+            its roles do: through its router if it has one, otherwise to the world. An operator may be at several hosts.
 
     Raises:
         InventoryError: a process has no host, or the host of an operator is unknown.
@@ -336,7 +336,7 @@ def enrolment(
             known = f"must be one of hosts: {', '.join(hosts)}"
             raise InventoryError([f"{placed.source}: operator {name!r} is at {host!r}; {known}"])
         people[f"{OPERATOR}.{name}", host or None] = None
-    # Any host may run the processes of the scenario, and drivers, even those that it does not expect.
+    # Any host may run any process of the scenario, and any driver, even one that the scenario does not expect.
     movable = [name for name in places if name != WORLD]
     movable += [name for name in drivers_of(scenario) if name not in places]
     wanted = [(places[WORLD], WORLD), *((router.host, f"{ROUTER}.{name}") for name, router in routers.items())]
@@ -348,7 +348,7 @@ def enrolment(
         return list(dict.fromkeys(who for who, at in people if (hosts[at].router if at else None) == router))
 
     def clients_of(router: str) -> list[str]:
-        """Return the processes that may connect to a router: every role if it has hosts, to which any can be moved."""
+        """Return the processes that may connect to a router: every role if it has hosts, as any role can move there."""
         has_hosts = any(host.router == router for host in hosts.values())
         return [*(movable if has_hosts else []), *operators_at(router)]
 
@@ -371,7 +371,7 @@ def enrolment(
     return requests, access
 
 
-# Rights as Zenoh's rules, from the view of the listening process: (flow, messages, field of Rights with the keys)
+# Rights as Zenoh's rules, as seen by the listening process: (flow, messages, field of Rights with the keys)
 _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("declare_subscriber",), "reads"),
     ("egress", ("put",), "reads"),
@@ -388,7 +388,7 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
 ANYONE = "anyone"  # any peer with a certificate of the authority: a subject without conditions matches all
-# Anyone may query its own rights; see zsim.transport.tls.
+# Any peer may query its own rights; see zsim.transport.tls.
 _ACCESS_QUERY = (("ingress", "query"), ("egress", "reply"))
 
 
@@ -400,9 +400,9 @@ def access_control(
     Everything else is denied; a process that is not named may only query its own rights.
 
     Args:
-        clients: names of the processes that connect to it.
-        routers: names of the routers that connect to it, with the processes behind each.
-        above: names of the world or the router to which it connects itself.
+        clients: names of the processes that connect to the listening process.
+        routers: names of the routers that connect to it, with the names of the processes behind each.
+        above: name of the world or the router to which the listening process itself connects, if any.
     """
     granted = {name: rights.rights_for(name, scenario) for name in clients}
     for name, behind in routers.items():

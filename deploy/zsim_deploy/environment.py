@@ -1,4 +1,4 @@
-"""`zsim rerun --install`: a Python environment with the packages of a bundle, in which it is flown again.
+"""`zsim rerun --install`: a Python environment with the packages of a bundle, in which the bundle is flown again.
 
 CACHE/environments/KEY    one for each Python, lock and version of zsim; KEY is a hash of these
 
@@ -24,7 +24,7 @@ from zsim_analysis.bundle.bundle_rerun import check_content
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, default_cache, requirement
 
-KEY_DIGITS = 16  # 64 bits of a SHA-256
+KEY_DIGITS = 16  # hexadecimal digits; 64 bits of a SHA-256
 READY = "ready"  # file that marks a complete environment
 LEFT_OUT = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 
@@ -37,7 +37,7 @@ def rerun_in_environment(
     Args:
         python: interpreter of the environment; None: this one.
         trust: whether the bundle's own code may be run, and the packages that it needs installed.
-        note: takes a line on each step.
+        note: called with a line about each step.
 
     Raises:
         RunError: the bundle is refused, or the environment cannot be created.
@@ -55,7 +55,7 @@ def rerun_in_environment(
 
 
 def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: Callable[[str], None]) -> Path:
-    """Return the folder of an environment with the packages of a lock, created if missing."""
+    """Return the folder of an environment with the packages of a lock file; create it if missing."""
     version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is not a Python")
     name, origin = str(checkout() or ""), ""
     if not name:
@@ -86,12 +86,12 @@ def _python_of(environment: Path) -> Path:
 
 
 def _clean() -> dict[str, str]:
-    """Return the environment variables without those that make a Python import the modules of another one."""
+    """Return the environment variables without those that make one Python import the modules of another."""
     return {name: value for name, value in os.environ.items() if name not in LEFT_OUT}
 
 
 def _output(words: Sequence[str], fault: str) -> str:
-    """Run a program and return its output; RunError with its last error line if it fails."""
+    """Run a program and return its output; raise RunError with its last error line if it fails."""
     try:
         done = subprocess.run(words, env=_clean(), capture_output=True, text=True, errors="replace", check=False)
     except OSError as error:

@@ -87,7 +87,8 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "no world to record": (("record", "--connect", "{free}", "--wait", "0.5"), ("'zsim'", "0.5 s", "`zsim world`")),
     "malformed endpoint": (("world", "{one}", "--listen", "nonsense"), ("endpoint is 'nonsense'",)),
     "malformed connect": (("keys", "--connect", "nonsense"), ("endpoint is 'nonsense'",)),
-    "unknown transport": (("world", "{one}", "--listen", "pigeon/1"), ("pigeon/1",)),
+    "unknown protocol": (("world", "{one}", "--listen", "pigeon/1"), ("endpoint is 'pigeon/1'", "tcp")),
+    "unknown protocol to connect": (("keys", "--connect", "pigeon/1"), ("endpoint is 'pigeon/1'", "tcp")),
     "address of others": (
         ("world", "{one}", "--listen", "tcp/192.0.2.1:7000", "--insecure"),
         ("tcp/192.0.2.1:7000",),

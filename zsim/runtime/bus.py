@@ -1,6 +1,6 @@
 """Runs a world and its agents in one process on an in-memory bus.
 
-The agents receive the same inputs in the same order as on Zenoh, and therefore give identical results.
+The agents receive the same inputs in the same order as over Zenoh, so that the results are identical.
 """
 
 import copy
@@ -18,7 +18,7 @@ from zsim.runtime.inbox import NEVER_NS, Inbox, RoutingTable, output_hold_ns
 from zsim.runtime.membership import Membership
 from zsim.scenario.faults import PROCESS_KILL
 
-GATES_MAX = 10  # maximum gates of the world in a row, if commands are delayed by as many
+GATES_MAX = 10  # maximum number of gates that the world advances per turn; the command delay may limit it further
 
 
 class SteppedWorld(Protocol):
@@ -37,13 +37,13 @@ class SteppedWorld(Protocol):
 
 
 class _Route(NamedTuple):
-    inboxes: tuple[Inbox, ...]  # of the agents that read the key
-    is_counted: bool  # whether the world counts its messages as outputs of their sender
-    is_relayed: bool  # whether the world does nothing else with them
+    inboxes: tuple[Inbox, ...]  # inboxes of the agents that read the key
+    is_counted: bool  # whether the world counts the key's messages as outputs of their sender
+    is_relayed: bool  # whether the world only counts them
 
 
 class Bus:
-    """The bus of one process: every message goes to the sink, the world, and the inboxes of its readers."""
+    """In-memory bus of one process; delivers every message to the sink, the world and the inboxes of its readers."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class Bus:
         agents: Sequence[Agent],  # in the order in which they are stepped
         wall_ns: Callable[[], int],
         sink: Callable[[str, Any], None] = lambda key, message: None,  # receives every message in order of publication
-        # receives the world's messages of each gate; without it the sink receives each one decoded
+        # receives the world's messages of each gate undecoded; if None, `sink` receives them decoded, one by one
         gate_sink: Callable[[GateMessages], None] | None = None,
     ) -> None:
         self._coordinator = coordinator
@@ -61,7 +61,7 @@ class Bus:
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted, uncounted=agent.uncounted)) for agent in agents]
         self._readers = RoutingTable([agent.reads for agent in agents])
         self._routes: dict[str, _Route] = {}
-        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and its readers
+        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a key table, and the readers of its keys
         host, run_id = socket.gethostname(), coordinator.run_id
         self._memberships = {
             agent.name: Membership(agent.name, host, run_id, agent.next_seq, agent.serves, agent.period_ns)
@@ -70,10 +70,10 @@ class Bus:
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
-        self._failures: dict[str, UserCodeError] = {}  # by agent, in order of failure
+        self._failures: dict[str, UserCodeError] = {}  # by agent name, in order of failure
 
     def join(self) -> None:
-        """Rehearse every agent and join the run."""
+        """Rehearse every agent and publish its join."""
         for agent, _ in self._agents:
             agent.rehearse()
             self._to_world(keys.process(agent.name, "join"), self._memberships[agent.name].join())
@@ -83,9 +83,9 @@ class Bus:
                 inbox.hold_ns = hold_ns
 
     def turn(self, gates_max: int = GATES_MAX) -> bool:
-        """Advance the world as far as possible, and step every agent; return whether the run continues.
+        """Advance the world by up to `gates_max` gates, and step every agent; return whether the run continues.
 
-        Stepping the world and each agent through several gates keeps the code of each in the processor's caches.
+        Stepping the world and each agent through several gates at a time keeps their code in the processor's caches.
 
         Raises:
             RunError: the world waits for a process that is not on this bus.
@@ -124,7 +124,7 @@ class Bus:
                 self.publish(agent, t_ns, outputs)
             stepped = stepped or bool(steps)
             if agent.name in self._failures and inbox.taken_ns != NEVER_NS:
-                inbox.start_after(NEVER_NS)  # it receives no further inputs
+                inbox.start_after(NEVER_NS)  # a failed agent receives no further inputs
                 self._leave(agent, str(self._failures[agent.name]), failed=True)
         return stepped
 
@@ -133,7 +133,7 @@ class Bus:
         self._to_world(keys.process(agent.name, "bye"), bye)
 
     def snapshot(self) -> list[Inbox]:
-        """Return copies of the inputs that the agents have not taken, for `restore`; only between turns."""
+        """Return copies of the agents' inboxes, for `restore`; must be called between turns."""
         return [copy.deepcopy(inbox) for _, inbox in self._agents]
 
     def restore(self, inboxes: Sequence[Inbox]) -> None:
@@ -142,9 +142,10 @@ class Bus:
         self._routes, self._gate_route, self._failures = {}, ((), ()), {}
 
     def end(self) -> None:
-        """Publish the byes of the agents and the world's last messages.
+        """Publish the world's last messages and the byes of the agents.
 
-        UserCodeError, after everything is published, if a user's class failed earlier.
+        Raises:
+            UserCodeError: a user's class failed earlier; raised once everything is published.
         """
         self._coordinator.publish_end()
         self._spread()
@@ -189,7 +190,7 @@ class Bus:
             agent.update_faults(info, faults)
 
     def publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
-        """Publish an agent's outputs of a gate, and its done."""
+        """Publish an agent's outputs of a gate and its done message."""
         sent, world, routes = 0, self._coordinator, self._routes
         for key, message in outputs:
             inboxes, is_counted, is_relayed = routes.get(key) or self._route(key)

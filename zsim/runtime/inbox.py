@@ -1,7 +1,8 @@
 """The inputs of an agent sorted by gate (`Inbox`), and the readers of each key (`RoutingTable`).
 
-The order of arrival is irrelevant: a gate is complete when each of its closing keys has a message stamped with it and
-every counted sensor message has arrived. A gate of which nothing arrived shows as a gap in a status's sequence numbers.
+The order of arrival is irrelevant: a gate is complete once a message with its stamp has arrived on each closing key,
+together with every counted sensor message. A gate that was lost entirely shows as a gap in the sequence numbers of a
+drone's status.
 """
 
 from bisect import bisect_right, insort
@@ -17,16 +18,16 @@ from zsim.errors import DecodeError
 GAP_MAX = 10  # maximum number of consecutive lost gates to request again; the world is never farther ahead of an agent
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
-KEYS_MAX = 200_000  # keys with cached readers; 1000 drones have about 15 000, other processes may invent any
+KEYS_MAX = 200_000  # maximum keys with cached readers; 1000 drones have about 15 000, and any process may invent more
 Input = tuple[str, Any]
-"""A key and a message; or `keys.GATE` and a GateMessages."""
+"""A key and its message, or `keys.GATE` and a `GateMessages`."""
 
 
 def output_hold_ns(info: Info) -> int:
-    """Return the delay after its stamp with which an output that closes no gate is delivered [ns]; see `Inbox.hold_ns`.
+    """Return the time from the stamp of an output that closes no gate to its delivery [ns]; see `hold_ns` of `Inbox`.
 
-    By then all agents have published theirs: the world is ahead of them by the command delay, or not at all if agents
-    exchange messages. In realtime, outputs are delivered on arrival.
+    By then all agents have published their outputs with that stamp: the world is at most the command delay ahead of
+    them, or not at all if agents exchange messages. In realtime, outputs are delivered on arrival.
     """
     if info.mode == "realtime":
         return 0
@@ -34,7 +35,7 @@ def output_hold_ns(info: Info) -> int:
 
 
 def is_held(key: str, gate_keys: Container[str], uncounted: Container[str]) -> bool:
-    """Whether a key's messages are outputs of other agents, delivered after the hold time."""
+    """Whether a key's messages are outputs of other agents, to be delivered after the hold time."""
     return key not in gate_keys and key not in uncounted and messages.is_output(key)
 
 
@@ -48,33 +49,33 @@ class Inbox:
 
     def __init__(
         self,
-        # keys of which one message each with t_ns == t closes the gate t
+        # closing keys: a gate t is complete once each of them has a message with t_ns == t
         gate_keys: Sequence[str],
-        counted: Sequence[str] = (),  # drones whose `sensor/*` messages are all waited for, by their status's `count`
-        # deliver late messages with the next gate, once: in realtime an old input is better than none
+        counted: Sequence[str] = (),  # drones whose `sensor/*` messages are all awaited, as counted in their status
+        # whether a late message is delivered, once, with the next gate: in realtime an old input is better than none
         keep_late: bool = False,
-        # keys whose late messages are always delivered: they belong to no gate, such as detections in a picture
+        # keys whose messages belong to no gate, such as detections in pictures; late ones are always delivered
         uncounted: Sequence[str] = (),
-        # closing keys whose publishers may skip gates, such as drivers of external drones; waited for until they do
+        # closing keys whose publishers, such as drivers of external drones, may skip gates; awaited until they do
         sparse: Sequence[str] = (),
-        # delay of agents' outputs on keys that close no gate, as if stamped later: command delay plus one gate, when
-        # they have certainly arrived, so that the order of arrival is irrelevant
+        # delivery delay of agents' outputs on keys that close no gate: command delay plus one gate, after which they
+        # have certainly arrived, so that the order of arrival is irrelevant
         hold_ns: int = 0,
     ) -> None:
         self._closing = dict.fromkeys(gate_keys)
-        # with the stamps of the last two messages; initially before any gate
+        # stamps of the last two messages by key; initially earlier than any gate
         self._sparse = dict.fromkeys(sparse, (ALWAYS_NS - 1, ALWAYS_NS - 1))
         of_world = dict.fromkeys(key for key in gate_keys if keys.is_status(key) and key not in self._sparse)
-        self._not_of_world = {key: None for key in gate_keys if key not in of_world}  # not closed by GateMessages
+        self._not_of_world = {key: None for key in gate_keys if key not in of_world}  # not closed by `GateMessages`
         self._pulse = next(iter(of_world), None)  # status whose sequence numbers reveal lost gates
-        self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp, then by key and number
+        self._waiting: dict[int, dict[tuple[str, int], Input]] = {}  # by stamp plus hold time, then by key and seq
         self._stamps: list[int] = []
-        self._lacking: dict[int, dict[str, None]] = {}  # by gate, the closing keys still missing
+        self._lacking: dict[int, dict[str, None]] = {}  # closing keys still missing, by gate
         self._gates: list[int] = []
         self._expected_from_ns: dict[str, int] = {}
         self._meters = {keys.status(drone): _Meter() for drone in counted}
         self._came_of: dict[str, list[int] | None] = {}
-        self._beats: dict[int, int] = {}  # by gate, the sequence number of the pulse
+        self._beats: dict[int, int] = {}  # sequence number of the pulse, by gate
         self._last_beat: tuple[int, int] | None = None
         self.taken_ns = self._former_ns = -1  # the last two gates taken; -1 before the first
         self.hold_ns = hold_ns
@@ -90,7 +91,7 @@ class Inbox:
         self.late = 0  # messages that arrived after their gate was taken
 
     def put(self, key: str, message: Any) -> bool:
-        """Keep one message, or GateMessages on `keys.GATE`; return False for a duplicate or one that is too late."""
+        """Store a message, or a `GateMessages` under `keys.GATE`; return False if it is a duplicate or too late."""
         t_ns = message.t_ns
         if key in self._sparse:
             _, newest_ns = last = self._sparse[key]
@@ -102,7 +103,7 @@ class Inbox:
         due_ns = t_ns + hold_ns
         if due_ns <= self.taken_ns:
             self.late += 1
-            handed_ns = self._newest.get(key, ALWAYS_NS)  # this message or a newer one has been delivered
+            handed_ns = self._newest.get(key, ALWAYS_NS)  # if >= t_ns, this message or a newer one was delivered
             if (not self._keep_late or t_ns <= handed_ns) and key not in self._uncounted:
                 return False
             self._belated[key, message.seq] = (key, message)
@@ -132,7 +133,7 @@ class Inbox:
                 self._beats[t_ns] = message.seq
             if key in self._meters:
                 self._meters[key].count(message)
-        elif type(message) is GateMessages:  # arrives as a unit: none of its messages can be missing
+        elif type(message) is GateMessages:  # it arrives as a unit: none of its messages can be missing
             if t_ns in self._lacking:
                 self._lacking[t_ns] = {each: None for each in self._lacking[t_ns] if each in self._not_of_world}
             else:
@@ -145,7 +146,7 @@ class Inbox:
     # Complete and missing gates
 
     def next_gate_ns(self) -> int | None:
-        """Return the earliest gate not taken, from closing messages and gaps in the pulse's sequence numbers [ns]."""
+        """Return the earliest gate not taken yet [ns], from closing messages and gaps in the pulse's sequence."""
         if not self._gates:
             return None
         t_ns = self._gates[0]
@@ -161,7 +162,7 @@ class Inbox:
         return self._gates[-1] if self._gates else None
 
     def missing(self, t_ns: int) -> str | None:
-        """Return a key that the gate still lacks; None if it is complete."""
+        """Return a missing closing key, or the status key of a drone with missing sensor messages; None if complete."""
         for key in self._lacking.get(t_ns, self._closing):
             if self._waits_for(key, t_ns):
                 return key
@@ -173,7 +174,7 @@ class Inbox:
     def last_missing(self) -> str | None:
         """Return the last closing key that the next gate lacks, so that a waiting thread wakes up only once.
 
-        If no closing key is missing, return the key of a counted message; None if nothing is missing.
+        If no closing key is missing, return the status key of a drone with missing sensor messages, or else None.
         """
         next_ns = self.next_gate_ns()
         t_ns = self.taken_ns + 1 if next_ns is None else next_ns
@@ -183,7 +184,11 @@ class Inbox:
         return self.missing(t_ns) if next_ns is not None else None
 
     def lost(self, t_ns: int) -> str | None:
-        """Return a missing key whose message will not arrive, since its publisher has published a later gate's."""
+        """Return the missing key if its message is lost; otherwise None.
+
+        A closing message is lost if its publisher has moved on to a later gate; sensor messages are lost if the status
+        that counts them has arrived without them.
+        """
         key = self.missing(t_ns)
         if key is None or key not in self._lacking.get(t_ns, self._closing):
             return key
@@ -192,7 +197,7 @@ class Inbox:
     def _waits_for(self, key: str, t_ns: int) -> bool:
         """Whether a gate waits for a closing key.
 
-        A key whose publisher may skip gates is waited for if messages arrived for both of the last gates taken.
+        A key whose publisher may skip gates is awaited if messages arrived for both of the last two gates taken.
         """
         if t_ns < self._expected_from_ns.get(key, ALWAYS_NS):
             return False
@@ -200,7 +205,7 @@ class Inbox:
         return newest_ns >= self.taken_ns and former_ns >= self._former_ns
 
     def expect(self, key: str, from_ns: int) -> None:
-        """Wait for a key from the gate `from_ns` on; NEVER_NS if its publisher is dropped from the run."""
+        """Wait for a key from the gate `from_ns` on, which is NEVER_NS if its publisher is dropped from the run."""
         self._expected_from_ns[key] = from_ns
 
     # Delivery
@@ -234,7 +239,7 @@ class Inbox:
 
 
 def _once(ready: list[Input]) -> list[Input]:
-    """Return the inputs without sensor messages that a GateMessages also contains: a replay sends them singly."""
+    """Return the inputs without sensor messages that a `GateMessages` also contains: a replay sends them singly."""
     gates = [message for _, message in ready if type(message) is GateMessages]
     if not gates or not any(keys.is_sensor(key) for key, _ in ready):
         return ready
@@ -245,13 +250,13 @@ def _once(ready: list[Input]) -> list[Input]:
 class _Meter:
     """Compares the number of sensor messages received from a drone with the count in its status.
 
-    The first gate of a late joiner is not compared, since it began before the join; a status with seq 0 counts from the
-    beginning.
+    The first gate received is not compared, since it may have begun before the process joined, unless the seq of its
+    status is 0.
     """
 
     def __init__(self) -> None:
-        self.came: list[int] = []  # stamps of the drone's pending messages, sorted
-        # stamps and counts of the drone's pending statuses; `short` is false without any
+        self.came: list[int] = []  # stamps of the drone's pending sensor messages, sorted
+        # stamps and counts of the drone's pending statuses; if empty, `short` is false
         self.counts: list[tuple[int, int]] = []
         self.partial = True  # whether the first status may count messages from before the join
 
@@ -273,7 +278,7 @@ class _Meter:
 
 
 def _insert(stamps: list[int], t_ns: int) -> None:
-    """Insert a stamp into a sorted list; nearly always at the end."""
+    """Insert a stamp into a sorted list; fast at the end, where nearly all belong."""
     if not stamps or t_ns >= stamps[-1]:
         stamps.append(t_ns)
     else:
@@ -289,22 +294,22 @@ def _cut(stamps: list[int], t_ns: int) -> list[int]:
 
 
 class RoutingTable:
-    """The readers of every key, found once per key.
+    """Table of the readers of every key, which are determined once per key.
 
         routes = RoutingTable([["drone/*/truth"], ["drone/drone1/sensor/imu", "**"]])
         routes.readers("drone/drone1/truth")      (0, 1)
 
     Comparing every expression with every key would dominate the run time of a process with 1000 drones. Expressions
-    with wildcards for whole chunks are looked up by substituting the wildcards in the key; only those with `**` or `$*`
-    are compared one by one.
+    with no wildcard but `*` are looked up by substituting `*` for chunks of the key; only those with `**` or `$*` are
+    compared one by one.
 
     Args:
         expressions: key expressions of each reader; readers are identified by their index.
     """
 
     def __init__(self, expressions: Sequence[Sequence[str]]) -> None:
-        self._filed: defaultdict[str, list[int]] = defaultdict(list)  # expressions without wildcards, or only with *
-        self._starred: defaultdict[int, set[tuple[int, ...]]] = defaultdict(set)  # by number of chunks, positions of *
+        self._filed: defaultdict[str, list[int]] = defaultdict(list)  # readers by expression with no wildcard but *
+        self._starred: defaultdict[int, set[tuple[int, ...]]] = defaultdict(set)  # positions of *, by number of chunks
         self._compared: list[tuple[str, int]] = []
         self._known: dict[str, tuple[int, ...]] = {}
         for reader, own in enumerate(expressions):
@@ -325,7 +330,7 @@ class RoutingTable:
         found = set(self._filed.get(key, ()))
         chunks = key.split("/")
         for starred in self._starred.get(len(chunks), ()):
-            if not any(chunks[place].startswith("@") for place in starred):  # not matched by wildcards
+            if not any(chunks[place].startswith("@") for place in starred):  # no wildcard matches such a chunk
                 masked = ["*" if place in starred else chunk for place, chunk in enumerate(chunks)]
                 found.update(self._filed.get("/".join(masked), ()))
         found.update(reader for expression, reader in self._compared if keys.matches(expression, key))
@@ -339,14 +344,14 @@ class RoutingTable:
 
 
 class GateRouter:
-    """Splits the messages of gates; only messages that have readers are decoded, once for all of them."""
+    """Splits gates into messages; only messages that have readers are decoded, once for all readers."""
 
     def __init__(self, routes: RoutingTable) -> None:
         self._routes = routes
         self._read = PerPattern(self._read_of)
 
     def _read_of(self, gate: GateMessages) -> list[tuple[tuple[int, ...], str, int]]:
-        """Return readers, key and index in the gate of each message that has readers."""
+        """Return the readers, the key and the index in the gate of each message that has readers."""
         which, readers_of = gate.which.tolist(), self._routes.readers
         if not which or min(which) < 0 or max(which) >= len(gate.table):
             return []
@@ -354,9 +359,9 @@ class GateRouter:
         return [(readers, key, place) for place, key in enumerate(keys_of) if (readers := readers_of(key))]
 
     def split(self, gate: GateMessages) -> Iterator[tuple[tuple[int, ...], str, Any]]:
-        """Yield readers, key and message of each message that has readers, in order of publication.
+        """Yield (readers, key, message) for each message that has readers, in order of publication.
 
-        Messages that do not have their key's type are omitted, as are gates whose columns point outside their table.
+        Messages that are not of their key's type are omitted, as are gates whose columns point outside their table.
         """
         for readers, key, place in self._read.of(gate):
             try:

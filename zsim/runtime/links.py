@@ -1,12 +1,12 @@
-"""The effect of links on the messages of a gate: the radio's bandwidth at the sender, all else at the receiver.
+"""Effects of links on the messages of a gate: the radio's bandwidth at the sender, all others at the receiver.
 
     agent ──messages──▶ Transmitter ──within its bandwidth──▶ … ──▶ Links ──now, later or never──▶ agent
 
-The radio acts on messages between users' agents, by the connectivity that the world publishes at every gate
+The radio acts on messages between users' agents, according to the connectivity that the world publishes at every gate
 (`RadioLinks`); injected link faults act on all messages.
 
-The lockstep counts the messages regardless; only the agent receives them late or never. Loss and delay of a message
-are drawn from its link's random stream by the identity of the message (key, t_ns, seq), so that neither the order of
+Lockstep counts every message on arrival regardless; only the agent receives it late or never. The loss and delay of a
+message are drawn from its link's random stream by the message's identity (key, t_ns, seq), so that neither the order of
 arrival nor a restart of the receiver changes a draw.
 """
 
@@ -29,7 +29,7 @@ from zsim.scenario import faults as fault_kinds
 from zsim.scenario.roles import ROLES
 from zsim.scenario.scenario import Radio
 
-LISTS_KEPT = 50  # lists of RadioLinks: a second of them, for realtime; lockstep needs two
+LISTS_KEPT = 50  # number of `RadioLinks` kept: those of one second, for realtime; lockstep needs two
 NEVER = None  # as a delay: the message is lost
 ENVELOPE = frozenset(AgentMessage.__struct_fields__)  # fields that a real radio would not carry
 
@@ -40,10 +40,10 @@ Point = Sequence[float]
 
 
 class Links:
-    """Delays and drops the messages of a gate for one receiver.
+    """Delays or drops the messages of a gate to one receiver.
 
     Args:
-        names: names of the receiver; an estimator of several drones has one per drone.
+        names: names of the receiver; an estimator for several drones has one name per drone.
         radio: radio between users' agents; None if all of them receive all messages.
     """
 
@@ -54,7 +54,7 @@ class Links:
         self._roles = {each.key: each.role for each in info.own_messages}
         self._drones = frozenset(drone.name for drone in info.drones)
         self._clusters = {cluster.name: cluster.drones for cluster in info.clusters}
-        self._list: Faults | None = None  # newest
+        self._list: Faults | None = None  # newest list of faults
         self._faults: list[Fault] = []
         self._later: list[tuple[int, str, Any]] = []  # gate of delivery, key, message
         self._positions: dict[str, Point] = {}
@@ -76,7 +76,7 @@ class Links:
     def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
         """Return the messages delivered at the gate t_ns, in canonical order.
 
-        `inputs`: the single messages received for that gate.
+        `inputs` are the individual messages received for that gate.
         """
         acting = [fault for fault in self._faults if fault_kinds.acts(fault, t_ns)]
         if acting:
@@ -99,9 +99,10 @@ class Links:
         return sorted(handed, key=canonical)
 
     def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
-        """Return the delay of a message [ns] or NEVER; of several estimators, that of the drone in the key receives it.
+        """Return the delay of a message [ns]; NEVER if it is lost.
 
-        A radio fault affects messages of its drones to processes that are not on the same drone.
+        If this process is the estimator of several drones, a sensor message is addressed to that of the drone in its
+        key. A radio fault affects messages of its drones to processes that are not on the same drone.
         """
         over_radio_ns = self._radio.delay_ns(key, message) if self._radio and isinstance(message, AgentMessage) else 0
         if over_radio_ns is None:
@@ -144,17 +145,17 @@ class Links:
 
 
 def total_delay_ns(
-    faults: Iterable[Fault],  # acting on its link
+    faults: Iterable[Fault],  # those acting on the link
     seed: int,  # of the scenario
-    link: str,  # name of the link's random stream: its receiver
+    link: str,  # name of the receiver, which selects the link's random stream
     key: str,
     message: Any,
-    # for a radio, returns the distance between sender and receiver; None if unknown
+    # returns the distance between sender and receiver for a radio fault [m]; None if unknown
     distance_m: Callable[[Fault], float | None] = lambda fault: None,
 ) -> int | None:
-    """Return the total delay of a message by several faults [ns]; NEVER if one of them loses it.
+    """Return the total delay that several faults cause a message [ns]; NEVER if it is lost.
 
-    A radio delivers a message with the probability 1 / (1 + exp((d - range) / spread)).
+    Under a radio fault, a message over the distance d arrives with probability 1 / (1 + exp((d - range) / spread)).
     """
     total_ns = 0
     for fault in faults:
@@ -179,7 +180,7 @@ def total_delay_ns(
 
 
 def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
-    """Whether a fault concerns the link from one of the senders to a receiver."""
+    """Whether a fault affects the link from one of the senders `froms` to the receiver `to`."""
     first, _, second = fault.target.partition("/")
     if second == to and first in froms:
         return True
@@ -189,9 +190,9 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
 def place_of(
     process: str, places: Mapping[str, Any], drones: Container[str], where: Callable[[str], Point | None]
 ) -> Point | None:
-    """Return the position of a process [m; W]: from `places`, that of its drone, or the origin.
+    """Return the position of a process [m; W]: that in `places`, otherwise that of its drone, otherwise the origin.
 
-    `where`: returns the position of a drone [m; W]; None if unknown.
+    `where` returns the position of a drone [m; W], None if unknown.
     """
     place = places.get(process, drone_of(process, drones) or fault_kinds.ORIGIN)
     return where(place) if isinstance(place, str) else place
@@ -202,7 +203,7 @@ def distance_between(a: Point | None, b: Point | None) -> float | None:
 
 
 def drone_of(process: str, drones: Container[str]) -> str | None:
-    """Return the drone that carries a process, for roles with one process per drone, also users'; otherwise None."""
+    """Return the drone that carries a process; None for roles, users' included, without one process per drone."""
     role, _, thing = process.partition(".")
     about = ROLES[role].about if role in ROLES else "drone"
     return thing if about == "drone" and thing in drones else None
@@ -211,10 +212,10 @@ def drone_of(process: str, drones: Container[str]) -> str | None:
 def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str, ...]:
     """Return the names of the processes that count as the sender of a message.
 
-    Agents that share a process under one name are named after the drone or cluster in the key.
+    Agents that share a process, and thus its name, are named after the drone or cluster in the key.
 
     Args:
-        roles: of users' agents, by the shape of their messages' keys.
+        roles: roles of users' agents, by the shape of their messages' keys.
     """
     if role := roles.get(messages.shape_of(key)):
         return (f"{role}.{keys.thing(key)}",)
@@ -231,7 +232,7 @@ def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str,
     else:
         return (whose,) if kind == "process" else (WORLD,)
     is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
-    return (named,) if is_shared or not source else (named, source)  # another process in its place
+    return (named,) if is_shared or not source else (named, source)  # a process of another name may replace it
 
 
 class Receiver:
@@ -248,7 +249,7 @@ class Receiver:
         self._lists: deque[RadioLinks] = deque(maxlen=LISTS_KEPT)
 
     def _place_of(self, thing: str) -> int | None:
-        """Return the index of a drone or the ground station; None if the agent is wired to all."""
+        """Return the index of a drone or of the ground station; None if the agent is wired to all others."""
         station = None if self._radio.station_m is None else len(self._places)
         return self._places.get(thing, station)
 
@@ -276,7 +277,7 @@ class Receiver:
 
 
 def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
-    """Return the probability that a message arrives; 0 if the receiver does not hear the sender."""
+    """Return the probability that a message arrives; 0 if the receiver cannot hear the sender."""
     hears = links.hears[receiver] if receiver < len(links.hears) else ()
     if sender not in hears:
         return 0.0
@@ -286,20 +287,20 @@ def _reception(links: RadioLinks, receiver: int, sender: int) -> float:
 
 
 class Transmitter:
-    """Sends the messages of an agent one after another within its bandwidth.
+    """Sends an agent's messages one after another within the radio's bandwidth.
 
-    A message whose transmission begins before the next gate is published at this one. Others wait for a later gate and
-    receive its stamp; beyond `queue_max` the oldest are lost.
+    A message whose transmission begins before the next gate is published at the current one. Others wait for a later
+    gate and receive its stamp; if more than `queue_max` wait, the oldest are lost.
     """
 
     def __init__(self, radio: Radio, gate_ns: int) -> None:
         self._gate_ns, self._queue_max, self._header_bytes = gate_ns, radio.queue_max, radio.header_bytes
         self._ns_per_byte = 8e6 / radio.bandwidth_kbit_s if radio.bandwidth_kbit_s else 0.0
         self._waiting: deque[tuple[str, AgentMessage]] = deque()
-        self._free_ns = 0  # when the last transmission ends
+        self._free_ns = 0  # time at which the last transmission ends
 
     def send(self, t_ns: int, outputs: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-        """Return the outputs of an agent to publish at a gate; only messages to agents wait."""
+        """Return the outputs to publish at a gate; only messages to other agents may have to wait."""
         if not self._ns_per_byte:
             return [*outputs]
         published = []
@@ -317,7 +318,7 @@ class Transmitter:
         return published
 
     def size_bytes(self, message: AgentMessage) -> int:
-        """Return the transmitted size of a message [bytes]: a header, and the values of its fields in msgpack."""
+        """Return the transmitted size of a message [bytes]: the header and the values of its fields in msgpack."""
         values = [getattr(message, name) for name in messages.fields(type(message)) if name not in ENVELOPE]
         return self._header_bytes + len(msgspec.msgpack.encode(values))
 

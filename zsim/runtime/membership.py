@@ -1,6 +1,6 @@
-"""The messages of a process about itself: join, done, bye and health, on Zenoh and on the in-memory bus.
+"""Messages of a process about itself (join, done, bye, health), on Zenoh and on the in-memory bus.
 
-Also makes garbage collections rare, so that they do not delay gates.
+Also makes garbage collection rare, so that it does not delay gates.
 """
 
 import gc
@@ -22,23 +22,23 @@ from zsim.runtime.rate_limit import RateLimit
 
 PERIOD_S = 1.0  # wall time between health messages, set by the contract
 STEPS_KEPT = 1000
-READS_MAX = 8  # key expressions listed per process
-ALLOCATIONS = 50_000  # between collections; a gate allocates hundreds of objects and leaves no cycles
+READS_MAX = 8  # maximum number of key expressions listed in a health message
+ALLOCATIONS = 50_000  # allocations between garbage collections; a gate makes hundreds and leaves no reference cycles
 
 
 @dataclass
 class Membership:
-    """The join, dones and bye of a process."""
+    """Makes the join, done and bye messages of a process."""
 
     name: str  # name of the process, "role.thing"
-    host: str  # name of its host
+    host: str  # host name of its machine
     run_id: str
-    next_seq: Callable[[str], int]  # returns the next sequence number of a kind of message, from 0
+    next_seq: Callable[[str], int]  # returns the next sequence number for a kind of message, from 0
     serves: tuple[str, ...] = ()  # names of the processes that it replaces
-    period_ns: int = 0  # interval of its dones; 0: sends none
-    slack_ns: int = 0  # lead that the world may have over the dones of a process without a period; 0: any
-    calculates: bool = True  # whether results depend on its arithmetic; if not, its join has no fingerprint
-    incarnation: int = 0  # random number of this start of the process; 0 if processes are never restarted
+    period_ns: int = 0  # interval of an agent's done messages; 0 for other processes
+    slack_ns: int = 0  # maximum lead of the world over a process without a period; 0: unlimited
+    calculates: bool = True  # whether results depend on its arithmetic; if so, its join has a fingerprint
+    incarnation: int = 0  # random number that identifies this start of the process; 0 if processes are never restarted
 
     def join(self, t_ns: int = 0) -> Join:
         return Join(
@@ -57,7 +57,7 @@ class Membership:
         )
 
     def done(self, t_ns: int, sent: int) -> Done:
-        """Return the done of a gate, with the number of outputs sent since the previous done."""
+        """Return the done message of a gate, with the number of outputs sent since the previous one."""
         return Done(t_ns, self.next_seq("done"), self.run_id, self.incarnation, t_ns, sent)
 
     def bye(self, t_ns: int, reason: str, failed: bool = False) -> Bye:
@@ -65,12 +65,12 @@ class Membership:
 
 
 class HealthMeter:
-    """Counters of one process.
+    """Counters and step durations of one process, for its health messages.
 
     Attributes:
         received: messages received.
-        refused: messages that could not be decoded.
-        dropped: inputs lost: dropped messages and skipped pictures, or gates stepped without all their inputs.
+        refused: received messages that could not be decoded.
+        dropped: lost inputs: dropped messages, skipped pictures, and gates stepped without all their inputs.
     """
 
     def __init__(
@@ -78,23 +78,23 @@ class HealthMeter:
         role: str,
         wall_s: Callable[[], float] = time.monotonic,
         host: str | None = None,
-        reads: Sequence[str] = (),  # its subscribed key expressions; the session extends this list
+        reads: Sequence[str] = (),  # key expressions that it subscribes to; the session extends this list
     ) -> None:
         self._role = role
         self._host = host or socket.gethostname()
         self._reads = reads
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
         self._limit = RateLimit(PERIOD_S, now=wall_s)
-        self._limit.spend()  # so that the first is due after a period
+        self._limit.spend()  # so that the first message is due after one period
         self.received = self.refused = self.dropped = 0
-        self.lag_ns = 0  # lead of the newest gate over the one last handled
+        self.lag_ns = 0  # lead of the newest gate over the last one handled
         self.link_lost = False  # whether the world is currently unreachable
 
     def step(self, duration_ns: int) -> None:
         self._steps_us.append(duration_ns / 1000)
 
     def due(self) -> bool:
-        """Whether health is due, once per wall second."""
+        """Return whether a health message is due, which is so once per wall second."""
         return self._limit.spend()
 
     def message(self, t_ns: int, seq: int) -> Health:
@@ -116,7 +116,7 @@ class HealthMeter:
 
 
 def resident_bytes() -> int:
-    """Return the resident memory of this process [bytes]; 0 where it is unknown."""
+    """Return the resident memory of this process [bytes]; 0 if unknown."""
     if sys.platform == "linux":
         with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # file descriptors may run out
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -125,9 +125,9 @@ def resident_bytes() -> int:
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Collect garbage rarely within the block, and exempt the objects that already exist.
+    """Collect garbage rarely within the `with` block, and exempt objects that already exist.
 
-    By default Python collects after 700 allocations, which is every few gates, and sometimes examines all objects.
+    By default Python collects after 700 allocations, that is, every few gates, and sometimes examines all objects.
     """
     gc.collect()
     gc.freeze()

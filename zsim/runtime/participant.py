@@ -1,7 +1,7 @@
-"""The participation of a process in a run: join, done, health, bye, supersession, and rejoining after a lost link.
+"""Participation of a process in a run: join, done, health, bye, supersession, and rejoining after a lost link.
 
     participant = Participant(link, info, "console.1")
-    participant.announce()              join; the world admits it by an event on `world/event`
+    participant.announce()              join; the world admits the process by an event on `world/event`
     participant.tick()                  health once a second, and a new join after a lost link
     participant.leave("closed")         bye
 
@@ -30,21 +30,21 @@ from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import replay
 
 ANOTHER_RUN = "the world has begun another run"
-REPLAY_S = 2.0  # wall time; a hub answers a replay within milliseconds, over a lost link never
-REJOINS_MAX = 6  # unanswered rejoins until one is assumed received; a new router forwards nothing at first
+REPLAY_S = 2.0  # wall-time limit of a replay; a hub answers within milliseconds, or never if the link is lost
+REJOINS_MAX = 6  # unanswered joins after which one is assumed to have arrived; a new router forwards nothing at first
 RETRY_S = 0.5  # wall time between attempts at an unanswered request to the world
-ASKED_MAX = 10  # replays for a lost message: a message still on its way to the world is missing from the first
+ASKED_MAX = 10  # replays requested for a lost message: the first lacks a message still on its way to the world
 RESUME_NS = 4_000_000_000  # maximum simulated age of a usable snapshot: the world keeps 5 s of history
-GATES_KEPT = 2  # gates whose outputs are kept to answer a get (contract); more if the world runs ahead
+GATES_KEPT = 2  # gates whose outputs are kept for queries, as the contract demands; more if the world runs ahead
 
 
 class Participant:
-    """One process in one run.
+    """A process that takes part in one run.
 
     Attributes:
         admitted: whether the world has admitted its newest incarnation.
-        successor: host and pid of the process that has taken over its name; empty while it has the name.
-        end_reason: why its part in this run is over; empty while the run continues.
+        successor: host and pid of the process that has taken over its name; empty if none has.
+        end_reason: why it no longer takes part in this run; empty while it does.
     """
 
     def __init__(
@@ -56,20 +56,20 @@ class Participant:
         # how far the world may be ahead of its last done; 0 for a process that the world does not wait for
         slack_ns: int = 0,
         *,
-        period_ns: int = 0,  # how often an agent reports done; 0 for other processes
-        # whether its results depend on floating-point arithmetic; otherwise its join states no fingerprint
+        period_ns: int = 0,  # interval at which an agent reports done; 0 for other processes
+        # whether results depend on its floating-point arithmetic; if not, its join has no fingerprint
         calculates: bool = True,
         next_seq: Callable[[str], int] | None = None,
     ) -> None:
         self.name = name
-        # whether the world waits for it; it then announces itself only after subscribing to all its inputs
+        # whether the world waits for this process, which must then subscribe to all its inputs before `announce`
         self.gates = slack_ns > 0
-        self.now_ns = 0  # simulated time of the newest clock received
-        self.done_ns = -1  # newest gate done, -1 before the first
-        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)  # counters that it publishes
-        self.must_rejoin = False  # whether the world may consider it dead, or have mistaken another process for it
+        self.now_ns = 0  # simulated time of the newest clock message received
+        self.done_ns = -1  # newest gate done; -1 before the first
+        self.health = HealthMeter(name.split(".", 1)[0], host=link.host, reads=link.reads)  # its published counters
+        self.must_rejoin = False  # whether the world may consider it dead or have mistaken another process for it
         self.successor = self.end_reason = ""
-        self.next_seq = next_seq or self._count  # returns the number of its next message of a kind, from 0
+        self.next_seq = next_seq or self._count  # returns the next sequence number for a kind of message, from 0
         self._link, self._info = link, info
         others = tuple(each for each in serves if each != name)
         own = (name, link.host, info.run_id, self.next_seq)
@@ -92,10 +92,10 @@ class Participant:
     def superseded(self) -> bool:
         return bool(self.successor)
 
-    # What it publishes
+    # Publications
 
     def announce(self) -> None:
-        """Join the run, and follow the events and the link state that may require another join."""
+        """Join the run, and watch for events and link changes that require another join."""
 
         def follow_link(up: bool) -> None:
             self.must_rejoin = up and self._was_link_lost
@@ -118,17 +118,17 @@ class Participant:
             self.publish("done", self._membership.done(t_ns, 0))
 
     def leave(self, reason: str, failed: bool = False) -> None:
-        """Publish bye once, unless superseded; `failed` for a process that cannot go on."""
+        """Publish a bye, once, unless superseded; `failed` means that the process cannot continue."""
         if not self.superseded and not self._has_left:
             self._has_left = True
             self.publish("bye", self._membership.bye(self.now_ns, reason, failed))
 
     def tick(self) -> None:
-        """Rejoin if necessary, and publish health once per wall second; must be called more often than that."""
+        """Rejoin if necessary, and publish health once per wall second; call this more often than that."""
         if self.must_rejoin:
             self.must_rejoin = False
             self.join(again=True)
-            if self.done_ns >= 0:  # the last done may be lost, or belong to the former incarnation
+            if self.done_ns >= 0:  # the last done may have been lost, or belong to the former incarnation
                 self.done(self.done_ns)
         self.publish_health()
 
@@ -143,7 +143,7 @@ class Participant:
     # Inputs
 
     def update_clock(self, payload: bytes) -> run_messages.Clock | None:
-        """Update the state of the run from a message on `clock`; return it, None if it cannot be decoded."""
+        """Update the state of the run from a message on `clock`; return the message, None if it cannot be decoded."""
         try:
             clock: run_messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
@@ -162,7 +162,7 @@ class Participant:
             self.take_entry(entry)
 
     def entry_in(self, payload: bytes) -> ProcessEntry | None:
-        """Return the admission of a process of this name that an event reports; None if it reports none."""
+        """Return the admission of a process of this name from an event; None if the event is any other."""
         try:
             event = messages.read_event(payload)
         except DecodeError:
@@ -174,7 +174,7 @@ class Participant:
     def take_entry(self, entry: ProcessEntry) -> None:
         """Handle the admission of a process of this name: this one, or one that replaces it.
 
-        While this incarnation is not admitted, another admitted one came before it and will be replaced by it.
+        Until this incarnation is admitted, any other admitted one precedes it and will be replaced by it.
         """
         if self.is_own(entry):
             self.admitted = True
@@ -191,9 +191,9 @@ class Participant:
 
 
 class AgentParticipant(Participant):
-    """The process of an agent in one run.
+    """The process of an agent that takes part in one run.
 
-    `settle` repeats unanswered requests to the world.
+    `settle` repeats unanswered requests to the world and must be called regularly.
     """
 
     def __init__(
@@ -204,7 +204,7 @@ class AgentParticipant(Participant):
         take_in: Callable[[ReceivedSample], None],  # receives the messages of a replay
         say: Callable[[str], None],
         wall_s: Callable[[], float] = time.monotonic,
-        stopped: Callable[[], bool] = lambda: False,  # whether the process is to end
+        stopped: Callable[[], bool] = lambda: False,  # returns whether the process is to end
     ) -> None:
         super().__init__(link, info, agent.name, agent.serves, period_ns=agent.period_ns, next_seq=agent.next_seq)
         self._agent = agent
@@ -217,12 +217,12 @@ class AgentParticipant(Participant):
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
         self._unsent: Pairs = []
         self._resumed = False
-        self._unproved = 0  # rejoins left to publish, unless the world proves to continue with this process …
-        self._proof_ns = 0  # … by passing this gate
+        self._unproved = 0  # joins left to repeat, unless the world proves that it goes on with this process …
+        self._proof_ns = 0  # … beyond this gate
         self._missed_since_ns: int | None = None
         self._asked_ns, self._asked = -1, 0
         self._retry_s = 0.0
-        # gate up to which the predecessor published all outputs, which are not published again
+        # gate up to which the predecessor published all outputs; they are not published again
         self.published_ns = -1
         self.awaited = False  # whether the world has yet to admit this process
         self.failure: RunError | None = None  # why it can no longer take part; None while it can
@@ -230,7 +230,7 @@ class AgentParticipant(Participant):
     # Taking over from a predecessor
 
     def resume(self) -> int | None:
-        """Restore the agent from the newest snapshot of its predecessor; return its time, None if unusable.
+        """Restore the agent from its predecessor's newest snapshot; return the snapshot's time, None if unusable.
 
         The world's history must reach back to the snapshot: later messages are fetched and processed again.
         """
@@ -247,7 +247,7 @@ class AgentParticipant(Participant):
             except Exception as error:  # any program may have written it, and a user's class reads it
                 self._say(f"{self.name}: its last snapshot is unusable: {error or type(error).__name__}")
                 if fresh is not None:
-                    self._agent.resume(self._info, fresh)  # the former state may be half restored
+                    self._agent.resume(self._info, fresh)  # the unusable state may be half restored
                 continue
             self._say(f"{self.name}: continues from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
             self.done_ns = self.now_ns = snapshot.t_ns
@@ -256,7 +256,7 @@ class AgentParticipant(Participant):
         return None
 
     def warm_start(self) -> int | None:
-        """Pass the last values of its predecessor to the agent; return their time, None if there are none."""
+        """Pass the last values of its predecessor to the agent; return the newest one's time, or None."""
         for key in self._agent.warm_start_keys():
             for sample in self._last_values(key):
                 try:
@@ -275,11 +275,11 @@ class AgentParticipant(Participant):
     def _last_values(self, key: str) -> list[ReceivedSample]:
         """Return the world's last values of a key, waiting until a world answers.
 
-        A dead world is restarted; an agent that did not wait for it would lose its former state.
+        A world that has died is restarted; an agent that did not wait for it would lose its former state.
         """
         while not self._stopped():
             found = self._link.get_surely(key)
-            if not found and self._link.get_surely(keys.INFO):  # a world is there, possibly only since now
+            if not found and self._link.get_surely(keys.INFO):  # a world answers, but may have appeared only just now
                 found = self._link.get_surely(key)
                 if found is not None:
                     return found
@@ -289,7 +289,7 @@ class AgentParticipant(Participant):
         return []
 
     def check_reach(self, t_ns: int, snapshot_ns: int) -> None:
-        """Set `failure` if the first gate that the world replays is not the one after a snapshot."""
+        """Set `failure` if the first gate replayed by the world, `t_ns`, is not the one after the snapshot."""
         if t_ns > snapshot_ns + self._info.gate_ns:
             self._fail_behind(f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are")
 
@@ -299,7 +299,7 @@ class AgentParticipant(Participant):
     # Taking part
 
     def enter(self) -> None:
-        """Join; repeat the join and step no gate until the world has admitted this process."""
+        """Join; until the world admits this process, no gate is stepped and `settle` repeats the join."""
         self.awaited = True
         self.join()
         self._retry_s = self._wall_s() + RETRY_S
@@ -315,9 +315,10 @@ class AgentParticipant(Participant):
         self._unsent.append((self._done_key, messages.encode(done)))
 
     def publish_snapshot(self, t_ns: int) -> None:
-        """Queue a snapshot of the agent after a gate for `send`, if it offers one.
+        """Queue a snapshot of the agent after a gate for `send`, if the agent supports snapshots.
 
-        UserCodeError if a user's class returned a state other than plain values.
+        Raises:
+            UserCodeError: a user's class returned a state that does not consist of plain values.
         """
         state = self._agent.checkpoint()
         if state is None:
@@ -326,17 +327,17 @@ class AgentParticipant(Participant):
         self._unsent.append((keys.process(self.name, "snapshot"), messages.encode(snapshot)))
 
     def send(self) -> None:
-        """Publish everything queued since the last call at once, which wakes readers less often."""
+        """Publish everything queued since the last call in one batch, which wakes readers less often."""
         if self._unsent:
             unsent, self._unsent = self._unsent, []
             self._link.put_all(unsent)
 
     def outputs(self) -> list[list[object]]:
-        """Return [key, payload] of the outputs of the last gates, for a world that lost them."""
+        """Return the outputs of the last gates as [key, payload] pairs, for a world that lost them."""
         return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
 
     def take_entry(self, entry: ProcessEntry) -> None:
-        """Handle an admission; if it is this process's, fetch the messages since the restored state."""
+        """Handle an admission; if it is that of this process, fetch the messages since the restored state."""
         is_rejoining = self.must_rejoin
         super().take_entry(entry)
         if self.is_own(entry):
@@ -372,7 +373,7 @@ class AgentParticipant(Participant):
         return self.awaited or self._missed_since_ns is not None
 
     def ask_again(self, t_ns: int, missing: str) -> None:
-        """Fetch the missing messages of a gate, for example after a cut link."""
+        """Fetch the missing messages of a gate, for example after the link was cut."""
         if t_ns != self._asked_ns:
             self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
             self._say(f"{self.name}: {missing} of t = {t_ns / 1e9:.2f} s did not arrive; requesting it again")
@@ -421,7 +422,7 @@ class AgentParticipant(Participant):
         self._retry_s = self._wall_s() + RETRY_S
 
     def _publish_again(self) -> None:
-        """Join, and repeat the outputs and dones that may be lost."""
+        """Join, and repeat the outputs and done messages that may have been lost."""
         self.join()
         for t_ns, outputs in self._kept:
             for key, message in outputs:

@@ -1,4 +1,4 @@
-"""Progress of a run: on a terminal a live line and a line per event (`Screen`), for a launcher JSON lines."""
+"""Progress of a run: a live line and a line per event on a terminal (`Screen`), or JSON lines for a launcher."""
 
 import json
 import math
@@ -17,21 +17,21 @@ from zsim.contract.run_messages import Waiting, waiting_text
 from zsim.errors import printable, without_figures
 
 PERIOD_S = 0.2  # wall time between two updates
-SLOW_S = 3.0  # wall time; code compiled earlier loads within 2 s unless the machine is busy
+SLOW_S = 3.0  # wall time until the notice; compiled code loads within 2 s unless the machine is busy
 SLOW_NOTICE = "loading compiled code; the first time on a machine it is compiled, which takes one to three minutes"
-REPEATED_S = 10.0  # simulated time over which equal events are counted; the interval of plain clock lines
-REASON_NS = 5_000_000_000  # simulated time for which a reason must last; a normal take-off has one for 3 s
+REPEATED_S = 10.0  # simulated time over which equal events are counted, like the interval of plain clock lines
+REASON_NS = 5_000_000_000  # simulated time after which a reason is shown; in a normal take-off one lasts 3 s
 DRIVERS, COMINGS = "driver.", ("join", "leave")  # shown because people start drivers by hand and watch this screen
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
 def cell(text: str) -> Text:
-    """Return a text for rich in which brackets are not markup and control codes are visible."""
+    """Return a text for rich in which brackets are not parsed as markup and control codes are visible."""
     return Text(printable(text))
 
 
 class NotebookLine:
-    """A line below a notebook's cell that is updated in place; rich would need ipywidgets for it."""
+    """A line below a notebook cell that is updated in place; rich would need ipywidgets for this."""
 
     def __init__(self) -> None:
         self._handle: Any = None
@@ -47,7 +47,7 @@ class NotebookLine:
 
 
 class ProgressSink(Protocol):
-    """Shows progress: a `Screen` or `JsonProgress`."""
+    """Interface of progress displays: `Screen` and `JsonProgress`."""
 
     def clock(self, line: dict[str, Any]) -> None: ...
     def event(self, line: dict[str, Any]) -> None: ...
@@ -68,14 +68,14 @@ class SlowStart:
 
 
 class HoldReasons:
-    """The reasons for which clusters wait; a reason that lasts is shown once."""
+    """Reasons for which clusters wait; a reason that persists is shown once."""
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[str, int]] = {}
         self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
-        """Return a line with a state's reason once it has persisted for REASON_NS, ignoring changes of its numbers."""
+        """Return a line once a state's reason, whatever its numbers, has persisted for REASON_NS; otherwise None."""
         shape = without_figures(state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:
@@ -101,7 +101,7 @@ class RepeatedEvents:
         return lines if first else [*lines, f"  {t_s:8.2f} s  {kind}: {text}"]
 
     def over(self, t_s: float) -> list[str]:
-        """Return the lines of events that have been counted for REPEATED_S."""
+        """Return a line for each repeated event that has been counted for REPEATED_S, and stop counting it."""
         ended = [key for key, (first_s, _, _) in self._counted.items() if t_s - first_s >= REPEATED_S]
         counted = [(*key, *self._counted.pop(key)) for key in ended]
         return [
@@ -112,11 +112,11 @@ class RepeatedEvents:
 
 
 class JsonProgress:
-    """Writes progress as JSON lines for a launcher or its parent process."""
+    """Writes progress as JSON lines for the launcher or another parent process."""
 
     @staticmethod
     def read(text: str) -> tuple[str, Any]:
-        """Return kind and content of a line written by this class; the kind is empty for a library's output."""
+        """Return the kind and content of a line from this class; the kind is empty for a line from a library."""
         try:
             line = json.loads(text)
         except ValueError:
@@ -156,7 +156,7 @@ class PipedConsole(Console):
 
 
 class Screen:
-    """Shows progress live on a terminal; elsewhere, events and a line every ten simulated seconds.
+    """Shows progress live on a terminal; elsewhere, prints events and a line every ten simulated seconds.
 
     Args:
         duration_s: simulated time at the end.

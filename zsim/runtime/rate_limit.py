@@ -1,6 +1,6 @@
-"""The rate limiter of requests, refusals, joins and lines on a terminal.
+"""Rate limiter for requests, refusals, joins and lines on a terminal.
 
-Its clock is a parameter: simulated time where a rerun or a resumed world must behave identically, else wall time.
+Its clock is a parameter: simulated time where a rerun or a resumed world must behave identically, otherwise wall time.
 """
 
 import time
@@ -10,11 +10,11 @@ SUBJECTS_MAX = 10_000  # subjects remembered; bounds the memory that invented na
 
 
 class RateLimit:
-    """A token bucket per subject: `burst` tokens at first, then one more per `period`.
+    """A token bucket per subject: initially full, it regains one token per `period`.
 
     Args:
         period: interval at which a token is added, in the clock's unit.
-        burst: capacity of the bucket.
+        burst: capacity of a bucket, in tokens.
         now: the clock; by default monotonic wall time [s].
     """
 
@@ -22,7 +22,7 @@ class RateLimit:
         self.period = period
         self._burst = burst
         self._now = now
-        self._spent: dict[str, tuple[float, float]] = {}  # by subject: tokens spent, and the time of the last
+        self._spent: dict[str, tuple[float, float]] = {}  # by subject: tokens spent, and when the last was
 
     def knows(self, subject: str) -> bool:
         return subject in self._spent
@@ -32,7 +32,7 @@ class RateLimit:
 
     def spend(self, subject: str = "") -> bool:
         """Spend a token; return False if none is left."""
-        now = self._now()  # repeats `_counted` for speed: some callers do this at each gate
+        now = self._now()  # inlines `_counted` for speed: some callers spend a token at each gate
         spent, at = self._spent.get(subject, (0.0, 0))
         counted = max(0.0, spent - (now - at) / self.period)
         if counted > self._burst - 1:

@@ -1,4 +1,4 @@
-"""Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, publishes done, leaves.
+"""Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, publishes its outputs, and leaves.
 
 Lockstep and realtime share one loop: lockstep waits for an incomplete gate; realtime stops waiting when the next one
 arrives.
@@ -27,13 +27,13 @@ from zsim.scenario.faults import PROCESS_KILL
 from zsim.schema import plugin
 from zsim.transport.session import Query, RawSample, ReceivedSample, Session, Subscription
 
-TICK_S = 0.1  # interval of checks for a stop and for unanswered requests while nothing arrives
-DRAIN_S = 1.0  # how long to wait for the last gates once the run has ended
-VIEW_PERIOD_S = 1 / 20  # wall time; the contract allows 30 Hz, a console draws 20 frames per second
+TICK_S = 0.1  # interval between checks for a stop and unanswered requests while nothing arrives
+DRAIN_S = 1.0  # wall time to wait for the last gates once the run has ended
+VIEW_PERIOD_S = 1 / 20  # wall time between views; the contract allows 30 Hz, and a console draws 20 frames per second
 
 
 class Runner:
-    """One agent on one session."""
+    """Runs one agent on one session."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class Runner:
         agent: Agent,
         stopped: Callable[[], bool] = lambda: False,  # called every TICK_S; True ends the process with a bye
         say: Callable[[str], None] = lambda text: None,
-        # called at the end; True leaves without a bye, as if it died, so that the world waits for a successor
+        # called at the end; if True, the agent leaves without a bye, as if dead, and the world waits for a successor
         deserted: Callable[[], bool] = lambda: False,
         snapshot_ns: int = 0,  # simulated time between snapshots of the agent; 0: none
     ) -> None:
@@ -62,7 +62,7 @@ class Runner:
         self._snapshot_due_ns = 0
         self._resumed_ns: int | None = None
         self._list_seq = -1
-        self._kills: dict[int, run_messages.Fault] = {}  # by id
+        self._kills: dict[int, run_messages.Fault] = {}  # by fault id
         self._lives_after_ns: int | None = None  # kills up to this gate concerned a predecessor
         self._lacks = False
         self._view_wall_s = 0.0
@@ -70,7 +70,7 @@ class Runner:
         self._end_wall_s = 0.0
         self._leave: str | None = None
         self._over = threading.Event()
-        self.killed = False  # whether a fault ended it, without a bye; its process must then die too
+        self.killed = False  # whether a fault ended it without a bye; its process must then die too
 
     def run(self) -> str:
         """Take part until the run ends; return the reason for leaving.
@@ -113,7 +113,7 @@ class Runner:
         return self._leave
 
     def _turn(self) -> None:
-        """Take in messages, step through every complete gate, and wait if there was none."""
+        """Take in messages and step through every complete gate; if none is complete, wait."""
         self._serve_rare()
         self._inputs.take_in_all()
         stepped = False
@@ -155,12 +155,12 @@ class Runner:
             lost = inbox.lost(t_ns)
             if lost is None or self.health.link_lost:
                 return None
-            member.ask_again(t_ns, lost)  # it will not arrive without a request
+            member.ask_again(t_ns, lost)  # the missing messages will not arrive without a request
             self._lacks = inbox.missing(t_ns) is not None
             return None if self._lacks else t_ns
         if inbox.latest_gate_ns() == t_ns:
             return None
-        self.health.dropped += 1  # the next gate has arrived: step this one with the messages received
+        self.health.dropped += 1  # the next gate has arrived: step this one with what was received
         return t_ns
 
     def _step(self, t_ns: int) -> None:
@@ -184,7 +184,7 @@ class Runner:
                 self._link.put(key, message)
         if self._lives_after_ns is None:
             self._lives_after_ns = t_ns - self._agent.period_ns
-        for fault in self._kills.values():  # only kills within its own gates count; their outputs are still sent
+        for fault in self._kills.values():  # only kills at this process's own gates count; their outputs are still sent
             lives_after_ns = max(self._lives_after_ns, self._member.published_ns)
             if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
                 self._leave, self.killed = f"killed by fault {fault.id}", True
@@ -195,8 +195,8 @@ class Runner:
     def _update_kills(self, faults: run_messages.Faults) -> None:
         """Update the faults that kill this process from a published list.
 
-        A kill that has begun remains even if newer lists omit it, since a late process has yet to reach it; a kill that
-        has not begun and is not on the list was cleared.
+        A kill that has begun remains even if newer lists omit it, since a process that lags behind has yet to reach it;
+        a kill that has not begun and is not on the list was cleared.
         """
         if faults.seq > self._list_seq:
             self._list_seq = faults.seq
@@ -256,7 +256,7 @@ class Runner:
 
 
 class RunnerInputs:
-    """The subscriptions of one agent, sorted into its inbox, and inputs from Zenoh's threads."""
+    """Receives the messages of one agent into its inbox, and its rare inputs from Zenoh's threads."""
 
     def __init__(
         self, link: Session, info: messages.Info, agent: Agent, health: HealthMeter, say: Callable[[str], None]
@@ -266,7 +266,7 @@ class RunnerInputs:
         self._health = health
         self._say = say
         self._is_realtime, self._gate_ns = info.mode == "realtime", info.gate_ns
-        self._blocking: Subscription | None = None  # subscription on which `wait` is waiting
+        self._blocking: Subscription | None = None  # subscription on which `wait` blocks
         self._external = frozenset(drone.name for drone in info.drones if drone.body is not UNSET)
         of_drivers = [key for key in agent.gate_keys if keys.parts(key)[1] in self._external]
         self.inbox = Inbox(
@@ -278,16 +278,16 @@ class RunnerInputs:
         self._subscriptions: dict[str, Subscription] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = run_key_table(info)
-        # key of the gate's sensor messages as GateMessages; drivers publish those of external drones singly
+        # key of a gate's sensor messages as `GateMessages`; drivers publish those of external drones singly
         of_world = [drone for drone in agent.counted if drone not in self._external]
         self._gate_key = ""
         if of_world and len(agent.counted) > 1:
             self._gate_key = keys.GATE
         elif of_world and agent.takes_gates:
             self._gate_key = keys.gate(of_world[0])
-        self.rare: deque[WorldEvent | Query | bool] = deque()  # served in order; a bool says whether the link is up
+        self.rare: deque[WorldEvent | Query | bool] = deque()  # in order of arrival; a bool says whether the link is up
         self._fault_lists: deque[run_messages.Faults] = deque()
-        self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
+        self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and seq
 
     def subscribe(self) -> None:
         """Subscribe to the agent's keys; declare its request keys and liveliness token."""
@@ -321,7 +321,7 @@ class RunnerInputs:
             subscription.wake()
 
     def take_in_all(self) -> None:
-        """Receive messages, gate-closing keys first, so that messages that arrived before them are not missed."""
+        """Receive messages, closing keys first, so that no message that arrived before a closing one is missed."""
         for subscription in self._subscriptions.values():
             for sample in subscription.drain():
                 self._open(sample)
@@ -378,7 +378,7 @@ class RunnerInputs:
                 yield key, request
 
     def ignore_estimates(self, process: str) -> None:
-        """Stop waiting for the estimates that a process published last, or for those that its name implies."""
+        """Stop waiting for the estimates last published by a process, or if none arrived, those its name implies."""
         for key, stock in self._stock.items():
             if process == (self._estimated_by.get(key) or stock):
                 self.inbox.expect(key, NEVER_NS)
@@ -389,7 +389,7 @@ class RunnerInputs:
             if process in (self._estimated_by.get(key), stock):
                 self.inbox.expect(key, from_ns)
 
-    # In threads of Zenoh
+    # On Zenoh's threads
 
     def _on_event(self, sample: RawSample) -> None:
         try:

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 
 from zsim.contract import keys, messages
-from zsim.errors import DecodeError, NoWorldError, SessionError
+from zsim.errors import DecodeError, NoListenerError, NoWorldError, SessionError
 from zsim.transport import tls, zenoh_settings
 from zsim.transport.session import Query, Session, config_of, open_session
 from zsim.transport.tls import Identity, Permissions, permissions_of
@@ -79,7 +79,8 @@ def connect(
     """Open a client of the hub (or of a router).
 
     Raises:
-        SessionError: no process listens there within `wait_s`, or one side refuses the other's certificate.
+        NoListenerError: no process listens there within `wait_s`.
+        SessionError: the endpoint is malformed, or one side refuses the other's certificate.
     """
     identity = identity or Identity()
     client = zenoh_settings.connecting(endpoint, identity, wait_s or 0.5)
@@ -116,14 +117,14 @@ def _listening(
         yield session
 
 
-def no_listening(endpoints: Sequence[str], error: str) -> str:
-    """Return the reason why listening on endpoints failed, and the remedy; `error` is Zenoh's text."""
+def no_listening(endpoints: Sequence[str], error: str) -> SessionError:
+    """Return the error of a hub that could not listen, with the remedy; `error` is Zenoh's text."""
     found = _OS_ERROR.search(error)
     why = _LISTEN_FAULTS.get(int(found[1]) if found else 0)
     if why is None:
         why = next((words for text, words in _LISTEN_TEXTS.items() if text in error), None)
     text = f"cannot listen on {', '.join(endpoints)}"
-    return f"{text}: {why}" if why else f"{text} ({error}); {_OTHER}"
+    return SessionError(f"{text}: {why}" if why else f"{text} ({error}); {_OTHER}")
 
 
 @contextmanager
@@ -166,9 +167,8 @@ def find_world(
                     break
                 info = None
                 time.sleep(PAUSE_S)
-            except SessionError as error:
-                if "nobody listens" not in str(error) or "not supported" in str(error):
-                    raise  # waiting would not help
+            except NoListenerError:
+                pass
             if waited_s >= limit_s:
                 why = _no_answer(link, identity) if link is not None else _no_link(endpoint)
                 raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")

@@ -486,12 +486,12 @@ class Session:
 
 @contextmanager
 def open_session(
-    settings: Settings, federation: str, identity: Identity, explain: Callable[[str], str]
+    settings: Settings, federation: str, identity: Identity, explain: Callable[[str], SessionError]
 ) -> Iterator[Session]:
     """Open a Zenoh session, and close it with all its declarations.
 
     Args:
-        explain: converts Zenoh's error to the line shown to the user.
+        explain: converts Zenoh's error text to the error to raise.
 
     Raises:
         SessionError: it cannot be opened, or the limit of open files is too low.
@@ -504,7 +504,7 @@ def open_session(
         # a Rust panic, whose class no module exports: out of threads or memory
         if not isinstance(error, zenoh.ZError) and type(error).__name__ != "PanicException":
             raise
-        raise SessionError(explain(_first_sentence(error))) from error
+        raise explain(_first_sentence(error)) from error
     session = Session(raw, federation, identity)
     try:
         yield session

@@ -20,6 +20,8 @@ from typing import Any, Literal, NamedTuple
 
 from msgspec import Struct
 
+from zsim.errors import NoListenerError, SessionError
+
 CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # in a folder of `zsim certs init`
 DAYS = 30.0  # validity of a certificate
 PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answers within milliseconds
@@ -97,11 +99,11 @@ def own_name(identity: Identity) -> str:
     return _name(_read_own(identity))
 
 
-def no_link(identity: Identity, endpoint: str, error: str) -> str:
-    """Return a line that explains why a client could not connect; `error` is Zenoh's text."""
+def no_link(identity: Identity, endpoint: str, error: str) -> SessionError:
+    """Return the error of a client that could not connect; `error` is Zenoh's text."""
     if fault := peer_fault(identity, endpoint):
-        return f"cannot connect to {endpoint}: {fault}"
-    return f"nobody listens on {endpoint}; start a world there ({error})"
+        return SessionError(f"cannot connect to {endpoint}: {fault}")
+    return NoListenerError(f"nobody listens on {endpoint}; start a world there ({error})")
 
 
 def peer_fault(identity: Identity, endpoint: str) -> str | None:

@@ -32,6 +32,8 @@ QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's limit, 2 its default
 _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
 _TLS = "transport/link/tls"
 ACCESS = "access_control"
+# In Zenoh's wheel; a client that connects with another one would wait for ever, since Zenoh reports only a timeout.
+PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws", "unixsock-stream")
 
 SESSION_FILES = 32  # of a process with a session; 22 measured, the others for files read while it loads
 CLIENT_FILES = 3  # of a hub, for each process that connects; 2.2 measured, more while many connect at once
@@ -104,6 +106,9 @@ def upstream(endpoint: str, identity: Identity) -> Settings:
 def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Settings:
     """Return the settings of TLS, with certificates on both sides, and of access control."""
     for endpoint in endpoints:  # refuse combinations that are less secure than they look
+        protocol, separator, _ = endpoint.partition("/")
+        if separator and protocol not in PROTOCOLS:
+            raise SessionError(f"endpoint is {endpoint!r}; its protocol must be one of {', '.join(PROTOCOLS)}")
         secure = tls.is_tls(endpoint)
         if secure and identity.tls is None:
             raise SessionError(f"{endpoint}: needs a certificate; give --tls a folder created by zsim certs init")

@@ -1,1 +1,1 @@
-"""References of single drones: paths, the goals of several drones, and the pilot that flies one."""
+"""References of single drones: paths, cruises to goals, their combination into flights, and the pilot of one drone."""

@@ -1,21 +1,22 @@
 """Tracking of a reference, cruise paths to goals, and courses of drones that receive new goals at any time. Pure.
 
-The commanded velocity is that of the reference, advanced by the lag of the drone's velocity loop, plus a share of the
-position error. To first order this is an acceleration feed-forward without a second derivative.
+The commanded velocity is the reference's, taken ahead by the lag of the drone's velocity loop, plus a gain times the
+position error. To first order, the lead amounts to an acceleration feed-forward that needs no second derivative.
 
-A cruise path leads from any motion to rest at a goal at a cruise speed, within limits of speed and acceleration.
+A cruise path leads from any motion to rest at a goal, at a cruise speed and within limits of speed and acceleration.
 It has three parts. At constant full acceleration a, the velocity changes from the initial v to the cruise velocity q
-in t1; the drone cruises at q for t2; it brakes along q in t3 = |q| / a and is at rest at the goal. From rest it is a
-straight line with a trapezoidal speed profile: Biagiotti and Melchiorri, Trajectory Planning for
-Automatic Machines and Robots, Springer 2008, chapter 3.
+in t1; the drone cruises at q for t2; it brakes along q in t3 = |q| / a and is at rest at the goal. From rest, the path
+is a straight line with a trapezoidal speed profile: Biagiotti and Melchiorri, Trajectory Planning for Automatic
+Machines and Robots, Springer 2008, chapter 3.
 
-With D from start to goal, D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 determines q: its direction, and its length, which
-is the cruise speed, or less where t2 would be negative: |q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves
-|q(t1) - v| = a t1, which has a solution below the maximum t1 of all q, because q is a continuous function of t1. All
-velocities between two that satisfy the limits satisfy them too. From any state on a path, the path to its goal is the
-remainder of that path.
+Let D lead from start to goal; then D - v t1/2 = q (t1/2 + t2 + t3/2). So t1 determines both the direction of q and its
+length: the cruise speed, or less where t2 would be negative, with |q|^2 / 2a + |q| t1/2 = |D - v t1/2|. t1 solves
+|q(t1) - v| = a t1. Since q(t1) is continuous and bounded, a solution exists, at most the time of the largest possible
+change of velocity. Any velocity between two that satisfy the limits satisfies them too. Planned anew from any state
+on a path, the path to the same goal is the remainder of the old one.
 
-Horizontal and vertical limits differ: |.| above is the larger of the horizontal and the vertical share of the limits.
+Horizontal and vertical limits differ: |.| above stands for the larger of the horizontal and the vertical component,
+each divided by its limit.
 """
 
 from __future__ import annotations
@@ -33,20 +34,20 @@ from zsim.scenario.scenario import Piloted
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.references.path import DEGREE, LEAST_S, SHARE, PathLimits, PiecewisePolynomial
 
-K_YAW_1_S = 1.0  # gain of the heading; chosen: a decade below the yaw loop's bandwidth
-LOST_M = 2.0  # deviation from which the path is planned anew; chosen: above the tracking error without wind
-RISE_S = 0.5  # time in which climb and yaw rates reach their limits; chosen: above the lags of both loops
-HALVINGS = 60  # bisection steps for t1: to the last bit
-SHORT_S = 1e-9  # shorter parts are omitted
+K_YAW_1_S = 1.0  # gain of the heading loop; design choice: a decade below the yaw loop's bandwidth
+LOST_M = 2.0  # deviation beyond which the path is planned anew; design choice: above the tracking error without wind
+RISE_S = 0.5  # time in which climb and yaw rates rise from 0 to their limits; design choice: above both loops' lags
+HALVINGS = 60  # bisection steps: enough to determine a time to the last bit
+SHORT_S = 1e-9  # duration below which a part is omitted
 
 Four = Sequence[float]
-"""x, y, z [m, W] and yaw [rad], or their rates."""
+"""x, y, z [m; W] and yaw [rad], or their rates."""
 Axes = tuple[float | None, float | None, float | None, float | None]
-"""As `Four`, None for axes without a goal."""
+"""Like `Four`, with None for an axis without a goal."""
 
 
 class Cruise(NamedTuple):
-    """Cruise speeds [m/s], which apply if lower than the limits."""
+    """Cruise speeds [m/s]; the drone's limits apply where they are lower."""
 
     horizontal_m_s: float = math.inf
     up_m_s: float = math.inf
@@ -57,10 +58,11 @@ FREE = Cruise()
 
 
 class Course:
-    """The paths of a drone that may receive a new goal at any time.
+    """The successive paths of a drone that may receive a new goal at any time.
 
-    A path starts in the present state of the previous path, or in that of the drone if it has no path or is more than
-    LOST_M off it. An axis without a goal follows its rate; an axis with a goal and a rate tracks both directly.
+    A new path starts in the current state of the previous one, or in the drone's own state if the drone has no path or
+    is more than LOST_M off it. An axis without a goal follows its rate; an axis with a goal and a rate tracks both
+    directly, without a path.
 
     Args:
         limits: limits of the drone; a path uses SHARE of the acceleration.
@@ -81,19 +83,19 @@ class Course:
     def send(
         self, goal: Axes, t_s: float, here: Four, moving: Four, rate: Four = (0.0,) * 4, speeds: Cruise = FREE
     ) -> None:
-        """Set the goal; `here` and `moving` are the position and rate of the drone at t_s."""
+        """Set the goal and the rate to follow; `here` and `moving` are the drone's own position and rate at `t_s`."""
         own, own_rate = self._motion(t_s, here, moving)
         self._goal, self._rate, self._speeds = goal, rate, speeds
         self._begin(t_s, own, own_rate)
 
     def stop(self, t_s: float, here: Four, moving: Four) -> Vector:
-        """Return the position [m, W] where the drone can come to rest; arguments as in `send`."""
+        """Return the position [m; W] where the drone can come to rest; arguments as in `send`."""
         own, rate = (np.array(each, float) for each in self._motion(t_s, here, moving))
         x, y, z = cruise_to_rest(own, self._limits, rate).value(math.inf)[0][:3].tolist()
         return x, y, z
 
     def velocity(self, t_s: float, here: Four, moving: Four) -> tuple[Vector, float]:
-        """Return the velocity [m/s, W] and yaw rate [rad/s] to command; arguments as in `send`.
+        """Return the velocity [m/s; W] and yaw rate [rad/s] to command; arguments as in `send`.
 
         Raises:
             RuntimeError: no goal has been set.
@@ -116,7 +118,7 @@ class Course:
         return velocity, self._rate[3] if goal[3] is None else turn
 
     def _motion(self, t_s: float, here: Four, moving: Four) -> tuple[Four, Four]:
-        """Return position and rate: of the path on its axes, of the drone on the others."""
+        """Return position and rate: those of the path on the axes it controls, those of the drone on the others."""
         own, rate = list(here), list(moving)
         if self._way is not None and not self._is_lost(t_s, here):
             place, pace = self._state(t_s)
@@ -158,7 +160,8 @@ def velocity_towards(
 
     Args:
         ahead: rate of the reference `law.lead_s` later.
-        limits: limits of the result; `down_m_s`: limit of the descent, if lower.
+        limits: limits of the result.
+        down_m_s: limit of the descent, if lower than that in `limits`.
     """
     x, y, z = (v + law.gain_1_s * (p - own) for v, p, own in zip(ahead[:3], place[:3], here[:3], strict=True))
     speed = el.hypot(x, y)
@@ -169,7 +172,7 @@ def velocity_towards(
 
 
 class _Bounds(NamedTuple):
-    """Limits of velocity and acceleration, horizontal (x and y together) and vertical."""
+    """Limits of velocity and acceleration: horizontal, for x and y together, and vertical."""
 
     speed: float
     up: float
@@ -178,7 +181,7 @@ class _Bounds(NamedTuple):
     accel_z: float
 
     def rise_s(self, x: float, y: float, z: float) -> float:
-        """Return the time of a change of velocity [s]."""
+        """Return the time that a change of velocity takes at full acceleration [s]."""
         return max(el.hypot(x, y) / self.accel, abs(z) / self.accel_z)
 
     def speed_along(self, x: float, y: float, z: float) -> float:
@@ -188,7 +191,7 @@ class _Bounds(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """A part of a path with constant acceleration: its duration, and position and velocity at its start."""
+    """A part of a path at constant acceleration; `place` and `velocity` are those at its start."""
 
     duration_s: float
     place: Vector
@@ -204,10 +207,10 @@ def cruise(
 ) -> PiecewisePolynomial:
     """Return the path from a position (4,) with a rate (4,), by default 0, to rest at a goal (4,).
 
-    Yaw turns the shorter way, independently of the translation.
+    The drone turns the shorter way, independently of its translation.
 
     Args:
-        limits: limits of speeds and horizontal acceleration; climb and yaw rates reach theirs in RISE_S.
+        limits: limits of the speeds and of the horizontal acceleration; climb and yaw rates reach theirs in RISE_S.
     """
     vx, vy, vz, turning = (0.0, 0.0, 0.0, 0.0) if rate is None else rate.tolist()
     (x, y, z, yaw), (to_x, to_y, to_z, to_yaw) = start.tolist(), goal.tolist()
@@ -229,9 +232,9 @@ def cruise_through(
     speeds: Cruise = FREE,
     radius_m: float = 0.0,
 ) -> PiecewisePolynomial:
-    """Return the path through goals (4,) to rest at the last one.
+    """Return the path through goals (4,) to rest at the last one; other arguments as in `cruise`.
 
-    Within radius_m of each earlier goal it turns towards the next one; 0: it comes to rest at each.
+    Within `radius_m` of each earlier goal it turns towards the next one; 0: it comes to rest at each.
     """
     durations: list[Array] = []
     coefficients: list[Array] = []
@@ -253,7 +256,7 @@ def cruise_through(
 
 
 def cruise_to_rest(start: Array, limits: PathLimits, rate: Array) -> PiecewisePolynomial:
-    """Return the shortest straight path to rest of a drone moving at a rate (4,)."""
+    """Return the shortest straight path on which a drone moving at a rate (4,) comes to rest."""
     aside, climb, turn = el.hypot(rate[0], rate[1]), abs(float(rate[2])), abs(float(rate[3]))
     rise_s = max(aside / limits.accel_m_s2, climb / limits.climb_m_s * RISE_S), turn / limits.yaw_rate_rad_s * RISE_S
     stop = start + rate * np.array([*(rise_s[0],) * 3, rise_s[1]]) / 2.0
@@ -266,7 +269,7 @@ def _parts(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> li
     vx, vy, vz = velocity
 
     def cruise_after(t1: float) -> tuple[Vector, float]:
-        """Return q, and the time from the middle of the first part to the middle of the last."""
+        """Return q for `t1`, and the time from the middle of the first part to the middle of the last."""
         along = x - vx * t1 / 2.0, y - vy * t1 / 2.0, z - vz * t1 / 2.0
         left = el.length(along)
         if left == 0.0:
@@ -284,7 +287,7 @@ def _parts(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> li
             middle = (early + t1) / 2.0
             (qx, qy, qz), _ = cruise_after(middle)
             early, t1 = (early, middle) if bounds.rise_s(qx - vx, qy - vy, qz - vz) <= middle else (middle, t1)
-    elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # displacement taken as a velocity; t2 = 0: |q| t1 is its length
+    elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # of the displacement as if a velocity; if t2 = 0, |q| t1 = |D|
         t1 = min(math.sqrt(rise_s), rise_s * bounds.speed_along(x, y, z))
     (qx, qy, qz), over_s = cruise_after(t1)
     parts = []
@@ -308,7 +311,7 @@ def _moved(place: Vector, velocity: Vector, accel: Vector, t: float) -> Vector:
 
 
 def _polynomials(way: list[_Part], turn: list[_Part]) -> PiecewisePolynomial:
-    """Return a translation and a turn with a common start as one path."""
+    """Return a translation and a turn that start together as one path."""
     begins = [_begins(way), _begins(turn)]
     times = sorted({t for each in begins for t in each})
     kept = [t for t, after in pairwise(times) if after - t > SHORT_S]
@@ -330,7 +333,7 @@ def _begins(parts: list[_Part]) -> list[float]:
 
 
 def _state(parts: list[_Part], begins: list[float], t: float) -> tuple[Vector, Vector, Vector]:
-    """Return position, velocity and acceleration at t (the acceleration after it); at rest after the last part."""
+    """Return position, velocity and acceleration at `t`; at a boundary, of the later part; rest after the last."""
     number = max(k for k, begin in enumerate(begins) if begin <= t)
     if number == len(parts):
         last = parts[-1]

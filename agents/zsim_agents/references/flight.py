@@ -1,8 +1,9 @@
 """The flights of drones with their own references: take-off, approach to a path, and the path. Pure.
 
-A flight is checked in advance: speeds, yaw rates and horizontal accelerations against the drone's limits, heights, and
-distances to other flights and to formations. When a formation engages and how it approaches its target or trajectory
-depend on its estimates, so distances to it are checked only from the time by which it has certainly arrived.
+A flight is checked in advance: its speeds, yaw rates and horizontal accelerations against the drone's limits, its
+heights, and its distances to other flights and to formations. When a formation engages, and how it approaches its
+target or trajectory, depends on its estimates; so distances to it are checked only from the time by which it must have
+arrived there.
 """
 
 from __future__ import annotations
@@ -45,17 +46,17 @@ from zsim_agents.references.path import (
 if TYPE_CHECKING:
     from zsim_agents.formation.engagement_setup import PlannedMotion
 
-READY_S = 4.0  # minimum time from the take-off command to the first path; the take-off of an AR.Drone takes 4 s or more
-WAY_SHARE = 0.5  # usable share of the limits on the approach to a path that starts at rest, where there is no hurry
+READY_S = 4.0  # minimum time from the take-off command to the first path; an AR.Drone takes at least 4 s to take off
+WAY_SHARE = 0.5  # usable share of the limits on the approach to a path that starts at rest, which need not be fast
 ROUNDING = 1.0 + 1e-9  # tolerance for durations that just satisfy the limits
-HEIGHT_MIN_M = 0.2  # minimum height of a path, above most of the ground effect of the smallest drones
+HEIGHT_MIN_M = 0.2  # minimum height of a path: above most of the ground effect of the smallest drones
 SAMPLES_MAX, SAMPLE_S = 4001, 0.05  # sampling of a path's heights
 TOLERANCE_M = 1e-3  # tolerance of the minimum distance between two paths
-STEP_S = 0.05  # interval between comparisons of all paths
-LEAST_STEP_S = 1e-4  # minimum length of an interval that is halved
+STEP_S = 0.05  # interval at which the distances between all paths are checked
+LEAST_STEP_S = 1e-4  # minimum length of an interval that is still halved
 LATE_S = 15.0  # maximum delay of a formation: take-off takes up to 12 s (READY_S planned), engagement awaits estimates
-LOOK_S, FINE_S = 0.1, 0.01  # interval between comparisons with a formation: normally, and at close distances
-NEARER_M = 0.5  # distance by which a drone and a robot approach within LOOK_S at most
+LOOK_S, FINE_S = 0.1, 0.01  # interval at which distances to a formation are checked: normally, and at close range
+NEARER_M = 0.5  # maximum decrease within LOOK_S of the distance between a drone and a robot of a formation
 PLACE_NAMES = ("x", "y", "z", "yaw")
 QUANTITIES = (
     ("horizontal speed", "m/s"),
@@ -66,7 +67,10 @@ QUANTITIES = (
 
 
 class FlightError(ValueError):
-    """A flight is impossible; the message is `path`, the field within the reference or exchange, then `text`."""
+    """A flight is impossible.
+
+    The message consists of `path`, the field within the reference or exchange, and `text`, what is wrong with it.
+    """
 
     def __init__(self, path: str, text: str) -> None:
         super().__init__(f"{path} {text}".strip())
@@ -91,7 +95,7 @@ class Place:
 
 
 class Leg(NamedTuple):
-    """A part of a flight: a path that starts at the simulated time start_s."""
+    """A part of a flight: a path that starts at the simulated time `start_s`."""
 
     start_s: float
     path: Reference
@@ -102,7 +106,8 @@ class Leg(NamedTuple):
 class Flight:
     """The `Reference` of a drone over simulated time [s].
 
-    Before the first leg it is `hover` (4,), where the take-off ends; the end of a leg is held until the next leg.
+    Before the first leg the drone stays at `hover` (4,), where its take-off ends; after a leg it stays at the leg's end
+    until the next one starts.
     """
 
     hover: Array
@@ -133,14 +138,14 @@ class Flight:
         return leg.phase, own_s if leg.phase == "path" else None
 
     def peaks(self) -> Peaks:
-        """Return the peaks over all legs, with times of 0."""
+        """Return the peaks over all legs; their times are not determined and set to 0."""
         each = [peaks_of(leg.path) for leg in self.legs]
         speed, climb, turn, accel = np.max([[0.0] * 4, *(peaks[:4] for peaks in each)], axis=0).tolist()
         return Peaks(speed, climb, turn, accel, at_s=(0.0, 0.0, 0.0, 0.0))
 
 
 def limits_of(drone: Drone, gravity_m_s2: float) -> PathLimits:
-    """Return the path limits of a drone: those of its firmware, with the tilt converted to an acceleration."""
+    """Return the path limits of a drone: its firmware's limits, with the tilt converted to an acceleration."""
     own = drone.limits
     accel = gravity_m_s2 * el.tan(math.radians(own.tilt_deg))
     return PathLimits(own.horizontal_speed_m_s, own.vertical_speed_m_s, math.radians(own.yaw_rate_deg_s), accel)
@@ -153,7 +158,7 @@ def hover_of(drone: Drone) -> Array:
 
 
 def flight_of(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone with a reference or in an exchange.
+    """Return the flight of a drone that has a reference or takes part in an exchange.
 
     Raises:
         FlightError: the flight is impossible.
@@ -178,7 +183,7 @@ def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion |
     """Return the approach from a position and yaw (4,) to the start of a path.
 
     Raises:
-        FlightError: the motion at an end is too fast.
+        FlightError: no path within the limits exists, usually since the path to be joined starts too fast.
     """
     place, rate = path.value(0.0)
     end = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
@@ -214,7 +219,7 @@ def fitted_path(spec: DroneReference, limits: PathLimits, yaw: float, altitude_m
 
 
 def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Reference]]:
-    """Return the constructor for each kind of path; `yaw` is the default heading [rad]."""
+    """Return a constructor for each kind of path; `yaw` is the default heading [rad]."""
     base = np.array([0.0, 0.0, 0.0, yaw])
 
     def expressions() -> Reference:
@@ -251,7 +256,10 @@ def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
 
 
 def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
-    """Return the minimum-snap path through points, at rest until the time of the first, turning the shorter way."""
+    """Return the minimum-snap path through points, at rest until the time of the first one, turning the shorter way.
+
+    `yaw` is the heading at points before the first one that states its own [rad].
+    """
     places = np.empty((len(points), 4))
     for row, point in zip(places, points, strict=True):
         wanted = yaw if point.yaw_deg is None else math.radians(point.yaw_deg)
@@ -281,7 +289,7 @@ def _polynomials(spec: DroneReference) -> Reference:
 
 
 def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, now: str) -> str:
-    """Return the error text on the quantity that exceeds its limit most."""
+    """Return the error text on the quantity that exceeds its limit most; `now` states the current time scale."""
     shares = [own / most for own, most in zip(peaks[:4], limits, strict=True)]
     weighed = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # weighted as in `Peaks.factor`
     worst = int(np.argmax(weighed))
@@ -307,9 +315,9 @@ def _check_heights(path: Reference, altitude_max_m: float) -> None:
 
 
 def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight]:
-    """Return the flights of an exchange by drone.
+    """Return the flights of an exchange, by drone.
 
-    In each stage the drones, assigned to the goals, fly straight lines that start and end at the same times.
+    In each stage, the drones are assigned to the goals and fly there in straight lines, all over the same time.
 
     Raises:
         FlightError: a stage is too fast, too low, or starts too early.
@@ -366,9 +374,9 @@ def land_s_of(flown: Piloted) -> float:
 
 
 def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Yield the path and text of each fault of a reference, and of each distance that is too small.
+    """Yield the field's path and the text of each fault of a reference, then of distances that are too small.
 
-    Distances are checked between flights, and to formations once these have certainly reached their planned motion.
+    Distances are checked between flights, and to formations from the time by which these must follow their plan.
     """
     flights: dict[str, Flight] = {}
     exchanges = [] if not isinstance(scenario.exchanges, list) else scenario.exchanges
@@ -394,7 +402,7 @@ def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
 
 
 def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
-    """Return a text on the first pair of drones whose flights come too close, None if none do."""
+    """Return a text about the first two drones whose flights come too close, or None."""
     names = [*flights]
     try:
         clearance = np.array([_clearance_m(scenario, name) for name in names])
@@ -414,10 +422,12 @@ def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
 
 
 def checked_flight(scenario: Scenario, drone: str) -> Flight:
-    """Return the flight of a drone, checked; for the first drone that has one, all flights of the scenario are checked.
+    """Return the flight of a drone after checking it.
+
+    For the first drone that has a flight, all flights of the scenario are checked.
 
     Raises:
-        RunError: a flight is impossible, or two come too close.
+        RunError: a flight is impossible, or comes too close to another or to a formation.
     """
     try:
         flight = flight_of(scenario, drone)
@@ -431,7 +441,7 @@ def checked_flight(scenario: Scenario, drone: str) -> Flight:
 
 
 class Approach(NamedTuple):
-    """Two paths that come too close: their indices, the distance [m], and its time [s]."""
+    """Two paths that come too close: their indices, the distance between them [m], and the time [s]."""
 
     first: int
     second: int
@@ -440,13 +450,14 @@ class Approach(NamedTuple):
 
 
 def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -> Approach | None:
-    """Return the first pair of paths in time that comes closer than allowed, to within a millimetre; None if none does.
+    """Return the earliest approach of two paths closer than allowed, to within a millimetre; None if there is none.
 
-    In an interval, the distance between two paths is at least the mean of its values at both ends minus half the
-    interval times the sum of the peak speeds; where this bound is too small, the interval is halved.
+    Within an interval, the distance between two paths is at least the mean of its values at both ends minus half the
+    interval's length times the sum of the peak speeds; where this bound is too small, the interval is halved.
 
     Args:
-        least_m: clearance of each drone, (n,); the minimum distance of a pair is the sum of its clearances.
+        least_m: clearance of each drone [m], (n,); the minimum distance of a pair is the sum of both clearances.
+        until_s: end of the search.
     """
     from scipy.spatial import KDTree
 
@@ -471,7 +482,7 @@ def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -
 def _nearer(
     a: Reference, b: Reference, speed: float, least_m: float, from_s: float, to_s: float
 ) -> tuple[float, float] | None:
-    """Return the first distance below least_m between from_s and to_s, and its time; None if there is none."""
+    """Return the first distance below `least_m` between `from_s` and `to_s`, and its time; None if there is none."""
 
     def apart(t_s: float) -> float:
         return el.distance(a.value(t_s)[0][:3].tolist(), b.value(t_s)[0][:3].tolist())
@@ -492,7 +503,7 @@ def _nearer(
 def _meetings(
     scenario: Scenario, flights: Mapping[str, Reference], until_s: Mapping[str, float]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the path and text of each formation's first meeting with a drone that has a reference.
+    """Yield, for each formation that comes too close to a drone with a reference, the field's path and a text.
 
     Args:
         flights: flights by drone.
@@ -505,7 +516,7 @@ def _meetings(
             planned = planned_motion(scenario, cluster)
             clearance = {name: _clearance_m(scenario, name) for name in (*flights, *cluster.drones)}
         except (NotTrustedError, DocumentError, RunError, UserCodeError):
-            continue  # reported by the check of the plan, or due to user code that is not loaded here
+            continue  # reported by the check of the plan, or caused by user code that is not loaded here
         if planned is None:
             continue
         own_m = max(clearance[name] for name in cluster.drones)
@@ -521,7 +532,7 @@ def _meetings(
 def _meeting(
     planned: PlannedMotion, flight: Reference, until_s: float, least_m: float
 ) -> tuple[float, float, int] | None:
-    """Return the time when a drone is first too close to a robot, their distance and the robot; None if never."""
+    """Return when a drone first comes too close to a robot, their distance, and the robot's index; None if never."""
     from_s, to_s = planned.from_s + LATE_S, min(planned.until_s, until_s)
     for t_s in np.arange(from_s, to_s, LOOK_S).tolist():
         if float(_distances(planned, flight, t_s).min()) >= least_m + NEARER_M:

@@ -1,10 +1,10 @@
-"""Paths of one drone: position and rate over time, their peaks, and the duration that satisfies limits. Pure.
+"""Paths of one drone: position and rate over time, peak speeds and acceleration, and scaling to limits. Pure.
 
-Paths are minimum-snap polynomials, or a circle, helix or figure-8 flown in laps that begin and end at rest on the
+A path is a minimum-snap polynomial, or a circle, helix or figure-8 flown in laps that begin and end at rest on the
 curve.
 
-A path is a `Reference` of four variables, x, y, z [m; W] and yaw [rad, not wrapped]. Time is in seconds from its start;
-outside [0, duration_s] it stays at its nearer end.
+A path is a `Reference` of four variables, x, y, z [m; W] and yaw [rad, not wrapped]. Its time starts at 0; outside
+[0, duration_s] it rests at its nearer end.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from zsim.math import linear
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import Reference, TrajectoryError
 
-# Degree of a piece, as in the files of uav_trajectories: the minimum that allows position, velocity, acceleration and
+# Degree of a piece, as in the files of uav_trajectories: the lowest that allows position, velocity, acceleration and
 # jerk to be prescribed at both ends
 DEGREE = 7
 ENDS = 3  # number of derivatives prescribed at each end of a path
-BELOW, ABOVE = 11, 3  # diagonals below and above the main one in the equations of a minimum-snap path, piece by piece
+BELOW, ABOVE = 11, 3  # diagonals below and above the main one in the equations of `minimum_snap`
 PEAK_SAMPLES = 64  # samples per piece in the search for its peaks
 GOLDEN = 0.6180339887498949  # (sqrt(5) - 1) / 2
 GOLDEN_STEPS = 40  # steps of a golden-section search; each leaves 0.62 of the interval, all leave 1e-10 of a piece
 SAMPLE_S, SAMPLES_MIN, SAMPLES_MAX = 0.05, 65, 4001  # sampling of non-polynomial paths, before peaks are refined
-HORIZON_S = 600.0  # part of an endless path that is searched for peaks
-DIFFERENCE_S = 1e-4  # step of central differences of rates; relative error 1e-7 in motions with time scales of 1 s
-FACTOR_DIGITS = 3  # decimals of the factor of a fitted path, which is rounded up
-SHARE = 0.8  # usable share of the drone's limits, as in formations; the feedback has the rest
-# Minimum duration of a move (25 gates), maximum duration, and growth of the duration in the search between
+HORIZON_S = 600.0  # initial part of an endless path that is searched for peaks
+DIFFERENCE_S = 1e-4  # step of central differences of rates; relative error 1e-7 for motions with time scales of 1 s
+FACTOR_DIGITS = 3  # decimals to which the factor of a fitted path is rounded up
+SHARE = 0.8  # share of the drone's limits that a path may use, as in formations; the rest is left to the feedback
+# Minimum duration of a move (25 gates), maximum duration, and factor by which the search lengthens it in each step
 LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1
 STILL = 1e-9  # value below which a quantity counts as zero
-RAMP = 0.25  # duration of speeding up from rest, or of slowing down, over that of a lap
+RAMP = 0.25  # duration of speeding up from rest, and of slowing down, as a share of a lap's
 Curve = Callable[[float], tuple[Array, Array]]
 """Maps the angle [rad] to the position (4,) and its derivative with respect to the angle."""
 
@@ -57,7 +57,7 @@ class PathLimits(NamedTuple):
 
 
 class Peaks(NamedTuple):
-    """The maximum of each quantity of `PathLimits` on a path, and the time when it is reached [s]."""
+    """The maximum of each quantity in `PathLimits` over a path, and when it is reached [s]."""
 
     speed_m_s: float
     climb_m_s: float
@@ -66,13 +66,13 @@ class Peaks(NamedTuple):
     at_s: tuple[float, float, float, float]
 
     def factor(self, limits: PathLimits) -> float:
-        """Return the factor by which to stretch the duration to just satisfy the limits; below 1: it may shrink."""
+        """Return the factor by which to stretch the duration to just satisfy the limits; below 1, it may shrink."""
         speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
         return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # acceleration scales as 1/t^2
 
 
 class PiecewisePolynomial:
-    """A sequence of polynomials in local time.
+    """A path of consecutive polynomial pieces, each in its own local time.
 
     Args:
         durations_s: durations of the pieces, (m,).
@@ -91,7 +91,7 @@ class PiecewisePolynomial:
         piece = bisect.bisect_right(self._begins, clamped) - 1
         local = clamped - self._begins[piece]
         place, rate = [], []
-        for highest, *others in self._axes[piece]:  # plain floats, since numpy takes five times as long
+        for highest, *others in self._axes[piece]:  # in plain floats: numpy takes five times as long
             value, slope = highest, 0.0
             for coefficient in others:
                 slope = slope * local + value
@@ -101,7 +101,7 @@ class PiecewisePolynomial:
         return np.array(place), np.array(rate) if clamped == t_s else np.zeros(4)
 
     def until(self, end_s: float) -> PiecewisePolynomial:
-        """Return the part of the path before end_s > 0."""
+        """Return the part of the path before `end_s` > 0."""
         count = bisect.bisect_left(self._begins, end_s)
         durations = self.durations_s[:count].copy()
         durations[-1] = min(durations[-1], end_s - self._begins[count - 1])
@@ -122,14 +122,17 @@ class PiecewisePolynomial:
 
 
 def _powers(x: float, count: int) -> Array:
-    """Return x^0, x^1, ..., (count,)."""
+    """Return x^0, x^1, ..., x^(count - 1)."""
     return np.array([el.power(x, float(k)) for k in range(count)])
 
 
 def _greatest(columns: Array) -> tuple[float, float]:
-    """Return the maximum on [0, 1] of the sum of squares of k polynomials, coefficients (n, k), and its argument.
+    """Return the maximum over [0, 1] of the sum of squares of k polynomials, and where it is.
 
     It is found by sampling and golden section; only maxima narrower than the spacing of the samples can be missed.
+
+    Args:
+        columns: coefficients of t^0 to t^(n - 1), a column per polynomial, (n, k).
     """
     falling = columns[::-1].T.tolist()
 
@@ -171,15 +174,16 @@ def at_rest() -> EndMotion:
 def minimum_snap(
     times_s: Sequence[float], places: Array, begin: EndMotion | None = None, end: EndMotion | None = None
 ) -> PiecewisePolynomial:
-    """Return the path through positions at given times with the minimum integral of the squared fourth derivative.
+    """Return the path through positions at given times that minimises the integral of the squared fourth derivative.
 
     With the first three derivatives prescribed at both ends, zero by default, it is the spline of degree 7. The cost is
     that of Mellinger and Kumar, ICRA 2011; for the spline see Schoenberg, Proc. Nat. Acad. Sci. 52 (1964) 947. From 0
     to 1 in one second, at rest at both ends, it is 35 t^4 - 84 t^5 + 70 t^6 - 20 t^7.
 
     Args:
-        times_s: increasing times, (m,), of which the first is the start of the path.
-        places: x, y, z [m; W] and yaw [rad], (m, 4).
+        times_s: increasing times, (m,); the path starts at the first.
+        places: x, y, z [m; W] and yaw [rad] at these times, (m, 4).
+        begin, end: derivatives at the first and at the last time.
     """
     ends = begin or at_rest(), end or at_rest()
     spans = np.diff(np.asarray(times_s, float))
@@ -190,7 +194,7 @@ def minimum_snap(
     diagonals, b = np.zeros((m * size, BELOW + 1 + ABOVE)), np.zeros((m * size, 4))
 
     def put(row: int, piece: int, values: Array, first: int = 0) -> None:
-        """Write a row's entries for the coefficients of a piece from t^first on."""
+        """Write a row's entries for the coefficients of a piece, from that of t^`first` on."""
         at = piece * size + first - row + BELOW
         diagonals[row, at : at + len(values)] = values
 
@@ -228,12 +232,13 @@ def move(
     begin: EndMotion | None = None,
     end: EndMotion | None = None,
 ) -> PiecewisePolynomial:
-    """Return the minimum-snap path from one position and yaw (4,) to another within limits, turning the shorter way.
+    """Return the minimum-snap path within limits from one position and yaw (4,) to another, turning the shorter way.
 
-    It lasts over_s, or longer if the limits require. It begins and ends at rest or in the given motions.
+    It lasts `over_s`, or longer if the limits require it. It begins and ends at rest or in the given motions.
 
     Raises:
-        TrajectoryError: no path of less than an hour satisfies the limits, usually since an end's motion exceeds them.
+        TrajectoryError: no path of less than an hour satisfies the limits, usually since the motion at an end exceeds
+            them.
     """
     turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
     places = np.array([start, [*goal[:3], turned]])
@@ -241,7 +246,7 @@ def move(
         unit = minimum_snap((0.0, 1.0), places).peaks().factor(limits)
         return minimum_snap((0.0, max(over_s, LEAST_S, round_up(unit))), places)
     length_s = max(over_s, LEAST_S)
-    while length_s < MOVE_MAX_S:  # no factor exists: the motions at the ends do not scale
+    while length_s < MOVE_MAX_S:  # by search: the given motions do not scale with the duration
         path = minimum_snap((0.0, length_s), places, begin, end)
         if path.peaks().factor(limits) <= 1.0:
             return path
@@ -279,7 +284,7 @@ class Scaled:
 
 
 def peaks_of(path: Reference) -> Peaks:
-    """Return the peaks of a path: its own if it has any, or else found by sampling and refinement."""
+    """Return the peaks of a path: from its own method if it has one, otherwise by sampling and refinement."""
     own: Callable[[], Peaks] | None = getattr(path, "peaks", None)
     if own is not None:
         return own()
@@ -313,7 +318,7 @@ def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -
 
 
 def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
-    """Return a circle around the origin, counter-clockwise from (radius, 0), which climbs by climb_m per lap."""
+    """Return a circle around the origin, counter-clockwise from (radius, 0); a helix if `climb_m` per lap is not 0."""
 
     def at(angle: float) -> tuple[Array, Array]:
         c, s, rise = radius_m * el.cos(angle), radius_m * el.sin(angle), climb_m / math.tau
@@ -323,7 +328,7 @@ def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
 
 
 def figure_eight(length_m: float, width_m: float) -> Curve:
-    """Return the lemniscate of Gerono with its length along x, starting at its crossing, the origin."""
+    """Return the lemniscate of Gerono with its length along x, starting at the crossing, which is the origin."""
 
     def at(angle: float) -> tuple[Array, Array]:
         x, y = length_m / 2.0, width_m / 2.0
@@ -334,9 +339,9 @@ def figure_eight(length_m: float, width_m: float) -> Curve:
 
 
 class Laps:
-    """A curve flown for a number of laps of period_s each, from rest to rest; RAMP adds a quarter of a period.
+    """A curve flown for a number of laps of `period_s` each, from rest to rest; the ramps add RAMP periods in total.
 
-    The angular rate follows a quintic at both ends, so that acceleration and jerk are zero there as well.
+    In the ramp at either end the angular rate is a quintic, so that acceleration and jerk are zero at the ends as well.
     """
 
     def __init__(self, curve: Curve, period_s: float, laps: float) -> None:
@@ -357,7 +362,7 @@ class Laps:
         return place, slope * rate
 
     def _begun(self, t: float) -> tuple[float, float]:
-        """Return the angle [rad] and angular rate [rad/s] at a time t [s] after the start from rest."""
+        """Return the angle [rad] and angular rate [rad/s] at a time `t` [s] after the start from rest."""
         s = t / self._ramp_s
         if s >= 1.0:
             return self._rate * (t - 0.5 * self._ramp_s), self._rate

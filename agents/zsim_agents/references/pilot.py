@@ -1,6 +1,6 @@
-"""The pilot of one drone with its own reference: take-off, tracking by velocity commands, landing, requests.
+"""The pilot of one drone with its own reference: it takes off, tracks the reference by velocity commands, and lands.
 
-The flight is a function of simulated time and of the newest request on `drone/{d}/control`:
+Until the first request on `drone/{d}/control`, it flies as the scenario states. Requests:
 
 takeoff, land
 hold: come to rest and hover
@@ -49,7 +49,7 @@ REQUESTS_MAX = 1000  # maximum number of requests between two gates, as for a co
 PLAIN = ("takeoff", "land", "hold")
 OPERATIONS = (*PLAIN, "goto", "follow")
 OF_EXPRESSIONS = ("constants", "duration_s")
-FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # a reference's other fields are for scenarios
+FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # its other fields only make sense in a scenario
 
 
 class ReferencePilot(Agent):
@@ -92,7 +92,7 @@ class ReferencePilot(Agent):
         if self._state in AIRBORNE:
             self._has_flown = self._has_flown or not self._is_over
         elif self._has_flown and self._state in ("landed", "emergency"):
-            self._is_over = True  # whoever landed the drone: it takes off again only on request
+            self._is_over = True  # regardless of who landed the drone: it takes off again only on request
         if not self._is_over:
             outputs += self._commands(t_ns, t_s)
         place, rate = self._flight.value(t_s)
@@ -129,7 +129,7 @@ class ReferencePilot(Agent):
             return self._mode(t_ns, "land")
         estimate = self._estimate
         if estimate is None or t_ns - estimate.t_ns > AGE_MAX_S * 1e9:
-            return []  # without commands the firmware soon holds the drone's position
+            return []  # without commands, the firmware soon holds the position by itself
         velocity, yaw_rate = self._velocity(t_s, estimate, (t_ns - estimate.t_ns) * 1e-9)
         return [self.command(t_ns, self._drone, Velocity(0, 0, "", velocity, yaw_rate, "world"))]
 
@@ -142,7 +142,7 @@ class ReferencePilot(Agent):
         return velocity_towards(place.tolist(), ahead.tolist(), here, self._limits, self._settings)
 
     def _mode(self, t_ns: int, mode: Any) -> list[Output]:
-        """Return a mode command, or nothing within RESEND_S of the last one."""
+        """Return a mode command, or nothing if the last one was sent less than RESEND_S ago."""
         if t_ns - self._mode_ns < RESEND_S * 1e9:
             return []
         self._mode_ns = t_ns
@@ -195,7 +195,7 @@ class ReferencePilot(Agent):
         return {"from_s": t_s, "until_s": flight.duration_s}
 
     def _requests_of_gate(self, t_ns: int) -> list[Output]:
-        """Return the requests since the last gate as outputs for the record."""
+        """Return the requests answered since the last gate as outputs, so that they are recorded."""
         answered, self._answered = self._answered, []
         return [
             Output(
@@ -248,7 +248,7 @@ def _vector(place: Array) -> tuple[float, float, float]:
 
 
 class DroneRequestError(ValueError):
-    """A request that is invalid or cannot be carried out now; the text names the field, the finding and the remedy."""
+    """A request is invalid or cannot be carried out now; the text states the field, the finding and the remedy."""
 
 
 class Goto(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -310,7 +310,7 @@ def _unused(asked: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
 
 
 def requested_flight(asked: Any, t_s: float, place: Array, rate: Array, drone: Drone, limits: PathLimits) -> Flight:
-    """Return the flight requested at t_s, which begins with the present position and its rate, both (4,).
+    """Return the flight requested at `t_s`; it begins with the current position and rate, both (4,).
 
     Raises:
         FlightError: the flight is impossible.

@@ -1,1 +1,1 @@
-"""The AR.Drone 2.0 in both directions: drones of a run as AR.Drones, and a real aircraft as a drone of a run."""
+"""The AR.Drone 2.0's protocol in both directions: presents a run's drones as AR.Drones, and a real one to a run."""

@@ -1,9 +1,9 @@
 """One drone of a run presented as an AR.Drone 2.0: messages and datagrams in, commands and datagrams out. Pure.
 
-`Aircraft` is the session of one aircraft between a run and pilots' programs: its configuration, watchdogs and state.
-`Pilot` carries out their REF and PCMD: it requests modes until they are entered, and repeats a setpoint while it is in
-force; `SetpointSender` converts setpoints for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; clients'
-datagrams.
+`Aircraft` stands between the run and pilots' programs, and holds the aircraft's configuration, watchdogs and state.
+`Pilot` carries out the programs' REF and PCMD: it requests a mode until it is entered, and repeats a setpoint while it
+is in force; `SetpointSender` converts setpoints for the drone. Source: AR.Drone Developer Guide SDK 2.0, 6.6; datagrams
+of existing clients.
 """
 
 import math
@@ -31,9 +31,9 @@ from zsim_bridges.ardrone.navdata import (
 )
 from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, ModeName, OnboardState
 
-WATCHDOG_NS = 50_000_000  # ns without an AT command until the watchdog bit is set (Developer Guide 6.6, COMWDG)
-LAND_AFTER_NS = 2_000_000_000  # chosen; ns of hovering without a pilot's program before the drone lands
-MALFORMED_SHOWN = 20  # chosen; invalid parts of datagrams that are reported; further ones are only counted
+WATCHDOG_NS = 50_000_000  # time without an AT command until the watchdog bit is set (Developer Guide 6.6, COMWDG)
+LAND_AFTER_NS = 2_000_000_000  # time of hovering without a pilot's program after which the drone lands
+MALFORMED_SHOWN = 20  # number of invalid parts of datagrams that are reported in full; further ones are only counted
 LOW_BATTERY_PERCENT = 10.0  # %; zsim's firmware does not take off below this, and lands below 5 %
 RANGE_COSINE = math.cos(math.radians(75.0))  # cosine of the tilt at which the firmware cuts the motors
 THREADS = StateBit.AT_THREAD | StateBit.NAVDATA_THREAD | StateBit.VIDEO_THREAD | StateBit.ACQUISITION_THREAD
@@ -46,20 +46,20 @@ CONTROL_STATES = {
     "landing": ControlState.LANDING,
     "emergency": ControlState.DEFAULT,
 }
-FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 the same with the other inset, 4 the next
+FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 the same with the other camera inset, 4 the next
 NEXT_CHANNEL = 4
-AGAIN_NS = 500_000_000  # ns, chosen; a mode not yet entered is requested again, as a pilot's program repeats REF
-ASKED_MAX = 3  # chosen; requests for a mode before it is abandoned
-PER_GATE = 3  # chosen; maximum number of setpoints sent at once within a gate, since the world takes one per gate
+AGAIN_NS = 500_000_000  # period at which a mode not yet entered is requested again, as a pilot's program repeats REF
+ASKED_MAX = 3  # number of requests after which a mode that is not entered is abandoned; design choice: 1.5 s in all
+PER_GATE = 3  # maximum number of setpoints sent within a gate: the world takes only one per gate
 IN_THE_AIR = ("taking_off", *AIRBORNE)
-NO_ALTITUDE_LIMIT_MM = 100_000  # altitude_max that stands for no limit (ARDroneLib)
-CLIMB_1_S = 1.5  # climb rate per metre left to the maximum height [1/s], as in zsim's firmware
-CALIBRATION_YAW_RAD_S = 1.0  # rad/s, chosen: a turn takes 6 s, as on the real aircraft
+NO_ALTITUDE_LIMIT_MM = 100_000  # value of altitude_max that stands for no limit (ARDroneLib)
+CLIMB_1_S = 1.5  # maximum climb rate per metre below the maximum height [1/s], as in zsim's firmware
+CALIBRATION_YAW_RAD_S = 1.0  # yaw rate of a calibration: a full turn takes 6 s, as on the real aircraft
 FIGURES = "figures are not flown here; the aircraft's flips are its firmware's"
 
 
 class Outlets(NamedTuple):
-    """Outputs of an aircraft: commands to the run, navdata to programs, bytes to the control port, refusals."""
+    """Outputs of an aircraft: commands to the run, navdata to programs, bytes to the control port, and refusals."""
 
     put: Callable[[str, Any], None]
     send_navdata: Send
@@ -68,7 +68,7 @@ class Outlets(NamedTuple):
 
 
 class Aircraft:
-    """One aircraft, flown by its pilots' programs; `gate_ns` is the resolution of arrival times."""
+    """One aircraft, controlled by pilots' programs; `gate_ns` is the resolution of arrival times."""
 
     def __init__(self, drone: Drone, source: str, gate_ns: int, outlets: Outlets) -> None:
         self._name = drone.name
@@ -123,7 +123,7 @@ class Aircraft:
                 self._navdata.on_instant(message.t_ns)
 
     def _watch_pilot(self) -> None:
-        """Hover, and later land, when the pilot's program is silent."""
+        """Hover when the pilot's program falls silent, and land if it stays silent."""
         silent_ns = self._silent_ns()
         lost_ns = round(self.configuration.number("general:com_watchdog") * SECOND_NS)
         if silent_ns <= lost_ns:
@@ -136,7 +136,7 @@ class Aircraft:
             self.pilot.land()
 
     def _silent_ns(self) -> int:
-        """Return the time since the last AT command arrived, less one gate, the resolution of arrival times."""
+        """Return the time since the last AT command, less one gate, the resolution of arrival times [ns]."""
         return 0 if self._command_ns is None else max(0, self._now_ns - self._command_ns - self._gate_ns)
 
     # Pilots' programs
@@ -151,7 +151,7 @@ class Aircraft:
             self._malformed += 1
             self._refuse(refusal if self._malformed <= MALFORMED_SHOWN else "more data that are not AT commands")
         for command in commands:
-            # a program may restart its numbers at 0 or 1, and anywhere after a silence
+            # a program may restart its sequence numbers at 0 or 1 at any time, and anywhere after a silence
             if command.sequence > self._last_sequence or command.sequence in (0, 1) or self._is_lost:
                 self._last_sequence = command.sequence
                 self._command_ns, self._is_lost = self._now_ns, False
@@ -241,12 +241,13 @@ class Aircraft:
 
 
 class TiltSetpoint(NamedTuple):
-    """A PCMD within its limits: fractions of the maximum tilt, climb and yaw rate.
+    """A PCMD clipped to its range: fractions of the maximum tilt, climb rate and yaw rate.
 
     Attributes:
         hover: whether to hover in place, ignoring the fractions.
         right, back, up, clockwise: fractions in [-1, 1].
-        pilot_heading_rad: clockwise from north, if right and back are relative to the pilot; None if to the drone.
+        pilot_heading_rad: the pilot's heading, clockwise from north, to which `right` and `back` are relative; None if
+            they are relative to the drone.
     """
 
     hover: bool
@@ -261,12 +262,12 @@ HOVER = TiltSetpoint(hover=True)
 
 
 class Pilot:
-    """The pilot of one drone.
+    """Carries out the REF and PCMD commands that pilots' programs send to one drone.
 
     Attributes:
-        setpoint: the setpoint in force; None if there is none.
-        has_flown: whether this pilot has flown the drone since it last stood; stopped_by_pilot: whether it caused the
-            emergency.
+        setpoint: the setpoint in force, or None.
+        has_flown: whether this pilot has flown the drone since it last stood on the ground.
+        stopped_by_pilot: whether this pilot caused the emergency.
     """
 
     def __init__(
@@ -278,10 +279,10 @@ class Pilot:
         self._refuse = refuse
         self._status: Status | None = None
         self._held_take_off = self._held_emergency = False  # bits of the last REF
-        self._mode: ModeName | None = None  # the mode to be entered
+        self._mode: ModeName | None = None  # the mode that is requested but not yet entered
         self._mode_ns, self._mode_count = 0, 0
         self.setpoint: TiltSetpoint | None = None
-        self._sent_ns: int | None = None  # when the setpoint was last sent; None while it is new
+        self._sent_ns: int | None = None  # when the setpoint was last sent; None: not yet
         self._gate_ns, self._gate_count = -1, 0
         self._psi_rad: float | None = None  # the pilot's heading in the last PCMD_MAG
         self._calibrated_ns: int | None = None  # when the calibration turn ends
@@ -321,7 +322,7 @@ class Pilot:
     def on_ref(self, ref: Ref) -> None:
         """Take off or land, and toggle the emergency.
 
-        The bits are levels that a pilot's program repeats; rising edges trigger a take-off and the toggle.
+        A pilot's program sends the levels of both bits again and again; rising edges trigger a take-off and the toggle.
         """
         rises = ref.takes_off and not self._held_take_off
         toggles = ref.emergency and not self._held_emergency
@@ -344,7 +345,7 @@ class Pilot:
             self._ask("land")
 
     def on_pcmd(self, pcmd: Pcmd | PcmdMag) -> None:
-        """Fly a PCMD until the next one arrives."""
+        """Follow a PCMD until the next one arrives."""
         if isinstance(pcmd, PcmdMag):
             self._psi_rad = math.pi * share(pcmd.psi)
         if self.state not in IN_THE_AIR or self._mode in ("land", "emergency") or self._is_refused("PCMD"):
@@ -409,7 +410,7 @@ class Pilot:
         self._pursue(mode)
 
     def _pursue(self, mode: ModeName) -> None:
-        """Request a mode until it is entered, abandoned, or no longer possible."""
+        """Request a mode whenever that is due, until it is entered or abandoned."""
         entered = {
             "takeoff": self.state in (*IN_THE_AIR, "emergency"),
             "land": self.state not in IN_THE_AIR,
@@ -450,15 +451,16 @@ class Pilot:
 
 
 class SetpointSender:
-    """Sends setpoints to one drone: fractions of the firmware's limits, in the drone's frame, up to a maximum height.
+    """Sends setpoints to one drone as fractions of its firmware's limits, in its own frame, and limits its height.
 
     Args:
-        limits: the firmware's limits, to which zsim's fractions refer.
-        configuration: holds the limits to which the pilot's fractions refer.
+        limits: the firmware's limits, to which the fractions sent to the drone refer.
+        configuration: holds the limits to which the pilot's fractions refer, and the maximum height.
 
     Attributes:
-        altitude_m, heading_rad: above ground, and clockwise from magnetic north; the caller keeps them up to date.
-        turn_ns: duration of one full turn for the calibration.
+        altitude_m: height above ground, kept up to date by the caller.
+        heading_rad: heading, clockwise from magnetic north, kept up to date by the caller.
+        turn_ns: duration of the full turn of a calibration.
     """
 
     def __init__(self, sender: CommandSender, limits: Limits, configuration: Configuration) -> None:
@@ -498,7 +500,7 @@ class SetpointSender:
         self._sender.velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
 
     def _climb_left_m_s(self) -> float:
-        """Return the maximum climb rate that keeps the drone below altitude_max."""
+        """Return the maximum climb rate with which the drone stays below altitude_max."""
         highest_mm = self._configuration.number("control:altitude_max")
         if highest_mm >= NO_ALTITUDE_LIMIT_MM:
             return math.inf

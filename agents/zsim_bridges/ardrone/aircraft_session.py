@@ -1,4 +1,4 @@
-"""The session with one AR.Drone 2.0: configures it, requests and decodes its navdata, and makes it carry out demands.
+"""The session with one AR.Drone 2.0: it configures the aircraft, requests and decodes navdata, and carries out demands.
 
 Pure. Units and axes of navdata: millidegrees, millimetres, milli-g; x forward, y right, z down; psi clockwise from
 the heading at which the aircraft was switched on. Source: AR.Drone Developer Guide SDK 2.0, chapters 6 to 8.
@@ -47,18 +47,19 @@ from zsim_bridges.vehicle_links.vehicle_session import (
 )
 
 NAVDATA, AT = 0, 1  # channels
-REQUEST_NS = 100_000_000  # chosen as in npm ar-drone; silence after which navdata is requested again
-CONFIG_NS = 500_000_000  # chosen; time without an acknowledgement after which an entry is sent again
-WATCHDOG_NS = 1_000_000_000  # period of watchdog resets, half of the aircraft's com_watchdog
-RESTARTED = 100  # chosen; packets; if the sequence number falls back by more, the aircraft was restarted
-PERIOD_NS = 30_000_000  # the Developer Guide, 6.3, allows at most 30 ms between commands
-CHANGED_NS = 15_000_000  # minimum spacing of changed demands; chosen below a gate, which brings one command
-PULSE_NS = 90_000_000  # chosen: three datagrams carry the emergency bit, of which two may be lost
-PULSES_NS = 400_000_000  # chosen: longer than a pulse takes to show in navdata, since a second one would undo the first
-VELOCITY_1_S = 2.5  # velocity gain; chosen: 46 deg of phase margin with 0.14 s of delay and 0.14 s of tilt lag
-INTEGRAL_1_S2 = 2.0  # integral gain; chosen: as fast as that margin allows; gusts last some seconds
-DRAG_1_S = 0.58  # 1/s, deceleration by drag per speed (tum_ardrone's model, fitted to flights)
-STEP_S_MAX = 0.1  # s; a longer pause is integrated only up to this
+REQUEST_NS = 100_000_000  # silence after which navdata is requested again, as in npm ar-drone
+CONFIG_NS = 500_000_000  # time without an acknowledgement after which an entry is sent again
+WATCHDOG_NS = 1_000_000_000  # period of watchdog resets: half of the aircraft's com_watchdog
+RESTARTED = 100  # packets; a sequence number that falls back by at least this much shows that the aircraft restarted
+PERIOD_NS = 30_000_000  # maximum time between commands (Developer Guide, 6.3)
+CHANGED_NS = 15_000_000  # minimum time between changed demands; design choice: below a gate, which brings one command
+PULSE_NS = 90_000_000  # duration of an emergency pulse: three datagrams carry the bit, so two of them may be lost
+# Minimum time between emergency pulses: longer than one takes to show in navdata, since a second would undo the first
+PULSES_NS = 400_000_000
+VELOCITY_1_S = 2.5  # velocity gain; tuned: 46 deg of phase margin with 0.14 s of delay and 0.14 s of tilt lag
+INTEGRAL_1_S2 = 2.0  # integral gain; tuned: as fast as that margin allows, since gusts last only a few seconds
+DRAG_1_S = 0.58  # deceleration by drag per unit of speed (tum_ardrone's model, fitted to flights)
+STEP_S_MAX = 0.1  # maximum time step of the integration; longer pauses count as this long
 ANSWER_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
 HOVER = Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0)  # flag 0: hold the position
 STATES: dict[int, DroneState] = {
@@ -70,15 +71,15 @@ STATES: dict[int, DroneState] = {
     ControlState.LOOPING: "flying",
 }
 OPTIONS_MASK = sum(1 << tag for tag in (*FULL_TAGS, GPS_TAG))
-SONAR_MM = range(30, 6000)  # mm; values outside mean that there was no echo
-GPS_1_S = 0.1  # 1/s, chosen; rate at which the position follows the GPS, whose 2 m of noise at 5 Hz become 0.3 m
-YAW_1_S = 0.1  # 1/s, chosen; rate at which the heading follows the magnetometer
-GAP_S_MAX = 0.5  # s; longer gaps are not integrated
+SONAR_MM = range(30, 6000)  # valid readings; any other value means that there was no echo
+GPS_1_S = 0.1  # rate at which the position follows the GPS; design choice: reduces 2 m of noise at 5 Hz to 0.3 m
+YAW_1_S = 0.1  # rate at which the heading follows the magnetometer
+GAP_S_MAX = 0.5  # gap in navdata from which on the velocity is not integrated
 
 
-# The aircraft's settings; the limits are the SDK's: outdoor tilt and climb, indoor yaw rate
+# Limits set in the aircraft: the SDK's outdoor tilt and climb rate, and its indoor yaw rate
 TILT_RAD, CLIMB_M_S, YAW_RATE_RAD_S = 0.35, 1.0, 1.75
-SETTINGS = {  # `outdoor` comes first, since it replaces the limits
+SETTINGS = {  # `outdoor` precedes the limits, since setting it replaces them
     "general:navdata_demo": "FALSE",
     "general:navdata_options": str(OPTIONS_MASK),
     "control:outdoor": "TRUE",
@@ -146,7 +147,7 @@ class AircraftSession(VehicleSession):
         if demo is not None:
             self._battery = float(min(100, demo.battery_percent))
             self._state = STATES.get(demo.ctrl_state >> 16, "landed")
-        elif StateBit.FLYING not in packet.state:  # a bootstrap packet, such as after a restart
+        elif StateBit.FLYING not in packet.state:  # without options, such as a bootstrap packet after a restart
             self._state = "landed"
         if StateBit.EMERGENCY in packet.state:
             self._state = "emergency"
@@ -169,7 +170,7 @@ class AircraftSession(VehicleSession):
             yield AT, datagram
 
     def _set_up(self, now_ns: int) -> Iterator[Command]:
-        """Yield the next configuration entry; a state bit acknowledges each, and is cleared before the next is sent."""
+        """Yield what the set-up needs next; an entry's acknowledgement is cleared before the next entry is sent."""
         if self._received_ns is None:
             return
         acknowledged = StateBit.COMMAND_ACK in self._bits
@@ -192,9 +193,9 @@ class AircraftSession(VehicleSession):
 
 
 class FlightCommands:
-    """The AT commands that make one aircraft carry out demands, without sequence numbers.
+    """Generates the AT commands that make one aircraft carry out demands; sequence numbers are left at 0.
 
-    REF commands a take-off or a landing, and is repeated while that is demanded; PCMD is sent every 30 ms.
+    REF commands a take-off or a landing, and is repeated while that is demanded; PCMD is sent at least every 30 ms.
     Source: AR.Drone Developer Guide SDK 2.0, chapter 6.
     """
 
@@ -205,7 +206,7 @@ class FlightCommands:
         self._rose_ns = -PULSES_NS  # when the emergency bit last rose
 
     def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
-        """Yield the commands that are due; `emergency` and `pose` are the aircraft's."""
+        """Yield the commands that are due; `emergency` states whether the aircraft is in an emergency."""
         if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGED_NS):
             return
         self._last, self._sent_ns = demand, now_ns
@@ -226,13 +227,13 @@ class FlightCommands:
                 yield self._pcmd(now_ns, demand, pose)
 
     def _toggle(self, now_ns: int, due: bool) -> Command:
-        """Return the next REF of a pulse of the emergency bit; the aircraft obeys the rising edge."""
+        """Return the next REF of a pulse of the emergency bit, begun if `due`; the aircraft obeys the rising edge."""
         if due and now_ns - self._rose_ns >= PULSES_NS:
             self._rose_ns = now_ns
         return at_commands.ref(0, takes_off=False, emergency=now_ns - self._rose_ns < PULSE_NS)
 
     def _pcmd(self, now_ns: int, demand: Demand, pose: AircraftPose | None) -> Command:
-        """Return the command for a velocity; tilts are fractions of the limits in the aircraft's configuration."""
+        """Return the PCMD for a demand; its values are fractions of the limits in the aircraft's configuration."""
         if demand.action != "fly" or pose is None:
             self._axes = _Axis(), _Axis()
             return HOVER
@@ -249,8 +250,8 @@ class FlightCommands:
 class _Axis:
     """A velocity loop along one axis of W, around the aircraft's own tilt loop.
 
-    The velocity follows a reference that approaches the demand with a lag. Its deviation from the reference of
-    ANSWER_NS ago, to which it now responds, is attributed to wind, and is integrated.
+    The velocity follows a reference that approaches the demand with a lag. The measured velocity responds to the
+    reference of ANSWER_NS ago; any deviation from that is attributed to wind, and is integrated.
     """
 
     def __init__(self) -> None:
@@ -260,7 +261,7 @@ class _Axis:
         self._references: deque[tuple[int, float]] = deque()
 
     def accel(self, now_ns: int, wanted: float, measured: float, most_m_s2: float) -> float:
-        """Return the acceleration [m/s^2] that the tilt has to produce; wind is integrated only below `most_m_s2`."""
+        """Return the acceleration [m/s^2] that the tilt must produce; from `most_m_s2` on, wind is not integrated."""
         dt_s = 0.0 if self._then_ns is None else min(STEP_S_MAX, (now_ns - self._then_ns) * 1e-9)
         if self._then_ns is None:
             self._reference = measured
@@ -279,12 +280,12 @@ class _Axis:
 
 
 class NavdataReadings(AircraftReadings):
-    """The measurements of one aircraft, and its position integrated since the start.
+    """The measurements of one aircraft, and its position, integrated from its velocity since the start.
 
     Args:
-        origin: origin of W: latitude, longitude [deg], height [m].
+        origin: latitude and longitude [deg] and height [m] of the origin of W.
         position_m: the aircraft's position at the start [W].
-        field_ut: the Earth's magnetic field [uT; W], which gives the heading.
+        field_ut: the Earth's magnetic field [uT; W], from which the heading is determined.
         yaw_rad: the aircraft's heading at the start; None to take it from the magnetometer.
     """
 
@@ -326,7 +327,7 @@ class NavdataReadings(AircraftReadings):
             self._on_gps(gps, taken_ns)
 
     def _on_demo(self, demo: Any, options: dict[int, Any], taken_ns: int) -> None:
-        """Integrate the aircraft's own velocity, which is relative to its heading."""
+        """Update the pose, integrating the velocity that the aircraft measures relative to its heading."""
         roll, pitch = math.radians(demo.phi_mdeg / 1e3), -math.radians(demo.theta_mdeg / 1e3)
         yaw = -math.radians(demo.psi_mdeg / 1e3)
         dt_s = 0.0 if self._then_ns is None else (taken_ns - self._then_ns) * 1e-9
@@ -348,7 +349,7 @@ class NavdataReadings(AircraftReadings):
         self.read("flow", taken_ns, own, 1.0)
 
     def _align(self, yaw: float, magnetic: float, dt_s: float) -> None:
-        """Let the heading follow the magnetometer slowly, unless the initial heading was given."""
+        """Let the heading slowly follow the magnetometer, unless the initial heading was given."""
         if self._stated_yaw_rad is not None:
             if self._yaw_offset_rad is None:
                 self._yaw_offset_rad = self._stated_yaw_rad - yaw
@@ -372,5 +373,5 @@ class NavdataReadings(AircraftReadings):
 
 
 def _flipped(v: Any) -> Vector:
-    """Convert a body vector from forward, right, down to B."""
+    """Convert a body vector from axes forward, right, down to B."""
     return float(v[0]), -float(v[1]), -float(v[2])

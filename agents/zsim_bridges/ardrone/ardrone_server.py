@@ -1,6 +1,6 @@
-"""`zsim ardrone serve`: presents the drones of a run as AR.Drones, each with the ports on an address of its own.
+"""`zsim ardrone serve`: presents the drones of a run as AR.Drones, each with all of its ports on its own address.
 
-The FTP server offers what SDK programs use of the aircraft's: anonymous login, passive mode, one file `version.txt`.
+The FTP servers offer only what SDK programs use: anonymous login, passive mode, and the file `version.txt`.
 Source: RFC 959; ARDroneLib, ardrone_ftp.c and its check of the firmware's version.
 """
 
@@ -31,18 +31,18 @@ from zsim_bridges.vehicle_links.server import PictureServer, Say
 
 AUTHENTICATION_PORT = 5552  # UDP, on which programs look for drones (ARDroneLib, config.h)
 QUESTION, ANSWER = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
-BACKLOG_MAX = 500_000  # chosen; unsent bytes of a connection, some seconds; beyond this it waits for an IDR frame
-NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # errors of a port below 1024 without a privilege
-CONNECTIONS_MAX = 8  # chosen; simultaneous connections per port, of which a pilot's program needs one
-LINE_MAX = 512  # chosen; bytes in a line
-BROKEN = (OSError, EOFError, TimeoutError, ValueError)  # errors of a broken connection, and of an overlong line
+BACKLOG_MAX = 500_000  # unsent bytes, a few seconds of video, beyond which a connection skips to the next IDR frame
+NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # errors of opening a port below 1024 without the privilege to do so
+CONNECTIONS_MAX = 8  # maximum simultaneous connections per port; design choice: a pilot's program needs only one
+LINE_MAX = 512  # maximum length of a line [bytes]
+BROKEN = (OSError, EOFError, TimeoutError, ValueError)  # errors of a broken connection or an overlong line
 Address = tuple[str, int]
 Refuse = Callable[[str], None]
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
-VERSION_PORT, FILES_PORT = 5551, 21  # TCP ports of the version and of videos (ARDroneLib, config.h)
+VERSION_PORT, FILES_PORT = 5551, 21  # TCP ports for FTP: of the version, and of videos (ARDroneLib, config.h)
 VERSION_FILES = {"version.txt": b"2.4.8\r\n"}  # the newest firmware of an AR.Drone 2.0
-DATA_WITHIN_S = 10.0  # chosen; s of wall time within which a client must open the data connection
-IDLE_S = 300.0  # chosen; s of wall time without a command after which a connection is closed
+DATA_WITHIN_S = 10.0  # wall time within which a client must open the data connection
+IDLE_S = 300.0  # wall time without a command after which a connection is closed
 _FIXED = {
     "USER": "230 logged in",
     "PASS": "230 logged in",
@@ -58,7 +58,12 @@ _FIXED = {
 
 
 class ArdroneOptions(NamedTuple):
-    """How the drones are offered; `addresses` as in `drone_addresses`, `peers` are obeyed on non-loopback addresses."""
+    """How the drones are presented.
+
+    Attributes:
+        addresses: the text that `drone_addresses` reads.
+        peers: hosts that are obeyed on addresses other than loopback.
+    """
 
     addresses: str
     peers: frozenset[str]
@@ -66,10 +71,10 @@ class ArdroneOptions(NamedTuple):
 
 
 class ArdroneServer(PictureServer):
-    """One run's drones as AR.Drones.
+    """Presents the drones of one run as AR.Drones.
 
     Raises:
-        RunError: an address is invalid, or may not be offered.
+        RunError: an address is invalid, or could be reached by hosts that are not named as peers.
     """
 
     options: ArdroneOptions
@@ -104,7 +109,7 @@ class ArdroneServer(PictureServer):
 
     def forward(self, key: str, payload: bytes) -> None:
         kind, thing, leaf = keys.parts(key)
-        # an aircraft's electronics know the sensor data, the estimate, and the rotor speeds
+        # what an aircraft's electronics know: the sensor data, the estimate, and the rotor speeds in the truth
         is_onboard = leaf.startswith("sensor/") or leaf in ("estimate", "truth")
         if not (kind == "drone" and thing in self._drones and is_onboard):
             self.on_run(key, payload)
@@ -129,7 +134,7 @@ class ArdroneServer(PictureServer):
         _, thing, what = keys.parts(event.subject)
         drone = self._drones.get(thing)
         is_overtaken = what != "cmd/mode" and drone is not None and drone.aircraft.pilot.setpoint is None
-        if not is_overtaken:  # the refusal of a setpoint is expected at the gate in which a landing begins
+        if not is_overtaken:  # at the gate in which a landing begins, a setpoint is expected to be refused
             self.refuse(f"{event.subject}: {event.data.get('reason', event.text)}")
 
 
@@ -173,7 +178,7 @@ class DroneServer:
                     errno.EADDRNOTAVAIL: "the address is not this host's; give one that is, as --addresses",
                 }.get(error.errno or 0, error.strerror or str(error))
                 raise RunError(f"{self._name}: {kind} port {port} of {self.address} cannot be had: {why}") from error
-        try:  # optional: few programs use this port, and it needs a privilege
+        try:  # optional, since few programs use this port and opening it needs a privilege
             await self._files.open(self.address, FILES_PORT)
         except OSError as error:
             why = "needs a privilege" if error.errno in NOT_PERMITTED else error.strerror
@@ -199,7 +204,7 @@ class VideoServer:
     def __init__(self, peers: "AllowedHosts", refuse: Refuse) -> None:
         self._refuse = refuse
         self.port = StreamPort(peers, self._serve, refuse)
-        self._ready: set[asyncio.StreamWriter] = set()  # received an IDR frame and all frames since
+        self._ready: set[asyncio.StreamWriter] = set()  # those sent an IDR frame and all frames since
         self._newest: CameraImage | None = None
         self._busy: asyncio.Task[None] | None = None
         self._encoder: VideoEncoder | None = None
@@ -260,7 +265,7 @@ class VideoServer:
 
 
 class FileServer:
-    """An FTP server with `files`, given as contents by name."""
+    """An FTP server that offers `files`, given as contents by name."""
 
     def __init__(self, address: str, peers: "AllowedHosts", files: dict[str, bytes], refuse: Refuse) -> None:
         self._address = address
@@ -336,7 +341,7 @@ def _reply(writer: asyncio.StreamWriter, text: str) -> None:
 
 
 class DatagramPort(asyncio.DatagramProtocol):
-    """A UDP port: `take` is called with each datagram from a peer and its address; others are refused."""
+    """A UDP port: `take` is called with each datagram from a peer and its source address; others are refused."""
 
     def __init__(self, peers: "AllowedHosts", take: Callable[[bytes, Address], None], refuse: Refuse) -> None:
         self._peers = peers
@@ -345,7 +350,7 @@ class DatagramPort(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
 
     async def open(self, address: str, port: int) -> int:
-        """Bind the port; return its number, which the system chooses for 0.
+        """Bind the port; return its number, which the system chooses if `port` is 0.
 
         Raises:
             OSError: the port is taken, or the address is not this host's.
@@ -370,7 +375,7 @@ class DatagramPort(asyncio.DatagramProtocol):
 
 
 class StreamPort:
-    """A TCP port: `serve` serves one connection of a peer until it ends; `writers` are those of all connections."""
+    """A TCP port: `serve` handles one connection of a peer until it ends; `writers` are those of all connections."""
 
     def __init__(self, peers: "AllowedHosts", serve: Serve, refuse: Refuse) -> None:
         self._peers = peers
@@ -381,10 +386,10 @@ class StreamPort:
         self.writers: set[asyncio.StreamWriter] = set()
 
     async def open(self, address: str, port: int) -> int:
-        """Listen on the port; return its number, which the system chooses for 0.
+        """Listen on the port; return its number, which the system chooses if `port` is 0.
 
         Raises:
-            OSError: the port is taken, or needs a privilege.
+            OSError: the port is taken or needs a privilege, or the address is not this host's.
         """
         self._server = await asyncio.start_server(self._accept, address, port, limit=LINE_MAX)
         return self._server.sockets[0].getsockname()[1]
@@ -425,16 +430,16 @@ class StreamPort:
 
 
 async def read_until_end(reader: asyncio.StreamReader, _: asyncio.StreamWriter) -> None:
-    """Serve a connection whose peer only listens; received data are dropped."""
+    """Keep open a connection on which the peer should only listen; received data are dropped."""
     while await reader.read(LINE_MAX):
         pass
 
 
 class AllowedHosts:
-    """The peers obeyed on an address: on loopback every program on this host, otherwise the named hosts.
+    """The hosts obeyed on an address: on a loopback address every program on this host, otherwise the named hosts.
 
     Raises:
-        RunError: the address is not loopback, and no host is named.
+        RunError: the address is not a loopback address, and no host is named.
     """
 
     def __init__(self, address: str, named: frozenset[str]) -> None:
@@ -454,11 +459,12 @@ def drone_addresses(text: str, drones: Sequence[str]) -> dict[str, str]:
     """Return the address of each drone that has one.
 
     Args:
-        text: the first drone's address, which is counted up for the others; or DRONE=ADDRESS, separated by commas.
-        drones: the run's drones, in its order.
+        text: the first drone's address, incremented for each further one; or DRONE=ADDRESS pairs, separated by commas.
+        drones: names of the run's drones, in the run's order.
 
     Raises:
-        RunError: `text` has neither form, names a drone that is not in the run, or gives an address twice.
+        RunError: `text` has neither form, names a drone that is not in the run, gives an address twice, or leaves too
+            few addresses.
     """
     addresses: dict[str, str] = {}
     if "=" in text:
@@ -487,7 +493,7 @@ def _address(text: str) -> ipaddress.IPv4Address:
 
 
 def peer_addresses(hosts: Iterable[str]) -> frozenset[str]:
-    """Return the addresses of the hosts that are obeyed.
+    """Return the IPv4 addresses of hosts given by name or address.
 
     Raises:
         RunError: a name has no address.

@@ -4,11 +4,11 @@ A datagram holds one or more complete commands `AT*NAME=sequence,argument,...\r`
 quoted, and a float is written as the signed integer with the same 32 bits.
 
 In addition to the common configuration, each application, user (`profile`) and session has its own values, stored under
-an identifier, for the entries of its category. Writing an identifier to an entry of `custom` makes it the current one;
-a new identifier starts with the defaults. The aircraft sends its configuration on the control port, TCP 5559: a line
-`section:key = value\n` per entry, then a zero byte. The list of custom configurations has the blocks `[applis]`,
-`[profiles]` and `[sessions]`, with a line `id,description` per configuration; lines end in `\r`, the list in a
-zero byte.
+an identifier, for the entries of its category. Writing an identifier to an entry of section `custom` makes it the
+current one; a new identifier starts with the defaults. The aircraft sends its configuration on the control port, TCP
+5559: a line `section:key = value\n` per entry, then a zero byte. The list of custom configurations has the blocks
+`[applis]`, `[profiles]` and `[sessions]`, with a line `id,description` per configuration; each line ends in `\r`, and
+the list in a zero byte.
 
 Source: AR.Drone Developer Guide SDK 2.0, chapters 6 and 8; ARDroneLib (SDK 2.0.1), ardrone_api.c, config_keys.h,
 ardrone_control.c and ardrone_control_configuration.c.
@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 PORT = 5556  # UDP (ARDroneLib, config.h)
-DATAGRAM_MAX = 8192  # bytes; chosen: eight commands of maximum length
+DATAGRAM_MAX = 8192  # bytes; design choice: eight commands of maximum length
 COMMAND_MAX = 1024  # characters in a command, including its terminator (Developer Guide 6.1)
 REF_CONSTANT = 0x1154_0000  # bits 18, 20, 22, 24, 28, which are always set (Developer Guide 6.6)
 TAKE_OFF_BIT, EMERGENCY_BIT = 1 << 9, 1 << 8  # bits of a REF (Developer Guide 6.6)
@@ -34,7 +34,7 @@ IGNORED_NAMES = frozenset(
 
 
 class Ref(NamedTuple):
-    """Take-off or landing, and the emergency toggle."""
+    """Take off or land, and toggle the emergency."""
 
     sequence: int
     bits: int
@@ -49,7 +49,7 @@ class Ref(NamedTuple):
 
 
 class Pcmd(NamedTuple):
-    """Flight demands as fractions of the limits, in [-1, 1]: roll right, pitch backward, gaz up, yaw clockwise."""
+    """Fly with fractions of the limits, in [-1, 1]: `roll` right, `pitch` backward, `gaz` up, `yaw` clockwise."""
 
     sequence: int
     flag: int
@@ -60,7 +60,7 @@ class Pcmd(NamedTuple):
 
 
 class PcmdMag(NamedTuple):
-    """Like Pcmd, in the pilot's frame: psi is the controller's heading clockwise from north, a fraction of 180 deg."""
+    """Like Pcmd, in the pilot's frame: `psi` is the controller's heading clockwise from north, divided by 180 deg."""
 
     sequence: int
     flag: int
@@ -79,14 +79,14 @@ class FlatTrim(NamedTuple):
 
 
 class Calibrate(NamedTuple):
-    """Calibrate a device; 0 is the magnetometer."""
+    """Calibrate a device: 0, the magnetometer."""
 
     sequence: int
     device: int
 
 
 class ConfigIds(NamedTuple):
-    """The identifiers to which the next Config applies."""
+    """State the identifiers to which the next Config applies."""
 
     sequence: int
     session: str
@@ -95,7 +95,7 @@ class ConfigIds(NamedTuple):
 
 
 class Config(NamedTuple):
-    """Set an entry of the configuration, `section:key`."""
+    """Set an entry of the configuration; `key` has the form `section:key`."""
 
     sequence: int
     key: str
@@ -117,7 +117,7 @@ class ResetWatchdog(NamedTuple):
 
 
 class Led(NamedTuple):
-    """Play an animation of the LEDs."""
+    """Play an LED animation."""
 
     sequence: int
     animation: int
@@ -164,14 +164,14 @@ _SEQUENCE_MAX = 2**32 - 1
 
 
 class Parsed(NamedTuple):
-    """The commands of a datagram in order, and an error text for each invalid part."""
+    """The commands of a datagram, in order, and an error text for each invalid part."""
 
     commands: list[Command]
     refusals: list[str]
 
 
 class _RefusalError(ValueError):
-    """A part of a datagram is not a valid command; the message says why."""
+    """A part of a datagram is not a valid command; the message states why."""
 
 
 def parse(datagram: bytes) -> Parsed:
@@ -240,12 +240,12 @@ def _shown(part: bytes) -> str:
 
 
 def float_of_bits(bits: int) -> float:
-    """Return the float that has the same 32 bits as a signed integer."""
+    """Return the float with the same 32 bits as a signed integer."""
     return _FLOAT.unpack(_BITS.pack(bits))[0]
 
 
 def bits_of_float(value: float) -> int:
-    """Return the signed integer that has the same 32 bits as a float."""
+    """Return the signed integer with the same 32 bits as a float."""
     return _BITS.unpack(_FLOAT.pack(value))[0]
 
 
@@ -261,7 +261,7 @@ def format_command(command: Command) -> bytes:
 
 
 def ref(sequence: int, takes_off: bool, emergency: bool = False) -> Ref:
-    """Return a REF with the bits that are always set."""
+    """Return a REF that includes the bits that are always set."""
     bits = REF_CONSTANT | (TAKE_OFF_BIT if takes_off else 0) | (EMERGENCY_BIT if emergency else 0)
     return Ref(sequence, bits)
 
@@ -269,13 +269,13 @@ def ref(sequence: int, takes_off: bool, emergency: bool = False) -> Ref:
 CONTROL_PORT = 5559  # TCP (ARDroneLib, config.h)
 TEXT_MAX = 128  # characters in a value (Developer Guide 8.1)
 DEFAULT_ID = "00000000"  # initial identifier at each level (Developer Guide 8.1)
-KEPT_MAX = 64  # chosen; configurations kept per level, since a client may invent any number of identifiers
+KEPT_MAX = 64  # maximum number of configurations kept per level, since clients may invent any number of identifiers
 END = b"\0"
 _BLOCKS = ("applis", "profiles", "sessions")
 _ID = re.compile(r"[0-9A-Za-z]{1,32}")
 Category = Literal["common", "application", "user", "session"]
 _LEVELS: dict[str, Category] = {"application": "application", "profile": "user", "session": "session"}
-"""Categories by the names that the entries of `custom` use for them."""
+"""Categories by the names that the entries of section `custom` use for them."""
 
 
 class ConfigurationEntry(NamedTuple):
@@ -289,7 +289,7 @@ class ConfigurationEntry(NamedTuple):
 
 
 LIMITS = ("euler_angle_max", "control_vz_max", "control_yaw")
-"""Limits of tilt [rad], climb [mm/s] and yaw rate [rad/s], of which the aircraft keeps an indoor and an outdoor set."""
+"""Limits of tilt [rad], climb rate [mm/s] and yaw rate [rad/s]; the aircraft keeps an indoor and an outdoor set."""
 _ALTITUDE = "20|100000"  # mm; the maximum stands for no limit (ARDroneLib)
 _TILT, _CLIMB, _YAW = "0|0.52", "200|2000", "0.7|6.11"  # ranges in rad, mm/s and rad/s (Developer Guide 8.6)
 _CODE = "0|255"  # codecs, modes and channels, each as one byte
@@ -389,21 +389,21 @@ gps:longitude|number|session|500|-1000|1000
 gps:altitude|number|session|0|-1e5|1e5
 """
 ENTRIES: dict[str, ConfigurationEntry] = {}
-"""Entries by `section:key`, except for the identifiers and descriptions of `custom`."""
+"""Entries by `section:key`, without the identifiers and descriptions of section `custom`."""
 for _name, _kind, _category, _default, *_range in (line.split("|") for line in _TABLE.split("\n") if line):
     ENTRIES[_name] = ConfigurationEntry(_kind, _category, _default, *map(float, _range))  # type: ignore[arg-type]
 
 
 class ConfigurationError(ValueError):
-    """The setting of an entry is refused; the message says why."""
+    """An entry may not be set in this way; the message states why."""
 
 
 class Configuration:
     """The values of all entries.
 
     Args:
-        highest: upper limits of the aircraft's values, for entries where they are below the SDK's.
-        fixed: values specific to this aircraft.
+        highest: the aircraft's own maxima, by entry, where they are below the SDK's.
+        fixed: values specific to this aircraft, by entry.
     """
 
     def __init__(self, highest: Mapping[str, float], fixed: Mapping[str, str]) -> None:
@@ -414,7 +414,7 @@ class Configuration:
         self._current: dict[Category, str] = dict.fromkeys(_LEVELS.values(), DEFAULT_ID)
 
     def text(self, key: str) -> str:
-        """Return the value of an entry as text, limited to what the aircraft can fly."""
+        """Return the value of an entry as text, limited to what the aircraft is capable of."""
         entry = ENTRIES[key]
         value = self._values(entry).get(key, entry.default)
         high = self._highest.get(key)
@@ -427,7 +427,7 @@ class Configuration:
         return self.text(key) == "TRUE"
 
     def all(self) -> dict[str, str]:
-        """Return all entries, those of `custom` last."""
+        """Return the values of all entries, those of section `custom` last."""
         custom: dict[str, str] = {}
         for name, level in _LEVELS.items():
             current = self._current[level]
@@ -504,7 +504,7 @@ class Configuration:
 
 
 def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
-    """Return a value in its stored form, with numbers clipped to their range."""
+    """Return a value in its stored form, a number clipped to its range."""
     if entry.kind == "fixed":
         raise ConfigurationError(f"{key} is read only")
     if entry.kind == "text":

@@ -3,12 +3,12 @@
 A packet consists of a header (magic, state bits, sequence number, vision flag; uint32 each), options, and finally the
 checksum option, the sum of all bytes before it. An option begins with its tag and its size in bytes, both uint16; the
 size includes these four bytes. Everything is little-endian and packed. The table has the format described in
-`wire_table`; angles are in millidegrees where a name says so, theta nose up, phi to the right, psi clockwise; axes x
-forward, y right, z down.
+`wire_table`; angles are in millidegrees where a name says so: theta nose up, phi right side down, psi clockwise, 0
+where the aircraft was switched on. The body axes are x forward, y right, z down.
 
 The packets come first, then `NavdataSender`, which schedules them, and `NavdataContent`, which fills them. Pure.
-Source: AR.Drone Developer Guide SDK 2.0, chapter 7; ARDroneLib (SDK 2.0.1), navdata_common.h and config.h; the GPS
-option of firmware 2.4 and later: its branch `gps`.
+Source: AR.Drone Developer Guide SDK 2.0, chapter 7; ARDroneLib (SDK 2.0.1), navdata_common.h and config.h; for the GPS
+option of firmware 2.4 and later, ARDroneLib's branch `gps`.
 """
 
 import math
@@ -30,14 +30,14 @@ from zsim_bridges.vehicle_links.wire_table import Entry, WireLayout, read_table
 PORT = 5554  # UDP (ARDroneLib, config.h)
 REQUEST_UNICAST = b"\x01\x00\x00\x00"  # a program's request for navdata (ARDroneLib, navdata client)
 MAGIC = 0x5566_7788
-MAGICS = (MAGIC, 0x5566_7789)  # the second is that of newer firmware (npm ar-drone, parseNavdata.js)
+MAGICS = (MAGIC, 0x5566_7789)  # the second is sent by newer firmware (npm ar-drone, parseNavdata.js)
 DEMO_RATE_HZ, FULL_RATE_HZ = 15, 200  # Developer Guide 7.1
 SECONDS_SHIFT, MICROSECONDS = 21, (1 << 21) - 1  # option `time`: seconds above, microseconds below (navdata_common.h)
 HEADER = struct.Struct("<HH")  # tag and size of an option
 CHECKSUM_TAG = 0xFFFF
-GPS_TAG = 27  # in older SDKs the tag of zimmu_3000, of 12 bytes
-CLIENTS_MAX = 8  # chosen; programs that receive navdata; a further one displaces the oldest
-REQUESTS = (b"\x01", b"Init")  # how a request for navdata begins (ARDroneLib; its Windows client)
+GPS_TAG = 27  # in older SDKs, the tag of option zimmu_3000, of 12 bytes
+CLIENTS_MAX = 8  # maximum number of programs that receive navdata; a further one displaces the oldest
+REQUESTS = (b"\x01", b"Init")  # first bytes of a request for navdata (ARDroneLib; its Windows client)
 SECOND_NS = 1_000_000_000
 ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = (
     512,
@@ -46,17 +46,18 @@ ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = (
 GYRO_LSB_PER_DEG_S = 16.4  # scale of the raw gyro (measured on an aircraft)
 MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
 MG_PER_UT = 10.0  # milligauss per microtesla
-PWM_MAX = 255  # at a motor's maximum speed; chosen proportional below, since the curve is not published
+PWM_MAX = 255  # at a motor's maximum speed; assumed to be proportional to the speed, since the curve is not published
 VOLTAGE_MV = (0.0, 10.0, 50.0, 100.0), (9000.0, 10_500.0, 11_686.0, 12_500.0)
-"""Charges [%] and voltages [mV] of the battery: the SDK's vbat_min, 50 % as measured on an aircraft, and two chosen."""
-SECONDS_MASK = 0x7FF  # 11 bits
+"""Charges [%] and voltages [mV] of the battery: 0 % is the SDK's vbat_min, 50 % was measured on an aircraft, the others
+are assumed."""
+SECONDS_MASK = 0x7FF  # the seconds in option `time` have 11 bits
 FIX_3D = 3  # fix type of a GPS receiver, as in NMEA
 _INT16 = 32_767
 _UNUSED_OF_DEMO = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frame count and camera detections
 Send = Callable[[bytes, Hashable], None]
 """Sends a datagram to an address."""
 Putters = dict[str, Callable[..., None]]
-"""Functions that write an option's numbers, by its name."""
+"""Functions that write an option's numbers, by the option's name."""
 _START = struct.Struct("<IIII")
 _SUM = struct.Struct("<HHI")
 _MOST = 1 << 32
@@ -117,7 +118,7 @@ _TABLE = f"""
 
 
 class OptionLayout(WireLayout):
-    """The layout of an option; `size` [bytes] includes its header, `make` builds the NamedTuple of its fields."""
+    """The layout of an option; `size` [bytes] includes the header, `make` builds a NamedTuple of the fields."""
 
     def __init__(self, entry: Entry) -> None:
         super().__init__(entry.fields)
@@ -136,8 +137,8 @@ LAYOUTS = {entry.number: OptionLayout(entry) for entry in read_table(_TABLE)}
 """Layouts by tag."""
 TAG_OF = {layout.name: tag for tag, layout in LAYOUTS.items()}
 FULL_TAGS = tuple(tag for tag in LAYOUTS if tag < GPS_TAG)
-"""The options of a full packet, of 1904 bytes. The GPS option is sent only on request, because clients disagree about
-the meaning of its tag."""
+"""The options of a full packet, which has 1904 bytes. The GPS option is sent only on request, because clients disagree
+about the meaning of its tag."""
 DEMO, TIME, PHYS, PWM = (TAG_OF[name] for name in ("demo", "time", "phys_measures", "pwm"))
 ALTITUDE, PRESSURE, MAGNETO = (TAG_OF[name] for name in ("altitude", "pressure_raw", "magneto"))
 KALMAN_PRESSURE = TAG_OF["kalman_pressure"]
@@ -151,7 +152,7 @@ StateBit = IntFlag(
     "ULTRASOUND_DEAF CUTOUT PIC_VERSION_OK AT_THREAD NAVDATA_THREAD VIDEO_THREAD ACQUISITION_THREAD "
     "CONTROL_WATCHDOG ADC_WATCHDOG COM_WATCHDOG EMERGENCY",
 )
-"""The state word of a packet (ARDroneLib, config.h)."""
+"""The bits of a packet's state word (ARDroneLib, config.h)."""
 
 
 ControlState = IntEnum(
@@ -160,20 +161,20 @@ ControlState = IntEnum(
 """The upper half of demo's ctrl_state (ARDroneLib, control_states.h)."""
 
 
-LOST_COM, MAGNETO_CALIBRATION = 8, 12  # the lower half of ctrl_state while hovering (control_states.h)
+LOST_COM, MAGNETO_CALIBRATION = 8, 12  # values of the lower half of ctrl_state while hovering (control_states.h)
 
 
 class NavdataError(ValueError):
-    """A datagram is not navdata; the message says why."""
+    """A datagram is not valid navdata; the message states why."""
 
 
 class Navdata(NamedTuple):
     """A packet.
 
     Attributes:
-        vision: whether the camera defines a frame.
+        vision: the vision flag, which states whether the camera defines a frame.
         options: options by tag, each a NamedTuple of its fields.
-        unknown: contents, by tag, of options that are not in the table, or have another size there.
+        unknown: contents, by tag, of options that are not in the table or have another size there.
     """
 
     state: StateBit
@@ -188,12 +189,12 @@ class Navdata(NamedTuple):
 
 
 def checksum(packet: bytes | bytearray | memoryview) -> int:
-    """Return the sum of all bytes before the checksum option."""
+    """Return the checksum of a packet without its checksum option: the sum of all bytes."""
     return int(np.frombuffer(packet, np.uint8).sum(dtype=np.uint64)) % _MOST
 
 
 def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, Iterable[Any]]] = ()) -> bytes:
-    """Return a packet; sequence numbers begin with 1, `options` are tags with values in wire order.
+    """Return a packet; sequence numbers begin with 1, `options` are pairs of a tag and its values in wire order.
 
     Raises:
         struct.error: a value is out of range for its field.
@@ -208,8 +209,9 @@ def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, It
 
 def unpack(datagram: bytes) -> Navdata:
     """Decode a packet.
+
     Raises:
-        NavdataError: it is not a packet, or its checksum is wrong.
+        NavdataError: the datagram is not a packet, or its checksum is wrong.
     """
     if len(datagram) < _START.size + _SUM.size:
         raise NavdataError(f"has {len(datagram)} bytes; must have at least {_START.size + _SUM.size}")
@@ -256,7 +258,7 @@ class NavdataTemplate:
             at += LAYOUTS[tag].size
 
     def filler(self, tag: int) -> Callable[..., None]:
-        """Return a function that writes an option's flat numbers, or does nothing if the packet lacks the option."""
+        """Return a function that writes an option's numbers in wire order, or does nothing if the packet lacks it."""
         at, packet = self._places.get(tag), self._packet
         if at is None:
             return lambda *_: None
@@ -271,19 +273,16 @@ class NavdataTemplate:
 
 
 class NavdataSender:
-    """Sends an aircraft's navdata: decides when packets are due, on their options, and on their receivers.
-
-    The SDK's body axes are x forward, y right, z down; its angles are theta nose up, phi to the right, and psi
-    clockwise, 0 where the aircraft was switched on. Values that no sensor of the drone measures are zero.
+    """Sends an aircraft's navdata: decides when packets are due, which options they have, and who receives them.
 
     Args:
         state_bits: returns the state word without the bits of the navdata mode.
         ctrl_state: returns demo's ctrl_state.
-        refuse: reports what cannot be sent, with the reason.
+        refuse: reports why something cannot be sent.
 
     Attributes:
         clients: addresses to which navdata is sent, in order of their requests.
-        is_bootstrap: whether packets have no options yet.
+        is_bootstrap: whether packets do not contain options yet.
     """
 
     def __init__(
@@ -301,7 +300,7 @@ class NavdataSender:
         self._state_bits = state_bits
         self._ctrl_state = ctrl_state
         self._refuse = refuse
-        self._last: tuple[int, int] | None = None  # rate [Hz], and packet number since the start of simulated time
+        self._last: tuple[int, int] | None = None  # rate [Hz] of the last packet, and its number since simulated time 0
         self.clients: dict[Hashable, None] = {}
         self._sequence = 0
         self._prepare(())
@@ -330,7 +329,7 @@ class NavdataSender:
                 self._send(packet, address)
 
     def on_gate(self) -> None:
-        """Update the values that change at gates."""
+        """Have the values that change at gates updated in the next packet."""
         self._is_gate_new = True
 
     def _packet(self, t_ns: int) -> bytes:
@@ -358,7 +357,7 @@ class NavdataSender:
         self._is_gate_new = True
 
     def _tags(self) -> tuple[int, ...]:
-        """Return the tags of a packet's options; GPS only if its bit requests it."""
+        """Return the tags of a packet's options; GPS only if its bit in navdata_options is set."""
         if self.is_bootstrap:
             return ()
         options = int(self._configuration.number("general:navdata_options"))
@@ -369,7 +368,7 @@ class NavdataSender:
 
 
 class NavdataContent:
-    """Fills packets with the state of one aircraft."""
+    """Fills packets with the state of one aircraft; values that no sensor of the drone measures are zero."""
 
     def __init__(self, state: OnboardState, rotor_max_rad_s: float) -> None:
         self._state = state
@@ -398,12 +397,12 @@ class NavdataContent:
 
     @property
     def heading_deg(self) -> float:
-        """Heading by the magnetometer, clockwise from magnetic north, in (-180, 180]; 0 without one."""
+        """Heading from the magnetometer, clockwise from magnetic north, in (-180, 180]; 0 without a reading."""
         mag = self._state.mag
         if mag is None:
             return 0.0
         theta_deg, phi_deg, _ = self.angles_deg
-        roll, pitch = math.radians(phi_deg), math.radians(-theta_deg)  # positive right side down, and nose down
+        roll, pitch = math.radians(phi_deg), math.radians(-theta_deg)  # positive right side down, positive nose down
         x, y, z = mag.field_ut
         sine_roll, cosine_roll = math.sin(roll), math.cos(roll)
         forward = x * math.cos(pitch) + math.sin(pitch) * (sine_roll * y + cosine_roll * z)
@@ -412,7 +411,7 @@ class NavdataContent:
 
     @property
     def angles_deg(self) -> Vector:
-        """Theta nose up, phi to the right, psi clockwise [deg]."""
+        """Angles theta nose up, phi right side down, psi clockwise [deg]."""
         if self._attitude is not self._state.attitude:
             self._attitude = self._state.attitude
             last_psi_deg = self._angles_deg[2]
@@ -445,7 +444,7 @@ class NavdataContent:
         return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
 
     def fill_gate(self, put: Putters, tags: tuple[int, ...]) -> None:
-        """Fill in the values that change at gates; skips omitted options to save time."""
+        """Fill in the values that change at gates, of the options in `tags` only, to save time."""
         state = self._state
         climb_mm_s = 1e3 * state.flow.velocity_m_s[2] if state.flow else 0.0
         if PWM in tags:
@@ -496,7 +495,7 @@ class NavdataContent:
 
 
 def angles_deg(q_WB: Quaternion) -> Vector:
-    """Return theta nose up, phi to the right and psi clockwise [deg] of an attitude; psi is 0 towards east."""
+    """Return the angles theta nose up, phi right side down, psi clockwise from east [deg] of an attitude."""
     w, x, y, z = q_WB
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))

@@ -12,16 +12,16 @@ PORT = 5555  # TCP (ARDroneLib, config.h)
 SIGNATURE = b"PaVE"
 VERSION = 2
 CODEC_H264 = 4
-HEADER_SIZE = 64  # bytes with a meaning; later firmware adds four more
+HEADER_SIZE = 64  # bytes; later firmware appends four without a meaning
 WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = (
     640,
     360,
     368,
 )  # displayed size; the coded height is a whole number of macroblocks
 RATE_HZ = 30  # frames per second, for the encoder's rate control
-IDR_EVERY = 30  # frames, chosen: after a loss, decoding can resume within a second
+IDR_EVERY = 30  # frames; design choice: after a loss, decoding can resume within a second
 BIT_RATE = 1_000_000  # bit/s; the SDK's video:bitrate, 1000 kbit/s
-IDR_FRAME, P_FRAME = 1, 3  # frame types in a header; an IDR frame is preceded by SPS and PPS
+IDR_FRAME, P_FRAME = 1, 3  # frame types in a header; an IDR frame includes SPS and PPS
 IDR, SPS, PPS = 5, 7, 8  # types of NAL units (ITU-T H.264, table 7-1)
 PRESET = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline", "x264-params": "annexb=1"}
 _HEADER = struct.Struct("<4sBBHIHHHHIIBBBBIIHBBBB2xI12x")
@@ -36,7 +36,7 @@ class VideoFrame(NamedTuple):
 
     Attributes:
         is_idr: whether decoding can begin here; the frame then contains SPS and PPS.
-        sps_size, pps_size: sizes of SPS and PPS [bytes], including start codes; 0 without them.
+        sps_size, pps_size: sizes of SPS and PPS [bytes], including start codes; 0 if the frame has none.
     """
 
     data: bytes
@@ -75,7 +75,7 @@ def pave_header(frame: VideoFrame, frame_number: int, timestamp_ms: int, stream_
 
 
 class VideoEncoder:
-    """Encodes a stream of JPEG images like an AR.Drone 2.0. Needs av (PyAV)."""
+    """Encodes a stream of JPEG images as an AR.Drone 2.0 would. Needs av (PyAV)."""
 
     def __init__(self) -> None:
         import av
@@ -90,7 +90,7 @@ class VideoEncoder:
         self._count = 0
 
     def encode(self, jpeg: bytes, begins: bool) -> VideoFrame | None:
-        """Return the frame of a JPEG image; `begins` makes it one with which decoding can begin.
+        """Return the frame of a JPEG image, None if the encoder returns no data; `begins`: decoding can begin with it.
 
         Raises:
             VideoError: the data are not a readable JPEG.

@@ -1,1 +1,1 @@
-"""FMUs as agents: controllers of drones and formations, and estimators, from Simulink, Modelica and others, by FMPy."""
+"""FMUs as agents: controllers and estimators exported from Simulink, Modelica tools and others, run with FMPy."""

@@ -1,7 +1,7 @@
-"""An FMU as an agent: inputs from the messages of a gate, one communication step, outputs as commands or an estimate.
+"""An FMU as an agent: at a gate it reads messages, makes a communication step and sends commands or an estimate.
 
 At gate t the FMU receives the newest values of its inputs and steps from t to t + period; its outputs are then
-published with the stamp t, like any agent's answer to that gate.
+published with the time stamp t, like any agent's outputs at that gate.
 """
 
 import math
@@ -45,18 +45,19 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 
 
 class Fmu:
-    """An FMU for a flight: `zsim.run("step.yaml", agents=[zsim.Fmu("controller.fmu", "drone1", {...})])`.
+    """Factory of an FMU agent: `zsim.run("step.yaml", agents=[zsim.Fmu("controller.fmu", "drone1", {...})])`.
 
     Args:
-        path: path of the file, FMI 2 or 3 for co-simulation.
-        drone: drone to which places without a name refer; None if all places have names.
-        map: places by variable, `{"vx": "velocity_m_s.0"}`, or texts `vx=velocity_m_s.0`; see docs/fmu.md.
-        name: name of the process (default `fmu.` and the drone, or `fmu.main`); that of a stock agent replaces it.
-        period_s: communication step [s], a multiple of the gate; default: the one that the FMU suggests, or the gate.
-        param: start values of parameters and inputs, by variable.
-        takeoff_s: simulated time at which the drones that it commands take off [s]; None if others command this.
-        frame: frame of velocity commands.
-        log: whether to print the whole log of the FMU, not only warnings and errors.
+        path: path of the FMU, which must be for co-simulation with FMI 2 or 3.
+        drone: drone to which entries of `map` without a drone or cluster refer; None if there are no such entries.
+        map: message fields by variable, `{"vx": "velocity_m_s.0"}`, or texts `vx=velocity_m_s.0`; see docs/fmu.md.
+        name: process name (default: `fmu.` and the drone's name, or `fmu.main`); a stock agent's name replaces it.
+        period_s: communication step [s], a multiple of the gate period; default: the FMU's suggestion, or the gate
+            period.
+        param: start values of parameters and inputs, by variable name.
+        takeoff_s: simulated time [s] at which the commanded drones take off; None if another process commands this.
+        frame: frame of the velocity commands.
+        log: whether to print the FMU's whole log, not only warnings and errors.
         say: receives lines about the FMU; by default they go to standard error.
     """
 
@@ -82,11 +83,11 @@ class Fmu:
         self.takeoff_s, self.log, self.say = takeoff_s, log, say
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the pickled state; the path is absolute, so that a process in another folder finds the file."""
+        """Return the state to pickle; its path is absolute, so that a process in another folder finds the file."""
         return {**vars(self), "path": self.path.resolve()}
 
     def __call__(self, info: Info, scenario: Scenario) -> "FmuAgent":
-        """Return the agent for a run.
+        """Return the agent that runs the FMU.
 
         Raises:
             RunError: the file, its variables or the mapping cannot be used.
@@ -95,7 +96,7 @@ class Fmu:
 
 
 class FmuAgent(Agent):
-    """An FMU in a run."""
+    """The agent that runs an FMU."""
 
     def __init__(self, of: Fmu, info: Info, scenario: Scenario) -> None:
         super().__init__()
@@ -122,7 +123,7 @@ class FmuAgent(Agent):
         self._commanded = sorted({drone for writer in self._writers for drone in writer.commanded})
         self._takeoff_ns = None if of.takeoff_s is None else round(of.takeoff_s * 1e9)
         self._latest: dict[str, Any] = {}
-        self._states: dict[str, Any] = {}  # states of firmwares, by drone
+        self._states: dict[str, Any] = {}  # firmware states, by drone
         self._raised: set[str] = set()  # modes whose outputs were true at the last step
         self._has_started = False
         self._declare_keys(info)
@@ -179,7 +180,7 @@ class FmuAgent(Agent):
         return outputs
 
     def _values(self) -> Inputs:
-        """Return the inputs whose messages have arrived; the others keep their start values."""
+        """Return values for the inputs whose messages have arrived; the other inputs keep their start values."""
         values = []
         for link in self._inputs:
             place = link.place
@@ -202,7 +203,7 @@ class FmuAgent(Agent):
         return Output(key, Mode(t_ns, self.next_seq(key), self.source, mode))
 
     def motion(self, t_ns: int, formation: Formation, c_dot: Sequence[float]) -> list[Output]:
-        """Return velocity commands, for rates c_dot (4n,), to those drones of a formation that accept setpoints."""
+        """Return velocity commands for cluster rates c_dot (4n,), to the formation's drones that accept setpoints."""
         outputs = []
         for drone, command in zip(formation.drones, formation.velocities(self._latest, c_dot), strict=False):
             if self.takes_setpoints(drone):
@@ -214,7 +215,7 @@ class FmuAgent(Agent):
         return state_refusal(drone, self._states.get(drone, "landed"), "setpoint") is None
 
     def rises(self, flag: str, is_set: bool) -> bool:
-        """Return whether a flag has become true since the last step."""
+        """Record a flag and return whether it has become true since the last step."""
         was_set = flag in self._raised
         (self._raised.add if is_set else self._raised.discard)(flag)
         return is_set and not was_set
@@ -239,7 +240,7 @@ class FmuAgent(Agent):
 
 
 class _Writer:
-    """Builds the messages of one key from outputs of the FMU."""
+    """Builds the messages on one key from the FMU's outputs."""
 
     def __init__(self, key: str, links: Sequence[MappedVariable], frame: Frame) -> None:
         self.key, self.links = key, links
@@ -302,7 +303,7 @@ class _Writer:
 
 
 class _FormationWriter:
-    """Builds the velocity commands of a formation from c_dot; elements that the FMU does not provide are 0."""
+    """Builds a formation's velocity commands from c_dot, whose elements are 0 where the FMU provides none."""
 
     def __init__(self, key: str, links: Sequence[MappedVariable], formation: Formation) -> None:
         self.key, self.links, self.commanded = key, links, formation.drones
@@ -329,7 +330,7 @@ def _writers(
 
 
 def _period_ns(model: FmuModel, period_s: float | None, info: Info) -> int:
-    """Return the communication step [ns]; raise a RunError if the FMU refuses it, or it is no multiple of the gate."""
+    """Return the communication step [ns]; raise a RunError if the FMU or the gate period does not permit it."""
     gate_s = info.gate_ns / 1e9
     wanted_s = period_s if period_s is not None else model.step_s
     if model.is_step_fixed and period_s is not None and not math.isclose(period_s, model.step_s or 0.0):

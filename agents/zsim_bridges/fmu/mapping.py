@@ -1,11 +1,12 @@
-"""The mapping between variables of an FMU and fields of messages: texts such as `vx=velocity_m_s.0`, parsed, checked.
+"""The mapping between an FMU's variables and message fields: parses and checks texts such as `vx=velocity_m_s.0`.
 
     NAME = [WHOSE/] [MESSAGE.] FIELD [.INDEX]
 
 WHOSE is a drone or a cluster (by default the FMU's drone), or a key up to its last `/`. MESSAGE is the last part of a
 key: for inputs `estimate`, `truth`, a sensor, or `state` of a cluster; for outputs `velocity`, `attitude`, `rotors`,
-`ardrone`, `mode`, `estimate`. Without it, an input belongs to the drone's estimate, an output to its velocity command.
-`main/c` is the estimated c of the cluster `main`, and `main/c_dot` its commanded rates.
+`ardrone`, `mode`, `estimate`. Without it, an input is a field of the drone's estimate, an output a field of its
+velocity command. `main/c` stands for the estimated variables c of the cluster `main`, `main/c_dot` for their commanded
+rates.
 """
 
 import math
@@ -27,10 +28,10 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.fmu.model import FmuModel, Kind, Unit, Variable
 
 MODES = ("takeoff", "land", "emergency", "reset")
-NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster's state with one number for each of its variables
-FORMATION = {"c": False, "c_dot": True}  # quantities of a cluster without a message; True for outputs of an FMU
-OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # fields that the process fills in
-# Units of fields by the suffixes of their names: name, exponents of BASE_UNITS, factor to SI units
+NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster state with one number per cluster variable
+FORMATION = {"c": False, "c_dot": True}  # cluster quantities that no message carries; True: an output of the FMU
+OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # fields that the agent fills in
+# Units by suffix of the field name: unit name, exponents of BASE_UNITS, factor to SI units
 RAD, PER_S = (0, 0, 0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0, 0, 1)
 UNITS = {
     "_rad_s": Unit("rad/s", PER_S),
@@ -44,7 +45,7 @@ UNITS = {
     "_ut": Unit("uT", (1, 0, -2, -1, 0, 0, 0, 0), 1e-6),
     "_ns": Unit("ns", (0, 0, 1, 0, 0, 0, 0, 0), 1e-9),
 }
-# Kinds of values that a receiver of each kind accepts
+# The kinds of value that a receiver of each kind accepts
 TAKES: dict[Kind, tuple[Kind, ...]] = {
     "number": ("number", "integer", "boolean"),
     "integer": ("integer", "boolean"),
@@ -59,7 +60,7 @@ class Place(NamedTuple):
     text: str  # as the user wrote it
     key: str
     field: str
-    indices: tuple[int, ...] | None  # indices of its elements; None for a field with a single value
+    indices: tuple[int, ...] | None  # indices of the elements; None for a single value
     kind: Kind
 
     @property
@@ -71,7 +72,7 @@ class Place(NamedTuple):
         return next((unit for end, unit in UNITS.items() if self.field.endswith(end)), None)
 
     def read(self, message: Any) -> list[Any] | None:
-        """Return its values in a message, None if the message omits them."""
+        """Return the values of this place in a message; None if the message omits them."""
         value = getattr(message, self.field)
         if value is None:
             return None
@@ -79,21 +80,21 @@ class Place(NamedTuple):
 
 
 class MappedVariable(NamedTuple):
-    """A variable and its place; `to_unit` converts from the sender's to the receiver's unit, None: no conversion."""
+    """A variable and its place; `to_unit` converts values from the sender's to the receiver's unit, if they differ."""
 
     variable: Variable
     place: Place
     to_unit: Callable[[float], float] | None
 
     def converted(self, values: list[Any]) -> list[Any]:
-        """Return values in the receiver's unit."""
+        """Return the values in the receiver's unit."""
         if self.to_unit is not None:
             return [self.to_unit(value) for value in values]
         return values
 
 
 class FmuMapping(NamedTuple):
-    """The mapped inputs and outputs of an FMU, and lines about differing units."""
+    """The mapped inputs and outputs of an FMU, and notes on differing units."""
 
     inputs: list[MappedVariable]
     outputs: list[MappedVariable]
@@ -103,14 +104,14 @@ class FmuMapping(NamedTuple):
 def mapping_of(
     model: FmuModel, texts: Sequence[str], info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]
 ) -> FmuMapping:
-    """Return the mapping that texts `NAME=PLACE` describe.
+    """Return the mapping that the texts `NAME=PLACE` describe.
 
     Args:
-        drone: drone to which places without WHOSE refer; None: all places need it.
+        drone: drone to which places without WHOSE refer; None: every place must have WHOSE.
         cluster_names: returns the names of a cluster's variables.
 
     Raises:
-        RunError: a text is invalid; the error has the text, what was found, and what is allowed.
+        RunError: a text is invalid; the error quotes it and states what was found and what is allowed.
     """
     found = FmuMapping([], [], [])
     places = _Places(info, drone, cluster_names)
@@ -157,7 +158,7 @@ def _check_once(found: FmuMapping) -> None:
 
 
 class _Places:
-    """Parses places in a run."""
+    """Parses places, given the drones and clusters of a run."""
 
     def __init__(self, info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]) -> None:
         self._drones = {each.name: each for each in info.drones}
@@ -226,10 +227,10 @@ class _Places:
     def _elements_at(
         self, text: str, key: str, field: str, rest: list[str], kind: Kind, names: Sequence[str], where: str
     ) -> Place:
-        """Return the place of all elements of a field, or of the one with this name or number."""
+        """Return the place of all elements of a field, or of the one whose name or number is in `rest`."""
         if not rest:
             return Place(text, key, field, tuple(range(len(names))), kind)
-        wanted = ".".join(rest)  # names of variables of a group contain a dot
+        wanted = ".".join(rest)  # the names of a group's variables contain a dot
         index = next((i for i, each in enumerate(names) if wanted in (each, str(i))), None)
         if index is None:
             hint = suggestion(wanted, names) if names[0] != "0" else ""
@@ -253,7 +254,7 @@ class _Places:
         return kind
 
     def _elements(self, key: str, field: str, described: Any) -> tuple[Kind | None, Sequence[str]]:
-        """Return the kind of a field's elements and their names; None if it has no fixed number of such elements."""
+        """Return the kind and names of a field's elements; the kind is None if it or the number of elements varies."""
         _, thing, _ = keys.parts(key)
         if isinstance(described, msgspec.inspect.TupleType):
             kinds: set[Kind | None] = {_kind(each) for each in described.item_types}
@@ -293,7 +294,7 @@ def _kind(described: Any) -> Kind | None:
 
 
 def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Callable[[float], float] | None, str]:
-    """Return the conversion of values (None: none), and a line if units differ or cannot be compared (or empty)."""
+    """Return the conversion of values (or None), and a note on units that differ or cannot be compared (or "")."""
     theirs, ours = variable.unit, place.unit
     if theirs is None or ours is None or theirs.name == ours.name or place.kind != "number":
         return None, ""
@@ -301,7 +302,7 @@ def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Call
     if theirs.exponents is None:
         return None, f"{found}, not compared, since the FMU does not define its unit; values are passed unchanged"
     assert ours.exponents is not None
-    if theirs.exponents[:-1] != ours.exponents[:-1]:  # many tools omit rad
+    if theirs.exponents[:-1] != ours.exponents[:-1]:  # many tools omit the exponent of rad
         return None, f"{found}, a different quantity; values are passed unchanged"
     if (theirs.factor, theirs.offset) == (ours.factor, ours.offset):
         return None, ""
@@ -312,13 +313,13 @@ def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Call
 
 
 class Formation:
-    """A formation for an FMU: cluster variables from the estimates, and velocities from rates of these variables.
+    """A formation's kinematics: cluster variables from estimates, and velocities from rates of these variables.
 
-    An FMU can thus be a cluster space controller without kinematics: c in, c_dot out.
+    An FMU can thus be a cluster space controller without kinematics of its own: c in, c_dot out.
 
     Attributes:
-        drones: its drones, in the order of its robots.
-        names: names of its variables, in the order of c.
+        drones: names of the drones, in the order of the cluster's robots.
+        names: names of the cluster variables, in the order of c.
     """
 
     def __init__(self, scenario: Scenario, cluster: str) -> None:
@@ -332,7 +333,7 @@ class Formation:
         self._estimates = [keys.estimate(drone) for drone in self.drones]
 
     def c(self, latest: Mapping[str, Any]) -> list[float] | None:
-        """Return c (4n,) from the newest estimates; None if one is missing, or the formation is singular."""
+        """Return c (4n,) from the newest estimates; None if an estimate is missing or the formation is singular."""
         estimates = [latest.get(key) for key in self._estimates]
         if None in estimates:
             return None
@@ -344,7 +345,7 @@ class Formation:
             return None
 
     def velocities(self, latest: Mapping[str, Any], c_dot: Sequence[float]) -> list[Velocity]:
-        """Return the drones' velocity commands in W [m/s, rad/s] for rates c_dot (4n,); empty if c is None.
+        """Return the drones' velocity commands in W [m/s, rad/s] for rates c_dot (4n,); empty if `c` returns None.
 
         Raises:
             UserCodeError: the formation is singular for this motion.

@@ -1,4 +1,4 @@
-"""An FMU, a functional mock-up unit of FMI 2 or 3 for co-simulation: opened, checked, and stepped by FMPy.
+"""An FMU (functional mock-up unit) for co-simulation with FMI 2 or 3: opened, checked and stepped with FMPy.
 
     model = FmuModel(Path("controller.fmu"))       its description
     unit = FmuInstance(model, "fmu.drone1", say)   its library, loaded into this process
@@ -45,11 +45,11 @@ Inputs = Iterable[tuple["Variable", Values]]
 
 ALLOWED = "must be an FMU of FMI 2 or 3 for co-simulation"
 WARNING, FATAL = 1, 4  # statuses of FMI 2 and 3; those above a warning are failures
-LABELS = ("ok", "warning", "discard", "error", "fatal", "pending")  # names of the statuses
-LINES_KEPT = 5  # number of lines of an FMU's log that explain a failure
-NAMED_MAX = 10  # number of variables that a refusal lists
+LABELS = ("ok", "warning", "discard", "error", "fatal", "pending")  # names of the statuses, by number
+LINES_KEPT = 5  # number of the FMU's last log lines quoted with a failure
+NAMED_MAX = 10  # number of variables that an error lists
 BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-# For each FMI version and type: the kind of its values, and the suffix of FMPy's functions get… and set…
+# For each FMI version and type: the kind of value, and the suffix of FMPy's methods get… and set…
 TYPES: dict[int, dict[str, tuple[Kind, str]]] = {
     2: {
         "Real": ("number", "Real"),
@@ -69,10 +69,10 @@ TYPES: dict[int, dict[str, tuple[Kind, str]]] = {
 
 
 class Unit(NamedTuple):
-    """A unit: a value x in it is `factor` x + `offset` in the SI unit with these exponents."""
+    """A unit: a value x in this unit equals `factor` x + `offset` in the SI unit with the same exponents."""
 
     name: str
-    exponents: tuple[int, ...] | None = None  # of BASE_UNITS; None if an FMU does not define the unit
+    exponents: tuple[int, ...] | None = None  # of BASE_UNITS; None if the FMU does not define the unit
     factor: float = 1.0
     offset: float = 0.0
 
@@ -82,11 +82,11 @@ class Variable(NamedTuple):
 
     name: str
     causality: str
-    type: str  # FMI's name of its type
+    type: str  # FMI's name of the type
     kind: Kind
-    call: str  # suffix of FMPy's functions get… and set…
+    call: str  # suffix of FMPy's methods get… and set…
     references: tuple[int, ...]
-    size: int  # number of its values
+    size: int  # number of values
     unit: Unit | None
 
 
@@ -94,14 +94,14 @@ class FmuModel:
     """The description of an FMU.
 
     Attributes:
-        path: path of the file, with which all error messages begin.
-        version: version of FMI, 2 or 3.
+        path: path of the file; all error messages begin with it.
+        version: FMI version, 2 or 3.
         step_s: suggested communication step [s]; None if the FMU suggests none.
         is_step_fixed: whether the FMU accepts no other step.
-        restores: whether its state can be saved as bytes and restored.
+        restores: whether the state of an instance can be saved as bytes and restored.
 
     Raises:
-        RunError: the file is no such FMU, or has no library for this machine.
+        RunError: the file is not an FMU for co-simulation with FMI 2 or 3, or has no library for this machine.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,7 +124,7 @@ class FmuModel:
         self.restores = about.canGetAndSetFMUstate and about.canSerializeFMUstate
         units = {unit.name: _unit(unit) for unit in self.description.unitDefinitions}
         types = TYPES[self.version]
-        self._unsupported: dict[str, str] = {}  # types of unsupported variables, by name
+        self._unsupported: dict[str, str] = {}  # unsupported types, by variable name
         self.variables: dict[str, Variable] = {}
         for each in self.description.modelVariables:
             if each.type not in types:
@@ -176,10 +176,10 @@ class FmuInstance:
 
     Args:
         name: name of the instance in its own log.
-        say: receives the warnings and errors that it logs; all lines if `log`.
+        say: receives the warnings and errors that the instance logs, or all lines if `log`.
 
     Raises:
-        RunError: its library cannot be loaded, or it refuses to be instantiated.
+        RunError: the library cannot be loaded, or the FMU cannot be instantiated.
     """
 
     def __init__(self, model: FmuModel, name: str, say: Callable[[str], None], log: bool = False) -> None:
@@ -201,13 +201,13 @@ class FmuInstance:
             else:
                 self._unit = FMU3Slave(**identity, libraryPath=str(folder / model.library))
                 self._unit.instantiate(loggingOn=True, logMessage=self._log.take_3)
-        except Exception as error:  # FMPy raises bare exceptions, and a library that it needs may be missing
+        except Exception as error:  # FMPy raises bare exceptions, and a library that the FMU needs may be missing
             raise RunError(f"{model.path}: cannot be started: {self._explained(reason_of(error))}") from error
         self._finalizer = weakref.finalize(self, _free, self._unit, model.version)
-        self._finalizer.atexit = False  # at exit, the interpreter that a library embeds may be gone
+        self._finalizer.atexit = False  # at exit, an interpreter embedded in the library may be gone
 
     def start(self, t_s: float, inputs: Inputs) -> None:
-        """Initialise the FMU at simulated time t_s with the inputs of that time."""
+        """Initialise the FMU at simulated time t_s with the inputs at that time."""
         if self.model.version == 2:
             self._call(self._unit.setupExperiment, startTime=t_s)
             self._call(self._unit.enterInitializationMode)
@@ -217,17 +217,17 @@ class FmuInstance:
         self._call(self._unit.exitInitializationMode)
 
     def write(self, inputs: Inputs) -> None:
-        """Set inputs, and parameters before the start."""
+        """Set inputs or, before the start, parameters."""
         self._call(self._write, inputs)
 
     def step(self, t_s: float, step_s: float) -> None:
-        """Advance by step_s from simulated time t_s; a request to end the simulation raises a UserCodeError."""
+        """Advance by step_s from simulated time t_s; raise a UserCodeError if the FMU requests the end."""
         result = self._call(self._unit.doStep, t_s, step_s)
         if result is not None and result[1]:
             raise UserCodeError(self._explained(f"{self.model.path}: requests the end of the simulation"))
 
     def read(self, variables: Sequence[Variable]) -> list[list[Any]]:
-        """Return the values of each variable as float, int, bool or str."""
+        """Return each variable's values, as float, int, bool or str."""
         return self._call(self._read, variables)
 
     def state(self) -> bytes:
@@ -235,7 +235,7 @@ class FmuInstance:
         return self._call(self._state)
 
     def restore(self, state: bytes) -> None:
-        """Restore a serialised state, whether or not the FMU was started."""
+        """Restore a serialised state, whether or not the FMU has been started."""
         self._call(self._restore, state)
 
     def _write(self, inputs: Inputs) -> None:
@@ -293,14 +293,14 @@ class FmuInstance:
 
 
 class FmuLog:
-    """Receives the log of an FMU: passes warnings and errors, or all lines, to `say`, and keeps the last bad ones."""
+    """Receives an FMU's log: passes warnings and errors, or all lines, to `say`, and keeps the last of the former."""
 
     def __init__(self, name: str, say: Callable[[str], None], all_lines: bool) -> None:
         self._name, self._say, self._all = name, say, all_lines
         self.lines: deque[str] = deque(maxlen=LINES_KEPT)
 
     def callbacks(self) -> Any:
-        """Return the callback functions of an FMU of FMI 2."""
+        """Return the callback functions for an FMU of FMI 2."""
         callbacks = fmi2CallbackFunctions()
         callbacks.logger = fmi2CallbackLoggerTYPE(self._take_2)
         callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
@@ -312,7 +312,7 @@ class FmuLog:
         self._take(status, text)
 
     def take_3(self, _environment: Any, status: int, _category: bytes, text: bytes) -> None:
-        """Receive a line from an FMU of FMI 3; the callback of its log."""
+        """Receive a log line; this is the log callback for an FMU of FMI 3."""
         self._take(status, text)
 
     def _take(self, status: int, text: bytes | None) -> None:
@@ -329,7 +329,7 @@ def _described(path: Path) -> Any:
         with zipfile.ZipFile(path) as archive:
             if "modelDescription.xml" not in archive.namelist():
                 raise RunError(f"{path}: is not an FMU (it contains no modelDescription.xml); {ALLOWED}")
-        description = read_model_description(BytesIO(path.read_bytes()))  # FMPy leaves a refused file open
+        description = read_model_description(BytesIO(path.read_bytes()))  # FMPy leaves invalid files open
     except zipfile.BadZipFile as error:
         raise RunError(f"{path}: is not an FMU (not a zip archive); {ALLOWED}") from error
     except OSError as error:
@@ -368,15 +368,15 @@ def _plain(value: Any, kind: Kind) -> Any:
 
 @cache
 def _unpacked(path: Path, _mtime_ns: int, _size: int) -> Path:
-    """Return the folder with the unpacked FMU, which all its instances in this process share."""
+    """Return the folder of the unpacked FMU, shared by all its instances in this process until the file changes."""
     folder = temporary_folder("fmu-")
     fmpy.extract(path, folder)
     return folder
 
 
 def _free(unit: Any, version: int) -> None:
-    """Free an instance; its library stays loaded, since one that embeds an interpreter cannot be unloaded."""
-    with suppress(Exception):  # it may have failed already
+    """Free an instance; its library stays loaded, since a library with an embedded interpreter cannot be unloaded."""
+    with suppress(Exception):  # the FMU may have failed already
         unit.terminate()
     with suppress(Exception):
         getattr(unit, f"fmi{version}FreeInstance")(unit.component)

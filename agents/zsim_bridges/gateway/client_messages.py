@@ -1,6 +1,6 @@
-"""Client messages: errors and limits, permitted keys, defaults, JSON, and requests on a stream. Pure.
+"""The messages of the gateway's clients: errors, limits, permitted keys, defaults, JSON, stream requests. No I/O.
 
-A request on a stream is one JSON object per line:
+A stream carries one request per line, each a JSON object:
 {"op": "put", "key": "drone/drone1/cmd/velocity", "value": {"velocity_m_s": [1, 0, 0]}, "id": 7}
 """
 
@@ -24,7 +24,7 @@ COUNTED_KEYS = (
     keys.command("*", "*"),
     keys.estimate("*"),
     keys.cluster_state("*"),
-)  # contract: counted in `sent` of a done
+)  # keys of the messages that the contract counts in `sent` of a done
 CAMERA_KEYS = (keys.camera("*", "*"), keys.camera_info("*", "*"), keys.detections("*"))
 """Keys of clients' own cameras, renderers and detectors."""
 CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"), *CAMERA_KEYS)
@@ -45,12 +45,12 @@ RESERVED_KEYS = (
     keys.drone_request("*"),
     keys.reference("*"),
 )
-"""Keys on which only the world, or a process in its own name, publishes; a client's message would impersonate it.
+"""Keys on which only the world, or a process in its own name, publishes: a client's message would impersonate it.
 
-Drivers can be armed only over Zenoh, by operators.
+Only operators can arm drivers, and only over Zenoh.
 """
-CACHED_VALUES = 256  # number of values; one that is sent to many clients is encoded once
-INTEGER_MAX = 2.0**63  # a double of this size or more does not fit a 64-bit integer
+CACHED_VALUES = 256  # number of values kept as JSON, so that a value sent to many clients is encoded once
+INTEGER_MAX = 2.0**63  # a double of this magnitude or more does not fit into a 64-bit integer
 JSON = ("application/json", "text/json", "text/json5")
 TEXT = ("text/plain", "zenoh/string")
 _to_json = msgspec.json.Encoder().encode
@@ -69,7 +69,7 @@ class UnknownError(ZsimError):
 
 
 class MethodError(ZsimError):
-    """An HTTP method that a key does not have; `allowed` are those that it has."""
+    """An HTTP method that a key does not support; `allowed` lists those that it does."""
 
     def __init__(self, text: str, allowed: tuple[str, ...]) -> None:
         super().__init__(text)
@@ -77,7 +77,7 @@ class MethodError(ZsimError):
 
 
 def count_request(limit: RateLimit, address: str = "") -> None:
-    """Count a request of an address, or raise a TooManyError with the time to wait."""
+    """Count a request from an address, or raise a TooManyError that says how long to wait."""
     if not limit.spend(address):
         wait_s = limit.wait(address)
         raise TooManyError(f"more than {1 / limit.period:g} requests a second; wait {wait_s:.3f} s")
@@ -104,7 +104,7 @@ class ClientLimit:
 
 
 def is_counted_key(key: str) -> bool:
-    """Return whether a done counts the messages of a key."""
+    """Return whether a done counts the messages on a key."""
     return _matches_any(COUNTED_KEYS, key)
 
 
@@ -128,7 +128,7 @@ def _matches_any(expressions: Sequence[str], key: str) -> bool:
 
 
 def check_not_reserved(key: str) -> None:
-    """Raise a DecodeError for an invalid key, a ForbiddenError for a key on which clients may not publish."""
+    """Raise a DecodeError for an invalid key, and a ForbiddenError for a key on which clients may not publish."""
     if "*" in key or not key:
         raise DecodeError(f"{key[:80]!r}: is not a key; must be names separated by /")
     if is_reserved(key):
@@ -139,14 +139,14 @@ def check_not_reserved(key: str) -> None:
 
 
 class MessageDefaults:
-    """Fills in time, sequence number and source of the messages of one client, which publishes as `source`."""
+    """Fills in the time stamps, sequence numbers and source of one client's messages; `source` is its process name."""
 
     def __init__(self, source: str) -> None:
         self._source = source
         self._next_seq: Counter[str] = Counter()
 
     def fill(self, key: str, value: Any, now_ns: int) -> Any:
-        """Return plain data with `t_ns` (of the newest gate), `seq` and `source` added if its message has them."""
+        """Return `value` with `t_ns` (now_ns), `seq` and `source` filled in where its message has these fields."""
         kind = messages.type_of(key)
         if kind is None or not isinstance(value, dict):
             return value
@@ -158,7 +158,7 @@ class MessageDefaults:
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Roll back the sequence numbers if anything is refused in this context, so that they have no gaps."""
+        """Roll back the sequence numbers if an error leaves this context, so that refused messages cause no gaps."""
         before = self._next_seq.copy()
         try:
             yield
@@ -171,7 +171,7 @@ class MessageDefaults:
 
 
 def is_sound(key: str, payload: bytes) -> bool:
-    """Return whether a payload is the message of the contract for its key; any payload is valid on other keys."""
+    """Return whether a payload is a message of the contract for its key; on other keys, any payload is valid."""
     try:
         return messages.type_of(key) is None or messages.decode(key, payload) is not None
     except DecodeError:
@@ -181,8 +181,8 @@ def is_sound(key: str, payload: bytes) -> bool:
 def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
     """Return a payload as JSON.
 
-    A message of the contract has all of its fields. On other keys, JSON, text and msgpack are converted to values, in
-    which bytes become base64; any other payload becomes base64. `encoding` is Zenoh's, if known.
+    A message of the contract is returned with all of its fields. On other keys, JSON, text and msgpack are converted to
+    values, in which bytes become base64; any other payload becomes base64. `encoding` is Zenoh's, if known.
 
     Raises:
         DecodeError: the payload is not the message of the contract for its key.
@@ -204,7 +204,7 @@ def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
 
 
 def json_value(value: Any) -> Any:
-    """Return a value if JSON can represent it, otherwise its msgpack as base64."""
+    """Return a value if JSON can represent it, otherwise its msgpack encoding as base64."""
     try:
         _to_json(value)
     except REFUSALS:
@@ -215,10 +215,10 @@ def json_value(value: Any) -> Any:
 def json_to_payload(key: str, value: Any) -> bytes:
     """Return plain data, as decoded from JSON, as the payload of a key.
 
-    An integer field also accepts 20000000.0, as written by languages that have only doubles.
+    An integer field also accepts a number such as 20000000.0, as written by languages that have only doubles.
 
     Raises:
-        DecodeError: it is not the message of the key; a key outside the contract accepts anything.
+        DecodeError: the data is not a message of the key; a key outside the contract accepts anything.
     """
     if messages.type_of(key) is None:
         return _pack(key, value)
@@ -246,7 +246,7 @@ def _pack(key: str, value: Any) -> bytes:
 
 
 def _with_integers(value: Any) -> Any:
-    """Return a value with its whole-number floats as integers."""
+    """Return a value with its whole-number floats converted to integers."""
     if isinstance(value, dict):
         return {name: _with_integers(entry) for name, entry in value.items()}
     if isinstance(value, list):
@@ -260,7 +260,7 @@ def json_entry(key: str, payload: bytes, encoding: str = "") -> dict[str, Any]:
 
 @lru_cache(maxsize=CACHED_VALUES)
 def value_line(sample: RawSample) -> bytes:
-    """Return the line of a value for a client: null for a deleted key, nothing for an invalid message."""
+    """Return the line that sends a value to a client: null for a deleted key; an empty line for an invalid message."""
     try:
         value = payload_to_json(sample.key, sample.payload, sample.encoding) if sample.payload else b"null"
     except DecodeError:
@@ -275,38 +275,38 @@ Keys = Annotated[list[Key], Meta(max_length=1000)]
 
 
 class StreamRequest(Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
-    """Any request; the answer repeats its `id`."""
+    """Base of all requests; the answer repeats `id`."""
 
     id: int | str | None = None
 
 
 class HelloRequest(StreamRequest, tag="hello"):
-    """The client's name, and the token if one is needed. The answer describes the run."""
+    """Gives the client's name, and the token if one is needed; the answer describes the run."""
 
     name: str = ""
     token: str = ""
 
 
 class LatestRequest(StreamRequest, tag="latest"):
-    """The last values of a key, or of an expression."""
+    """Requests the last value of a key, or of each key that an expression matches."""
 
     key: Key
 
 
 class SubscribeRequest(StreamRequest, tag="subscribe"):
-    """Every value on a key expression from now on."""
+    """Requests every value on a key expression from now on."""
 
     key: Key
 
 
 class UnsubscribeRequest(StreamRequest, tag="unsubscribe"):
-    """End the subscription to a key expression."""
+    """Ends the subscription to a key expression."""
 
     key: Key
 
 
 class PutRequest(StreamRequest, tag="put"):
-    """A value for a key. `quiet`: answered only if it is refused."""
+    """Publishes a value on a key; if `quiet`, it is answered only when refused."""
 
     key: Key
     value: Any
@@ -314,7 +314,7 @@ class PutRequest(StreamRequest, tag="put"):
 
 
 class AskRequest(StreamRequest, tag="ask"):
-    """A control request to the process that answers on a key: world/control, cluster/*/control."""
+    """Sends a control request to the process that answers on a key, such as world/control or cluster/*/control."""
 
     key: Key
     request: str
@@ -323,10 +323,11 @@ class AskRequest(StreamRequest, tag="ask"):
 
 
 class JoinRequest(StreamRequest, tag="join"):
-    """Take part in the lockstep: a `gate` is sent every `period_s`, and time waits for its `done`.
+    """Joins the lockstep: a `gate` is sent every `period_s`, and simulated time waits for the client's `done`.
 
-    `reads` are the key expressions whose messages are sent with each gate. `gates` are the keys whose messages complete
-    a gate, one each; by default those keys with a message at every gate that `reads` match.
+    `reads` are the key expressions whose messages are sent with each gate. A gate is complete
+    once a message has arrived on each key of `gates`; by default, the keys matched by `reads` that have a message at
+    every gate.
     """
 
     name: str
@@ -336,21 +337,21 @@ class JoinRequest(StreamRequest, tag="join"):
 
 
 class LockstepOutput(Struct, forbid_unknown_fields=True):
-    """An output of a gate."""
+    """One output of a client at a gate."""
 
     key: Key
     value: Any
 
 
 class DoneRequest(StreamRequest, tag="done"):
-    """All outputs of the gate t_ns."""
+    """Answers the gate at `t_ns` with all outputs of the client."""
 
     t_ns: int
     outputs: list[LockstepOutput] = []
 
 
 class LeaveRequest(StreamRequest, tag="leave"):
-    """Leave the lockstep."""
+    """Leaves the lockstep."""
 
     reason: str = ""
 

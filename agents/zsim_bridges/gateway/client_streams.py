@@ -1,6 +1,6 @@
 """Byte streams to clients: lines of JSON on TCP, text messages on a WebSocket, server-sent events, and pictures.
 
-Each client has a bounded outbox, so that one that does not read does not affect the others.
+Each client has a bounded outbox, so that a client that stops reading does not affect the others.
 """
 
 import asyncio
@@ -20,20 +20,20 @@ from zsim.transport.session import RawSample
 from zsim_bridges.gateway.run_access import SharedSubscriptions
 
 OUTBOX_BYTES_MAX = 4_000_000  # about 20 s of a drone's sensors as JSON
-FLUSH_S = 2.0  # time limit for sending the rest to a client that closes its connection
-LINES_PER_TURN = 100  # number of consecutive lines of one client before other tasks of the loop run
-LINE_MAX = 1_000_000  # bytes of a request
-HEARTBEAT_S = 20.0  # wall; after which a WebSocket whose client is gone is detected
-ALIVE_S = 10.0  # wall; after which an idle stream sends a sign of life, to detect a client that is gone
-LINGER_S = 10.0  # wall; how long a camera's subscription outlives its last client, since some request single pictures
+FLUSH_S = 2.0  # time limit for sending the remaining lines once a connection ends
+LINES_PER_TURN = 100  # consecutive lines of one client after which other tasks of the loop may run
+LINE_MAX = 1_000_000  # size limit of a request [bytes]
+HEARTBEAT_S = 20.0  # wall; period of the pings that detect a WebSocket whose client is gone
+ALIVE_S = 10.0  # wall; silence after which a stream sends a sign of life, to detect a client that is gone
+LINGER_S = 10.0  # wall; how long a camera's subscription outlives its last client: some request single pictures
 BOUNDARY = "zsim-picture"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "Access-Control-Allow-Origin": "*"}
 _SOCKET_OPTIONS = (
     (socket.IPPROTO_TCP, "TCP_NODELAY", 1),  # send a line at once, without waiting for more
     (socket.SOL_SOCKET, "SO_KEEPALIVE", 1),  # detect hosts that are gone
     (socket.IPPROTO_TCP, "TCP_KEEPIDLE", 5),  # s of silence before the first keepalive probe
-    (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 2),  # s between two probes
-    (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),  # probes without an answer that end a connection
+    (socket.IPPROTO_TCP, "TCP_KEEPINTVL", 2),  # s between probes
+    (socket.IPPROTO_TCP, "TCP_KEEPCNT", 3),  # unanswered probes that end a connection
     (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", 15_000),  # ms without an acknowledgement of sent data
 )
 
@@ -41,12 +41,12 @@ Half = Coroutine[Any, Any, None]
 
 
 class Outbox:
-    """A queue of lines for one client. When full, it drops the oldest values; dropping an answer ends the connection.
+    """A queue of lines for one client. When full, it drops the oldest lines; dropping an answer ends the connection.
 
     Args:
         cut: ends the connection at once.
         lost_line: returns the line that reports how many values were dropped.
-        bytes_max: size limit of the waiting lines.
+        bytes_max: limit of the total size of the waiting lines.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Outbox:
         self._closed = False
 
     def put(self, line: bytes, droppable: bool = False) -> None:
-        """Add a line, with its newline; on the loop. A line is droppable if a newer one of its kind replaces it."""
+        """Add a line, including its newline; call on the loop. A value that a newer one replaces is droppable."""
         if self._closed:
             return
         self._lines.append((line, droppable))
@@ -107,7 +107,7 @@ ClientFactory = Callable[[Outbox, bool], StreamHandler]
 
 
 async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], cut: Callable[[], None]) -> None:
-    """Read and send until one of the two ends; then send the rest.
+    """Read and send concurrently until either ends; then send the rest.
 
     Args:
         reading: ends with the client's last request.
@@ -139,7 +139,7 @@ def _lost_line(lost: int) -> bytes:
 async def serve_lines(
     new_client: ClientFactory, authenticated: bool, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
 ) -> None:
-    """Serve a connection of lines until it ends; `authenticated`: the client needs no token."""
+    """Serve a TCP connection until it ends; if `authenticated`, the client needs no token."""
     cut = writer.transport.abort
     outbox = Outbox(cut, _lost_line)
     raw = writer.get_extra_info("socket")
@@ -160,7 +160,7 @@ async def serve_lines(
 
 
 async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> None:
-    """Process the lines; refuse a browser that a page caused to send an HTTP request here."""
+    """Process the lines; refuse an HTTP request, which a malicious web page may make a browser send here."""
     count = 0
     while True:
         try:
@@ -187,7 +187,7 @@ async def _read_lines(client: StreamHandler, reader: asyncio.StreamReader) -> No
 
 
 async def serve_websocket(request: web.Request, new_client: ClientFactory) -> web.WebSocketResponse:
-    """Serve a WebSocket, whose request has been authenticated, until it ends: a text message is a line."""
+    """Serve a WebSocket until it ends: each text message is a line. Its request has already been authenticated."""
     websocket = web.WebSocketResponse(max_msg_size=LINE_MAX, heartbeat=HEARTBEAT_S)
     await websocket.prepare(request)
     cut = _cutter(request)
@@ -251,21 +251,21 @@ async def stream_events(
         unsubscribe()
 
 
-# Pictures of cameras, with one subscription for all clients of a camera. A slow client misses pictures: it is sent the
-# newest one each time.
+# Camera pictures, with one subscription per camera for all its clients. A slow client misses pictures: each time, it is
+# sent the newest one.
 
 
 class NumberedPicture(NamedTuple):
-    """A picture, and the number of earlier ones."""
+    """A picture, and the number of pictures before it."""
 
     number: int
     image: CameraImage
 
 
 class PictureFeed:
-    """The newest picture of a camera, for clients on one loop.
+    """The newest picture of a camera, for all its clients on one loop.
 
-    `refuse` is called with the reason for each message that is not a picture; `stop` ends its subscription.
+    `refuse` is called with the reason for each message that is not a picture; `stop` ends the camera's subscription.
     """
 
     def __init__(self, key: str, refuse: Callable[[str], None]) -> None:
@@ -289,7 +289,7 @@ class PictureFeed:
         arrived.set()
 
     async def after(self, number: int, within_s: float) -> NumberedPicture | None:
-        """Return the newest picture if its number is greater, otherwise the next; None if none arrives in time."""
+        """Return the newest picture if it comes after `number`, otherwise the next; None if none arrives in time."""
         if self.newest is None or self.newest.number <= number:
             try:
                 await asyncio.wait_for(self._arrived.wait(), within_s)
@@ -299,7 +299,7 @@ class PictureFeed:
 
 
 class PictureFeeds:
-    """The feeds of cameras that have, or recently had, clients; `subscribe` returns the end of a subscription."""
+    """The feeds of cameras that have, or recently had, clients; `subscribe` returns a function to unsubscribe."""
 
     def __init__(
         self,
@@ -312,7 +312,7 @@ class PictureFeeds:
 
     @contextmanager
     def watched(self, key: str) -> Iterator[PictureFeed]:
-        """Yield the feed of a key, on the loop."""
+        """Yield the feed of a key; call on the loop."""
         feed = self._feeds.get(key)
         if feed is None:
             feed = PictureFeed(key, self._refuse)
@@ -333,7 +333,7 @@ class PictureFeeds:
             feed.stop()
 
     def forget(self) -> None:
-        """Drop the newest pictures, since another run begins."""
+        """Drop the newest pictures, as another run begins."""
         for feed in self._feeds.values():
             feed.newest = None
 
@@ -357,12 +357,12 @@ async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.Stream
 
 
 def picture_part(image: CameraImage) -> bytes:
-    """Return a picture as a part followed by the boundary, which browsers read before they show the part."""
+    """Return a picture as a part with the boundary after it, for which browsers wait before they show the part."""
     kind = f"Content-Type: image/jpeg\r\nContent-Length: {len(image.data)}\r\n"
     head = f"{kind}X-Timestamp: {exposure_s(image)}\r\n\r\n"
     return b"%b%b\r\n--%b\r\n" % (head.encode(), image.data, BOUNDARY.encode())
 
 
 def exposure_s(image: CameraImage) -> str:
-    """Return the simulated time of a picture's exposure for a header [s]."""
+    """Return the simulated time [s] of a picture's exposure as the text of a header."""
     return f"{image.t_sample_ns / 1e9:.6f}"

@@ -1,4 +1,4 @@
-"""The gateway: serves HTTP, WebSocket and lines of JSON for one run after another, and each client on a stream."""
+"""The gateway: serves one run after another over HTTP, WebSocket and lines of JSON, and each client on a stream."""
 
 import asyncio
 import secrets
@@ -47,21 +47,21 @@ CLIENTS_MAX = 500  # number of concurrent streams
 UNAUTHENTICATED_MAX = 100  # number of concurrent unauthenticated connections
 HELLO_TIMEOUT_S = 5.0  # time limit for a client to present its token
 DRAIN_S = 2.0  # after the end of a run, how long agents may still answer their last gates
-FAULTS_REPORTED_MAX = 100  # number of different errors that are printed
-PICTURES_WAITING_MAX = 4  # number of waiting messages of a camera; each may have megabytes
-RELEASE_TIMEOUT_S = 1.0  # the world answers within milliseconds
-STREAM_RATE_HZ = 5_000.0  # requests per wall second of one stream; a loop at the speed of the fastest run makes 2 500
+FAULTS_REPORTED_MAX = 100  # number of distinct errors that are printed
+PICTURES_WAITING_MAX = 4  # number of waiting messages per camera; each may take megabytes
+RELEASE_TIMEOUT_S = 1.0  # ample: the world answers within milliseconds
+STREAM_RATE_HZ = 5_000.0  # requests per wall second on one stream; a loop in step with the fastest run makes 2 500
 STREAM_BURST = 10_000.0
 BYE_TIMEOUT_S = 2.0  # how long shutdown waits for the agents to leave
-SUBSCRIPTIONS_MAX = 100  # number for one client; `drone/*/truth` is one
-ANSWER_MAX = OUTBOX_BYTES_MAX  # bytes of an answer
-PENDING_MAX = 8  # number of unanswered requests of one client
+SUBSCRIPTIONS_MAX = 100  # number per client; `drone/*/truth` counts as one
+ANSWER_MAX = OUTBOX_BYTES_MAX  # size limit of an answer [bytes]
+PENDING_MAX = 8  # number of unanswered requests per client
 ROLE = "client"  # role added to a name without one
 _encode = msgspec.json.Encoder().encode
 
 
 class GatewayPorts(NamedTuple):
-    """The address where the gateway listens."""
+    """The host and the ports on which the gateway listens."""
 
     host: str
     http_port: int
@@ -69,16 +69,16 @@ class GatewayPorts(NamedTuple):
 
 
 class Gateway:
-    """One gateway.
+    """A gateway: its servers, its clients, and the current run.
 
     Args:
         token: the clients' token; None if only this machine can connect.
         dial: opens a session to the world for a named process.
         say: prints a line.
-        secured: whether access control restricts where it may publish.
+        secured: whether access control restricts the keys on which the gateway may publish.
 
     Raises:
-        RunError: other machines could reach it, and there is no token.
+        RunError: other machines could reach the gateway without a token.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class Gateway:
         return self._run
 
     def start_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
-        """Run a client's agent on a separate link until it leaves; `ended` is called with the reason."""
+        """Run a client's lockstep session on a link of its own until it ends; then call `ended` with the reason."""
         for client in self._clients:
             client.lose_lockstep(session, "another client took the name")
         thread = threading.Thread(target=self._run_lockstep, args=(session, ended), name=session.name, daemon=True)
@@ -166,7 +166,7 @@ class Gateway:
         """Count a client as authenticated.
 
         Raises:
-            TooManyError: the limit of clients is reached, or it was evicted meanwhile.
+            TooManyError: the limit of clients is reached, or this client has been evicted meanwhile.
         """
         if client not in self._unauthenticated:
             raise TooManyError("the connection was closed, since it waited too long for its token; connect again")
@@ -213,7 +213,7 @@ class Gateway:
         self._notify_clients("begun", run)
 
     def _end(self, run: RunAccess, another: bool = False) -> None:
-        """End a run for the clients; `another`: the world has begun another one, so the link is restored."""
+        """End a run for the clients; `another`: another run has begun, so the link is restored."""
 
         def end_lockstep_sessions() -> None:
             for client in self._clients:
@@ -234,15 +234,15 @@ class Gateway:
 
     def _observe_link(self, run: RunAccess) -> None:
         def on_link(up: bool) -> None:
-            with suppress(RuntimeError):  # called in a Zenoh thread; the gateway has ended
+            with suppress(RuntimeError):  # called in a Zenoh thread, perhaps after the gateway has ended
                 self.loop.call_soon_threadsafe(self._notify_link, run, up)
 
         run.link.on_link(on_link)
-        if not run.link.links():  # lost before it was observed, so no event follows
+        if not run.link.links():  # the link was lost before it was observed, so no event follows
             on_link(False)
 
     def _notify_link(self, run: RunAccess, up: bool) -> None:
-        """Notify clients that the link is lost or restored, but not if the world exits after the end of its run."""
+        """Notify clients that the link is lost or restored, but not if the world exits after its run has ended."""
         if run is self._run and up == self._link_lost:
             self._link_lost = not up
             self._notify_clients("back" if up else "lost", run)
@@ -265,7 +265,7 @@ class Gateway:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve clients on a separate thread; raise RunError if a port is taken."""
+        """Serve clients in a separate thread; raise a RunError if a port is taken."""
         with open_on_thread(self.loop, "gateway servers", self._open, lambda servers: self._close(*servers)):
             yield
 
@@ -312,7 +312,7 @@ class Gateway:
                 client.refuse(str(error))
                 return client
         else:
-            if len(self._unauthenticated) >= UNAUTHENTICATED_MAX:  # close the one that has waited longest
+            if len(self._unauthenticated) >= UNAUTHENTICATED_MAX:  # close the connection that has waited longest
                 oldest = next(iter(self._unauthenticated))
                 oldest.expire()
                 self.remove(oldest)
@@ -333,11 +333,11 @@ class Client:
     """The client on one stream: executes its requests; answers and values go into its outbox.
 
     Args:
-        source: name under which it publishes until it gives one.
-        authenticated: whether it has presented the token, or needs none.
+        source: name under which the client publishes until it gives its own.
+        authenticated: whether the client has presented the token, or needs none.
 
     Attributes:
-        commanded: (source, drone) of the drones that it has commanded in this run, outside a lockstep session.
+        commanded: (source, drone) of the drones that the client has commanded in this run, outside a lockstep session.
     """
 
     def __init__(self, gateway: Gateway, outbox: Outbox, source: str, authenticated: bool, limit: RateLimit) -> None:
@@ -420,7 +420,7 @@ class Client:
         self.send(answer, request)
 
     def _process_name(self, name: str) -> str:
-        """Return the process name of a client, to which ROLE is added if it has no role, or raise a DecodeError."""
+        """Return a client's process name, with ROLE prepended if it has no role, or raise a DecodeError."""
         process = name if "." in name else f"{ROLE}.{name}"
         if not keys.PROCESS_NAME.fullmatch(process) or "." not in process.strip(".") or process == self._gateway.name:
             raise DecodeError(

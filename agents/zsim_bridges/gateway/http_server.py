@@ -4,7 +4,7 @@ Full keys form the tree of the Zenoh REST plugin, with unchanged payloads. GET a
 DELETE deletes; `Accept: text/event-stream` subscribes; `?_raw` returns the first payload alone. Source: zenoh,
 plugins/zenoh-plugin-rest.
 
-/json/KEY, without the federation's name, has JSON by the schema of each message.
+/json/KEY, where KEY lacks the federation's name, exchanges JSON by the schema of each message:
 GET    /json/drone/drone1/sensor/imu      the last value; for an expression, a list of {key, value}
 GET    … with Accept: text/event-stream   every value from now on
 PUT    /json/drone/drone1/cmd/velocity    {"velocity_m_s": [1, 0, 0]}; t_ns, seq and source are filled in
@@ -63,12 +63,12 @@ from zsim_bridges.gateway.run_access import RunAccess, SharedSubscriptions
 from zsim_bridges.web import is_loopback_authority
 from zsim_bridges.web.web_server import tokens_match
 
-HTTP_RATE_HZ = 5_000.0  # requests per wall second of one address: 500 clients that ask ten times a second
+HTTP_RATE_HZ = 5_000.0  # requests per wall second from one address: 500 clients with ten requests a second each
 HTTP_BURST = 10_000.0
 METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"
-BYTES = "zenoh/bytes"  # the plugin's encoding of a body without Content-Type
+BYTES = "zenoh/bytes"  # the plugin's encoding for a body without Content-Type
 PICTURE_S = 2.0  # wall; time to wait for the first picture: twice the period of a slow camera
 NO_PICTURE = "no picture yet; is a camera process publishing there, and is time running?"
 NO_VALUE = "no value yet; is the key right, and does a process publish it?"
@@ -152,10 +152,10 @@ def application(access_check: "AccessCheck", trees: "KeyTrees", new_client: Clie
 
 
 class AccessCheck:
-    """Forwards or refuses requests.
+    """Middleware that forwards or refuses requests.
 
     Args:
-        token: token that every request must have; None if only this machine can connect.
+        token: token that every request must carry; None if only this machine can connect.
         report: prints an internal error of the gateway.
     """
 
@@ -169,7 +169,7 @@ class AccessCheck:
 
     @web.middleware
     async def check(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests without the token, from other sites' pages, or above the limit; answer errors."""
+        """Refuse requests without the token, from other sites' pages, or above the rate limit; answer errors."""
         response = await self._answer(request, handler)
         if not response.prepared:
             response.headers.setdefault("Access-Control-Allow-Origin", "*")
@@ -204,16 +204,16 @@ class AccessCheck:
 
 
 def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:
-    """Return a response with an error and the methods that the key allows."""
+    """Return a response with an error and, if given, the methods that the key allows."""
     headers = {"Allow": ", ".join(allowed)} if allowed else None
     return web.Response(status=status, body=_encode({"error": text}), content_type="application/json", headers=headers)
 
 
 def _is_from_this_machine(request: web.Request) -> bool:
-    """Return whether a request is from a program of this machine and not from a page of another server (by its origin).
+    """Return whether a request comes from a program on this machine and not, by its origin, from another server's page.
 
-    A server on another port of this machine is another server, whose pages are not trusted. The Host header must be
-    checked, too: another site can make its own name resolve to this machine.
+    A server on another port of this machine is another server, so its pages are not trusted. The Host header must be
+    checked too, since another site can make its own name resolve to this machine.
     """
     origin = request.headers.get("Origin")  # "null" for a sandboxed frame, which any page can create
     try:
@@ -225,7 +225,7 @@ def _is_from_this_machine(request: web.Request) -> bool:
 
 @dataclass(frozen=True)
 class KeyTrees:
-    """Handlers of the trees of full keys, of JSON, and of the pictures of cameras."""
+    """Handlers for the trees of full keys, of JSON, and of camera pictures."""
 
     run: Callable[[], RunAccess]  # returns the current run
     full_subscriptions: SharedSubscriptions  # subscriptions to full keys
@@ -235,7 +235,7 @@ class KeyTrees:
     source: str  # source of control requests that name none
 
     async def get_full(self, request: web.Request) -> web.StreamResponse:
-        """Answer a GET or a POST of a full key."""
+        """Answer a GET or a POST on a full key."""
         expression, accepted = _key_of(request, "/"), _first_accepted(request)
         if any(part.startswith("@") for part in expression.split("/")):  # wildcards match no such parts
             raise ForbiddenError(
@@ -259,7 +259,7 @@ class KeyTrees:
         stored = [] if body else run.last_samples(expression)
         if stored and "*" not in expression:
             return stored
-        # The query string holds Zenoh's parameters and the gateway's own.
+        # The query string may hold the gateway's token besides Zenoh's parameters.
         parts = [part for part in request.query_string.split("&") if part.partition("=")[0] not in (TOKEN, "")]
         answers = await run.query(expression, ";".join(parts), body, _encoding_of(request))
         stored_keys = {sample.key for sample in stored}
@@ -324,7 +324,7 @@ class KeyTrees:
 
 
 def methods_of(key: str) -> tuple[str, ...]:
-    """Return the HTTP methods of a key: POST for control keys, GET for reserved keys, all for clients' own keys."""
+    """Return a key's methods: POST for control keys, GET for reserved, GET and PUT for other keys of the contract."""
     if is_control_key(key):
         return ("POST",)
     if is_reserved(key):
@@ -347,7 +347,7 @@ def _key_of(request: web.Request, prefix: str) -> str:
 
 
 def _checked_key(request: web.Request) -> str:
-    """Return the key of a request, or raise a MethodError if the key does not have its method."""
+    """Return the key of a request, or raise a MethodError if the key does not support its method."""
     key = _key_of(request, JSON_PREFIX)
     check_expression(key)
     allowed = methods_of(key)
@@ -377,7 +377,7 @@ def _first_accepted(request: web.Request) -> str:
 def described_sample(sample: RawSample) -> dict[str, Any]:
     """Return an answer or a publication in the plugin's JSON format."""
     kind, payload = sample.encoding.partition(";")[0], sample.payload
-    value: Any = base64.b64encode(payload).decode() if payload else None  # if it is invalid in its encoding
+    value: Any = base64.b64encode(payload).decode() if payload else None  # if invalid in its encoding
     try:
         if payload and kind in JSON:
             value = json.loads(payload)
@@ -396,7 +396,7 @@ def _sample_event(sample: RawSample) -> bytes:
 
 @lru_cache(maxsize=CACHED_VALUES)
 def value_event(sample: RawSample) -> bytes:
-    """Return a publication as an event; nothing for an invalid message."""
+    """Return a publication as an event; empty for an invalid message."""
     deleted = {"key": sample.key, "value": None}
     try:
         value = json_entry(sample.key, sample.payload, sample.encoding) if sample.payload else deleted
@@ -444,7 +444,7 @@ def description() -> dict[str, Any]:
     return {
         "openapi": "3.1.0",
         "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
-        "servers": [{"url": "."}],  # relative to this description, under any path of a proxy
+        "servers": [{"url": "."}],  # relative to this description, so that it holds behind a proxy under any path
         "paths": {**paths, **_other_paths()},
         "components": {
             "schemas": {**schemas, "Refusal": refusal},

@@ -1,6 +1,6 @@
-"""Access to a run for the gateway's clients: last values of keys, shared subscriptions, requests, the lockstep.
+"""Access to a run for the gateway's clients: last values of keys, shared subscriptions, requests, and the lockstep.
 
-In the lockstep a client is an agent whose step is executed at the other end of a socket.
+In the lockstep, a client is an agent whose step is executed at the other end of a socket.
 """
 
 import asyncio
@@ -42,19 +42,19 @@ from zsim_bridges.gateway.client_messages import (
     json_to_payload,
 )
 
-TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
+TICK_S = 0.1  # wall; period at which health is published and a stop is noticed while nothing arrives
 REQUESTS_MAX = 64  # concurrent requests; each has a thread that waits for Zenoh
-ECHOES_MAX = 256  # number of expected echoes per key; a paused world returns none while clients may continue
+ECHOES_MAX = 256  # number of expected echoes per key; a paused world returns none while clients may publish
 DELETED = None
 OWN_BYTES_MAX = 64_000_000  # total size of the values on clients' own keys
-KEYS_MAX = 200_000  # number of keys with a last value; 1000 drones have about 12 000
+KEYS_MAX = 200_000  # number of keys with a last value; 1000 drones make about 12 000
 WAITING_MAX = 50_000  # default limit of an expression's messages that wait for the loop
 DELIVER_MAX = 500  # messages delivered before other tasks of the loop run
-EXPRESSIONS_MAX = 2_000  # number for all clients together; the world's session checks each subscription
+EXPRESSIONS_MAX = 2_000  # number for all clients together; the world's session checks every subscription
 
 Subscriber = Callable[[RawSample], None]
 ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
-LATE_PERIODS = 2  # in realtime, a gate late by this many is skipped: its inputs are sent with a newer one
+LATE_PERIODS = 2  # in realtime, a gate that is this many periods late is skipped: its inputs are sent with a newer gate
 NO_GATE_NS = -1  # no gate waits for an answer
 _encode = msgspec.json.Encoder().encode
 
@@ -98,7 +98,7 @@ class RunAccess:
     # Messages that pass through the world
 
     def open(self) -> None:
-        """Subscribe to the messages that pass through the world, and read the present last values."""
+        """Subscribe to the messages that pass through the world, and read the current last values."""
         self._traffic = Traffic(self.link, run_key_table(self.info), self.count_refused)
         # Views do not pass through the world.
         self.link.declare_subscriber("view/**", lambda sample: self._keep(self.values.add, sample))
@@ -132,7 +132,7 @@ class RunAccess:
             ticker.join()
 
     def _keep(self, add: Callable[[str, bytes], None], sample: RawSample | ReceivedSample) -> None:
-        """Store a last value; ignore an invalid message, which any process may publish."""
+        """Store a last value; count an invalid message, which any process may publish, but ignore it."""
         if is_sound(sample.key, sample.payload):
             add(sample.key, sample.payload)
         else:
@@ -156,14 +156,14 @@ class RunAccess:
     def publish(self, key: str, payload: bytes, encoding: str = "") -> None:
         """Publish a checked payload, with the given encoding, or else the default of its key."""
         self.link.put_sample(key, payload, encoding or messages.encoding(key))
-        if not keys.is_picture(key):  # too large for last values; the world keeps none either
+        if not keys.is_picture(key):  # pictures are too large to keep; the world keeps none either
             self.values.add_own(key, payload, encoding)
 
     def encode(self, key: str, value: Any) -> bytes:
         """Return plain data as the payload of a key on which clients may publish.
 
         Raises:
-            DecodeError: it is not a message of the key; the error has key, field, value and what is allowed.
+            DecodeError: the data is not a message of the key; the error states key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
             UnknownError: the run has no such drone or cluster.
             SessionError: the key is invalid.
@@ -172,7 +172,7 @@ class RunAccess:
         return json_to_payload(key, value)
 
     def _check_key(self, key: str) -> None:
-        """Refuse a key of the federation that is reserved or invalid."""
+        """Raise an error for a key of the federation that is reserved, invalid, or unknown to the run."""
         check_not_reserved(key)
         check_expression(key)
         self.check_known(key)
@@ -209,7 +209,7 @@ class RunAccess:
     async def request(
         self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Send a control request to the process that answers on a key; TooManyError if REQUESTS_MAX are waiting."""
+        """Send a control request to the process that answers on a key; TooManyError if REQUESTS_MAX are under way."""
         if "*" in key:
             raise DecodeError(f"{key[:80]!r}: is not a key; a request needs one without wildcards")
         self.check_known(key)
@@ -228,7 +228,7 @@ class RunAccess:
         return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
-        """Publish a payload on a full key; raise DecodeError if it is not the message of the key."""
+        """Publish a payload on a full key; raise a DecodeError if it is not a message of the key."""
         own = self._federation_key(key)
         if own is None:
             self.bare_link.put_sample(key, payload, encoding)
@@ -248,7 +248,7 @@ class RunAccess:
         """Return a full key without this federation's name; None for a key of no federation or of another one.
 
         Raises:
-            DecodeError, ForbiddenError, UnknownError: clients may not publish there, in any federation.
+            DecodeError, ForbiddenError, UnknownError: clients may not publish on this key, in any federation.
         """
         own = key.removeprefix(self._prefix)
         if own != key:
@@ -270,11 +270,11 @@ class RunAccess:
 
 
 class EchoFilter:
-    """Recognises clients' values that return from the world after a newer value, by key.
+    """Recognises clients' values that the world echoes when a newer value is already stored.
 
-    After two values in a row the first returns when the second is already stored; after a value and its deletion
-    the value returns. An echo that never arrives is dropped with the next one of its key. Echoes are expected for
-    at most `keys_max` keys.
+    After two values in quick succession, the echo of the first arrives when the second is already stored; after a
+    value and its deletion, the echo arrives when nothing should be stored. An echo that never arrives is forgotten
+    with the next echo on its key. Echoes are expected for at most `keys_max` keys.
     """
 
     def __init__(self, keys_max: int) -> None:
@@ -315,7 +315,7 @@ class LastValues:
         self._indices = {key: index for index, key in enumerate(self._table)}
         self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0
-        self._lock = threading.Lock()  # values are added in the clients' thread and in the world's
+        self._lock = threading.Lock()  # clients and the world add values in different threads
         self._encodings: dict[str, tuple[bytes, str]] = {}
         self._echoes = EchoFilter(KEYS_MAX)
         self._of_gates: dict[int, tuple[GateMessages, int]] = {}
@@ -367,16 +367,16 @@ class LastValues:
         return encoding if encoding and payload == self._payloads.get(key) else messages.encoding(key)
 
     def add_gate(self, gate: GateMessages) -> None:
-        """Store the world's messages of a gate, whose columns have been checked."""
+        """Store the world's messages of a gate; their columns have been checked."""
         for m, index in enumerate(gate.which.tolist()):
             self._of_gates[index] = (gate, m)
 
     def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
-        """Return keys and payloads that an expression matches, in order of the keys.
+        """Return the keys that an expression matches, sorted, with their payloads.
 
         Args:
             expression: key expression with the prefix.
-            prefix: prepended to each key for the comparison; returned keys are without it.
+            prefix: prepended to each key for the comparison; the returned keys lack it.
         """
         if "*" not in expression:
             matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
@@ -391,12 +391,12 @@ class LastValues:
 
 
 class SharedSubscriptions:
-    """Subscriptions that clients share, and that outlast the session of a run.
+    """Subscriptions that clients share, and that outlast the Zenoh session of a run.
 
     Args:
-        loop: on which everything but Zenoh's callbacks is called.
+        loop: event loop on which everything but Zenoh's callbacks is called.
         limit: bounds the number of clients; a connection with a single subscription counts as one.
-        waiting_max: number of an expression's messages that wait for the loop; the oldest of more are dropped.
+        waiting_max: number of an expression's messages that may wait for the loop; beyond it, the oldest are dropped.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, limit: ClientLimit, waiting_max: int = WAITING_MAX) -> None:
@@ -409,7 +409,7 @@ class SharedSubscriptions:
     def attach(self, link: Session) -> None:
         self._link = link
         for expression, shared in self._by_expression.items():
-            with suppress(SessionError):  # without the right to read it, nothing arrives, as on keys without publishers
+            with suppress(SessionError):  # without the right to read, nothing arrives, as on keys without publishers
                 shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
 
     def detach(self) -> None:
@@ -423,7 +423,7 @@ class SharedSubscriptions:
 
         Raises:
             SessionError: the expression is invalid.
-            TooManyError: there are EXPRESSIONS_MAX others.
+            TooManyError: there are EXPRESSIONS_MAX other expressions already.
         """
         shared = self._by_expression.get(expression)
         if shared is None:
@@ -479,7 +479,7 @@ class _SharedSubscription:
         self.undeclare: Callable[[], None] | None = None
 
     def on_publication(self, sample: RawSample) -> None:
-        """Store a publication; called in a thread of Zenoh."""
+        """Store a publication; called in a Zenoh thread."""
         self._waiting.append(sample)
         if not self._scheduled:
             self._scheduled = True
@@ -498,17 +498,17 @@ class _SharedSubscription:
 
 
 class LockstepSession(Agent):
-    """A client's session in the lockstep, from joining to leaving: sends each gate's inputs, waits for its outputs.
+    """A client's session in the lockstep, from joining to leaving: sends each gate's inputs and waits for the outputs.
 
-    The runner calls its methods in a separate thread; all others are called on the loop.
+    The runner calls the methods of `Agent` in a separate thread; all others are called on the loop.
 
     Args:
-        name: process name of the participant, role.thing.
+        name: process name of the client, such as `client.myctrl`.
         loop: event loop of the client.
         send: sends the line of a gate; called on the loop.
 
     Attributes:
-        connection_lost: whether its client disconnected without leaving, so that its process counts as dead.
+        connection_lost: whether the client disconnected without leaving, so that its process counts as dead.
 
     Raises:
         DecodeError: the period or a gate key is invalid.
@@ -603,7 +603,7 @@ class LockstepSession(Agent):
         self._answers.put(counted)
 
     def leave(self, connection_lost: bool = False) -> None:
-        """End the session, and a step that waits for an answer."""
+        """End the session, and any step that waits for an answer."""
         self.has_left, self.connection_lost = True, connection_lost
         self._answers.put([])
 
@@ -611,8 +611,9 @@ class LockstepSession(Agent):
 def gate_keys_of(info: Info, reads: Sequence[str], name: str, required: Collection[tuple[str, str]]) -> tuple[str, ...]:
     """Return the keys with a message at every gate that match an expression of `reads`; `clock` if there are none.
 
-    A drone's status and truth come from the world. Its estimate and the state of a cluster arrive at every gate if the
-    run does not start without a process for it, other than the one that joins.
+    The world sends a drone's status and truth at every gate. The estimate of a drone and the state of a cluster arrive
+    at every gate if the run cannot start without another process than the joining one that serves this drone or
+    cluster.
     """
     served = {thing for process, thing in required if process != name}
     of_world = [key(drone.name) for drone in info.drones for key in (keys.status, keys.truth)]

@@ -1,1 +1,1 @@
-"""MAVLink in both directions: drones of a run as MAVLink vehicles, and a MAVLink vehicle as a drone of a run."""
+"""MAVLink in both directions: presents a run's drones as MAVLink vehicles, and a MAVLink vehicle as a drone."""

@@ -1,6 +1,6 @@
 """The session with one MAVLink vehicle: requests, monitors and decodes its telemetry, and makes it carry out demands.
 
-Pure. Sources: https://mavlink.io/en/services/ (heartbeat, command, timesync, message intervals); PX4
+No I/O. Sources: https://mavlink.io/en/services/ (heartbeat, command, timesync, message intervals); PX4
 px4_custom_mode.h; ArduPilot Copter mode.h; https://mavlink.io/en/messages/common.html#MAV_CMD_DO_SET_MODE.
 """
 
@@ -46,14 +46,14 @@ from zsim_bridges.vehicle_links.vehicle_session import (
 
 SYSTEM, COMPONENT = 245, 191  # ids of this driver; the component is MAV_COMP_ID_ONBOARD_COMPUTER
 HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
-TIMESYNC_NS = 500_000_000  # chosen: ten round trips within the window of the clock offset
-REQUEST_NS = 3_000_000_000  # chosen; time after which a missing stream is requested again
+TIMESYNC_NS = 500_000_000  # design choice: ten round trips within the window of the clock offset
+REQUEST_NS = 3_000_000_000  # time after which a missing stream is requested again: three periods of the slowest one
 STRANGERS_MAX = 256  # other systems reported, each only once
-CLIMBED = 0.85  # chosen; fraction of the take-off height from which it counts as reached
-REPEAT_NS = 1_000_000_000  # period of repeated commands; chosen: an autopilot answers within some 0.1 s
-KILL_REPEAT_NS = 200_000_000  # chosen: shorter, since this is the one command that must not be lost
+CLIMBED = 0.85  # fraction of the take-off height that counts as reached; design choice: allows for errors of both
+REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopilot answers within about 0.1 s
+KILL_REPEAT_NS = 200_000_000  # shorter, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
-CHANGED_NS = 15_000_000  # minimum spacing of changed setpoints; chosen below a gate, which brings one command
+CHANGED_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period, in which one command arrives
 STREAMED_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
 HERE = (
@@ -63,7 +63,7 @@ HERE = (
     math.nan,
     math.nan,
     math.nan,
-)  # first parameters of NAV_LAND and NAV_TAKEOFF: no position
+)  # first six parameters of NAV_LAND and NAV_TAKEOFF: no position given
 _RATES_HZ: dict[type, float] = {
     dialect.AttitudeQuaternion: 50,
     dialect.LocalPositionNed: 50,
@@ -77,19 +77,20 @@ _RATES_HZ: dict[type, float] = {
 ACCEL_GYRO, MAG, PRESSURE = 0x003F, 0x01C0, 0x0200  # HIGHRES_IMU_UPDATED_FLAGS
 DOWNWARD = 25  # MAV_SENSOR_ROTATION_PITCH_270
 FLOW_NS = 66_000_000  # 15 Hz, as on the AR.Drone; period of the estimated velocities that replace a missing flow
-FLOW_LOST_NS = 1_000_000_000  # chosen; time without flow after which the estimated velocity replaces it
+FLOW_LOST_NS = 1_000_000_000  # time without flow after which the estimated velocity replaces it: 15 periods
 UT_PER_GAUSS, PA_PER_HPA = 100.0, 100.0
 DOP_M = 2.0  # position error per unit of dilution [m], usual for single-frequency receivers
 
 
 class ExternalControl(NamedTuple):
-    """How an autopilot's velocity is controlled externally, and how the mode for that is entered.
+    """How to control an autopilot's velocity externally: the mode for it, and how to enter this mode.
 
     Attributes:
-        custom_mode: that mode, as in heartbeats; parameters: those of DO_SET_MODE, from the second on.
-        takes_off: whether the vehicle takes off in that mode, rather than in a separate one.
-        own: further modes in which this driver keeps control, and from which it may return to that mode.
+        custom_mode: the mode, as in heartbeats; parameters: those of DO_SET_MODE for it, from the second on.
+        takes_off: whether the vehicle takes off in this mode, rather than in a separate one.
+        own: further modes in which this driver remains in control, and from which it may return to `custom_mode`.
         landing: mode in which the vehicle lands, whether for this driver, its pilot, or its own failsafe.
+        rates_hz: requested rates, by telemetry message.
     """
 
     custom_mode: int
@@ -121,13 +122,13 @@ CONTROL = {
 
 
 class AutopilotSession(VehicleSession):
-    """The session with one vehicle.
+    """A session with one vehicle.
 
     Args:
         origin: origin of W: latitude, longitude [deg], height [m].
         system: the vehicle's system id; 0 for the first autopilot that appears.
-        local_origin_m: origin of its local frame [m; W]; None for the reported one.
-        key: key of the signatures in both directions; None for no signatures.
+        local_origin_m: origin of the vehicle's local frame [m; W]; None for the origin that it reports.
+        key: signing key for both directions; None for unsigned messages.
         unix_s: returns the wall time [s since 1970] for signatures.
     """
 
@@ -184,7 +185,7 @@ class AutopilotSession(VehicleSession):
                 self._take(received.message, now_ns)
 
     def _is_vehicle(self, received: Received) -> bool:
-        """Return whether a message is from the vehicle, which the first heartbeat of an autopilot identifies."""
+        """Return whether a message is from the vehicle; the first heartbeat from a known autopilot identifies it."""
         message: Any = received.message
         address = received.system_id, received.component_id
         if self._autopilot is not None and address == self._autopilot.address:
@@ -321,7 +322,7 @@ class AutopilotState:
         return self.custom_mode == self.control.custom_mode
 
     def command(self, number: int, *parameters: float) -> dialect.CommandLong:
-        """Return a command to the vehicle; `parameters` start with the first."""
+        """Return a command to the vehicle; `parameters` are its first ones, and the others are 0."""
         return dialect.CommandLong(*self.address, number, 0, *parameters)
 
     def state(self, flies: bool, climbed: bool) -> DroneState:
@@ -374,7 +375,7 @@ class DemandSequence:
                 yield from self._repeat("kill", now_ns, kill, KILL_REPEAT_NS if autopilot.armed else REPEAT_NS)
 
     def _take_off(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
-        """Yield the next command: enter the controlled mode, if the vehicle takes off in it, then arm, take off."""
+        """Yield the next command: enter the mode for external control if the vehicle takes off in it, arm, take off."""
         takes_off = autopilot.control.takes_off
         if takes_off and not autopilot.is_controlled:
             yield from self._enter_mode(now_ns, autopilot)
@@ -419,14 +420,15 @@ class DemandSequence:
 
 
 class TelemetryReadings(AircraftReadings):
-    """Converts the telemetry of one vehicle.
+    """Converts one vehicle's telemetry to sensor readings.
 
     Args:
         origin: origin of W: latitude, longitude [deg], height [m].
-        local_origin_m: origin of its local frame [m; W]; None for its GPS_GLOBAL_ORIGIN, until then that of W.
+        local_origin_m: origin of the vehicle's local frame [m; W]; None for its GPS_GLOBAL_ORIGIN, and before that
+            arrives, the origin of W.
 
     Attributes:
-        clock, unix_clock: offsets for messages timestamped since boot, and since 1970.
+        clock, unix_clock: clock offsets for messages with time since boot and since 1970.
         has_origin: whether the origin of the vehicle's local frame is known.
     """
 
@@ -445,7 +447,7 @@ class TelemetryReadings(AircraftReadings):
         self.unix_clock.add_round_trip(duration_ns, now_ns)
 
     def receive(self, m: Any, now_ns: int) -> None:
-        """Decode a message that arrives now; a message with non-finite values is ignored."""
+        """Decode a message that arrived at `now_ns`; ignore a message with non-finite values."""
         values = (getattr(m, name) for name in m.__struct_fields__)
         if not all(math.isfinite(value) for value in values if isinstance(value, float)):
             return
@@ -453,7 +455,7 @@ class TelemetryReadings(AircraftReadings):
             case dialect.AttitudeQuaternion():
                 q = dialect.attitude_ned((m.q1, m.q2, m.q3, m.q4))
                 length = el.length(q)
-                if length > 0.5:  # otherwise it is not an attitude
+                if length > 0.5:  # otherwise not an attitude
                     w, x, y, z = (part / length for part in q)
                     self._q_WB, self._w_WB_B = (w, x, y, z), frd((m.rollspeed, m.pitchspeed, m.yawspeed))
             case dialect.LocalPositionNed():

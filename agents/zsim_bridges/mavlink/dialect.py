@@ -125,7 +125,7 @@ LandedState = IntEnum("LandedState", "UNDEFINED ON_GROUND IN_AIR TAKEOFF LANDING
 
 
 class SensorBit(IntFlag):
-    """MAV_SYS_STATUS_SENSOR: the sensors and subsystems of the vehicles here."""
+    """MAV_SYS_STATUS_SENSOR: the sensors and subsystems of the vehicles presented here."""
 
     GYRO = 0x01
     ACCEL = 0x02
@@ -415,17 +415,17 @@ if TYPE_CHECKING:
 
 
 def ned(v_W: Vector) -> Vector:
-    """Convert a vector from W to north, east, down; its own inverse."""
+    """Convert a vector from W to north, east, down, or back."""
     return v_W[1], v_W[0], -v_W[2]
 
 
 def frd(v_B: Vector) -> Vector:
-    """Convert a vector from B to forward, right, down; its own inverse."""
+    """Convert a vector from B to forward, right, down, or back."""
     return v_B[0], -v_B[1], -v_B[2]
 
 
 def attitude_ned(q_WB: Quaternion) -> Quaternion:
-    """Convert an attitude B to W to one FRD to NED, w first and non-negative; its own inverse.
+    """Convert an attitude from B-to-W to FRD-to-NED, or back; w comes first, and is non-negative in the result.
 
     W to NED is a half-turn about (1, 1, 0), FRD to B a half-turn about x.
     """
@@ -441,7 +441,7 @@ def wrapped(angle_rad: float) -> float:
 
 
 def yaw_ned(yaw_W: float) -> float:
-    """Convert a yaw counter-clockwise from east to one clockwise from north [rad]; its own inverse."""
+    """Convert a yaw [rad] counter-clockwise from east to one clockwise from north, or back."""
     return wrapped(0.5 * math.pi - yaw_W)
 
 
@@ -496,7 +496,7 @@ class Signing:
     """Signs frames with a 32-byte key, and checks the signatures of received frames.
 
     Attributes:
-        timestamp: that of the newest frame signed or accepted [10 us since 2015].
+        timestamp: timestamp of the newest frame signed or accepted [10 us since 2015].
     """
 
     def __init__(self, key: bytes) -> None:
@@ -511,7 +511,7 @@ class Signing:
         self.timestamp = max(self.timestamp, min(TIMESTAMP_MAX, int((unix_s - EPOCH_S) * TICKS_PER_S)))
 
     def sign(self, frame: bytes) -> bytes:
-        """Return the signature to append to a frame, which is given from header to checksum."""
+        """Return the signature to append to a frame, given from its header to its checksum."""
         self.timestamp += 1
         head = LINK_ID + self.timestamp.to_bytes(6, "little")
         return head + self._hash(frame + head)
@@ -570,7 +570,7 @@ class Parser:
     """Splits received datagrams into frames and decodes them.
 
     Args:
-        signing: checks signatures, and unsigned frames are refused; None to accept frames unchecked.
+        signing: checks signatures, which frames must then have; None to accept all frames unchecked.
 
     Attributes:
         refused: number of refused frames by reason: `bad_crc`, `unknown` (not in the dialect), `incompatible` (unknown

@@ -33,7 +33,7 @@ from zsim_bridges.vehicle_links.server import Say, TrafficIntake, VehicleServer
 from zsim_bridges.web import is_loopback
 
 ANSWER_S = 1.0  # wall time to wait for an answer from the world
-TICK_S = 0.1  # wall time between two checks of what is due by wall time
+TICK_S = 0.1  # wall time between checks of what is due by wall time
 SWITCH_S = 5e-4  # s; thread switch interval, so that a setpoint does not wait for a gate; Python's default is 5 ms
 SYSTEM_IDS = 254  # 255 is the ground station's by convention
 DATAGRAM_MAX = 1400  # bytes; fits into an Ethernet frame
@@ -57,14 +57,14 @@ Address = tuple[str, int]
 
 
 class MavlinkOptions(NamedTuple):
-    """How the drones are offered.
+    """How the drones are presented.
 
     Attributes:
         level: level of the telemetry rates.
-        gcs, gcs_local: address of the ground station, and the first local port that talks to it.
-        api, api_local: the programs' address for the first drone, and the first local port that talks to programs.
+        gcs, gcs_local: address of the ground station, and the first drone's local port for it.
+        api, api_local: address of programs for the first drone, and its local port for them; later drones count up.
         key: signing key; None for no signatures.
-        rate: pace requested of a run that would go as fast as possible; None for none.
+        rate: pace to request from a run that would go as fast as possible; None to request none.
         first_system_id: system id of the first drone; the others count up.
     """
 
@@ -144,7 +144,7 @@ class MavlinkServer(VehicleServer):
         stack.callback(asyncio.create_task(self._tick_always()).cancel)
 
     async def on_arrivals(self, intake: TrafficIntake) -> None:
-        """Process what has arrived, but only the newest of each kind of message from a drone."""
+        """Process what has arrived, but only the newest message on each of a drone's keys."""
         newest: dict[str, bytes] = {}
         for arrived in intake.arrivals():
             for key, payload in arrived:
@@ -167,7 +167,7 @@ class MavlinkServer(VehicleServer):
             await asyncio.sleep(0)  # let setpoints that have arrived meanwhile go first
 
     def report_mission(self, vehicle: MavlinkVehicle) -> None:
-        """Report to the world how far a mission was flown, for the record; gates do not wait for this."""
+        """Report the progress of a mission to the world, for the run's record; gates do not wait for this."""
         for report in vehicle.flight.mission.reports:
             args = {"drone": vehicle.name, **report._asdict()}
             self._requests.submit(self.link.request, keys.CONTROL, "mission", self.observer.name, args, ANSWER_S)
@@ -195,7 +195,7 @@ class MavlinkServer(VehicleServer):
 
 
 class ServedVehicle:
-    """A vehicle and its ports, which share one sequence of message numbers."""
+    """A vehicle and its ports, which share one series of sequence numbers."""
 
     def __init__(self, vehicle: MavlinkVehicle, ports: "Sequence[VehiclePort]", link: Link) -> None:
         self.vehicle = vehicle
@@ -231,7 +231,7 @@ class ServedVehicle:
 
 
 class VehiclePort:
-    """One UDP port, which sends to `peer` from the start.
+    """One UDP port; it sends to `peer` without having heard from it.
 
     Raises:
         RunError: the port cannot be opened.
@@ -275,7 +275,7 @@ class VehiclePort:
             except (BlockingIOError, InterruptedError):
                 return
             except OSError:
-                continue  # reports that an earlier datagram could not be delivered
+                continue  # an earlier datagram could not be delivered
             if self.peers.accepts(address, time.monotonic()):
                 for received in self.parser.feed(data):
                     self._on_received(received)

@@ -68,7 +68,7 @@ SPEED_MAX_M_S = 1e3  # m/s; faster setpoints are refused, since no vehicle here 
 Setpoint = Target | TiltTarget
 TEXT_MAX = 50  # characters in a STATUSTEXT
 REFUSED_MAX = 100  # refusal reasons remembered, so that each is reported only once
-DO_GO_TO = 2  # MISSION_ITEM.current with which older ArduPilot clients request to fly there now
+DO_GO_TO = 2  # value of MISSION_ITEM.current with which older ArduPilot clients send the vehicle there at once
 HEARTBEAT_NS = 1_000_000_000  # heartbeat period [ns of wall time]
 STICK = 1000.0  # full deflection in MANUAL_CONTROL
 STICKS_UNUSED = 32767
@@ -92,7 +92,7 @@ class Options(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A command with its seven parameters, of which the fifth and sixth are in degrees or metres, and their frame."""
+    """A command with its seven parameters, the fifth and sixth in degrees or metres, and the frame of its position."""
 
     command: int
     params: tuple[float, float, float, float, float, float, float]
@@ -110,7 +110,7 @@ class Request(NamedTuple):
         return cls(m.command, (m.param1, m.param2, m.param3, m.param4, *place), frame)
 
     def integer(self, place: int) -> int:
-        """Return a parameter truncated to an integer; -1 if it is not finite, negative, or 2**31 or more."""
+        """Return parameter `place` (from 0) truncated to an integer; -1 if not finite, negative, or 2**31 or more."""
         value = self.params[place]
         return int(value) if math.isfinite(value) and 0 <= value < 2**31 else -1
 
@@ -230,7 +230,7 @@ class MavlinkVehicle:
                 self._send(dialect.LogEntry())
             case dialect.CommandCancel():
                 self._send(dialect.CommandAck(message.command, Result.DENIED, 0, 0, *sender))
-            case dialect.FileTransferProtocol(payload=payload):  # there are no files here: answer NAK, UnknownCommand
+            case dialect.FileTransferProtocol(payload=payload):  # no files are offered: answer NAK, UnknownCommand
                 seq = int.from_bytes(payload[:2], "little") + 1 & 0xFFFF
                 answer = seq.to_bytes(2, "little") + bytes((0, 129, 1, payload[3], 0, 0, 0, 0, 0, 0, 7))
                 self._send(dialect.FileTransferProtocol(0, *sender, answer))
@@ -351,7 +351,7 @@ class MavlinkVehicle:
     def _set_point(self, setpoint: Setpoint | str) -> None:
         reason = setpoint if isinstance(setpoint, str) else self.flight.set_point(setpoint)
         if reason and without_figures(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
-            self._refused.add(without_figures(reason))  # a stream of them would flood the operator's screen
+            self._refused.add(without_figures(reason))  # a stream of refusals would flood the operator's screen
             self._deny(reason)
 
     def _steer(self, message: dialect.ManualControl) -> None:
@@ -398,7 +398,7 @@ class MavlinkVehicle:
 
 
 def _place(state: VehicleState, request: Request) -> Vector | None:
-    """Return a command's position in W, None if invalid; the vehicle's own replaces non-finite coordinates."""
+    """Return a command's position in W, None if invalid; the vehicle's own coordinates replace non-finite ones."""
     params, frame = request.params, request.frame
     item = PlanItem(frame, request.command, params[:4], *params[4:])
     if frame not in FRAMES or (abs(item.x) > 180.0 and frame not in LOCAL):
@@ -503,7 +503,7 @@ class DroneWatch:
 
     Args:
         source: name of this process; refusals of its commands are reported.
-        seen: state and flight of the drone; fence breaches are recorded there.
+        seen: state and flight of the drone; fence breaches are recorded in it.
     """
 
     def __init__(self, drone: str, source: str, seen: TelemetrySource, parameters: Parameters, report: Report) -> None:

@@ -1,4 +1,4 @@
-"""Waypoint missions: their items, a vehicle's progress through them, and the transfer of items, including fences.
+"""Waypoint missions: their items, a vehicle's progress through them, and the transfer of mission and fence items.
 
 Sources: https://mavlink.io/en/messages/common.html#mav_commands for the items, and
 https://mavlink.io/en/services/mission.html for the protocol.
@@ -29,7 +29,7 @@ COMMANDS: tuple[Any, ...] = (
     *(Cmd.NAV_WAYPOINT, Cmd.NAV_LOITER_UNLIM, Cmd.NAV_LOITER_TIME, Cmd.NAV_RETURN_TO_LAUNCH, Cmd.NAV_LAND),
     *(Cmd.NAV_TAKEOFF, Cmd.NAV_DELAY, Cmd.DO_JUMP, Cmd.DO_CHANGE_SPEED),
 )
-ITEMS_MAX = 1000  # items in one mission; chosen: autopilots store some hundreds
+ITEMS_MAX = 1000  # items in one mission; design choice: autopilots store some hundreds
 RETRY_NS = 500_000_000  # ns of wall time after which a missing item is requested again
 TRIES_MAX = 10
 FENCE_COMMANDS: tuple[Any, ...] = (
@@ -41,7 +41,7 @@ Address = tuple[int, int]
 
 
 class PlanItem(NamedTuple):
-    """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is in m. NaN means not given."""
+    """An item: x and y are latitude and longitude [deg], or [m] in local frames; z is in m. NaN: not given."""
 
     frame: int
     command: int
@@ -53,15 +53,15 @@ class PlanItem(NamedTuple):
 
     @property
     def has_place(self) -> bool:
-        """Whether the item has a horizontal position, for which one of x and y is enough."""
+        """Whether the item has a horizontal position, for which a non-zero x or y is enough."""
         return any(math.isfinite(value) and value for value in (self.x, self.y))
 
 
 class MissionReport(NamedTuple):
-    """How far a mission was flown, for the record of the run: `done` of `items`, without ArduPilot's item 0.
+    """A mission's progress, for the run's record: `done` of `items`, not counting ArduPilot's item 0.
 
     Attributes:
-        reason: why it was aborted; "" if it was not.
+        reason: why the mission was aborted; "" if it was not.
         failsafe: whether the vehicle aborted it, rather than a client.
     """
 
@@ -117,7 +117,7 @@ class Mission:
         self.reports: list[MissionReport] = []
         self._reported: int | None = None  # items done at the last report; None while the mission is not being flown
         self._index = 0
-        self._since_ns: int | None = None  # when the vehicle reached the current item
+        self._since_ns: int | None = None  # simulated time at which the vehicle reached the current item
         self._waits_at: Vector = (0.0, 0.0, 0.0)  # position held during a delay [m; W]
         self._speed_m_s: float | None = None
         self._jumps: dict[int, int] = {}  # jumps left, by item index
@@ -184,7 +184,7 @@ class Mission:
     # Steps
 
     def takeoff_height_m(self, state: VehicleState) -> float | None:
-        """Return z in W to which the mission takes off; None if the current item is not a take-off."""
+        """Return the height z in W to which the mission takes off; None if the current item is not a take-off."""
         item = self._item
         return place_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
 
@@ -278,7 +278,7 @@ class MissionProtocol:
     Args:
         loaded: called with the type and the items of a complete upload, or with no items after a removal.
         home: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which
-            requests items as MISSION_ITEM_INT first.
+            requests items in the form MISSION_ITEM_INT first.
     """
 
     def __init__(
@@ -396,14 +396,14 @@ def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
 
 
 def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
-    """Return the fault of an item; None if it is valid."""
+    """Return what is wrong with an item; None if it is valid."""
     if item.command not in (COMMANDS if type_ == MISSION else FENCE_COMMANDS):
         return MissionResult.UNSUPPORTED
     if item.frame not in FRAMES:
         return MissionResult.UNSUPPORTED_FRAME
     is_whole = item.has_place and math.isfinite(item.x) and math.isfinite(item.y)
     z = 0.0 if math.isnan(item.z) and item.command == Cmd.NAV_LAND else item.z
-    x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))  # not given
+    x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))  # NaN: not given
     if item.frame in LOCAL:
         is_good = is_place((x, y, z))
     else:

@@ -92,7 +92,7 @@ Setting = Literal[
 
 
 class ParameterSpec(NamedTuple):
-    """A parameter with initial value and range; a fixed one cannot be set. The setting is the value times `unit`."""
+    """A parameter with its initial value and range; fixed ones cannot be set. The setting is the value times `unit`."""
 
     name: str
     type: ParamType
@@ -157,7 +157,7 @@ class Personality(NamedTuple):
 
     Attributes:
         specs: returns the parameters of a drone, given its system id.
-        fence_actions: actions by the value of the fence's action parameter.
+        fence_actions: fence actions by the value of the parameter that sets them.
         is_px4: PX4 enters OFFBOARD only while it receives setpoints, holds when they stop, sends integer parameters as
             their bytes, and has no item 0 for home in its missions.
         version: flight_sw_version: major, minor, patch and type.
@@ -211,7 +211,7 @@ class Parameters:
 
     @property
     def fence_action(self) -> FenceAction:
-        """The action outside the fence; ArduPilot's fence is active only while FENCE_ENABLE is 1."""
+        """The action to take outside the fence; ArduPilot's fence is active only while FENCE_ENABLE is 1."""
         if not self.values.get("FENCE_ENABLE", 1.0):
             return FenceAction.NONE
         return self._personality.fence_actions.get(int(self["fence_action"]), FenceAction.WARN)
@@ -237,7 +237,7 @@ class Parameters:
         return map(self.message, self._names)
 
     def find(self, name: str, index: int) -> str | None:
-        """Return the name of a parameter, given its index, or -1 and its name; None if it does not exist."""
+        """Return the name of the parameter with an index or, if that is -1, a name; None if it does not exist."""
         if index >= 0:
             return self._names[index] if index < len(self._names) else None
         return name if name in self._specs else None
@@ -258,5 +258,5 @@ class Parameters:
         return float(value)
 
     def _is_bytewise(self, type_: int) -> bool:
-        """Whether a value is sent as the bytes of an integer in a float field."""
+        """Return whether values of a type are sent as the bytes of an integer in a float field."""
         return self._personality.is_px4 and type_ in _INTEGERS

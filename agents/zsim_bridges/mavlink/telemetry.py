@@ -1,7 +1,7 @@
 """The telemetry of a vehicle: its messages, each built from the state at one gate, and their rates.
 
-A builder returns None if there is nothing to send, or its sensor has failed. Messages that are due at one gate are
-sent in the order of the table.
+A builder returns None if there is nothing to send or its sensor has failed. Messages that are due at the same gate are
+sent in the order of ROWS.
 """
 
 import math
@@ -57,7 +57,7 @@ class TelemetrySource:
     """The data behind the telemetry; values that several messages need are computed once per gate.
 
     Attributes:
-        voltage_v, capacity_mah: nominal values of its battery.
+        voltage_v, capacity_mah: nominal voltage and capacity of the battery.
         breach: which limit of the fence is breached (FENCE_BREACH); breaches: how many so far; breach_ns: since when.
     """
 
@@ -76,7 +76,7 @@ class TelemetrySource:
             self.__dict__.pop(name, None)
 
     def sample(self, sensor: str) -> Any:
-        """Return the newest sample of a sensor; None if there is none, or the sensor has failed."""
+        """Return the newest sample of a sensor; None before the first, or if the sensor has failed."""
         sample = self.state.samples.get(sensor)
         return None if sample is None or self.state.has_failed(sensor) else sample
 
@@ -278,7 +278,7 @@ def altitude(s: TelemetrySource) -> WireMessage:
 
 
 def _estimator_flags(s: TelemetrySource) -> int:
-    """Return the estimator's flags: all, without the absolute position if the GPS has failed."""
+    """Return the estimator's flags: all, but without those of the absolute position if the GPS has failed."""
     if s.state.is_estimated and s.state.has_failed("gps"):
         return dialect.ALL_ESTIMATED & ~(dialect.POS_HORIZ_ABS | dialect.PRED_POS_HORIZ_ABS)
     return dialect.ALL_ESTIMATED
@@ -331,7 +331,7 @@ Rates = tuple[float, float]
 
 
 class Row(NamedTuple):
-    """A message: builder, rates for each autopilot (None: only on request), the sensor whose samples it waits for."""
+    """A message: its builder, its rates by autopilot (None: on request), and the sensor whose samples it awaits."""
 
     build: Builder
     px4: Rates | None = None
@@ -443,7 +443,7 @@ class Telemetry:
         return ROWS[kind].build(self._source) if kind else None
 
     def put_interval(self, message_id: int, interval_us: float) -> bool:
-        """Set the interval of a message: -1 never, 0 the default; return False if this vehicle does not send it."""
+        """Set the interval of a message (-1: never, 0: the default); return False if this vehicle does not send it."""
         kind = BY_ID.get(message_id)
         if kind is None:
             return False
@@ -453,7 +453,7 @@ class Telemetry:
         return True
 
     def interval_us(self, message_id: int) -> int:
-        """Return the interval of a message: -1 if it is off, 0 if this vehicle has no such message."""
+        """Return the interval of a message; -1 if it is off, 0 if this vehicle has no such message."""
         kind = BY_ID.get(message_id)
         if kind is None:
             return 0

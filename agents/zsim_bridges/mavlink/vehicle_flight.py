@@ -1,7 +1,7 @@
-"""The flight of one vehicle: its arming state, mode and targets, and the commands that make it hold these.
+"""The flight of one vehicle: its arming state, mode and targets, and the commands that make the drone follow them.
 
-A landed drone of zsim has no armed state; here, armed means that it takes off on command. Positions are approached like
-the references of drones, by `zsim_agents.references.cruise`.
+A landed drone of zsim has no armed state; here, armed means that it takes off on command. Positions are approached as
+references are, by `zsim_agents.references.cruise`.
 """
 
 import math
@@ -19,16 +19,16 @@ from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, Mode
 OVER_ON_GROUND = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN, FlightMode.MISSION)
 Report = Callable[[Severity, str], None]
 ANSWER_NS = 1_000_000_000  # ns within which the drone should begin a requested take-off or landing
-ARRIVED_M = 0.3  # m; a climb ends this close to its height
+ARRIVED_M = 0.3  # m; a climb ends this close to its target height
 STEP_NS = 40_000_000  # ns; the guidance law is evaluated 25 times a second
-BURST = 500  # commands in one burst: half of what the world records of a source outside the lockstep
+BURST = 500  # commands in one burst: half as many as the world records from a source outside the lockstep
 
 
 class Flight:
     """The flight of one vehicle; requests return None, or the reason for their refusal.
 
     Args:
-        name: name of this process, as in the commander of a drone.
+        name: name of this process, as it appears in a drone's `commander`.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Flight:
         self._stand("Emergency: rotors stopped")
 
     def reboot(self) -> str | None:
-        """Restart, which is possible only on the ground, and leave an emergency."""
+        """Restart, which is possible only on the ground; this ends an emergency."""
         if self._state.is_airborne:
             return "in flight"
         if self._state.state == "emergency":
@@ -149,7 +149,7 @@ class Flight:
         return reason
 
     def set_point(self, target: Target | TiltTarget) -> str | None:
-        """Accept a setpoint of a stream; in OFFBOARD (GUIDED) it is followed at once."""
+        """Accept a setpoint from a stream; in OFFBOARD (GUIDED) it is followed at once."""
         self._setpoint_ns = self._state.t_ns
         if self.mode is not FlightMode.OFFBOARD:
             return None if self._personality.is_px4 else "not in GUIDED"

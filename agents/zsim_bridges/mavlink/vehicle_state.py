@@ -18,7 +18,7 @@ from zsim_bridges.vehicle_links.drone_link import has_attitude
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
 SAMPLES_MISSED = 5  # periods without a sample after which a sensor counts as failed
-LOW_BATTERY_PERCENT = 20.0  # chosen: above BAT_CRIT_THR and the like, so that the pilot is warned before they act
+LOW_BATTERY_PERCENT = 20.0  # above BAT_CRIT_THR and the like, so that the pilot is warned before these act
 OFF_THE_GROUND = ("taking_off", "hovering", "flying", "landing")
 SENSORS = {
     "imu": SensorBit.GYRO | SensorBit.ACCEL,
@@ -168,7 +168,7 @@ class Target(NamedTuple):
 
     Attributes:
         position_m: position in W; None in axes in which only the velocity counts.
-        velocity_m_s: velocity that is added to that towards the position.
+        velocity_m_s: velocity added to the one towards the position.
         yaw_rad: counter-clockwise from east; None to turn at `yaw_rate_rad_s`.
         yaw_rate_rad_s: counter-clockwise.
         along_heading: whether the velocity is forward, left, up instead of in W.

@@ -1,4 +1,4 @@
-"""A node's dealings with its ROS master: XML-RPC calls, addresses, and a registration that survives its restart."""
+"""A node's dealings with its ROS master: XML-RPC calls, addresses, and a registration that outlives master restarts."""
 
 import http.client
 import os
@@ -16,7 +16,7 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 from zsim.errors import RunError
 
 TIMEOUT_S = 3.0  # time limit of one call
-BODY_MAX = 1_000_000  # bytes in a request
+BODY_MAX = 1_000_000  # size limit of a request [bytes]
 DONE = 1  # code of a successful answer
 DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's default
 DEFAULT_PORT = 11311
@@ -25,7 +25,7 @@ UNREGISTER_S = 2.0  # time limit for unregistering
 
 
 class ApiError(Exception):
-    """An answer is an error, or does not have the form that ROS prescribes."""
+    """An answer that is an error, or that does not have the form prescribed by ROS."""
 
 
 CALL_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error, ExpatError, ValueError, TypeError, ApiError)
@@ -60,7 +60,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing about clients that are silent or do not send XML-RPC."""
+        """Log nothing about clients that stay silent or do not send XML-RPC."""
 
     def do_POST(self) -> None:
         size = self.headers.get("content-length", "")

@@ -29,7 +29,7 @@ EVERYWHERE, LOOPBACK = "0.0.0.0", "127.0.0.1"
 STOP_POLL_S = 0.1  # period at which the XML-RPC server checks for its shutdown
 RETRY_S, RETRY_MAX_S = 0.5, 8.0  # first and maximum wall time between attempts to reach a publisher; it doubles
 DONE, FAILED = b"\x01", b"\x00"  # first byte of a service's response
-HEADER_MAX = 1_000_000  # bytes; the definitions of the largest messages take some 10 000
+HEADER_MAX = 1_000_000  # bytes; the definitions of the largest messages take about 10 000
 FRAME_MAX = 1_000_000  # bytes; other nodes send only commands, which are short
 HANDSHAKE_S = 10.0  # time limit for connecting, and for the arrival of a header
 ANY_TYPE = "*"  # md5sum of a node that accepts any type
@@ -176,13 +176,13 @@ class SlaveApi:
         return [OK, "", [[topic, s.topic_type.type] for topic, s in self._node.subscribed.items()]]
 
     def getBusInfo(self, caller: str) -> Answer:
-        """Return all connections: number, peer, direction, transport, topic, and whether it is up."""
+        """Return all connections, each as number, peer, direction, transport, topic, and whether it is up."""
         links = [(link.caller, "o", topic) for topic, p in self._node.published.items() for link in list(p.links)]
         links += [(uri, "i", topic) for topic, s in self._node.subscribed.items() for uri in list(s.connected)]
         return [OK, "", [[n, other, way, "TCPROS", topic, True] for n, (other, way, topic) in enumerate(links)]]
 
     def getBusStats(self, caller: str) -> Answer:
-        """Return the bytes sent per topic, and for each connection its number, bytes, messages and whether it is up.
+        """Return the bytes sent per topic, and for each connection its number, bytes, messages, and whether it is up.
 
         Subscribed topics and services are not included.
         """
@@ -224,7 +224,7 @@ class PublishedTopic:
         self.sent = 0
 
     def publish(self, make: Callable[[int], Any]) -> None:
-        """Send the message that `make` returns for a sequence number; called only if there are subscribers."""
+        """Send what `make` returns for a sequence number; `make` is called only if there are subscribers."""
         if not self.links:
             return
         framed = frame(serialize(self.topic_type.type, make(self.sent)))

@@ -1,7 +1,7 @@
-"""The bridge process: presents one run's drones in the graph of a ROS 1 master; it commands, but never gates.
+"""The bridge process: presents one run's drones in a ROS 1 graph; it sends commands, but no gate waits for it.
 
 Each drone appears like ardrone_autonomy's driver in a namespace with the drone's name: messages, commands, cameras.
-Units, signs and frames are the driver's; frames are named as if its tf_prefix were the drone's name. Sources:
+Units, signs and frames are the driver's; frames are named as if the driver's tf_prefix were the drone's name. Sources:
 ardrone_autonomy 1.4.1, src/ardrone_driver.cpp (PublishNavdata, PublishOdometry), src/teleop_twist.cpp; REP 103 and 105.
 """
 
@@ -35,7 +35,7 @@ from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, Mode
 from zsim_bridges.vehicle_links.server import PictureServer, Say
 
 WORLD = "world"
-MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
+MAG_LSB_PER_UT = 1 / 0.3  # the AR.Drone 2.0's AK8975 has 0.3 uT per LSB (datasheet)
 FIX_3D = 3  # fix type with a height, as in NMEA
 NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags recognised by a camera
     **dict.fromkeys(("temp", "wind_speed", "wind_angle", "wind_comp_angle", "tags_count"), 0),
@@ -218,7 +218,7 @@ class TiltCommand(NamedTuple):
 
 
 class DriverCommands:
-    """Commands from ROS nodes to one drone, by the driver's rules. Pure.
+    """Passes commands from ROS nodes to one drone, by the driver's rules.
 
     Like the driver, it repeats the last cmd_vel until another arrives, or until the drone comes down.
     """
@@ -244,7 +244,7 @@ class DriverCommands:
         self.send_mode("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
 
     def trim_refusal(self) -> str | None:
-        """Return why the drone cannot be trimmed now; a landed one is level, so trimming it has no further effect."""
+        """Return why the drone cannot be trimmed now; a landed drone is level, so trimming has no effect."""
         state = self._status.state if self._status else "not there yet"
         return None if state == "landed" else f"the drone is {state}; must be landed"
 
@@ -279,10 +279,10 @@ def tilt_of(twist: Any) -> TiltCommand:
 
 
 class CameraTopics:
-    """Topics of a drone's cameras, like those of the driver with image_transport, and the service togglecam.
+    """Topics of a drone's cameras, as the driver has them with image_transport, and the service togglecam.
 
-    Each camera has its topics, and so has the active camera, which the service changes. Since images are large, those
-    of a camera are read only while a node subscribes to them.
+    Each camera has topics of its own; a further set carries the active camera, which the service changes. Since
+    images are large, those of a camera are read only while a node subscribes to them.
     """
 
     def __init__(self, node: Ros1Node, name: str) -> None:
@@ -381,9 +381,9 @@ def fix(seq: int, sample: messages.Gps, frames: DriverFrames) -> Any:
 
 
 def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
-    """Return ardrone/odometry: the aircraft's own velocity, integrated since the start.
+    """Return ardrone/odometry, whose pose integrates the aircraft's own velocity since the start.
 
-    The velocity is that of navdata, along the level axes x forward, y left, z up.
+    The velocity is navdata's, along the level axes x forward, y left, z up.
     """
     assert state.status is not None
     velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)

@@ -4,8 +4,8 @@ Follows ros2/rmw_zenoh as shipped with Jazzy (from 0.2.4), Kilted and Rolling: `
 quality of service, `attachment_helpers.cpp` for attachments. Humble's version has neither type hashes nor this
 attachment. Type hashes are those of REP-2011; the types used here are the same from Iron to Lyrical.
 
-The wire comes first, which is pure; then the context, whose nodes have publishers, subscriptions and services; then the
-types: classes, CDR, and definitions that rosbags lacks.
+The wire format comes first, without any I/O; then the context, whose nodes have publishers, subscriptions and services;
+then the types: classes, CDR, and definitions that rosbags lacks.
 """
 
 import re
@@ -24,7 +24,7 @@ from rosbags.typesys.store import Typestore
 from zsim.transport.session import Query, RawSample, Session
 
 CDR = "application/cdr"
-_OTHERS = re.compile(r"[^a-z0-9]+")  # runs become one underscore, since ROS reserves two in a row
+_OTHERS = re.compile(r"[^a-z0-9]+")  # each run becomes one underscore, since ROS reserves double ones
 TOKEN_SPACE = "@ros2_lv"  # prefix of all tokens; `**` does not match it
 TOKEN_PARTS = 13  # parts of an endpoint's token
 GID_BYTES = 16
@@ -161,8 +161,8 @@ class RosContext:
 
     Args:
         link: a session with full keys, without the prefix of a federation.
-        wall_ns: returns the wall time since 1970.
-        refuse: called with the name and the reason when a message is refused, in Zenoh's threads.
+        wall_ns: returns the wall time since 1970 [ns].
+        refuse: called, in Zenoh's threads, with the name of the topic or service and the reason for refusing a message.
     """
 
     def __init__(

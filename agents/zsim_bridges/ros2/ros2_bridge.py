@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import CameraInfo
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, SessionError
+from zsim.errors import DecodeError, NoListenerError
 from zsim.runtime.participant import Participant
 from zsim.scenario import scenario_file
 from zsim.transport import connection
@@ -29,8 +29,8 @@ from zsim_bridges.ros2.topics import DRIVER, DroneCameras, RosNames, Topic
 from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
 
 NODE = "zsim"
-POLL_S = 0.1  # period of checking for a stop
-STATUS_S = 1.0  # time limit for a drone's state
+POLL_S = 0.1  # period of checks for a stop request
+STATUS_S = 1.0  # time limit for reading a drone's state
 ATTEMPT_S = 1.0  # time limit of one attempt to connect to the ROS router
 LAST_S = 1.0  # time limit for reading a last value; the world answers within milliseconds
 SAMPLES_MAX = 2000  # samples waiting to be converted, about a tenth of a second of work
@@ -79,9 +79,7 @@ def serve(
                     ros_link = stack.enter_context(
                         connection.connect(network.router, "", wait_s=ATTEMPT_S, reader=True, identity=network.identity)
                     )
-                except SessionError as error:
-                    if "nobody listens" not in str(error):
-                        raise
+                except NoListenerError:
                     waits = f"no router of ROS on {network.router} yet, waiting for it; start rmw_zenohd there"
                     bridge.report_once("router", waits)
             if ros_link is not None and not entered:
@@ -152,7 +150,7 @@ class Ros2Bridge:
         commands = RosCommands(self._link, self._observer, self.names.drones)
         root = context.node("/", NODE)
         self._advertise(root, topics.run_topics(self.names))
-        # Fixed frames are published only once, also for later subscribers
+        # Fixed frames are published only once; later subscribers receive them too.
         static = root.publisher("/tf_static", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF_STATIC)
         names = self.names.drones
         frames = [frame for d in self._drones for frame in topics.static_transforms(names[d.name], d.sensors)]
@@ -217,7 +215,7 @@ class RosCommands:
         self._lock = threading.Lock()
 
     def send_velocity(self, drone: str, twist: Any) -> None:
-        """Fly a Twist: forward, left, up [m/s] in the heading frame, and yaw rate counter-clockwise [rad/s].
+        """Command a Twist: forward, left, up [m/s] in the heading frame, and a counter-clockwise yaw rate [rad/s].
 
         Raises:
             ValueError: a component is not finite.
@@ -310,7 +308,7 @@ class SourceSubscriptions:
     """The run's keys that are read for ROS: each once, while a ROS node subscribes to a topic that uses it.
 
     Args:
-        refuse: called with the name and the reason when a message cannot be converted.
+        refuse: called with a key or topic, and the reason why a message cannot be converted.
         prompt: whether estimates and cluster states are converted on arrival, rather than with the next clock: waking
             up for each costs more than converting it, and only in realtime does a gate take long.
     """

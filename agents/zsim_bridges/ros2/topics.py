@@ -1,8 +1,8 @@
-"""The topics of a run in ROS 2: name, type, quality of service, source keys and conversion of each. Pure.
+"""The topics of a run in ROS 2: name, type, quality of service, source keys and conversion of each. No I/O.
 
 Frames follow REP-103 and REP-105: map is W (east, north, up); each drone has `NAME/odom`, the frame of its estimate
 (identical to map, since estimates are in W), `NAME/base_link` (forward, left, up), and a frame for each sensor.
-Quaternions are w first. Samples are stamped with the time at which they are valid.
+Quaternions begin with w. Samples are stamped with the time at which they are valid.
 """
 
 import math
@@ -60,7 +60,7 @@ class Topic(NamedTuple):
 
 
 class RosNames(NamedTuple):
-    """Names in ROS by the names in the contract."""
+    """ROS names, by name in the contract."""
 
     drones: dict[str, str]
     clusters: dict[str, str]

@@ -1,7 +1,7 @@
-"""The driver process: makes an aircraft at the other end of a wire one drone of a run.
+"""The driver process: presents an aircraft at the other end of a wire as one drone of a run.
 
-The session with the aircraft and the failsafe are pure and in separate files; this one has the drone's messages, keys,
-sockets, the event loop, and the command-line options.
+The session with the aircraft and the failsafe, which perform no I/O, are in other modules; this one has the drone's
+messages and keys, the sockets, the event loop, and the command-line options.
 """
 
 import asyncio
@@ -52,8 +52,9 @@ class DriverOptions(NamedTuple):
 
     Attributes:
         drone: the drone of the run that the aircraft represents.
-        origin_m: origin of the aircraft's own frame, or its position [m; W]; None for the reported or the scenario's.
-        yaw_deg: the aircraft's heading at the start, counter-clockwise from east; None for its own compass.
+        origin_m: origin of the aircraft's own frame, or its initial position [m; W]; None for the one that the aircraft
+            reports or the scenario states.
+        yaw_deg: the aircraft's heading at the start, counter-clockwise from east; None for the heading by its compass.
     """
 
     drone: str
@@ -66,11 +67,11 @@ class DriverOptions(NamedTuple):
 TICK_S = 0.01  # s, wall; at most half of the period at which setpoints are repeated
 REPORT_S = 1.0  # s, wall; period of reports on the link
 LANDING_S = 30.0  # s, wall; time to wait for the aircraft to land before exiting
-PATIENCE_S = 5.0  # s, wall; silence after which possible causes are printed; chosen: heartbeats come once a second
-FORMER_S = 2.0  # s, wall; time to wait for a port; chosen: a replaced driver keeps its port for some 10 ms
-AGAIN_S = 0.02  # s, wall, chosen; pause between two attempts to open a port
+PATIENCE_S = 5.0  # s, wall; silence after which possible causes are printed: five heartbeat periods
+FORMER_S = 2.0  # s, wall; time to wait for a port; ample, since a replaced driver keeps its port for about 10 ms
+AGAIN_S = 0.02  # s, wall; pause between attempts to open a port
 WAITING_MAX = 4000  # readings, 10 s of a 200 Hz IMU and all other sensors; beyond this, the oldest are dropped
-EXTRAPOLATED_NS = 500_000_000  # chosen; maximum time over which a pose is extrapolated
+EXTRAPOLATED_NS = 500_000_000  # maximum time over which a pose is extrapolated: half of LINK_LOST_S
 Say = Callable[[str], None]
 SessionMaker = Callable[[Info, Scenario, DriverOptions], VehicleSession]
 
@@ -87,7 +88,7 @@ def drive(
     """Run the driver of one aircraft until the run is over, or `stopped` returns True.
 
     Raises:
-        RunError: the drone is not external, or the run does not keep the pace of the wall clock.
+        RunError: the drone is not external, or the run does not follow the wall clock.
     """
     check_run(info, observer.name, options.drone)
     session = make_session(info, scenario_file.from_text(info.scenario), options)
@@ -306,7 +307,7 @@ class DriverClock:
 
 
 class ExternalDrone:
-    """Converts an aircraft's readings to the messages of one drone, gate by gate. Pure.
+    """Converts an aircraft's readings to the messages of one drone, gate by gate. No I/O.
 
     Args:
         to_simulated: converts a time of this process's clock to simulated time.
@@ -328,7 +329,7 @@ class ExternalDrone:
         self._gate_ns = -1
 
     def gate(self, t_ns: int, vehicle: AircraftState, commander: str | None) -> list[tuple[str, Any]]:
-        """Return keys and messages of a gate in order: samples by time, truth, status; nothing for an old gate."""
+        """Return the keys and messages of a gate in order: samples by time, truth, status; nothing for an old gate."""
         if t_ns <= self._gate_ns or vehicle.pose is None:
             return []
         self._gate_ns = t_ns
@@ -445,7 +446,7 @@ def position(text: str) -> Vector:
 
 
 def aircraft_host(text: str) -> str:
-    """Return the host of an aircraft whose ports are fixed.
+    """Return the host of an aircraft, whose ports are fixed.
 
     Raises:
         RunError: the text is not just a host.

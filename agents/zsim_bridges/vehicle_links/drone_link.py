@@ -1,4 +1,4 @@
-"""A bridge's link to one drone: the commands sent to it, and the state known to its electronics. Pure."""
+"""A bridge's link to one drone: the commands sent to it, and the state known to its electronics. No I/O."""
 
 import math
 from collections import deque
@@ -14,7 +14,7 @@ from zsim.math.rotation import LEVEL, Vector
 from zsim.sensors.sensor import Mount
 from zsim_agents.estimation.strapdown import madgwick_step
 
-BETA_RAD_S = 0.02  # gain of Madgwick's filter: levels within seconds, and is hardly disturbed by manoeuvres
+BETA_RAD_S = 0.02  # gain of Madgwick's filter, which levels within seconds and is hardly disturbed by manoeuvres
 REPEAT_NS = (
     100_000_000  # ns; repetition period of setpoints: a commander silent for 0.5 s counts as lost (`silence.hover_s`)
 )
@@ -42,16 +42,16 @@ class CommandSender:
         yaw_rate_rad_s: float,
         frame: Literal["heading", "world"] = "world",
     ) -> None:
-        """Fly a velocity in W, or in the heading frame, and turn counter-clockwise."""
+        """Command a velocity in W or in the heading frame, and a counter-clockwise yaw rate."""
         x, y, z = velocity_m_s
         self._send("velocity", flight_messages.Velocity, t_ns, (x, y, z), yaw_rate_rad_s, frame)
 
     def tilt(self, t_ns: int, forward: float, left: float, up: float, yaw_left: float, hover: bool) -> None:
-        """Fly by commands like the AR.Drone's: fractions of its limits in [-1, 1], or hovering."""
+        """Command the drone as an AR.Drone: by fractions of its limits in [-1, 1], or to hover."""
         self._send("ardrone", flight_messages.Ardrone, t_ns, forward, left, up, yaw_left, hover)
 
     def attitude(self, t_ns: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float) -> None:
-        """Hold the tilt of an attitude with a thrust [N] and a yaw rate."""
+        """Command the tilt of an attitude, a thrust [N] and a yaw rate."""
         w, x, y, z = q_WB
         self._send("attitude", flight_messages.Attitude, t_ns, (w, x, y, z), thrust_n, yaw_rate_rad_s)
 
@@ -67,7 +67,7 @@ class OnboardState:
 
     The attitude is that of the drone's estimator or, if none runs, of Madgwick's filter on the drone's own IMU, whose
     heading is 0 at the start, like that of the aircraft at power-on. The position is integrated from the optical flow.
-    `imu` and `mag` are the poses of these sensors in the body.
+    The arguments are the poses of the IMU and the magnetometer in the body.
 
     Attributes:
         imu, mag, baro, flow, status, estimate: newest message of each kind, in body axes; None before the first.

@@ -1,4 +1,4 @@
-"""Servers that present one run's drones as aircraft to the programs of a wire; they command, but never gate."""
+"""Servers that present one run's drones as aircraft on a wire; they send commands, but no gate waits for them."""
 
 import asyncio
 import contextlib
@@ -24,8 +24,8 @@ BACKLOG = 100  # batches kept for a slow reader, one or two seconds in realtime
 class TrafficIntake:
     """Messages in the order in which they passed through the world; a slow reader continues with the newest.
 
-    The messages that it has not yet read are dropped, since acting on old messages is worse than missing some. `news`
-    is set when there is something to read.
+    The messages that such a reader has not yet read are dropped, since acting on old messages is worse than missing
+    some. `news` is set when there is something to read.
     """
 
     def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
@@ -77,7 +77,7 @@ WAITING_MAX = 10  # images waiting for the loop; beyond this, the oldest are dro
 
 
 class PictureIntake:
-    """Images of the cameras in use, with a subscription to each."""
+    """Receives the images of the cameras in use, with a subscription to each."""
 
     def __init__(self, link: Session, loop: asyncio.AbstractEventLoop, take: Callable[[str, bytes], None]) -> None:
         self._link = link
@@ -109,7 +109,7 @@ class PictureIntake:
             self._take(sample.key, sample.payload)
 
 
-POLL_S = 0.1  # period of checking for a stop
+POLL_S = 0.1  # period of checks for a stop request
 REPORTED_MAX = 1000  # texts remembered, so that each is printed only once
 Say = Callable[[str], None]
 
@@ -222,7 +222,7 @@ class PictureServer(VehicleServer):
 
 
 def set_pace(link: Session, info: Info, name: str, rate: float | None) -> None:
-    """Request a pace from the world, if one is given; refuse a run without one, since programs use the wall clock.
+    """Request a pace from the world, if one is given; refuse a run that has none, since programs use the wall clock.
 
     Raises:
         RunError: the run goes as fast as possible, or the world refuses the pace.

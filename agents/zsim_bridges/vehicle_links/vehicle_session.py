@@ -1,13 +1,13 @@
-"""The wire-independent parts of a driver: demands on an aircraft, and the session that carries them out. Pure.
+"""The wire-independent parts of a driver: demands on an aircraft, and the session that carries them out. No I/O.
 
 `Failsafe` turns accepted commands into demands within limits, and makes the aircraft hold or land if commands cease.
 Its rules, with times that pass at the rate of the run:
 - Nothing is demanded before an operator has armed the driver.
 - After `silence.hover_s` without a setpoint the aircraft holds; after a further `silence.land_s`, it lands.
-- After the same total time without the world's clock it lands, whoever is flying it.
+- After the same total time without the world's clock, it lands, whoever is flying it.
 - Outside the fence it lands, and it does not take off from there.
-- When killed by an operator or an accepted emergency command, armed or not, it stops its motors and is disarmed.
-- An aircraft that begins to land by itself is landed. One that is down or in an emergency without a command is
+- When an operator or an accepted emergency command kills it, armed or not, its motors stop and the driver is disarmed.
+- An aircraft that begins to land by itself is landed. If it is down or in an emergency without a command, the driver is
   disarmed, so that a commander that keeps requesting a take-off starts no motor.
 - While nothing is received from the aircraft, only a landing, a stop or a reset is sent: after a power cycle, it might
   take the next setpoint or a repeated take-off for a new command.
@@ -29,22 +29,22 @@ from zsim.math.frames import geodetic_to_enu, heading, turned_about_up
 from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Silence
 
-WINDOW_NS = 5_000_000_000  # chosen: long compared with queuing, short compared with clock drift (50 ppm: 0.25 ms)
+WINDOW_NS = 5_000_000_000  # design choice: long against queuing, short against clock drift (50 ppm: 0.25 ms)
 SIGMA_UNKNOWN_M = 2.0  # m, for a GPS receiver that does not report its accuracy (paper, section VI)
 P0_PA = 101_325.0  # Pa, pressure at sea level (ISO 2533)
 SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
 EXPONENT = 0.190263  # R lapse / g (ISO 2533)
-PRESSURES = 250  # readings averaged; chosen: 10 s at 25 Hz reduce 0.1 m of noise to less than 1 cm
+PRESSURES = 250  # readings averaged; 10 s at 25 Hz reduce 0.1 m of noise to less than 1 cm
 STILL: Vector = (0.0, 0.0, 0.0)
 STANDING: tuple[DroneState, ...] = ("landed", "emergency")  # states in which no rotor turns
 LOSS_WINDOW = 1000  # messages over which the loss is computed, a few seconds of telemetry
 Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
-TAKEOFF_S = 20.0  # time limit of a take-off; chosen: four times what an AR.Drone needs
-RESET_S = 2.0  # time limit of a reset; chosen: ten times what an AR.Drone needs to leave its emergency
-LINK_LOST_S = 1.0  # silence that means a lost link; chosen: heartbeats come once a second, telemetry ten times as often
-BRAKING_M_S2 = 1.0  # chosen: half the acceleration of an AR.Drone at 12 deg of tilt; limits the speed towards a fence
-RETURN_M_S = 0.5  # speed of the return to the fence; chosen: slow, since nobody commanded it
-BREACH_M = 1.0  # chosen; distance outside the fence at which the aircraft lands, though the fence should stop it before
+TAKEOFF_S = 20.0  # time limit of a take-off: four times what an AR.Drone needs
+RESET_S = 2.0  # time limit of a reset: ten times what an AR.Drone needs to leave its emergency
+LINK_LOST_S = 1.0  # silence that means a lost link: telemetry comes ten times a second, heartbeats once
+BRAKING_M_S2 = 1.0  # half the acceleration of an AR.Drone at 12 deg of tilt; limits the speed towards a fence
+RETURN_M_S = 0.5  # speed of the return to the fence; slow, since nobody commanded it
+BREACH_M = 1.0  # distance outside the fence at which the aircraft lands; a margin, since it should stop at the fence
 Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
 
 
@@ -87,9 +87,9 @@ class FlightLimits(NamedTuple):
         radius_m, ceiling_m: radius and height of the fence; inf for none.
     """
 
-    speed_m_s: float = 2.0  # chosen: a person can follow on foot
-    climb_m_s: float = 1.0  # chosen: the AR.Drone's outdoor control_vz_max
-    yaw_rate_rad_s: float = 1.75  # chosen: the AR.Drone's indoor control_yaw
+    speed_m_s: float = 2.0  # design choice: a person can follow on foot
+    climb_m_s: float = 1.0  # the AR.Drone's outdoor control_vz_max
+    yaw_rate_rad_s: float = 1.75  # the AR.Drone's indoor control_yaw
     radius_m: float = math.inf
     ceiling_m: float = math.inf
 
@@ -247,7 +247,7 @@ class Failsafe:
     def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
         """Enter the next phase once the aircraft has reached it, or because of a silence."""
         airborne = vehicle.state in AIRBORNE
-        has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # for its telemetry to show that it obeys
+        has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # for the telemetry to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
             self.reason, self._uncommanded = "the aircraft is in an emergency", True
             self._settle(now_ns)
@@ -328,7 +328,7 @@ class LinkFigures(NamedTuple):
 
 
 class VehicleSession(ABC):
-    """The state machine of one aircraft at the other end of a wire. Pure: the process passes in the time.
+    """The state machine of one aircraft at the other end of a wire. No I/O: the process passes in the time.
 
     Args:
         channels: the aircraft's ports; a channel number is an index into them.
@@ -439,7 +439,7 @@ class AircraftReadings:
             height_m: the aircraft's own estimate of its height; the first readings are aligned with it, because the
                 standard atmosphere does not account for the weather.
         """
-        # the altitude at which the standard atmosphere has this pressure, valid below 11 km
+        # Altitude at which the standard atmosphere has this pressure, valid below 11 km.
         altitude_m = SCALE_M * (1.0 - (max(pressure_pa, 0.0) / P0_PA) ** EXPONENT)
         if self._pressures < PRESSURES:
             self._pressures += 1
@@ -449,7 +449,7 @@ class AircraftReadings:
     def gps_values(
         self, place: Vector, speed_m_s: float, course_rad: float, sigma_m: float, fix: int, satellites: int
     ) -> tuple:
-        """Return the values of a fix, with its position in W; the climb is that of the pose, since the wires send none.
+        """Return the values of a fix, with its position in W; the climb rate is the pose's, since the wires send none.
 
         Args:
             place: latitude, longitude [deg], height [m].
@@ -470,9 +470,9 @@ def _is_finite(values: tuple) -> bool:
 
 
 class ClockOffset:
-    """Estimates the offset of another clock from this one by the messages that arrive.
+    """Estimates the offset of another clock from this one, based on messages with timestamps.
 
-    The minimum difference between arrival and timestamp within a window counts, since delays by a link or a busy
+    It uses the minimum difference between arrival and timestamp within a window, since delays by a link or a busy
     process are never negative. The minimum delay is half of the shortest round trip, if round trips are measured.
     """
 
@@ -505,7 +505,7 @@ class ClockOffset:
         return self._round_trips[0][1] / 1e6 if self._round_trips else None
 
     def taken_ns(self, stamp_ns: int, arrival_ns: int) -> int:
-        """Record a timestamped message that arrives now; return when it was created, by this clock."""
+        """Record a timestamped message and its arrival; return when it was created, by this clock."""
         self.add(stamp_ns, arrival_ns)
         return min(arrival_ns, stamp_ns + self.offset_ns)
 

@@ -8,7 +8,7 @@ continue on indented lines:
 
 `name:code` uses the codes of the struct module, preceded by a count for an array; names separated by commas are fields
 of the same type. Two codes have a special meaning: `s` is an array of bytes, `c` a text. A unit may follow in brackets,
-and after `=` the default of the field, otherwise zero. Fields after `|` are extensions.
+and after `=` the default of the field, which is zero otherwise. Fields after `|` are extensions.
 """
 
 import re

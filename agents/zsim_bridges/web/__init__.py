@@ -1,6 +1,6 @@
 """Parts shared by the web servers: listening on a separate thread, access, connections, image streams.
 
-Console and gateway use it for HTTP. This file does not import aiohttp, since other bridges use it too.
+Console and gateway use it for HTTP. This module does not import aiohttp, since other bridges use it too.
 """
 
 from ipaddress import ip_address

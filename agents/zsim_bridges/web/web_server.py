@@ -2,8 +2,8 @@
 
 aiohttp waits indefinitely for the end of a request, and keeps the part of its body that has arrived; a thousand
 connections with unfinished requests would take a gigabyte, and all file descriptors of the process. A connection is a
-stranger until one of its requests has been answered without an error, except while one is being answered; strangers
-never displace others.
+stranger until one of its requests has been answered without an error, except while a request is being answered;
+strangers never displace others.
 """
 
 import asyncio

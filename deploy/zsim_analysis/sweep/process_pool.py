@@ -1,7 +1,7 @@
-"""The worker processes of a sweep on this host: one that dies is replaced, and its run is repeated.
+"""The worker processes of a sweep on this host; a worker that dies is replaced, and its run is repeated.
 
-A worker flies many runs, so that imports and kernels are loaded once. `ProcessPoolExecutor` would fail completely when
-a worker dies, without showing which run was fatal.
+Each worker flies many runs, so that modules and kernels are loaded only once. `ProcessPoolExecutor` is not used: when a
+worker dies, it fails as a whole, without showing which run was fatal.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from zsim_analysis.sweep.sweep_run import Row, Task
 
 READY, _END = "ready", "end"
-SAFE_PATH = "PYTHONSAFEPATH"  # environment variable of Python
-DEATHS_MAX = 3  # most deaths of workers in one run, or in sequence before they are ready
-EXIT_S = 5.0  # wall time within which an idle worker exits on its own
+SAFE_PATH = "PYTHONSAFEPATH"  # environment variable that keeps the working folder off Python's module search path
+DEATHS_MAX = 3  # most worker deaths in the same run, or in succession before any worker is ready
+EXIT_S = 5.0  # wall time granted to an idle worker to exit on its own
 
 
 def work(link: Connection) -> None:
     """Fly the tasks received on a link and send back their rows, until `None` is received or the launcher dies.
 
-    An exception is sent back if every further run would fail as well.
+    A RuntimeError is sent instead of a row if every further run would fail as well.
     """
 
     def exit_with_launcher() -> None:
@@ -46,8 +46,8 @@ def work(link: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher receives and handles it
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=exit_with_launcher, name="launcher-monitor", daemon=True).start()
-    warnings.simplefilter("ignore", RuntimeWarning)  # the run's row reports a state that overflows
-    from zsim_analysis.sweep.sweep_run import fly  # after the signals are set, since it takes seconds
+    warnings.simplefilter("ignore", RuntimeWarning)  # a state that overflows is reported in the run's row
+    from zsim_analysis.sweep.sweep_run import fly  # after the signal handlers are set, since the import takes seconds
 
     link.send(READY)
     try:
@@ -68,10 +68,10 @@ def cores() -> int:
 
 @contextlib.contextmanager
 def _bare_start() -> Iterator[None]:
-    """Start processes that import neither modules of the working folder nor this program's main module.
+    """Keep processes started in this context from importing the working folder's modules or the main module.
 
     `spawn` imports the main module again, which would rerun a script without `if __name__ == "__main__"`. Workers do
-    not need it, since classes that a script defines are put into a module of their own.
+    not need it, since classes defined in a script are written to a module of their own.
     """
     main, former = sys.modules["__main__"], os.environ.get(SAFE_PATH)
     sys.modules["__main__"] = ModuleType("__main__")
@@ -92,12 +92,12 @@ class WorkerProcess:
         self.process = context.Process(target=work, args=(far,), name="zsim-sweep", daemon=True)
         with _bare_start():
             self.process.start()
-        far.close()  # so that the link ends when the process dies
+        far.close()  # so that `recv` fails once the process is dead
         self.ready = False
         self.task: Task | None = None
 
     def send(self, task: Task) -> None:
-        """Send a task; `receive` detects a dead worker."""
+        """Send a task to the worker; if it is dead, `receive` reports that."""
         self.task = task
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
             self.link.send(task)
@@ -111,7 +111,7 @@ class WorkerProcess:
             return None
 
     def stop(self) -> None:
-        """End the process, immediately if it is flying a task."""
+        """End the process, at once if it is flying a task."""
         if self.task is None:
             with contextlib.suppress(OSError):
                 self.link.send(None)
@@ -135,9 +135,9 @@ class ProcessPool:
         self._deaths_at_start = 0
 
     def rows(self, tasks: Iterator[Task | None]) -> Generator[Row]:
-        """Yield the rows of tasks as they finish; when exhausted or closed, all workers have ended.
+        """Yield the row of each task as it finishes; once the generator is exhausted or closed, all workers have ended.
 
-        `tasks` yields None while its next task depends on unfinished rows; it is continued after the next row.
+        `tasks` yields None while its next task depends on unfinished rows, and is resumed after the next row.
 
         Raises:
             RunError: workers cannot start, or rows cannot be recorded.
@@ -161,7 +161,7 @@ class ProcessPool:
         self._workers[worker.link] = worker
 
     def _hand_out(self, tasks: Iterator[Task | None]) -> None:
-        """Give each idle worker a task, or end it if there are no more."""
+        """Give each idle worker a task, or stop it if no task is left."""
         for worker in [each for each in self._workers.values() if each.ready and each.task is None]:
             task = self._again.popleft() if self._again else next(tasks, _END)
             if isinstance(task, str):
@@ -184,7 +184,7 @@ class ProcessPool:
             yield message  # type: ignore[misc]
 
     def _on_death(self, worker: WorkerProcess) -> Iterator[Row]:
-        """Replace a dead worker; a run in which DEATHS_MAX workers died gets a failed row."""
+        """Replace a dead worker and repeat its run; after DEATHS_MAX deaths in the same run, yield a failed row."""
         del self._workers[worker.link]
         worker.link.close()
         self._deaths_at_start += not worker.ready

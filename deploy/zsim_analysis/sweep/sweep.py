@@ -1,4 +1,4 @@
-"""Flies a sweep into its folder: plan in; finished runs and their table out; a live line on the terminal.
+"""Flies the runs of a plan, records them in the sweep's folder, and shows progress on the terminal.
 
 The folder of a sweep:
 
@@ -38,10 +38,10 @@ from zsim_analysis.sweep.sweep_run import FIXED, Row, Task
 JOURNAL, TABLE, RUNS, LOCK = "journal.jsonl", "sweep.parquet", "runs", ".lock"
 NEW_PLAN = f".{PLAN}.new"
 PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata
-PLAIN_S = 10.0  # wall time between lines of progress without a terminal
+PLAIN_S = 10.0  # wall time between progress lines if there is no terminal
 BAR = 20  # width of the progress bar [characters]
-FAILURES_MAX = 5  # most lines about why runs failed
-UNMEASURED_MAX = 5  # most lines about runs without the user's metrics
+FAILURES_MAX = 5  # most reasons for failed runs that are printed
+UNMEASURED_MAX = 5  # most runs without the user's metrics that are printed
 _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 
@@ -51,15 +51,15 @@ class SweepRequest(Struct, frozen=True):
     plan: SweepPlan
     out: Path  # folder of the sweep
     workers: int | None = None  # number of processes on this host; None: one per core
-    dask: Any = None  # a Dask client, or the address of a scheduler, whose workers fly the runs instead
+    dask: Any = None  # Dask client, or address of a Dask scheduler, whose workers fly the runs; None: this host
     force: bool = False  # whether the folder may hold other files
     console: Console | None = None  # where progress is shown; None: stderr
     open_run: Callable[[Path], Any] | None = None  # see Task
-    modules: tuple[Path, ...] = ()  # generated for definitions of a notebook or a script; copied into the folder
+    modules: tuple[Path, ...] = ()  # generated from definitions in a notebook or script; copied into the folder
 
 
 def sweep(request: SweepRequest) -> list[Row]:
-    """Fly the runs that are missing in the folder; return the rows of all finished runs.
+    """Fly the runs that are missing from the folder; return the rows of all finished runs.
 
     Raises:
         RunError: the folder holds something else or cannot be written, or workers cannot start.
@@ -114,7 +114,7 @@ def _fly(folder: "SweepFolder", request: SweepRequest, missing: list[int], scree
 
 
 def _tasks(folder: "SweepFolder", runs: list[int], open_run: Callable[[Path], Any] | None) -> Iterator[Task]:
-    """Yield the tasks of some runs lazily."""
+    """Yield the task of each run, built only when it is needed."""
     design = folder.design
     for run in runs:
         values = design.values(run)
@@ -129,7 +129,7 @@ def _tasks(folder: "SweepFolder", runs: list[int], open_run: Callable[[Path], An
 
 
 class SweepScreen:
-    """Context that shows the progress of a sweep: a live line on a terminal or in a notebook, otherwise plain lines."""
+    """Context manager that shows a sweep's progress: a live line on a terminal or in a notebook, else plain lines."""
 
     def __init__(
         self, total: int, done: int, console: Console | None = None, now_s: Callable[[], float] = time.monotonic
@@ -197,7 +197,7 @@ class SweepScreen:
 
 
 def span(seconds: float) -> str:
-    """Format a duration, to the second if it is below an hour."""
+    """Format a duration: to the second below one hour, otherwise to the minute."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
@@ -225,7 +225,7 @@ class SweepFolder:
         return [rows[run] for run in sorted(rows)]
 
     def compact(self) -> list[Row]:
-        """Move the journal's rows into the table, and return all rows; a crash at any time loses none.
+        """Move the journal's rows into the table and return all rows; a crash at any time loses none.
 
         Raises:
             ReportError: the table cannot be written.
@@ -237,7 +237,7 @@ class SweepFolder:
 
 
 def load(path: Path) -> SweepFolder:
-    """Return the sweep in a folder; RunError if its plan cannot be read."""
+    """Return the sweep in a folder; raise RunError if its plan cannot be read."""
     try:
         return SweepFolder(path, msgspec.json.decode((path / PLAN).read_bytes(), type=SweepPlan))
     except (OSError, msgspec.MsgspecError, ValueError) as error:
@@ -248,7 +248,7 @@ def load(path: Path) -> SweepFolder:
 def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFolder]:
     """Yield the folder of a new or continued sweep, locked against other sweeps.
 
-    With `force`, it may contain other files, but never a run or another sweep.
+    With `force`, the folder may contain other files, but never a run or another sweep.
 
     Raises:
         RunError: another sweep is running in the folder, or it contains something else.
@@ -264,7 +264,7 @@ def locked(path: Path, plan: SweepPlan, force: bool = False) -> Iterator[SweepFo
 
 
 def _write_plan(path: Path, plan: SweepPlan) -> None:
-    """Write the plan; RunError if the folder has another sweep, unless none of its runs is finished."""
+    """Write the plan; raise RunError if the folder holds another sweep with finished runs."""
     try:
         content = indented_json(plan)
     except UnicodeEncodeError as error:
@@ -306,7 +306,7 @@ class Journal:
         os.close(self._file)
 
     def append(self, row: Row) -> None:
-        """Append a row, which then survives a crash and a power failure.
+        """Append a row so that it survives a crash or a power failure.
 
         Raises:
             RunError: the row cannot be written.
@@ -324,13 +324,13 @@ class Journal:
 
 
 def read_journal(path: Path) -> list[Row]:
-    """Return the rows of a journal, without an incomplete last line; empty if there is no such file."""
+    """Return the rows of a journal, without an incomplete last line; empty if the file does not exist."""
     content = path.read_bytes() if path.exists() else b""
     return msgspec.json.Decoder().decode_lines(content[: content.rfind(b"\n") + 1])
 
 
 def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence[Axis]) -> None:
-    """Write the rows atomically, in the order of the runs; ReportError if the file cannot be written."""
+    """Write the rows atomically, ordered by run number; raise ReportError if the file cannot be written."""
     ordered = sorted(rows, key=lambda row: row["run"])
     schema = _schema(ordered, axes).with_metadata({PLAN_METADATA: msgspec.json.encode(plan)})
     json_columns = [field.name for field in schema if field.metadata]
@@ -347,7 +347,7 @@ def write_table(path: Path, rows: Iterable[Row], plan: SweepPlan, axes: Sequence
 
 
 def read_table(path: Path) -> list[Row]:
-    """Return the rows of a table, with None for empty cells; no rows if there is no such file.
+    """Return the rows of a table, with None for empty cells; no rows if the file does not exist.
 
     Raises:
         ReportError: the file is not a table of a sweep.
@@ -368,12 +368,12 @@ def read_table(path: Path) -> list[Row]:
 
 
 def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
-    """Return the columns: inputs, results, then errors in the order of their first occurrence."""
+    """Return the schema of the table: inputs, results, then all other columns in order of first occurrence."""
     fixed = [
         (name, next(_TYPES[each] for each in (*getattr(kind, "__args__", ()), kind) if each in _TYPES))
         for name, kind in FIXED.items()
     ]
-    varied: list[tuple[str, pa.DataType | None]] = []  # None: values of different types, which are stored as JSON
+    varied: list[tuple[str, pa.DataType | None]] = []  # type None: values of mixed types, stored as JSON
     for axis in axes:
         kinds = {type(value) for value in axis.values} if isinstance(axis, Grid) else {float}
         if kinds == {int, float}:

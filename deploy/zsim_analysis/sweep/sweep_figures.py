@@ -1,6 +1,6 @@
 """The figures of a sweep: the runs at each point of the grid, with their mean and its confidence interval.
 
-Order of this file: figures; one quantity in a panel; means and their intervals; the x axis of a grid.
+Sections of this file: figures; one quantity in a panel; means and their intervals; the x axis of a grid.
 """
 
 import re
@@ -32,10 +32,10 @@ from zsim_analysis.sweep.sweep_summary import (
     share_interval,
 )
 
-PANELS_MAX = 24  # most quantities in one figure, enough for 6 drones
+PANELS_MAX = 24  # most quantities in one figure; enough for a formation of 6 drones
 COLUMNS = 3  # columns of panels
-NARROW_MAX = 8  # most points side by side in a panel as wide as a third of the page
-SLICES = 6  # groups of runs by a drawn value, each with its own mean
+NARROW_MAX = 8  # most points side by side in a panel one third of the page wide
+SLICES = 6  # number of groups of runs, sorted by a randomly drawn value, each with its own mean
 LEGEND_COLUMNS = 4
 ONE_RUN, BEYOND_AXIS, TABLE_I = "one run", "the interval goes beyond the axis", "the paper's Table I"
 NEVER_AS_PLANNED = "no run as planned"
@@ -44,12 +44,12 @@ SHARES = (
     ("of these, as planned", "D", style.BLUE),
     ("of these, without collision", "s", style.BLACK),
 )
-LEVEL_LETTERS, UPRIGHT_LETTERS = 28, 25  # letters of PAPER_PT that fit the width and height of a third of a page
+LEVEL_LETTERS, UPRIGHT_LETTERS = 28, 25  # characters of size PAPER_PT that fit the width and height of a panel
 FORMULA = re.compile(r"\$[^$]*\$")
 
 
 class Panel(Struct, frozen=True):
-    """A quantity with a panel: its column, its label with its unit, and the paper's value."""
+    """A quantity shown in a panel: its column, its label with unit, and the value printed in the paper."""
 
     column: str
     label: str
@@ -57,7 +57,7 @@ class Panel(Struct, frozen=True):
 
 
 def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
-    """Yield the figures for which there are data, with a panel for each quantity."""
+    """Yield the figures for which there are data; quantities have a panel each."""
     own = [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]]
     rms, std = list[Panel](), list[Panel]()
     for prefix, each in list(results.parameters.items())[:PANELS_MAX]:
@@ -202,7 +202,7 @@ def most_runs(results: SweepResults) -> int:
 
 
 def mean_label(results: SweepResults) -> str:
-    """Return the legend of a mean with its number of runs, which are called seeds if only these differ."""
+    """Return the legend entry of the means, with the number of runs (of seeds if only these vary)."""
     counts = {results.ended_well(point)[0] for point in range(results.design.points)} - {0}
     many = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
     what = "runs" if results.drawn or not results.has_seeds else "seeds"
@@ -211,7 +211,7 @@ def mean_label(results: SweepResults) -> str:
 
 
 def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
-    """Draw quantities against a drawn value, with the means of slices of it."""
+    """Draw each quantity against a randomly drawn value, with the mean of each slice of runs."""
     figure, grid = _panel_grid(len(panels), COLUMNS, 1.8)
     x, beyond = results.values(path), False
     for axes, panel in zip(grid, panels, strict=True):
@@ -236,7 +236,7 @@ def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> F
 
 
 def slices(x: Samples, y: Samples) -> Sequence[tuple[float, Samples]]:
-    """Sort runs by x into SLICES groups of nearly equal size; return mean x and all y of each."""
+    """Sort runs by x into SLICES groups of nearly equal size; return mean x and all y of each group of two or more."""
     both = np.isfinite(x) & np.isfinite(y)
     order = np.argsort(x[both], kind="stable")
     groups = [part for part in np.array_split(order, SLICES) if len(part) >= 2]
@@ -244,7 +244,7 @@ def slices(x: Samples, y: Samples) -> Sequence[tuple[float, Samples]]:
 
 
 def wrapped(text: str, letters: int) -> str:
-    """Wrap a label between words to lines of at most `letters`; a formula counts as two letters."""
+    """Wrap a label between words into lines of at most `letters` characters; a formula counts as two."""
     lines: list[str] = []
     for each in text.split("\n"):
         line = ""
@@ -262,12 +262,12 @@ def wrapped(text: str, letters: int) -> str:
 # One quantity in a panel
 
 DOTS_MAX = 400  # most runs of a point that are drawn individually
-BINS = (5, 30)  # least and most bins of a histogram
+BINS = (5, 30)  # minimum and maximum number of bins in a histogram
 GOLDEN = 0.6180339887  # fractional part of the golden ratio; its multiples modulo 1 spread dots evenly and reproducibly
 
 
 def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "GridAxis | None") -> bool:
-    """Draw one quantity at all points, or as a histogram without `axis`; return whether an interval leaves the axis."""
+    """Draw one quantity at all points, or its histogram if `axis` is None; return whether an interval is cut off."""
     if axis is None:
         style.dress(axes)
         axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=style.PAPER_PT)
@@ -285,7 +285,7 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "Gr
                 look: dict[str, Any] = {"fontsize": style.PAPER_PT - 1, "color": mean.colour, "zorder": 6}
                 offset: dict[str, Any] = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
                 axes.annotate(count, (mean.x, mean.mean.value), **look, **offset)
-    for series in range(len(axis.series) if axis.field else 0):  # a line for each combination of the other fields
+    for series in range(len(axis.series) if axis.field else 0):  # one line per combination of the other fields
         own = sorted((each for place, each in drawn if place.series == series), key=lambda each: each.x)
         if own:
             values = [each.mean.value for each in own]
@@ -319,7 +319,7 @@ def _draw_histogram(axes: Axes, samples: Samples, printed: float | None) -> bool
 
 
 def _with_printed(low: float, high: float, value: float) -> tuple[float, float]:
-    """Return the limits of an axis, extended to the paper's value."""
+    """Return the limits of an axis, extended to include the paper's value."""
     room = 0.05 * (high - low)
     return min(low, value - room), max(high, value + room)
 
@@ -348,12 +348,12 @@ def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") 
 
 # Means and their intervals
 
-MEAN_ROOM = 0.08  # margin at each end of an axis, as a share of the samples' range, which intervals may exceed
+MEAN_ROOM = 0.08  # margin at each end of an axis, as a share of the samples' range; intervals may exceed it
 BEYOND = {"y": ("v", "^"), "x": ("<", ">")}  # marks at the low and the high end of an axis
 
 
 class DrawnMean(Struct, frozen=True):
-    """A mean with its interval, drawn at x."""
+    """A mean with its confidence interval, drawn at `x`."""
 
     x: float
     mean: ConfidenceInterval
@@ -382,31 +382,31 @@ def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"]
 # The x axis of a grid
 
 POINTS_MAX = 24  # most points side by side in one panel; the tables have all
-# colours of the combinations of the other fields
+# colours of the combinations of those fields that are not on the axis
 SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
-DECADES_MIN = 30.0  # ratio of the largest to the smallest value from which on an axis may be logarithmic
-TURNED_FROM = 34  # most characters of all labels, with a space each, that fit side by side in a panel
-ABOVE = 1.1  # height of marks above runs and intervals, as a share of the height of the axes
+DECADES_MIN = 30.0  # least ratio of the largest to the smallest value for a logarithmic axis
+TURNED_FROM = 34  # most characters of all labels together, with a space each, that fit side by side in a panel
+ABOVE = 1.1  # height of the marks drawn above runs and intervals, as a share of the axes' height
 MARK = style.VERMILION
-GROUP_MAX = 0.3  # largest share of the range that the combinations at one value take: room for six marks
-TICKS_MAX = 8  # most labelled values of an axis; of more values, only some are labelled
+GROUP_MAX = 0.3  # largest share of the axis range for the combinations at one value; leaves room for six marks
+TICKS_MAX = 8  # most labelled values on an axis; if there are more values, only every n-th is labelled
 
 
 class Place(Struct, frozen=True):
-    """Where a point of the grid is drawn."""
+    """The position at which a point of the grid is drawn."""
 
-    x: float  # its centre
-    room: tuple[float, float]  # the range of x over which its runs are spread
+    x: float  # centre of the point
+    room: tuple[float, float]  # range of x over which its runs are spread
     series: int = 0  # index of its combination of the other fields
 
 
 class GridAxis:
-    """The x axis of a sweep over several points: numbers at their values, anything else side by side.
+    """The x axis of a sweep over several points: numeric values to scale, all others side by side.
 
     Attributes:
-        field: the field on the axis; None if the points stand side by side.
-        series: texts of the combinations of the other fields; [""] if there are none.
-        places: where to draw each point.
+        field: path of the field on the axis; None if the points stand side by side.
+        series: labels of the combinations of the other fields; [""] if there are no other fields.
+        places: the place of each point.
     """
 
     def __init__(self, design: SweepDesign) -> None:
@@ -430,7 +430,7 @@ class GridAxis:
         self.field = field
         self._numbers = [float(design.at(point)[field]) for point in range(design.points)]
         values = sorted(set(self._numbers))
-        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # values over decades, most of them small
+        if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # values over several decades, most of them small
             steps = np.diff(values)
             self._is_logarithmic = bool(steps.max() > 2 * steps.min())
         combinations = [
@@ -459,7 +459,7 @@ class GridAxis:
 
     @property
     def is_turned(self) -> bool:
-        """Whether the labels are too long to stand side by side."""
+        """Whether the labels are too long to fit side by side."""
         return not self.field and sum(len(text) + 1 for text in self._labels) > TURNED_FROM
 
     def mark(self, axes: Axes, points: Sequence[int]) -> None:

@@ -1,7 +1,7 @@
-"""Makes the report of a sweep: table in; summary.json, figures/*.png and report.html out; and tables for the terminal.
+"""Makes the report of a sweep from its table: summary.json, figures/*.png, report.html, and tables for the terminal.
 
-A table has a row for each point of the grid. On the page, it has intervals and is split to fit the page; on a terminal,
-it is brief and split into as few tables as the width allows without cutting names.
+Every table has a row for each point of the grid. On the page, tables show intervals and are split to fit its width; on
+a terminal, they are brief and split into as few as the width allows without truncating names.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -49,10 +49,10 @@ QUANTILES = "true RMS, 5 to 95 %"
 def make_sweep_report(
     directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> SweepSummary:
-    """Write the report of a sweep, which may still be running, as `write_report` does.
+    """Write the report of a sweep, which may still be running; see `write_report`.
 
     Raises:
-        RunError: the directory is not that of a sweep.
+        RunError: the directory does not hold a sweep.
         ReportError: no run is finished yet, or the directory cannot be written.
     """
     sweep = load(directory)
@@ -77,7 +77,7 @@ class PointTable(NamedTuple):
 def _table(
     points: Sequence[GridPoint], titles: Mapping[str, str], text: Callable[[GridPoint, str], str], *about: str
 ) -> PointTable:
-    """Return the table of the columns in `titles`; `text` formats a column at a point."""
+    """Return the table of the columns in `titles`; `text` formats a cell; `about` is its title and caption."""
     return PointTable(list(titles.values()), [[text(p, column) for column in titles] for p in points], *about)
 
 
@@ -114,7 +114,7 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
 
 
 def axes_of(summary: SweepSummary) -> list[FieldName]:
-    """Return the names of the grid's fields, or one name for the only point if there are none."""
+    """Return the names of the grid's fields; if there are none, the heading of a single column for the point."""
     return [field_name(path) for path in summary.points[0].values] or [FieldName("point")]
 
 
@@ -123,12 +123,12 @@ def values_of(point: GridPoint) -> list[str]:
 
 
 def heading_of(point: GridPoint) -> str:
-    """Describe the fields of a point and their values."""
+    """Return the fields of a point with their values, as text."""
     return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
 
 
 def differing(summary: SweepSummary) -> dict[str, str]:
-    """Return the titles of the columns that have paired differences, the user's own first."""
+    """Return the titles of the columns that have paired differences, by column, the user's metrics first."""
     errors = {f"{prefix}.true_rms": f"RMS of {each.titled}" for prefix, each in summary.parameters.items()}
     own = {column: str(field_name(column)) for column in summary.metrics}
     titles = {**own, **errors, SEPARATION: "separation (m)", OBSTACLE_DISTANCE: "from obstacles (m)"}
@@ -150,7 +150,7 @@ def _blocks(
 
 
 def facts(summary: SweepSummary) -> list[tuple[str, str]]:
-    """Return label and value of each line at the top of the page."""
+    """Return the label and value of each line at the top of the page."""
     well = summary.finished - sum(summary.failed.values())
     hosts = ", ".join(f"{host} ({count})" for host, count in summary.hosts.items())
     return [
@@ -171,7 +171,7 @@ def windows_of(summary: SweepSummary) -> str:
 
 
 def marks_of(summary: SweepSummary) -> list[str]:
-    """Return a line for each kind of deviation of the runs from their plan."""
+    """Return a line for each way in which runs deviated from their plan."""
     runs = f"of {summary.finished} runs"
     lines = [f"{count} {runs} not as planned: {text}" for text, count in summary.not_as_planned.items()]
     if summary.judged_unengaged:
@@ -200,7 +200,7 @@ def notes(summary: SweepSummary) -> list[str]:
 
 
 def without_data(summary: SweepSummary) -> str:
-    """Describe quantities that are missing in every run; empty if there are none."""
+    """Return a sentence that names the quantities missing from every run; empty if there are none."""
     errors = {each.titled: prefix for prefix, each in summary.parameters.items()}
     own = {str(field_name(column)): column for column in summary.metrics}
     known = summary.known | {column.rpartition(".")[0] for column in summary.known}
@@ -213,7 +213,7 @@ def without_data(summary: SweepSummary) -> str:
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
-    """Return the table of one point, a row per formation parameter; empty if no run there has errors."""
+    """Return the table of one point, with a row per formation parameter; empty if no run there has errors."""
     rows: list[list[str]] = []
     if not any(f"{prefix}.true_rms" in point.spreads for prefix in names):
         return rows
@@ -241,7 +241,7 @@ def overview(point: GridPoint, brief: bool = False) -> list[str]:
 
 
 def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False) -> str:
-    """Return the mean of a column, with its interval unless brief, and with its number of runs if those are not all."""
+    """Return the mean of a column, with its interval unless `brief`, and the number of runs if some are left out."""
     spread = point.spreads.get(column)
     if spread is None:
         return "–"
@@ -251,7 +251,7 @@ def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False)
 
 
 def _difference(point: GridPoint, column: str, brief: bool = False) -> str:
-    """Return the mean of paired differences, with its interval and the number of pairs."""
+    """Return the mean of the paired differences, with its interval and the number of pairs."""
     spread = point.differences.get(column)
     if spread is None:
         return "–"
@@ -278,14 +278,14 @@ def _noted(text: str, note: str) -> str:
 
 TERMINAL_POINTS_MAX = 40
 BETWEEN = 3  # width between two columns of a table [characters]
-EDGE = 1  # width saved after the last column of a table, including its edges [characters]
-ERRORS_MAX = 9  # most parameters, as many as in the paper's Table I
-HEAD = 8  # width up to which a heading is not wrapped [characters]
-AXES_MAX = 3  # most fields of the grid with a column each; more share one
+EDGE = 1  # width saved after a table's last column, net of the table's edges [characters]
+ERRORS_MAX = 9  # most parameters shown on a terminal, as many as in the paper's Table I
+HEAD = 8  # least width to which a heading is wrapped [characters]
+AXES_MAX = 3  # most grid fields with a column each; if there are more, all share one
 
 
 class TerminalColumn(Struct, frozen=True):
-    """A column: its heading, which is wrapped only between words, and a cell for each point."""
+    """A column: a heading, wrapped only between words, and a cell for each point."""
 
     head: str
     cells: tuple[str, ...]
@@ -296,7 +296,7 @@ class TerminalColumn(Struct, frozen=True):
 
     @property
     def width(self) -> int:
-        """Its width in characters, with the space to the next column."""
+        """The width in characters, with the space before the next column."""
         return max(map(len, (*self.lines, *self.cells))) + BETWEEN
 
 
@@ -315,13 +315,13 @@ class TerminalText(Struct, frozen=True):
 
 
 def terminal_tables(summary: SweepSummary) -> list[PointTable]:
-    """Return tables of the user's metrics, paired differences, ends of runs, and errors; some may have no columns."""
+    """Return the tables of user metrics, paired differences, ends of runs, and errors; some may have no columns."""
     points, level = summary.flown[:TERMINAL_POINTS_MAX], f"{100 * summary.level:g} %"
     own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
     columns = {f"{prefix}.true_rms": each for prefix, each in summary.parameters.items()}
     flown = {column: each for column, each in columns.items() if column in summary.known}
     cluster = next((each.cluster for each in flown.values()), None)
-    # the first parameters of the first cluster except headings; for Test 1 these are the paper's
+    # the first parameters of the first cluster, without headings (phi_…): for Test 1, those of the paper
     shown = [(column, each.name) for column, each in flown.items() if each.cluster == cluster]
     errors = dict([(column, name) for column, name in shown if not name.startswith("phi_")][:ERRORS_MAX])
     compared = {  # differences of the user's metrics if there are any, otherwise of the errors
@@ -370,7 +370,7 @@ def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Te
 
 
 def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
-    """Split columns into as few parts of similar size as fit a width in characters; wider columns are alone."""
+    """Split columns into the fewest parts of similar size that each fit `room` characters, or are a single column."""
     for count in range(1, len(columns) + 1):
         ends = np.linspace(0, len(columns), count + 1).round().astype(int).tolist()
         parts = [columns[start:end] for start, end in pairwise(ends)]

@@ -1,7 +1,7 @@
-"""One run of a sweep: its task, its flight in this process, and its row of the table.
+"""One run of a sweep: its task, its flight in this process, and its row in the table.
 
-It is judged as by `zsim report`, without a record on disk. `report.metrics` names the user's functions that compute
-further numbers from the flight:
+The run is judged as by `zsim report`, but needs no record on disk. `report.metrics` names the user's functions that
+compute further numbers from the flight:
 
     def metrics(flight: RecordedFlight) -> float | Mapping[str, float]
     def metrics(run: zsim.Run) -> float | Mapping[str, float]
@@ -9,9 +9,9 @@ further numbers from the flight:
 The name of the argument decides what is passed: for `flight`, the arrays of a RecordedFlight; for any other name, the
 recorded run.
 
-A number becomes the column `metrics.FUNCTION`, a mapping a column `metrics.NAME` for each of its names. The unit at the
-end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None become empty
-cells. An exception of a function becomes the run's `metrics_failure`; its other columns are kept.
+A returned number becomes the column `metrics.FUNCTION`; a mapping, one column `metrics.NAME` for each of its names. A
+unit at the end of a name, as in scenarios (`overshoot_m`), is shown in tables and figures. NaN, infinity and None
+become empty cells. An exception raised by a function becomes the run's `metrics_failure`; its other columns are kept.
 """
 
 import math
@@ -49,13 +49,13 @@ from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
-FLIGHT = "flight"  # name of the argument for a RecordedFlight
-METRICS_MAX = 100  # most metrics of one function
+FLIGHT = "flight"  # name of an argument that takes a RecordedFlight
+METRICS_MAX = 100  # most metrics that one function may return
 _NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
 
 Row = dict[str, Any]
-"""Values by column: `FIXED`, the varied paths, the time of each cluster's engagement (`engaged_column`), the errors by
-their paths in summary.json, and the user's `metrics.NAME`."""
+"""Values by column: `FIXED`, the varied paths, the time of each cluster's engagement (`engaged_column`), errors and
+tracking by their paths in summary.json, and the user's `metrics.NAME`."""
 
 
 class Task(Struct, frozen=True):
@@ -63,30 +63,30 @@ class Task(Struct, frozen=True):
 
     run: int  # number of the run
     point: int  # point of the grid
-    varied: dict[str, Any]  # values by path, without the seed
+    varied: dict[str, Any]  # values of the varied fields by path, without the seed
     scenario: Scenario  # resolved, with the run's seed
     record: str | None = None  # folder for the record; None to keep none
     open_run: Callable[[Path], Any] | None = None  # opens a record as a `zsim.Run`, for metrics
-    more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns with JSON values
-    processes: Callable[[Scenario, Path], None] | None = None  # flies it as processes into a folder; None: in process
-    judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # returns further columns from summary and row
+    more: Callable[[RecordedFlight], Mapping[str, Any]] | None = None  # returns further columns, with JSON values
+    processes: Callable[[Scenario, Path], None] | None = None  # flies the run as processes into a folder; None: here
+    judge: Callable[[RunSummary, Row], Mapping[str, Any]] | None = None  # returns further columns
 
 
 class RunResult(Struct, frozen=True, kw_only=True):
-    """The columns that every run has, in order; None if a failed run has no value."""
+    """The columns that every run has, in order; None where a failed run has no value."""
 
     run: int
     point: int
     seed: int
     failure: str | None = None  # why the run did not end well
-    ended: str | None = None  # the reason given by the world
+    ended: str | None = None  # why the flight ended, according to the world
     truth_sha256: str | None = None
     sim_s: float | None = None
     wall_s: float | None = None  # wall time of the flight
     real_time_factor: float | None = None
     min_separation_m: float | None = None
-    collisions: int | None = None  # number of contacts between drones and with obstacles
-    min_obstacle_distance_m: float | None = None  # of any drone's centre; None without obstacles and surfaces
+    collisions: int | None = None  # number of contacts of drones with each other and with obstacles
+    min_obstacle_distance_m: float | None = None  # least over all drones' centres; None without obstacles and surfaces
     # whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight
     crashed: bool | None = None
     # whether every cluster was engaged at some time within the judged window; None without a cluster
@@ -96,10 +96,10 @@ class RunResult(Struct, frozen=True, kw_only=True):
     as_planned: bool | None = None  # whether the flight followed its plan
     shortfall: str | None = None  # first deviation of the flight from its plan
     metrics_failure: str | None = None  # why the run lacks metrics that the user requested
-    # window_from_s, window_to_s: the judged window
+    # window_from_s, window_to_s: start and end of the judged window
     window_from_s: float | None = None
     window_to_s: float | None = None
-    window_note: str | None = None  # why the window is not the scenario's; empty if it is
+    window_note: str | None = None  # why the judged window is not the scenario's; empty if it is
     date: str | None = None  # when the run was flown (ISO 8601, UTC)
     host: str = ""  # host that flew the run
     fingerprint: str = ""  # hosts with equal fingerprints give identical bits
@@ -129,10 +129,10 @@ def failed_row(task: Task, reason: str, **known: Any) -> Row:
 
 
 def fly(task: Task) -> Row:
-    """Fly a run; return its row, which also has the error of a failed run, so that the sweep goes on.
+    """Fly a run and return its row; an error of the run is reported in the row, so that the sweep goes on.
 
     Raises:
-        RecordError, OSError: the record cannot be written, which would fail for other runs, too.
+        RecordError, OSError: the record cannot be written; other runs would fail as well.
     """
     needs_run = task.open_run and any(map(_takes_run, task.scenario.report.metric_names))
     if task.record is None and (needs_run or task.processes):
@@ -156,7 +156,7 @@ def fly(task: Task) -> Row:
         summary = summarise(flight, formations, Path(task.record or "") / RECORD)
     except (RecordError, OSError):
         raise
-    except Exception as error:  # of any type, since the scenario caused it
+    except Exception as error:  # any type, since the scenario caused it
         return failed_row(task, reason_of(error), **where)
     engaged = engaged_s(formations, summary.window_s)
     clusters = [cluster.name for cluster in task.scenario.clusters]
@@ -181,8 +181,8 @@ def fly(task: Task) -> Row:
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
     for i, (name, cluster) in enumerate([] if diverged else summary.clusters.items()):
-        # Errors by their paths in summary.json. They are None for a cluster that was not engaged, and for a flight
-        # that was not as planned, since errors of drones that stay on the ground, hover or fall are not comparable.
+        # Errors by their paths in summary.json: None for a cluster that was not engaged, and for a flight that was
+        # not as planned, since errors of drones that stay on the ground, hover or fall are not comparable.
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
         counts = summary.as_planned and engaged[name] is not None
         for parameter, errors in cluster.errors.items():
@@ -199,7 +199,7 @@ def fly(task: Task) -> Row:
 def fly_scenario(
     scenario: Scenario, writer: RecordWriter | None = None, answers: bool = False
 ) -> tuple[RecordedFlight, Exception | None]:
-    """Fly a resolved scenario; return the flight, and the error if it diverged.
+    """Fly a resolved scenario; return the flight, and the exception if it diverged.
 
     With `answers`, and for the user's metrics, the flight includes the drones' estimates and commands.
     """
@@ -212,7 +212,7 @@ def fly_scenario(
 
 
 class _CpuTime:
-    """An observer of a flight that measures the CPU time of this process from the first gate to the last."""
+    """Observer of a flight that measures the CPU time of this process from the first gate to the last."""
 
     def __init__(self) -> None:
         self._gates_s: list[float] = []
@@ -222,7 +222,7 @@ class _CpuTime:
         return self._gates_s[-1] - self._gates_s[0] if self._gates_s else None
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Do nothing, since the time is read at gates."""
+        """Do nothing: the time is read at gates."""
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         self._gates_s[1:] = [time.process_time()]
@@ -262,7 +262,7 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
 
 
 def made_modules(names: Iterable[str], folders: Iterable[Path]) -> list[Path]:
-    """Return the files of those modules in `names` that were generated for definitions of a notebook or a script."""
+    """Return the files of those modules in `names` that were generated from definitions in a notebook or script."""
     made = dict.fromkeys(name.partition(":")[0] for name in names if name.startswith(plugin.MADE))
     files = [folder / f"{module}.py" for module in made for folder in folders]
     return [file for file in files if file.is_file()]
@@ -275,7 +275,7 @@ def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dic
 
 
 def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | None], str | None]:
-    """Return the metrics of the user's functions by column, and a line on why some are missing, None if none are."""
+    """Return the metrics of the user's functions by column, and why some are missing, or None."""
     metrics: dict[str, float | None] = {}
     failures: list[str] = []
 
@@ -297,7 +297,7 @@ def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | No
 
 
 def _takes_run(name: str) -> bool:
-    """Return whether a user's function takes the recorded run, that is, its argument is not called `flight`."""
+    """Return whether a user's function takes the recorded run, that is, its argument is not named `flight`."""
     try:
         arguments = signature(plugin.load_function(name, METRICS)).parameters
     except (DocumentError, TypeError, ValueError):  # reported when the function is called
@@ -324,5 +324,5 @@ def _metrics_of(name: str, given: Callable[[], Any]) -> tuple[dict[str, float | 
         return metrics, None
     except DocumentError as error:
         return {}, error.faults[0]
-    except (Exception, SystemExit) as error:  # of any type, since the user's function raised it
+    except (Exception, SystemExit) as error:  # any type, since the user's function raised it
         return {}, f"{METRICS} {name}: {reason_of(error)}"

@@ -1,7 +1,7 @@
 """summary.json of a sweep: distributions and confidence intervals at each point of its grid; names of fields.
 
-`SweepResults` has the rows in columns, from which summary, tables and figures are made. Nothing here reads or writes
-files.
+`SweepResults` holds the rows as columns, from which the summary, tables and figures are made. This module neither reads
+nor writes files.
 """
 
 import math
@@ -25,15 +25,15 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 Samples = NDArray[np.float64]
 
 LEVEL = 0.95  # confidence level of all intervals
-RUNS_MIN = 5  # fewest runs with an interval; chosen: that of two runs is 13 times as wide as their distance
+RUNS_MIN = 5  # fewest runs for an interval; design choice: the interval of 2 runs is 13 times as wide as they differ
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
 _FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1
-_COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # a parameter's column: its cluster's name, and its own
+_COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # groups: the cluster's name, the parameter's name
 
 
 class ConfidenceInterval(Struct, frozen=True):
-    """A value with the limits of its confidence interval, which are NaN for too few samples."""
+    """A value with the limits of its confidence interval; these are NaN if there are too few samples."""
 
     value: float
     low: float
@@ -41,7 +41,7 @@ class ConfidenceInterval(Struct, frozen=True):
 
 
 def mean_interval(samples: Samples) -> ConfidenceInterval:
-    """Return the mean of samples (n,) with Student's interval, mean ± t(n − 1) s / √n, or NaN below RUNS_MIN samples.
+    """Return the mean of samples (n,) with Student's interval, mean ± t(n − 1) s / √n; NaN limits if n < RUNS_MIN.
 
     The interval is exact for normal samples, and asymptotically correct for others by the central limit theorem.
     """
@@ -56,7 +56,7 @@ def mean_interval(samples: Samples) -> ConfidenceInterval:
 def share_interval(count: int, of: int) -> ConfidenceInterval:
     """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
 
-    Its coverage is at least LEVEL for every share and number of runs.
+    The coverage is at least LEVEL for every share and number of runs.
     """
     tail = (1 - LEVEL) / 2
     low = float(betaincinv(count, of - count + 1, tail)) if count else 0.0
@@ -79,7 +79,7 @@ class Distribution(Struct, frozen=True):
 
 
 def distribution(samples: Samples) -> Distribution | None:
-    """Return the distribution of the finite ones of samples (n,); None if there are none."""
+    """Return the distribution of the finite values among samples (n,); None if there are none."""
     known = finite(samples)
     if not len(known):
         return None
@@ -94,7 +94,7 @@ def finite(samples: Samples) -> Samples:
 
 
 def count_text(count: int, of: int) -> str:
-    """Return the number of runs behind a mean as text; empty if it is all runs."""
+    """Return the number of runs behind a mean as text; empty if these are all runs."""
     return f"n = {count}" if count < of else ""
 
 
@@ -115,7 +115,7 @@ class FormationParameter(Struct, frozen=True):
 
 
 def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, FormationParameter]:
-    """Return the formation parameters of columns of errors, by column prefix; names may contain dots.
+    """Return the formation parameters of error columns, by column prefix; names may contain dots.
 
     Examples of columns: errors.x_c.true_rms, and clusters.NAME.errors.x_c.true_rms for clusters after the first.
     """
@@ -131,14 +131,14 @@ class GridPoint(Struct, frozen=True):
 
     label: str
     values: dict[str, Any]  # by path; empty if only seeds and drawn values vary
-    names: dict[str, str]  # the abbreviated values, unique for each field
+    names: dict[str, str]  # abbreviated values by path, distinct for each field
     runs: int  # number of finished runs
-    ended_well: ConfidenceInterval | None  # share of the finished runs; None without any
+    ended_well: ConfidenceInterval | None  # share of the finished runs; None if no run is finished
     # share of the runs that ended well in which no drone collided or crashed
     without_collision: ConfidenceInterval | None
     # runs that ended well with every cluster engaged at some time within the judged window; None without clusters
     engaged: int | None
-    as_planned: ConfidenceInterval | None  # share of the runs that ended well that followed their plan
+    as_planned: ConfidenceInterval | None  # of the runs that ended well, the share that followed their plan
     spreads: dict[str, Distribution]  # by column, over the runs that ended well and followed their plan
     excluded: int = 0  # runs that ended well without following their plan, which are in neither spreads nor differences
     least_separation_m: float | None = None  # over all runs that ended well; None if unknown
@@ -147,7 +147,7 @@ class GridPoint(Struct, frozen=True):
     differences: dict[str, Distribution] = {}
 
     def count(self, column: str) -> str:
-        """Return the number of runs behind a mean as text; empty if it is all that ended well."""
+        """Return the number of runs behind a mean as text; empty if these are all that ended well."""
         well = round(self.ended_well.value * self.runs) if self.ended_well else 0
         spread = self.spreads.get(column)
         return count_text(spread.runs, well) if spread else ""
@@ -159,7 +159,7 @@ class SweepSummary(Struct, frozen=True):
     scenario: str
     seed: int
     vary: tuple[str, ...]
-    changed: tuple[str, ...] | None  # overrides `a.b.c=value` of the command line; None: not known
+    changed: tuple[str, ...] | None  # overrides `a.b.c=value` from the command line; None: unknown
     # when the first and the last run were flown (ISO 8601, UTC); None if no run has a date
     dates: tuple[str, str] | None
     runs: int
@@ -243,17 +243,17 @@ class SweepResults:
         return finite(np.array([value - first.get(run - point, np.nan) for run, value in own.items()], np.float64))
 
     def ended_well(self, point: int) -> tuple[int, int]:
-        """Return how many of a point's finished runs ended well, and their number."""
+        """Return how many runs of a point ended well, and how many are finished."""
         at_point = self.points == point
         return int((at_point & self.well).sum()), int(at_point.sum())
 
     def without_collision(self, point: int) -> tuple[int, int]:
-        """Return in how many of a point's runs that ended well no drone collided or crashed, and their number."""
+        """Of a point's runs that ended well, return how many had no collision or crash, and how many there are."""
         collisions, crashed = self.values("collisions", point), self.values("crashed", point)
         return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
 
     def count(self, flag: str, point: int | None = None) -> tuple[int, int]:
-        """Return how many runs that ended well have a flag set, such as `as_planned`, and for how many it is known."""
+        """Return for how many runs that ended well a flag such as `as_planned` is set, and for how many it is known."""
         flags = self.values(flag, point)
         return int((flags == 1).sum()), int(np.isfinite(flags).sum())
 
@@ -339,22 +339,22 @@ class SweepResults:
 
 # Names of fields
 
-UNITS = {  # units by suffix of a name, longer suffixes first
+UNITS = {  # units by name suffix, longer suffixes first
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_nm_s2": "N m s²", "_rad_s": "rad/s", "_deg_s": "deg/s", "_n_s_m": "N s/m",
     "_n_s2": "N s²", "_1_s2": "1/s²", "_m_s2": "m/s²", "_percent": "%", "_1_s": "1/s", "_m_s": "m/s", "_px2": "px²",
     "_deg": "deg", "_rad": "rad", "_mah": "mAh", "_px": "px", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT",
     "_m": "m", "_s": "s",
 }  # fmt: skip
-OF_CHANNEL = {  # units of noise parameters relative to the unit of their channel: zsim.sensors
+OF_CHANNEL = {  # units of noise parameters, relative to the unit of their channel; see zsim.sensors
     "noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "bias_instability": "", "quantum": "",
 }  # fmt: skip
-SECTIONS = ("environment", "sensors", "drones", "clusters", "agents", "metrics")  # omitted from their fields' names
+SECTIONS = ("environment", "sensors", "drones", "clusters", "agents", "metrics")  # omitted from names of fields
 WORDS = {
     "gps": "GPS", "imu": "IMU", "mag": "magnetometer", "baro": "barometer", "accel": "accelerometer",
     "gyro": "gyroscope", "takeoff": "take-off",
 }  # fmt: skip
-OF_VARIABLES = ("target", "values", "expressions")  # maps of a plan, by the variables of its cluster
-OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # likewise omitted from names
+OF_VARIABLES = ("target", "values", "expressions")  # maps in a plan, keyed by the variables of its cluster
+OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # likewise omitted from field names
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
 
@@ -387,7 +387,7 @@ def field_name(path: str) -> FieldName:
         words = " ".join(WORDS.get(word, word) for word in step.removesuffix(end).split("_"))
         parted.append((words, UNITS.get(end, "")))
     if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
-        name = steps[-1]  # a variable: an angle is in rad, or in deg if its name ends in that
+        name = steps[-1]  # a variable; angles are in rad unless the name ends in _deg
         parted[-1] = (name[:-4], "deg") if name.endswith("_deg") else (name, unit(name))
     measure = parted[-1][1]
     if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:

@@ -26,8 +26,8 @@ from zsim_deploy.cli import federation_commands, hosts_commands, role_commands, 
 from zsim_deploy.roles.closed_output import STREAMS, is_unread
 
 UsageError: Any = importlib.import_module(typer.BadParameter.__module__).UsageError  # from the click that typer uses
-UNREAD = 128 + 13  # exit code of a command whose output is no longer read, as of one killed by SIGPIPE
-# errors of a path given by the user, or of its disk, wherever it is first accessed
+UNREAD = 128 + 13  # exit code of a command whose output is no longer read, as if killed by SIGPIPE
+# errors caused by a path that the user gave, or by its disk, wherever the path is first accessed
 FILE_FAULTS = {errno.ENAMETOOLONG, errno.EACCES, errno.EPERM, errno.ELOOP, errno.EROFS, errno.EIO, errno.ESTALE}
 PATH_SHOWN = 200  # characters of a path in an error; a longer one is shortened in the middle
 EXIT_CODES = {  # by class, for errors other than wrong input
@@ -88,9 +88,9 @@ def main() -> None:
         code = _run()
     except BrokenPipeError:
         if not any(map(is_unread, STREAMS)):
-            raise  # the pipe was not an output stream, but a connection
+            raise  # the broken pipe was a connection, not an output stream
         code = UNREAD
-    except SystemExit as ended:  # click exits with 1 when the output is not read
+    except SystemExit as ended:  # click exits with 1 when its output is not read
         code = UNREAD if isinstance(ended.__context__, BrokenPipeError) else ended.code
     try:
         sys.stdout.flush()
@@ -145,7 +145,7 @@ def _show_usage(error: Any) -> None:
     if isinstance(error, typer.BadParameter) and error.param is None:
         text = error.message
     else:
-        text = " ".join(error.format_message().split()).replace("Value error, ", "")  # pydantic's, in newer typers
+        text = " ".join(error.format_message().split()).replace("Value error, ", "")  # pydantic's, in newer typer
     command = error.ctx.command_path if error.ctx else "zsim"
     if text:
         line = f"{command}: {text[0].lower()}{text[1:].rstrip('.')}; see `{command} --help`"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from zsim.contract.run_messages import Fault
     from zsim.transport.session import Session
 
-SOURCE = "zsim.fault"  # source of the requests
+SOURCE = "zsim.fault"  # source named in fault requests
 ALL = "all"
 
 app = typer.Typer()
@@ -139,7 +139,7 @@ def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
 
 
 def duration(text: str | None) -> str | None:
-    """Return an option's text; BadParameter if it is not a duration such as 10s, 500ms or 2min."""
+    """Return an option's text; raise BadParameter if it is not a duration such as 10s, 500ms or 2min."""
     _seconds(text)
     return text
 
@@ -250,7 +250,7 @@ def kinds(
 
 
 def selector(which: str, scenario: str) -> dict[str, Any]:
-    """Return the arguments of `fault_clear` for the word of a command line.
+    """Return the arguments of `fault_clear` for a word from the command line.
 
     `which`: a number, kind or target, or ALL; `scenario`: text of the run's scenario, which may add kinds.
     """

@@ -26,14 +26,14 @@ from zsim_deploy import SAFE_PATH
 from zsim_deploy.roles.closed_output import renew_streams
 
 READY = b"ready"
-PACKET_MAX = 1 << 17  # size of a packet, bytes
-FILES = 4  # files with each packet: standard input, output and error, and the one with the byte to begin
+PACKET_MAX = 1 << 17  # maximum size of a packet [bytes]
+FILES = 4  # open files with each packet: standard input, output and error, and the one for the starting byte
 ARG_START, ARG_END = 47, 48  # indices of fields in /proc/self/stat, from 0; proc(5)
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # linux/prctl.h
 
 
 def main() -> None:
-    """Fork roles until the launcher closes the socket; in a role, run it."""
+    """Fork roles until the launcher closes the socket; in a forked process, run the role."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by forked processes
     _show_as("forkserver", [sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])

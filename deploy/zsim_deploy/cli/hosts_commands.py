@@ -1,4 +1,4 @@
-"""The commands for runs on several hosts, from `zsim push` to `zsim down`, and `zsim certs` and `zsim render`."""
+"""The commands for runs on several hosts, from `zsim push` to `zsim down`, plus `zsim certs` and `zsim render`."""
 
 import codecs
 import contextlib
@@ -123,7 +123,7 @@ def older_processor() -> dict[str, str]:
     settings = {"NPY_DISABLE_CPU_FEATURES": " ".join(getattr(numpy_core, "__cpu_dispatch__", ()))}
     if platform.machine() in ("x86_64", "AMD64"):
         settings["OPENBLAS_CORETYPE"] = "Nehalem"  # SSE4.2 at most
-        settings["GLIBC_TUNABLES"] = "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F,-AVX2_Usable,-FMA_Usable"  # glibc of any age
+        settings["GLIBC_TUNABLES"] = "glibc.cpu.hwcaps=-AVX2,-FMA,-AVX512F,-AVX2_Usable,-FMA_Usable"  # for any glibc
     else:
         settings["OPENBLAS_CORETYPE"] = "ARMV8"
     return {name: value for name, value in settings.items() if value}
@@ -135,7 +135,7 @@ def _check_processor(scenario: Path, duration_s: float) -> str:
     The scenario is flown normally; its record is then rerun with the code of the C library, BLAS and numpy for a
     processor of 2008 without fused operations. zsim's own code gives the same results with both. A difference comes
     from a user's class that calls functions whose results depend on the processor: np.linalg or `@`, np.exp on arrays,
-    math.sin. RunError if it cannot be flown in one process.
+    math.sin. Raise RunError if the scenario cannot be flown in one process.
     """
     with tempfile.TemporaryDirectory(prefix="zsim-doctor-") as folder:
         out = str(Path(folder, "run"))
@@ -203,7 +203,7 @@ def up(
                 outcome = HostRun(loaded, placed, folder, launch, status).run()
             conclude(outcome, folder, report)
         finally:
-            if not was_there:  # removing fails unless the folder is empty, because the run was refused
+            if not was_there:  # rmdir removes only an empty folder: that of a refused run
                 with contextlib.suppress(OSError):
                     folder.rmdir()
 

@@ -23,7 +23,7 @@ SILENCE_S = 1.0  # wall time without a message after which `hz` reports silence;
 UNHEARD_S = 3.0  # wall time after which a key without any message is reported; live keys have at least one a second
 NAMED_MAX = 5  # number of similar keys suggested for a key without a publisher
 OUTCOME_S = 3.0  # wall time for the world to report the outcome of a command; a paused world does not report it
-UNKNOWN_SENDER = "somebody"  # source that the world's event gives for a message that it could not decode
+UNKNOWN_SENDER = "somebody"  # source in the world's event about a message that it could not decode
 PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
@@ -52,7 +52,7 @@ def echo(
 ) -> int:
     """Pass the messages on a key expression to `emit` until `count` or the timeout is reached; return their number.
 
-    `emit` takes the key and the message, with `raw` the payload in hexadecimal digits; `note` takes notices for the
+    `emit` takes the key and the message, or, if `raw`, the payload in hexadecimal digits; `note` takes notices for the
     user.
     """
     subscription = link.subscribe(expression)
@@ -72,14 +72,14 @@ def echo(
 
 
 def keys_like(link: Session, expression: str) -> str:
-    """Return the end of a line on a key without a publisher: similar keys that are in use."""
+    """Return the end of a message about a key without a publisher: similar keys that are in use."""
     in_use = [key for key, _, _ in list_keys(link, "**")]
     named = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
     return f"; similar keys in use: {named}" if named else "; `zsim keys` lists the keys in use"
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as JSON values; one outside the contract as its MessagePack value, or else why it is refused."""
+    """Return a message as JSON values; one outside the contract as its MessagePack value, or why it is refused."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
@@ -127,7 +127,7 @@ class MessageRate:
 
 
 def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> int:
-    """Pass a line on the message rate to `emit`, once a second and at the end; return the number of messages.
+    """Pass a line about the message rate to `emit`, once a second and at the end; return the number of messages.
 
     `seconds`: duration, wall time; `window`: see `MessageRate`.
     """
@@ -177,16 +177,16 @@ class Published(NamedTuple):
     """The outcome of commands sent by hand."""
 
     sent: int
-    refused: int = 0  # number of those that the world refused, according to its events
+    refused: int = 0  # number of commands that the world refused, according to its events
     reason: str = ""  # reason of the first refusal
-    note: str = ""  # why the outcome is not known, empty if it is
+    note: str = ""  # why the outcome is unknown; empty if it is known
 
 
 def publish(link: Session, info: messages.Info, key: str, text: str, count: int, rate_hz: float) -> Published:
     """Publish a JSON text as a command `count` times, and wait for the outcome.
 
-    t_ns, seq and source are filled in. RunError if the text is not a message of the key, or the key is not that of a
-    command to a drone of the run.
+    t_ns, seq and source are filled in. Raise RunError if the text is not a message of the key, or the key is not that
+    of a command to a drone of the run.
     """
     _refuse_wildcards(key, "pub")
     kind = messages.type_of(key)
@@ -219,7 +219,7 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
 def _outcome(
     events: Subscription, clock: "_SimulatedTime", gate_ns: int, ours: tuple[str, str], sent: int
 ) -> Published:
-    """Return the outcome of commands from the world's events, once the last one has taken effect or was refused."""
+    """Return the outcome of commands from the world's events, once the last one has taken effect or been refused."""
     key, source = ours
     accepted, refused, last_ns, reason = 0, 0, 0, ""
     until_s = time.monotonic() + OUTCOME_S
@@ -282,7 +282,7 @@ def _map(what: str, text: str, example: str) -> dict[str, Any]:
 
 
 def ask(link: Session, key: str, op: str, text: str) -> Any:
-    """Send a request, its arguments as a JSON text; return the result as JSON values, or raise the refusal."""
+    """Send a request with arguments in a JSON text; return the result as JSON values, or raise the refusal."""
     _refuse_wildcards(key, "ask")
     result = result_of(link.request(key, op, ASK, _map(f"{op}: args", text, '{"gates": 50}')))
     with suppress(DecodeError):  # only the result of a replay contains messages

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 FIRST_ADDRESS = "127.0.0.2"  # address of the first AR.Drone; programs on this host send from 127.0.0.1
 TOKEN = "ZSIM_TOKEN"  # environment variable, because a command line is visible to all users of the machine
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID of ROS 2
-KEY_BYTES = 32  # MAVLink 2, "Message Signing"
-GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # UDP ports of PX4's simulation: of the ground station, and the first local one
+KEY_BYTES = 32  # length of a signing key; MAVLink 2, "Message Signing"
+GCS_PORT, GCS_LOCAL_PORT = 14550, 18570  # UDP ports of PX4's simulation: the ground station's, the first local one
 API_PORT, API_LOCAL_PORT = 14540, 14580  # the same for programs (offboard API)
 GATEWAY_NEEDS = {"gateway": ("aiohttp",)}
 FMU_NEEDS = {"fmu": ("fmpy",)}
@@ -254,8 +254,8 @@ def serve_as(
 ) -> None:
     """Serve one run after another, as the process that `process_name` names.
 
-    `lowered`: run at a lower priority than the processes that the world waits for; `remain`: called after a launched
-    run.
+    `lowered`: run at a lower priority than the processes that the world waits for; `remain`: called after a
+    launched run.
     """
     from zsim_deploy.roles import roles
     from zsim_deploy.roles.roles import process_name
@@ -300,7 +300,7 @@ def console(
     from zsim_bridges.console.page_server import ListenAddress
     from zsim_deploy.roles.roles import log_printer, process_name
 
-    # It keeps normal priority, because an operator's emergency stop goes through it.
+    # The console keeps normal priority, because an operator's emergency stop goes through it.
     own_name = process_name("console", name, reach.who, "*")
     say_line = JsonProgress().say if reach.launched else log_printer(None)
     require_files(SERVER_FILES, "a console and its pages")
@@ -332,12 +332,12 @@ def gateway(
     from zsim_deploy.roles.roles import log_printer, process_name
     from zsim_deploy.roles.stop_channel import lower_priority
 
-    lower_priority()  # before its threads are started
+    lower_priority()  # before the gateway's threads are started
     own_name = process_name("gateway", name, reach.who)
 
     def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
         who = reach.who
-        if who.tls is not None:  # a client's certificate is beside the gateway's
+        if who.tls is not None:  # a client's certificate is kept beside the gateway's
             folder = who.tls.parent / process
             if not folder.is_dir():
                 remedy = "name it in the scenario and in the inventory"

@@ -102,7 +102,7 @@ def run(
         mode, pace = flight.mode_and_rate()
         scenario = with_cameras(flight.scenario()) if cameras else flight.scenario()
         if in_process:
-            check_plans(scenario, flight.path.name)  # otherwise the controllers do
+            check_plans(scenario, flight.path.name)  # otherwise the controllers check them
         if agent:
             plugin.search(*plugin.folders(), Path.cwd())
         agents = [AgentSpec.parse(shlex.split(each) or [""]) for each in agent or ()]
@@ -128,7 +128,7 @@ def run(
 
 
 def _given(context: typer.Context, options: Sequence[str]) -> str:
-    """Return those of `options` that the command line gives, joined by "and"; empty if none."""
+    """Return those of `options` that the command line gives, joined by "and"; empty if it gives none."""
     sources = {each.opts[0]: context.get_parameter_source(each.name or "") for each in context.command.params}
     return " and ".join(option for option in options if (source := sources[option]) and source.name == "COMMANDLINE")
 
@@ -190,7 +190,7 @@ def validate(scenario: opt.ScenarioPath, set_: opt.Set = None, trust: opt.Trust 
     with plugin.names_only(not trust) as skipped:
         loaded = opt.load_scenario(scenario, set_)
         check_plans(loaded, scenario.name)
-    if modules := [name for name in skipped if ":" not in name]:  # they define parameters of vehicles and sensors
+    if modules := [name for name in skipped if ":" not in name]:  # these define parameters of vehicles and sensors
         note(f"{scenario.name}: the resolved scenario is not printed because it depends on {', '.join(modules)}")
     else:
         print(printable(scenario_file.to_text(loaded)), end="", flush=True)
@@ -313,7 +313,7 @@ def sweep(
 
 
 def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
-    """Make the report; fail if a run failed, or no run was flown as planned."""
+    """Make the report; exit with code 1 if a run failed, or no run was flown as planned."""
     if report:
         _report(folder)
     say(f"table: {folder / 'sweep.parquet'}")

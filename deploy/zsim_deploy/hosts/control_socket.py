@@ -22,16 +22,16 @@ from zsim_deploy.arguments import note
 
 REQUEST_S = 5.0  # wall time for a request to arrive, from the same machine
 ANSWER_S = 150.0  # wall time for an answer; a move, with a connection, checks and a copy, takes 135 s at most
-LINE_MAX = 1_000_000  # length of a request, bytes
-PATH_MAX = 107  # length of a socket's path on Linux without the final zero, bytes; unix(7). macOS reports its own 103
+LINE_MAX = 1_000_000  # maximum length of a request [bytes]
+PATH_MAX = 107  # maximum length of a socket path on Linux, without the final zero [bytes]; unix(7). On macOS it is 103
 
 Act = Callable[..., Any]
 
 
 def place(federation: str) -> Path:
-    """Return the path of the socket of a federation's launcher, to which only its user can connect.
+    """Return the socket path of a federation's launcher; only the launcher's user can connect to it.
 
-    RunError on Windows, which has no such sockets.
+    Raise RunError on Windows, which has no such sockets.
     """
     if not hasattr(socket, "AF_UNIX") or not hasattr(os, "getuid"):
         raise RunError("launchers are reached through Unix sockets, which this system lacks; use Linux or WSL")
@@ -61,7 +61,7 @@ def launchers() -> list[str]:
 def ask(federation: str, op: str, **args: Any) -> Any:
     """Send a request to a federation's launcher on this machine, and return the result.
 
-    RunError if no launcher runs, or it does not answer, or refuses the request.
+    Raise RunError if no launcher runs, or if it does not answer or refuses the request.
     """
     path = place(federation)
     with socket.socket(socket.AF_UNIX) as line:
@@ -95,7 +95,7 @@ def seen_by_ps(federation: str, status: Callable[[], dict[str, Any]]) -> Iterato
 
 
 class ControlSocket:
-    """The launcher's end of the socket, a context.
+    """The launcher's end of the control socket; a context manager.
 
     Args:
         acts: function for each `op`; called in a thread with the request's arguments, it returns a JSON value.

@@ -31,7 +31,7 @@ from zsim_deploy.hosts.host_link import (
 from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
 from zsim_deploy.roles.stop_channel import FOLDER
 
-CLOCK_OFFSET_MAX_S = 1.0  # enough to compare logs; certificates are back-dated by a day, messages carry simulated time
+CLOCK_OFFSET_MAX_S = 1.0  # logs remain comparable; certificates are back-dated by a day, messages carry simulated time
 LOAD_MAX = 0.5  # load average per core; in lockstep a busy host slows down all others
 FREE_MIN_BYTES = 1_000_000_000  # about the size of a record of an hour with three drones
 BITS_PER_S_MIN = 10e6  # three drones in realtime send 2 Mbit/s to a recorder; lockstep runs as fast as the link allows
@@ -43,7 +43,7 @@ NO_MODULE = "no module named"  # part of Python's error, in lower case
 NO_PROGRAM = ("not found", "no such file")  # parts of shells' errors on a missing program, in lower case
 NO_PROGRAM_CODES = (126, 127)  # shells' exit codes for a missing program; POSIX, 2.8.2
 NEEDED_TO_COMPUTE = "scipy"  # a host without it runs only routers and recorders; world and agents need it
-OFFSET_SAMPLES = 3  # the one with the shortest round trip gives the best estimate of the clock offset
+OFFSET_SAMPLES = 3  # clock readings; the one with the shortest round trip gives the best estimate of the offset
 HOST_COLUMNS = (
     Column("host", "name"),
     Column("python", worth=3),
@@ -62,7 +62,7 @@ PATH_COLUMNS = (
     Column("round trip", "text"),
     Column("bandwidth", worth=1, right=True),
 )
-RUNS = "runs"  # folder below that of zsim on a host, with a folder per run
+RUNS = "runs"  # folder in zsim's folder on a host, with a folder for each run
 # A run whose processes are still alive is not listed; without ps, all runs are.
 LIST_RUNS = f"""
 alive=$(ps -A -ww -o args 2>/dev/null || ps -A -o args 2>/dev/null)
@@ -73,8 +73,8 @@ for run in *; do
 done
 true
 """
-# Program for the host's Python, run as `python - ADDRESS PORT...`. It reports only ports in use; the log of a process
-# has any other fault of its port.
+# Program for the host's Python, run as `python - ADDRESS PORT...`. It reports only ports in use; any other
+# fault of a port appears in the log of its process.
 TRY_PORTS = """
 import errno, json, socket, sys
 address, taken = sys.argv[1], []
@@ -105,7 +105,7 @@ class NetworkPath(NamedTuple):
     source: str
     target: str
     port: int
-    measured: dict[str, Any]  # answer of `probe reach`: round_trip_s, bits_per_s; or error
+    measured: dict[str, Any]  # answer of `probe reach`: round_trip_s and bits_per_s, or error
 
 
 class CheckResult(NamedTuple):
@@ -154,13 +154,13 @@ def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckRe
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
-    """Run a probe on a host; HostsError if the host has no zsim or cannot be reached.
+    """Run a probe on a host; raise HostsError if the host has no zsim or cannot be reached.
 
-    `python`: its interpreter; `hosts`: path of the inventory, for remedies.
+    `python`: the host's interpreter; `hosts`: path of the inventory, for remedies.
     """
-    push = f"run `zsim push --hosts {hosts}`"  # without effect on a host with a `python` of its own
+    push = f"run `zsim push --hosts {hosts}`"  # has no effect on a host with a `python` of its own
     remedy = f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
-    answers: list[tuple[float, float]] = []  # round trip of a line, and the clock offset, s
+    answers: list[tuple[float, float]] = []  # round trip of a line, and clock offset [s]
     try:
         async with _probe(link, python, "about", link.host.folder) as there:
             facts = await there.answer(ABOUT_S)
@@ -230,7 +230,7 @@ def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
 
 
 def _lacking(reports: dict[str, HostReport]) -> Iterator[str]:
-    """Yield a warning for each host that lacks a package with which others compute: slower, but with the same bits."""
+    """Yield a warning for each host that lacks a package that others compute with: slower, but with the same bits."""
     for name, report in reports.items():
         others = {part for each in reports.values() for part in each.facts["machine"]}
         if lacking := " and ".join(sorted(others - set(report.facts["machine"]))):
@@ -249,7 +249,7 @@ def hosts_table(reports: Mapping[str, HostReport]) -> FittedTable:
 async def network_paths(
     links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int
 ) -> list[NetworkPath]:
-    """Measure the network paths from hosts to a port of another host, on which no other program may listen."""
+    """Measure the network paths from hosts to a port of another host; no other program may listen on that port."""
 
     async def reach(link: HostLink) -> dict[str, Any]:
         try:
@@ -299,14 +299,14 @@ def paths_table(paths: Sequence[NetworkPath]) -> FittedTable:
 
 
 def runs_folder(host: Host) -> str:
-    """Return the folder of runs on a host, absolute or relative to the home (~/)."""
+    """Return the folder of runs on a host, absolute or relative to the home folder (~/)."""
     return f"{inv.below_home(host.folder)}/{RUNS}"
 
 
 async def leftovers(link: HostLink, base: Path) -> list[str]:
-    """Describe what earlier runs have left on a host: at most one line on records, and one on private keys.
+    """Return warnings about leftovers of earlier runs on a host: at most one on records and one on private keys.
 
-    A greeting of the login shell is skipped. HostsError if the host cannot be reached.
+    A greeting of the login shell is skipped. Raise HostsError if the host cannot be reached.
     """
     name, folder = link.name, runs_folder(link.host)
     script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
@@ -340,7 +340,7 @@ def scp(host: Host, base: Path, path: str) -> str:
 
 
 async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
-    """Return a line for each port of a host that is in use; HostsError if the host cannot be reached."""
+    """Return a line for each port of a host that is in use; raise HostsError if the host cannot be reached."""
     if not ports:
         return []
     command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"

@@ -1,7 +1,7 @@
 """Access to the hosts of an inventory over ssh: connections, commands, long-running programs, and file transfer.
 
 Every failure is one line: the host, what failed, and what to do. All connections belong to one event loop in its own
-thread (`EventLoopThread`), so that the supervisor of a run stays a plain loop.
+thread (`EventLoopThread`), so that the supervisor of a run remains a plain loop.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ from zsim_deploy.inventory import SSH_PORT, Host, InventoryFile
 # Wall times; a host on a poor link answers within a few round trips
 CONNECT_S = 10.0  # time limit for logging in
 KEEPALIVE_S = 15.0  # time without data after which a keepalive is sent
-KEEPALIVE_COUNT = 4  # unanswered keepalives until the connection is given up, a minute: it survives an outage of 20 s
+KEEPALIVE_COUNT = 4  # unanswered keepalives before the connection is given up; one minute, to survive outages of 20 s
 ECHO_S = 0.5  # interval at which the host echoes a line
 RETRY_S = 0.5  # interval between attempts to reconnect
 CLOSE_S = 1.0  # time limit for closing a connection; a cut one never closes
@@ -37,7 +37,7 @@ ANSWER_S = 10.0  # time limit for a short command
 OPEN_S = 10.0  # time limit for opening SFTP
 STALL_S = 20.0  # time without data after which the host is considered lost; TCP retransmits well within that
 
-CHANNELS = 8  # channels on a connection; sshd allows 10 (sshd_config(5), MaxSessions), and counts closed ones a while
+CHANNELS = 8  # channels per connection; sshd allows 10 (sshd_config(5), MaxSessions) and counts closed ones for a while
 BLOCK_BYTES = 32_768  # size of an SFTP request; even at 100 kbit/s one is answered within 3 s
 
 Result = TypeVar("Result")
@@ -51,12 +51,12 @@ class EventLoopThread:
         self._thread.start()
 
     def call(self, work: Coroutine[Any, Any, Result], timeout_s: float | None = None) -> Result:
-        """Run a coroutine and return its result; if it takes longer than the timeout, cancel it: TimeoutError."""
+        """Run a coroutine and return its result; if it exceeds the timeout, cancel it and raise TimeoutError."""
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result(timeout_s)
         except BaseException:
-            future.cancel()  # Ctrl-C, too
+            future.cancel()  # also on Ctrl-C
             raise
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> Future[None]:
@@ -94,7 +94,7 @@ class HostLink:
         self._lock = asyncio.Lock()
 
     async def open(self) -> Connection:
-        """Return a connection with a free channel; HostsError if logging in to the host fails."""
+        """Return a connection with a free channel; raise HostsError if logging in to the host fails."""
         async with self._lock:
             for connection, channels in list(self._channels.items()):
                 if connection.is_closed():
@@ -126,9 +126,9 @@ class HostLink:
     async def run(
         self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", retry: bool = False
     ) -> bytes:
-        """Run a POSIX shell command and return its output; HostsError if it fails or takes too long.
+        """Run a POSIX shell command and return its output; raise HostsError if it fails or takes too long.
 
-        `what`: what it does, for errors; `retry`: try until the host is reached; the timeout counts from then.
+        `what`: what the command does, for errors; `retry`: try until the host is reached; the timeout counts from then.
         """
         async with self.channel(retry) as connection:
             try:
@@ -150,7 +150,7 @@ class HostLink:
     ) -> None:
         """Write files, given by path below a folder, readable by their owner alone.
 
-        HostsError if they cannot be written; if the link breaks, none is.
+        Raise HostsError if they cannot be written; if the link breaks, no file is written.
         """
         packed = io.BytesIO()
         with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
@@ -215,14 +215,14 @@ class HostLinks:
         self._loop.spawn(link.measure_round_trips())
 
     def listen(self) -> None:
-        """Start measuring whether each host answers."""
+        """Start to measure the round trips to all hosts."""
         for link in self.by_name.values():
             self._loop.spawn(link.measure_round_trips())
 
     def on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
         """Run a coroutine for all hosts at once; return the results by host.
 
-        HostsError with a line for each host for which it failed or took longer than `within_s`.
+        Raise HostsError with a line for each host for which the coroutine failed or took longer than `within_s`.
         """
 
         async def bounded(link: HostLink) -> Any:
@@ -242,9 +242,9 @@ class HostLinks:
 
 
 def raise_faults(results: list[Any]) -> list[Any]:
-    """Return results that were gathered with exceptions.
+    """Return gathered results if no exception is among them.
 
-    HostsError with a line for each ZsimError among them; any other exception is raised as it is.
+    Raise HostsError with a line for each ZsimError; raise any other exception as it is.
     """
     for result in results:
         if isinstance(result, BaseException) and not isinstance(result, ZsimError):
@@ -255,7 +255,7 @@ def raise_faults(results: list[Any]) -> list[Any]:
 
 
 class ProgramEndedError(HostsError):
-    """A program on a host ended without an answer; has its exit code, and its last line on standard error."""
+    """A program on a host ended without an answer; `status`: its exit code; `last`: its last line on standard error."""
 
     def __init__(self, name: str, status: int | None, last: str) -> None:
         super().__init__(f"{name}: it ended with code {status} ({last or 'it printed nothing'})")
@@ -275,7 +275,7 @@ class RemoteProgram:
     async def answer(self, within_s: float, late: str = "") -> dict[str, Any]:
         """Return the program's next answer, skipping any greeting of the login shell.
 
-        ProgramEndedError if it has ended; HostsError, with the text `late` if given, if it takes too long.
+        Raise ProgramEndedError if it has ended, and HostsError (with the text `late`, if given) if it takes too long.
         """
         try:
             async with asyncio.timeout(within_s):
@@ -292,7 +292,7 @@ class RemoteProgram:
 
 @contextlib.asynccontextmanager
 async def open_program(link: HostLink, command: str) -> AsyncIterator[RemoteProgram]:
-    """Run a program on a host for the duration of the block; HostsError if the connection fails or breaks."""
+    """Run a program on a host for the duration of the block; raise HostsError if the connection fails or breaks."""
     try:
         async with link.channel() as connection:
             process = await connection.create_process(command, encoding="utf-8", errors="replace")
@@ -307,8 +307,8 @@ async def open_program(link: HostLink, command: str) -> AsyncIterator[RemoteProg
 async def fetch(link: HostLink, source: str, into: Path) -> bool:
     """Copy a file from a host; return False if it does not exist there.
 
-    An incomplete copy has .part appended to its name. HostsError if the file cannot be read or the transfer stalls;
-    OSError if it cannot be written here.
+    An incomplete copy has .part appended to its name. Raise HostsError if the file cannot be read or the transfer
+    stalls, and OSError if it cannot be written here.
     """
     part, moved = into.with_name(f"{into.name}.part"), asyncio.Event()
     try:
@@ -319,7 +319,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
                     source.removeprefix("~/"), part, block_size=BLOCK_BYTES, progress_handler=lambda *_: moved.set()
                 )
             )
-            copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # else asyncio reports it
+            copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # or else asyncio reports it
             try:
                 while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
                     if not moved.is_set():
@@ -340,7 +340,7 @@ async def fetch(link: HostLink, source: str, into: Path) -> bool:
 
 
 async def start_sftp(name: str, connection: Connection) -> asyncssh.SFTPClient:
-    """Open SFTP on a connection; HostsError if the host does not offer it."""
+    """Open SFTP on a connection; raise HostsError if the host does not offer it."""
     try:
         return await connection.start_sftp_client()
     except (asyncssh.ChannelOpenError, asyncssh.SFTPConnectionLost, asyncssh.SFTPEOFError) as error:
@@ -361,7 +361,7 @@ def shell_line(words: Iterable[str]) -> str:
 
 
 def json_answer(lines: Iterable[str]) -> dict[str, Any] | None:
-    """Return the first JSON object among lines; None without one."""
+    """Return the first JSON object among lines; None if there is none."""
     for line in lines:
         with contextlib.suppress(ValueError):
             value = json.loads(line)
@@ -371,7 +371,7 @@ def json_answer(lines: Iterable[str]) -> dict[str, Any] | None:
 
 
 class _Client(asyncssh.SSHClient):
-    """Remembers a refused host key: the host name, address and port for which it was looked up, and the key."""
+    """ssh client that remembers a refused host key, with the host name, address and port for which it was looked up."""
 
     refused: tuple[str, str, int, asyncssh.SSHKey] | None = None
 
@@ -383,8 +383,8 @@ class _Client(asyncssh.SSHClient):
 async def connect(name: str, host: Host, base: Path) -> Connection:
     """Connect to a host; ~/.ssh/config fills in what its inventory entry leaves out.
 
-    Relative paths of `key` and `known_hosts` refer to `base`, the folder of the inventory. HostsError if the host
-    cannot be reached, shows another key than known_hosts has, or refuses the user or key.
+    Relative paths of `key` and `known_hosts` refer to `base`, the folder of the inventory. Raise HostsError if the host
+    cannot be reached, shows a host key other than that in known_hosts, or refuses the user or key.
     """
     client, address = _Client(), host.ssh or host.address
     options: dict[str, Any] = {"keepalive_interval": KEEPALIVE_S, "keepalive_count_max": KEEPALIVE_COUNT}
@@ -414,7 +414,7 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
 def _changed_key(
     name: str, host: Host, known: Path, looked_for: str, address: str, port: int, shown: asyncssh.SSHKey
 ) -> str:
-    """Describe a host key that differs from the known one; empty if it does not differ, or none is known."""
+    """Return a text on a host key that differs from the known one; empty if it does not, or none is known."""
     path = str(known.expanduser())
     try:
         keys = asyncssh.match_known_hosts(path, looked_for, address, None if port == SSH_PORT else port)[0]
@@ -431,7 +431,7 @@ def _changed_key(
 
 
 def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) -> str:
-    """Describe why a connection failed, and what to do."""
+    """Return why a connection failed, and what to do."""
     address = host.ssh or host.address
     at = f"{address} port {host.port}"
     user = host.user or getpass.getuser()

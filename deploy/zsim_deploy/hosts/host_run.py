@@ -71,7 +71,7 @@ PID = "zsim-pid "  # prefix of the line with the process id; a login shell may p
 
 
 class HostRun:
-    """One run on several hosts; InventoryError if a process has no host."""
+    """One run on several hosts; raises InventoryError if a process has no host."""
 
     def __init__(
         self, scenario: Scenario, placed: InventoryFile, out: Path, launch: Launch, status: StatusTable
@@ -90,10 +90,10 @@ class HostRun:
         self._replacing = threading.Lock()  # held by a request that replaces a process
 
     def run(self) -> Outcome:
-        """Run to the end; however it ends, no process or key of the run is left on a host that can be reached.
+        """Fly the run to its end; however it ends, no process or key of the run is left on a host that can be reached.
 
-        RunError if the federation already runs on this machine; HostsError with a line for every missing certificate
-        and every host that cannot take part.
+        Raise RunError if the federation already runs on this machine, and HostsError with a line for every missing
+        certificate and every host that cannot take part.
         """
         requests = {
             "ps": lambda: {"rows": self._status.rows(), "clock": self._status.clock_now, **self._where()},
@@ -129,7 +129,7 @@ class HostRun:
 
     def _check(self) -> None:
         async def inspect(link: HostLink) -> tuple[HostReport, list[str], list[str]]:
-            """Return the report of a host, faults of its ports, and a line on what earlier runs have left there."""
+            """Return the report of a host, faults of its ports, and lines on what earlier runs have left there."""
             python = self._plan.python(link.name)
             report = await host_report(link, python, self._placed.word)
             taken = await port_faults(link, python, self._plan.ports(link.name))
@@ -296,7 +296,7 @@ class HostRun:
 
 
 async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
-    """Raise HostsError if the Python of a host cannot import what a role needs; it names what is missing."""
+    """Raise HostsError if the Python of a host cannot import what a role needs; the error names what is missing."""
     for extra in extras([role]):
         code = f"import {MODULES[extra]}"
         command = f"{shell_word(python)} -c {shell_word(code)}"
@@ -308,7 +308,7 @@ async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
 
 
 class HostPlan:
-    """The processes of one run that zsim starts, and their hosts; immutable. InventoryError if one has no host."""
+    """The processes that zsim starts in a run, and their hosts; immutable. Raises InventoryError if one has none."""
 
     def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
         self.placed = placed
@@ -318,7 +318,7 @@ class HostPlan:
         in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
         self.processes = {process.name: process for process in in_order}  # each after the process that it connects to
         self.programs = inv.programs_here(placed, scenario)  # the user's own programs, started on this machine
-        # a line on each of the user's programs that is placed on a host; zsim does not start those
+        # a line about each of the user's programs that is placed on a host; zsim does not start these
         self.remarks = [line for host in placed.inventory.hosts for line in inv.own_programs(placed, scenario, host)]
 
     def moved(self, name: str, host: str) -> HostPlan:
@@ -348,7 +348,7 @@ class HostPlan:
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"
 
     def record_location(self) -> str:
-        """Return host and path of the record, with the command that fetches it."""
+        """Return the host and path of the record, with the command that fetches it."""
         name = self.host(RECORDER)
         command = scp(self.placed.inventory.hosts[name], self.placed.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"
@@ -382,9 +382,9 @@ class HostPlan:
         return contents
 
     def identity(self, name: str) -> dict[str, bytes]:
-        """Return certificates, key and access control of a process, by path below the run's folder.
+        """Return the certificates, key and access control of a process, by path below the run's folder.
 
-        HostsError if one cannot be read.
+        Raise HostsError if one cannot be read.
         """
         process = self.processes[name]
         if not process.secure:
@@ -405,12 +405,12 @@ class HostPlan:
 class RemoteProcess:
     """A role on another host, started, watched and stopped over ssh; its output goes to a file on this machine.
 
-    The standard input of the process is the ssh channel. The process ends when sshd closes that, because the launcher
-    has died, and when it has received nothing for ORPHAN_S, for instance because the launcher's host is down
+    The standard input of the process is the ssh channel. The process ends when sshd closes the channel because the
+    launcher has died, or when it has received nothing for ORPHAN_S, for instance because the launcher's host is down
     (roles/stop_channel.py).
 
     Args:
-        on_line: takes every line of its standard output; None: they go to the log too.
+        on_line: takes every line of its standard output; None: these lines go to the log as well.
         files: a folder on the host, and the contents of the files that the process needs, by path below that folder.
             The process removes its key when it ends, so each restart copies the files again.
     """
@@ -521,7 +521,7 @@ class RemoteProcess:
         return self._log.last
 
     def request_stop(self, reason: str) -> None:
-        """Ask the process to leave; remembered while it is starting, without effect once it has ended."""
+        """Ask the process to stop; the request is kept while the process is starting, and void once it has ended."""
         self._stop = reason
         self._loop.call_soon(self._send, f"stop {reason}\n")
 
@@ -548,14 +548,14 @@ class RemoteProcess:
         self._loop.spawn(kill(f"kill -9 {self.pid}"))
 
     def close(self) -> None:
-        """Kill the process; one that cannot be reached ends by itself."""
+        """Kill the process; a process that cannot be reached ends by itself."""
         if self._life is not None:
             self.kill()
             self._ended.wait(KILL_S)
 
 
 class ProcessLog:
-    """The log file of a process; if it cannot be written, that is reported once, and only the last line is kept."""
+    """The log file of a process; if it cannot be written, this is reported once, and only the last line is kept."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
         self.last = ""  # the last line that is not empty

@@ -1,14 +1,14 @@
 """The program that `zsim push` runs on a host; it is sent as text, and needs nothing there but Python.
 
 Standard input is this text, followed by orders, one JSON line each; each is answered by a JSON line on standard output.
-When standard input ends, or has been silent for a while, the push is over or its launcher is lost: the current command
-is killed.
+When standard input ends, or has been silent for a while, the push is over or its launcher is lost; the current command
+is then killed.
 
 {"act": "look"}                      report the Python, the platform, what is installed, and the wheels in FOLDER
 {"act": "install", ...}              install wheels into FOLDER/venv
 {"act": "warm_up", ...}              run an installed module, with the extras as its arguments
 
-Only one instance works in a folder at a time; any other one reports who does, and waits.
+Only one instance works in a folder at a time; any other one reports whose push it is waiting for.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ import venv
 from collections.abc import Iterator
 from pathlib import Path
 
-LOCK = "push.lock"  # file in the folder, locked by the instance that works there; it contains who that is
+LOCK = "push.lock"  # file in the folder, locked by the instance that works there; names the user who pushes
 NOTE = "zsim-installed.json"  # file in the environment with what was installed; missing during an installation
 
 
@@ -49,7 +49,7 @@ def inspect_folder(folder: Path) -> dict:
 
 
 def _installed(environment: Path) -> dict | None:
-    """Return the note of an earlier push; None if its environment has another Python than the running one."""
+    """Return the note of an earlier push; None if its environment has a Python other than the running one."""
     if not os.access(environment / "bin" / "python", os.X_OK):
         return None
     with contextlib.suppress(OSError, ValueError):
@@ -70,7 +70,7 @@ class CommandRunner:
         self._child: subprocess.Popen | None = None
 
     def run(self, command: list) -> None:
-        """Run a command to its end; CommandError if it fails."""
+        """Run a command to its end; raise CommandError if it fails."""
         with self._gate:
             self._child = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -92,10 +92,10 @@ class CommandRunner:
 
 
 def install(folder: Path, order: dict, children: CommandRunner) -> None:
-    """Install wheels from FOLDER/wheels alone.
+    """Install wheels, only from FOLDER/wheels.
 
-    `order` has project and pip (names of their wheels), wheels (names of other new ones), extras, modules (to import as
-    a check), and note (to store). CommandError if pip or the check fails, OSError if the disk is full.
+    `order`: project and pip (names of their wheels), wheels (names of other new ones), extras, modules (to import as a
+    check), and note (to store). Raise CommandError if pip or the check fails, OSError if the disk is full.
     """
     environment, wheels = folder / "venv", folder / "wheels"
     fresh = _installed(environment) is None
@@ -117,9 +117,9 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, who: str) -> Iterator[str]:
-    """Lock a folder; while another instance holds the lock, report which, and wait.
+    """Lock a folder; while another instance holds the lock, report whose push that is, and wait.
 
-    Yield why the folder cannot be locked, empty if it is. `who`: user and machine that push.
+    Yield why the folder cannot be locked; empty if it is locked. `who`: user and machine that push.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / LOCK, "a+") as file:

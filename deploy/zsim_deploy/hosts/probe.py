@@ -24,15 +24,15 @@ from zsim import __version__
 from zsim.contract.fingerprint import fingerprint, machine, parts
 
 GOVERNORS = "/sys/devices/system/cpu"  # folder of the CPU governors; Linux, cpufreq
-PINGS = 9  # empty transfers whose median is the round trip
+PINGS = 9  # number of empty transfers; their median time is the round trip
 SIZE_BYTES = 8  # length of the size prefix
 BULKS_BYTES = tuple(16_384 << power for power in range(9))  # transfers of up to 4 MB, which take 0.3 s at 100 Mbit/s
 BULK_S = 1.0  # wall time of a transfer that is long enough to measure the bandwidth
-CHUNK_BYTES = 65_536  # read at a time
+CHUNK_BYTES = 65_536  # most bytes read at a time
 TIMEOUT_S = 10.0  # wall time for a transfer; the smallest one takes this long at 13 kbit/s
 SERVE_S = 60.0  # wall time without a connection after which a server ends by itself
 SHORTEST_S = 1e-4  # lower bound of a transfer's time without the round trip; 4 MB in that time are 300 Gbit/s
-DONE = b"."  # confirms a transfer
+DONE = b"."  # byte that confirms a transfer
 
 
 def about(folder: Path) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def governors(folder: Path) -> list[str]:
 
 
 def serve(port: int) -> None:
-    """Confirm transfers on a port until standard input ends; first print that it listens, or why it cannot."""
+    """Confirm transfers on a port until standard input ends; first print that the port is ready, or why it is not."""
     try:
         server = listening(port)
     except OSError as error:

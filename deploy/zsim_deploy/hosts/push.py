@@ -43,7 +43,7 @@ COPIES = 4  # number of files copied to a host at a time
 START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
 BEAT_S = 5.0  # interval of the launcher's heartbeat, wall time
 SILENT_S = 60.0  # without a heartbeat for this long, on_host.py ends itself; shorter link outages are survived
-WAIT_S = 1800.0  # wall time for another push to end, as long as installing and compiling may take
+WAIT_S = 1800.0  # wall time for another push to end; the sum of INSTALL_S and COMPILE_S
 OLDEST_MINOR = 11  # the oldest Python 3 to look for; requires-python in pyproject.toml
 NEWEST_MINOR = 14  # the newest Python 3 to look for
 PLAIN = "python3"  # preferred name of the interpreter
@@ -55,10 +55,11 @@ Progress = Callable[[str, str], None]  # host, current step
 async def push(
     placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
-    """Install what their roles need on hosts, by default on all; return for each whether anything was installed.
+    """Install on hosts, by default on all, what their roles need; return whether anything was installed, by host.
 
-    `names`: the hosts; `more`: extras besides those of the roles; `cache`: folder of the wheelhouse. InventoryError if
-    a host or an extra is unknown; HostsError with a line for each host that failed, once the others are done.
+    `names`: the hosts; `more`: extras besides those of the roles; `cache`: folder of the wheelhouse. Raise
+    InventoryError if a host or an extra is unknown, and HostsError with a line for each host that failed, once the
+    others are done.
     """
     hosts = placed.inventory.hosts
     more = list(more)
@@ -125,7 +126,7 @@ async def _install(
 
 
 def is_installed(wanted: WheelSet, installed: dict[str, Any] | None) -> bool:
-    """Return whether these wheels are installed on a host, by the note of the last push (`installed`)."""
+    """Return whether the wanted wheels are installed on a host, according to the last push's note (`installed`)."""
     if installed is None or installed["project"] != wanted.project.sha256:
         return False
     return set(wanted.extras) <= set(installed["extras"]) and not _new(wanted, installed)
@@ -177,7 +178,7 @@ class Interpreter(NamedTuple):
 
 
 def interpreter_query() -> str:
-    """Return a POSIX shell command that prints command, version and path of each Python on a host."""
+    """Return a POSIX shell command that prints the command, version and path of each Python on a host."""
     names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST_MINOR - 1, -1))]
     code = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
     return f"for p in {' '.join(names)}; do facts=$($p -c '{code}' 2>/dev/null) && echo $p $facts; done; true"
@@ -192,7 +193,7 @@ def parse_interpreters(answer: str) -> list[Interpreter]:
 def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
     """Return the Python to install for: one with the launcher's minor version (`here`), preferably called `python3`.
 
-    HostsError if the host has none, because runs with different Pythons would not be identical.
+    Raise HostsError if the host has none, because runs with different Pythons would not be identical.
     """
     fit = [each for each in interpreters if each.version[:2] == here]
     if fit:
@@ -209,13 +210,13 @@ def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tup
 
 
 class Installer:
-    """on_host.py running on a host, over one ssh channel; when that closes, it ends with its children."""
+    """on_host.py running on a host, over one ssh channel; when the channel closes, the program and its children end."""
 
     def __init__(self, name: str, python: str, program: RemoteProgram) -> None:
         self._name, self._python, self._program = name, python, program
 
     async def ask(self, act: str, timeout_s: float, **order: Any) -> dict[str, Any]:
-        """Send an order and return the answer; HostsError if it fails, takes too long, or the host is lost."""
+        """Send an order and return the answer; raise HostsError if it fails, takes too long, or the host is lost."""
         self._program.send(json.dumps({"act": act, **order}) + "\n")
         message = await self.answer(timeout_s, f"{act} took longer than {timeout_s:g} s; is the host busy?")
         if "error" in message:
@@ -236,7 +237,7 @@ async def open_installer(
 ) -> AsyncIterator[Installer]:
     """Run on_host.py with a Python of a host for the duration of the block, after any other push to it has ended.
 
-    `folder`: that of zsim on the host; `progress` takes a line on the push that is being waited for. HostsError if the
+    `folder`: zsim's folder on the host; `progress` takes a line about a push that is awaited. Raise HostsError if the
     host cannot be reached, its folder cannot be used, or the other push takes too long.
     """
     script = Path(on_host.__file__).read_bytes()
@@ -270,7 +271,7 @@ async def open_installer(
 
 
 class PushProgress:
-    """A context that shows the current step of each host."""
+    """Context manager that shows the current step of each host."""
 
     def __init__(self, console: Console | None = None) -> None:
         self._console = console or Console(stderr=True)

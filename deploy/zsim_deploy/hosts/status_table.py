@@ -23,10 +23,10 @@ FIRST_S = 1.0  # simulated time from which the run counts as flying
 SILENT_S = 1.0  # wall time without an answer after which a host is shown as silent; it is probed twice a second …
 ROUND_TRIPS = 2.0  # … plus this many of its round trips, because over a slow link every answer takes long
 WAITED_S = 0.5  # wall time after which a wait for a process is shown; shorter waits are normal in lockstep
-SILENT_PROCESS_S = 1.8  # wall time; health arrives once a second, so a stopped process is shown within 2 s
+SILENT_PROCESS_S = 1.8  # wall time of silence; health arrives once a second, so a stopped process is shown within 2 s
 STALE_S = 3.0  # wall time after which a process's health is no longer shown; it arrives once a second
 AROUND = 4  # lines of a terminal besides the rows: progress, two of the table's head, and the count of hidden rows
-NAMED_MAX = 8  # number of roles named in a refusal
+NAMED_MAX = 8  # most roles named in an error
 LONGEST_S = float("inf")  # age and lag of a process that has sent no health yet, so that it is shown first
 ATTENTION = (  # prefixes of states, the most urgent first; all other states follow, and NOTHING_AMISS comes last
     "ended (",
@@ -37,7 +37,7 @@ ATTENTION = (  # prefixes of states, the most urgent first; all other states fol
     "waits for",
 )
 NOTHING_AMISS = ("running", "ended")
-NUMBERS = {  # by sort key, in descending order: field, and the value in place of an unknown one
+NUMBERS = {  # by sort key, for descending order: field of a row, and the value in place of an unknown one
     "age": ("age_s", LONGEST_S),
     "lag": ("lag_ms", LONGEST_S),
     "messages": ("messages_per_s", 0.0),
@@ -84,7 +84,7 @@ class StatusTable(Screen):
             super().clock(line)
 
     def health(self, line: dict[str, Any]) -> None:
-        """Take the health of a process; its message rate follows from the previous one."""
+        """Store the health of a process; its message rate follows from the previous health."""
         now_s = time.monotonic()
         former = self._health.get(line["name"])
         rate = None
@@ -138,7 +138,7 @@ class StatusTable(Screen):
     def _no_sign_s(self, name: str, round_trip_s: float) -> float:
         """Return how long a process has been silent [s, wall]; 0 if that is not unusually long.
 
-        The health of all other processes arrives through the world: while the world is silent, only it is reported.
+        The health of all other processes arrives through the world; while it is silent, only the world is reported.
         """
         now_s, patience_s = time.monotonic(), SILENT_PROCESS_S + ROUND_TRIPS * round_trip_s
         heard_s = self._health[name]["wall_s"] if name in self._health else None

@@ -28,14 +28,14 @@ from zsim.errors import HostsError
 from zsim_deploy import SAFE_PATH
 
 PROJECT = "zsim"
-KEY_DIGITS = 16  # 64 bits of a SHA-256
-LOCK = "constraints.txt"  # file in a checkout with the versions of packages
-PIP = "pip"  # copied for hosts without pip, unconstrained: this machine's version may be too old for a newer Python
+KEY_DIGITS = 16  # hexadecimal digits; 64 bits of a SHA-256
+LOCK = "constraints.txt"  # file in a checkout that pins the versions of packages
+PIP = "pip"  # for hosts without pip; unconstrained, since this machine's may be too old for a newer Python
 RETRIES = "1"  # pip's retries for each page of an index; its default of 5 takes minutes without a network
 LINE_BYTES = 1 << 20  # maximum length of a line that pip prints
 NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # pip prints this, with the reason, before a retry
 MANYLINUX_OLDEST = 5  # minor version of the oldest glibc with a tag, 2.5; PEP 600
-MANYLINUX2014 = 17  # minor version of its glibc, 2.17; PEP 599. With manylinux2014 pip also accepts the older aliases
+MANYLINUX2014 = 17  # minor version of its glibc, 2.17; PEP 599. Given manylinux2014, pip also accepts the older aliases
 
 Progress = Callable[[str], None]
 
@@ -66,7 +66,7 @@ class WheelTarget(NamedTuple):
 
 
 def wheel_target(name: str, facts: Mapping[str, Any]) -> WheelTarget:
-    """Return the target of wheels for a host, from the facts of on_host.py; HostsError if no wheels exist for it."""
+    """Return a host's target for wheels, from the facts of on_host.py; raise HostsError if no wheels exist for it."""
     major, minor = facts["version"]
     if facts["implementation"] != "cpython":
         raise HostsError(f"{name}: its Python is {facts['implementation']}; must be CPython; install CPython there")
@@ -124,7 +124,7 @@ class Wheelhouse:
     async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
         """Return the wheels that a host needs.
 
-        HostsError if the project cannot be built, a wheel for the host is missing, or no package index is reached.
+        Raise HostsError if the project cannot be built, a wheel for the host is missing, or no index can be reached.
         """
         async with self._lock:
             if self._unreachable:
@@ -151,7 +151,7 @@ class Wheelhouse:
     async def _project(self) -> Path:
         """Return the wheel of this project, built from the checkout or from the installed version.
 
-        Its build requirements are cached, so that the next build needs no index.
+        The build requirements are cached, so that the next build needs no index.
         """
         root = checkout()
         source = str(root) if root else requirement(importlib.metadata.distribution(PROJECT))
@@ -230,7 +230,7 @@ def constraints() -> list[str]:
 
 
 def lock() -> list[str]:
-    """Return the versions with which a checkout is tested, as pip constraints; none without a checkout."""
+    """Return the versions with which a checkout is tested, as pip constraints; empty without a checkout."""
     root = checkout()
     path = root / LOCK if root else None
     return path.read_text("utf-8").splitlines() if path and path.exists() else []
@@ -248,7 +248,7 @@ def _description(root: Path) -> dict[str, Any]:
 
 
 def _sources(root: Path) -> list[tuple[str, str]]:
-    """Return path and hash of each file that affects the wheel."""
+    """Return the path and hash of each file that affects the wheel."""
     files = [root / "pyproject.toml", root / "README.md"]
     for package in _description(root)["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
         files += sorted(path for path in (root / package).rglob("*") if path.is_file())
@@ -291,7 +291,7 @@ async def download_wheels(
 ) -> bool:
     """Collect wheels for a target in a folder; return whether the first list of constraints could not be met.
 
-    Projects of which the index has only sources are built here.
+    Projects that the index has only as sources are built here.
 
     Args:
         held: lists of pip constraints, the preferred one first: the versions of this machine, because identical results
@@ -343,7 +343,7 @@ async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> b
 async def pip(*arguments: str, progress: Progress) -> None:
     """Run this Python's pip with the user's configuration, except for the number of retries.
 
-    PipError if it fails; UnreachableError, with the reason, if an index does not answer.
+    Raise PipError if it fails, and UnreachableError, with the reason, if an index does not answer.
     """
     options = ("--disable-pip-version-check", "--no-input", "-q")
     process = await asyncio.create_subprocess_exec(

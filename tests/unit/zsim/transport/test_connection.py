@@ -13,7 +13,7 @@ import zenoh
 from free_ports import free_port
 from refused import has_terms, refused
 
-from zsim.errors import NoWorldError, SessionError
+from zsim.errors import NoListenerError, NoWorldError, SessionError
 from zsim.scenario.scenario import DRONES_MAX
 from zsim.transport import connection, zenoh_settings
 from zsim.transport.connection import find_world
@@ -36,7 +36,7 @@ def silent(*_: Any, **__: Any) -> Iterator[Silent]:
 
 
 def nobody(endpoint: str, *_: Any, **__: Any) -> Any:
-    raise SessionError(f"nobody listens on {endpoint}; start a world there (it did not answer)")
+    raise NoListenerError(f"nobody listens on {endpoint}; start a world there (it did not answer)")
 
 
 def said(endpoint: str, identity: Identity | None = None) -> str:
@@ -119,6 +119,11 @@ def test_a_port_that_is_taken_is_refused_with_the_option_that_gives_another() ->
     assert has_terms(str(caught.value), endpoint, "--listen")
 
 
+def test_a_port_where_no_process_listens_may_be_tried_again() -> None:
+    with pytest.raises(NoListenerError), connection.connect(f"tcp/127.0.0.1:{free_port()}", "zsim"):
+        pass
+
+
 @pytest.mark.parametrize(
     ("endpoint", "terms"),
     [
@@ -139,12 +144,12 @@ def test_every_cause_of_not_listening_has_its_line(endpoint: str, terms: tuple[s
 
 def test_causes_that_the_system_numbers_are_told_apart() -> None:
     texts = {
-        number: connection.no_listening(["tcp/h:1"], f"no listener: [h:1: some words (os error {number}))")
+        number: str(connection.no_listening(["tcp/h:1"], f"no listener: [h:1: some words (os error {number}))"))
         for number in connection._LISTEN_FAULTS
     }
     assert len(set(texts.values())) == len(texts)
     assert not any("some words" in text for text in texts.values())
-    assert "some words" in connection.no_listening(["tcp/h:1"], "some words (os error 5)")
+    assert "some words" in str(connection.no_listening(["tcp/h:1"], "some words (os error 5)"))
 
 
 def test_a_panic_of_zenoh_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:

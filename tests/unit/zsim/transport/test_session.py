@@ -17,13 +17,14 @@ ALONE = ("unshare", "--map-root-user", "--mount")  # Linux: mounts that nobody e
 WITH_SHM = "mount -t tmpfs -o {options} tmpfs /dev/shm && exec {python} -c '{code}'"
 OPENS = """
 import os
+from zsim.errors import SessionError
 from zsim.transport import zenoh_settings
 from zsim.transport.session import open_session
 from zsim.transport.tls import Identity
 
 who = Identity("here")
 settings = zenoh_settings.common("router", "lockstep") | zenoh_settings.listening(["tcp/127.0.0.1:0"], who)
-with open_session(settings, "zsim", who, str):
+with open_session(settings, "zsim", who, SessionError):
     print(os.listdir("/dev/shm"))
 """
 
@@ -48,7 +49,7 @@ def test_a_far_end_that_takes_nothing_does_not_fail_who_leaves(monkeypatch: pyte
         raise zenoh.ZError("close operation timed out!")
 
     monkeypatch.setattr(zenoh, "open", lambda config: SimpleNamespace(close=close))
-    with open_session({}, "zsim", Identity("here"), str):
+    with open_session({}, "zsim", Identity("here"), SessionError):
         pass
     assert closed
 
