@@ -1,7 +1,9 @@
-"""CPU time on one thread of drawing a picture and finding hats in it: python -m benchmarks.cameras [PICTURES]
+"""Measure the CPU time of drawing a picture and of finding hats in it, on one thread.
 
-A front camera of 640 x 360 px sees ten drones, hovering and in motion. Given PICTURES, a folder, write the pictures of
-docs/cameras.md to it.
+    python -m benchmarks.cameras [PICTURES]
+
+A front camera of 640 x 360 px sees ten drones, hovering and in motion. If a folder PICTURES is given, the pictures of
+docs/cameras.md are written to it instead.
 """
 
 import sys
@@ -20,8 +22,8 @@ from zsim_agents.cameras.renderer import Renderer
 from zsim_agents.cameras.scene import DroneStates, Scene, default_look
 
 DRONES = 11  # the first looks at the other ten
-REPEATS, CALLS = 30, 20  # minimum of REPEATS means of CALLS calls, which excludes other load
-ROTOR_RAD_S = 400.0  # rad/s; roughly that of hovering
+REPEATS, CALLS = 30, 20  # the minimum of REPEATS means of CALLS calls excludes other load
+ROTOR_RAD_S = 400.0  # rad/s; roughly the speed in hover
 
 
 def situation(moving: bool = False) -> DroneStates:

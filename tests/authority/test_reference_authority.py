@@ -12,6 +12,7 @@ from zsim_agents.formation.assembly import assign, straight_separation
 from zsim_agents.references.cruise import RISE_S, Cruise, cruise, cruise_through
 from zsim_agents.references.flight import first_approach
 from zsim_agents.references.path import (
+    EndMotion,
     Laps,
     PathLimits,
     PiecewisePolynomial,
@@ -113,6 +114,13 @@ def test_a_move_uses_its_limits() -> None:
         peaks = move(np.zeros(4), np.array(goal, float), limits).peaks()
         assert peaks[quantity] == pytest.approx(limits[quantity], rel=2e-3)
         assert peaks.factor(limits) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("over_s", [100.0, 3600.0, 7200.0])
+def test_a_move_from_flight_lasts_as_long_as_requested(over_s: float) -> None:
+    begin = EndMotion(np.array([0.1, 0, 0, 0]), np.zeros(4), np.zeros(4))
+    path = move(np.zeros(4), np.array([20.0, 0, 0, 0]), PathLimits(1.0, 0.5, 1.0, 2.0), over_s, begin)
+    assert path.duration_s == over_s
 
 
 LIMITS = PathLimits(5.0, 1.0, 1.0, 2.0)

@@ -1,1 +1,1 @@
-"""Cameras: pictures rendered from the truth, and hats found in pictures."""
+"""Cameras: rendering of pictures from the drones' true states, and detection of the drones' hats in pictures."""

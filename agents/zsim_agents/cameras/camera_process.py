@@ -1,6 +1,6 @@
-"""The processes of cameras and detectors: the former render pictures from the truth, the latter find hats in them.
+"""Camera processes render pictures from the drones' true states; detector processes find hats in these pictures.
 
-A process that is too slow drops pictures and counts them; if cameras gate in the scenario, the run waits for them.
+A process that is too slow drops pictures and counts them; if the scenario lets cameras gate, the run waits for them.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from zsim_agents.cameras.detector import PIXELS_MAX, HatDetector, decoded, rehea
 from zsim_agents.cameras.renderer import Renderer
 from zsim_agents.cameras.scene import DroneStates, scene_of
 
-TICK_S = 0.1  # interval of checks for a stop while no message arrives
-# Number of gates, beyond the command delay, that cameras may be behind the world before they drop pictures: tolerates
+TICK_S = 0.1  # interval between checks for a stop while no message arrives
+# Number of gates, beyond the command delay, by which cameras may lag the world before they drop pictures: tolerates
 # messages that arrive in bursts, and exceeds the slack of cameras that gate
 BEHIND_MAX = 5
 ANSWER_S = 0.5  # timeout of queries, which the world and cameras answer within milliseconds
-OVERTAKING_S = 0.1  # delay of the bye: of higher priority, it would reach recorders before the last pictures
+OVERTAKING_S = 0.1  # delay of the bye, whose higher priority would let it reach recorders before the last pictures
 DRAIN_S = 1.0  # maximum wall time to wait for the last truths of a run
-PENDING_MAX = 64  # maximum number of gates that are kept although the truth of a drone is missing
-ASK_S = 2.0  # minimum wall time between requests for an unknown camera info
-REPORTS_MAX = 5  # maximum number of lines about refused messages; health has their count
+PENDING_MAX = 64  # maximum number of gates kept while the truth of a drone is missing
+ASK_S = 2.0  # minimum wall time between requests for a camera's missing info
+REPORTS_MAX = 5  # maximum number of lines printed about refused messages; the health message counts all of them
 
 
 class RunProcess:
@@ -89,7 +89,7 @@ class RunProcess:
 
 
 class CameraProcess(RunProcess):
-    """Publishes the pictures of some drones' cameras."""
+    """Publishes the pictures of all cameras of the given drones."""
 
     def __init__(
         self, link: Session, info: Info, participant: Participant, scenario: Scenario, drones: Sequence[str]
@@ -116,7 +116,7 @@ class CameraProcess(RunProcess):
         super().__init__(link, participant)
 
     def begin(self) -> None:
-        """Subscribe to the truth, publish the camera info, and join if the world waits for this process."""
+        """Subscribe to the truth, publish the camera infos, and join if the world waits for this process."""
         for eye in self._eyes:
             self._link.declare_queryable(eye.info_key, self._on_query)
         self._link.declare_subscriber(keys.truth("*"), self._on_truth)
@@ -132,7 +132,8 @@ class CameraProcess(RunProcess):
     def join(self) -> None:
         """Join, so that the world waits for this process, and catch up with a run that has begun.
 
-        A run that has not begun need not be queried; replies to a query may overtake earlier publications.
+        Before the run has begun, no truth can have been missed; querying for it is avoided, since replies to a query
+        may overtake earlier publications.
         """
         has_begun = bool(self._link.get(keys.truth("*"), timeout_s=ANSWER_S))
         self._participant.announce()
@@ -197,10 +198,10 @@ class CameraProcess(RunProcess):
                 self._truths.add(number, truth)
 
     def _due(self) -> list[tuple[_Eye, int]]:
-        """Return the due pictures as cameras and numbers, and count pictures that are too old as dropped.
+        """Return the due pictures as pairs of camera and picture number, and count those that are too old as dropped.
 
         The cameras take turns, starting with the one whose last picture is oldest, so that a process that is too slow
-        drops pictures of all of them.
+        drops pictures of all cameras alike.
         """
         newest_ns = self._truths.newest_ns
         if newest_ns < 0:
@@ -265,7 +266,7 @@ class CameraProcess(RunProcess):
 
 
 class DetectorProcess(RunProcess):
-    """Publishes the hats of a given diameter [m] in the pictures of some drones' cameras."""
+    """Finds hats of the given diameter in the pictures of the given drones' cameras, and publishes the sightings."""
 
     def __init__(
         self,
@@ -277,10 +278,10 @@ class DetectorProcess(RunProcess):
     ) -> None:
         self._say = say
         self._drones, self._diameter_m = drones, diameter_m
-        # newest picture of each camera; the one that has waited longest comes first
+        # newest picture of each camera, beginning with the camera that has waited longest
         self._pictures: OrderedDict[str, RawSample] = OrderedDict()
         self._infos: dict[str, RawSample] = {}
-        self._detectors: dict[str, HatDetector] = {}  # by the key of the camera, like the next two
+        self._detectors: dict[str, HatDetector] = {}  # by camera key, as in the next two
         self._known: dict[str, CameraInfo] = {}
         self._asked_s: dict[str, float] = {}
         self._seq: defaultdict[str, int] = defaultdict(int)
@@ -288,14 +289,14 @@ class DetectorProcess(RunProcess):
         super().__init__(link, participant)
 
     def begin(self) -> None:
-        """Subscribe to pictures and camera infos under known names only, since any program could invent others."""
+        """Subscribe to the pictures and infos of known camera names only, since any program could invent others."""
         rehearse()
         for drone, name in product(self._drones, CAMERAS):
             self._link.declare_subscriber(keys.camera_info(drone, name), self._on_info)
             self._link.declare_subscriber(keys.camera(drone, name), self._on_picture)
 
     def turn(self) -> None:
-        """Search the newest picture of each camera, starting with the one that has waited longest."""
+        """Search the newest picture of each camera for hats, beginning with the camera that has waited longest."""
         self.wait()
         while self._infos:
             self._learn(self._infos.popitem()[1])
@@ -368,7 +369,7 @@ class DetectorProcess(RunProcess):
 
 
 class _Eye:
-    """A camera of a drone: its renderer, and the number of its next picture."""
+    """A camera of a drone, with its renderer and the number of its next picture."""
 
     def __init__(self, drone: str, name: str, camera: Camera, renderer: Renderer) -> None:
         self.key, self.info_key = keys.camera(drone, name), keys.camera_info(drone, name)
@@ -376,13 +377,13 @@ class _Eye:
         self.latency_ns = round(camera.latency_ms * 1e6)
         self.next = 0
         self.seq = 0
-        self.last = -1  # number of its last picture among the pictures of all cameras
+        self.last = -1  # index of its last picture in the sequence of all cameras' pictures
 
     def exposure_ns(self, number: int) -> int:  # middle of the exposure
         return round(number * 1e9 / self.camera.rate_hz)
 
     def last_due(self, t_ns: int) -> int:
-        """Return the number of the newest picture available at t_ns; -1 before the first."""
+        """Return the number of the newest picture available at `t_ns`; -1 before the first."""
         due_ns = t_ns - self.latency_ns
         number = int(due_ns * self.camera.rate_hz / 1e9) + 1
         while number >= 0 and self.exposure_ns(number) > due_ns:
@@ -391,13 +392,13 @@ class _Eye:
 
 
 class TruthHistory:
-    """The true states of all drones at the last gates, with interpolation between gates. Pure.
+    """The true states of all drones at the most recent gates, with interpolation between gates.
 
-    External drones, whose drivers may skip gates, are extrapolated from their last pose.
+    External drones, whose drivers may skip gates, are extrapolated at their last published velocity.
 
     Args:
         span_ns: minimum time span that the history covers [ns].
-        external: initial state of each external drone by index, valid until its driver publishes.
+        external: initial states of the external drones by index, used until their drivers publish.
     """
 
     def __init__(self, drones: int, gate_ns: int, span_ns: int, external: Mapping[int, Truth] = {}) -> None:
@@ -413,7 +414,7 @@ class TruthHistory:
         t_ns = truth.t_ns
         if drone in self._external:
             if truth_fault(truth, len(self._external[drone].rotor_rad_s)):
-                return  # as the world does
+                return  # the world refuses it as well
             self._external[drone] = max(self._external[drone], truth, key=attrgetter("t_ns"))
         if t_ns <= self.newest_ns:
             return
@@ -432,7 +433,7 @@ class TruthHistory:
             del self._pending[min(self._pending)]
 
     def bodies(self, t_ns: int) -> DroneStates | None:
-        """Return all drones at t_ns, or None if a neighbouring gate is missing."""
+        """Return the states of all drones at `t_ns`; None if a neighbouring gate is missing."""
         before_ns = t_ns // self._gate_ns * self._gate_ns
         before, after = self._whole.get(before_ns), self._whole.get(before_ns + self._gate_ns)
         if before is None:
@@ -443,7 +444,7 @@ class TruthHistory:
 
 
 def standing(drone: Drone, rotors: int) -> Truth:
-    """Return a drone at its start position, with stopped rotors."""
+    """Return the state of a drone at rest at its start position, with stopped rotors."""
     half = 0.5 * math.radians(drone.yaw_deg)
     still, q_WB = (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half))
     return Truth(0, 0, drone.position_m, still, q_WB, still, still, (0.0,) * rotors)
@@ -466,7 +467,7 @@ def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence
 
 
 def _detector_of(info: CameraInfo, diameter_m: float) -> HatDetector:
-    """Return the detector for a camera.
+    """Return a hat detector for the camera that `info` describes.
 
     Raises:
         PictureError: the camera's pictures are too large, or its intrinsics are invalid.

@@ -1,14 +1,15 @@
 """Finds magenta hats in a simulated or real picture: bearing and range of each, with standard deviations. Pure.
 
-The magenta level of a pixel is linear in mixtures of a hat with grass, sky or hull, and zero for orange: the share of a
-pixel that a hat covers is the pixel's level divided by the hat's own. Direction and range follow from the circle of the
-hat's outline, which rotors may partly hide: a ball of radius r at a distance d has an apparent radius a with
-sin a = r / d anywhere in the picture.
+A pixel's magenta level is zero for orange, and varies linearly with the share of the pixel that a hat covers in front
+of grass, sky or hull: the covered share is the pixel's level divided by that of the hat alone. Direction and range
+follow from the hat's circular outline, which rotors may partly hide: wherever a ball of radius r at a distance d is in
+the picture, its apparent radius is the angle a with sin a = r / d.
 
-The edge is searched for inwards from outside, in directions all around a point of the ball. The best circle through
-half of the edge points, consecutive ones, determines which other points are on it. Circles are fitted by least squares
-to x^2 + y^2 = 2 a x + 2 b y + c (I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the tangent plane of the unit sphere
-at the ball, where the outline is a circle at any position in the picture.
+Edge points are found by searching inwards from outside, in all directions around the centroid of the covered pixels.
+Of the circles fitted to half of the edge points, consecutive ones, the circle that best explains all points determines
+which of them lie on the outline. Circles x^2 + y^2 = 2 a x + 2 b y + c are fitted by least squares (I. Kasa, IEEE
+Trans. Instrum. Meas. 25, 1976) in the tangent plane of the unit sphere at the ball, where the outline is a circle
+wherever the ball is in the picture.
 """
 
 import math
@@ -28,23 +29,24 @@ from zsim_agents.cameras.scene import View
 Picture = NDArray[np.uint8]
 Levels = NDArray[np.float32]
 
-PIXELS_MAX = 1920 * 1080 * 2  # maximum size of a decoded picture; twice the limit of a scenario's camera
+PIXELS_MAX = 1920 * 1080 * 2  # maximum number of pixels to decode, twice the limit for a camera in a scenario
 LEVEL_MIN = 24  # minimum R - G of magenta, out of 255; smaller differences are noise
 SHARE_MIN = 0.3  # minimum (R - G) / R of magenta
-BLUE_SHARE = 0.2  # minimum (B - G) / (R - G) of magenta, 0.59 for the paper's; lower values are orange or red
+BLUE_SHARE = 0.2  # minimum (B - G) / (R - G) of magenta (the paper's has 0.59); lower values are orange or red
 BLUE_WEIGHT = 1.5  # reduction of the magenta level per unit of missing blue
-AREA_MIN_PX = 2  # minimum area of a region at half the resolution
+AREA_MIN_PX = 2  # minimum area of a region's box at half the resolution
 BLOBS_MAX = 100  # maximum number of regions to examine, the largest first
 ROOM_PX = 4  # margin around a region, for its edge and the background
 CORE = 0.5  # minimum level of a hat's pixels, as a fraction of the maximum level
-CORE_MIN_PX = 12  # minimum number of fully covered pixels that give a hat's own level; it is otherwise found from blur
-POINT_BLUR_PX2 = 1.1  # variance by which lens, pixel, JPEG and the mean of nine pixels blur a point [px^2]; calibrated
-ROUND_MIN = 0.3  # minimum ratio of the smaller to the larger variance of a ball
-PIECE_GAP = 0.3  # maximum gap between two pieces of a ball over its size; a guard in front is 0.2 wide
-SHARE_OF_EDGE_MIN = 0.3  # minimum visible share of the edge that determines a circle
-DIAMETER_MIN_PX = 4.0  # minimum diameter of a hat [px]; the bias in the range of smaller ones exceeds its sigma
-# Calibrated standard deviations of a centre and of a diameter: px per px of roughness of the edge; px^2 over the
-# diameter (for a centre, in proportion to the hidden part); px^3 over the squared diameter (centre) or px (diameter).
+CORE_MIN_PX = 12  # number of fully covered pixels above which they give the hat's level; otherwise the blur gives it
+POINT_BLUR_PX2 = 1.1  # variance of a point's blur by lens, pixel, JPEG and the mean of nine pixels [px^2]; calibrated
+ROUND_MIN = 0.3  # minimum ratio of the smaller to the larger principal variance of a ball's image
+PIECE_GAP = 0.3  # maximum gap between two pieces of a ball over the ball's size; a rotor guard leaves a gap of 0.2
+SHARE_OF_EDGE_MIN = 0.3  # minimum visible share of a hat's edge
+DIAMETER_MIN_PX = 4.0  # minimum diameter of a hat [px]; the range of smaller hats has a bias that exceeds its sigma
+# Calibrated terms of the standard deviations of centre and diameter [px], added in quadrature: a factor of the edge's
+# roughness; px^2, divided by the diameter (for the centre also in proportion to the hidden part); px^3, divided by the
+# squared diameter (centre), or px (diameter).
 CENTRE = 2.0, 6.5, 8.0
 DIAMETER = 2.0, 4.6, 0.1
 SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
@@ -52,29 +54,30 @@ SQUARE_3, SQUARE_5 = (np.ones((side, side), np.uint8) for side in (3, 5))
 DIRECTIONS = 32
 STEP_PX = 0.5  # step of the search along a direction
 EDGE = 0.5  # covered share of a pixel at the edge of a ball
-EDGE_BLUR_PX2 = 1.1  # variance of the blur of an edge [px^2], which moves a curved edge inwards; calibrated
-# Tolerance of an edge point's distance from its circle: px, px^2 over the radius, px over the noise of the share;
-# calibrated
+EDGE_BLUR_PX2 = 1.1  # variance of the blur that moves a curved edge inwards [px^2]; calibrated
+# Calibrated terms of an edge point's maximum distance from its circle: constant [px], divided by the radius [px^2], and
+# multiplied by the noise of the covered share [px]
 NEAR_PX, NEAR_PX2, NEAR_NOISE = 0.2, 1.0, 6.0
 POINTS_MIN = 5  # minimum number of points on a circle
 REFINEMENTS = 3  # number of refinements of the set of points on a circle
-OUTSIDE = 3.0  # relative cost of a point outside the circle: part of a ball may be hidden, but none protrudes
+OUTSIDE = 3.0  # cost of a point outside the circle, at most 1 inside: part of a ball may be hidden, but none protrudes
 WHOLE_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of an unobstructed ball
-SINGULAR = 1e-9  # maximum determinant of collinear points over the squared sum of their variances
+SINGULAR = 1e-9  # points are collinear up to this ratio of the determinant to the squared trace of their second moments
 
 EDGE_POINT = columns("EdgePointColumns", (Field("x", "px"), Field("y", "px"), Field("on", "1")))
 
 _x = np.linspace(1e-3, 60, 6000)
-_PEAK = (1 - np.exp(-_x)) / _x  # peak of a blurred disc over its own level, divided by x = r^2 / 2 s^2, for each x
+# Ratio of the peak of a blurred disc to its unblurred level, divided by x = r^2 / (2 s^2); radius r, blur sigma s
+_PEAK = (1 - np.exp(-_x)) / _x
 
 
 def decoded(data: bytes, width: int, height: int) -> Picture:
-    """Return a decoded JPEG, (height, width, 3), in B, G, R.
+    """Return the pixels of a JPEG, (height, width, 3), in B, G, R.
 
-    Its size is read from the header before decoding, to bound the memory that an untrusted picture takes.
+    The size is read from the header before decoding, to bound the memory that an untrusted picture takes.
 
     Raises:
-        PictureError: it is not a JPEG, differs from the announced size, or has too many pixels.
+        PictureError: `data` is not a whole JPEG, differs from the announced size, or has too many pixels.
     """
     _, found_width, found_height = frame_of(data)
     if (found_width, found_height) != (width, height):
@@ -101,14 +104,14 @@ class _Box(NamedTuple):
     high: int
 
     def touches(self, other: "_Box") -> bool:
-        """Return whether the gap to another box is so small for this box's size that both are pieces of one ball."""
+        """Return whether the gap to another box is small enough, for this box's size, within a single ball."""
         gap = 1 + PIECE_GAP * max(self.wide, self.high)
         across = max(self.u, other.u) - min(self.u + self.wide, other.u + other.wide)
         down = max(self.v, other.v) - min(self.v + self.high, other.v + other.high)
         return max(across, down) <= gap
 
     def united(self, other: "_Box") -> "_Box":
-        """Return the smallest box that contains both."""
+        """Return the smallest box that contains both boxes."""
         u, v = min(self.u, other.u), min(self.v, other.v)
         right, low = max(self.u + self.wide, other.u + other.wide), max(self.v + self.high, other.v + other.high)
         return _Box(u, v, right - u, low - v)
@@ -123,12 +126,12 @@ class HatDetector:
         self._half = max(1, lens.width // 2), max(1, lens.height // 2)
 
     def seen(self, picture: Picture) -> tuple[Seen, ...]:
-        """Return the hats in a picture of the camera, (height, width, 3) in B, G, R, the largest first."""
+        """Return the hats in a picture of the camera, (height, width, 3) in B, G, R, largest first."""
         found = [self._hat(picture, box) for box in self._boxes(picture)]
         return tuple(hat for hat in found if hat is not None)
 
     def _boxes(self, picture: Picture) -> list[_Box]:
-        """Return boxes around magenta regions at half the resolution, the largest first."""
+        """Return boxes around magenta regions at half the resolution, largest first."""
         blue, green, red = cv2.split(cv2.resize(picture, self._half, interpolation=cv2.INTER_AREA))
         level = cv2.subtract(red, green)
         strong = cv2.addWeighted(level, 1.0, red, -SHARE_MIN, 0.5 - LEVEL_MIN)
@@ -137,7 +140,7 @@ class HatDetector:
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         boxes = [_Box(*cv2.boundingRect(contour)) for contour in contours]
         large = [box for box in boxes if box.wide * box.high >= AREA_MIN_PX]
-        whole: list[_Box] = []  # the pieces of a ball that a rotor guard divides are united
+        whole: list[_Box] = []  # with the pieces of each ball united, which a rotor guard may divide
         for box in sorted(large, key=lambda box: (-box.wide * box.high, box))[:BLOBS_MAX]:
             for i, other in enumerate(whole):
                 if other.touches(box):
@@ -148,12 +151,12 @@ class HatDetector:
         return whole
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
-        """Return the hat in a box at half the resolution; None if there is no hat, or the picture's edge cuts it."""
+        """Return the hat in a box at half the resolution; None if there is none, or the picture's edge cuts it off."""
         u, v, wide, high = (2 * side for side in box)
         room = ROOM_PX + max(wide, high) // 6
         u0, v0, u1, v1 = u - room, v - room, u + wide + room, v + high + room
         if u <= 2 or v <= 2 or u + wide >= self._lens.width - 2 or v + high >= self._lens.height - 2:
-            return None  # a cut hat gives neither bearing nor range
+            return None  # a truncated hat gives neither bearing nor range
         part = slice(max(v0, 0), v1), slice(max(u0, 0), u1)
         blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture[part]))
         level, bluish = red - green, blue - green  # the magenta level is R - G, reduced where blue is missing
@@ -161,7 +164,7 @@ class HatDetector:
         level = np.where(level > 0, np.maximum(level - lack, 0), level)
         sides = level[0], level[-1], level[1:-1, 0], level[1:-1, -1]
         behind = float(np.median(np.concatenate(sides)))
-        noise = min(_deviation(side) for side in sides)  # a hull may cross some sides, not all
+        noise = min(_deviation(side) for side in sides)  # a hull may cross some sides, but not all
         level -= np.float32(behind)
         outlined = _outlined(level, noise, self._rays[part], self._lens.fx)
         if outlined is None:
@@ -186,12 +189,12 @@ def _deviation(values: Levels) -> float:
 
 
 class Outline(NamedTuple):
-    """The circle of a ball on the sphere of directions.
+    """The outline of a ball: a circle on the unit sphere of directions.
 
     Attributes:
-        ray: unit vector to its centre, in K.
-        radius_rad: its apparent radius; NaN if there is no circle.
-        share: visible share of its edge.
+        ray: unit vector to the circle's centre, in K.
+        radius_rad: the ball's apparent radius; NaN if no circle was found.
+        share: visible share of the circle.
         rough_px: root mean square distance of the edge points from the circle.
         centre, radius: standard deviations of the centre, per axis, and of the radius, over that of an edge point.
     """
@@ -205,27 +208,27 @@ class Outline(NamedTuple):
 
 
 def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tuple[Outline, float] | None:
-    """Return the circle of a hat from the levels above the background, (h, w), and the pixels per radian there."""
+    """Return a hat's outline and the pixels per radian there; None if invalid. `level` is above the background."""
     mean = cv2.blur(level, (3, 3), borderType=cv2.BORDER_REPLICATE)
     v, u = divmod(int(np.argmax(mean)), level.shape[1])
     peak = float(mean[v, u])
-    if peak < max(LEVEL_MIN / 2, 2 * noise / 3):  # the mean of nine pixels has a third of the noise
+    if peak < max(LEVEL_MIN / 2, 2 * noise / 3):  # the mean of nine pixels has a third of a pixel's noise
         return None
     cosine = float(rays[v, u, 2])
     core = (level > CORE * peak).astype(np.uint8)
     near = cv2.dilate(core, SQUARE_5).astype(np.uint8)
     covered = _covered(level, core, near, peak)
-    oblique = cosine * cosine  # ratio of the variances of a ball's image off the optical axis: cos^2 of the angle
+    oblique = cosine * cosine  # ratio of the principal variances of a ball's image at this angle from the optical axis
     if _roundness(covered) / oblique < ROUND_MIN:
         return None
     scale = focal_px / (cosine * math.sqrt(cosine))  # geometric mean of the radial and tangential scales
-    circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # same array layout as in `rehearse`
+    circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # the layout compiled for in `rehearse`
     is_known = circle.share >= SHARE_OF_EDGE_MIN and 2 * circle.radius_rad * scale >= DIAMETER_MIN_PX
     return (circle, scale) if is_known else None
 
 
 def _covered(level: Levels, core: Picture, near: Picture, peak: float) -> Levels:
-    """Return the covered share of each pixel: its level over the hat's own, which varies locally with the shading."""
+    """Return the covered share of each pixel: its level over that of the hat alone, which varies with the shading."""
     inner = cv2.erode(core, SQUARE_3)
     count = int(inner.sum())
     own: Levels | float
@@ -242,7 +245,7 @@ def _covered(level: Levels, core: Picture, near: Picture, peak: float) -> Levels
 
 
 def _roundness(covered: Levels) -> float:
-    """Return the ratio of the smaller to the larger variance of the covered area; 0 if nothing is covered."""
+    """Return the ratio of the smaller to the larger principal variance of the covered area; 0 if it is empty."""
     moments = cv2.moments(covered)
     area = moments["m00"]
     if area < 1:
@@ -257,13 +260,13 @@ Circle = tuple[float, float, float]  # x and y of the centre, radius [px]
 
 
 def rehearse() -> None:
-    """Load or compile the kernels with an empty picture, so that the first hat is not delayed."""
+    """Load or compile the kernels by processing an empty picture, so that the first hat is not delayed."""
     outline(np.zeros((3, 3), np.float32), 0.0, np.ones((3, 3, 3), np.float32), 1.0)
 
 
 @portable
 def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outline:
-    """Return the circle of a ball, NONE if there is no circle.
+    """Return the outline of a ball; NONE if no circle explains the edge points.
 
     Args:
         covered: share of each pixel that the ball covers, float32 (h, w).
@@ -316,7 +319,7 @@ def _middle(covered: NDArray) -> tuple[float, float]:
 
 @portable
 def _between(picture: NDArray, u: float, v: float) -> float:
-    """Return the bilinearly interpolated value of a picture (h, w), 0 outside."""
+    """Return the bilinearly interpolated value of a picture (h, w); 0 outside."""
     if u < 0.0 or v < 0.0 or u >= picture.shape[1] - 1 or v >= picture.shape[0] - 1:
         return 0.0
     i, j = int(u), int(v)
@@ -336,7 +339,7 @@ def _ray(rays: NDArray, u: float, v: float) -> Vector:
 
 @portable
 def _edge(covered: NDArray, u: float, v: float, cosine: float, sine: float) -> float:
-    """Return the distance from a point to the outermost edge in a direction [px]; 0 without an edge."""
+    """Return the distance from a point to the outermost edge in a direction [px]; 0 if there is no edge."""
     steps = int(math.hypot(float(covered.shape[0]), float(covered.shape[1])) / STEP_PX)
     outer = 0.0
     for step in range(steps, -1, -1):
@@ -350,7 +353,7 @@ def _edge(covered: NDArray, u: float, v: float, cosine: float, sine: float) -> f
 
 @portable
 def _fitted(points: NDArray, first: int, count: int) -> Circle:
-    """Return the circle fitted to the marked points among `count` consecutive ones from `first` on."""
+    """Return the circle fitted to the marked points among `count` consecutive ones from `first` on, cyclically."""
     n, mx, my = 0.0, 0.0, 0.0
     for k in range(count):
         x, y, on = points[(first + k) % len(points)]
@@ -378,7 +381,7 @@ def _near_px(r: float, noise: float) -> float:
 
 @portable
 def _cost(points: NDArray, circle: Circle, noise: float) -> float:
-    """Return the cost of a circle as an explanation of all points."""
+    """Return the cost of explaining all points by a circle."""
     x, y, r = circle
     if r <= 0.0:
         return math.inf
@@ -407,7 +410,7 @@ def _choose(points: NDArray, noise: float) -> bool:
         for k in range(count):
             off = abs(math.hypot(points[k, 0] - x, points[k, 1] - y) - r)
             near[k] = 1.0 if off < _near_px(r, noise) else 0.0
-        for k in range(count):  # next to a hidden point the edge is blurred
+        for k in range(count):  # the edge next to a hidden point is unreliable, because blurred
             points[k, EDGE_POINT.on] = near[k] * near[k - 1] * near[(k + 1) % count]
         if points[:, EDGE_POINT.on].sum() < POINTS_MIN:
             return False
@@ -417,7 +420,7 @@ def _choose(points: NDArray, noise: float) -> bool:
 
 @portable
 def _spread(points: NDArray, x: float, y: float, r: float) -> tuple[float, float, float]:
-    """Return `centre`, `radius` and `rough_px` of an `Outline`."""
+    """Return the fields `centre`, `radius` and `rough_px` of an `Outline`."""
     n, sx, sy, sxx, sxy, syy, rough = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(points)):
         if points[k, EDGE_POINT.on] != 0.0:

@@ -1,12 +1,13 @@
 """The foreground of a camera's picture: drones, hats, obstacles and surfaces. Pure.
 
 A drone consists of hull, arms, motors, the sweeps of its rotor blades, and a hat. It looks as in the console
-(zsim_bridges.console.scene), with the AR.Drone's dimensions scaled by the arms. All drones of a picture are computed
-together.
+(zsim_bridges.console.scene), with the AR.Drone's dimensions scaled by the length of the arms. All drones in a picture
+are computed together.
 
-A ray hits a ball, such as a hat, if it passes the centre within the radius. This is exact anywhere in the picture and
-for any lens; the edge is antialiased over one pixel, so that the drawn centre is the projected centre. Faces of
-obstacles are clipped in front of the camera, distorted by the lens, and shaded by the sun.
+A ray hits a ball, such as a hat, if its distance from the ball's centre is at most the radius. This is exact anywhere
+in the picture and for any lens; the edge is antialiased over one pixel, so that the drawn centre is the projected
+centre. Faces of obstacles are clipped to the space in front of the camera, distorted by the lens, and shaded by the
+sun.
 """
 
 from __future__ import annotations
@@ -50,44 +51,44 @@ COLOURS = {  # B, G, R, as in the console, except for the darker underside of th
     "nose": np.array([24.0, 108.0, 240.0]),
     "rotor": np.array([30.0, 28.0, 28.0]),
 }
-RING = 1.31  # outer radius of a hull ring over the rotor radius
+RING = 1.31  # outer radius of the hull's ring around a rotor, over the rotor radius
 RING_POINTS = 16
-RING_Z_M, RING_HIGH_M = 0.022, 0.042  # z of a ring's middle, and its height
+RING_Z_M, RING_HIGH_M = 0.022, 0.042  # z of a ring at mid-height, and height of the ring
 ARM_Z_M, ARM_WIDE_M = 0.004, 0.014
 ROTOR_Z_M, ROTOR_CHORD_M = 0.030, 0.016
-LENS_M = 0.013  # radius
+LENS_M = 0.013  # radius of the lens on a drone's nose
 MOTOR_WIDE_M = 0.034
 REACH_M = 0.36  # distance from the AR.Drone's centre to the farthest point of its rotors and hull
 BODY_POINTS, NOSE_POINTS = 40, 20
 SECTOR = 5  # points along the arc of a blade's sweep
 BLADES = 2
 BLADE_RAD = 0.3  # angle that a blade covers at two thirds of its radius
-OPACITY = 0.16, 0.9  # minimum and maximum opacity of a blade's sweep, a matter of appearance
-DETAIL_PX = 14.0  # minimum width of a drone that is drawn with lens, motors and rotors
+OPACITY = 0.16, 0.9  # minimum and maximum opacity of a blade's sweep; tuned by eye
+DETAIL_PX = 14.0  # width of a drone above which its lens, motors and rotors are drawn
 THICKNESS_MAX_PX = 80
 SEEN_M = 300.0  # distance beyond which drones are smaller than a pixel
-ROOM_M = 0.5  # distance from the centre of a drone with arms of 0.18 m that none of its parts exceeds
-BLURRED_PX = 2.0  # motion from which drones are blurred; hulls need not be as exact as hats
-EDGE_PX = 3.0  # distance to which antialiased edges and blur may extend beyond the lines
+ROOM_M = 0.5  # upper bound on the distance of any part of an AR.Drone from its centre
+BLURRED_PX = 2.0  # motion above which drones are blurred; hulls need not be as exact as hats
+EDGE_PX = 3.0  # distance by which antialiased edges and blur may extend beyond lines
 Levels = NDArray[np.float32]
 AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun, for matt foam outdoors
 STEPS_MAX = 6  # maximum number of times within an exposure at which a moving ball is drawn
-STEP_PX = 0.8  # motion between two of these times
+STEP_PX = 0.8  # motion between two consecutive ones of these times
 ROUNDING = np.float32(0.5)
 AXIS = np.array([0.0, 0.0, 1.0])
 NEAR_M = 0.05  # depth below which nothing is drawn
-FAR_PX = 16_000.0  # limit that coordinates are clipped to: they have 32 bits in all, and long lines take long to draw
+FAR_PX = 16_000.0  # limit of coordinates: with SHIFT fractional bits they must fit 32 bits, and long lines are slow
 SIDES = 24  # number of sides that approximate a cylinder
-PIECES = 8  # number of segments of an edge that the lens bends
+PIECES = 8  # number of straight segments that approximate an edge bent by the lens
 OBSTACLE = np.array([92.0, 118.0, 146.0])  # B, G, R of weathered wood, far from magenta
 SURFACE = np.array([102.0, 116.0, 124.0])  # B, G, R of stone, far from magenta
 BENT_PX = 24.0  # size of a triangle above which the lens visibly bends its edges
 
 
 class DroneImager:
-    """Makes the images of a scene's drones in a camera on drone number `carrier`, over an exposure [s].
+    """Computes the images of a scene's drones in a camera on drone number `carrier`.
 
-    `brightness` is the brightness of the light on the sensor.
+    `brightness` scales the colours; it is 1 on a clear day.
     """
 
     def __init__(self, view: View, scene: Scene, carrier: int, exposure_s: float, brightness: float) -> None:
@@ -108,11 +109,11 @@ class DroneImager:
     def images(
         self, motion: CameraMotion, t_s: float, bodies: DroneStates, R_WB: Array
     ) -> dict[int, tuple[float, list[BallImage | DroneImage]]]:
-        """Return the drones that may be in the picture during an exposure around t_s [s], by their index.
+        """Return the images of the drones that may be in the picture of an exposure centred on `t_s`, by drone index.
 
         Returns:
-            The distance from the camera [m], and the images of the drone (if entirely in front of the camera) and of
-            its hat (if visible), in drawing order.
+            For each drone, its distance from the camera [m], and the images of the drone (if entirely in front of the
+            camera) and of its hat (if visible), in drawing order.
         """
         R_KB = motion.R_WK.T @ R_WB
         centres = motion.points_K(bodies.p_WB)
@@ -145,14 +146,14 @@ class DroneImager:
         return images
 
     def hats(self, centres_K: Array, ways_K: Array, motion: CameraMotion) -> dict[int, BallImage]:
-        """Return the images of hats in front of the camera, by their index; for the arguments see `ball_images`."""
+        """Return the images of hats in front of the camera, by index; for the arguments see `ball_images`."""
         colour = self._brightness * MAGENTA
         return ball_images(self._view, centres_K, ways_K, self._radius_m, colour, SUN_W @ motion.R_WK)
 
     def _images(
         self, kind: int, which: list[int], poses: _Poses, t_s: float, bodies: DroneStates
     ) -> dict[int, DroneImage]:
-        """Return the images of those drones of one look that are entirely in front of the camera."""
+        """Return the images of those drones in `which`, all of one look, that are entirely in front of the camera."""
         look, model = self._looks[kind], self._models[kind]
         speeds = np.array([bodies.rotors[i] for i in which], float)
         blades = _blade_points(look, model.size, t_s, self._exposure_s, speeds)
@@ -166,7 +167,7 @@ class DroneImager:
         pixels = fixed(self._view.pixels(points[whole].transpose(0, 2, 1)))
         ways_px = self._view.flow_px(poses.centres[near], poses.ways[near])
         scales = self._view.lens.fx * model.size / poses.centres[near, 2]
-        turned = np.abs(speeds[whole]) * self._exposure_s  # angle [rad] of each rotor
+        turned = np.abs(speeds[whole]) * self._exposure_s  # angle by which each rotor turns [rad]
         blurs: list[Kernel | None] = [None] * len(near)
         moved = np.flatnonzero(np.hypot(*ways_px.T) > BLURRED_PX).tolist()
         for i, kernel in zip(moved, motion_blur_kernels(ways_px[moved]) if moved else [], strict=True):
@@ -185,7 +186,7 @@ class DroneImager:
         return {i: DroneImage(model, *row) for i, row in zip(near.tolist(), rows, strict=True) if has_pixels(row[0])}
 
     def _boxes(self, pixels: Fixed, ways_px: Array, scales: Array) -> list[list[int]]:
-        """Return the parts of the picture that contain drones, whose points are given in sixteenths of a pixel."""
+        """Return for each drone, given by its points in sixteenths of a pixel, the box of the picture around it."""
         u, v, wide, high = np.array([cv2.boundingRect(each) for each in pixels]).T / (1 << SHIFT)
         lowest, highest = np.stack([u, v], axis=-1), np.stack([u + wide, v + high], axis=-1)
         half_way = np.minimum(np.abs(ways_px), BLUR_MAX_PX) / 2
@@ -194,9 +195,9 @@ class DroneImager:
 
 
 class _Poses(NamedTuple):
-    """All drones in K: rotations B to K (N, 3, 3), centres and their motion during the exposure, (N, 3) each [m; K].
+    """Poses of all drones: rotations B to K (N, 3, 3), centres and their motion in the exposure, (N, 3) each [m; K].
 
-    `cameras_B` has the position of the camera relative to each drone, (N, 3) [m; B].
+    `cameras_B` is the position of the camera relative to each drone, (N, 3) [m; B].
     """
 
     R_KB: Array
@@ -206,7 +207,7 @@ class _Poses(NamedTuple):
 
 
 class _DroneModel(NamedTuple):
-    """Points of a drone, part by part, (P, 3) [m; B], its size relative to the AR.Drone, and its lit colours."""
+    """A drone's points, part by part, (P, 3) [m; B], its size relative to the AR.Drone, and its colours as lit."""
 
     points: Array
     parts: dict[str, slice]
@@ -246,9 +247,9 @@ def _ellipsoid(middle: float, length: float, width: float, height: float, points
 
 
 def _blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, speeds: Array) -> Array:
-    """Return the sweeps of blades during an exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then the arc.
+    """Return the sweeps of blades during an exposure, (..., R BLADES (SECTOR + 1), 3) [m; B]: hub, then arc, of each.
 
-    The truth has no rotor angles, so speed times time is used; no one can see the difference.
+    The truth contains no rotor angles, so speed times time is used; the difference is invisible.
 
     Args:
         speeds: speeds of the rotors, (..., R) [rad/s].
@@ -269,15 +270,15 @@ class DroneImage(NamedTuple):
     """A drone to be drawn.
 
     Attributes:
-        box: the part of the picture that contains it: u0, v0, u1, v1.
+        box: the part of the picture that contains the drone: u0, v0, u1, v1.
         pixels: coordinates of the model's points, then of its blades' sweeps, in sixteenths of a pixel,
             (P + R BLADES (SECTOR + 1), 2).
-        scale: px per m of the AR.Drone.
-        blur: kernel of its motion during the exposure; None if it hardly moves.
-        from_above: whether the camera is above its rotors.
-        shows_lens: whether the camera is in front of it.
+        scale: pixels per metre on an AR.Drone, from which drones of other sizes are scaled.
+        blur: kernel of the drone's motion during the exposure; None if it hardly moves.
+        from_above: whether the camera is above the drone's rotors.
+        shows_lens: whether the camera is in front of the drone.
         opacity: opacity of a blade's sweep.
-        whole_turns: whether the blades of each rotor cover the full circle.
+        whole_turns: whether the blades of each rotor cover the full circle during the exposure.
     """
 
     model: _DroneModel
@@ -298,7 +299,7 @@ class DroneImage(NamedTuple):
         if self.blur is None:
             self._draw(part, pixels)
             return
-        layer = np.zeros((*part.shape[:2], 4), np.uint8)  # the fourth channel is the coverage by the drone
+        layer = np.zeros((*part.shape[:2], 4), np.uint8)  # the fourth channel is the share covered by the drone
         self._draw(layer, pixels)
         cv2.filter2D(layer, -1, self.blur, dst=layer, borderType=cv2.BORDER_REPLICATE)
         passes = cv2.bitwise_not(cv2.extractChannel(layer, 3))
@@ -345,11 +346,11 @@ def _fill_hull(picture: Picture, pixels: Fixed, colour: Colour) -> None:
 
 
 class BallImage(NamedTuple):
-    """A ball in a part of the picture.
+    """A ball to be drawn.
 
     Attributes:
-        box: the part: u0, v0, u1, v1.
-        light: light from the ball, plus a half for rounding, (h, w, 3).
+        box: the part of the picture that contains the ball: u0, v0, u1, v1.
+        light: light from the ball, plus 0.5 for rounding, (h, w, 3).
         passes: share of the light from behind that passes the ball, (h, w, 1).
     """
 
@@ -366,7 +367,7 @@ class BallImage(NamedTuple):
 def ball_images(
     view: View, centres_K: Array, ways_K: Array, radius_m: float, colour: Array, sun_K: Array
 ) -> dict[int, BallImage]:
-    """Return the images of those balls that are in the picture during an exposure, by their index.
+    """Return the images of those balls that are in the picture during an exposure, by index.
 
     Since balls are many and small, all pixels that may be covered are computed in one array, at as many times as the
     fastest ball in the picture requires.
@@ -395,7 +396,7 @@ def ball_images(
     pixels = _Pixels(along, to_way, to_sun, to_axis, [len(part) for part in parts])
     steps = min(STEPS_MAX, max(1, math.ceil(ways_px[shown].max() / STEP_PX)))
     covered = _covered(pixels, centres, ways, radius_m, view.lens.fx, steps)
-    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # for the shade, 1 facing the sun
+    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # for where rays meet the ball's surface
     meets = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + rest, 0))
     cosine = (meets * pixels.to_sun - pixels.of_ball(centres @ sun_K)) * np.float32(DIFFUSE / radius_m)
     shade = np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))
@@ -411,7 +412,7 @@ def ball_images(
 
 
 def _boxes(view: View, centres_K: Array, ways_px: Array, radius_m: float) -> dict[int, list[int]]:
-    """Return the parts of the picture that contain balls, by their index."""
+    """Return the boxes of the picture around those balls that are in it, by index."""
     x, y, z = centres_K.T
     before = z >= radius_m + NEAR_M
     wide_px = view.lens.fx * radius_m / np.where(before, z - radius_m, np.inf) * (1 + np.hypot(x, y) / z)
@@ -421,7 +422,10 @@ def _boxes(view: View, centres_K: Array, ways_px: Array, radius_m: float) -> dic
 
 
 class _Pixels(NamedTuple):
-    """Components along four vectors, (P,) each, of the rays through the pixels of one ball after another."""
+    """Rays through the P pixels of all balls, one ball after another, as components along four vectors, (P,) each.
+
+    `counts` is the number of pixels of each ball.
+    """
 
     along: Levels
     to_way: Levels
@@ -430,13 +434,13 @@ class _Pixels(NamedTuple):
     counts: list[int]
 
     def of_ball(self, values: Array) -> Levels:
-        """Return values of the balls (..., M), repeated for each pixel, (..., P)."""
+        """Return values (..., M) of the balls, repeated for each of a ball's pixels, (..., P)."""
         return np.repeat(values.astype(np.float32), self.counts, axis=-1)
 
 
 def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_px: float, steps: int) -> Levels:
-    """Return the covered share of each pixel, averaged over time, from how far its ray passes within the radius."""
-    shares = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # in exposures, from the middle
+    """Return the covered share of each pixel, averaged over time, from how far within the radius its ray passes."""
+    shares = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # time since mid-exposure over the exposure time
     moved = centres + shares[..., None] * ways
     away2 = (moved * moved).sum(axis=-1)
     along = pixels.along + shares.astype(np.float32) * pixels.to_way
@@ -450,7 +454,7 @@ def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_
 def draw_obstacle(
     picture: Picture, view: View, row: tuple[float, ...], motion: CameraMotion, brightness: float
 ) -> None:
-    """Draw an obstacle, given as a row as in zsim.scenario.surroundings."""
+    """Draw an obstacle, given as a row in the format of zsim.scenario.surroundings."""
     if row[SHAPE] == SPHERE:
         centre_K = motion.points_K(np.array([row[CENTRE : CENTRE + 3]]))
         if centre_K[0, 2] > 0:
@@ -519,16 +523,16 @@ def fixed(pixels: Array) -> NDArray[np.int32]:
 
 
 def bgr(colour: Array) -> tuple[float, float, float]:
-    """Return a colour (3,) as a scalar of OpenCV."""
+    """Return a colour (3,) as an OpenCV scalar."""
     b, g, r = colour.tolist()
     return round(b), round(g), round(r)
 
 
 class SurfaceImager:
-    """Draws surfaces for one camera: triangles (T, 9) as in zsim.scenario.surroundings, visible from both sides.
+    """Draws surfaces for one camera: triangles (T, 9), in the format of zsim.scenario.surroundings, with two sides.
 
-    They have a uniform colour and are drawn in order of the distance to their centres, among drones and obstacles;
-    their edges are not antialiased, so that no gap shows between neighbours.
+    Each triangle has a uniform colour and is drawn, among drones and obstacles, in order of the distance to its centre.
+    Edges are not antialiased, so that no gaps show between neighbours.
     """
 
     def __init__(self, view: View, triangle: Array, brightness: float) -> None:
@@ -540,7 +544,7 @@ class SurfaceImager:
         self._brightness = brightness
 
     def shown(self, motion: CameraMotion) -> list[tuple[float, int]]:
-        """Return distance [m] and number of each triangle that may be visible, and keep their data for `draw`."""
+        """Return the distance [m] and index of each triangle that may be visible, and keep its data for `draw`."""
         self._points_K = motion.points_K(self._corners_W)
         z = self._points_K[..., 2]
         ahead = (z > NEAR_M).all(axis=1)
@@ -562,7 +566,7 @@ class SurfaceImager:
         return list(zip(distance.tolist(), chosen.tolist(), strict=True))
 
     def draw(self, picture: NDArray[np.uint8], number: int) -> None:
-        """Draw one of the triangles returned by `shown`."""
+        """Draw the triangle with the given index, which `shown` must have returned."""
         colour = self._shade[number] * SURFACE
         if self._is_plain[number]:
             cv2.fillConvexPoly(picture, fixed(self._pixels[number]), bgr(colour), cv2.LINE_8, SHIFT)

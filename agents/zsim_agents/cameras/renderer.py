@@ -2,9 +2,9 @@
 
 Pure: equal inputs give bit-identical pictures.
 
-The backdrop of ground and sky is a grey picture, which a map converts to colours: warping one channel costs a third of
-warping three. Greys up to 150 are ground, and greys from HAZE on are sky. The ground repeats a square tile around W's
-origin, in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
+The backdrop of ground and sky is a grey picture, which a map converts to colours: warping one channel takes a third of
+the time of warping three. Greys up to 150 are ground, and greys from HAZE on are sky. The ground repeats a square tile
+around W's origin, in levels of decreasing resolution: coarser ones are drawn far away to avoid aliasing.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, V
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 BLURRED_PX = 0.8  # minimum motion for which the ground is blurred
-WIDER_MAX = 2.0  # maximum size of the undistorted picture over that of the final one, where its edge is then repeated
+WIDER_MAX = 2.0  # maximum ratio of the undistorted to the final picture's size; beyond, edge pixels are repeated
 MARGIN = 64  # pixels by which the noise image exceeds the picture
 NOISE_MAX = 48.0  # maximum standard deviation of the amplified noise, in grey levels
-FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444  # keeps the colour of small hats
+# No chroma subsampling: it would blur the colour of hats a few pixels wide
+FULL_COLOUR = cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
 MIX = 0x9E3779B97F4A7C15  # 2^64 over the golden ratio: its multiples mod 2^64 are evenly spread (Knuth, TAOCP 3, 6.4)
 view_of = cache(View)
 Grey = NDArray[np.uint8]
@@ -41,11 +42,11 @@ Points = list[tuple[float, float]]
 TEXEL_M = 0.02  # side of a texel of the finest level, which shows a line 6 cm wide but no blade of grass
 TILE = 1000  # texels along a side of the tile: 20 m, so that lines every metre continue across the seam
 FACTORS = (1, 4, 20, 100)  # size of the texels of each level over that of the finest
-WINDOW = (3000, 2000, 1500, 1000)  # texels along a side of each level's ground: 60 m, 160 m, 600 m, 2 km
-MINIFIED_MAX = 2.0  # maximum depth of a pixel on the ground, in texels, before a coarser level is drawn
+WINDOW = (3000, 2000, 1500, 1000)  # minimum texels along a side of each level's ground: 60 m, 160 m, 600 m, 2 km
+MINIFIED_MAX = 2.0  # depth of ground covered by a pixel, in texels, beyond which a coarser level is drawn
 HEIGHT_MIN_M = 0.03  # minimum height of the camera above the ground
 HAZE = 176  # grey of the horizon
-ZENITH = 0.6  # sine of the elevation from which the sky is bluest, a matter of appearance
+ZENITH = 0.6  # sine of the elevation above which the sky is bluest; tuned by eye
 SKY_SLOPE = (255 - HAZE) / ZENITH  # increase of the sky's grey per unit of the sine of the elevation
 COLOURS = {  # B, G, R by grey: dry grass, white lines, a hazy blue sky
     0: (24, 36, 30),
@@ -61,14 +62,14 @@ class Renderer:
     """Renders the pictures of a camera on drone number `carrier` of a scene.
 
     Args:
-        seed, name: seed and name, e.g. "drone1/front", of the random stream of the noise.
+        seed, name: seed and name of the noise's random stream; the name is e.g. "drone1/front".
         ground: the ground; None for a meadow with lines every metre.
     """
 
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # compensates for half of the stops by which a clear day is brighter
+        gain = 1.0 / math.sqrt(scene.light)  # compensates for half of the stops by which the light is below a clear day
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)
@@ -86,7 +87,7 @@ class Renderer:
         self._backdrop = Backdrop(flat, ground or meadow())
 
     def jpeg(self, number: int, t_s: float, bodies: DroneStates) -> bytes:
-        """Return `picture` as a JPEG."""
+        """Return the picture of an exposure as a JPEG; for the arguments see `picture`."""
         options = [cv2.IMWRITE_JPEG_QUALITY, self._camera.jpeg_quality, *FULL_COLOUR]
         return cv2.imencode(".jpg", self.picture(number, t_s, bodies), options)[1].tobytes()
 
@@ -96,7 +97,7 @@ class Renderer:
         Args:
             number: number of the picture, which selects its noise.
             t_s: middle of the exposure [s].
-            bodies: all drones at t_s, in the scene's order.
+            bodies: states of all drones at `t_s`, in the scene's order.
         """
         R_WB = rotation_matrix(bodies.q_WB)
         motion = camera_motion(self._pose, bodies, R_WB[self._carrier], self._carrier)
@@ -135,9 +136,9 @@ class Renderer:
         return picture
 
     def _blur_ground(self, grey: Picture, motion: CameraMotion) -> None:
-        """Blur the ground by its motion during the exposure at the centre of the picture's lower half.
+        """Blur all ground by the motion, during the exposure, of the ground at the centre of the picture's lower half.
 
-        The rows of the sky are skipped, since it is smooth, except those near the horizon.
+        Rows of sky, which is smooth, are skipped, except those near the horizon.
         """
         ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
         down = -float(motion.R_WK[2] @ ray_K)
@@ -186,7 +187,7 @@ def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
 
 
 class Level(NamedTuple):
-    """A level of the ground: its texels, the side of a texel [m], and the distance up to which it can be drawn [m].
+    """A level of the ground: its texels, the side of a texel [m], and the distance up to which the level extends [m].
 
     `place` is the homography (3, 3) from (x, y, 1) [m; W] to texels, whose centres have integer coordinates.
     """
@@ -201,7 +202,7 @@ class Ground:
     """A ground in levels of decreasing resolution.
 
     Args:
-        tile: square of greys up to 150, its side a multiple of 100 texels; its centre is W's origin, its top is north.
+        tile: square of greys up to 150, centred on W's origin, north up; its side is a multiple of 100 texels.
         texel_m: side of a texel.
     """
 
@@ -221,7 +222,7 @@ class Ground:
 
 @cache
 def meadow() -> Ground:
-    """Return a meadow with a line every metre, every fifth one wider."""
+    """Return a meadow with lines every metre, every fifth of them wider."""
     rng = np.random.default_rng(1)
     patches = sum(_patches(rng, cells) * share for cells, share in ((10, 12.0), (50, 10.0), (250, 8.0), (1000, 9.0)))
     tile = np.clip(70.0 + patches, 15, 110)
@@ -243,7 +244,7 @@ def _patches(rng: np.random.Generator, cells: int) -> Array:
 
 
 def colour_map(brightness: float) -> Grey:
-    """Return the B, G, R of each grey, (256, 1, 3)."""
+    """Return B, G, R of each grey at a given brightness, (256, 1, 3)."""
     at = np.arange(256)
     channels = [np.interp(at, list(COLOURS), [colour[k] for colour in COLOURS.values()]) for k in range(3)]
     return np.rint(brightness * np.stack(channels, axis=-1)).astype(np.uint8)[:, None, :]
@@ -270,9 +271,9 @@ class Backdrop:
         """Return the picture, which the next call overwrites."""
         height_m = max(float(motion.p_WK[2]), HEIGHT_MIN_M)
         to_W = motion.R_WK @ self._K_inv  # from a pixel (u, v, 1) to its ray in W
-        down = (-to_W[2]).tolist()  # descent [W] of a ray with z = 1 in K
+        down = (-to_W[2]).tolist()  # coefficients of (u, v, 1): descent in W of the pixel's ray with z = 1 in K
         limits = [math.inf]
-        for level in self._ground.levels:  # a pixel at distance s covers s^2 / (f h) of ground in depth
+        for level in self._ground.levels:  # from height h, a pixel at distance s covers s^2 / (f h) of ground in depth
             reach_m = math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m)
             limits.append(height_m / min(reach_m, 0.7 * level.reach_m))
         least, most = _extremes(self._size, down)
@@ -290,7 +291,7 @@ class Backdrop:
         # homography from pixels to (x, y, 1) on the ground [m], relative to the nearest repetition of the tile
         x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in motion.p_WK[:2].tolist())
         to_ground = np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]]) @ to_W
-        for i in range(first, -1, -1):  # limits of `down` for this level and the finer one
+        for i in range(first, -1, -1):  # limits[i + 1] and limits[i]: minimum descent for this and the next finer level
             if most > limits[i + 1]:
                 self._draw_level(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
         return self.grey
@@ -302,7 +303,7 @@ class Backdrop:
         return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
 
     def _draw_level(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
-        """Draw a level in the rows that are near enough for it but not entirely near enough for a finer one."""
+        """Draw a level in the rows that are near enough for it, except rows entirely near enough for the finer one."""
         part = half_plane(self._size, down, least)
         rows = _rows(part, self._size)
         coarse = _rows(half_plane(self._size, [-each for each in down], -most), self._size) if most < math.inf else rows
@@ -326,7 +327,7 @@ class Backdrop:
 
 
 def _rows(part: Points, size: tuple[int, int]) -> tuple[int, int] | None:
-    """Return the first row of a part of the picture, and the row after its last one."""
+    """Return the first row of a part of the picture, and the row after its last one; None if it is empty."""
     if len(part) < 3:
         return None
     heights = [v for _, v in part]
@@ -345,7 +346,7 @@ def _extremes(size: tuple[int, int], linear: Sequence[float]) -> tuple[float, fl
 
 
 def half_plane(size: tuple[int, int], linear: Sequence[float], least: float) -> Points:
-    """Return the polygon where a u + b v + c >= least in a picture; with fewer than three points it is empty."""
+    """Return the polygon in a picture where a u + b v + c >= least; with fewer than three points, it is empty."""
     a, b, c = linear
     corners = _rectangle(*size)
     over = [a * u + b * v + c - least for u, v in corners]

@@ -19,11 +19,11 @@ from zsim.sensors.camera import Hats
 from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, undistorted
 from zsim.vehicles.vehicle import cross_layout
 
-cv2.setNumThreads(1)  # leaves the other cores to the world and the agents, and gives the same bits everywhere
+cv2.setNumThreads(1)  # leaves the other cores to the world and the agents, and makes pictures bit-identical everywhere
 Array = NDArray[np.float64]
 Kernel = NDArray[np.float32]
-ARM_M = 0.1785  # arm of the AR.Drone, for records that do not give the rotors of a drone
-ROTOR_RADIUS_M = 0.10  # 8-inch propellers of the AR.Drone
+ARM_M = 0.1785  # arm length of the AR.Drone, for records that do not give the rotors of a drone
+ROTOR_RADIUS_M = 0.10  # the AR.Drone's propellers have a diameter of 8 inches
 SUN_AZIMUTH_RAD, SUN_ELEVATION_RAD = math.radians(215.0), math.radians(50.0)  # from east; afternoon, in the south-west
 SUN_W = np.array(
     [
@@ -39,7 +39,7 @@ SHIFT = 4  # fractional bits of coordinates for OpenCV: sixteenths of a pixel
 
 
 class DroneLook(NamedTuple):
-    """Appearance of a drone: hubs (R, 2) [m; B], directions of rotation (R,), rotor radius, whether it has a hat."""
+    """Look of a drone: rotor hubs (R, 2) [m; B], directions of rotation (R,), rotor radius, whether it has a hat."""
 
     hubs_B: Array
     turns: Array
@@ -53,7 +53,7 @@ NO_TRIANGLE = np.empty((0, TRIANGLE))
 class Scene(NamedTuple):
     """The constant parts of a run's scene.
 
-    Obstacles and surfaces are rows as in zsim.scenario.surroundings; a clear day has light 1.
+    Obstacles and surfaces are rows in the format of zsim.scenario.surroundings; a clear day has light 1.
     """
 
     drones: tuple[DroneLook, ...]
@@ -66,7 +66,7 @@ class Scene(NamedTuple):
 class DroneStates(NamedTuple):
     """States of N drones at one time: position [m; W], velocity [m/s; W] and angular velocity [rad/s; B], (N, 3) each.
 
-    `q_WB` is the attitude, B to W, (N, 4); `rotors` has the speeds of each drone's rotors [rad/s].
+    `q_WB` is the attitude, B to W, (N, 4); `rotors` contains the speeds of each drone's rotors [rad/s].
     """
 
     p_WB: Array
@@ -158,12 +158,12 @@ class View:
         return np.asarray(flat, float).reshape(*points_K.shape[:-1], 2)
 
     def flow_px(self, points_K: Array, rates_K: Array) -> Array:
-        """Return the optical flow of moving points [px/s], (..., 2), ignoring the lens's distortion."""
+        """Return the optical flow of moving points [px/s], (..., 2), ignoring lens distortion."""
         z = points_K[..., 2:]
         return self.lens.fx * (rates_K[..., :2] - points_K[..., :2] / z * rates_K[..., 2:]) / z
 
     def boxes(self, lowest_px: Array, highest_px: Array) -> list[list[int]]:
-        """Return boxes (u0, v0, u1, v1) of the picture around rectangles given by opposite corners, (M, 2) each."""
+        """Return boxes (u0, v0, u1, v1), clipped to the picture, around rectangles given by two corners (M, 2)."""
         size = self.lens.width, self.lens.height
         ends = np.concatenate([np.floor(lowest_px), np.ceil(highest_px) + 1], axis=1)
         return np.clip(ends, 0, size * 2).astype(int).tolist()
@@ -174,7 +174,7 @@ def has_pixels(box: list[int]) -> bool:
 
 
 def motion_blur_kernels(ways_px: Array) -> list[Kernel]:
-    """Return the blur kernels of motions during an exposure, (N, 2) [px]: the share of the time spent in each pixel."""
+    """Return the blur kernels of motions in an exposure, (N, 2) [px]: the share of the time spent in each pixel."""
     lengths = np.hypot(*ways_px.T)
     ways = ways_px * np.minimum(1.0, BLUR_MAX_PX / np.maximum(lengths, 1e-9))[:, None]
     count = max(2, math.ceil(min(lengths.max(), BLUR_MAX_PX) * SAMPLES_PER_PX))

@@ -1,6 +1,7 @@
-"""Estimators of drones: from sensor readings to an estimate at every gate. Imports zsim only.
+"""Estimators, which turn the sensor readings of drones into an estimate at every gate. Imports only zsim.
 
-estimator (the agent) -> estimator_bank (one step for all drones) or joint_filter (of a cluster) -> measurement_update
-and strapdown -> kalman_update. Columns of a row: filter_state; initial values: filter_setup. Instead of these:
-paper_estimator, or a class of the user's (drone_estimator).
+Modules from the top: estimator (the agent) -> estimator_bank (one step for all drones) or joint_filter (one filter for
+a cluster) -> measurement_update and strapdown -> kalman_update. filter_state defines the columns of the filter's
+arrays, filter_setup their initial values. Instead of this filter, the agent can run paper_estimator or a user's class
+(drone_estimator).
 """

@@ -1,8 +1,9 @@
-"""The interface of estimators: one object per drone receives its sensors and returns an estimate at every gate.
+"""The interface of estimators: one object per drone receives its sensor readings and returns an estimate at every gate.
 
-A scenario chooses one by `estimation: {algorithm: …}`: `ekf`, the default of this package; `paper`; or
-`package.module:Class`, a user's class with the methods of `DroneEstimator`. It sees only plain objects: sections
-of the scenario, messages of the contract, and numbers. For the search path of its module see `zsim.schema.plugin`.
+A scenario selects the estimator by `estimation: {algorithm: …}`: `ekf`, this package's default; `paper`; or
+`package.module:Class`, a user's class with the methods of `DroneEstimator`. Such a class sees only plain objects:
+sections of the scenario, messages of the contract, and numbers. For the search path of its module, see
+`zsim.schema.plugin`.
 """
 
 import math
@@ -21,8 +22,8 @@ from zsim.schema.checker import show
 
 CLASSES = {"paper": "zsim_agents.estimation.paper_estimator:PaperEstimator"}
 SIZES = {"position_m": 3, "velocity_m_s": 3, "orientation_wxyz": 4, "covariance": 36, "gyro_bias_rad_s": 3}
-STATES = 6  # of the covariance
-NORM_TOLERANCE = 1e-3  # chosen: of a quaternion; 0.1 % is a hundred times the error of single precision
+STATES = 6  # rows of the covariance
+NORM_TOLERANCE = 1e-3  # maximum error of a quaternion's norm; design choice: far above rounding in single precision
 Numbers = Sequence[float] | NDArray[np.float64]
 
 
@@ -33,25 +34,25 @@ class StateEstimate(NamedTuple):
     velocity_m_s: Numbers  # v_WB, in W
     orientation_wxyz: Numbers  # q_WB
     yaw_rad: float
-    covariance: Numbers  # of position and velocity, 6 x 6, row-major, SI units
+    covariance: Numbers  # covariance of position and velocity, 6 x 6, row-major, SI units
     yaw_sigma_rad: float
     gyro_bias_rad_s: Numbers = (0.0, 0.0, 0.0)  # in B
-    sensors: Mapping[str, tuple[int, int]] = {}  # readings (used, refused) since the start, by sensor
+    sensors: Mapping[str, tuple[int, int]] = {}  # numbers of used and refused readings since the start, by sensor
 
 
 class DroneEstimator(Protocol):
     """Estimates the state of one drone.
 
-    A class may have three more methods, for a process that takes over from one that died. `snapshot(self)` returns the
-    state of the estimator as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
-    `restore(self, state)` sets it in a new object, which then continues bit-identically. Without them
-    `warm_start(self, last)` is called, with the last `zsim.contract.flight_messages.Estimate` that was published.
+    A class may have three more methods, which a process uses when it takes over from one that died. `snapshot(self)`
+    returns the state of the estimator as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
+    `restore(self, state)` restores it in a new object, which then continues bit-identically. If these two are missing,
+    `warm_start(self, last)` is called with the last published `zsim.contract.flight_messages.Estimate`.
 
     Args:
-        drone: its sensors, their mounts, rates and error models; its start position.
+        drone: the drone's section of the scenario: sensors with mounts, rates and error models; start position.
         environment: gravity and magnetic field.
         estimation: settings of the scenario's estimators.
-        gate_s: interval of the gates [s].
+        gate_s: interval between gates [s].
     """
 
     def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None: ...
@@ -59,24 +60,24 @@ class DroneEstimator(Protocol):
     def receive(self, sensor: str, message: Any) -> None:
         """Receive a reading.
 
-        Readings of a gate come in order of arrival, then of name; some may be late or missing.
+        The readings of a gate come in order of arrival, then of sensor name; some may be late or missing.
 
         Args:
             sensor: "imu", "gps", "mag", "baro", "sonar", "flow", or a user's sensor.
-            message: message of that sensor, such as `zsim.contract.messages.Imu`; `t_sample_ns` is when it measured.
+            message: the sensor's message, such as `zsim.contract.messages.Imu`, measured at its `t_sample_ns`.
         """
         ...
 
     def estimate(self, t_s: float) -> StateEstimate:
-        """Return the estimate for the end of a gate [s], after all its readings."""
+        """Return the estimate at `t_s` [s], the end of a gate, after all readings of the gate have been received."""
         ...
 
 
 def estimator_class(algorithm: str, where: str = "estimation.algorithm") -> Callable[..., DroneEstimator] | None:
-    """Return the class that an algorithm names; None for `ekf`, whose drones share one `EstimatorBank`.
+    """Return the class that an algorithm names; None for `ekf`, for which all drones share one `EstimatorBank`.
 
     Raises:
-        DocumentError: there is no such module or class, or a method is missing; the text begins with `where`.
+        DocumentError: the module, the class or one of its methods does not exist; the text begins with `where`.
     """
     if algorithm == ESTIMATORS[0]:
         return None
@@ -84,7 +85,7 @@ def estimator_class(algorithm: str, where: str = "estimation.algorithm") -> Call
 
 
 class EstimatorSet:
-    """An estimator of one class for each of several drones, with the methods of an `EstimatorBank`."""
+    """Estimators of several drones, one object of the same class for each, with the methods of an `EstimatorBank`."""
 
     def __init__(
         self,
@@ -104,10 +105,14 @@ class EstimatorSet:
             self._raise(error, i)
 
     def receive_gate(self, gate: Any) -> bool:
-        return False  # its messages are to be passed one by one
+        return False  # the messages must be passed one by one
 
     def estimate(self, t_s: float) -> list[StateEstimate]:
-        """Return the estimates for `t_s`, as plain numbers; UserCodeError: a class raised or gave an invalid one."""
+        """Return the estimates at `t_s` [s], as plain numbers.
+
+        Raises:
+            UserCodeError: the user's class raised an error, or returned an invalid estimate.
+        """
         estimates = []
         for i, estimator in enumerate(self._estimators):
             try:
@@ -118,14 +123,14 @@ class EstimatorSet:
         return estimates
 
     def _raise(self, error: BaseException, i: int) -> NoReturn:
-        """Raise an error of a user's class with its drone, any other one unchanged."""
+        """Raise an error of a user's class with the drone's name in its text, any other error unchanged."""
         failure = plugin.user_code_error(error, "")
         if failure is None:
             raise error
         raise UserCodeError(f"{failure.text}, for {self._drones[i]}") from error
 
     def snapshot(self) -> State | None:
-        """Return the states of all estimators, None if their class has no `snapshot`."""
+        """Return the states of all estimators; None if their class does not provide them."""
         if not all(hasattr(each, "snapshot") for each in self._estimators):
             return None
         states = []
@@ -147,7 +152,7 @@ class EstimatorSet:
 
 
 def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> StateEstimate:
-    """Return a validated estimate as plain numbers."""
+    """Return an estimate as plain numbers, after validating it."""
     what = f"{plugin.full_name(type(estimator))}.estimate returns for {drone}"
     values = {}
     for field in (*SIZES, "yaw_rad", "yaw_sigma_rad"):

@@ -1,4 +1,4 @@
-"""The estimator of one or several drones as an agent: takes sensor messages, publishes estimates at every gate."""
+"""The estimator of one or several drones as an agent: receives sensor messages, publishes estimates at every gate."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,11 +24,11 @@ from zsim_agents.estimation.joint_filter import ClusterBanks
 class Estimator(Agent):
     """Passes the messages on `drone/{d}/sensor/*` to the estimators: a bank, or one object of a user's class per drone.
 
-    The agent is named after the first of its drones and also serves as the estimator of the others.
+    The agent is named after the first of its drones, and also serves under the names of the others.
 
     Raises:
         RunError: the scenario lacks one of the drones, or none is given.
-        DocumentError: the class that the scenario names cannot be loaded here.
+        DocumentError: the class named in the scenario cannot be loaded on this machine.
     """
 
     def __init__(self, info: messages.Info, scenario: Scenario, drones: str | Sequence[str]) -> None:
@@ -55,7 +55,7 @@ class Estimator(Agent):
         read = names
         if isinstance(self._estimators, ClusterBanks):
             read = tuple(self._estimators.drones)
-            specs = [scenario.drone(drone) for drone in read]  # detectors find the sightings that the world does not
+            specs = [scenario.drone(drone) for drone in read]  # sightings not from the world come from detectors
             detected = (each.name for each in specs if each.sensors.sightings is UNSET or each.is_external)
             self.uncounted = tuple(map(keys.detections, detected))
         self.gate_keys = tuple(keys.status(drone) for drone in read)
@@ -86,7 +86,7 @@ class Estimator(Agent):
             return
         _, drone, what = keys.parts(key)
         if drone in self._index:
-            # a message over a slow link has arrived since the last gate, whatever its stamp
+            # a message over a slow link has arrived since the last gate, whatever its time stamp
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
             self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)
 
@@ -97,10 +97,10 @@ class Estimator(Agent):
     def step(self, t_ns: int) -> list[Output]:
         estimates = self._estimators.estimate(t_ns * 1e-9)
         named = zip(self._names, self.writes, estimates, strict=True)
-        if self._external:  # a drone whose driver has been silent since the last gate has no estimate
+        if self._external:  # a drone whose driver has been silent since the last gate gets no estimate
             named = [each for each in named if each[0] not in self._silent]
             self._silent = set(self._external)
-        make: Any = flight_messages.Estimate  # the fields of a StateEstimate have sequences of unspecified length
+        make: Any = flight_messages.Estimate  # Any: sequences in a StateEstimate are not typed by length
         source, self._last, outputs = self.source, {}, []
         for drone, key, estimate in named:
             self._last[drone] = message = make(t_ns, self.next_seq(key), *estimate, source=source)

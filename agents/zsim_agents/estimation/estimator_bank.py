@@ -1,4 +1,4 @@
-"""The estimators of many drones as rows of arrays, with one compiled step from sensor readings to estimates.
+"""Estimators of many drones, stored as rows of arrays, with one compiled step from sensor readings to estimates.
 
 Readings are stored on arrival. At the end of a gate, each drone's nominal state and covariance are propagated with its
 IMU (strapdown), and its other readings are tested and used (measurement_update).
@@ -63,7 +63,7 @@ NOBODY = -1
 NS_S = 1e-9  # s/ns
 BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # indices among the floats of these messages
 GPS_FIX, SONAR_VALID = 3, 3  # indices among the integers of these messages
-RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # positions of sensors in the order of delivery, by key
+RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # rank of each sensor in the order of delivery, by key
 
 read = inlined(framing.read)
 
@@ -80,11 +80,12 @@ _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # columns `values` a
 class EstimatorBank:
     """Fuses the sensors of several drones; `i` is a drone's index in the given order.
 
-    The sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the last
-    one of the sensor, not finite, or outside their innovation gate are refused and counted.
+    Between two gates, readings of different sensors may arrive in any order. Duplicates are ignored; readings that are
+    older than the sensor's last one, not finite, or outside their innovation gate are refused and counted.
 
     Attributes:
-        counted: sensors in the order of publication, with the columns of their counts of used and refused readings.
+        counted: name of each sensor, in the order of publication, and the columns of its counts of used and refused
+            readings, relative to COUNT.used.
     """
 
     counted = (*((name, k, _REFUSED + k) for k, name in enumerate(SENSORS) if k != IMU), ("imu", IMU, _REFUSED + IMU))
@@ -110,7 +111,7 @@ class EstimatorBank:
         self._count += 1
 
     def receive_gate(self, gate: GateMessages) -> bool:
-        """Store all sensor messages of a gate; return False, and store none, if one of them must be decoded."""
+        """Store all sensor messages of a gate; store none and return False if one of them must be fully decoded."""
         while self._count + len(gate) > len(self._readings):
             self._make_room(2 * len(self._readings))
         count = self._reader.take(gate, self._readings, self._count)
@@ -119,7 +120,7 @@ class EstimatorBank:
         return count >= 0
 
     def estimate(self, t_s: float, wanted: Sequence[int] | None = None) -> list[StateEstimate]:
-        """Use the readings since the last gate; return the estimates of all drones, or those wanted, for `t_s` [s]."""
+        """Use the readings since the last gate; return the estimates at `t_s` [s], of all drones or those `wanted`."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
         rows, counts = self._estimates.tolist(), self.rows.counts[:, COUNT.used :].tolist()
@@ -140,14 +141,14 @@ class EstimatorBank:
         ]
 
     def use(self, t_s: float, readings: Array) -> Array:
-        """Use readings (M, READING.size) and return the estimates for `t_s` [s], (N, ESTIMATE.size)."""
+        """Use readings, (M, READING.size), and return the estimates at `t_s` [s], (N, ESTIMATE.size)."""
         if self._held_rows is not self.rows:
             self._held, self._held_rows = hold(self.rows), self.rows
         step(self._held, t_s, readings, self._estimates)
         return self._estimates
 
     def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
-        """Continue from a published estimate; must precede the first reading.
+        """Continue from a published estimate; must be called before the first reading.
 
         The covariances of tilt and biases, which are not published, remain those of a cold start.
         """
@@ -186,12 +187,12 @@ class EstimatorBank:
 
 @portable
 def step(held: Held, t_s: float, readings: Array, estimates: Array) -> None:
-    """Use the readings of all drones in a gate, and write the estimates for `t_s` [s].
+    """Use the readings of all drones in a gate, and write the estimates at `t_s` [s].
 
     Args:
         held: the Rows of N drones, as returned by `hold`; updated in place.
-        readings: readings, (M, READING.size), those of each drone in order of arrival.
-        estimates: receives the estimates, (N, ESTIMATE.size).
+        readings: readings, (M, READING.size); those of each drone are in order of arrival.
+        estimates: filled by this function with the estimates, (N, ESTIMATE.size).
     """
     rows = held.content
     count = rows.nominal.shape[0]
@@ -204,12 +205,12 @@ def step(held: Held, t_s: float, readings: Array, estimates: Array) -> None:
 
 @portable
 def sort_readings(rows: Rows, readings: Array, first: Array, after: Array) -> None:
-    """Propagate the nominal state of each drone with its IMU, and chain the aiding readings to be used.
+    """Propagate the nominal state of each drone with its IMU, and chain those of its aiding readings that are accepted.
 
     Args:
         readings: readings, (M, READING.size).
-        first: receives the index of each drone's first aiding reading, (N,); must be filled with -1, for none.
-        after: receives, for each reading, the index of the next one of the same drone, (M,); must be filled with -1.
+        first: index of each drone's first aiding reading, (N,); -1 (none) on entry, modified in place.
+        after: index of the same drone's next aiding reading, for each reading, (M,); likewise.
     """
     last = np.full(rows.nominal.shape[0], -1)
     for m in range(readings.shape[0]):
@@ -243,10 +244,10 @@ def _step_one(rows: Rows, i: int, t_s: float, readings: Array, first: int, after
 
 @portable
 def write_estimate(row: Array, setting: Array, P: Array, t_s: float, estimate: Array) -> None:
-    """Write the estimate of a drone for `t_s` [s], (ESTIMATE.size,).
+    """Write the estimate of a drone at `t_s` [s], (ESTIMATE.size,).
 
-    Beyond the last IMU sample it is extrapolated with that sample's acceleration; its noise and possible manoeuvres add
-    to the covariance.
+    Beyond the last IMU sample, the state is extrapolated with that sample's acceleration, whose noise adds to the
+    covariance, as do possible manoeuvres.
     """
     p, v, q, a_W, w, _ = reckoning(row)
     ahead = t_s - row[NOMINAL.t]
@@ -274,17 +275,17 @@ def write_estimate(row: Array, setting: Array, P: Array, t_s: float, estimate: A
 
 
 class ReaderTables(NamedTuple):
-    """The layout of the messages of a gate for compiled code, and buffers for one message."""
+    """The layouts of a gate's messages, for compiled code, and buffers for one message."""
 
     program: Program
-    owner: Array  # drone and sensor of each key of the table, or NOBODY, (keys, 2)
+    owner: Array  # drone and sensor of each key in the gate's table, or NOBODY twice, (keys, 2)
     ints: Array
     floats: Array
     bits: Array  # view of the floats as integers
 
 
 class GateReader:
-    """Reads the sensor messages of drones, which are in the order of the bank, from gates."""
+    """Reads the sensor messages of drones, given in the order of the bank, from gates."""
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._whose = {
@@ -299,10 +300,10 @@ class GateReader:
         self._held = hold(self._tables)
 
     def take(self, gate: GateMessages, readings: Array, count: int) -> int:
-        """Write the readings of a gate to rows of `readings` (M, READING.size) from `count` on; they must all fit.
+        """Write the readings of a gate to `readings`, (M, READING.size), from row `count` on; they must all fit.
 
         Returns:
-            The new count, or -1 if a message must be decoded.
+            The new count, or -1 if a message must be fully decoded.
         """
         if gate.table is not self._table:
             self._table = gate.table
@@ -317,7 +318,7 @@ class GateReader:
 
 @portable
 def collect(held: Held, which: Array, ends: Array, data: Array, readings: Array, count: int) -> int:
-    """Write the sensor messages of a gate as readings, sorted by time and name per drone; see `GateReader.take`."""
+    """Write a gate's sensor messages as readings, sorted by time and sensor name per drone; see `GateReader.take`."""
     program, owner, ints, floats, bits = held.content
     start, first = 0, count
     marks = np.empty(which.shape[0], np.int64)

@@ -1,8 +1,8 @@
 """The initial rows of the filter from a scenario: noise, biases, gain and initial uncertainty.
 
-The error state is position (3), velocity (3), small rotation of the attitude (3), all in the world frame, gyroscope
-bias (3) in the body frame, accelerometer bias (3) if the drone has one, then the biases of other channels, then the
-clones.
+The error state consists of position (3), velocity (3) and a small rotation of the attitude (3), all in the world frame;
+gyroscope bias (3) and, if estimated, accelerometer bias (3), both in the body frame; the biases of other channels; and
+the clones.
 """
 
 import math
@@ -51,23 +51,24 @@ from zsim_agents.estimation.strapdown import (
 
 Array = NDArray[np.float64]
 
-LINK_S = 0.4  # s, chosen: latency that a radio and sparse telemetry add for an external drone
+LINK_S = 0.4  # s; design choice: latency that a radio and sparse telemetry add for an external drone
 LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
-CLONE_EVERY_S = 0.1  # s, chosen: process noise over half of it is small compared to any sensor's noise
-CLONED_FROM = 0.01  # chosen: share of a reading's variance; less process noise since its sampling is neglected
-COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # chosen: noisier readings do not initialise the heading
-ON_ROOF_M = 0.01  # m, chosen: a drone this close to an obstacle starts on it
+CLONE_EVERY_S = 0.1  # s; design choice: process noise over half this interval is small against any sensor's noise
+CLONED_FROM = 0.01  # share of a reading's variance; design choice: less process noise since its sampling is negligible
+COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # design choice: noisier readings do not initialise the heading
+ON_ROOF_M = 0.01  # m; design choice: a drone that starts this close to an obstacle stands on it
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
-VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest, or in gentle flight
+VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest or in gentle flight
 TILT_SIGMA_RAD = 0.05  # rad: ground that is level to 3 deg
 GYRO_BIAS_MIN = math.radians(0.01)  # rad/s: bias assumed if the scenario has none
 GYRO_WALK_MIN = math.radians(1e-4)  # rad/s/sqrt(s): random walk assumed if the scenario has none
 ACCEL_SIGMA_MIN = 0.02  # m/s^2 per sample: error of sampling and of the trapezoidal rule
 GYRO_SIGMA_MIN = 2e-4  # rad/s per sample: the same error for the gyroscope
-JOLT_SIGMAS = 10.0  # of the accelerometer; the sum of three changes of pure noise is 3.4 on average, 1.5 in spread
-JOLT_MIN_M_S2 = 1.0  # m/s^2 between samples: above the rotors' vibration in flight; ground contact causes tens
-# A sensor refused continuously for this long is trusted again, after its states' variances are increased [s].
-# Wrong heights and velocities diverge quickly; a magnetic field may be disturbed temporarily.
+# Limit of the summed changes of three axes, in sigmas of the accelerometer: noise gives 3.4 on average, 1.5 in spread
+JOLT_SIGMAS = 10.0
+JOLT_MIN_M_S2 = 1.0  # m/s^2 between samples: above rotor vibration in flight; ground contact causes tens of m/s^2
+# Time for which a sensor is refused continuously before the variances of the states it observes are increased, so that
+# it is trusted again [s]. Wrong heights and velocities diverge quickly; a magnetic field may be disturbed temporarily.
 PATIENCE_S = {"gps": 10.0, "mag": 10.0, "baro": 5.0, "sonar": math.inf, "flow": 1.0}
 
 
@@ -75,8 +76,8 @@ class UpdateChannel(NamedTuple):
     """A quantity that an aiding sensor measures.
 
     Attributes:
-        field: field of the sensor's section in a scenario that contains the error model.
-        sigma_min: model error, so that a scenario without noise does not give infinite confidence.
+        field: field of the sensor's section of a scenario that contains the quantity's error model.
+        sigma_min: error of the measurement model, so that a scenario without noise does not give infinite confidence.
     """
 
     sensor: str
@@ -105,9 +106,9 @@ AIDING = (  # in the order of the values of a reading
 
 
 class Bias(NamedTuple):
-    """Bias states: initial standard deviation, and random walk per sqrt(s) in the channel's unit.
+    """Bias states: initial standard deviation, and random walk per sqrt(s), in the channel's unit.
 
-    `decay_1_s` of a Gauss-Markov process is 1 over its correlation time.
+    `decay_1_s` is the inverse of a Gauss-Markov process's correlation time; 0 for other biases.
     """
 
     axes: int
@@ -156,13 +157,14 @@ class DroneSetup:
     """The parameters of one drone's rows, from the sections of a scenario.
 
     Attributes:
-        clones: number needed by late readings; 0 if process noise is small compared to their noise.
-        biases: that the filter estimates, in the order of the error state: "gyro", "accel" if present, then of aiding
-            channels, which are (channel, whether it is a Gauss-Markov process).
-        first: first state of each bias.
-        own: states before the clones.
-        size: n, clones included.
-        variance, walk, decay: at the start, of each bias' random walk [unit^2/s], and of each bias [1/s], (n,).
+        clones: number of clones that late readings need; 0 if their noise far exceeds the process noise.
+        biases: estimated biases in the order of the error state: "gyro"; "accel" if estimated; then those of aiding
+            channels, named (channel, whether the bias is a Gauss-Markov process).
+        first: index of each bias's first state.
+        own: number of states before the clones.
+        size: number of all states, n.
+        variance: initial variances, (n,).
+        walk, decay: random walk [unit^2/s] and decay [1/s] of each bias, zero elsewhere, (n,) each.
     """
 
     def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
@@ -202,8 +204,8 @@ class DroneSetup:
     def _clone_count(self) -> int:
         """Return the number of clones that late readings need, from the process noise during their delay.
 
-        White acceleration and a random walk of the tilt, integrated per horizontal axis (Y. Bar-Shalom, X. R. Li,
-        T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 6.2).
+        The noise is white acceleration and a random walk of the tilt, integrated per horizontal axis (Y. Bar-Shalom,
+        X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 6.2).
         """
         sensors, longest_s = self._drone.sensors, 0.0
         white = el.square(self._accel_sigma) / sensors.imu.rate_hz  # m^2/s^3
@@ -224,17 +226,17 @@ class DroneSetup:
         return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
 
     def _floor_m(self) -> float:
-        """Return the height of the roof on which the drone starts [m], 0 on the ground.
+        """Return the height of the roof on which the drone starts [m]; 0 on the ground.
 
-        The first heights come from the sonar alone and would be wrong by the height of the roof. Above other obstacles,
-        sonar readings are refused as outliers.
+        The first heights come from the sonar alone, and would otherwise be wrong by the height of the roof. Above other
+        obstacles, sonar readings are refused as outliers.
         """
         x, y, z = self._drone.position_m
         away_m = float(Surroundings(self._environment).distances_m((x, y, z))[0])
         return z if abs(away_m) < ON_ROOF_M else 0.0
 
     def setting(self) -> list[float]:
-        """Return the columns SETTING."""
+        """Return the drone's row of SETTING columns."""
         sensors, imu = self._drone.sensors, self._drone.sensors.imu
         row = [
             self._gravity,
@@ -269,9 +271,9 @@ class DroneSetup:
         return row
 
     def layout(self) -> list[int]:
-        """Return the columns LAYOUT."""
+        """Return the drone's row of LAYOUT columns."""
         estimation, mag, mount = self._estimation, self._drone.sensors.mag.field_ut, self._drone.sensors.imu.mount
-        # whether one magnetometer reading gives a heading as accurate as setting the drone down by eye
+        # whether a single magnetometer reading gives a heading about as accurate as setting the drone down by eye
         horizontal_ut = el.length(self._environment.magnetic_field_ut[:2])
         sideways_ut = el.hypot(HEADING_CHANNEL.sigma(self._drone.sensors), el.hypot(mag.bias, mag.correlated_sigma))
         has_compass = estimation.magnetometer and sideways_ut <= COMPASS_SIGMA_RAD * horizontal_ut
@@ -307,8 +309,8 @@ BiasName = str | tuple[UpdateChannel, bool]
 def biases_of(sensors: Sensors, estimation: Estimation) -> dict[BiasName, Bias]:
     """Return the estimated biases.
 
-    A Gauss-Markov process of the IMU is combined with its other biases as a random walk with the same growth over the
-    correlation time, which is never overconfident. That of an aiding channel is a separate state.
+    A Gauss-Markov process of an IMU channel is combined with the channel's other biases to a random walk with the same
+    driving noise, which is never overconfident. A Gauss-Markov process of an aiding channel has states of its own.
     """
 
     def gauss_markov_walk(error: ErrorModel) -> float:  # driving noise per sqrt(s)
@@ -339,14 +341,14 @@ def biases_of(sensors: Sensors, estimation: Estimation) -> dict[BiasName, Bias]:
 
 
 def innovation_limits(gate_probability: float) -> Array:
-    """Return the limits of y^T S^-1 y by the number of rows, (DOF_MAX + 1,)."""
+    """Return the limits of y^T S^-1 y, for innovations y with covariance S, by the number of rows, (DOF_MAX + 1,)."""
     return np.array([0.0, *(chi_square_quantile(gate_probability, dof) for dof in range(1, DOF_MAX + 1))])
 
 
 def white_sigma(error: ErrorModel, rate_hz: float) -> float:
-    """Return the standard deviation of the white part per sample, in the channel's unit.
+    """Return the standard deviation of an error's white part per sample, in the channel's unit.
 
-    Noise, density * sqrt(rate) and the converter's rounding (uniform: quantum^2/12) in quadrature.
+    It combines noise, density * sqrt(rate) and the converter's rounding (uniform: quantum^2/12) in quadrature.
     """
     noise = 0.0 if error.correlation_time_s else error.noise
     return math.sqrt(el.square(noise) + el.square(error.density) * rate_hz + el.square(error.quantum) / 12.0)
@@ -358,7 +360,7 @@ def accel_sigma(imu: ImuConfig) -> float:
 
 
 def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> float:
-    """Return the gain [rad/s] of the scenario, or the one that levels in `LEVELLING_S` under the IMU's noise."""
+    """Return Madgwick's gain [rad/s]: the scenario's, or else the one that levels in LEVELLING_S under IMU noise."""
     if estimation.madgwick_beta is not None:
         return estimation.madgwick_beta
     return beta_for(LEVELLING_S, accel_sigma(imu) / gravity)
@@ -367,9 +369,9 @@ def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> flo
 def tilt_density(beta: float, direction_sigma: float, gravity: float, period_s: float) -> float:
     """Return the tilt noise per axis added by Madgwick's accelerometer step [rad^2/s].
 
-    Noise turns each step of 2 beta dt in a random direction (half its square per axis). An acceleration a acts as a
-    tilt a/g, towards which the attitude is pulled with the levelling time, at most at 2 beta; it is modelled as white
-    noise of the same power at low frequency.
+    Noise gives each step, of length 2 beta dt, a random direction, and so each axis half the squared length. An
+    acceleration a acts as a tilt a/g, towards which the attitude is pulled with the levelling time, at a rate of at
+    most 2 beta; it is modelled as white noise of the same power at low frequency.
     """
     if beta == 0.0:
         return 0.0

@@ -1,4 +1,4 @@
-"""The state of the estimators of N drones: arrays with a row per drone, and their columns.
+"""The state of the estimators of N drones: arrays with one row per drone, and their columns.
 
 Compiled code reads the columns as constants. A sensor's number is its index in `zsim.contract.keys.SENSORS`.
 """
@@ -14,7 +14,7 @@ from zsim.math.rotation import Matrix, Quaternion, Vector
 
 Array = np.ndarray
 IMU, GPS, MAG, BARO, SONAR, FLOW = (SENSORS.index(name) for name in ("imu", "gps", "mag", "baro", "sonar", "flow"))
-SIZES = (6, 6, 3, 1, 1, 3)  # values of a reading of each sensor
+SIZES = (6, 6, 3, 1, 1, 3)  # number of values in a reading of each sensor
 VALUES_MAX = max(SIZES)
 CHANNELS = 4  # maximum biases per sensor: two channels, each with a constant or random walk and a Gauss-Markov process
 
@@ -23,9 +23,9 @@ _MOMENT_FIELDS = (
     Field("p_WB", "m", 3),
     Field("v_WB", "m/s", 3),
     Field("q_WB", "1", 4),
-    Field("w_WB_B", "rad/s", 3),  # of the last sample of the IMU, without its bias
+    Field("w_WB_B", "rad/s", 3),  # from the last IMU sample, minus the bias
     Field("p_corrected", "m", 3),  # sum of the filter's corrections
-    Field("v_corrected", "m/s", 3),
+    Field("v_corrected", "m/s", 3),  # likewise
 )
 MOMENT = columns("Moment", _MOMENT_FIELDS)
 NOMINAL = columns(  # starts with the fields of a moment, so that one function reads both
@@ -33,21 +33,21 @@ NOMINAL = columns(  # starts with the fields of a moment, so that one function r
     (
         *_MOMENT_FIELDS,
         Field("a_WB", "m/s^2", 3),
-        Field("f_B", "m/s^2", 3),  # of the last sample of the IMU, without its bias
+        Field("f_B", "m/s^2", 3),  # from the last IMU sample, minus the bias
         Field("gyro_bias", "rad/s", 3),
         Field("accel_bias", "m/s^2", 3),
-        Field("t_start", "s"),  # start of the interval since the last gate; the next four belong to it
+        Field("t_start", "s"),  # start of the interval since the last gate, which the next four fields describe
         Field("v_start", "m/s", 3),
-        Field("dt_squared", "s^2"),  # sum of the squared steps of the IMU
-        Field("lost_velocity", "m^2/s^2"),  # variance added for missing samples
-        Field("lost_turn", "rad^2"),  # likewise
+        Field("dt_squared", "s^2"),  # sum of the squared times between IMU samples
+        Field("lost_velocity", "m^2/s^2"),  # variance added for missing samples and jolts
+        Field("lost_turn", "rad^2"),  # variance added for missing samples
         Field("t_first_gate", "s"),  # NaN before the first gate
         Field("t_sample", "s", len(SENSORS)),  # time of each sensor's last reading
         Field("refused_since", "s", len(SENSORS)),  # NaN while a sensor is trusted
     ),
 )
 
-CLONE = columns(  # a past position and velocity with errors in the error state, for late readings
+CLONE = columns(  # past position and velocity whose errors are in the error state, for late readings
     "Clone",
     (
         Field("t", "s"),  # NaN for an unused clone
@@ -55,7 +55,7 @@ CLONE = columns(  # a past position and velocity with errors in the error state,
         Field("v_corrected", "m/s", 3),
     ),
 )
-CLONED = 6  # states of a clone: position and velocity, the first states of the error state
+CLONED = 6  # number of states of a clone: copies of the first states, position and velocity
 
 SENSOR = columns(  # settings of a sensor
     "Sensor",
@@ -85,7 +85,7 @@ SETTING = columns(
         Field("levelling", "s"),
         Field("clone_every", "s"),
         Field("field_W", "uT", 3),
-        Field("floor", "m"),  # z of the surface under the start, above which the sonar measures
+        Field("floor", "m"),  # z of the surface under the start, to which the sonar measures the range
         Field("sensors", "1", len(SENSORS) * SENSOR.size),
     ),
 )
@@ -97,14 +97,14 @@ LAYOUT = columns(
     (
         Field("states", "1"),  # size of the error state, clones included
         Field("clones", "1"),
-        Field("first_clone", "1"),  # index of its first state; clones are the last states
-        Field("history", "1"),  # number of entries of the ring
-        Field("imu_displaced", "1"),
+        Field("first_clone", "1"),  # index of the first clone's first state; clones are the last states
+        Field("history", "1"),  # number of entries of the history's ring
+        Field("imu_displaced", "1"),  # whether the IMU is rotated or away from the centre of mass
         Field("accel_bias", "1"),  # whether an accelerometer bias is estimated
         Field("aiding_biases", "1"),  # whether there are biases of aiding sensors, or clones
         Field("correlated", "1"),  # whether any bias is a Gauss-Markov process
         Field("magnetometer", "1"),  # whether the magnetometer is used
-        Field("compass", "1"),  # whether one of its readings can initialise the heading
+        Field("compass", "1"),  # whether a magnetometer reading can initialise the heading
         Field("flow", "1"),  # whether optical flow is used
         Field("biases", "1", len(SENSORS) * CHANNELS * BIAS.size),
     ),
@@ -115,8 +115,8 @@ COUNT = columns(
     (
         Field("running", "1"),  # 0 or 1, like the next field
         Field("heading_known", "1"),
-        Field("kept", "1"),  # number of entries of the history in use
-        Field("newest", "1"),  # index of the newest one
+        Field("kept", "1"),  # number of history entries in use
+        Field("newest", "1"),  # index of the newest history entry
         Field("used", "1", len(SENSORS)),  # used readings by sensor
         Field("refused", "1", len(SENSORS)),
         Field("sightings_used", "1"),

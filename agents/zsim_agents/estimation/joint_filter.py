@@ -1,8 +1,9 @@
-"""The joint filter of the drones of a cluster: one covariance of all their errors, corrected by mutual sightings.
+"""The joint filter of a cluster's drones: one covariance of all their errors, corrected by mutual sightings.
 
-Each estimator of such a cluster reads the sensors of all its drones and computes the same filter; it publishes the
-estimates of its own drones. For a sighting, the owner of the hat is identified, then both drones are corrected. A
-sighting is compared with the states of both drones at the time of its picture. Errors are defined as in strapdown.
+Each estimator process of such a cluster reads the sensors of all drones in the cluster and computes the same filter,
+but publishes the estimates of its own drones only. For each sighting, the drone that wears the hat is identified; the
+sighting is compared with the states of both drones at the time of the picture, and corrects all drones. Errors are
+defined as in strapdown.
 """
 
 import math
@@ -37,14 +38,14 @@ from zsim_agents.estimation.measurement_update import correct_all
 from zsim_agents.estimation.strapdown import ATTITUDE, POSITION, VELOCITY, move_columns, recall_known
 
 SIGHTINGS_MAX = 1000  # maximum number used per gate; more are a flood
-PICTURES_KEPT = 256  # the last that were used; of 12 drones at 15 Hz, those of 1.4 s
-SIGHTING = columns(  # of one hat
+PICTURES_KEPT = 256  # number of used pictures remembered: 1.4 s of those of 12 drones at 15 Hz
+SIGHTING = columns(  # sighting of one hat
     "SightingColumns",
     (
         Field("drone", "1"),  # the observer
         Field("t_arrival", "s"),
         Field("t_sample", "s"),
-        Field("p_BK", "m", 3),  # of the camera
+        Field("p_BK", "m", 3),  # position of the camera
         Field("direction_B", "1", 3),
         Field("range", "m"),
         Field("sigma_direction", "rad"),
@@ -52,14 +53,14 @@ SIGHTING = columns(  # of one hat
     ),
 )
 NO_SIGHTINGS = np.empty((0, SIGHTING.size))
-# by which y^T S^-1 y of the second best must exceed that of the best: chosen, a likelihood ratio of 150
+# Minimum difference of y^T S^-1 y between the best and the second-best hat; design choice: a likelihood ratio of 150
 AMBIGUITY = 10.0
-# Standard deviations by which the places of two hats must differ: while the filter knows them less well, as when GPS is
-# averaged on the ground, one hat is occasionally taken for another, and stays so.
+# Standard deviations by which the positions of two hats must differ: while the filter knows them less well, as when GPS
+# is averaged on the ground, one hat is occasionally mistaken for another, and the mistake persists.
 APART = 6.0
-NEAREST_M = 0.1  # closer, a direction is undefined
+NEAREST_M = 0.1  # minimum distance of a hat; closer, its direction is undefined
 RANGE_MAX_M = 1e4  # maximum distance at which a hat is seen
-SIGMA_MIN_RAD, SIGMA_MIN_M = 1e-4, 1e-3  # lost by interpolating past states
+SIGMA_MIN_RAD, SIGMA_MIN_M = 1e-4, 1e-3  # minimum standard deviations: errors of interpolating past states
 NOBODY = -1
 
 Picture = tuple[int, str, int]  # drone, camera, time of exposure [ns]
@@ -67,10 +68,10 @@ Sighting = tuple[float, ...]  # columns SIGHTING
 
 
 class ClusterBanks:
-    """A JointBank for each cluster of some drones, an EstimatorBank for a drone of none; methods of an EstimatorBank.
+    """A JointBank per cluster and an EstimatorBank per drone in no cluster, with the methods of one EstimatorBank.
 
     Attributes:
-        drones: drones whose sensors are needed, in the order of indices of `receive`.
+        drones: drones whose sensors are needed; `receive` takes indices into it.
     """
 
     def __init__(self, scenario: Scenario, drones: Sequence[str], gate_s: float) -> None:
@@ -91,7 +92,7 @@ class ClusterBanks:
 
     def receive_gate(self, gate: GateMessages) -> bool:
         if len(self._banks) > 1:
-            return False  # one bank might accept the gate and another not
+            return False  # one bank might accept the gate and another refuse it
         return self._banks[0].receive_gate(gate)
 
     def estimate(self, t_s: float) -> list[StateEstimate]:
@@ -113,7 +114,7 @@ class ClusterBanks:
 
 
 class JointBank(EstimatorBank):
-    """Fuses the sensors and the sightings of the drones of a cluster; arguments as for EstimatorBank."""
+    """Fuses the sensor readings and sightings of a cluster's drones; arguments as for EstimatorBank."""
 
     counted = (
         *EstimatorBank.counted,
@@ -135,8 +136,8 @@ class JointBank(EstimatorBank):
         self._cameras = [{n: camera_pose(c).p_BK.tolist() for n, c in d.sensors.cameras().items()} for d in drones]
         self._drones = {keys.sensor(drone.name, keys.SIGHTINGS): i for i, drone in enumerate(drones)}
         self._places = PerPattern(self._sighting_places)
-        self._sighted: dict[Picture, tuple[str, list[Sighting]]] = {}  # of this gate, with the detector
-        self._hats = 0  # of this gate, replaced pictures included
+        self._sighted: dict[Picture, tuple[str, list[Sighting]]] = {}  # this gate's, with the name of the detector
+        self._hats = 0  # number of hats in this gate, including those of replaced sightings
         self._pictures_used: dict[Picture, None] = {}
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
@@ -149,8 +150,8 @@ class JointBank(EstimatorBank):
         p_BK = self._cameras[i].get(message.camera)
         if p_BK is None or not message.seen:
             return
-        # Two detectors that look at one picture have the same errors. Of two at one gate the first by name counts,
-        # whichever came first: other estimators of the cluster do the same.
+        # Two detectors that search the same picture make the same errors, so only one is used. In one gate it is the
+        # first by name, whichever arrived first, so that all estimators of the cluster use the same one.
         picture = (i, message.camera, message.t_sample_ns)
         other = self._sighted.get(picture)
         if picture in self._pictures_used or (other is not None and other[0] <= message.source):
@@ -175,7 +176,7 @@ class JointBank(EstimatorBank):
         return True
 
     def _sighting_places(self, gate: GateMessages) -> list[tuple[int, int, str]]:
-        """Return index in the gate, drone and key of the messages that are sightings."""
+        """Return the index in the gate, the drone and the key of each message that contains sightings."""
         by_message = ((m, gate.table[which]) for m, which in enumerate(gate.which.tolist()))
         return [(m, self._drones[key], key) for m, key in by_message if key in self._drones]
 
@@ -205,13 +206,13 @@ class JointBank(EstimatorBank):
 
 @portable
 def step_jointly(rows: Rows, t_s: float, readings: Array, sightings: Array, hat_B: Vector, estimates: Array) -> None:
-    """Use the readings and sightings of a gate of all drones and write their estimates for `t_s`.
+    """Use all drones' readings and sightings of a gate, and write the estimates at `t_s` [s].
 
     Args:
-        readings: (M, READING.size), in order of arrival for each drone.
-        sightings: (M, SIGHTING.size), those of one picture adjacent.
-        hat_B: centre of a hat in the body of its drone [m].
-        estimates: (N, ESTIMATE.size), written.
+        readings: (M, READING.size); those of each drone are in order of arrival.
+        sightings: (M, SIGHTING.size); those from the same picture are adjacent.
+        hat_B: centre of a hat in the body frame of its drone [m].
+        estimates: filled by this function, (N, ESTIMATE.size).
     """
     count, n = rows.covariance.shape[:2]
     first, after = np.full(count, -1), np.full(readings.shape[0], -1)
@@ -246,7 +247,7 @@ def _grow(rows: Rows, i: int, t_s: float) -> None:
 
 @portable
 def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
-    """Use the sightings of a gate one after the other; those that match no hat are counted as refused."""
+    """Use the sightings of a gate one by one; count those that match no hat as refused."""
     taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
     HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
     for m in range(sightings.shape[0]):
@@ -265,7 +266,7 @@ def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
 
 @portable
 def is_possible(rows: Rows, sighting: Array) -> bool:
-    """Return whether time and values of a sighting are plausible."""
+    """Return whether a sighting's time and values are plausible, and its observer's heading is known."""
     i = int(sighting[SIGHTING.drone])
     age_s = sighting[SIGHTING.t_arrival] - sighting[SIGHTING.t_sample]
     good = 0.0 <= age_s <= rows.setting[i, SETTING.age_max] and rows.counts[i, COUNT.heading_known] != 0
@@ -276,9 +277,10 @@ def is_possible(rows: Rows, sighting: Array) -> bool:
 
 @portable
 def owner(rows: Rows, sighting: Array, hat_B: Vector, taken: Array, HJ: Array, S: Array, y: Array) -> int:
-    """Return the drone whose hat was seen; NOBODY if none fits, two fit, or two are not distinguishable.
+    """Return the drone whose hat was seen; NOBODY if no hat fits, or another one could have been seen.
 
-    HJ, S and the innovation y, (3,), are those of the returned hat; `taken` marks hats already seen in the picture.
+    HJ, S and the innovation y, (3,), are filled for the returned drone; `taken` marks drones whose hats have already
+    been seen in the picture.
     """
     count, i = rows.nominal.shape[0], int(sighting[SIGHTING.drone])
     places, seen = np.zeros((count, 3)), place_of(sighting)
@@ -314,9 +316,9 @@ def owner(rows: Rows, sighting: Array, hat_B: Vector, taken: Array, HJ: Array, S
 def predict_sighting(
     rows: Rows, sighting: Array, j: int, hat_B: Vector, HJ: Array, S: Array
 ) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
-    """Return the expected position of the hat of drone j, and axes along and across the line of sight.
+    """Return the expected position of drone j's hat from the camera, and axes along and across the line of sight.
 
-    Writes H J, (3, D), and the covariance S of the innovation, (3, 3), along these axes.
+    Fill HJ with H J, (3, D), and S with the covariance of the innovation, (3, 3), both along these axes.
     """
     i, n = int(sighting[SIGHTING.drone]), rows.covariance.shape[1]
     t_s = sighting[SIGHTING.t_sample]
@@ -357,9 +359,9 @@ def write_rows(
     axes: tuple[Vector, Vector, Vector],
     lags: tuple[float, float],
 ) -> None:
-    """Write the Jacobians of a sighting along three axes of the observer's body, (3, n), which come in as zero.
+    """Write the Jacobians, (3, n), of a sighting along three axes, given in the observer's body frame.
 
-    H_i is by the errors of the observer, H_j by those of the observed drone.
+    H_i is with respect to the errors of the observer, H_j to those of the observed drone; both are zero on entry.
     """
     R_a, hat_W = matrix(a[3]), product(matrix(b[3]), hat_B)
     away = subtract(add(b[1], hat_W), a[1])
@@ -377,7 +379,7 @@ def write_rows(
 
 @portable
 def across(d: Vector) -> tuple[Vector, Vector, Vector]:
-    """Return a unit vector and two perpendicular to it."""
+    """Return a unit vector, and two more that are perpendicular to it and to each other."""
     side = (0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)
     e = cross(d, side)
     e = scaled(e, 1.0 / norm(e))
@@ -386,7 +388,7 @@ def across(d: Vector) -> tuple[Vector, Vector, Vector]:
 
 @portable
 def innovation(axes: tuple[Vector, Vector, Vector], seen: Vector, r: Vector) -> Array:
-    """Return the measured minus the expected position, along and across, (3,) [m]."""
+    """Return the measured minus the expected position of a hat, along and across the line of sight, (3,) [m]."""
     miss = subtract(seen, r)
     return np.array([dot(axes[0], miss), dot(axes[1], miss), dot(axes[2], miss)])
 

@@ -1,8 +1,8 @@
 """Linear algebra of the filter: prediction of a covariance, innovation gates, and updates with stacked measurements.
 
-All functions are compiled. The prediction and the update follow filterpy's ExtendedKalmanFilter (Joseph form), with
-which the tests compare them. A joint covariance J is (D, D) with D = N n, for the error states of N drones one after
-another, n each (filter_setup).
+All functions are compiled. Prediction and update follow filterpy's ExtendedKalmanFilter (Joseph form), against which
+tests compare them. A joint covariance J, (D, D) with D = N n, contains the error states of N drones one after another,
+n states each (see filter_setup).
 """
 
 import math
@@ -14,20 +14,20 @@ from zsim.math.linear import product_with
 
 Array = np.ndarray
 DOF_MAX = 6  # rows of the largest block, a GPS fix with position and velocity
-JOSEPH_MAX = 24  # maximum number of states for the Joseph form: with more (clones), its n^3 products would dominate
+JOSEPH_MAX = 24  # maximum states for the Joseph form: with more (clones), its n^3 products would dominate the run time
 
 
 @portable
 def stacked_update(
     P: Array, H: Array, variance: Array, y: Array, blocks: Array, limits: Array, distances: Array
 ) -> tuple[bool, Array, Array, Array]:
-    """Test the innovations y (m,) of a stack and, if all are within their gates, use them; P (n, n) is not changed.
+    """Test the innovations y (m,) of a stack and, if all are within their gates, use them; P (n, n) is not modified.
 
     H is the Jacobian, (m, n), and `variance` the white-noise variance of each row, (m,); for the other arguments see
     `within_gates`.
 
     Returns:
-        Whether the innovations were used, the correction K y of the state, (n,), the new covariance, and S, (m, m).
+        Whether the innovations were used; the correction K y of the state, (n,); the new covariance; and S, (m, m).
     """
     PHt = np.zeros((P.shape[0], H.shape[0]))
     S = innovation_covariance(P, H, variance, PHt)
@@ -43,16 +43,16 @@ def stacked_update(
 
 @portable
 def within_gates(S: Array, y: Array, blocks: Array, limits: Array, distances: Array) -> bool:
-    """Write y^T S^-1 y of each block of innovations on its own; return whether all are within their limits.
+    """Compute y^T S^-1 y separately for each block of innovations; return whether all are within their limits.
 
-    It is computed with the Cholesky factor of the block's covariance, and is infinite if that is not positive definite
-    or an innovation is NaN.
+    The Cholesky factor of the block's covariance is used; the result is infinite if that covariance is not positive
+    definite, or an innovation is NaN.
 
     Args:
         S, y: covariance (m, m) of all innovations, and the innovations (m,).
         blocks: first row and number of rows of each block, (k, 2).
-        limits: limit by number of rows, (DOF_MAX + 1,).
-        distances: receives the result, (k,) or longer.
+        limits: limit of the result by number of rows, (DOF_MAX + 1,).
+        distances: filled by this function with the results, (k,) or longer.
     """
     L = np.zeros((DOF_MAX, DOF_MAX))
     u = np.zeros(DOF_MAX)
@@ -132,7 +132,7 @@ def predict_jointly(J: Array, i: int, F: Array, Q: Array) -> None:
 
 @portable
 def innovation_covariance(P: Array, H: Array, variance: Array, PHt: Array) -> Array:
-    """Return S = H P H^T + R, (m, m), and write P H^T, (n, m); R is diagonal with `variance`, (m,)."""
+    """Return S = H P H^T + R, (m, m), and write P H^T, (n, m); R is diagonal, with the elements of `variance`, (m,)."""
     m, n = H.shape
     S = np.zeros((m, m))
     PHt[:, :] = 0.0
@@ -154,7 +154,7 @@ def innovation_covariance(P: Array, H: Array, variance: Array, PHt: Array) -> Ar
 
 @portable
 def gain(S: Array, PHt: Array) -> Array:
-    """Return K = P H^T S^-1, (n, m), by the Cholesky factor of S."""
+    """Return K = P H^T S^-1, (n, m), computed with the Cholesky factor of S."""
     n, m = PHt.shape
     L = cholesky(S)
     K = PHt.copy()
@@ -172,7 +172,7 @@ def gain(S: Array, PHt: Array) -> Array:
 
 @portable
 def cholesky(S: Array) -> Array:
-    """Return the lower triangular L of S = L L^T, (m, m)."""
+    """Return the lower triangular matrix L, (m, m), with L L^T = S."""
     m = S.shape[0]
     L = np.zeros((m, m))
     for i in range(m):
@@ -206,7 +206,7 @@ def joseph(P: Array, H: Array, variance: Array, K: Array) -> Array:
 
 @portable
 def downdated(P: Array, PHt: Array, K: Array) -> Array:
-    """Return P - K H P, (n, n), symmetric, for P H^T and the gain K = P H^T S^-1, (n, m)."""
+    """Return P - K H P, (n, n), exactly symmetric, from P H^T and the gain K = P H^T S^-1, (n, m) each."""
     n, m = K.shape
     updated = P.copy()
     for i in range(n):
@@ -255,7 +255,10 @@ def add_innovation_covariance(HJ: Array, H: Array, first: int, S: Array) -> None
 
 @portable
 def whiten(S: Array, HJ: Array, y: Array) -> None:
-    """Replace HJ by W = L^-1 HJ and y by u = L^-1 y, with S = L L^T, so that J^+ = J - W^T W and x = W^T u."""
+    """Replace HJ by W = L^-1 HJ and y by u = L^-1 y, with S = L L^T.
+
+    The updated covariance is then J - W^T W, and the correction of the errors W^T u.
+    """
     L = cholesky(S)
     for i in range(L.shape[0]):
         for k in range(i):

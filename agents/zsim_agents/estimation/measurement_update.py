@@ -1,12 +1,12 @@
-"""The aiding readings of a drone in a gate: accepted on arrival, compared with dead reckoning, used in one update.
+"""The aiding readings of a drone in a gate: checked on arrival, compared with dead reckoning, used in one update.
 
-A reading is compared with the state at its own instant and tested by an innovation gate; accepted readings correct the
-nominal state, the biases and the covariance.
+A reading is compared with the state at the time of its sample and tested by an innovation gate; readings that pass
+correct the nominal state, the biases and the covariance.
 
-A measurement model takes the state at the instant of the sample (p, v in the world, R_WB, w_WB_B), writes its rows of
-the Jacobian H, which come in as zero, and returns the predicted reading. `lag` is the age of the sample [s]: to first
-order an error of the past position is the present one less lag times that of the velocity. The body rate's own error
-times a lever arm is left out: below 1 mm/s.
+A measurement model takes the state at the time of the sample (p, v in the world, R_WB, w_WB_B), writes its rows of the
+Jacobian H, which are zero on entry, and returns the predicted reading. `lag` is the age of the sample [s]: to first
+order, the error of the past position is that of the present position minus lag times that of the velocity. The effect
+of the body rate's error over a lever arm is neglected: it is below 1 mm/s.
 """
 
 import math
@@ -62,15 +62,15 @@ from zsim_agents.estimation.strapdown import (
 )
 
 ROWS_MAX = 32  # maximum rows of a stacked update; further measurements of a gate go into a second one
-YAW = ATTITUDE + 2  # indices in the error state
-VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would cost all others precision
-SQUARE_MAX = 1e8  # maximum innovation, in its unit; more would cost the covariance precision
-HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which sets the heading
-SET_DOWN_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye, where there is no magnetometer
-MOVES_SIGMAS = 2.0  # of the velocity's sigma, chosen: the estimate of a drone at rest exceeds it in 2 % of the samples
-DENIED_S = 2.0  # s since two drones saw each other, chosen: errors grow little meanwhile
-HEADING_WAIT_S = 1.0  # s without a reading of the magnetometer, after which the scenario's heading is used
-COSINE_MIN = 0.1  # minimum cosine of the sonar's ray to the vertical; beyond 84 deg it misses the ground below
+YAW = ATTITUDE + 2  # index in the error state
+VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would impair the precision of all other states
+SQUARE_MAX = 1e8  # maximum squared innovation, in squared units; more would impair the covariance's precision
+HEADING_SIGMA_RAD = 0.5  # rad: before the first magnetometer reading, which sets the heading
+SET_DOWN_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye, used without a magnetometer
+MOVES_SIGMAS = 2.0  # of the velocity; design choice: the estimate of a drone at rest exceeds it in 2 % of samples
+DENIED_S = 2.0  # s since the last sighting between two drones; design choice: errors grow little meanwhile
+HEADING_WAIT_S = 1.0  # s without a magnetometer reading, after which the scenario's heading is used
+COSINE_MIN = 0.1  # minimum cosine between the sonar's ray and the vertical; beyond 84 deg it misses the ground below
 
 
 @inlined
@@ -105,7 +105,7 @@ def accept(rows: Rows, i: int, reading: Array) -> bool:
 
 @inlined
 def start_heading(rows: Rows, i: int, P: Array, t_s: float, readings: Array, first: int, after: Array) -> None:
-    """Initialise the heading by the magnetometer, or else by the heading in the scenario."""
+    """Initialise the heading from the magnetometer, or else from the scenario."""
     row, counts, setting = rows.nominal[i], rows.counts[i], rows.setting[i]
     if math.isnan(row[NOMINAL.t_first_gate]):
         row[NOMINAL.t_first_gate] = t_s
@@ -116,7 +116,7 @@ def start_heading(rows: Rows, i: int, P: Array, t_s: float, readings: Array, fir
             seen = product(matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values)))
             field = vector(setting, SETTING.field_W)
             angle = el.atan2(field[1], field[0]) - el.atan2(seen[1], seen[0])
-            _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its variance follows from the update
+            _turn_heading(row, counts, setting[SETTING.gravity], angle)  # the update gives the heading's variance
             return
         at = after[at]
     if not rows.layout[i, LAYOUT.compass] or t_s - row[NOMINAL.t_first_gate] > HEADING_WAIT_S:
@@ -134,7 +134,7 @@ def _turn_heading(row: Array, counts: Array, gravity: float, angle: float) -> No
 
 @inlined
 def set_variance(P: Array, k: int, variance: float) -> None:
-    """Set the variance of a state, and remove its correlations."""
+    """Set the variance of state `k`, and remove the state's correlations."""
     for j in range(P.shape[0]):
         P[k, j] = P[j, k] = 0.0
     P[k, k] = variance
@@ -142,13 +142,13 @@ def set_variance(P: Array, k: int, variance: float) -> None:
 
 @portable
 def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array) -> Array:
-    """Test and use a gate's readings, in one stacked update unless there are very many; return the covariance.
+    """Test and use a drone's readings of a gate, in one stacked update unless very many; return the covariance.
 
     Args:
         P: covariance of drone i, (n, n).
-        readings: of the gate, (M, READING.size).
-        first: the drone's first among them; -1 for none.
-        after: for each reading, the next one of the same drone, (M,); -1 after the last.
+        readings: readings of all drones in the gate, (M, READING.size).
+        first: index of the drone's first aiding reading; -1 for none.
+        after: index of the same drone's next aiding reading, for each reading, (M,); -1 after the last.
     """
     row, counts, setting, n = rows.nominal[i], rows.counts[i], rows.setting[i], P.shape[0]
     H, z, expected, variance = np.zeros((ROWS_MAX, n)), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX)
@@ -192,7 +192,7 @@ def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array
 def stack(
     rows: Rows, i: int, reading: Array, H: Array, z: Array, expected: Array, at: int, known: tuple[Moment, float, int]
 ) -> None:
-    """Add a reading to a stack of measurements from row `at` on; `known` is what `strapdown.recall_known` returned."""
+    """Add a reading to a stack of measurements from row `at` on; `known` is the result of `strapdown.recall_known`."""
     kind, setting = int(reading[READING.sensor]), rows.setting[i]
     past, lag, state = known
     predict(H, at, kind, setting, past, lag, expected)
@@ -204,7 +204,7 @@ def stack(
 
 @inlined
 def predict(H: Array, at: int, kind: int, setting: Array, past: Moment, lag: float, out: Array) -> None:
-    """Write the expected reading of a sensor into out[at:], and its rows of H."""
+    """Write the expected reading of a sensor into out[at:], and its Jacobian into H[at:]."""
     aid = SETTING.sensors + kind * SENSOR.size
     _, p, v, q, w, _, _ = past
     R, arm = matrix(q), vector(setting, aid + SENSOR.p_BS)
@@ -235,7 +235,7 @@ def with_biases(rows: Rows, i: int, kind: int, H: Array, at: int, out: Array) ->
 
 @inlined
 def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
-    """Limit the effect of flow on the heading, in rows from `at` on, to the certain part of the motion.
+    """Limit the effect of flow on the heading, in two rows from `at` on, to the part of the motion that is certain.
 
     A heading error rotates the velocity. At rest the velocity error would thereby yield spurious heading information
     (G. P. Huang, A. I. Mourikis, S. I. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
@@ -251,7 +251,7 @@ def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
 
 @inlined
 def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> None:
-    """Write the variances of a reading's rows; a larger variance stated by a GPS receiver is used instead."""
+    """Write the variances of a reading's rows: those of the scenario, or a larger one that a GPS receiver states."""
     kind = int(reading[READING.sensor])
     known = SETTING.sensors + kind * SENSOR.size
     for k in range(SIZES[kind]):
@@ -264,7 +264,7 @@ def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> 
 
 @inlined
 def is_denied(rows: Rows, i: int, kind: int) -> bool:
-    """Return whether a drone seen by or seeing this one trusts its own sensor of a kind: then this sensor is wrong."""
+    """Return whether a drone that lately saw drone i, or was seen by it, trusts its own sensor: drone i's is wrong."""
     for j in range(rows.sighted.shape[0]):
         last_s = max(rows.sighted[i, j], rows.sighted[j, i])
         trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
@@ -297,9 +297,9 @@ def inflate(rows: Rows, i: int, P: Array, kind: int, z: Array, expected: Array, 
 
 @inlined
 def widen(P: Array, k: int, variance: float, layout: Array) -> None:
-    """Add a variance to a state of position or velocity, and to its clones: all have the same error."""
+    """Add a variance to a state of position or velocity, and to its clones, as an error that all of them share."""
     first = layout[LAYOUT.first_clone] + k
-    end = first + CLONED * layout[LAYOUT.clones]  # beyond are the places of larger error states
+    end = first + CLONED * layout[LAYOUT.clones]  # further states belong to drones with larger error states
     P[k, k] += variance
     for a in range(first, end, CLONED):
         P[a, k] += variance
@@ -312,9 +312,10 @@ def widen(P: Array, k: int, variance: float, layout: Array) -> None:
 def correct(
     rows: Rows, i: int, P: Array, H: Array, z: Array, expected: Array, variance: Array, blocks: Array, kinds: Array
 ) -> Array:
-    """Use a stack of measurements, (m,) each, with blocks (b, 2); return the covariance.
+    """Use a stack of measurements, (m,) each, in blocks, (b, 2); return the covariance.
 
-    All are tested together; if that fails, those outside of their own gates are omitted.
+    Measurements are used together if all blocks are within their innovation gates; otherwise, those outside are left
+    out.
     """
     y, distances = z - expected, np.zeros(ROWS_MAX)
     if rows.joint.shape[0]:
@@ -335,7 +336,7 @@ def correct(
 def _correct_jointly(
     rows: Rows, i: int, P: Array, H: Array, y: Array, variance: Array, blocks: Array, kinds: Array
 ) -> Array:
-    """Like `correct`, with the joint covariance of all drones, whose states are corrected."""
+    """Do the work of `correct` with the joint covariance, which corrects the states of all drones."""
     distances = np.zeros(ROWS_MAX)
     put_block(rows.joint, i, P)  # it may have been inflated
     used = use_own(rows, i, H, variance, y, blocks, distances)
@@ -347,9 +348,10 @@ def _correct_jointly(
 
 @portable
 def use_own(rows: Rows, i: int, H: Array, variance: Array, y: Array, blocks: Array, distances: Array) -> bool:
-    """Judge measurements of a drone's own sensors together and, if all are within their gates, use them.
+    """Test measurements of a drone's own sensors and, if all are within their gates, use them; return whether they are.
 
-    H is by its own errors, (m, n); blocks, distances: see `kalman_update.within_gates`. `rows.joint` is changed.
+    H is the Jacobian with respect to the drone's own errors, (m, n); for `blocks` and `distances` see
+    `kalman_update.within_gates`. `rows` is modified in place.
     """
     first, HJ = i * H.shape[1], np.zeros((H.shape[0], rows.joint.shape[0]))
     add_projection(rows.joint, H, first, HJ)
@@ -363,7 +365,7 @@ def use_own(rows: Rows, i: int, H: Array, variance: Array, y: Array, blocks: Arr
 
 @portable
 def correct_all(rows: Rows, HJ: Array, S: Array, y: Array) -> None:
-    """Correct all drones and the joint covariance by innovations y (m,) of covariance S; HJ = H J, overwritten as y."""
+    """Correct all drones and the joint covariance by innovations y, (m,), of covariance S; overwrite y and HJ = H J."""
     whiten(S, HJ, y)
     J, x = rows.joint, np.zeros(HJ.shape[1])
     for k in range(y.shape[0]):
@@ -386,7 +388,7 @@ def correct_all(rows: Rows, HJ: Array, S: Array, y: Array) -> None:
 
 @portable
 def keep(rows: Rows, i: int, used: bool, distances: Array, blocks: Array, kinds: Array) -> Array:
-    """Count the outcome of each block; return the rows (m,) to use: all, or those inside their own gates."""
+    """Count the outcome of each block; return the indices of the rows to use: all, or those within their gates."""
     kept, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
     for b in range(blocks.shape[0]):
         first, size = blocks[b, 0], blocks[b, 1]
@@ -415,7 +417,7 @@ SIX = tuple[float, float, float, float, float, float]
 
 @inlined
 def write_gps(H: Array, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SIX:
-    """Antenna at p_BS = `arm`: position p + R r [m], velocity v + R (w x r) [m/s]; six rows from `i`."""
+    """Predict a GPS fix, p + R r [m] and v + R (w x r) [m/s], of an antenna at r = `arm` in B; write six rows of H."""
     offset = product(R, arm)
     swing = product(R, cross(w, arm))
     for k in range(3):
@@ -429,7 +431,7 @@ def write_gps(H: Array, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm:
 
 @inlined
 def write_mag(H: Array, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -> Vector:
-    """Magnetometer turned by R_BS in a known field: (R R_BS)^T m [uT]; three rows from `i`."""
+    """Predict the reading (R R_BS)^T m [uT] of a magnetometer in the field m = `field_W`; write three rows of H."""
     R_WS = composed(R, R_BS)
     for k in range(3):
         row = cross(column(R_WS, k), field_W)
@@ -441,7 +443,7 @@ def write_mag(H: Array, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -> Vec
 
 @inlined
 def write_baro(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) -> float:
-    """Barometer at p_BS = `arm`: its height [m]; one row."""
+    """Predict the height [m] of a barometer at `arm` in B; write one row of H."""
     offset = product(R, arm)
     H[i, POSITION + 2] = 1.0
     H[i, VELOCITY + 2] = -lag
@@ -452,9 +454,9 @@ def write_baro(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) 
 
 @inlined
 def write_sonar(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, floor: float, lag: float) -> float:
-    """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = `floor`: height / cosine [m]; one row.
+    """Predict the range [m], height / cosine, of a sonar at `arm` in B to the ground z_W = `floor`; write one row of H.
 
-    Returns 0 with an empty row if the sonar does not look down.
+    The sonar looks along `down_B`; if this does not point down, return 0 and leave the row empty.
     """
     offset = product(R, arm)
     ray = product(R, down_B)
@@ -472,7 +474,10 @@ def write_sonar(H: Array, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vec
 
 @inlined
 def write_flow(H: Array, i: int, v: Vector, R: Matrix, w: Vector, arm: Vector) -> Vector:
-    """Velocity of the camera at p_BS = `arm` in the heading frame, Rz(yaw)^T (v + R (w x r)); three rows."""
+    """Predict the flow camera's velocity [m/s; heading frame], Rz(yaw)^T (v + R (w x r)); write three rows of H.
+
+    The camera is at r = `arm` in B.
+    """
     swing = product(R, cross(w, arm))
     x, y, _ = column(R, 0)
     length = math.sqrt(max(x * x + y * y, HORIZONTAL_MIN))

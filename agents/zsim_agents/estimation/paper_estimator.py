@@ -36,7 +36,7 @@ IMU_GAP_MAX_S = 0.1  # after a gap of this length or longer, only one IMU period
 
 
 class PaperEstimator:
-    """Estimates one drone; see `zsim_agents.estimation.drone_estimator.DroneEstimator`."""
+    """Estimates the state of one drone; see `zsim_agents.estimation.drone_estimator.DroneEstimator`."""
 
     def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
         gyro, flow = drone.sensors.imu.gyro_deg_s, drone.sensors.flow
@@ -73,7 +73,7 @@ class PaperEstimator:
         dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
         self._t_s = t_s
         yaw = float(frames.heading(self._q))
-        position = self._velocity_variance() * self._flow_period_s * dt  # a velocity error lasts one flow sensor period
+        position = self._velocity_variance() * self._flow_period_s * dt  # a velocity error lasts one period of the flow
         drift = (el.square(self._gyro_sigma) * self._imu_period_s + el.square(self._gyro_bias) * DRIFT_S) * dt
         noise = np.diag([position, position, position, drift])
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, noise, dt)
@@ -140,9 +140,9 @@ class DeadReckoningFilter:
         self.P = np.diag([el.square(POSITION_SIGMA_M)] * 3 + [el.square(YAW_SIGMA_RAD)])
 
     def reckon(self, u: Vector, yaw: float, Q: NDArray[np.float64], dt: float) -> None:
-        """Move for `dt` [s] with the velocity u [m/s; heading frame], to a heading [rad] that Madgwick's filter gives.
+        """Predict over `dt` [s] with the velocity u [m/s; heading frame] and the new heading `yaw` [rad].
 
-        Q is the covariance of the process noise, (4, 4).
+        Madgwick's filter gives `yaw`; Q is the covariance of the process noise, (4, 4).
         """
         step = linear.product(rotation_z(yaw), u) * dt
         self.x = np.append(self.x[:3] + step, yaw)

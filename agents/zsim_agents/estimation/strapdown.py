@@ -1,17 +1,17 @@
-"""The nominal state of a drone: propagated by every IMU sample, corrected by the filter, with a history.
+"""The nominal state of a drone: propagated by every IMU sample, corrected by the filter, and kept in a history.
 
-A late reading measures a state without the process noise since then. If that matters, the error state has clones of
-position and velocity: the reading is compared with the clone nearest to its instant, whose correlations correct the
-present state. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
+A late reading measures a past state, free of the process noise since then. Where that matters, the error state contains
+clones of past positions and velocities: the reading is compared with the clone nearest in time, whose correlations
+correct the present state. S. I. Roumeliotis, J. W. Burdick, "Stochastic cloning: a generalized framework for processing
 relative state measurements", IEEE International Conference on Robotics and Automation, 2002.
 
-Dead reckoning, from `reckon` on: Madgwick's attitude filter, strapdown integration, and the growth of small errors.
-S. O. H. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays", University of
-Bristol, 2010: quaternion rate (12), objective of gravity (25), its Jacobian (26), fusion (33). Quaternions are
-Hamilton, w first, body to world; the world is z up, so a body at rest feels +g along world z.
+The functions from `reckon` on are dead reckoning: Madgwick's attitude filter, strapdown integration, and the growth of
+small errors. S. O. H. Madgwick, "An efficient orientation filter for inertial and inertial/magnetic sensor arrays",
+University of Bristol, 2010: quaternion rate (12), objective function of gravity (25), its Jacobian (26), fusion (33).
+Quaternions are Hamilton, w first, body to world; the world's z axis points up, so a body at rest feels +g along it.
 
-Errors are additive for position and velocity; the attitude's is a small rotation in the world frame,
-R_true = (I + [theta_W]x) R_WB, so that a past attitude has the error of the present one.
+Errors of position and velocity are additive; the attitude error is a small rotation in the world frame,
+R_true = (I + [theta_W]x) R_WB, so that a past attitude has the same error as the present one.
 J. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017, section 7 (globally defined errors).
 """
 
@@ -68,11 +68,11 @@ from zsim_agents.estimation.kalman_update import predict_jointly, predicted_cova
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # first index of each error in the error state
 HORIZONTAL_MIN = 1e-6  # minimum squared horizontal part of a unit vector; closer to the zenith, a heading is undefined
-# Mean of a unit vector in the plane along a small offset e under noise s per axis: slope * e/s.
+# A planar unit vector along a small offset e, with noise s per axis added to e, has the mean slope * e/s.
 UNIT_VECTOR_SLOPE = math.sqrt(math.pi / 8)
 ZERO: Vector = (0.0, 0.0, 0.0)
 ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads more
-GYRO_MAX_RAD_S = 100.0  # rad/s, 5700 deg/s: likewise
+GYRO_MAX_RAD_S = 100.0  # rad/s, 5700 deg/s: likewise for gyroscopes
 MANOEUVRE_M_S2 = 0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
 MANOEUVRE_S = 0.5  # s, its correlation time
 LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate during a missing gyroscope sample
@@ -84,7 +84,7 @@ COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
     """Propagate to the time of an IMU sample; ignore a duplicate, refuse and count a late or impossible sample.
 
-    `accel` is the specific force [m/s^2], `gyro` the body rate [rad/s], both in S.
+    `accel` is the specific force [m/s^2], `gyro` the body rate [rad/s], both in the sensor frame S.
     """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
     if not possible(accel, gyro):
@@ -108,7 +108,7 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
     before, after = state[5], moved[5]
     jolt = abs(after[0] - before[0]) + abs(after[1] - before[1]) + abs(after[2] - before[2])
     if jolt > setting[SETTING.jolt]:
-        hidden = 0.5 * jolt * dt  # error of a step anywhere between two samples
+        hidden = 0.5 * jolt * dt  # maximum velocity error if the acceleration steps at any time between two samples
         row[NOMINAL.lost_velocity] += hidden * hidden
     row[NOMINAL.t] = t_s
     row[NOMINAL.dt_squared] += dt * dt
@@ -177,7 +177,7 @@ def grow(rows: Rows, i: int, P: Array) -> Array:
         F, Q = np.eye(n), np.zeros((n, n))
         write_growth(rows, i, F, Q)
         if n < P.shape[0]:
-            predict_jointly(P, 0, F, Q)  # the clones, which do not change, are the other errors
+            predict_jointly(P, 0, F, Q)  # the clones, which do not change, take the place of other drones' errors
         else:
             P = predicted_covariance(P, F, Q)
     begin_interval(row, row[NOMINAL.t])
@@ -186,7 +186,7 @@ def grow(rows: Rows, i: int, P: Array) -> Array:
 
 @inlined
 def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
-    """Write the growth of the errors over the interval that ends now: transition into F, which is I, and noise into Q.
+    """Write the growth of the errors over the interval that ends now: transition into F, I on entry, and noise into Q.
 
     Biases that are Gauss-Markov processes decay.
     """
@@ -210,7 +210,7 @@ def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
         for k in range(F.shape[0]):
             x = 0.5 * dt * rows.decay[i, k]
             if x > 0.0:
-                F[k, k] = max(1.0 - x, 0.0) / (1.0 + x)  # exp(-2 x) to x^3, without libm
+                F[k, k] = max(1.0 - x, 0.0) / (1.0 + x)  # exp(-2 x) up to errors of order x^3, without libm
                 rows.bias[i, k] *= F[k, k]
                 Q[k, k] = 0.5 * rows.walk[i, k] / rows.decay[i, k] * (1.0 - F[k, k] * F[k, k])
 
@@ -230,7 +230,7 @@ def correct(row: Array, layout: Array, gravity: float, error: Array) -> None:
 
 @inlined
 def turn_heading(row: Array, gravity: float, angle: float) -> None:
-    """Turn the attitude about the world's z axis."""
+    """Turn the attitude about the world's z axis by an angle [rad]."""
     q = multiply(about_z(angle), quaternion(row, NOMINAL.q_WB))
     put_quaternion(row, NOMINAL.q_WB, q)
     put(row, NOMINAL.a_WB, acceleration(q, vector(row, NOMINAL.f_B), gravity))
@@ -241,16 +241,16 @@ def turn_heading(row: Array, gravity: float, angle: float) -> None:
 def clone(rows: Rows, i: int, J: Array, first: int) -> None:
     """Replace the oldest clone by the present position and velocity, if one is due.
 
-    J is the covariance of the drone's errors, or of all drones' together, in which `first` is its first state.
+    J is the covariance of the drone's errors or of all drones' errors; `first` is the index of the drone's first state.
     """
     row, layout = rows.nominal[i], rows.layout[i]
     if not layout[LAYOUT.clones] or not rows.counts[i, COUNT.heading_known]:
         return
     every_s = rows.setting[i, SETTING.clone_every]
-    count = math.floor(row[NOMINAL.t] / every_s + 1e-6)  # from t = 0 on, as samples are
+    count = math.floor(row[NOMINAL.t] / every_s + 1e-6)  # clones are due at multiples of every_s, as samples are
     slot = count % layout[LAYOUT.clones]
     former = rows.clones[i, slot]
-    if former[CLONE.t] / every_s + 1e-6 >= count:  # also false where there is none
+    if former[CLONE.t] / every_s + 1e-6 >= count:  # also false for an unused clone, whose time is NaN
         return
     former[CLONE.t] = row[NOMINAL.t]
     put(former, CLONE.p_corrected, vector(row, NOMINAL.p_corrected))
@@ -274,17 +274,17 @@ def remember(counts: Array, history: Array, longest: int, now: Moment) -> None:
 
 @inlined
 def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, float, int]:
-    """Return the state at `t_s` as known now, and the errors that it has.
+    """Return the state at `t_s` as known now, and the errors that it shares.
 
     Returns:
-        the state; how much earlier it is than the position and velocity whose errors it has [s]; the place of these in
-        the error state: 0 for the present ones, else those of a clone.
+        The state; how much earlier it is than the position and velocity whose errors it shares [s]; the index of these
+        in the error state: 0 for the present position and velocity, otherwise those of a clone.
     """
     past = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, now)
     nearest, slot = abs(now[0] - t_s), -1
     for k in range(rows.layout[i, LAYOUT.clones]):
         away = abs(rows.clones[i, k, CLONE.t] - t_s)
-        if away < nearest:  # false where there is none
+        if away < nearest:  # false for an unused clone, whose time is NaN
             nearest, slot = away, k
     if slot < 0:
         return past, now[0] - past[0], 0
@@ -300,8 +300,9 @@ def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, f
 def recall(counts: Array, history: Array, longest: int, t_s: float, now: Moment) -> Moment:
     """Return the state at `t_s` as known at `now`, including later corrections.
 
-    It is interpolated between the history's entries and `now`, the oldest one before them, and extrapolated with
-    constant velocity and rate after `now`. `history` is the drone's ring, of which it uses `longest` entries.
+    The state is interpolated between the history's entries and `now`, constant before the oldest entry, and
+    extrapolated after `now` with constant velocity and rate. `longest` is the number of entries of the drone's ring,
+    `history`.
     """
     if t_s == now[0]:
         return now
@@ -319,7 +320,7 @@ def recall(counts: Array, history: Array, longest: int, t_s: float, now: Moment)
 
 @inlined
 def _as_seen(past: Moment, now: Moment) -> Moment:
-    """Return a past state with the corrections since then."""
+    """Return a past state including the corrections since then."""
     p = subtract(add(past[1], now[5]), past[5])
     v = subtract(add(past[2], now[6]), past[6])
     return past[0], p, v, past[3], past[4], now[5], now[6]
@@ -334,7 +335,7 @@ def _ahead(now: Moment, dt: float) -> Moment:
 
 @inlined
 def _between(a: Moment, b: Moment, t_s: float) -> Moment:
-    """Interpolate linearly; quaternions of neighbouring instants are never opposite."""
+    """Interpolate linearly; the quaternions of neighbouring moments never differ in sign."""
     part = (t_s - a[0]) / (b[0] - a[0])
     q_a, q_b = a[3], b[3]
     q = normalised((
@@ -353,7 +354,7 @@ def _mix(a: Vector, b: Vector, part: float) -> Vector:
 
 @inlined
 def move_columns(H: Array, at: int, size: int, state: int) -> None:
-    """Convert rows of a Jacobian by the present position and velocity into rows by those of a clone at `state`."""
+    """Move derivatives with respect to the present position and velocity, in rows of H, to the clone at `state`."""
     for r in range(at, at + size if state > 0 else at):
         for k in range(CLONED):
             H[r, state + k] = H[r, k]
@@ -374,12 +375,12 @@ def reckon(
     """Return the state after one IMU sample: Madgwick's step, then velocity and position by trapezoids.
 
     Args:
-        state: at the previous sample.
-        accel: specific force of the centre of mass as measured [m/s^2; B].
-        gyro: body rate as measured [rad/s; B].
-        accel_bias, gyro_bias: subtracted.
+        state: state at the previous sample.
+        accel: measured specific force at the centre of mass [m/s^2; B].
+        gyro: measured body rate [rad/s; B].
+        accel_bias, gyro_bias: biases to be subtracted from these.
         beta: Madgwick's gain [rad/s].
-        gravity: length of g_W [m/s^2], along -z.
+        gravity: magnitude of g_W [m/s^2], which points along -z.
     """
     p, v, q, a_before, w_before, _ = state
     w = subtract(gyro, gyro_bias)
@@ -450,10 +451,10 @@ def rotation_vector_quaternion(v: Vector) -> Quaternion:
 
 
 def levelling_time_s(beta: float, direction_sigma_rad: float) -> float:
-    """Return the time constant of the filter's correction to the measured tilt [s]; infinite for beta = 0.
+    """Return the time constant with which Madgwick's filter follows the measured tilt [s]; infinite for beta = 0.
 
-    The step has a fixed length 2 beta dt. Under noise of the measured direction, per axis [rad], its mean along a small
-    offset e is 2 beta dt * sqrt(pi/8) * e/sigma, hence a first-order pull.
+    The filter's step has a fixed length 2 beta dt. With noise sigma of the measured direction per axis [rad], its mean
+    along a small offset e is 2 beta dt * sqrt(pi/8) * e/sigma, hence a first-order pull.
     """
     if beta == 0.0:
         return math.inf
@@ -467,7 +468,7 @@ def beta_for(levelling_s: float, direction_sigma_rad: float) -> float:
 
 @inlined
 def corrected(state: Reckoning, error: Array, with_accel_bias: bool, gravity: float) -> Reckoning:
-    """Return the state corrected by an estimated error, (n,), ordered as in `write_transition`."""
+    """Return the state corrected by an estimated error, (n,)."""
     p, v, q, _, w, f_B = state
     p, v = add(p, vector(error, POSITION)), add(v, vector(error, VELOCITY))
     q = normalised(multiply(rotation_vector_quaternion(vector(error, ATTITUDE)), q))
@@ -497,7 +498,7 @@ def write_prediction(
     variances: Vector,
     dt: float,
 ) -> None:
-    """Write transition and process noise of an interval of dead reckoning from `v_before` [m/s] to `state`."""
+    """Write transition and process noise of dead reckoning from the velocity `v_before` [m/s] to `state`."""
     v = state[1]
     f_W = (
         (v[0] - v_before[0]) / dt,
@@ -510,11 +511,11 @@ def write_prediction(
 
 @inlined
 def write_transition(F: Array, f_W: Vector, R_WB: Matrix, levelling_s: float, with_accel_bias: bool, dt: float) -> None:
-    """Write the transition of the error state over `dt` into F, (n, n), which starts as the identity.
+    """Write the transition of the error state over `dt` [s] into F, (n, n), the identity on entry.
 
     p' = v; v' = -[f_W]x theta - R b_a; theta' = -R b_g - (theta_x, theta_y, 0)/levelling_s.
 
-    f_W is the mean specific force [m/s^2], levelling_s the time constant of Madgwick's pull [s]; it may be infinite.
+    f_W is the mean specific force [m/s^2], levelling_s the time constant of Madgwick's pull [s], possibly infinite.
     """
     for i in range(3):
         F[POSITION + i, VELOCITY + i] = dt
@@ -548,10 +549,10 @@ def write_minus_rotation(M: Array, row: int, column: int, R: Matrix, scale: floa
 
 @inlined
 def write_process_noise(Q: Array, walk: Array, variances: Vector, dt: float) -> None:
-    """Write the process noise of an interval `dt` [s] into Q, (n, n), which starts as zero.
+    """Write the process noise of an interval `dt` [s] into Q, (n, n), zero on entry.
 
-    `walk` is the density of each bias' random walk [unit^2/s], zero elsewhere, (n,); `variances` those gained per axis
-    by velocity [m^2/s^2], tilt and yaw [rad^2].
+    `walk`, (n,), is the density of each bias's random walk [unit^2/s], zero elsewhere; `variances` are those that
+    velocity [m^2/s^2], tilt and yaw [rad^2] gain per axis.
     """
     velocity_variance, tilt_variance, yaw_variance = variances
     for i in range(3):
@@ -577,7 +578,7 @@ def heading_and_sigma(q: Quaternion, P: Array) -> tuple[float, float]:
 
 @inlined
 def heading_gradient(R: Matrix) -> Vector:
-    """Return the derivative of the heading by a small world rotation; (0, 0, 1) when the nose is level."""
+    """Return the derivative of the heading with respect to a small rotation in W; (0, 0, 1) if the nose is level."""
     x = column(R, 0)
     squared = max(x[0] * x[0] + x[1] * x[1], HORIZONTAL_MIN)
     return -x[2] * x[0] / squared, -x[2] * x[1] / squared, 1.0

@@ -246,7 +246,8 @@ def move(
         unit = minimum_snap((0.0, 1.0), places).peaks().factor(limits)
         return minimum_snap((0.0, max(over_s, LEAST_S, round_up(unit))), places)
     length_s = max(over_s, LEAST_S)
-    while length_s < MOVE_MAX_S:  # by search: the given motions do not scale with the duration
+    length_max_s = max(over_s, MOVE_MAX_S)
+    while length_s <= length_max_s:  # by search: the given motions do not scale with the duration
         path = minimum_snap((0.0, length_s), places, begin, end)
         if path.peaks().factor(limits) <= 1.0:
             return path

@@ -1,6 +1,6 @@
 """The console: one run on a web page that viser draws, for operators, who control it, and viewers, who only watch.
 
-From the code that a browser reaches to the pure code:
+Its modules, from those that a browser reaches to those of pure code:
 - serving: `page_server` (HTTP, tokens, viser), `page_sockets` (actions, pictures);
 - one run: `console_server` ties it together; `console_page` and the forms are its panels, `scene`, `page_cameras` its
   scene, `manual_flight` flies single drones;

@@ -49,7 +49,7 @@ Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resettin
 
 
 class AircraftPose(NamedTuple):
-    """Position and velocity [W] of an aircraft's centre of mass, its attitude and rate, at `taken_ns` of our clock."""
+    """Position and velocity (W) of the centre of mass, attitude and angular rate, at `taken_ns` of this process."""
 
     taken_ns: int
     position_m: Vector
