@@ -68,7 +68,7 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
 
 
 def search_modules(record: Path, info: messages.Info | None) -> None:
-    """Let modules of a run's scenario be found where the run found them, beside the record, and in the working folder."""
+    """Let a scenario's modules be found where the run found them, beside the record, or in the working folder."""
     recorded = info.module_folders if info and info.module_folders is not UNSET else ()
     plugin.search(*(record.parent / each for each in recorded), record.parent, Path.cwd())
 
