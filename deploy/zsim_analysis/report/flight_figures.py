@@ -595,7 +595,7 @@ def draw_distances(
     colours: Mapping[str, str],
     marks: style.TimeMarks,
 ) -> Figure:
-    """Draw each pair's distance in both drones' colours, and the limits; for many drones, the distance to the nearest."""
+    """Draw each pair's distance in both drones' colours, and the limits; for many drones, distances to the nearest."""
     figure = style.new_figure(style.COLUMN_IN, 2.5)
     axes = figure.subplots()
     if distances.pairs:
