@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_VARIABLE = "ZSIM_CONNECT"  # environment variable: default of --connect
-RUN_ID = "{run}"  # stands for the run's id in the name of a record's folder; a restarted recorder finds it by that
+RUN_ID = "{run}"  # stands for the run's id in the name of a record's folder, so that a restarted recorder finds it
 CONSOLE_PORT = 8080  # TCP port of the console's page
 PORT_MAX = 65535
 REALTIME = "--realtime"  # option of the world, and of routers, whose lease it shortens
