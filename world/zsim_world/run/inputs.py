@@ -211,7 +211,7 @@ class Run:
         self.world.outbox.refuse(source, key[:80], messages.fault_at(key, error))
 
     def refuse_sample(self, sample: Sample, error: DecodeError) -> None:
-        """Refuse a message; if its sender is known, count it as an output all the same, because the sender's done does."""
+        """Refuse a message; if its sender is known, still count it as an output, because the sender's done does."""
         key, payload = sample
         self.refuse("somebody", key, error)
         with suppress(DecodeError):
