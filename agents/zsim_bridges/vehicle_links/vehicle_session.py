@@ -49,7 +49,7 @@ Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resettin
 
 
 class AircraftPose(NamedTuple):
-    """Position and velocity of the centre of mass in W, attitude, angular rate; `taken_ns` is by our own clock."""
+    """Position and velocity of an aircraft's centre of mass in W, its attitude and angular rate, at `taken_ns`."""
 
     taken_ns: int
     position_m: Vector
