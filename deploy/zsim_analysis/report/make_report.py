@@ -291,7 +291,7 @@ def date_text(date: str | None) -> str:
 
 
 def rendered(name: str, pictures: Iterable[Picture], package: str = "zsim_analysis.report", **values: Any) -> str:
-    """Return the page that a template of `package` makes of figures and `values`; it may use templates of the report."""
+    """Return the page that a template of `package` makes of figures and `values`; it may use the report's templates."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
         autoescape=True,
