@@ -317,7 +317,7 @@ class Coordinator(ABC):
             self.outbox.event("drop", name, f"{name} is waited for no longer", data)
 
     def overdue(self, wall_ns: int) -> str | None:
-        """Return a process that has not joined, or not returned after death or silence, in time; None if there is none."""
+        """Return a process that has not joined, or not returned after death or silence, in time, if any."""
         if self.clock.state == "waiting":
             waited_s = (wall_ns - self.start_wall_ns) / 1e9
             for name in self.barrier.absent():
