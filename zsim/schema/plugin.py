@@ -34,7 +34,7 @@ from zsim.schema.checker import show
 
 Object = TypeVar("Object")
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes search there too
-IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value to forbid imports
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value that forbids imports
 NO_LOOKUP = "unseen"  # value that also forbids looking up names
 WHERE = "install it, or put it on PYTHONPATH or in the scenario's folder"
 
