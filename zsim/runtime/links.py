@@ -232,7 +232,7 @@ def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str,
     else:
         return (whose,) if kind == "process" else (WORLD,)
     is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
-    return (named,) if is_shared or not source else (named, source)  # the agent may have been replaced by this process
+    return (named,) if is_shared or not source else (named, source)  # `source` may have replaced the agent
 
 
 class Receiver:

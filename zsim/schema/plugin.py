@@ -103,7 +103,7 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
 
     Raises:
         DocumentError: the module or class does not exist, or a method is missing or takes other arguments.
-        NotTrustedError: the class must not be imported; its source was only looked up.
+        NotTrustedError: importing the class is not allowed.
     """
     loaded = _attribute(name, where, "Class", isclass)
     methods = [method for method in dir(kind) if not method.startswith("_") and callable(getattr(kind, method))]
