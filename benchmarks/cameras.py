@@ -27,7 +27,7 @@ ROTOR_RAD_S = 400.0  # rad/s; roughly the speed in hover
 
 
 def situation(moving: bool = False) -> DroneStates:
-    """Return a drone and ten others in front of it, 3 to 15 m away."""
+    """Return the states of a drone and of ten others in front of it, 3 to 15 m away."""
     rng = np.random.default_rng(3)
     ahead = np.array([0.0, *(3 + 1.2 * np.arange(1, DRONES))])
     p = np.stack([ahead, rng.uniform(-0.5, 0.5, DRONES) * ahead, 4 + rng.uniform(-0.15, 0.15, DRONES) * ahead], axis=-1)
@@ -39,7 +39,7 @@ def situation(moving: bool = False) -> DroneStates:
 
 
 def formation() -> DroneStates:
-    """Return three drones in a triangle at a height of 4 m, the first facing the others."""
+    """Return the states of three drones in a triangle at a height of 4 m, the first facing the others."""
     p = np.array([(0.0, 0.0, 4.0), (3.0, 1.2, 4.0), (4.0, -1.3, 4.0)])
     rpy = np.array([(0.02, 0.03, 0.0), (0.05, 0.0, 2.6), (0.0, 0.04, -2.2)])
     still = np.zeros((3, 3))
