@@ -102,10 +102,10 @@ class FlightAnswer(NamedTuple):
 
     drone: str = ""
     state: str = "none"  # none, taking or flying
-    text: str = ""  # why the page does not fly it, or what it is doing
-    over: bool = False  # whether the page may take it over from its commander
+    text: str = ""  # why the page does not fly the drone, or what the drone is doing
+    over: bool = False  # whether the page may take the drone over from its commander
     commander: str = ""
-    id: str = ""  # id of the page's request to take it
+    id: str = ""  # id of the page's request to take the drone
     goal: Vector | None = None  # the drone's present destination [m; W]
     then: tuple[Vector, ...] = ()  # its later destinations [m; W]
 
@@ -447,9 +447,9 @@ class ManualFlight:
 
 
 class PageFlying:
-    """Single drones on the pages of one run; pages are identified by viser's number.
+    """Flies single drones for the pages of one run; pages are identified by viser's number.
 
-    `note` is called with each drone or formation whose return has ended otherwise than by landing, and the reason.
+    `note` is called with each drone or formation that ends its return without landing, and the reason.
     """
 
     def __init__(
@@ -479,7 +479,7 @@ class PageFlying:
         self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
-        """Return the plan view as plain data; with `whole`, including what does not change, and the past trails."""
+        """Return the plan view as plain data; with `whole`, including the constant part and the past trails."""
         drones, chosen = self._scene.drones, self.pages.chosen(client_id)
         if drones is None:
             return {"t_s": None, "chosen": chosen}
@@ -592,7 +592,7 @@ class ReturnFlights:
                     self._formations.pop(name, None)
 
     def _continue_drone(self, drone: str) -> bool:
-        """Send a drone to its start, or land it once above; return whether it is still returning."""
+        """Send a drone to its start, or land it if it is above; return whether it is still returning."""
         key, pose = ReturningDrone(drone), self._sight_of(drone).pose
         answer = self._control.steer(key, None)  # keeps the flight alive, as an open page does
         if answer.state == "none":

@@ -85,7 +85,10 @@ class TakeDrone(_Action, frozen=True, tag="take"):
 
 
 class SteerDrone(_Action, frozen=True, tag="steer"):
-    """Fly the taken drone while `held`, otherwise let it hover or go on; repeated, since a silent page does not fly."""
+    """Fly the taken drone while `held`; otherwise it hovers, or continues to its waypoints.
+
+    The page repeats this action, since the drone of a silent page hovers.
+    """
 
     held: bool = False
     forward: Deflection = 0.0
@@ -161,7 +164,7 @@ class ActionSockets:
     def act(self, text: str, role: str, page: Any = None) -> dict[str, Any] | None:
         """Carry out an action (JSON) from a page in a role; return the answer, None if it is invalid or not permitted.
 
-        `page` identifies the page, by its socket, to manual flight.
+        `page`, its socket, identifies the page that flies a drone.
         """
         try:
             action: _Look | _Operate = _ACTIONS.decode(text)

@@ -115,7 +115,7 @@ def drone_on_ray(
 
     Args:
         drones: N drones.
-        radii_m: (N,) m, radii of spheres around the drones that count as hits, at least CLICK_RAD seen from the origin.
+        radii_m: (N,) m, radii of the spheres that count as hits; a distant sphere is enlarged to subtend CLICK_RAD.
         origin_W, direction_W: origin and direction of the ray [m; W]; a zero direction hits nothing.
     """
     direction = np.array(direction_W)
@@ -285,7 +285,7 @@ class FlightPreview(NamedTuple):
 
     Attributes:
         paths_W: (n, M, 3) m, from the present desired positions on.
-        text: durations, heights, speeds and distances of the paths.
+        text: length, heights, speed and distances of the paths, for operators.
     """
 
     paths_W: Array

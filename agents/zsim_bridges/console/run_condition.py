@@ -1,7 +1,7 @@
 """The condition of the run that pages show: alarms, checks before a take-off, refusals, and the page's head. Pure.
 
-An alarm is amber or red. A control on a page is disabled, and shows the reason, while its request would be refused. A
-refusal is such a reason as a text; an empty one means that the request would be accepted.
+An alarm is amber or red. A control on a page is disabled, and shows the reason, while its request would be refused.
+Such reasons are called refusals here; an empty one means that the request would be accepted.
 """
 
 import math

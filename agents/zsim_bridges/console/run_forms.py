@@ -24,12 +24,12 @@ from zsim_bridges.console.run_condition import (
 )
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
-"""The bottom padding makes room for the row of tabs below, which would overlap the end of the text by 9 px."""
+"""The bottom padding is for the row of tabs below, which would overlap the end of the text by 9 px."""
 LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
 HELD_HINT = "hold for 0.6 s, with the pointer, Space or Enter"  # equal to HOLD_MS in orders.html
 DURATION_MAX_S = 1e5  # maximum duration of a fault; longer than any run
 DURATION_S = 30.0  # initial value of a fault's duration
-FIXES_LOST_PERCENT = 100.0  # initial value, like the following
+FIXES_LOST_PERCENT = 100.0  # this and the following are initial values
 THRUST_LEFT_PERCENT = 70.0  # remaining thrust of a weak motor; with less, the drone could not be held level
 GUST_M_S = 4.0  # about the strongest gust that the drones of a formation can withstand
 MESSAGES_LOST_PERCENT = 30.0
@@ -126,7 +126,7 @@ class FaultForm:
     Args:
         report: called with the outcome of each request that is refused here, unsent.
         scenario: names the drones and processes.
-        drones: drones of the run, with the names of their rotors; unnamed rotors have those of the AR.Drone.
+        drones: drones of the run, with the names of their rotors; without such names, those of the AR.Drone are used.
     """
 
     def __init__(

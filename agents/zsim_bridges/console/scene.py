@@ -53,7 +53,7 @@ from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
 NAMED_MAX = 60  # maximum number of drones with names beside them; more names would overlap
-SMALL = 0.8  # size of names if there are many drones, relative to that if there are few
+SMALL = 0.8  # relative size of the names if there are many drones
 SOLID = (134, 142, 150)
 EDGE = (96, 102, 118)  # edges of a surface's triangles, since shading hardly shows their slopes
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
@@ -62,7 +62,7 @@ PREVIEW_PX = 3.0  # width of a previewed path
 RADIO, ONE_WAY = (64, 192, 87), (250, 82, 82)  # radio links: bidirectional, one-way
 RADIO_PX = 1.5
 SIDE_PX = 2.0  # width of a formation's sides, at any distance
-WIND_M_PER_M_S = 0.5  # length of the wind's arrow per wind speed
+WIND_M_PER_M_S = 0.5  # length of the wind's arrow per unit of wind speed
 WIND_MIN_M_S = 0.05  # a weaker wind has no arrow
 WIND_ABOVE_M = 1.5  # height of the arrow above the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; position of a name relative to its drone
@@ -78,7 +78,7 @@ DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
 CHOSEN = (25, 113, 194)
 ARM_M = 0.1785  # distance from the centre to a rotor's axis
 ROTOR_RADIUS_M = 0.10  # the AR.Drone's 8 inch propellers
-RING = 1.31  # outer radius of a hull ring, in rotor radii: half the hull's width of 0.515 m, less 0.126 m to the centre
+RING = 1.31  # outer radius of a hull ring, in rotor radii: half the hull's 0.515 m less the ring's offset of 0.126 m
 ROTOR_Z_M = 0.030  # height of the rotors above the centre of mass, as drawn
 COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to stand out in the dark theme too
     "cross": (104, 108, 116),
@@ -484,7 +484,7 @@ class DroneShape(NamedTuple):
 
     @property
     def reach_m(self) -> float:
-        """Distance of its hull's outer edge from the centre [m]."""
+        """Distance of the hull's outer edge from the centre [m]."""
         return self.size * ARM_M + RING * self.radius_m
 
 

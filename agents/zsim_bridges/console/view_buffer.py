@@ -297,7 +297,7 @@ class EventRow(NamedTuple):
 class EventLog:
     """Keeps the newest events, with one row for all that differ only in numbers; thread-safe.
 
-    Rows of events caused by the console itself, `name`, are counted separately.
+    The rows of requests by the console's own process, `name`, are limited in number separately.
     """
 
     def __init__(self, name: str) -> None:
