@@ -1,1 +1,1 @@
-"""Comparisons with other simulators that take turns at the same work; each row is a ratio within one run."""
+"""Comparisons with other simulators, which take turns at the same work; each row is a ratio within one run."""

@@ -1,6 +1,6 @@
 """Measure the parts of the benchmarks, and write the results to benchmarks/README.md.
 
-make bench                                        all parts; makes the peers' environment first
+make bench                                        all parts; creates the peers' environment first
 .venv/bin/python -m benchmarks a b --repeats 7    some parts
 .venv/bin/python -m benchmarks c --against REV    this working tree against another commit
 .venv/bin/python -m benchmarks a --page           rewrite the page from results/a.json, without measuring
@@ -75,7 +75,7 @@ def main() -> None:
         "--of", nargs="+", choices=against.FLIGHTS, default=list(against.FLIGHTS), help="with --against: what is flown"
     )
     given = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are ended too
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are terminated too
     if unknown := set(given.parts) - set(PARTS):
         parser.error(f"part is {', '.join(sorted(unknown))}; must be of {' '.join(PARTS)}")
     chosen = {name: PARTS[name] for name in given.parts or PARTS}

@@ -1,8 +1,8 @@
 """Part c with `--against REV`: this working tree against another commit of zsim, in turn on one machine.
 
-Each flies its own Test 1 with the same seed and duration, and a grid of 99 drones. Processor time is that of a long
-flight minus that of a short one, which excludes start-up and shutdown. A ratio above 1 means that this tree is better:
-real-time factor here / there, processor time and memory there / here.
+Each revision flies its own Test 1 with the same seed and duration, and a grid of 99 drones. Processor time is that of a
+long flight minus that of a short one, which excludes start-up and shutdown. A ratio above 1 means that this tree is
+better: real-time factor here / there, processor time and memory there / here.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from benchmarks.run import end_event, spent
 from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
-GRID = 99  # drones; 33 clusters of three, so that none is left over
+GRID = 99  # drones; 33 clusters of three, so that no drone is left over
 SEED = 1
 FLOWN = ("world", "agents", "record")  # optional dependencies that a flight needs
 
@@ -42,7 +42,7 @@ class Flight(NamedTuple):
 
 FLIGHTS = {
     **{name: Flight(f"Test 1, {label}", 3, OPTIONS[name], 10.0, 330.0) for name, label in LABELS.items()},
-    # 4 s, as the grid takes off at 1 s and all its formations are engaged by then
+    # 4 s: the grid takes off at 1 s, and all its formations are engaged by then
     "grid": Flight(f"{GRID} drones, one process (`--in-process`)", GRID, ("--in-process",), 4.0, 14.0),
 }
 QUANTITIES = {"factor": "× real time", "cpu": "CPU ms per drone-second", "peak": "greatest resident memory, MB"}
@@ -89,7 +89,8 @@ def measure(repeats: int, revision: str, names: Sequence[str] = tuple(FLIGHTS)) 
 def checked_out(revision: str, folder: Path) -> Iterator[Side]:
     """Check a revision out with an environment that shares the installed packages; remove the checkout at the end.
 
-    RefusedError if git does not know the revision, or a package that it needs cannot be installed.
+    Raises:
+        RefusedError: git does not know the revision, or a package that it needs cannot be installed.
     """
     root = folder / "checkout"
     _ran(["git", "-C", str(ROOT), "worktree", "add", "--detach", "--quiet", str(root), revision], "git")
@@ -140,7 +141,7 @@ def _ran(command: Sequence[str], name: str) -> None:
 
 
 def described(root: Path) -> str:
-    """Return commit and date of a checkout, with `-dirty` if it has uncommitted changes."""
+    """Return the commit and date of a checkout, with `-dirty` if it has uncommitted changes."""
     asked = ["git", "-C", str(root), "log", "-1", "--format=%cs"]
     date = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
     asked = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
@@ -149,7 +150,7 @@ def described(root: Path) -> str:
 
 
 def _measured(sheet: Sheet, mine: str, name: str, flight: Flight, side: Side, path: Path) -> str:
-    """Fly a short and a long flight, add the results to the sheet, and return them as text."""
+    """Make a short and a long flight, add the results to the sheet, and return them as text."""
     try:
         _, short_cpu_s, _ = _flown(side, flight, flight.short_s, path)
         factor, long_cpu_s, peak_mb = _flown(side, flight, flight.long_s, path)
@@ -162,7 +163,7 @@ def _measured(sheet: Sheet, mine: str, name: str, flight: Flight, side: Side, pa
 
 
 def _flown(side: Side, flight: Flight, seconds: float, path: Path) -> tuple[float, float, float]:
-    """Return real-time factor, CPU seconds of all processes, and peak resident memory of the largest one [MB]."""
+    """Fly once; return real-time factor, CPU seconds of all processes, peak resident memory of the largest one [MB]."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         command = [str(side.python), "-m", "zsim_deploy.cli", "run", str(path), "--no-report", "--seed", str(SEED)]

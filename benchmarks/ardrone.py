@@ -1,9 +1,9 @@
-"""What `zsim ardrone serve` costs: processor time at full navdata, and the age that it adds to a command.
+"""The cost of `zsim ardrone serve`: processor time at full navdata, and the age of a command that passes through it.
 
     python -m benchmarks.ardrone [--drones 20] [--seconds 10]
 
 The world runs in realtime; each drone has a pilot that receives full navdata and sends REF and PCMD every 30 ms, as the
-SDK does. The age is measured from sending a PCMD that differs from the last one to the arrival of its command at a
+SDK does. The age is measured from sending a PCMD that differs from the last one to the arrival of the command at a
 Zenoh client; for comparison, a message of the same size is timed from one Zenoh client to another.
 """
 
@@ -28,9 +28,9 @@ from zsim_bridges.ardrone import at_commands, navdata
 PERIOD_S = 0.03  # command period of the SDK
 FIRST = "127.9.0.2"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
-PROBE_S = 0.05  # wall time between two timed messages
+PROBE_S = 0.05  # wall time between timed messages
 READY_S = 60.0
-INDOOR_RAD = 0.20944  # value of control:euler_angle_max
+INDOOR_RAD = 0.20944  # rad; value of control:euler_angle_max
 
 
 def scenario(drones: int) -> str:
@@ -66,7 +66,7 @@ class Pilots:
         self._socket.sendto(datagram, (address, at_commands.PORT))
 
     def steer(self, share: float = 0.0, only: str = "") -> None:
-        """Send the REF and PCMD that the SDK sends every 30 ms; `share` is the pitch, in -1 to 1."""
+        """Send the REF and PCMD that the SDK sends every 30 ms; `share` is the pitch, from -1 to 1."""
         for address in [only] if only else self.addresses:
             pcmd = at_commands.Pcmd(0, int(share != 0.0), 0.0, share, 0.0, 0.0)
             self._send(address, at_commands.ref(0, self.flies), pcmd)
@@ -168,7 +168,7 @@ def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[flo
 
 
 def _forward(tilt_rad: float) -> float:
-    """Return a command's `forward`, the share of zsim's tilt limit, by which it is recognised."""
+    """Return the `forward` of a command, a fraction of zsim's tilt limit, by which the command is recognised."""
     sent = at_commands.float_of_bits(at_commands.bits_of_float(tilt_rad / INDOOR_RAD))
     return math.tan(sent * INDOOR_RAD) / math.tan(math.radians(20.0))
 

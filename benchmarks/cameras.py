@@ -1,7 +1,9 @@
-"""CPU time on one thread of drawing a picture and finding hats in it: python -m benchmarks.cameras [PICTURES]
+"""Measure the CPU time of drawing a picture and of finding hats in it, on one thread.
 
-A front camera of 640 x 360 px sees ten drones, hovering and in motion. Given PICTURES, a folder, write the pictures of
-docs/cameras.md to it.
+    python -m benchmarks.cameras [PICTURES]
+
+A front camera of 640 x 360 px sees ten drones, hovering and in motion. If a folder PICTURES is given, the pictures of
+docs/cameras.md are written to it instead.
 """
 
 import sys
@@ -20,12 +22,12 @@ from zsim_agents.cameras.renderer import Renderer
 from zsim_agents.cameras.scene import DroneStates, Scene, default_look
 
 DRONES = 11  # the first looks at the other ten
-REPEATS, CALLS = 30, 20  # minimum of REPEATS means of CALLS calls, which excludes other load
-ROTOR_RAD_S = 400.0  # rad/s; roughly that of hovering
+REPEATS, CALLS = 30, 20  # the minimum of REPEATS means of CALLS calls excludes other load
+ROTOR_RAD_S = 400.0  # rad/s; roughly the speed in hover
 
 
 def situation(moving: bool = False) -> DroneStates:
-    """Return a drone and ten others in front of it, 3 to 15 m away."""
+    """Return the states of a drone and of ten others in front of it, 3 to 15 m away."""
     rng = np.random.default_rng(3)
     ahead = np.array([0.0, *(3 + 1.2 * np.arange(1, DRONES))])
     p = np.stack([ahead, rng.uniform(-0.5, 0.5, DRONES) * ahead, 4 + rng.uniform(-0.15, 0.15, DRONES) * ahead], axis=-1)
@@ -37,7 +39,7 @@ def situation(moving: bool = False) -> DroneStates:
 
 
 def formation() -> DroneStates:
-    """Return three drones in a triangle at a height of 4 m, the first facing the others."""
+    """Return the states of three drones in a triangle at a height of 4 m, the first facing the others."""
     p = np.array([(0.0, 0.0, 4.0), (3.0, 1.2, 4.0), (4.0, -1.3, 4.0)])
     rpy = np.array([(0.02, 0.03, 0.0), (0.05, 0.0, 2.6), (0.0, 0.04, -2.2)])
     still = np.zeros((3, 3))

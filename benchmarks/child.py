@@ -1,6 +1,6 @@
 """Child processes of the benchmarks, which print one result and exit, or keep answering questions.
 
-Each has its own process group, so that its children are killed with it, however it ends.
+Each has its own process group, so that its own children are killed with it, however it ends.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
     """Run a command in the project's folder and return the last line of JSON that it prints.
 
     Raises:
-        RefusedError: it failed, or did not end in time.
+        RefusedError: the command failed, or did not end in time.
     """
     with tempfile.TemporaryFile("w+") as errors:
         process = _started(command, errors, stdin=subprocess.DEVNULL)
@@ -52,7 +52,7 @@ class Server:
         return self._process.pid
 
     def ask(self, question: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-        """Return the answer to a question; RefusedError if the process refuses, has ended, or is too slow."""
+        """Return the answer to a question; raise a RefusedError if the process refuses, has ended, or is too slow."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):

@@ -1,4 +1,4 @@
-"""Part d: the age of a command at the world in realtime, from the publication of the samples that it answers.
+"""Part d: the age of a command on arrival at the world, in realtime, since the samples that it answers were published.
 
 For comparison, bare Zenoh is timed in the same run with as many processes: a round trip, and the path of a command
 (from the hub to N clients, through the hub to one more client that waits for all of them, and back).

@@ -1,8 +1,8 @@
-"""Part h: what the console costs: its share of a core, and by how much it slows a run in lockstep.
+"""Part h: the cost of the console: its share of a core, and by how much it slows a run in lockstep.
 
 The share is the processor time of the console's process divided by wall time, with one page open: a client that reads
-all that a page is sent. The slowdown is the real-time factor with a console and such a client, divided by the mean of
-the factors just before and just after; it is measured repeatedly within one run, because machines drift.
+everything that a page is sent. The slowdown is the real-time factor with a console and such a client, divided by the
+mean of the factors just before and just after; it is measured repeatedly within one run, because machines drift.
 """
 
 import json
@@ -37,7 +37,7 @@ from zsim_bridges.console.page_server import ViewerCamera
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 SIZES = (3, 50)  # drones
 SECONDS = 15.0  # wall time over which the share of a core is measured
-SETTLE_S = 5.0  # wall time before each measurement, as a newly opened page is sent everything at once
+SETTLE_S = 5.0  # wall time before each measurement, since a newly opened page is sent everything at once
 FLIGHT_S = 100_000.0  # simulated; the run of the real-time factors is ended long before this
 WINDOW_S = 8.0  # wall time over which a real-time factor is measured
 PAIRS = 8  # windows with a console per run, each between two without
@@ -49,7 +49,7 @@ PICTURES_HZ = {3: 20.0, 50: 10.0}  # picture rate of the console, by number of d
 LEAST_PICTURES = 0.8  # minimum share of these pictures; a starved console draws fewer and seems cheap
 LEAST_RATE = 0.9  # minimum real-time factor; a slower run gives the console less to draw
 DRONES = "/drones"  # node of the drones in viser's scene
-CAMERA = ViewerCamera(  # first message of a page; viser ignores its controls before it
+CAMERA = ViewerCamera(  # first message of a page, before which viser ignores its controls
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
 
@@ -63,14 +63,14 @@ class Share(NamedTuple):
 
 
 class Reader:
-    """A client that reads all that viser sends to a page, and draws nothing.
+    """A client that reads everything that viser sends to a page, but draws nothing.
 
     Args:
         port: the console's port.
 
     Attributes:
-        received: number of bytes.
-        pictures: number of updates of the drones.
+        received: number of bytes received.
+        pictures: number of updates of the drones received.
     """
 
     def __init__(self, port: int) -> None:
@@ -96,7 +96,7 @@ class Reader:
 
 
 def _has_drones(said: str | bytes) -> bool:
-    """Return whether a message of viser moves the drones; its layout is lengths, a packed part, arrays."""
+    """Return whether a viser message moves the drones; it consists of lengths, a packed part, and arrays."""
     assert isinstance(said, bytes)
     packed = said[16 : 16 + int.from_bytes(said[8:16], "little")]
     told = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(packed), strict=False)["messages"]
@@ -176,7 +176,7 @@ def _measure_shares(sheet: Sheet, folder: Path, count: int) -> str:
 
 
 def _check_kept_up(count: int, drawn: Share) -> None:
-    """Raise RefusedError if too few pictures were drawn, or the run did not keep up with real time."""
+    """Raise a RefusedError if too few pictures were drawn, or the run did not keep up with real time."""
     if drawn.read_per_s < LEAST_PICTURES * PICTURES_HZ[count] or drawn.factor < LEAST_RATE:
         found = f"{drawn.read_per_s:.1f} pictures a second at × {drawn.factor:.2f}"
         raise RefusedError(f"{count} drones: {found}; must be about {PICTURES_HZ[count]:g} at × 1")
@@ -203,7 +203,7 @@ def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
 
 @contextmanager
 def _looked_at(endpoint: str) -> Iterator[None]:
-    """Run a console, with a client that reads all that a page is sent."""
+    """Run a console, with a client that reads everything that a page is sent."""
     port = free_port()
     with _started("console", "--connect", endpoint, "--port", str(port)):
         _await(lambda: _runs(port), "a run on the console")

@@ -1,4 +1,4 @@
-"""Measure the CPU time of a run in one process, from its second simulated second on; print a line of JSON.
+"""Measure the CPU time of an in-process run, excluding its first simulated second; print a line of JSON.
 
 .venv/bin/python -m benchmarks.flight --drones 10 --seconds 5
 """
@@ -16,7 +16,7 @@ from benchmarks import grid
 from zsim.record import RecordWriter
 from zsim_analysis.in_process import InProcessFlight
 
-WARM_NS = 1_000_000_000  # simulated time that is not measured
+WARM_NS = 1_000_000_000  # simulated warm-up, not measured
 
 
 def main() -> None:

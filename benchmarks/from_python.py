@@ -1,7 +1,7 @@
-"""Part j: what the Python interface costs: a flight by zsim.run compared with `zsim run`, and stepped flights.
+"""Part j: overhead of the Python interface: a flight by `zsim.run` compared with `zsim run`, and stepped flights.
 
-The flights take turns, each as a separate process; both record, and neither makes a report. Steps are measured in CPU
-time of their process, from the second simulated second on; only the truth is observed.
+The flights of the comparison alternate, each in a separate process; both record, and neither makes a report. Stepped
+flights are measured in CPU time of their process, excluding the first simulated second; they read only the truth.
 """
 
 import gc
@@ -84,7 +84,7 @@ def _said(command: list[str]) -> str:
 
 
 def stepped(agents: Any, is_commanded: bool, wrap: Callable[[Callable[[], None]], None] = lambda fly: fly()) -> float:
-    """Return gates per CPU second of a stepped flight; `wrap` calls the measured part, e.g. under a profiler."""
+    """Return the gates per CPU second of a stepped flight; `wrap` calls the measured part, e.g. under a profiler."""
     import zsim
 
     sim = zsim.Simulation(SCENARIO, agents=agents, duration_s=3600)

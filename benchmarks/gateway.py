@@ -1,4 +1,4 @@
-"""Part g: what the gateway costs, compared with a bare aiohttp server and with plain Zenoh."""
+"""Part g: throughput and latency of the gateway, compared with a bare aiohttp server and with plain Zenoh."""
 
 import json
 import sys
@@ -15,7 +15,7 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import spread, table
 
-SIZE = 1  # number of drones, which does not matter, as no message measured concerns a drone
+SIZE = 1  # number of drones; irrelevant, as no measured message concerns a drone
 SECONDS = 2.0  # wall time of each measurement
 TIMEOUT_S = 120.0
 SCENARIO = """
@@ -24,7 +24,7 @@ duration_s: 3600
 drones: [{name: drone1, position_m: [0, 0, 0]}]
 processes: {expect: [nobody.yet]}
 """
-"""A world that stands still, so that only the gateway is measured."""
+"""Scenario of a world that stands still, as the expected process never joins: only the gateway is measured."""
 LABELS = {
     "get": "zsim gateway, GET of a last value",
     "bare_get": "bare aiohttp, GET",
@@ -78,7 +78,7 @@ def _client(what: str, port: int, *more: str) -> dict[str, float]:
 
 @contextmanager
 def _standing() -> Iterator[Ports]:
-    """Run a paused world, its gateway, and a bare server; yield their ports."""
+    """Run a world that stands still, its gateway and a bare aiohttp server; yield their ports."""
     ports = Ports(*(free_port() for _ in Ports._fields))
     zsim, endpoint = (sys.executable, "-m", "zsim_deploy.cli"), f"tcp/127.0.0.1:{ports.world}"
     doors = ("--http", str(ports.http), "--lines", str(ports.lines), "--connect", endpoint)

@@ -1,7 +1,7 @@
-"""Scenarios of any number of drones: a grid on the ground, GPS and all other sensors, an estimator for each.
+"""Scenarios with any number of drones, on a grid on the ground, each with GPS, all other sensors and an estimator.
 
-Three drones in a row do not form a triangle and would not take off, so the drones of a cluster of three stand at three
-corners of a square, and the squares form a grid.
+Three drones in a row do not form a triangle and would not take off, so a cluster's three drones stand at three corners
+of a square, and the squares form the grid.
 """
 
 import math
@@ -13,21 +13,21 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
 
-SPACING_M = 4.0  # about ten hulls, so that hulls never touch and downwash reaches no neighbour
+SPACING_M = 4.0  # about eight hull diameters, so that hulls never touch and downwash reaches no neighbour
 GUST_M_S = 0.5  # as in Test 1
 CLUSTER = 3  # drones per cluster, as in the paper
-CORNERS = ((0, 0), (1, 0), (0, 1))  # corners of a square that are occupied
+CORNERS = ((0, 0), (1, 0), (0, 1))  # the occupied corners of each square
 
 
 def document(
     count: int, duration_s: float = 60.0, cluster: int = CLUSTER, drone: Mapping[str, Any] | None = None
 ) -> Any:
-    """Return the document of a scenario with `count` drones.
+    """Return a scenario document with `count` drones.
 
     Args:
         count: number of drones.
         duration_s: simulated duration.
-        cluster: drones per cluster; every cluster takes off, and drones left over stay landed. 0 means no clusters.
+        cluster: drones per cluster, 0 for no clusters; every cluster takes off, leftover drones stay on the ground.
         drone: fields of every drone in addition to its name and position.
     """
     places = _triangles(count) if cluster == CLUSTER else _rows(count, SPACING_M)
@@ -63,14 +63,14 @@ def _triangles(count: int) -> list[tuple[float, float, float]]:
 def scenario(
     count: int, duration_s: float = 60.0, cluster: int = CLUSTER, drone: Mapping[str, Any] | None = None
 ) -> Scenario:
-    """Return the resolved scenario; arguments as for `document`."""
+    """Return the scenario of `document`, resolved; the arguments are the same."""
     return scenario_file.resolve(document(count, duration_s, cluster, drone))
 
 
 def write(
     path: Path, count: int, duration_s: float, cluster: int = CLUSTER, expect: Sequence[str] | None = None
 ) -> None:
-    """Write the scenario to a file; `expect` as in a scenario's `processes`."""
+    """Write the scenario of `document` to `path`, with `expect` in its section `processes`."""
     content = document(count, duration_s, cluster)
     content["processes"] = {"expect": expect}
     path.write_text(yaml_file.dump(content))

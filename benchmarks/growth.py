@@ -1,4 +1,4 @@
-"""Part e: the cost of each further drone, the time of a start, and the needs of an onboard estimator."""
+"""Part e: cost of each additional drone, start-up time of each role, and needs of an onboard estimator."""
 
 import sys
 import tempfile
@@ -16,7 +16,7 @@ ONBOARD = {"plain": "extra `agents`, numba taken out", "numba": "extra `agents`"
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly every size in one process, start every role, and install and fly an onboard estimator, repeatedly."""
+    """Install both onboard estimators; then repeatedly fly every size, start every role and fly both estimators."""
     sheet = Sheet("e", CPU)
     progress = Progress("e", repeats * (len(SIZES) + 1 + len(ONBOARD)))
     with tempfile.TemporaryDirectory() as folder:
@@ -56,7 +56,7 @@ def _started(sheet: Sheet, folder: Path) -> str:
 
 
 def _installed(sheet: Sheet, variant: str, folder: Path) -> Path | None:
-    """Install a variant and fly it once, so that its kernels are compiled."""
+    """Install a variant of the onboard estimator and fly it once, so that its kernels are compiled."""
     print(f"e installing an onboard estimator, {variant}", file=sys.stderr, flush=True)
     try:
         python = onboard.install(variant)

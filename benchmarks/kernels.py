@@ -1,4 +1,4 @@
-"""Part b: drone-seconds simulated per CPU second, with N drones in the air in one process."""
+"""Part b: drone-seconds simulated per CPU second with N drones in the air in one process."""
 
 import sys
 from contextlib import ExitStack
@@ -16,7 +16,7 @@ TIMEOUT_S = 240.0  # ample, as the first measurement includes compilation
 
 
 class Contender(NamedTuple):
-    """A contender: how it is run and what it leaves out; `peer` is None if it runs in zsim's own environment."""
+    """A contender: how to run it, its step, what it leaves out; `peer` is None if it runs in zsim's own environment."""
 
     label: str
     peer: str | None
@@ -60,7 +60,7 @@ PEERS = [name for name in CONTENDERS if not name.startswith("zsim")]
 
 
 def measure(repeats: int, sizes: tuple[int, ...] = SIZES, cpu_s: float = CPU_S) -> Sheet:
-    """Start all contenders, and measure them in turn at every size."""
+    """Start all contenders and measure them in turn at every size."""
     sheet = Sheet("b", "drone-seconds per CPU second")
     sheet.refused = {name: why for name, c in CONTENDERS.items() if c.peer and (why := peers.missing(c.peer))}
     running = [name for name in CONTENDERS if name not in sheet.refused]

@@ -19,7 +19,7 @@ WARM_UP, GATES, GATE_S = 100, 500, 0.02  # all drones are in the air after WARM_
 
 
 def share(lidar: bool) -> float:
-    """Return CPU seconds per simulated second of fleet and messages, in one thread."""
+    """Return the CPU seconds per simulated second of the fleet and its messages, in one thread."""
     document: dict[str, Any] = {
         "name": "lidars",
         "duration_s": 60,

@@ -88,7 +88,7 @@ def _goals(sheet: Sheet) -> str:
 
 
 def _against_best(sheet: Sheet, size: int) -> str:
-    """Return zsim's rate divided by that of the fastest HELICS core, repeat by repeat."""
+    """Return zsim's rate divided by that of each repeat's fastest HELICS core, as a table cell."""
     mine = sheet.values.get("zsim", {}).get(size, [])
     cores = [values for name in HELICS if (values := sheet.values.get(name, {}).get(size))]
     best = [max((value for value in values if value), default=None) for values in zip(*cores, strict=False)]

@@ -1,10 +1,10 @@
-"""What `zsim mavlink serve` costs, and by how much it delays a command.
+"""CPU load of `zsim mavlink serve`, and the delay it adds to a command.
 
 .venv/bin/python -m benchmarks.mavlink_vehicles [--drones 20] [--seconds 10]
 
 All drones of a realtime run fly as ArduPilot vehicles that send full-rate telemetry, each to a ground station and a
-program. The age runs from sending a datagram with a setpoint to the arrival of its command at a Zenoh subscriber; for
-comparison, a plain put on another key is timed to the same subscriber. The difference is the delay.
+program. A setpoint's age is the time from sending its datagram to the arrival of its command at a Zenoh subscriber; for
+comparison, a plain put on another key is timed to the same subscriber. The difference is the delay added.
 """
 
 import argparse
@@ -43,7 +43,7 @@ class Ports(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """The measurements: cores used, messages and bytes a second to one client, sorted ages [ms]."""
+    """The measurements: cores used, messages and bytes per second to one client, sorted ages [ms]."""
 
     cores: float
     messages_hz: float
@@ -69,7 +69,7 @@ class Program:
         self._link, self._parser = Link(255, 190), Parser()
 
     def take_off(self) -> None:
-        """Fly the vehicle until it holds its height."""
+        """Switch to guided mode, arm and take off; return once within 0.3 m of HEIGHT_M."""
         self.until(lambda message: isinstance(message, dialect.LocalPositionNed))
         for command, params in ((SET_MODE, (1.0, GUIDED)), (ARM, (1.0,)), (TAKEOFF, (0,) * 6 + (HEIGHT_M,))):
             values = (*params, *(0.0,) * (7 - len(params)))
@@ -100,7 +100,7 @@ class Program:
 
 @contextmanager
 def served(drones: int) -> Iterator[tuple[Ports, int]]:
-    """Run a world and its MAVLink server; yield their ports, and the server's process id."""
+    """Run a world and its MAVLink server; yield their ports and the server's process id."""
     ports = Ports(free_port(), free_port(), 41_000, 42_000, 43_000)
     zsim, endpoint = (sys.executable, "-m", "zsim_deploy.cli"), f"tcp/127.0.0.1:{ports.world}"
     where = ("--gcs", f"127.0.0.1:{ports.gcs}", "--api", f"127.0.0.1:{ports.api}")
@@ -140,16 +140,16 @@ def subscribed(endpoint: str, arrivals: dict[str, list[float]]) -> zenoh.Session
 
 
 def age_ms(arrived: list[float], send: Callable[[], None]) -> list[float]:
-    """Send a message; return its latency [ms], or nothing if it has not arrived when the next one is due."""
+    """Send a message; return its age on arrival [ms], or nothing if it has not arrived when the next one is due."""
     arrived.clear()
     sent_s = time.perf_counter()
     send()
-    time.sleep(0.5 / SETPOINTS_HZ)  # half a period, as two kinds of messages take turns
+    time.sleep(0.5 / SETPOINTS_HZ)  # half a period, as two kinds of message alternate
     return [1e3 * (arrived[0] - sent_s)] if arrived else []
 
 
 def ages_ms(program: Program, ports: Ports, count: int) -> tuple[list[float], list[float]]:
-    """Return the sorted ages of setpoints at a subscriber [ms], by MAVLink and by Zenoh alone."""
+    """Return the sorted ages [ms] of setpoints at a subscriber, sent by MAVLink and by Zenoh alone."""
     arrivals: dict[str, list[float]] = {}
     endpoint = f"tcp/127.0.0.1:{ports.world}"
     with subscribed(endpoint, arrivals), subscribed(endpoint, {}) as other:
@@ -183,7 +183,7 @@ def measure(drones: int, seconds: float) -> Figures:
 
 
 def quantile(values: list[float], share: float) -> float:
-    """Return the quantile of sorted values for a share in 0 to 1."""
+    """Return the `share` quantile (0 to 1) of sorted values."""
     return values[min(len(values) - 1, int(share * len(values)))]
 
 

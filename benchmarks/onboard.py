@@ -1,7 +1,7 @@
-"""The needs of one drone's onboard computer: an estimator installed alone, with and without numba.
+"""Disk, memory and CPU needs of an estimator installed alone on an onboard computer, with and without numba.
 
-Each variant is installed from this project into an environment of its own in .venv-bench, and flies one drone against
-a world in zsim's own environment, unpaced.
+Each variant is installed from this project into an environment of its own in .venv-bench, and estimates the state of
+one drone of a world that runs unpaced in zsim's own environment.
 """
 
 import subprocess
@@ -18,13 +18,13 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.peers import FOLDER, ROOT
 from benchmarks.run import CLI
 
-REMOVED: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # removed from extra `agents`
-SHORT_S, LONG_S = 5.0, 45.0  # simulated; the difference of the two flights excludes start-up
+REMOVED: dict[str, tuple[str, ...]] = {"plain": ("numba", "llvmlite"), "numba": ()}  # taken out of the extra `agents`
+SHORT_S, LONG_S = 5.0, 45.0  # simulated durations of two flights; their difference excludes start-up
 TIMEOUT_S = 180.0
 
 
 def install(variant: str) -> Path:
-    """Install a variant from the current working tree and return its Python; RefusedError if that fails."""
+    """Install a variant from the current working tree and return its Python; raise RefusedError if that fails."""
     folder = FOLDER / f"onboard-{variant}"
     python = folder / "bin" / "python"
     if not python.exists():
@@ -41,7 +41,7 @@ def install(variant: str) -> Path:
 
 
 def installed_mb(python: Path) -> float:
-    """Return the size of its packages [MB], without pip and setuptools, which are not needed to fly."""
+    """Return the size [MB] of the packages installed for `python`, except pip and setuptools, unneeded in flight."""
     found = 0
     for path in (python.parent.parent / "lib").rglob("*"):
         parts = path.parts[path.parts.index("site-packages") + 1 :] if "site-packages" in path.parts else ()
@@ -55,7 +55,7 @@ def fly(python: Path, folder: Path) -> dict[str, float]:
     """Fly one drone; return its estimator's peak resident memory [MB] and CPU ms per simulated second.
 
     Raises:
-        RefusedError: world or estimator failed.
+        RefusedError: the world or the estimator failed.
     """
     (short_s, _), (long_s, resident) = (_flown(python, folder, seconds) for seconds in (SHORT_S, LONG_S))
     return {"resident_mb": resident, "cpu_ms_per_simulated_s": 1e3 * (long_s - short_s) / (LONG_S - SHORT_S)}
@@ -78,7 +78,7 @@ def _flown(python: Path, folder: Path, seconds: float) -> tuple[float, float]:
 
 
 def _quiet(command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
-    """Start a process outside the project's folder, so that it imports the installed packages."""
+    """Start a process outside the project's folder, so that it imports the installed package."""
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 

@@ -1,4 +1,4 @@
-"""The environment of the peers, and which of them could be installed in it."""
+"""The environment of the peers (the packages zsim is compared with), and which of them could be installed in it."""
 
 import json
 import subprocess
@@ -12,7 +12,7 @@ PYTHON = FOLDER / "bin" / "python"
 PINS = Path(__file__).parent / "requirements.txt"
 STATE = FOLDER / "peers.json"
 CPU_TORCH = ("--extra-index-url", "https://download.pytorch.org/whl/cpu")  # PyPI's torch brings gigabytes of CUDA
-# peer: (arguments of pip, module that is imported to check the installation)
+# peer: (pip arguments, module imported to check the installation)
 PEERS: dict[str, tuple[tuple[str, ...], str]] = {
     "helics": (("helics",), "helics"),
     "mosaik": (("mosaik",), "mosaik"),
@@ -26,7 +26,7 @@ PEERS: dict[str, tuple[tuple[str, ...], str]] = {
 
 
 def ensure(say: Callable[[str], None]) -> None:
-    """Make the environment and install missing peers; store why a peer cannot be installed."""
+    """Create the environment and install missing peers; store why a peer cannot be installed."""
     if not PYTHON.exists():
         say(f"making {FOLDER.name} for the peers")
         subprocess.run([sys.executable, "-m", "venv", str(FOLDER)], check=True)

@@ -15,8 +15,8 @@ from benchmarks.sheet import Progress, Sheet
 from benchmarks.table import figure, ratios, table
 
 TEST_1 = ROOT / "scenarios" / "step.yaml"
-SIZES = {3: 330.0, 10: 20.0, 30: 8.0, 100: 4.0}  # drones: simulated seconds; 3 is Test 1, the others are grids
-PROCESSES_MAX = 10  # drones; with more, one process per role needs more memory than many machines have
+SIZES = {3: 330.0, 10: 20.0, 30: 8.0, 100: 4.0}  # drone count: simulated seconds; 3 is Test 1, the others are grids
+PROCESSES_MAX = 10  # number of drones; beyond it, one process per role needs more memory than many machines have
 LABELS = {
     "in_process": "one process (`--in-process`)",
     "hosted": "world, recorder, and one process for all others (`--hosted`)",
@@ -26,7 +26,7 @@ OPTIONS: dict[str, tuple[str, ...]] = {"in_process": ("--in-process",), "hosted"
 
 
 def measure(repeats: int) -> Sheet:
-    """Fly every size in several processes and in one, in turn."""
+    """Fly every size in every mode of LABELS, in turn."""
     sheet = Sheet("c", "× real time")
     todo = [(name, size) for size in SIZES for name in LABELS if name != "processes" or size <= PROCESSES_MAX]
     progress = Progress("c", repeats * len(todo))

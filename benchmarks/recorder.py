@@ -1,4 +1,4 @@
-"""Part i: the recorder of a federation of 50 drones: whether it records everything, and its share of a core.
+"""Part i: the recorder in a federation of 50 drones: whether it records everything, and what share of a core it takes.
 
 Missing messages are found by `seq`, which counts from 0 without gaps on every key. The share is processor time divided
 by wall time from the first recorded megabyte to the end of the run, which excludes start-up.
@@ -29,11 +29,11 @@ TEST_1 = ROOT / "scenarios" / "step.yaml"
 SECONDS = 20.0  # simulated duration
 OPTIONS: dict[str, tuple[str, ...]] = {"lockstep": (), "realtime": ("--realtime",)}
 LABELS = {"lockstep": "lockstep, as fast as it goes", "realtime": "realtime, 1×"}
-BEGUN_BYTES = 1_000_000  # size of the record from which the run counts as under way
+BEGUN_BYTES = 1_000_000  # record size above which the run counts as under way
 LOOK_S = 0.25  # wall time between two samples of the recorder's processor time
 TIMEOUT_S = 300.0
 FIELDS = ("core_percent", "messages_per_s", "megabytes_per_s", "missing", "broken")
-SLOWEST_S = 1.0  # s; five times the period of GPS, the slowest of the periodic keys
+SLOWEST_S = 1.0  # s; five times the period of GPS, the slowest periodic key
 
 
 class _Seq(msgspec.Struct):
@@ -49,8 +49,9 @@ class Flown(NamedTuple):
         sim_s: simulated time of the complete run.
         messages: number of recorded messages.
         size_bytes: size of the record.
-        faults: by key, where its `seq` breaks; for views, which may skip, only repetitions and steps back.
-        missing: how many values of `seq` are not on record, apart from views.
+        faults: what is wrong with each faulty key: a message that does not decode, a break in `seq` (for views, which
+            may skip, only repetitions and steps back), or an early end.
+        missing: number of values of `seq` that were not recorded, views excluded.
     """
 
     cpu_s: float
@@ -63,7 +64,7 @@ class Flown(NamedTuple):
 
 
 def fly(drones: int, seconds: float, *options: str) -> Flown:
-    """Fly a grid of drones with all sensors, their estimators and controllers in one process.
+    """Fly a grid of drones with all sensors, their estimators and controllers in one process; measure the recorder.
 
     Raises:
         RefusedError: the run failed.
@@ -112,7 +113,7 @@ def _recorder(launcher: int) -> psutil.Process | None:
 
 
 def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
-    """Return faults by key, the number of missing values of `seq`, the number of messages, and the last time [ns]."""
+    """Return faults by key, number of missing values of `seq`, number of messages, and the last message's time [ns]."""
     expected: dict[str, int] = {}
     faults: dict[str, str] = {}
     ends_ns: dict[str, int] = {}
@@ -137,7 +138,7 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
 
 
 def _cut_short(ends_ns: Mapping[str, int], last_ns: int) -> dict[str, str]:
-    """Return the periodic keys of drones that end before the run: a loss at the end leaves no gap in `seq`."""
+    """Return the drones' periodic keys that end before the run, as faults: a loss at the end leaves no gap in `seq`."""
     early = {key: (last_ns - end_ns) / 1e9 for key, end_ns in ends_ns.items() if key.startswith("drone/")}
     of_a_rate = {key: by_s for key, by_s in early.items() if "/sensor/" in key or key.endswith(("/truth", "/estimate"))}
     return {key: f"ends {by_s:g} s before the run" for key, by_s in of_a_rate.items() if by_s > SLOWEST_S}

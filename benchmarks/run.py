@@ -1,4 +1,4 @@
-"""Fly `zsim run` once, and measure the processor time and memory of its processes."""
+"""Run a command of zsim once, and measure the processor time and memory of its processes."""
 
 import contextlib
 import os
@@ -58,7 +58,7 @@ class Spent(NamedTuple):
 
 
 def spent(command: Sequence[str], folder: Path) -> Spent:
-    """Run a command in a folder and measure it; RefusedError if it fails, or does not end in time."""
+    """Run a command in a folder and measure it; raise RefusedError if it fails or does not end in time."""
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
             command, cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True
@@ -103,12 +103,12 @@ def _cpu_by_role(launcher: int) -> dict[str, float]:
 
 
 def role_of(process: psutil.Process) -> str:
-    """Return `role.thing` of a process of a run, or `forkserver` for the one from which roles are forked.
+    """Return a run's process as `role.thing`, as in `estimator.drone1`, or `forkserver` for the parent of forked roles.
 
     Raises:
         psutil.NoSuchProcess: the process has ended.
     """
-    words = [word for word in process.cmdline() if word]  # a forked role has empty arguments at the end
+    words = [word for word in process.cmdline() if word]  # a forked role has trailing empty arguments
     if words[1 : 1 + len(MODULE)] != [*MODULE]:
         return "forkserver"
     words = words[1 + len(MODULE) :]

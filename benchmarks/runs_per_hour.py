@@ -20,7 +20,7 @@ TIMEOUT_S = 300.0  # ample, as the first flight includes compilation
 
 
 class Contender(NamedTuple):
-    """A contender: how it follows the paths, and what it lacks; `peer` is None if it runs in zsim's own environment."""
+    """A contender: how to run it, what it flies and lacks; `peer` is None if it runs in zsim's own environment."""
 
     label: str
     peer: str | None
@@ -95,7 +95,7 @@ def _swept(sheet: Sheet) -> str:
 
 
 def _flown(sheet: Sheet, name: str, crew: list[Server], seed: int) -> str:
-    """Let all processes of a contender fly at once, and wait for the last; skip a contender that has failed before."""
+    """Let all processes of a contender fly at once and wait for the last; skip a contender that has failed before."""
     if why := sheet.refused.get(f"{name}@{WORKERS}"):
         return sheet.refuse(name, WORKERS, why, [name, f"{name}_cpu_s"])
     start_s = time.perf_counter()
@@ -140,7 +140,7 @@ def _row(sheet: Sheet, name: str, label: str, flown: str) -> list[str]:
 
 
 def _ratios(sheet: Sheet) -> str:
-    """Return the ratios of zsim to the only peer with an estimator, and of its world alone to the others."""
+    """Return a table of the ratios of zsim to the only peer with an estimator, and of its world alone to the others."""
     pairs = {
         "`zsim sweep` / RotorPy with its estimator": ("zsim", "rotorpy"),
         "zsim's world alone / gym-pybullet-drones": ("zsim_fleet", "pybullet"),

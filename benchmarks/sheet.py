@@ -41,11 +41,11 @@ class Sheet:
     machine: dict[str, Any] = field(default_factory=dict)
 
     def add(self, contender: str, size: int, value: float | None) -> None:
-        """Append the value of the next repeat, None if it has none."""
+        """Append the value of the next repeat, or None if it has no value."""
         self.values.setdefault(contender, {}).setdefault(size, []).append(value)
 
     def refuse(self, contender: str, size: int, reason: str, rows: Sequence[str]) -> str:
-        """Note why a contender has no values at a size in this repeat, in any of `rows`; return the reason."""
+        """Note why a contender has no value at a size in this repeat; add None to each of `rows`; return the reason."""
         self.refused[f"{contender}@{size}"] = reason
         for row in rows:
             self.add(row, size, None)
@@ -59,7 +59,7 @@ class Sheet:
         return spread(self.values.get(contender, {}).get(size, []))
 
     def ratio(self, contender: str, reference: str, size: int) -> Spread | None:
-        """Return the spread of the ratio of a contender to the reference, repeat by repeat; None if unknown."""
+        """Return the spread of the repeats' ratios of a contender to the reference; None if no ratio is known."""
         mine = self.values.get(contender, {}).get(size, [])
         its = self.values.get(reference, {}).get(size, [])
         return spread([a / b if a is not None and b else None for a, b in zip(mine, its, strict=False)])
@@ -81,7 +81,7 @@ def read(path: Path) -> Sheet:
 
 
 def spread(values: Sequence[float | None]) -> Spread | None:
-    """Return median, minimum and maximum of the values that are not None; None if there are none."""
+    """Return median, minimum and maximum of the values that are not None; None if all are."""
     found = [value for value in values if value is not None]
     return Spread(statistics.median(found), min(found), max(found)) if found else None
 

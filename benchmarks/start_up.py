@@ -1,4 +1,4 @@
-"""The time from starting a role until it is ready, and its memory at that time."""
+"""The time that each role takes from its start until it is ready, and its memory at that time."""
 
 import socket
 import subprocess
@@ -31,10 +31,10 @@ ROLES = {
 
 
 def measure(folder: Path) -> dict[str, float]:
-    """Return seconds until ready by role, and resident memory at that time by `{role}_mb` [MB].
+    """Return the seconds until ready as `{role}`, and the resident memory at that time as `{role}_mb` [MB].
 
     A world is ready when it answers `world/info`, a router when its port opens, the others when they have joined.
-    `zsim run`, with six processes and one gate, is timed to its end.
+    `zsim --help`, and `zsim run` with six processes and one gate, are timed to their end.
     """
     found = {"help": _timed_to_end([*CLI, "--help"])}
     scenario = folder / "start_up.yaml"
@@ -87,7 +87,7 @@ def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def _until(ready: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
-    """Wait until a process is ready; RefusedError if it ends, or is not ready in time."""
+    """Wait until a process is ready; raise RefusedError if it ends or is not ready in time."""
     until_s = time.perf_counter() + PATIENCE_S
     while not ready():
         if process.poll() is not None:

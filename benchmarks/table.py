@@ -27,7 +27,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def ratios(sheet: Sheet, labels: Mapping[str, str], reference: str, size_name: str = "N") -> str:
-    """Return a table with the values of the reference, and the others as multiples of it in the same repeat."""
+    """Return a table of the reference's values, and of the others' as multiples of it in the same repeat."""
     sizes = sheet.sizes()
     rows = [[f"{labels[reference]} [{sheet.unit}]", *(spread(sheet.spread(reference, size)) for size in sizes)]]
     for name, label in labels.items():
@@ -48,7 +48,7 @@ def _cell(sheet: Sheet, name: str, reference: str, size: int) -> str:
 
 
 def lines(sheet: Sheet, labels: Mapping[str, str], path: Path, title: str, size_name: str, ours: str = "zsim") -> None:
-    """Draw medians with their spread as SVG, in bold for contenders whose name begins with `ours`."""
+    """Draw medians with their spread as SVG, in bold for contenders whose names begin with `ours`."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -79,7 +79,7 @@ PICTURES = ROOT / "benchmarks" / "results"
 
 
 def replaced(text: str, part: str, content: str) -> str:
-    """Replace the section of a part in a page; ValueError if the page has no such section."""
+    """Replace the section of a part in a page; raise ValueError if the page has no such section."""
     begin, end = f"<!-- measured: {part} -->\n", f"<!-- end: {part} -->"
     before, found, rest = text.partition(begin)
     _, closed, after = rest.partition(end)

@@ -1,8 +1,8 @@
 """The code shared by all processes of a federation: frames, keys, messages, scenario, record, session, agent.
 
 Packages from the bottom up: errors; math and schema; sensors; contract; vehicles; record, scenario and transport, which
-do not import each other; runtime; presentation. Each imports those below it, and none imports another package of the
-product: what users call as `zsim.run` etc. belongs to `zsim_api`, which is imported when first used.
+do not import each other; runtime; presentation. Each imports only those below it, and none imports another package of
+the product: what users call as `zsim.run` etc. belongs to `zsim_api`, which is imported when first used.
 """
 
 import importlib
@@ -13,25 +13,25 @@ from typing import Any
 RELEASE = "0.2.0"  # as in pyproject.toml
 CONTRACT = 1
 COMMIT_FILE = "commit.txt"  # file with the commit in git archives, sdists and wheels
-DIGITS = 8  # digits of a commit in the version; enough to be unique in a repository of this size
+DIGITS = 8  # digits of the commit in the version; enough to be unique in a repository of this size
 
 
 def commit(package: Path = Path(__file__).parent) -> str:
-    """Return the commit of a package `zsim` in hex digits, from git's files or the build; empty if neither states it.
+    """Return the commit of the `zsim` package in hex digits, from git's files or the build; empty if neither states it.
 
-    It does not run git, since every process reads the commit when it starts.
+    git itself is not run, since every process reads the commit when it starts.
     """
     with suppress(OSError):
         if found := _checked_out(package.parent / ".git"):
             return found
     with suppress(OSError):
         found = (package / COMMIT_FILE).read_text().strip()
-        return "" if "$" in found else found  # in a checkout, the placeholder that `git archive` replaces
+        return "" if "$" in found else found  # a checkout has the placeholder that `git archive` replaces
     return ""
 
 
 def _checked_out(git: Path) -> str:
-    """Return the commit of a checkout. `.git` is a folder, or a file in a worktree (gitrepository-layout(5))."""
+    """Return the commit of a checkout; `git` is a folder or, in a worktree, a file (gitrepository-layout(5))."""
     if git.is_file():
         git = git.parent / git.read_text().removeprefix("gitdir:").strip()
     head = (git / "HEAD").read_text().strip()

@@ -1,4 +1,4 @@
-"""A client of a gateway, or of a bare server: measures one thing and prints it as a line of JSON.
+"""A client of a gateway or of a bare server: takes one measurement and prints it as a line of JSON.
 
 .venv/bin/python -m benchmarks.doors.client get --port 8000 --seconds 2
 """
@@ -16,11 +16,11 @@ import aiohttp
 import msgspec
 import zenoh
 
-CONNECTIONS = 4  # of HTTP, kept open
+CONNECTIONS = 4  # number of HTTP connections, kept open
 KEY = "bench/value"
 MESSAGE = {"t_ns": 0, "seq": 0, "accel_m_s2": [0.1, 0.2, 9.81], "gyro_rad_s": [0.01, 0.02, 0.03]}
-AHEAD = 2_000  # messages; the gateway's queue for a client holds about 20 000 of these
-PACE_S = 0.002  # between two messages whose latency is measured, so that none waits for another
+AHEAD = 2_000  # messages under way at most; the gateway's queue for a client holds about 20 000 of these
+PACE_S = 0.002  # time between messages whose latency is measured, so that none waits for another
 
 
 def quantiles(took_s: list[float]) -> dict[str, float]:
@@ -29,7 +29,7 @@ def quantiles(took_s: list[float]) -> dict[str, float]:
 
 
 async def rest(port: int, seconds: float, method: str) -> dict[str, float]:
-    """Send requests on several connections, then on one: requests per second, and the latency of one."""
+    """Send requests on several connections, then on one; return requests per second, and the latency of one."""
     url = f"http://127.0.0.1:{port}/json/{KEY}"
     body = json.dumps(MESSAGE).encode()
     took_s: list[float] = []
@@ -51,7 +51,7 @@ async def rest(port: int, seconds: float, method: str) -> dict[str, float]:
 
 
 def trip(port: int, seconds: float) -> dict[str, float]:
-    """Ask for a last value on the lines door, one request after the other."""
+    """Request a last value on the gateway's port for lines, one request after another."""
     stream = Lines(port)
     stream.ask({"op": "put", "key": KEY, "value": MESSAGE})
     took_s: list[float] = []
@@ -63,7 +63,7 @@ def trip(port: int, seconds: float) -> dict[str, float]:
 
 
 def zenoh_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
-    """Publish on Zenoh, and receive on Zenoh: messages per second, and the latency of one."""
+    """Publish and receive on Zenoh; return messages per second, and the latency of one."""
     with zenoh.open(_config(endpoint)) as sender, zenoh.open(_config(endpoint)) as receiver:
         taker = Taker()
         declared = receiver.declare_subscriber(f"zsim/{KEY}", lambda sample: taker.take(sample.payload.to_bytes()))
@@ -73,7 +73,7 @@ def zenoh_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
 
 
 def lines_flow(port: int, endpoint: str, seconds: float) -> dict[str, float]:
-    """Publish on Zenoh, and receive on the lines door."""
+    """Publish on Zenoh, and receive on the gateway's port for lines; return the same."""
     with zenoh.open(_config(endpoint)) as sender:
         taker, stream = Taker(), Lines(port)
         stream.ask({"op": "subscribe", "key": KEY})

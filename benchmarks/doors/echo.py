@@ -1,4 +1,4 @@
-"""A bare aiohttp server: GET returns what PUT brought, and nothing else happens. Prints its port."""
+"""A bare aiohttp server on the port given as argument: GET returns the body of the last PUT; nothing else happens."""
 
 import sys
 

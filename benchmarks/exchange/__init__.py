@@ -1,5 +1,5 @@
 """Contenders of part a: one world process and N agent processes that only wait for each other.
 
-Each file is one contender and prints one line of JSON, {"steps_per_s": …}. Files of peers run in the environment of
-the peers and import nothing but their peer and the standard library.
+Each module except `lap` is one contender and prints one line of JSON, {"steps_per_s": …}; `paced_zenoh` belongs to part
+d. Modules of peers run in the peers' environment, and import only their peer, `lap` and the standard library.
 """

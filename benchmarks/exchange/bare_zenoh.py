@@ -1,11 +1,11 @@
-"""The barrier that Zenoh alone allows, with zsim's settings and nothing else of zsim."""
+"""A barrier with Zenoh alone: with zsim's settings, but nothing else of zsim."""
 
 from contextlib import ExitStack
 
 from zsim.transport import session, zenoh_settings
 from zsim.transport.tls import Identity
 
-import zenoh  # isort: skip  # zsim.transport chooses its runtime first
+import zenoh  # isort: skip  # zsim.transport must set Zenoh's environment first
 
 from benchmarks.exchange.lap import PAYLOAD, Lap, agents, free_port, parser
 
@@ -48,19 +48,19 @@ def world(count: int, seconds: float, receive: str, express: bool, low_latency: 
 
 
 def _take(handler: zenoh.handlers.Handler, count: int) -> None:
-    """Take a number of answers, sleeping for each."""
+    """Take `count` answers, sleeping before each."""
     for _ in range(count):
         handler.recv().payload.to_bytes()
 
 
 def _drain(handler: zenoh.handlers.Handler, count: int) -> None:
-    """Take a number of answers, sleeping only if there is none."""
+    """Take `count` answers, sleeping only when none is waiting."""
     for _ in range(count):
         (handler.try_recv() or handler.recv()).payload.to_bytes()
 
 
 def agent(number: int, endpoint: str, express: bool, low_latency: bool) -> None:
-    """Announce itself, then answer everything until the stop."""
+    """Announce this agent, then answer every message until STOP."""
     chosen = zenoh_settings.common("client", "lockstep") | zenoh_settings.connecting(endpoint, Identity(), 10.0)
     with zenoh.open(config(chosen, low_latency)) as link:
         subscriber = link.declare_subscriber(f"bench/down/{number}", zenoh.handlers.FifoChannel(session.QUEUE_MAX))

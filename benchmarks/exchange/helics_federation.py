@@ -1,8 +1,8 @@
-"""HELICS: a broker, the world as a federate, every agent as a federate in its own process.
+"""HELICS: a broker, the world as a federate, and every agent as a federate in its own process.
 
-Equal semantics: the agents' time lies half a step after the world's, so that a value goes world, agent, world within
-one step, as in the other contenders; that takes two grants. `--one-grant` measures the exchange of neighbours
-(Jacobi) instead, in which every answer is a step late.
+The agents' time is half a step after the world's, so that a value travels from the world to an agent and back within
+one step, as with the other contenders; this takes two grants. `--one-grant` instead measures the exchange between
+neighbours (Jacobi), in which every answer arrives one step late.
 """
 # pyright: reportMissingImports=false
 
@@ -32,7 +32,7 @@ def main() -> None:
 
 
 def world(count: int, seconds: float, core: str, one_grant: bool) -> None:
-    """Publish to every agent, be granted the next step, read every agent."""
+    """At each step, publish to every agent, request the next time, and read every agent's answer."""
     at = f"bench{free_port()}" if core == "ipc" else str(free_port())
     place = f"--local_interface={at}" if core == "ipc" else f"--port={at}"
     broker = helics.helicsCreateBroker(core, at, f"-f {count + 1} {place} {SILENT}")
@@ -52,7 +52,7 @@ def world(count: int, seconds: float, core: str, one_grant: bool) -> None:
 
 
 def agent(number: int, core: str, at: str, one_grant: bool) -> None:
-    """Read the world, answer, until the stop."""
+    """Read and answer the world's messages until STOP."""
     with _federate(f"agent{number}", core, at, 0.0 if one_grant else 0.5) as me:
         out = helics.helicsFederateRegisterGlobalPublication(me, f"up{number}", KIND, "")
         inn = helics.helicsFederateRegisterSubscription(me, f"down{number}", "")
@@ -63,7 +63,7 @@ def agent(number: int, core: str, at: str, one_grant: bool) -> None:
 
 
 def _say(me: object, outs: list[object], text: str, until: float) -> float:
-    """Publish, and return the time granted."""
+    """Publish a text, request the time `until`, and return the time granted."""
     for out in outs:
         helics.helicsPublicationPublishString(out, text)
     return helics.helicsFederateRequestTime(me, until)
@@ -71,7 +71,7 @@ def _say(me: object, outs: list[object], text: str, until: float) -> float:
 
 @contextmanager
 def _federate(name: str, core: str, at: str, offset: float) -> Iterator[object]:
-    """Make a federate of period 1 with its own core, and finalize it afterwards."""
+    """Create a federate of period 1 with its own core, and disconnect it afterwards."""
     info = helics.helicsCreateFederateInfo()
     helics.helicsFederateInfoSetCoreTypeFromString(info, core)
     place = f"--broker_address={at}" if core == "ipc" else f"--brokerport={at}"

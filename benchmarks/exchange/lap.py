@@ -1,4 +1,4 @@
-"""What all contenders of the exchange share: the clock of a run, the agents' processes, the options, the result."""
+"""The parts shared by all contenders of the exchange: clock of a run, agent processes, options, result."""
 
 import argparse
 import json
@@ -10,15 +10,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 PAYLOAD = bytes(100)  # payload each way per agent and step, about the size of a drone's status
-WARM_S = 0.3  # wall time of steps that are not counted: caches fill, threads start
-PATIENCE_S = 60.0  # wall time in which an agent must leave when told to
+WARM_S = 0.3  # wall time of the first steps, which are not counted: caches fill, threads start
+PATIENCE_S = 60.0  # wall time within which an agent must leave when told to
 
 
 class Lap:
     """Counts steps for a number of wall seconds after a warm-up.
 
     Attributes:
-        steps: counted so far.
+        steps: number of steps counted so far.
     """
 
     def __init__(self, seconds: float, warm_s: float = WARM_S) -> None:
@@ -30,7 +30,7 @@ class Lap:
         self.steps = 0
 
     def more(self) -> bool:
-        """Note that a step begins (at the first call: that all is set up); return whether it is to be made."""
+        """Note that a step begins (at the first call: that everything is set up); return whether to make the step."""
         self._last_s = now_s = time.perf_counter()
         if self._begin_s is None:
             self._begin_s = now_s

@@ -1,7 +1,7 @@
-"""mosaik: its scheduler steps the world, then every agent, each a simulator in its own process.
+"""mosaik: its scheduler steps the world, which runs in the same process, and then every agent, each in its own.
 
-The world's output goes to the agents within a step; their answers come back one step later, as everywhere here.
-mosaik cannot be told to stop at a wall time: the number of steps is given.
+The world's output goes to the agents within a step, and their answers reach the world at its next step, as with all
+contenders. mosaik cannot be told to stop at a wall time, so the number of steps is fixed beforehand.
 """
 # pyright: reportMissingImports=false
 
@@ -19,7 +19,7 @@ from benchmarks.exchange.lap import PAYLOAD
 
 TEXT = "x" * len(PAYLOAD)
 WARM_STEPS = 20
-STEPS_S = 1200  # steps/s of one agent on the machine of benchmarks/README.md, from which the number of steps is chosen
+STEPS_S = 1200  # steps/s with one agent on the machine of benchmarks/README.md; sets the number of steps
 META: mosaik_api_v3.types.Meta = {
     "api_version": "3.0",
     "type": "time-based",
@@ -29,7 +29,7 @@ META: mosaik_api_v3.types.Meta = {
 
 
 class Node(mosaik_api_v3.Simulator):
-    """One entity that sends the same text at every step."""
+    """A simulator of entities that send the same text at every step."""
 
     def __init__(self) -> None:
         super().__init__(META)
@@ -45,7 +45,7 @@ class Node(mosaik_api_v3.Simulator):
 
 
 class Stopwatch(Node):
-    """The world's simulator, which runs inside the scheduler's process and notes when it was stepped."""
+    """The world's simulator, which runs inside the scheduler's process and records when it is stepped."""
 
     began: list[float] = []  # noqa: RUF012 - mosaik makes the only instance and does not hand it out
 

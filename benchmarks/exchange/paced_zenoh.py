@@ -1,8 +1,8 @@
-"""Bare Zenoh paced by the wall clock: the age of an answer on its return to the hub.
+"""Bare Zenoh paced by the wall clock: measures the age of an answer on its return to the hub.
 
-`--path trip`: the hub puts one message to each of N clients every 20 ms, each puts one back.
-`--path command`: the path of a command: hub to N clients, each to one more client through the hub, which waits for all
-N and puts N messages back.
+`--path trip`: the hub sends one message to each of N clients every 20 ms, and each sends one back.
+`--path command`: the path of a command, from the hub to N clients and from each through the hub to one more client,
+which waits for all N messages and sends N back.
 """
 
 import json
@@ -14,13 +14,13 @@ from contextlib import ExitStack, contextmanager
 from zsim.transport import session, zenoh_settings
 from zsim.transport.tls import Identity
 
-import zenoh  # isort: skip  # zsim.transport chooses its runtime first
+import zenoh  # isort: skip  # zsim.transport must set Zenoh's environment first
 
 from benchmarks.exchange.bare_zenoh import config
 from benchmarks.exchange.lap import PAYLOAD, agents, free_port, parser
 
 PERIOD_S = 0.02  # zsim's gate
-STOP = 2**62  # not the number of a step
+STOP = 2**62  # larger than any step number
 REST = PAYLOAD[8:]
 WARM_STEPS = 25
 Take = Callable[[int], None]
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def hub(count: int, seconds: float, path: str) -> None:
-    """Put a step every period, and note the age of each answer."""
+    """Send a step to every client each period, and record the age of each answer."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     steps = WARM_STEPS + round(seconds / PERIOD_S)
     sent_s: list[float] = []
@@ -88,7 +88,7 @@ def client(number: int, endpoint: str, where: str) -> None:
 
 
 def gatherer(count: int, endpoint: str) -> None:
-    """Wait for all clients of a step, then answer for all."""
+    """For each step, wait for the messages of all clients, then answer on behalf of all."""
     with _connected(endpoint) as link:
         subscriber = link.declare_subscriber("bench/mid/*", zenoh.handlers.FifoChannel(session.QUEUE_MAX))
         link.put("bench/up/gatherer", _message(STOP))
@@ -107,7 +107,7 @@ def gatherer(count: int, endpoint: str) -> None:
 
 @contextmanager
 def _reader(link: zenoh.Session, expression: str, take: Take) -> Iterator[None]:
-    """Hand every message to `take`, in a thread."""
+    """Pass the step of every message to `take`, in a separate thread."""
     subscriber = link.declare_subscriber(expression, zenoh.handlers.FifoChannel(session.QUEUE_MAX))
     handler = subscriber.handler
 
@@ -130,7 +130,7 @@ def _reader(link: zenoh.Session, expression: str, take: Take) -> Iterator[None]:
 @contextmanager
 def _children(count: int, others: int, endpoint: str, path: str) -> Iterator[None]:
     module = "benchmarks.exchange.paced_zenoh"
-    options = ["--agents", str(count), "--at", endpoint, "--path", path]  # the last --agents counts
+    options = ["--agents", str(count), "--at", endpoint, "--path", path]  # of two --agents, the last counts
     with agents(module, others, *options):
         yield
 

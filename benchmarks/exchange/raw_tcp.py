@@ -17,7 +17,7 @@ def main() -> None:
 
 
 def world(count: int, seconds: float, lookahead: bool) -> None:
-    """Send to every agent, wait for every agent; with lookahead, for the answers to the step before."""
+    """At each step, send to every agent and wait for all answers; with lookahead, for those to the previous step."""
     with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as stack:
         port = server.getsockname()[1]
         stack.enter_context(agents("benchmarks.exchange.raw_tcp", count, "--at", str(port)))

@@ -1,4 +1,4 @@
-"""pyzmq ROUTER/DEALER over TCP: one message to each agent, one back from each."""
+"""pyzmq ROUTER/DEALER over TCP: at each step, one message to each agent and one back."""
 # pyright: reportMissingImports=false
 
 import zmq
@@ -17,7 +17,7 @@ def main() -> None:
 
 
 def world(count: int, seconds: float, lookahead: bool) -> None:
-    """Send to every agent, wait for every agent; with lookahead, for the answers to the step before."""
+    """At each step, send to every agent and wait for all answers; with lookahead, for those to the previous step."""
     with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
         router.setsockopt(zmq.ROUTER_MANDATORY, 1)
         port = router.bind_to_random_port("tcp://127.0.0.1")
@@ -53,7 +53,7 @@ def _send(router: zmq.Socket, names: list[bytes]) -> None:
 
 
 def agent(number: int, endpoint: str) -> None:
-    """Announce itself, then answer everything until the stop."""
+    """Announce this agent, then answer every message until STOP."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
         dealer.setsockopt(zmq.IDENTITY, str(number).encode())
         dealer.connect(endpoint)

@@ -1,8 +1,8 @@
 """zsim's own lockstep with nothing to compute: the real world, barrier, hub and runner over Zenoh.
 
-In: WorldProcess, World, Barrier and MessageHistory, with truth, status and clock of every gate built, encoded, hashed,
-put and kept; in every agent Runner, Inbox and AgentParticipant, with status decoded and done encoded and put; joins,
-tokens, health. Out: the fleet (its truth stands still and it has no samples), and the agents' outputs.
+Included: WorldProcess, World, Barrier and MessageHistory, which build, encode, hash, put and keep truth, status and
+clock of every gate; in every agent, Runner, Inbox and AgentParticipant, which decode the status and encode and put the
+done; joins, tokens and health. Left out: the fleet (its truth stands still, without samples) and the agents' outputs.
 """
 
 from collections.abc import Iterator
@@ -41,11 +41,11 @@ def main() -> None:
 
 
 def run_world(count: int, seconds: float, lookahead: bool, low_latency: bool) -> Lap:
-    """Run gates for a number of wall seconds; without lookahead every gate waits for the dones of the one before it."""
+    """Run gates for `seconds` of wall time; without lookahead, every gate waits for the dones of the previous one."""
     with mock.patch.object(world, "Fleet", NullFleet):
         made = world.World(_scenario(count))
     if not lookahead:
-        made.clock.delay_ns = 0  # no scenario allows this: a command would take effect at the instant that it answers
+        made.clock.delay_ns = 0  # no scenario may set 0: a command would take effect at the very instant it responds to
     lap, over = Lap(seconds), False
 
     def tell(kind: str, message: Any, phase: str) -> None:
@@ -62,7 +62,7 @@ def run_world(count: int, seconds: float, lookahead: bool, low_latency: bool) ->
 
 
 def run_agent(number: int, endpoint: str) -> None:
-    """Say done to every gate until the run ends."""
+    """Answer every gate with a done until the run ends."""
     with find_world(endpoint, FEDERATION, wait_s=60.0) as (link, info):
         Runner(link, info, NullAgent(f"drone{number}")).run()
 
@@ -104,10 +104,10 @@ def _scenario(count: int) -> Any:
 
 @contextmanager
 def _transport(low_latency: bool) -> Iterator[None]:
-    """Let sessions use the low-latency transport, which zsim itself does not offer.
+    """With `low_latency`, let sessions use Zenoh's low-latency transport, which zsim itself does not offer.
 
-    Zenoh 1.10.2 panics when a listener to transport events is declared on it, so the agents do without theirs: they
-    would not notice a lost link.
+    Zenoh 1.10.2 panics when a listener for transport events is declared on this transport, so the agents declare none
+    and would not notice a lost link.
     """
     common = zenoh_settings.common
 

@@ -1,7 +1,7 @@
-"""crazyflow on JAX's CPU: rotors and body from first principles, attitude controller; no sensors, wind, contacts.
+"""crazyflow on JAX's CPU backend: first-principles rotors and body, attitude controller; no sensors, wind or contacts.
 
-400 Hz as zsim's physics; Euler (its default) or Runge-Kutta of fourth order (`--rk4`). A call flies 20 ms, as a
-command every gate asks for, or a second (`--long`). Compiled and warm.
+Steps at 400 Hz, like zsim's physics, by Euler's method (crazyflow's default) or fourth-order Runge-Kutta (`--rk4`). A
+call simulates 20 ms, as one command per gate requires, or a second (`--long`). Measured compiled and warm.
 """
 # pyright: reportMissingImports=false
 
@@ -12,7 +12,7 @@ from typing import Any
 from benchmarks.kernel.stopwatch import Flight, serve, single
 
 RATE_HZ = 400
-TOGETHER_MAX = 100  # drones in one world; a thousand take two minutes to build there and fly as fast in a world each
+TOGETHER_MAX = 100  # drones in one world; a thousand take two minutes to build in one, and run as fast in a world each
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
 
 
 def simulator(worlds: int, drones: int, **options: Any) -> Any:
-    """Return worlds of drones at rest, with body, rotors and attitude at RATE_HZ."""
+    """Return a simulator of drones at rest, with body, rotors and attitude controller stepped at RATE_HZ."""
     from crazyflow.sim import Sim
 
     rates = dict.fromkeys(("freq", "attitude_freq", "body_rate_freq", "force_torque_freq"), RATE_HZ)

@@ -1,7 +1,7 @@
-"""Bare MuJoCo: free bodies with four thrusts each; no firmware, sensors, rotors' lag, wind, or contacts.
+"""Bare MuJoCo: free bodies with four thrusts each; no firmware, sensors, rotor lag, wind or contacts.
 
-400 Hz, semi-implicit Euler (its default), 8 steps per call: 20 ms. All bodies in one model, as drones that could meet
-need it, or a model of one body stepped for each drone (`--apart`), as for drones that never meet.
+Steps at 400 Hz by semi-implicit Euler (MuJoCo's default), 8 steps (20 ms) per call. All bodies share one model, as
+drones that may meet require, or a model of one body is stepped for each drone (`--apart`), as if drones never met.
 """
 # pyright: reportMissingImports=false
 
@@ -12,7 +12,7 @@ import mujoco
 from benchmarks.kernel.stopwatch import Flight, serve, single
 
 STEP_S, STEPS = 0.0025, 8
-MASS_KG, INERTIA_KG_M2, ARM_M = 0.429, "2.24e-3 2.99e-3 4.80e-3", 0.126  # the AR.Drone, rotors at (±arm, ±arm)
+MASS_KG, INERTIA_KG_M2, ARM_M = 0.429, "2.24e-3 2.99e-3 4.80e-3", 0.126  # AR.Drone; rotors at (±ARM_M, ±ARM_M)
 THRUST_N = MASS_KG * 9.81 / 4.0
 
 

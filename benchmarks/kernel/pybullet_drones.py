@@ -1,9 +1,9 @@
-"""The physics of gym-pybullet-drones on pybullet: cf2x body, its calls in its order.
+"""The physics of gym-pybullet-drones on pybullet: the cf2x body, with the same calls in the same order.
 
-gym-pybullet-drones is not on the package index; its `BaseAviary` with Physics.PYB is followed here call by call
+gym-pybullet-drones is not on the package index, so its `BaseAviary` with Physics.PYB is followed here call by call
 (four forces and a torque per drone and step, then one step of Bullet; position, angles and velocities read once per
-control step) with its 240 Hz and 48 Hz, without its observations, rewards and spaces. No firmware, sensors, rotors'
-lag, or wind; Bullet's semi-implicit Euler; its contacts are on.
+control step), with its 240 Hz physics and 48 Hz control but without its observations, rewards and spaces. No firmware,
+sensors, rotor lag or wind; Bullet's semi-implicit Euler, with contacts on.
 """
 # pyright: reportMissingImports=false
 
@@ -16,9 +16,9 @@ import pybullet
 from benchmarks.kernel.stopwatch import Flight, serve, single
 
 STEP_HZ, CONTROL_HZ = 240, 48
-MASS_KG, GRAVITY_M_S2 = 0.027, 9.8  # cf2x.urdf, BaseAviary
-KF, KM = 3.16e-10, 7.94e-12  # N/rpm^2, N m/rpm^2, cf2x.urdf
-ROTORS_M = ((0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028))  # cf2x.urdf
+MASS_KG, GRAVITY_M_S2 = 0.027, 9.8  # from cf2x.urdf and BaseAviary
+KF, KM = 3.16e-10, 7.94e-12  # N/rpm^2, N m/rpm^2, from cf2x.urdf
+ROTORS_M = ((0.028, -0.028), (-0.028, -0.028), (-0.028, 0.028), (0.028, 0.028))  # from cf2x.urdf
 
 
 def flight(count: int) -> Flight:
@@ -41,7 +41,7 @@ def flight(count: int) -> Flight:
 
 
 def _push(drone: int, client: int, rpm: tuple[float, float, float, float]) -> None:
-    """As BaseAviary._physics."""
+    """Apply one drone's thrusts and yaw torque, as `BaseAviary._physics` does."""
     turn = 0.0
     for k, speed in enumerate(rpm):
         pybullet.applyExternalForce(
@@ -57,7 +57,7 @@ def _push(drone: int, client: int, rpm: tuple[float, float, float, float]) -> No
 
 
 def _read(drone: int, client: int) -> None:
-    """As BaseAviary._updateAndStoreKinematicInformation."""
+    """Read one drone's state, as `BaseAviary._updateAndStoreKinematicInformation` does."""
     _, q = pybullet.getBasePositionAndOrientation(drone, physicsClientId=client)
     pybullet.getEulerFromQuaternion(q)
     pybullet.getBaseVelocity(drone, physicsClientId=client)
@@ -79,7 +79,7 @@ def _load(count: int, client: int) -> list[int]:
 
 
 def _urdf() -> str:
-    """Return cf2x.urdf (MIT licence) without its visual parts."""
+    """Return cf2x.urdf (MIT licence) without its visual elements."""
     inertia = '<inertia ixx="1.4e-5" ixy="0" ixz="0" iyy="1.4e-5" iyz="0" izz="2.17e-5"/>'
     base = f'<inertial><mass value="{MASS_KG}"/>{inertia}</inertial>'
     hull = '<collision><geometry><cylinder radius=".06" length=".025"/></geometry></collision>'

@@ -1,8 +1,8 @@
-"""RotorPy's vehicle with rotor speeds as commands: a Python object per drone, or a batch on torch (`--batch`).
+"""RotorPy's vehicle with rotor speeds as commands: stepped drone by drone, or as a batch on torch (`--batch`).
 
-Aerodynamic wrench and motor noise as it has them, its own step of 10 ms, Runge-Kutta 4(5) with its own tolerances for
-objects (scipy) and of fourth order for a batch (torchdiffeq; one step of the fixed method is its cheapest). No
-firmware, wind, contacts, or sensors.
+RotorPy's own aerodynamic wrench, motor noise and step of 10 ms. Single drones are integrated by scipy's Runge-Kutta
+4(5) with RotorPy's tolerances; a batch by one fixed step of torchdiffeq's fourth-order Runge-Kutta, the cheapest
+choice for a batch. No firmware, wind, contacts or sensors.
 """
 # pyright: reportMissingImports=false
 
@@ -28,7 +28,7 @@ def main() -> None:
     given = parser.parse_args()
     if not given.threads:
         single()
-        torch.set_num_threads(1)  # rotorpy imports it before; two threads on one core wait for each other
+        torch.set_num_threads(1)  # rotorpy has imported torch before the pinning; two threads would wait for each other
     serve(batch if given.batch else objects)
 
 

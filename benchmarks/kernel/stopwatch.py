@@ -1,4 +1,4 @@
-"""Shared by all contenders of the kernel: measuring a step in CPU time of all threads, and serving measurements."""
+"""Shared by all contenders of part b: timing a step in CPU time of all threads, and serving measurements."""
 
 import json
 import os
@@ -11,16 +11,16 @@ WARM_CALLS = 3
 
 
 class Flight(NamedTuple):
-    """Drones ready to be flown."""
+    """Drones ready to be stepped."""
 
-    advance: Callable[[], object]  # flies on; called again and again
-    span_s: float  # simulated seconds per call
+    advance: Callable[[], object]  # simulates the next `span_s`; called repeatedly
+    span_s: float  # simulated time per call
 
 
 def answer(find: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
-    """Answer each line of JSON on stdin with one on stdout until it ends; an error is a refusal."""
+    """Answer each line of JSON on stdin with one on stdout until stdin ends; an exception is answered as a refusal."""
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # output of the peers is not an answer
+    os.dup2(2, 1)  # what a peer prints must not pass for an answer
     for line in sys.stdin:
         try:
             found = find(json.loads(line))
@@ -31,7 +31,7 @@ def answer(find: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
 
 
 def serve(build: Callable[[int], Flight]) -> None:
-    """Answer {"drones": N, "cpu_s": S} by {"drone_s_per_cpu_s": …}."""
+    """Answer each {"drones": N, "cpu_s": S} with {"drone_s_per_cpu_s": …}."""
     flights: dict[int, Flight] = {}
 
     def find(asked: dict[str, Any]) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def serve(build: Callable[[int], Flight]) -> None:
 
 
 def rate(flight: Flight, cpu_s: float) -> float:
-    """Return simulated seconds per CPU second, over at least a number of CPU seconds."""
+    """Return the simulated seconds per CPU second, measured over at least `cpu_s`."""
     for _ in range(WARM_CALLS):
         flight.advance()
     start, calls = time.process_time(), 0  # user and system time of all threads
@@ -56,5 +56,5 @@ def rate(flight: Flight, cpu_s: float) -> float:
 
 
 def single() -> None:
-    """Keep this process on one core; libraries then start one thread, or share the core."""
+    """Pin this process to one core: libraries then start one thread, or their threads share the core."""
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

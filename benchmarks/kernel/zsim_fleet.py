@@ -1,7 +1,7 @@
-"""zsim's fleet: firmware, all noisy sensors, wind, encounters; or its compiled kernel alone (`--bare`).
+"""zsim's fleet with firmware, all sensors with noise, wind and encounters; or its compiled kernel alone (`--bare`).
 
-Physics every 2.5 ms by Runge-Kutta of fourth order, firmware and IMU every 5 ms, a call per gate of 20 ms. The fleet
-draws its noise, returns samples and truth as arrays; the bare kernel reads the same noise again and returns nothing.
+Physics every 2.5 ms by fourth-order Runge-Kutta, firmware and IMU every 5 ms, one call per gate of 20 ms. The fleet
+draws its noise and returns samples and truth as arrays; the bare kernel reuses the same noise and returns nothing.
 """
 
 import argparse
@@ -13,9 +13,9 @@ from benchmarks.kernel.stopwatch import Flight, serve, single
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fleet import NOISE_GATES, Fleet
 
-CLIMB_GATES = 300  # 6 s: taking off is over
+CLIMB_GATES = 300  # 6 s, by when the drones have taken off
 LONG_S = 1e6  # s, simulated: longer than any measurement
-CHARGE_MAH = 1e5  # 20 h of hovering: no battery is empty before the measurement is over
+CHARGE_MAH = 1e5  # 20 h of hovering: no battery runs empty during the measurements
 
 
 def main() -> None:
@@ -27,7 +27,7 @@ def main() -> None:
 
 
 def fleet(count: int) -> Flight:
-    """Return a fleet that hovers and is flown as the world does."""
+    """Return a hovering fleet, advanced as the world advances it."""
     made = _airborne(count)
 
     def advance() -> Any:
@@ -38,7 +38,7 @@ def fleet(count: int) -> Flight:
 
 
 def bare_kernel(count: int) -> Flight:
-    """Return a fleet of which only the compiled kernel is run."""
+    """Return a hovering fleet of which only the compiled kernel is run."""
     made = _airborne(count)
     gates = counting()
 

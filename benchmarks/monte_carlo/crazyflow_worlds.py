@@ -1,8 +1,8 @@
 """crazyflow: worlds of three Crazyflies as one batch, each drone's mass drawn anew for each flight.
 
-Position controller (its Mellinger) at 50 Hz, attitude and thrust at 400 Hz, rotors and body from first principles by
-Euler's method at 400 Hz, single precision. A flight of all worlds, or its beginning, with what is judged of it, is one
-compiled loop: no return to Python within it. No sensors, estimators, wind, or contacts.
+Position controller (crazyflow's Mellinger) at 50 Hz, attitude and thrust control at 400 Hz, first-principles rotors and
+body by Euler's method at 400 Hz, single precision. A flight of all worlds, or its first `--seconds`, is one compiled
+loop that also computes the results and never returns to Python. No sensors, estimators, wind or contacts.
 """
 # pyright: reportMissingImports=false
 
@@ -19,7 +19,7 @@ from benchmarks.monte_carlo.way import Way
 from benchmarks.monte_carlo.worker import Flown, Fly, serve
 
 GATE_HZ = 50
-MASS_STD = 0.01  # of the mass; chosen so that flights differ
+MASS_STD = 0.01  # relative to the mass; design choice, so that flights differ
 
 
 def main() -> None:
@@ -29,13 +29,13 @@ def main() -> None:
 
 
 def build(way: Way, given: argparse.Namespace) -> Fly:
-    """Return worlds that stand where the drones of Test 1 do."""
+    """Return a function that flies all worlds, starting where the drones of Test 1 stand."""
     import jax
     from crazyflow.control import Control
     from crazyflow.sim.integration import Integrator
 
     worlds = given.worlds
-    with TemporaryDirectory() as folder, chdir(folder):  # MuJoCo writes a log of its warnings where it is
+    with TemporaryDirectory() as folder, chdir(folder):  # MuJoCo logs its warnings to a file in the working directory
         sim = simulator(worlds, 3, state_freq=GATE_HZ, control=Control.state, integrator=Integrator.euler)
     gates = min(round(given.seconds * GATE_HZ), len(way.p_W) - 1)
     commands = jax.numpy.asarray(_commands(way)[:gates], dtype=jax.numpy.float32)
@@ -53,7 +53,7 @@ def build(way: Way, given: argparse.Namespace) -> Fly:
 
 
 def _loop(step: Any, commands: Any, worlds: int) -> Any:
-    """Return what flies all worlds along the commands and gives mean square and least distance of each, compiled."""
+    """Return a compiled flight along `commands` that gives every world's mean square error and closest approach."""
     import jax
     import jax.numpy as jnp
     from crazyflow.sim import functional
@@ -77,7 +77,7 @@ def _loop(step: Any, commands: Any, worlds: int) -> Any:
 
 
 def _commands(way: Way) -> np.ndarray:
-    """Return (K, 3, 16) position, velocity, acceleration, attitude (x, y, z, w), rates, for the gates' ends."""
+    """Return position, velocity, acceleration, attitude (x, y, z, w) and rates at the end of every gate, (K, 3, 16)."""
     found = np.zeros((len(way.p_W) - 1, 3, 16))
     found[..., 0:3], found[..., 3:6] = way.p_W[1:], way.v_W[1:]
     found[..., 11], found[..., 12] = np.sin(way.yaw[1:] / 2), np.cos(way.yaw[1:] / 2)
@@ -85,7 +85,7 @@ def _commands(way: Way) -> np.ndarray:
 
 
 def _standing(states: Any, command: Any) -> Any:
-    """Return states with all drones at rest at their first point."""
+    """Return `states` with all drones at rest, posed as in `command`."""
     return states.replace(pos=states.pos.at[:].set(command[:, :3]), quat=states.quat.at[:].set(command[:, 9:13]))
 
 

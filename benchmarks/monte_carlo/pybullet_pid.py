@@ -1,8 +1,8 @@
-"""gym-pybullet-drones with its position controller: three Crazyflies (cf2x) in a world of Bullet.
+"""gym-pybullet-drones with its position controller: three Crazyflies (cf2x) in one Bullet world.
 
-It is not on the package index; its physics (benchmarks/kernel/pybullet_drones.py) and its DSLPIDControl (MIT licence)
-are followed call by call, 240 Hz and 48 Hz, without its observations, rewards, spaces and log. The drones' masses are
-drawn anew for each flight. No sensors, estimators, wind, or rotor lag; Bullet's contacts are on.
+It is not on the package index, so its physics (benchmarks/kernel/pybullet_drones.py) and its DSLPIDControl (MIT
+licence) are followed call by call, at 240 Hz and 48 Hz, without its observations, rewards, spaces and log. The drones'
+masses are drawn anew for each flight. No sensors, estimators, wind or rotor lag; Bullet's contacts are on.
 """
 # pyright: reportMissingImports=false
 
@@ -18,8 +18,8 @@ from benchmarks.kernel import pybullet_drones as bodies
 from benchmarks.monte_carlo.way import Way
 from benchmarks.monte_carlo.worker import Flown, Fly, serve
 
-MASS_STD = 0.01  # of the mass; chosen so that flights differ
-# What follows is DSLPIDControl's for cf2x
+MASS_STD = 0.01  # relative to the mass; design choice, so that flights differ
+# The following are DSLPIDControl's constants for cf2x
 P_FORCE, I_FORCE, D_FORCE = np.array([0.4, 0.4, 1.25]), np.array([0.05, 0.05, 0.05]), np.array([0.2, 0.2, 0.5])
 P_TORQUE, D_TORQUE = np.array([70000.0, 70000.0, 60000.0]), np.array([20000.0, 20000.0, 12000.0])
 I_TORQUE = np.array([0.0, 0.0, 500.0])
@@ -32,7 +32,7 @@ def main() -> None:
 
 
 def build(way: Way, given: argparse.Namespace) -> Fly:
-    """Return a world of Bullet with the drones where Test 1's stand."""
+    """Return a function that flies three drones in one Bullet world, starting where those of Test 1 stand."""
     client = pybullet.connect(pybullet.DIRECT)
     pybullet.setGravity(0, 0, -bodies.GRAVITY_M_S2, physicsClientId=client)
     pybullet.setRealTimeSimulation(0, physicsClientId=client)
@@ -58,7 +58,7 @@ def _put(drone: int, client: int, p_W: np.ndarray, yaw: float, mass_kg: float) -
 
 
 def _follow(way: Way, drones: list[int], client: int, steps: int) -> tuple[float, float]:
-    """Fly; return the sum of squared distances from the ways, and the least distance of two drones."""
+    """Fly for `steps`; return the sum of squared distances from the paths and the drones' closest approach."""
     controls = [Control(way.yaw[0, k]) for k in range(3)]
     squares, closest, p_W = 0.0, math.inf, np.zeros((3, 3))
     for step in range(steps):
@@ -84,7 +84,7 @@ class Control:
         self._p_sum, self._turn_sum = np.zeros(3), np.zeros(3)
 
     def rpm(self, p: np.ndarray, q: Any, v: np.ndarray, p_d: np.ndarray, v_d: np.ndarray, yaw: float) -> Any:
-        """Return the rotors' speeds [1/min] for a position, attitude (x, y, z, w) and velocity, and those desired."""
+        """Return rotor speeds [rpm]; `q` is (x, y, z, w), and `p_d`, `v_d` and `yaw` are desired."""
         R = np.array(pybullet.getMatrixFromQuaternion(q)).reshape(3, 3)
         thrust, R_d = self._position(p, v, R, p_d, v_d, yaw)
         return self._attitude(thrust, q, R, R_d)
@@ -92,7 +92,7 @@ class Control:
     def _position(
         self, p: np.ndarray, v: np.ndarray, R: np.ndarray, p_d: np.ndarray, v_d: np.ndarray, yaw: float
     ) -> tuple[float, np.ndarray]:
-        """As _dslPIDPositionControl; returns thrust as PWM, and the desired attitude."""
+        """Return the thrust as PWM and the desired attitude, as `_dslPIDPositionControl` does."""
         p_e = p_d - p
         self._p_sum = np.clip(self._p_sum + p_e / bodies.CONTROL_HZ, -2.0, 2.0)
         self._p_sum[2] = np.clip(self._p_sum[2], -0.15, 0.15)
@@ -106,7 +106,7 @@ class Control:
         return thrust, Rotation.from_euler("XYZ", Rotation.from_matrix(R_d).as_euler("XYZ")).as_matrix()
 
     def _attitude(self, thrust: float, q: Any, R: np.ndarray, R_d: np.ndarray) -> np.ndarray:
-        """As _dslPIDAttitudeControl."""
+        """Return the rotor speeds [rpm], as `_dslPIDAttitudeControl` does."""
         rpy = np.array(pybullet.getEulerFromQuaternion(q))
         turn = R_d.T @ R - R.T @ R_d
         turn_e = np.array([turn[2, 1], turn[0, 2], turn[1, 0]])

@@ -1,10 +1,10 @@
-"""RotorPy's own simulation of quadrotors with the AR.Drone's mass, inertia, rotors and drag, Dryden gusts of 0.5 m/s.
+"""RotorPy's own simulation of quadrotors with the AR.Drone's mass, inertia, rotors and drag, in gusts of 0.5 m/s.
 
-Its step of 10 ms, SE(3) controller, IMU with noise. A drone after the other by `Environment.run` with its motion
-capture and wind EKF, whose estimates nobody reads (the controller is given the truth), Runge-Kutta 4(5) by scipy; or
-many flights at once by `simulate_batch` on torch (`--batch`), which has neither, one step of RK4 per 10 ms, its
-cheapest. Some seconds of a flight are flown, for every step costs the same. No cluster controller, GPS, sonar, record
-on disk, or contacts.
+RotorPy's step of 10 ms, SE(3) controller, noisy IMU and Dryden gusts. Drones fly one after the other by
+`Environment.run`, with motion capture and a wind EKF whose estimates nothing reads (the controller is given the truth),
+integrated by scipy's Runge-Kutta 4(5); or many flights at once by `simulate_batch` on torch (`--batch`), with neither
+motion capture nor EKF, by one RK4 step per 10 ms, the cheapest choice. Only some seconds of a flight are simulated, as
+every step takes the same time. No cluster controller, GPS, sonar, recording or contacts.
 """
 # pyright: reportMissingImports=false
 
@@ -27,22 +27,22 @@ from benchmarks.monte_carlo.way import Way
 from benchmarks.monte_carlo.worker import Flown, Fly, serve
 
 STEP_S = 0.01  # RotorPy's default
-START_S = 40.0  # of Test 1: the formation climbs and goes
+START_S = 40.0  # time in Test 1 at which flights begin: the formation is climbing and moving
 GUST_M_S = 0.5  # scenarios/step.yaml
-THRUST_N_S2, HOVER_RAD_S = 8.048e-6, 361.5  # zsim/vehicles/ardrone2.py; sqrt(m g / 4 k)
+THRUST_N_S2, HOVER_RAD_S = 8.048e-6, 361.5  # k from zsim/vehicles/ardrone2.py; sqrt(m g / (4 k))
 ARM_XY_M = 0.1785 / np.sqrt(2.0)  # zsim/vehicles/ardrone2.py
 CORNERS = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # in the order of RotorPy's rotors
 ROTOR_POS_M = {f"r{k}": ARM_XY_M * np.array([x, y, 0.0]) for k, (x, y) in enumerate(CORNERS, 1)}
 ARDRONE = {
     **hummingbird,
-    "mass": 0.429,  # kg; this and what follows as scenarios' model ardrone2
+    "mass": 0.429,  # kg; this and the following as in the scenarios' model ardrone2
     "Ixx": 2.237568e-3,  # kg m^2
     "Iyy": 2.985236e-3,  # kg m^2
     "Izz": 4.80374e-3,  # kg m^2
     "rotor_pos": ROTOR_POS_M,
     "k_eta": THRUST_N_S2,
     "k_m": 2.423e-7,  # N m s^2
-    "k_d": 0.249 / (4 * HOVER_RAD_S),  # N s/m of drag, by the speed of the rotors in hover
+    "k_d": 0.249 / (4 * HOVER_RAD_S),  # drag of 0.249 N s/m, divided by the sum of the rotor speeds in hover
     "tau_m": 0.030,  # s
     "rotor_speed_min": 126.0,  # rad/s
     "rotor_speed_max": 503.0,  # rad/s
@@ -54,12 +54,12 @@ def main() -> None:
 
 
 def build(way: Way, given: argparse.Namespace) -> Fly:
-    """Return flights that begin on their way."""
+    """Return a function that flies Test 1 from START_S on."""
     return _batch(way, given.flights, given.seconds) if given.batch else _objects(way, given.seconds)
 
 
 class Follow:
-    """The way of one drone as RotorPy's trajectory."""
+    """The path of one drone as a RotorPy trajectory."""
 
     def __init__(self, way: Way, drone: int) -> None:
         self._way, self._drone = way, drone
@@ -73,7 +73,7 @@ class Follow:
 
 def _objects(way: Way, seconds: float) -> Fly:
     def flown(seed: int) -> Flown:
-        np.random.seed(seed)  # RotorPy draws from the global stream
+        np.random.seed(seed)  # RotorPy draws from NumPy's global generator
         p_W = np.stack([_flown_alone(way, k, seconds) for k in range(3)], axis=1)
         return _judged(way, p_W[:, None], seconds)
 
@@ -81,7 +81,7 @@ def _objects(way: Way, seconds: float) -> Fly:
 
 
 def _flown_alone(way: Way, drone: int, seconds: float) -> np.ndarray:
-    """Return the positions (steps + 1, 3) of one drone."""
+    """Fly one drone; return its positions, (steps + 1, 3)."""
     vehicle = Multirotor(ARDRONE, initial_state=_state(way, drone))
     environment = Environment(
         vehicle,
@@ -108,7 +108,7 @@ def _state(way: Way, drone: int) -> dict[str, np.ndarray]:
 
 
 class FollowAll:
-    """The ways of all drones of all flights as RotorPy's batched trajectory, made at once and not drone by drone."""
+    """The paths of all drones in all flights as one batched RotorPy trajectory, evaluated for all drones at once."""
 
     def __init__(self, way: Way, flights: int) -> None:
         import torch
@@ -157,7 +157,7 @@ def _batch(way: Way, flights: int, seconds: float) -> Fly:
 
 
 def _judged(way: Way, p_W: np.ndarray, seconds: float) -> Flown:
-    """Return what came of (steps + 1, flights, 3, 3) positions."""
+    """Return the results of flights with the positions `p_W`, (steps + 1, flights, 3, 3)."""
     meant = np.stack([way.p_W[way.at(START_S + k * STEP_S)] for k in range(len(p_W))])[:, None]
     rms_m = float(np.sqrt(np.mean(np.sum((p_W - meant) ** 2, axis=-1))))
     apart = np.linalg.norm(p_W - np.roll(p_W, 1, axis=2), axis=-1)

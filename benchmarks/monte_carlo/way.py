@@ -1,4 +1,4 @@
-"""The ways of Test 1's drones, which the peers' drones follow: where each was every 20 ms of a flight of zsim's."""
+"""The paths of Test 1's drones in a zsim flight, sampled every 20 ms, which the peers' drones follow."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-GATE_S = 0.02  # between two points
+GATE_S = 0.02  # s between two points of a path
 
 
 class Way(NamedTuple):
-    """True positions of three drones at every gate from t = 0."""
+    """The true paths of three drones: their states at every gate from t = 0."""
 
     p_W: NDArray[np.float64]  # (K, 3, 3) positions [m]
     v_W: NDArray[np.float64]  # (K, 3, 3) velocities [m/s]
@@ -21,7 +21,7 @@ class Way(NamedTuple):
         return (len(self.p_W) - 1) * GATE_S
 
     def at(self, t_s: float) -> int:
-        """Return the index of the last point not after a time."""
+        """Return the index of the last point not after `t_s`."""
         return min(int(t_s / GATE_S + 1e-6), len(self.p_W) - 1)
 
 

@@ -1,6 +1,6 @@
 """Shared by all peers that fly the paths of Test 1: a process with its own core that serves flights.
 
-It answers lines {"seed": n} of stdin on stdout until stdin ends; compilation happens at the first.
+The process answers each line {"seed": n} of stdin on stdout until stdin ends; the first answer includes compilation.
 """
 
 import argparse
@@ -16,18 +16,18 @@ from benchmarks.monte_carlo.way import Way, read
 
 
 class Flown(NamedTuple):
-    """Results of flights."""
+    """Results of one or more flights."""
 
-    flights: float  # whole flights of three drones, or fractions
-    rms_m: float  # root of the mean square distance from the ways, over all flights
-    closest_m: float  # least distance of two drones in any of them
+    flights: float  # number of flights of three drones; a part of a flight counts as a fraction
+    rms_m: float  # root mean square distance from the paths, over all flights
+    closest_m: float  # least distance between two drones in any flight
 
 
-Fly = Callable[[int], Flown]  # from a seed
+Fly = Callable[[int], Flown]  # flies with a seed
 
 
 def serve(build: Callable[[Way, argparse.Namespace], Fly], **options: Any) -> None:
-    """Answer {"seed": n} by what was flown; `options` are options of the command with their defaults."""
+    """Answer each {"seed": n} with a `Flown` and its CPU time; `options` maps command-line options to defaults."""
     parser = argparse.ArgumentParser()
     parser.add_argument("way", type=Path)
     parser.add_argument("worker", type=int, help="0 or 1: of which core")

@@ -1,8 +1,8 @@
-"""zsim's world alone, following the ways as the peers do: firmware, all noisy sensors, gusts, contacts.
+"""zsim's world alone, following the paths as the peers do: firmware, all sensors with noise, gusts, contacts.
 
-Each gate a position controller that knows the truth (velocity of the way and a share of the distance) gives velocity
-commands, and the samples and the truth of all drones are taken out. No estimators, cluster controller, messages, or
-judging; a flight at a time.
+At every gate, a position controller that knows the truth (path velocity plus a gain times the position error) gives
+velocity commands, and the samples and truth of all drones are produced. No estimators, cluster controller, messages or
+verdicts; one flight at a time.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from zsim.scenario import scenario_file
 from zsim_world.fleet.fleet import Fleet
 
 TAKEOFF_S = 20.0  # scenarios/step.yaml
-GAIN_1_S = 0.6  # of position and yaw, as the cluster controller's
+GAIN_1_S = 0.6  # for position and yaw, as in the cluster controller
 
 
 def main() -> None:
@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def build(way: Way, given: argparse.Namespace) -> Fly:
-    """Return flights of Test 1's scenario, another seed for each."""
+    """Return a function that makes `flights` flights of Test 1's scenario, each with another seed."""
     scenario = scenario_file.load(TEST_1)
 
     def flown(seed: int) -> Flown:
@@ -50,7 +50,7 @@ def _follow(way: Way, fleet: Fleet) -> Flown:
 
 
 def _command(fleet: Fleet, p_W: np.ndarray, v_W: np.ndarray, yaw: np.ndarray) -> None:
-    """Send all drones after their points; those on the ground take off when it is time."""
+    """Steer all drones towards their points on the paths; at TAKEOFF_S, make them take off."""
     truth = fleet.truth()
     wanted_W = v_W + GAIN_1_S * (p_W - truth.position_m)
     if fleet.t_ns == round(TAKEOFF_S * 1e9):

@@ -1,4 +1,4 @@
-"""zsim itself: `zsim sweep` as a user calls it, and a flight of Test 1 whose ways the others follow."""
+"""zsim itself: `zsim sweep` as a user calls it, and a flight of Test 1 whose paths the peers follow."""
 
 import resource
 import subprocess
@@ -21,9 +21,10 @@ TIMEOUT_S = 900.0
 
 
 def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, float]:
-    """Fly a sweep over seeds; return wall and CPU seconds, start-up included, and the least distance of two drones.
+    """Fly a sweep over seeds; return wall and CPU seconds, start-up included, and the drones' closest approach.
 
-    RefusedError if it failed, or a run of it did.
+    Raises:
+        RefusedError: the sweep or one of its runs failed.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "sweep"
@@ -39,7 +40,7 @@ def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, f
 
 
 def _closest_m(path: Path) -> float:
-    """Return the least distance of two drones in any run of a table; RefusedError if a run failed."""
+    """Return the closest approach of two drones in any run of a sweep's table; raise RefusedError if a run failed."""
     rows = pq.read_table(path, columns=["failure", "min_separation_m"]).to_pylist()
     if failures := [row["failure"] for row in rows if row["failure"]]:
         raise RefusedError(f"zsim sweep: {len(failures)} of {len(rows)} runs failed: {failures[0]}"[:200])
@@ -47,7 +48,7 @@ def _closest_m(path: Path) -> float:
 
 
 def flown_way(duration_s: float | None = None) -> Way:
-    """Fly Test 1 (None: all of it) with the scenario's seed and return where its drones went."""
+    """Fly Test 1 with the scenario's seed for `duration_s` (None: to its end); return the drones' paths."""
     overrides = [] if duration_s is None else [f"duration_s={duration_s}"]
     flight, diverged = fly_scenario(scenario_file.load(TEST_1, overrides))
     if diverged:

@@ -44,15 +44,15 @@ def fly(
     Args:
         scenario: the resolved scenario.
         record: path of the record; None: no record.
-        stop_reason: called at every gate; a text ends the run.
+        stop_reason: called at every gate; if it returns a text, the run ends.
         screen: shows progress.
         run_id: set only by tests that compare records.
         changed: as in `World`.
         own: as in `InProcessFlight`.
 
     Raises:
-        RunError: a user's class failed, or the state of a drone was no longer finite, which ended the run; the record
-            is complete up to there.
+        RunError: a user's class failed or the state of a drone was no longer finite, which ended the run; the record
+            is complete up to then.
     """
     progress = _Progress(scenario, screen) if screen else None
     writer = None
@@ -70,11 +70,11 @@ def fly(
 
 
 def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, list[Agent]]:
-    """Return a resolved scenario that waits for a user's agents, and ends if one fails; and these agents.
+    """Return a resolved scenario that waits for a user's agents and ends if one fails, and these agents.
 
     Raises:
         RunError: `own` is not a sequence, or one of its elements is not an agent.
-        UserCodeError: the class of an agent raised.
+        UserCodeError: an agent's class raised an error.
     """
     if not sequence_of_agents(own):
         return scenario, []
@@ -84,7 +84,7 @@ def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, 
 
 
 def sequence_of_agents(given: Any, others: str = "") -> Sequence[Any]:
-    """Return the given agents; RunError, which lists `others` as allowed, if they are not a sequence."""
+    """Return the given agents; raise RunError, which names `others` as also allowed, if they are not a sequence."""
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise RunError(f"agents is {show(given)}; must be {others}a sequence of agents")
     return given
@@ -99,18 +99,18 @@ class FlightObserver(Protocol):
 
 
 class InProcessFlight:
-    """A world with its agents on a bus, which is flown to its end (`run`) or in turns (`start`, `turn`, `end`).
+    """A world with its agents on a bus, flown to its end (`run`) or turn by turn (`start`, `turn`, `end`).
 
     Args:
         scenario: the resolved scenario.
         run_id, changed: as in `fly`.
-        own: a user's agents, beside those of the scenario: objects, or whatever `own_agent` accepts.
+        own: a user's agents, in addition to the scenario's: objects, or whatever `own_agent` accepts.
         stock: whether the estimators and controllers of the scenario fly.
         steered: whether `send` is used, so that the caller takes part as `python.main`.
 
     Raises:
         ScenarioError, RunError: the scenario cannot be flown.
-        UserCodeError: the class of an agent raised.
+        UserCodeError: an agent's class raised an error.
     """
 
     def __init__(
@@ -177,7 +177,8 @@ class InProcessFlight:
     def send(self, commands: Sequence[tuple[str, Struct]]) -> None:
         """Publish the caller's commands for the newest gate, as pairs of drone and command; the world waits for them.
 
-        Raises RunError, before anything is sent, if one of them is not a command.
+        Raises:
+            RunError: one of them is not a command; nothing is sent.
         """
         caller, t_ns = self._caller, self.world.now_ns
         assert caller is not None
@@ -221,7 +222,7 @@ class InProcessFlight:
 
 
 class Caller(Agent):
-    """Takes part on behalf of the caller that steps a flight, whose commands `InProcessFlight.send` publishes."""
+    """Takes part on behalf of the caller that steps a flight; `InProcessFlight.send` publishes its commands."""
 
     name, reads, gate_keys = CALLER, (), ()
 
@@ -249,7 +250,7 @@ class _Progress:
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
-        self._clock: run_messages.Clock | None = None  # the newest one, unless it is shown
+        self._clock: run_messages.Clock | None = None  # the newest clock message, unless already shown
         self._start = SlowStart(screen.say)
 
     def close(self) -> None:
@@ -257,7 +258,7 @@ class _Progress:
         self._show_clock()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Show nothing, since a gate has only truth, status and sensors."""
+        """Show nothing, as a gate has only truth, status and sensors."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         if key not in self._watched:

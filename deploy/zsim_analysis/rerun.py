@@ -1,4 +1,4 @@
-"""`zsim rerun`: flies a recorded run again from its own inputs, and compares it with the truth on record.
+"""`zsim rerun`: flies a recorded run again from its own inputs and compares the truth with that on record.
 
 First, world and agents are run again, with the inputs of others (operators, users' programs) from the record. If the
 truth differs, or the agents cannot be run again, the world is run alone, with all commands from the record: if that
@@ -37,7 +37,7 @@ from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 
 Say = Callable[[str], None]
-COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # fields in truth_sha256
+COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # fields hashed in truth_sha256
 
 
 class RerunResult(NamedTuple):
@@ -45,7 +45,7 @@ class RerunResult(NamedTuple):
 
     compared: "TruthComparison"  # comparison with the truth on record
     sha256: str  # hash of the truth
-    until: str  # why the comparison ended before the record; empty if it did not
+    until: str  # why the comparison ended before the record did; empty if it did not
     refused: list[str]  # requests that were carried out in the recorded run but are refused now
     first_output: str  # the first output of an agent that differs, with its field; empty if none does
     outputs: dict[str, str]  # SHA-256 of the agents' outputs by key, as in OutputHashes
@@ -55,7 +55,7 @@ class RerunResult(NamedTuple):
 def rerun_record(
     place: Path, commands_only: bool, say: Say, note: Say, outputs: Mapping[str, str] | None = None
 ) -> str:
-    """Fly a recorded run again; return how the truth differs from the record, empty if it is identical to the bit.
+    """Fly a recorded run again; return how the truth differs from the record, empty if it is bit-identical.
 
     With `commands_only`, no agents are run. `say` is called with each line of the results, `note` with each warning. If
     the agents' outputs must be the same too, `outputs` has their SHA-256 by key, as in OutputHashes.
@@ -191,7 +191,7 @@ class Difference(NamedTuple):
 
 
 def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Difference | None:
-    """Return the difference between two true states; None if the COUNTED fields are identical to the bit.
+    """Return the difference between two true states; None if the COUNTED fields are bit-identical.
 
     Raises:
         DecodeError: one of them is not a truth message.
@@ -213,7 +213,7 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
 
 
 def differing_field(recorded: Any, flown: Any, fields: Sequence[str]) -> str:
-    """Return the first of some fields that differs between two messages, with its index and both values; or empty."""
+    """Return the first field that differs between two messages, with its index and both values; empty if none does."""
     for name in fields:
         a, b = getattr(recorded, name), getattr(flown, name)
         if a == b:
@@ -256,7 +256,7 @@ class OutputComparison:
 
     @property
     def first(self) -> str:
-        """Key, time and field of the first output that differs or that only one side has; empty if there is none."""
+        """Key, time and field of the first output that differs or that only one side has; empty if all match."""
         if not self._first:
             return ""
         t_ns, _, key, field = self._first
@@ -273,7 +273,7 @@ class OutputComparison:
             self._note(output.t_ns, key, differing_field(*pair, output.__struct_fields__))
 
     def expire(self, t_ns: int) -> None:
-        """Count as different all outputs without a counterpart `match_within_ns` before t_ns."""
+        """Count as different all outputs from more than `match_within_ns` before `t_ns` without a counterpart."""
         for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._match_within_ns]:
             del self._unmatched[identity]
             self._note(identity[2], identity[0])
@@ -339,7 +339,7 @@ class RerunBus(Bus):
         self._rerun = agents.names
         self.truth: dict[str, bytes] = {}  # payloads at the newest gate, by drone
         self.refused: list[str] = []  # requests that were carried out in the recorded run but are refused now
-        self._admitted: set[_Joined] | None = None  # in this gate; None before the start, when all joins are admitted
+        self._admitted: set[_Joined] | None = None  # at this gate; None before the start: all are admitted
         self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
@@ -348,7 +348,7 @@ class RerunBus(Bus):
 
         Raises:
             RunError: an agent does not answer, since what it waits for is not on record; or the run ends differently.
-            RunFailedError: a user's code fails, which it did not at this gate on record.
+            RunFailedError: a user's code fails at this gate, where it did not fail on record.
         """
         self._admitted = _admitted(gate.inputs) if gate.t_ns else None
         for recorded in gate.inputs:
@@ -380,7 +380,7 @@ class RerunBus(Bus):
             pass
 
     def _update_faults(self, faults: run_messages.Faults) -> None:
-        if self._rerun:  # without agents, the recorded commands already contain their effect
+        if self._rerun:  # without agents, the recorded commands already contain the faults' effect
             super()._update_faults(faults)
 
     def _feed(self, recorded: Recorded) -> None:
@@ -417,7 +417,7 @@ class RerunBus(Bus):
         self._world.count_output(source)
 
     def _feed_event(self, event: run_messages.Event) -> None:
-        """Repeat what reached the world in other ways than as a message: deaths, requests, and withheld joins."""
+        """Repeat what reached the world other than as a message: deaths, requests, and withheld joins."""
         if event.kind in ADMISSIONS and event.source not in self._rerun:
             joined = _joined(event)
             if (join := self._withheld.pop(joined, None)) is not None:
@@ -441,7 +441,7 @@ def _joined(event: run_messages.Event) -> _Joined:
 
 
 def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
-    """Return the processes that were admitted in a gate, by the events among its inputs.
+    """Return the processes that were admitted at a gate, by the events among its inputs.
 
     Their joins are repeated in place. A join that was withheld for longer has its event in a later gate.
     """

@@ -18,7 +18,7 @@ from zsim_analysis.rerun import TruthComparison
 if TYPE_CHECKING:
     from zsim_api.recorded import Run
 
-NAMED_MAX = 3  # most collisions listed in a failure
+NAMED_MAX = 3  # maximum number of collisions listed in a failure
 
 
 class Assertions(ABC):
@@ -71,7 +71,7 @@ class Assertions(ABC):
             raise AssertionError("\n".join([*faults, f"the record is {run.record}"]))
 
     def assert_no_collision(self) -> None:
-        """Assert that no drone collided with another one or an obstacle; the AssertionError says which, and when."""
+        """Assert that no drone collided with another drone or an obstacle; the AssertionError says which, and when."""
         __tracebackhide__ = True
         run = self.run()
         with RecordReader(run.record) as reader:
@@ -89,7 +89,7 @@ class Assertions(ABC):
             other: another federation, a run, or the path of one.
 
         Raises:
-            AssertionError: with the drone, time and size of the first difference.
+            AssertionError: it is not; the message gives the drone, time and size of the first difference.
         """
         __tracebackhide__ = True
         from zsim_api.recorded import Run

@@ -50,7 +50,7 @@ def flipped(sim: Simulation, agent: str) -> bool:
 
 
 def far_away(distance_m: float) -> Ended:
-    """Return a condition that ends the episode of an agent with a drone farther than this from its initial position."""
+    """Return a condition that ends an agent's episode once one of its drones is farther than this from its start."""
 
     def is_far(sim: Simulation, agent: str) -> bool:
         places = [sim.names.index(drone) for drone in _drones(sim, agent)]
@@ -141,7 +141,7 @@ class _Episodes:
 
 
 class FormationEnv(ParallelEnv[str, Floats, Floats]):
-    """PettingZoo's environment for a scenario: an agent per drone, or per cluster; see `parallel_env`."""
+    """PettingZoo environment for a scenario, with one agent per drone or per cluster; see `parallel_env`."""
 
     metadata = {"name": "zsim_formation_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012
     render_mode = None
@@ -193,7 +193,7 @@ class FormationEnv(ParallelEnv[str, Floats, Floats]):
 
 
 class FlightEnv(gymnasium.Env[Floats, Floats]):
-    """Gymnasium's environment for a scenario, with all agents as one; see `gym_env`."""
+    """Gymnasium environment for a scenario, with all agents as one; see `gym_env`."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
 

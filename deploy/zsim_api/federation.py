@@ -61,7 +61,7 @@ class Moment(NamedTuple):
     """The state of a flight at a gate, passed to a condition of `wait_until`.
 
     Attributes:
-        t_s: simulated time.
+        t_s: simulated time [s].
         states: the newest received states of the clusters by name, which are two gates old.
         truth: the true motion of the drones by name, except external ones.
         events: events since the last `wait_until`.
@@ -83,8 +83,8 @@ class Federation(Assertions):
         scenario: path, `zsim.Scenario`, or a mapping as in YAML.
         duration: simulated time of the flight [s]; None: that of the scenario.
         seed, set, law, estimator, out: as in `zsim.run`; an earlier run in `out` is replaced.
-        agents: your own agents, as in `zsim.run`, or as texts for `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
-        programs: command lines of your own programs, in any language, each a text or a list of words. `{endpoint}`,
+        agents: your own agents, as in `zsim.run`, or as strings for `zsim run --agent`, "MODULE:CLASS NAME=VALUE".
+        programs: command lines of your own programs, in any language, each a string or a list of words. `{endpoint}`,
             `{federation}` and `{folder}` are replaced, and the environment has ZSIM_CONNECT and ZSIM_FEDERATION.
             Simulated time starts only once every program with a name ("ground.main=python ground.py") has joined.
             A program that ends with a code other than 0 fails the flight.
@@ -140,7 +140,7 @@ class Federation(Assertions):
             raise
         self._watch = _Watch()
         self._known = {*expected, WORLD, RECORDER}
-        self._has_others = bool(named or options) or any(not name for name, _ in started)  # of unknown names
+        self._has_others = bool(named or options) or any(not name for name, _ in started)  # with unknown names
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}

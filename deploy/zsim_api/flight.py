@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 COMMAND = (sys.executable, "-P", "-m", "zsim_deploy")
-LAUNCHER = "zsim-run"  # name of the log for output of the launcher that is not shown
+LAUNCHER = "zsim-run"  # name of the log for launcher output that is not shown
 INTERRUPTED = 130  # exit code of `zsim run` after Ctrl-C
 
 
@@ -190,7 +190,7 @@ def _file_of(source: Scenario, folder: Path) -> Path:
 
 
 def raise_failure(folder: Path, code: int) -> None:
-    """Raise RunFailedError with the failure of a run's processes; return if it flew to its end, if not as planned."""
+    """Raise RunFailedError with the failure that ended a run; return if it flew to its end, even if not as planned."""
     record = folder / RECORD
     if not record.exists():
         raise RunFailedError(f"{folder}: nothing was recorded: {_last_line(folder, code)}")
@@ -204,7 +204,7 @@ def raise_failure(folder: Path, code: int) -> None:
 
 
 def _last_line(folder: Path, code: int | None) -> str:
-    """Return the last line that `zsim run` printed into its log."""
+    """Return the last line that `zsim run` printed to its log."""
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     lines = log.read_text(errors="replace").split("\n") if log.exists() else []
     return next((line for line in reversed(lines) if line.strip()), f"`zsim run` ended with code {code}")

@@ -42,7 +42,7 @@ def name_of(obj: object, folder: Path, name: str | None = None) -> str:
     """Return the name `module:Name` under which this process and others find a class, a function or an instance.
 
     The module is the object's own if other processes can import the object from there. Otherwise, it is a new module
-    `zsim_own_HASH.py` in the folder, which must be searched for modules (`plugin.search`), as must `module_folders`.
+    `zsim_own_HASH.py` in `folder`; `plugin.search` must then include that folder and those of `module_folders`.
 
     Args:
         obj: a class, a function or an instance.

@@ -59,8 +59,8 @@ class Flown(Protocol):
 class Interface:
     """Observations and commands of an environment's agents: drones, or clusters if `action` is "cluster".
 
-    An observation (K,) of "truth" or "estimate" holds, for each drone of the agent, position [m], velocity [m/s] in W
-    and orientation (w, x, y, z, B to W), for "truth" also the angular velocity in B [rad/s]; then, for each other
+    An observation (K,) of "truth" or "estimate" holds, for each drone of the agent, position [m] and velocity
+    [m/s] in W, orientation (w, x, y, z; B to W) and, for "truth", angular velocity in B [rad/s]; then, for each other
     drone, position and velocity relative to the agent's first drone, in W. An observation of "sensors" holds the newest
     sample of every sensor, in the order of the contract; 0 before the first one.
 

@@ -67,9 +67,9 @@ if TYPE_CHECKING:
 Table = dict[str, NDArray[Any]]  # columns of equal length (K,), ordered by simulated time
 INDEX = "t_s"
 STAMPS = ("t_ns", "seq", "wall_ns")  # metadata columns of a message
-SHOWN = 12  # most names listed in an error
-ROWS_MAX = 200_000  # most rows read at once for several drones; that many estimates take 100 MB
-NOTES = 3  # most shortfalls shown when a notebook displays a run
+SHOWN = 12  # maximum number of names listed in an error
+ROWS_MAX = 200_000  # maximum number of rows read at once for several drones; that many estimates take 100 MB
+NOTES = 3  # maximum number of shortfalls shown when a notebook displays a run
 ERROR_COLUMNS = ("position_m_x", "position_m_y", "position_m_z", "yaw_rad")  # named as in tables of estimates
 Window = tuple[float, float]
 

@@ -28,7 +28,7 @@ from zsim.schema import plugin
 
 LOGS, SCENARIO, FIGURES = "logs", "scenario.yaml", "figures"
 JOURNAL = "journal"  # folder of the world's journal
-LAUNCH = "launch.json"  # in the journal's folder
+LAUNCH = "launch.json"  # file in the journal's folder
 LEFT = (SCENARIO, "run.log", "up.log")  # files left by a run that never flew, beside empty logs and journal
 WRITTEN = (RECORD, "summary.json", "report.html", *LEFT)  # files removed when a run is replaced
 WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes of a run's files, by folder
@@ -219,7 +219,7 @@ def launch_of(folder: Path) -> Launch:
 
 
 def reopen_record(folder: Path) -> None:
-    """Cut an interrupted run's record before its `end` event; raise RecordError if another process is writing it."""
+    """Truncate an interrupted run's record at its `end` event; raise RecordError if another process is writing it."""
 
     def is_end(payload: bytes) -> bool:
         try:

@@ -35,7 +35,7 @@ class Scenario:
     def __init__(self, **fields: Any) -> None:
         self._document: dict[str, Any] = copy.deepcopy(fields)
         self.source = "scenario"  # its origin, as named in error messages
-        self.folders: tuple[Path, ...] = (Path.cwd(),)  # folders searched for modules that it names
+        self.folders: tuple[Path, ...] = (Path.cwd(),)  # folders searched for the modules that it names
         self.changes: tuple[str, ...] | None = None  # overrides `a.b.c=value` of its file; None without a file
 
     @classmethod
@@ -97,7 +97,7 @@ class Scenario:
         return scenario
 
     def search(self) -> None:
-        """Search the scenario's folders for modules, in this process and in those that it starts."""
+        """Have the scenario's folders searched for modules, in this process and in those that it starts."""
         plugin.search(*self.folders)
 
     def keep_modules(self, folder: Path) -> None:
@@ -166,7 +166,7 @@ class Scenario:
 
 
 def _by_path(values: Any, path: str = "") -> dict[str, Any]:
-    """Return all values by path; list entries that have a name are listed under it."""
+    """Return all values by path; a list entry with a name is found under that name."""
     found = {path: values} if path else {}
     parts: dict[str, Any] = values if isinstance(values, dict) else {}
     if isinstance(values, list):
@@ -176,7 +176,7 @@ def _by_path(values: Any, path: str = "") -> dict[str, Any]:
     return found
 
 
-# Lets editors complete the fields, with the declared types as far as Python has them.
+# Lets editors complete the fields and show their declared types.
 _OWN = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind) for name, kind in get_type_hints(Resolved).items()]
 setattr(Scenario, "__signature__", Signature(_OWN))  # noqa: B010
 _SELF = [Parameter("self", Parameter.POSITIONAL_ONLY), Parameter("set", Parameter.POSITIONAL_ONLY, default={})]

@@ -37,7 +37,7 @@ from zsim_api.scenarios import AnyScenario, scenario_of
 from zsim_world.physics.fleet_arrays import STATE
 
 Array = NDArray[np.float64]
-GATES_HELD = 64  # most gates whose sensor messages are kept undecoded; design choice: 0.3 MB for 3 drones
+GATES_HELD = 64  # maximum number of gates whose sensor messages are kept undecoded; design choice: 0.3 MB for 3 drones
 
 
 class Truth(NamedTuple):
@@ -230,7 +230,7 @@ class Simulation:
     def ask(self, key: str, op: str, **args: Any) -> dict[str, Any]:
         """Send a request to the world or a controller: `sim.ask("cluster/main/control", "target", values={…})`.
 
-        As with `zsim ask`; the request takes effect between this gate and the next.
+        Equivalent to `zsim ask`; the request takes effect between this gate and the next.
 
         Raises:
             RequestRefusedError: the request was refused, for the reason given.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_VARIABLE = "ZSIM_CONNECT"  # environment variable: default of --connect
-RUN_ID = "{run}"  # stands for the run's id in the name of a record's folder; a restarted recorder finds it by that
+RUN_ID = "{run}"  # stands for the run's id in the name of a record's folder, so that a restarted recorder finds it
 CONSOLE_PORT = 8080  # TCP port of the console's page
 PORT_MAX = 65535
 REALTIME = "--realtime"  # option of the world, and of routers, whose lease it shortens
@@ -309,13 +309,13 @@ flight_options = option_group(
 observer_options = option_group("reach", WorldAccess, _OBSERVER)
 """Decorator for interactive commands, with an argument `reach`."""
 participant_options = option_group("reach", WorldAccess, _PARTICIPANT)
-"""Decorator for commands that run a process of a federation, with an argument `reach`; it waits for a world."""
+"""Decorator for commands that run a process that waits for a world and joins it, with an argument `reach`."""
 several_options = option_group(
     "reach",
     lambda connect, federation, wait, *more: WorldAccess(connect, federation, wait, None, *more),
     {name: each for name, each in _PARTICIPANT.items() if name != "tls"},
 )
-"""The same for a process that hosts several agents; it cannot have a certificate, which is for a single name."""
+"""Like `participant_options`, for a process that hosts several agents: no certificate, which is for a single name."""
 listener_options = option_group(
     "who",
     identity,

@@ -40,7 +40,7 @@ BACK = timedelta(days=1)  # certificates are back-dated by this, because clocks 
 EXPIRED = "expired on"  # start of a fault text; a date follows
 OPERATORS = "operators"  # folder, in place of HOST, for operators without a host in the inventory
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-SHOWN_MAX = 4  # most names listed in a fault; usually all certificates are missing at once
+SHOWN_MAX = 4  # maximum number of names listed in a fault; usually all certificates are missing at once
 READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH
 
 Root = x509.Certificate

@@ -1,4 +1,4 @@
-"""The scenario of a run: its fields, files and checks, and the processes and injected faults that follow from it.
+"""The scenario of a run: its fields, files and checks, and the processes and injected faults it implies.
 
 Imports vehicles, contract, sensors and schema.
 """

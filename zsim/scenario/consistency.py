@@ -1,6 +1,6 @@
-"""Checks between fields of a scenario: consistent names, distances, divisible times, units.
+"""Checks across fields of a scenario: consistent names and references, distances, divisible times, plausible units.
 
-They use the sound parts of a document (`checker.sound`): checks of missing or faulty fields are skipped.
+They use only the sound parts of a document (`checker.sound`); checks that need missing or faulty fields are skipped.
 """
 
 import math
@@ -37,35 +37,35 @@ from zsim.sensors.sensor_catalogue import DECLARED, MODULE, STOCK, declarations,
 from zsim.sensors.stock_sensors import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle, lift_shares
 
-FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
+FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's time step
 TEMPLATE_ROBOTS_MIN = 3  # robots; fewer are always collinear
-TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: any real formation is wider; the controller requires more in flight
+TEMPLATE_WIDTH_MIN_M = 0.1  # m, design choice: any real formation is wider; the controller requires more in flight
 WORLD_DEATHS = ("restart", "end")  # `on_death` of the world; no other process can continue the run
-LIFT_SHARE_MAX = 0.9  # maximum weight over the rotors' maximum lift; the rest is left for control
-TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # minimum cosine of a roof's slope; maximum penetration by a drone on it
-UPON_COSINE = 0.5  # minimum cosine of the slope on which a drone may stand; chosen: steeper than 60 deg is a wall
-THRUST_SHARE_MIN = 0.005  # minimum hover thrust over lift; chosen: racers that lift 15 times their weight have 0.07
-TILT_FREE_DEG = 30.0  # deg, allowed to any drone that is light enough to fly
-# Chosen, a decade or more beyond real drones, which take 60 (large rotors) to 400 W/kg (racers) for 3 min to 2 h
-HOVER_W_KG = (3.0, 10_000.0)  # W/kg of electric power for the rotors
-HOVER_S = (10.0, 86_400.0)  # s on a full battery
-TIP_MAX_M_S = 340.3  # m/s, speed of sound at 15 deg C, ISO 2533; propellers lose their thrust near it
-# m/s, chosen: no multirotor falls so slowly. Those of 20 g to 1 kg fall at 7 to 24 m/s in tests (Svaty et al.,
-# PLoS ONE 20 (2025) e0320073); with the drag modelled here an AR.Drone falls at 17 m/s, a Crazyflie at 43 m/s.
+LIFT_SHARE_MAX = 0.9  # maximum ratio of weight to the rotors' maximum lift; the rest is left for control
+TOP_COSINE, TOP_DEPTH_M = 0.999, 0.001  # minimum cosine of a flat top's slope; maximum depth of a drone in it
+UPON_COSINE = 0.5  # minimum cosine of a slope on which a drone may stand; design choice: beyond 60 deg it is a wall
+THRUST_SHARE_MIN = 0.005  # minimum weight / lift; design choice: racers that lift 15 times their weight have 0.07
+TILT_FREE_DEG = 30.0  # deg, tilt allowed to any drone that is light enough to fly
+# Design choice: a decade or more beyond real drones, which need 60 (large rotors) to 400 W/kg (racers) for 3 min to 2 h
+HOVER_W_KG = (3.0, 10_000.0)  # W/kg, the rotors' electric power in a hover per mass
+HOVER_S = (10.0, 86_400.0)  # s, endurance in a hover on a full battery
+TIP_MAX_M_S = 340.3  # m/s, speed of sound at 15 deg C, ISO 2533; propellers lose thrust near it
+# m/s, design choice: no multirotor falls so slowly. In tests, those of 20 g to 1 kg fall at 7 to 24 m/s (Svaty et al.,
+# PLoS ONE 20 (2025) e0320073); with the drag modelled here, an AR.Drone falls at 17 m/s and a Crazyflie at 43 m/s.
 AIR_M_S = 2.0
-# maximum inertia over mass_kg arm_m^2; chosen: the AR.Drone's about z is 0.35, that of a ring of rotors 1
+# maximum ratio of inertia to mass_kg arm_m^2; design choice: it is 0.35 for the AR.Drone about z, 1 for bare rotors
 INERTIA_MAX_MR2 = 10.0
-LEAST_K1 = -4 / 27  # minimum k1 times the squared tangent of half the diagonal; below it r + k1 r^3 turns back
-RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # used in names of zsim's own processes, in addition to ROLES
-SIGHTED_MAX = 12  # drones of a cluster: each of its estimators holds the states of all; the cost grows with the square
+LEAST_K1 = -4 / 27  # minimum of k1 tan^2(diagonal / 2); below it r + k1 r^3 peaks within the picture
+RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # roles of zsim's own processes in addition to ROLES
+SIGHTED_MAX = 12  # maximum drones of a cluster with sightings: each estimator holds all states, at quadratic cost
 
 
 def cross_faults(
     scenario: Any,
     vehicles: Mapping[str, Vehicle],  # by model; checks that need a missing vehicle are skipped
-    unread: Collection[str] = (),  # names of sensors missing from it because their modules could not be read
+    unread: Collection[str] = (),  # names of sensors missing from `scenario` because their modules could not be read
 ) -> Iterator[Fault]:
-    """Yield every fault between fields of a scenario, or of its parts returned by `checker.sound`."""
+    """Yield every conflict between fields of a scenario, or of its parts returned by `checker.sound`."""
     drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
     yield from _name_faults("drones", drones)
     yield from _name_faults("clusters", clusters)
@@ -100,7 +100,7 @@ def cross_faults(
 
 
 def unflown_plans(scenario: Scenario) -> list[str]:
-    """Return a line for each cluster of a resolved scenario whose plan begins or continues after the end of the run.
+    """Return a line for each cluster or drone of a resolved scenario with planned flight after the end of the run.
 
     This is not a fault: a run may be shortened, and another program may fly the drones.
     """
@@ -195,7 +195,7 @@ _SIZES = {"box": ("size_m",), "cylinder": ("radius_m", "height_m"), "sphere": ("
 
 
 def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
-    """Yield the faults of obstacles: names, sizes, and drones that start inside or too close, other than on top."""
+    """Yield the faults of obstacles: names, sizes, and drones that start inside or too close, unless on top."""
     yield from _name_faults("environment.obstacles", obstacles)
     names = _names(drones)
     starts = [(index, drone.position_m, _clearance_m(drone, vehicles)) for index, drone in _placed(drones)]
@@ -216,7 +216,7 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
         if sorted(fields) != sorted(wanted) or not _known(obstacle.position_m, obstacle.yaw_deg):
             continue
         row = row_of(obstacle)
-        x, reach = row[CENTRE], sum(row[HALF:])  # no point of it is farther from its centre, whatever its yaw
+        x, reach = row[CENTRE], sum(row[HALF:])  # no point of the obstacle is farther from its centre, at any yaw
         for drone, p_W, least in starts:
             if abs(p_W[0] - x) >= reach + least:
                 continue
@@ -230,7 +230,7 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
 def _surface_faults(
     surfaces: _Entries, obstacles: Collection[str], drones: _Entries, vehicles: Mapping[str, Vehicle]
 ) -> Iterator[Fault]:
-    """Yield the faults of surfaces: names, and drones that start too close, other than on top."""
+    """Yield the faults of surfaces: names, and drones that start too close, unless on top."""
     yield from _name_faults("environment.surfaces", surfaces)
     names = _names(drones)
     for index, surface in surfaces:
@@ -244,7 +244,7 @@ def _surface_faults(
             continue
         try:
             sheet = hold(sheet_of(SimpleNamespace(surfaces=[surface])))
-        except ValueError:  # invalid triangles are reported as a fault of their own
+        except ValueError:  # invalid triangles are reported elsewhere
             continue
         least = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
         places = np.array([drone.position_m for _, drone in placed])
@@ -263,7 +263,7 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
     gravity = scenario.environment and scenario.environment.gravity_m_s2
     vehicle = vehicles.get(drone.model) if drone.model else None
     if vehicle and _known(drone.thrust_n_s2, high):
-        scale = math.sqrt(math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2))  # larger may come from a wrong unit
+        scale = math.sqrt(math.sqrt(drone.thrust_n_s2 / vehicle.thrust_n_s2))  # a larger one may come from a wrong unit
         radius_m = vehicle.rotor_radius_m * min(1.0, scale)
         if radius_m * high > TIP_MAX_M_S:
             tip = f"so that the tip of a rotor of {radius_m:.3g} m moves at {radius_m * high:.0f} m/s"
@@ -292,12 +292,12 @@ def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) ->
 
 
 def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
-    """Yield drag coefficients in a wrong unit, with which slow air would push as hard as the weight.
+    """Yield drag coefficients so large that slow air would push as hard as the weight: their unit is wrong.
 
     A coefficient that is too small cannot be distinguished from an omitted one.
     """
     weight, v = drone.mass_kg * G_M_S2, AIR_M_S
-    of_rotors = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, sum of the rotor speeds in a hover
+    of_rotors = rotors * math.sqrt(weight / (rotors * drone.thrust_n_s2))  # rad/s, sum of the rotors' speeds in a hover
     speeds = {
         "drag_n_s_m": (v, "N s/m"),
         "aerodynamics.linear_drag_n_s_m": (v, "N s/m"),
@@ -320,7 +320,7 @@ def _drag_faults(drone: Any, rotors: int) -> Iterator[Fault]:
 
 
 def _hover_faults(drone: Any, vehicle: Vehicle, environment: Any) -> Iterator[Fault]:
-    """Yield implausible values of mass, rotors and battery in a hover, which indicate a wrong unit."""
+    """Yield values of mass, rotors and battery that make a hover implausible, which indicates a wrong unit."""
     count, shares = len(vehicle.rotors), lift_shares(vehicle)
     thrust, torque = drone.thrust_n_s2, drone.torque_nm_s2
     low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
@@ -460,7 +460,7 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
 
 
 def _in_line(places: list[Any]) -> bool:
-    """Return whether places (n, 3) are collinear, by the root mean square deviation."""
+    """Whether points (n, 3) are collinear: within TEMPLATE_WIDTH_MIN_M of a line, root mean square."""
     p = np.array(places, dtype=float)
     widths = singular_values(p - p.mean(axis=0)) / np.sqrt(len(p))
     return el.length(widths[1:].tolist()) < TEMPLATE_WIDTH_MIN_M
@@ -521,7 +521,7 @@ def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> It
 
 
 def _path_faults(reference: Any) -> Iterator[Fault]:
-    """Yield the faults between the fields of one drone's reference."""
+    """Yield conflicts between the fields of one drone's reference."""
     given = [name for name in PATHS if getattr(reference, name)]
     if len(given) > 1:
         yield given[1], f"is given beside {given[0]}; must be one of {', '.join(PATHS)}"
@@ -548,7 +548,7 @@ def _landing_faults(piloted: Any, from_s: float | None) -> Iterator[Fault]:
 
 
 def _piloted(scenario: Any, drones: _Entries) -> _Entries:
-    """Return the drones with a reference, or in an exchange."""
+    """Return the drones that have a reference or take part in an exchange."""
     exchanges = _entries(scenario.exchanges if isinstance(scenario.exchanges, list) else [])
     exchanged = {name for _, exchange in exchanges for _, name in _entries(exchange.drones)}
     return [(index, drone) for index, drone in drones if drone.reference or drone.name in exchanged]
@@ -584,7 +584,7 @@ def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterat
 
 
 def _graph_faults(topology: Any, drones: list[str]) -> Iterator[Fault]:
-    """Yield the names in a graph of drones that are not drones."""
+    """Yield the faults of a topology's graph: names that are not those of other drones."""
     graph = getattr(topology, "graph", None)
     for hearer, heard in graph.items() if isinstance(graph, dict) else ():
         where = f"topology.graph.{hearer}"

@@ -1,7 +1,7 @@
-"""The faults that can be injected into a run: their kinds, checks of descriptions, and the form typed in a terminal.
+"""Faults that can be injected into a run: their kinds, the checks of their descriptions, and their typed form.
 
 A fault is described by a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind. The same tables check
-scenarios, requests and commands. In a terminal or the console, a fault is typed:
+scenarios, requests and commands. In a terminal or the console, a fault is typed as
 `drone2 gps_dropout probability=0.5 --for 10s`.
 """
 
@@ -24,26 +24,26 @@ from zsim.sensors.sensor_catalogue import STOCK
 Target = Literal["drone", "world", "link", "radio", "process"]
 Shape = Literal["number", "vector", "choice", "word", "flag", "places"]
 
-ROTORS = ("front_left", "front_right", "rear_right", "rear_left")  # in the order of truth's rotor_rad_s
+ROTORS = ("front_left", "front_right", "rear_right", "rear_left")  # in the order of `rotor_rad_s` in truth messages
 PROCESS_KILL = "process_kill"
 VECTOR_SIZE = 3  # numbers in a bias given as a list
-ORIGIN = (0.0, 0.0, 0.0)  # m in W, position of a process that no `place` gives
+ORIGIN = (0.0, 0.0, 0.0)  # m in W, position of a process that `place` omits and no drone carries
 FOR_EVER_S = 1e6  # s, length of the longest scenario
 UNGATED = ("world", "recorder", "console", "gateway", "router")  # roles outside the lockstep, which ignore faults
-ALIKE = 0.85  # minimum ratio of difflib, chosen: at this ratio, words as long as "controller" differ by a typing error
+ALIKE = 0.85  # minimum difflib ratio; design choice: words as long as "controller" may differ by one typing error
 COMMON = ("kind", "target", "at_s", "for_s")  # fields of every fault; all others are parameters
 
 
 class FaultParameter(NamedTuple):
-    """A parameter of a kind of fault: a number, vector, word or map."""
+    """A parameter of a kind of fault."""
 
     name: str
     shape: Shape
     description: str  # for tables
-    unit: str = ""  # of the number or vector; empty if dimensionless
-    least: float = -1e9  # limits, also of each entry of a vector
+    unit: str = ""  # unit of the number or vector; empty if dimensionless
+    least: float = -1e9  # limits of the number, or of each entry of the vector
     most: float = 1e9
-    above: bool = False  # whether `least` itself is not allowed
+    above: bool = False  # whether `least` itself is excluded
     choices: tuple[str, ...] = ()  # allowed words
     default: Any = None  # value if omitted
     required: bool = True  # whether it must be given
@@ -53,13 +53,13 @@ class FaultParameter(NamedTuple):
 class FaultKind(NamedTuple):
     """One kind of fault."""
 
-    # a drone; the world; a link "a/b" between two processes; the radio of a cluster's or all drones; a process
+    # what it affects: a drone, the world, a link "a/b" between two processes, the radio of some drones, or a process
     strikes: Target
-    description: str  # of its effect, for tables
+    description: str  # its effect, for tables
     parameters: tuple[FaultParameter, ...] = ()
-    # "ends" requires `for_s`, "once" forbids it; "any" allows it, and without it lasts until cleared
+    # "ends" requires `for_s`, "once" forbids it; "any" allows it; without it the fault lasts until cleared
     lasts: Literal["any", "ends", "once"] = "any"
-    sensor: str = ""  # affected sensor, which not every drone has
+    sensor: str = ""  # affected sensor, if any, which not every drone has
 
 
 def _number(
@@ -86,14 +86,14 @@ class SensorPart(NamedTuple):
     """Values of a sensor that a fault affects together."""
 
     sensor: str
-    label: str  # of the part
-    channel: Channel  # of its first numbers, to which a bias is added
-    first: int  # index of its first number among those of the sensor
+    label: str  # name of the part in descriptions
+    channel: Channel  # channel of its first numbers, to which a bias is added
+    first: int  # index of its first number among the sensor's numbers
     width: int
 
 
 def sensor_parts(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, SensorPart]:
-    """Return the parts of sensors by the prefix of their fault kinds: accel and gyro of an IMU, else the sensor."""
+    """Return the parts of sensors by the prefix of their fault kinds: accel and gyro of an IMU, or a whole sensor."""
     parts: dict[str, SensorPart] = {}
     for name, sensor in sensors.items():
         first = 0
@@ -200,14 +200,14 @@ def unstated(kind: FaultKind, parameters: Mapping[str, Any]) -> list[FaultParame
 
 
 def planned(
-    description: Mapping[str, Any],  # must be free of flaws
-    number: int,  # its id
+    description: Mapping[str, Any],  # must have no flaws
+    number: int,  # id of the fault
     source: str,
     now_ns: int,  # start of a fault without `at_s`
     gate_ns: int,
     kinds: Mapping[str, FaultKind] = KINDS,
 ) -> Fault:
-    """Return the fault given by a valid description, rounded to whole gates and with every parameter.
+    """Return the fault given by a valid description, with times rounded to whole gates and every parameter set.
 
     It acts in the gates after `from_ns` up to `until_ns`: on the motion between these times, and on the messages of
     those gates.
@@ -222,7 +222,7 @@ def planned(
 
 
 def _plain(value: Any, p: FaultParameter) -> Any:
-    """Return a value as sent: numbers as floats, so that equal faults have equal texts."""
+    """Return a value as it is sent: numbers become floats, so that equal faults have equal texts."""
     if value is None:
         return p.default
     if p.shape == "number":
@@ -243,13 +243,13 @@ def acts(fault: Fault, gate_ns: int) -> bool:
 
 
 class Known(NamedTuple):
-    """Valid names of targets, and the kinds of faults of the run."""
+    """Valid names of targets, and the kinds of faults, in a run."""
 
     drones: tuple[str, ...]
     clusters: tuple[str, ...]
-    processes: tuple[str, ...] = ()  # besides estimators and controllers
+    processes: tuple[str, ...] = ()  # other than estimators and controllers
     kinds: Mapping[str, FaultKind] = KINDS
-    # by drone; empty if its vehicle's module is not imported here
+    # names by drone; empty if the module of its vehicle is not imported here
     rotors: Mapping[str, tuple[str, ...]] = {}
     external: tuple[str, ...] = ()  # drones whose bodies and sensors are not simulated
     sensors: Mapping[str, Collection[str]] = {}  # names by drone, where known
@@ -341,7 +341,7 @@ def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterat
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
-    """Return what a process's name must be; None if it is acceptable: a user's process may have almost any name."""
+    """Return what a process must be named instead; None if `name` is acceptable, as most are for users' processes."""
     if not keys.PROCESS_NAME.fullmatch(name):
         return "1 to 48 of a-z 0-9 _ . -"
     if name in known.processes:
@@ -422,7 +422,8 @@ def typed_duration_s(text: str) -> float:
 def typed_parameters(words: Sequence[str]) -> dict[str, Any]:
     """Return the parameters given by words NAME=VALUE, with values in YAML.
 
-    ValueError if a word has another form, repeats a name, or names an argument or option.
+    Raises:
+        ValueError: a word has another form, repeats a name, or names an argument or option.
     """
     values: dict[str, Any] = {}
     for text in words:
@@ -446,7 +447,7 @@ def typed_rest(text: str) -> dict[str, Any]:
     Lists and maps need no quotes here, since no shell parses them.
 
     Raises:
-        ValueError: it is not NAME=VALUE NAME=VALUE … --for DURATION --at DURATION.
+        ValueError: the text is not of the form NAME=VALUE NAME=VALUE … --for DURATION --at DURATION.
     """
     times: dict[str, float] = {}
     words: list[str] = []
@@ -480,5 +481,5 @@ def _words(text: str) -> list[str]:
 
 
 def allowed_kinds(found: Any, known: Collection[str]) -> str:
-    """Return the error text that names the allowed kinds, for an unknown kind of fault."""
+    """Return the part of an error text that says which kinds of faults are allowed instead of `found`."""
     return f"{suggestion(found, known)}must be one of the {len(known)} that `zsim fault kinds SCENARIO` lists"

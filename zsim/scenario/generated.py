@@ -1,11 +1,11 @@
 """Obstacles generated from a seed (forest, corridor) or read from files (point clouds, surfaces).
 
 They become entries of `environment.obstacles` when a scenario is resolved, so that the record contains each of them;
-a surface's file is replaced with its triangles. The same seed gives the same obstacles, rounded to a millimetre, on
+a surface's file is replaced by its triangles. The same seed gives the same obstacles, rounded to a millimetre, on
 every machine.
 
-Files: meshes (STL, OBJ, PLY), height maps (CSV, NPY), point clouds (PCD, PLY). Mesh and
-point cloud formats need trimesh and pypcd4, from the extra `obstacles`.
+Files: meshes (STL, OBJ, PLY), height maps (CSV, NPY) and point clouds (PCD, PLY, CSV). STL, OBJ and PLY need trimesh,
+PCD needs pypcd4; both come with the extra `obstacles`.
 """
 
 import importlib
@@ -27,15 +27,15 @@ from zsim.scenario.surroundings import TRIANGLE, TRIANGLES_MAX, packed, unpacked
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, faults_in, show, sound
 
-TRIES_MAX = 500  # attempts to place a trunk before the forest counts as full; chosen
-BYTES_MAX = 100_000_000  # size of a file
+TRIES_MAX = 500  # attempts to place a trunk before the forest counts as full; design choice: bounds the time it takes
+BYTES_MAX = 100_000_000  # maximum size of a file
 Entry = dict[str, Any]
 Array = NDArray[np.float64]
 _KINDS = {"forest": Forest, "corridor": Corridor, "cloud": Cloud}
 
 
 def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a raw document with obstacles in place of forest, corridor and cloud, and surfaces read; and faults."""
+    """Return a raw document with generated obstacles and the triangles of surfaces filled in, and the faults."""
     environment = document.get("environment")
     if not isinstance(environment, dict):
         return document, []
@@ -74,7 +74,8 @@ def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
 def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], where: str) -> list[Entry]:
     """Return trunks at random positions, clear of each other and of the drones' start positions.
 
-    DocumentError if limits are not ascending, or the trunks do not fit.
+    Raises:
+        DocumentError: limits are not ascending, or the trunks do not fit.
     """
     for name in ("radius_m", "height_m"):
         low, high = getattr(own, name)
@@ -108,7 +109,7 @@ def _forest(own: Forest, rng: np.random.Generator, starts: Sequence[Position], w
 
 
 def _corridor(own: Corridor, rng: np.random.Generator) -> list[Entry]:
-    """Return the walls on both sides of a line with a random turn after each segment, joined at the bends."""
+    """Return the walls on both sides of a path with a random turn after each segment, joined at the bends."""
     turns = [0.0, *np.radians(rng.uniform(-own.turn_deg, own.turn_deg, own.segments - 1)).tolist()]
     headings = (math.radians(own.heading_deg) + np.cumsum(turns)).tolist()
     middles = [own.start_m]
@@ -118,7 +119,7 @@ def _corridor(own: Corridor, rng: np.random.Generator) -> list[Entry]:
     bends = [*zip(middles, headings, turns, strict=False), (middles[-1], headings[-1], 0.0)]
     entries: list[Entry] = []
     for side, off in (("left", 1.0), ("right", -1.0)):
-        corners = []  # of a wall's centre line, on the bisector of each bend
+        corners = []  # corners of a wall's centre line, on the bisector of each bend
         for (x, y), heading, turn in bends:
             across, away = heading - 0.5 * turn, 0.5 * off * (own.width_m + own.wall_m) / el.cos(0.5 * turn)
             corners.append((x - away * el.sin(across), y + away * el.cos(across)))
@@ -137,7 +138,8 @@ def _corridor(own: Corridor, rng: np.random.Generator) -> list[Entry]:
 def _boxes(own: Cloud, where: str) -> list[Entry]:
     """Return boxes for the occupied cells of a point cloud, merged along z, then along x.
 
-    DocumentError if the file cannot be read, or yields too many boxes.
+    Raises:
+        DocumentError: the file cannot be read, or yields too many boxes.
     """
     points = points_of(plugin.beside(own.file), f"{where}.file")
     cells, counts = np.unique(np.floor(points / own.cell_m).astype(np.int64), axis=0, return_counts=True)
@@ -148,7 +150,7 @@ def _boxes(own: Cloud, where: str) -> list[Entry]:
             column[-1][1] = z
         else:
             column.append([z, z])
-    rows: dict[tuple[int, int, int], list[list[int]]] = {}  # first and last x of each run, by y and both z
+    rows: dict[tuple[int, int, int], list[list[int]]] = {}  # first and last x of each run, by y, first z and last z
     for (x, y), column in sorted(runs.items()):
         for low, high in column:
             row = rows.setdefault((y, low, high), [])
@@ -201,13 +203,13 @@ def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
 
 
 def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
-    """Return the triangles (T, 9), three corners each, of a mesh or of a height map with cells of width `cell_m` [m].
+    """Return the triangles, (T, 9), three corners each, of a mesh or of a height map with cells `cell_m` wide [m].
 
     A height map has a height [m] for every corner of its cells, row by row from south to north, centred at the origin;
     each cell gives two triangles.
 
     Raises:
-        DocumentError: the file cannot be read, or is not a mesh; one line that begins with `where`.
+        DocumentError: the file cannot be read, or is not a mesh or height map; its line begins with `where`.
     """
     kind = path.suffix.lower()
     if kind in (".csv", ".npy"):
@@ -236,7 +238,7 @@ def triangles_of(path: Path, where: str, cell_m: float | None) -> Array:
 
 
 def points_of(path: Path, where: str) -> Array:
-    """Return the finite points of a cloud, (P, 3) [m]. Errors as for `triangles_of`."""
+    """Return the finite points of a cloud, (P, 3) [m]; raises the errors of `triangles_of`."""
     kind = path.suffix.lower()
     if kind == ".pcd":
         read = lambda p: importlib.import_module("pypcd4").PointCloud.from_path(p).numpy(("x", "y", "z"))  # noqa: E731
@@ -256,7 +258,7 @@ def points_of(path: Path, where: str) -> Array:
 
 
 def _numpy_grid(path: Path) -> Array:
-    return np.load(path).astype(float, casting="same_kind")  # refuses archives, complex numbers and texts
+    return np.load(path).astype(float, casting="same_kind")  # refuses archives, complex numbers and strings
 
 
 def _text_grid(path: Path) -> Array:
@@ -272,7 +274,7 @@ def _read(path: Path, where: str, read: Callable[[Path], Any]) -> Any:
         raise
     except ModuleNotFoundError as error:
         raise DocumentError([f"{where} is {show(str(path))}: {missing(error) or error}"]) from error
-    except Exception as error:  # readers of foreign files raise any error
+    except Exception as error:  # third-party readers may raise any error
         _refuse(
             path, where, f"cannot be read ({str(error).splitlines()[0] if str(error) else type(error).__name__})", ""
         )
@@ -283,7 +285,7 @@ def _refuse(path: Path, where: str, found: str, allowed: str) -> NoReturn:
 
 
 def _of_heights(heights: Array, cell_m: float) -> Array:
-    """Return two triangles for each cell of a grid of heights, (T, 9)."""
+    """Return the triangles of a grid of heights, two for each cell, (T, 9)."""
     rows, columns = heights.shape
     x = (np.arange(columns) - 0.5 * (columns - 1)) * cell_m
     y = (np.arange(rows) - 0.5 * (rows - 1)) * cell_m

@@ -21,7 +21,7 @@ OF_THE_RUN = ("info", "scenario", "drone", "cluster")  # arguments of an agent's
 
 
 class AgentMethods:
-    """The methods required of an agent's class: those of zsim.Agent, which is not imported here."""
+    """Methods required of an agent's class: those of zsim.Agent, which is not imported here."""
 
     def receive(self, key: str, message: Any) -> None: ...
 
@@ -29,7 +29,7 @@ class AgentMethods:
 
 
 def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
-    """Return a scenario's `agents:` section, completed with parameters and messages of the classes, and its faults.
+    """Return a scenario's `agents:` section, completed with its classes' parameters and messages, and its faults.
 
     Args:
         imports: whether classes may be imported; if not, the section must already be complete.
@@ -125,7 +125,7 @@ def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:
     """Return the message classes that an agent's class publishes.
 
     Raises:
-        DocumentError: they are invalid.
+        DocumentError: one of them is invalid.
     """
     classes = getattr(kind, "messages", ())
     try:

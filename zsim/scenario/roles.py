@@ -1,8 +1,8 @@
-"""The roles of a federation: naming, agent class, requirements and key rights of their processes.
+"""Roles of a federation: the names, agent classes, requirements and key rights of their processes.
 
 Launchers, the world and access control use the table. Rights are the minimum that a role needs. They follow from the
 writers and readers declared by the messages of the contract (`zsim.contract.messages.TOPICS`); Zenoh's access control
-and the world's replays apply them.
+and the world's replays enforce them.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -14,21 +14,21 @@ from zsim.errors import ScenarioError
 from zsim.scenario.scenario import OnDeath, OnOverdue, OwnAgent, Scenario
 from zsim.schema.checker import listed
 
-MAIN = "main"  # second part of the name of an agent for the run
+MAIN = "main"  # second part of the name of an agent that serves the whole run
 OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
-PILOT = "reference"  # only for drones with a reference of their own
+PILOT = "reference"  # role of the pilots of drones with a reference of their own
 
 
 class Role(NamedTuple):
-    """A role."""
+    """Properties of the processes of one role."""
 
-    extra: str  # extra of the distribution that its hosts need; empty if none
+    extra: str  # extra of the distribution zsim that its hosts need; empty if none
     on_death: OnDeath  # default action on the death of a process
     # scope of its processes, named ROLE.NAME after each drone or cluster; None for roles without an agent
     about: Literal["drone", "cluster", "run"] | None = None
     agent: str = ""  # `package.module:Class` of the agent, constructed from world/info, scenario and name
-    joint: bool = False  # whether one agent, given all their names, may replace many
-    # default action if it does not return; `drop` if the run does not wait for it
+    joint: bool = False  # whether one agent may replace several, given all their names
+    # default action on a process that is overdue; `drop` if the run does not wait for the role
     on_overdue: OnOverdue = "end"
 
 
@@ -53,7 +53,7 @@ AGENTS = {name: role for name, role in ROLES.items() if role.about}
 
 
 def agent_roles(scenario: Scenario) -> dict[str, Role]:
-    """Return the roles of a scenario's agents: stock roles, and those of users' classes."""
+    """Return the roles of a scenario's agents: the stock roles and those of users' classes."""
     own = {name: Role("agents", "restart", each.per, each.named) for name, each in scenario.own_agents.items()}
     return AGENTS | own
 
@@ -85,10 +85,10 @@ def programs(scenario: Scenario) -> list[str]:
 
 
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
-    """Return the action on the death of a process: the scenario's for it, for its role, or the default.
+    """Return the action on the death of a process: the scenario's for its name, that for its role, or the default.
 
     Args:
-        actions: actions of the scenario by process name or role.
+        actions: the scenario's actions by process name or role.
         role: role in the process's join; by default the first part of its name.
     """
     role = role or name.partition(".")[0]
@@ -101,7 +101,7 @@ def on_overdue(
 ) -> OnOverdue:
     """Return the action on an overdue process; arguments as for `on_death`.
 
-    `gating`: roles other than agents for which the run waits.
+    `gating`: roles, other than those of agents, that the run waits for.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_overdue if role in ROLES and role not in gating else "end"
@@ -109,7 +109,7 @@ def on_overdue(
 
 
 def lets_drop(actions: Mapping[str, str], name: str) -> bool:
-    """Whether `on_death` or `on_overdue` explicitly lets a run continue without a process, not counted as a failure."""
+    """Whether a scenario explicitly lets a run continue without a process, which then does not count as a failure."""
     return (actions.get(name) or actions.get(name.partition(".")[0])) == "drop"
 
 
@@ -150,7 +150,7 @@ def drivers_of(scenario: Scenario) -> list[str]:
 
 
 def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
-    """Return a line on the drivers to start with a run; empty without external drones."""
+    """Return a line about the drivers to start with a run; empty without external drones."""
     drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
     awaited, others = (listed([d for d in drivers if (d in awaited_names) is wanted]) for wanted in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []
@@ -162,7 +162,7 @@ def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
 
 
 class Rights(NamedTuple):
-    """Key expressions, without the federation."""
+    """Key expressions that a process may use, without the federation's prefix."""
 
     reads: tuple[str, ...] = ()  # subscriptions
     writes: tuple[str, ...] = ()
@@ -172,7 +172,7 @@ class Rights(NamedTuple):
     watches: tuple[str, ...] = ()  # liveliness tokens to watch
 
 
-EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # wildcards do not match keys that begin with @
+EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # wildcards do not match chunks that begin with @
 ALL_RIGHTS = Rights(*[EVERYTHING] * len(Rights._fields))
 LAST_VALUES = tuple(key for key, topic in TOPICS.items() if topic.last)
 _READER = Rights(reads=("**", keys.BATCH), asks=LAST_VALUES, watches=(keys.token("*"),))
@@ -183,7 +183,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
 
     A camera or detector that is not named after a drone serves all drones with cameras. A user's process named after a
     drone has the rights of its estimator, one named after a cluster those of its controller, which it may replace. Any
-    other process may take part, and read the keys that all may read.
+    other process may take part and read the keys that are open to all.
     """
     role, _, thing = process.partition(".")
     if process == WORLD:
@@ -215,7 +215,7 @@ def rights_for(process: str, scenario: Scenario) -> Rights:
     granted = [own]
     if about != "cluster" and thing in [drone.name for drone in scenario.drones]:
         sensed = [keys.gate(thing)]
-        if scenario.estimation.use_sightings is True:  # all sensors of its cluster's drones
+        if scenario.estimation.use_sightings is True:  # it reads all sensors of its cluster's drones
             mates = next((cluster.drones for cluster in scenario.clusters if thing in cluster.drones), [thing])
             sensed.append(keys.GATE)
             for mate in mates:
@@ -243,9 +243,9 @@ def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
 
 
 def _granted(role: str, **names: Sequence[str]) -> Rights:
-    """Return a role's rights from the contract's messages on the keys of some drones, clusters or processes.
+    """Return the rights that the contract's messages give a role on the keys of some drones, clusters or processes.
 
-    `names`: names of `drone`, `cluster`, `process`, and of the process itself as `estimates`.
+    `names` lists them by kind of key: `drone`, `cluster`, `process`, and `estimates` for the process itself.
     """
     reads, writes, asks, answers = [], [], [], []
     for key, topic in TOPICS.items():

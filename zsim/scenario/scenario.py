@@ -1,4 +1,4 @@
-"""The scenario: typed, immutable, every quantity with its unit in its name.
+"""The scenario: typed and immutable, with the unit of every quantity in its name.
 
 `scenario_file.load` reads a file; its error messages quote the limits given here.
 """
@@ -19,16 +19,16 @@ from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import MODELS, Aerodynamics, Arm, Limits, Mass, RotorLag, TakeoffHeight, Vehicle
 
-TEMPLATE_FROM = 5  # robots; with fewer, a triad has fewer variables and is as well conditioned
+TEMPLATE_FROM = 5  # robots; with fewer, a triad has fewer variables and is equally well conditioned
 DRONES_MAX = 1000  # one world integrates them all
-OBSTACLES_MAX = 1000  # every drone is compared with every obstacle in every step
+OBSTACLES_MAX = 1000  # every drone is checked against every obstacle in every step
 SURFACES_MAX = 100
 FAULTS_MAX = 1000  # injected faults, planned and active; all are examined whenever one begins or ends
 CLUSTERS_MAX = DRONES_MAX // 2  # each has at least two drones, which belong to no other
-PROCESSES_MAX = 4 * DRONES_MAX  # an estimator per drone, a controller per cluster, and twice as many of the user's
-WAYPOINTS_MAX = 10_000  # an hour of waypoints at 3 a second
+PROCESSES_MAX = 4 * DRONES_MAX  # an estimator per drone, a controller per cluster, and 2500 processes of users
+WAYPOINTS_MAX = 10_000  # about an hour at 3 per second
 CONSTANTS_MAX = 100  # a user's constants in the expressions of a trajectory
-ROBOTS_MAX = 64  # drones of a cluster; above this, a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
+ROBOTS_MAX = 64  # drones of a cluster; above this, a dense 4n x 4n Jacobian no longer fits into a control gate of 20 ms
 POINTS_MAX = 1000  # points in the path of one drone
 PIECES_MAX = 5000  # polynomials in one path
 STAGES_MAX = 100  # stages of an exchange, and assemblies of a cluster's plan
@@ -37,16 +37,16 @@ ROLES_MAX = 20  # roles of users' agents; each may be a process for every drone
 PROGRAMS_MAX = 100  # users' programs, in addition to agents
 WORDS_MAX = 1000  # words of a command line
 LAW_SENSORS_MAX = 100  # sensors that a law reads
-MESSAGES_MAX = 20  # classes of messages that a class of agents publishes
+MESSAGES_MAX = 20  # message classes that an agent's class publishes
 VARIABLES_MAX = 4 * ROBOTS_MAX  # variables of a formation: four per robot
-SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
+SEA_HEIGHT_MAX_M = 11_000  # m above the sea: top of the layer whose pressure the barometer model covers (ISO 2533)
 
-EXTERNAL = "external"  # body of a drone that a driver publishes
+EXTERNAL = "external"  # `body` of a drone whose messages a driver publishes
 
 OnDeath = Literal["wait", "restart", "drop", "end"]
 OnOverdue = Literal["drop", "end"]
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
-Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; a tangent plane is no map of a larger area
+Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; a tangent plane cannot represent a larger area
 Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -55,7 +55,7 @@ class Spec(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 Value = Annotated[Real | str, Meta(description="a finite number or an expression")]
-"""Value of a variable: in metres or radians; in degrees where the name of an angle ends in `_deg`."""
+"""Value of a variable: in metres or radians, or in degrees if the name of an angle ends in `_deg`."""
 
 
 class Piloted(Spec, frozen=True, kw_only=True):
@@ -64,9 +64,9 @@ class Piloted(Spec, frozen=True, kw_only=True):
     takeoff_s: NonNegative = 0.0
     land_s: NonNegative | None = None
     fit: bool = False
-    """Whether a path too fast for the drone is slowed down; otherwise it is refused."""
-    gain_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6  # position gain; chosen: as for formations
-    lead_s: Annotated[float, Meta(ge=0, le=2)] = 0.4  # the AR.Drone's: 0.33 s of its velocity loop, 0.11 s of its tilt
+    """Whether a path that is too fast for the drone is slowed down; otherwise it is refused."""
+    gain_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6  # position gain; design choice: as for formations
+    lead_s: Annotated[float, Meta(ge=0, le=2)] = 0.4  # lag of the AR.Drone: 0.33 s of velocity loop, 0.11 s of tilt
 
 
 class PathPoint(Spec, frozen=True, kw_only=True):
@@ -81,7 +81,7 @@ Terms = Annotated[list[Real], Meta(max_length=8)]  # coefficients of t^0, t^1, .
 
 
 class Piece(Spec, frozen=True, kw_only=True):
-    """Polynomials in the time since the piece began [m, rad]."""
+    """Polynomials [m, rad] in the time since the start of the piece [s]."""
 
     duration_s: Annotated[float, Meta(gt=0, le=3600)]
     x: Terms = []
@@ -103,7 +103,7 @@ class Circle(Spec, frozen=True, kw_only=True):
 
 
 class FigureEight(Spec, frozen=True, kw_only=True):
-    """A figure of eight along x that begins at its crossing."""
+    """A figure of eight along x that begins at its crossing point."""
 
     length_m: Positive
     width_m: Positive
@@ -152,10 +152,10 @@ class Exchange(Piloted, frozen=True, kw_only=True):
 
 
 class Drone(Spec, frozen=True, kw_only=True):
-    """One aircraft. Unset fields default to its model (zsim/vehicles); the defaults here are the AR.Drone's."""
+    """One aircraft. Unset fields take the values of its model (zsim/vehicles); the defaults here are the AR.Drone's."""
 
     name: Name
-    model: str = "ardrone2"  # a stock vehicle, or the user's `package.module` that defines VEHICLE
+    model: str = "ardrone2"  # a stock vehicle, or a user's `package.module` that defines VEHICLE
     body: Literal["simulated", "external"] | UnsetType = UNSET
     """Unset: simulated, and left out of the resolved text. A driver publishes the messages of an external body."""
     position_m: Position
@@ -184,16 +184,16 @@ class Drone(Spec, frozen=True, kw_only=True):
 
 
 class Wind(Spec, frozen=True, kw_only=True):
-    """Steady wind and Dryden gusts, `gust_m_s` being the standard deviation per axis.
+    """Steady wind and Dryden gusts; `gust_m_s` is the standard deviation of the gusts per axis.
 
-    The form is that of MIL-HDBK-1797; its length scales, for aeroplanes high above the ground, are not used.
+    The spectra have the form of MIL-HDBK-1797, but not its length scales, which suit aeroplanes high above the ground.
     """
 
     steady_m_s: Vector3 = (0.0, 0.0, 0.0)
     gust_m_s: NonNegative = 0.0
-    gust_length_m: Positive = 10.0  # chosen: eddies about as large as the flight height
-    gust_speed_min_m_s: Positive = 2.0  # chosen: with 10 m, gusts on a hovering drone last 5 s
-    gust_correlation: Fraction = 0.5  # chosen: drones some metres apart share half of the variance
+    gust_length_m: Positive = 10.0  # design choice: eddies about as large as the flight height
+    gust_speed_min_m_s: Positive = 2.0  # design choice: with 10 m, gusts on a hovering drone last 5 s
+    gust_correlation: Fraction = 0.5  # design choice: drones a few metres apart share half of the variance
 
 
 class Obstacle(Spec, frozen=True, kw_only=True):
@@ -218,10 +218,10 @@ class Forest(Spec, frozen=True, kw_only=True):
     trees: Annotated[int, Meta(ge=1, le=OBSTACLES_MAX)]
     area_m: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
     """West, south, east and north limits of the trunks' centres."""
-    radius_m: Span = (0.1, 0.25)  # chosen: trunks of 20 to 50 cm
-    height_m: Span = (6.0, 10.0)  # chosen
-    gap_m: NonNegative = 1.5  # between any two trunks; chosen: three hulls of an AR.Drone
-    clear_m: NonNegative = 2.0  # around each drone's start position; chosen
+    radius_m: Span = (0.1, 0.25)  # design choice: trunks 20 to 50 cm thick
+    height_m: Span = (6.0, 10.0)  # design choice: well above the usual flight height
+    gap_m: NonNegative = 1.5  # between any two trunks; design choice: three hulls of an AR.Drone
+    clear_m: NonNegative = 2.0  # around each drone's start position; design choice: four hulls
     seed: Seed | UnsetType = UNSET  # unset: the scenario's
 
 
@@ -229,18 +229,18 @@ class Corridor(Spec, frozen=True, kw_only=True):
     """Walls on both sides of a randomly bending path, which become obstacles; see zsim.scenario.generated."""
 
     segments: Annotated[int, Meta(ge=1, le=100)]
-    length_m: Positive = 6.0  # length of a segment, chosen
-    turn_deg: Annotated[float, Meta(ge=0, le=90)] = 40.0  # maximum turn to either side between segments; chosen
-    width_m: Positive = 3.0  # between the walls, chosen
-    wall_m: Positive = 0.2  # thickness, chosen
-    height_m: Positive = 3.0  # chosen
+    length_m: Positive = 6.0  # length of a segment; design choice: twice the width
+    turn_deg: Annotated[float, Meta(ge=0, le=90)] = 40.0  # maximum turn to either side; design choice: clear bends
+    width_m: Positive = 3.0  # between the walls; design choice: six hulls of an AR.Drone
+    wall_m: Positive = 0.2  # thickness; design choice: an ordinary wall
+    height_m: Positive = 3.0  # design choice: one storey
     start_m: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     heading_deg: Real = 0.0  # direction of the first segment, from east towards north
     seed: Seed | UnsetType = UNSET  # unset: the scenario's
 
 
 class Cloud(Spec, frozen=True, kw_only=True):
-    """A cloud of points from a file, whose occupied cells become boxes; see zsim.scenario.generated."""
+    """A point cloud from a file; its occupied cells become boxes, see zsim.scenario.generated."""
 
     file: Annotated[str, Meta(min_length=1, max_length=1000)]
     """.pcd, .ply or .csv file, in the scenario's folder or the current one."""
@@ -250,7 +250,7 @@ class Cloud(Spec, frozen=True, kw_only=True):
 
 
 class Surface(Spec, frozen=True, kw_only=True):
-    """A triangle mesh from a file, which is an obstacle; see zsim.scenario.generated."""
+    """An obstacle given by a triangle mesh from a file; see zsim.scenario.generated."""
 
     name: Name
     file: Annotated[str, Meta(min_length=1, max_length=1000)] | UnsetType = UNSET
@@ -264,7 +264,7 @@ class Surface(Spec, frozen=True, kw_only=True):
 
 
 class Environment(Spec, frozen=True, kw_only=True):
-    """The flight field; by default in Buenos Aires, where the paper was written."""
+    """The flight field; by default in Buenos Aires, where the paper of Mas, Curi and Sánchez Peña was written."""
 
     latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = -34.603
     longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -58.368
@@ -279,14 +279,14 @@ class Environment(Spec, frozen=True, kw_only=True):
     cloud: Cloud | UnsetType = UNSET  # likewise
     surfaces: Annotated[list[Surface], Meta(max_length=SURFACES_MAX)] | UnsetType = UNSET
     hats: Hats | UnsetType = UNSET  # unset: the defaults, and left out of the resolved text
-    light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # share of a clear day's, for cameras; unset: 1
+    light: Annotated[float, Meta(ge=0.02, le=1)] | UnsetType = UNSET  # for cameras, relative to a clear day; unset: 1
 
 
 class Silence(Spec, frozen=True, kw_only=True):
     """What the firmware does when the commander falls silent, in simulated time."""
 
-    hover_s: Positive = 0.5  # chosen: 25 gates, longer than any delay of a link, shorter than the time to a collision
-    land_s: Positive = 2.0  # from then on; the AR.Drone's com_watchdog
+    hover_s: Positive = 0.5  # design choice: 25 gates; longer than any link delay, shorter than the time to a collision
+    land_s: Positive = 2.0  # further time until it lands; the AR.Drone's com_watchdog
 
 
 HeadingSigma = Annotated[float, Meta(gt=0, le=180)]
@@ -295,18 +295,19 @@ HeadingSigma = Annotated[float, Meta(gt=0, le=180)]
 class Gains(Spec, frozen=True, kw_only=True):
     """Gains of the cluster controller; see zsim_agents.formation.control_law.
 
-    All chosen. The loop becomes unstable at a proportional gain of about 2 1/s, and responds well from 0.5 to 0.8.
+    All defaults are design choices. The loop becomes unstable at a proportional gain of about 2 1/s, and responds well
+    from 0.5 to 0.8 1/s.
     """
 
     proportional_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6
     integral_1_s2: Annotated[float, Meta(ge=0, le=0.5)] = 0.05  # removes a steady wind's offset within half a minute
     horizontal_speed_m_s: Positive = 1.5  # a third of what the firmware allows; the rest is for wind
-    vertical_speed_m_s: Positive = 0.8  # of the 1 m/s that the firmware allows
-    yaw_rate_deg_s: Positive = 60.0  # of 200 deg/s; a turning drone drifts sideways off its path
+    vertical_speed_m_s: Positive = 0.8  # the firmware allows 1 m/s
+    yaw_rate_deg_s: Positive = 60.0  # the firmware allows 200 deg/s, but a turning drone drifts off its path
     separation_min_m: NonNegative = 2.0  # about four hulls; estimated separations err by 0.2 m
     separation_alarm_m: NonNegative = 1.5  # about three hulls
     sigma_max_m: Positive | UnsetType = UNSET
-    """Maximum sigma of each drone's position per axis at take-off and engagement; unset: 1 m. Twice that in flight."""
+    """Maximum sigma of a drone's position per axis at take-off and engagement, and twice that in flight; unset: 1 m."""
     heading_sigma_max_deg: HeadingSigma | UnsetType = UNSET  # likewise for the heading; unset: 15 deg
 
 
@@ -328,18 +329,18 @@ class Trajectory(Spec, frozen=True, kw_only=True):
 
 
 class AssemblyPoint(Spec, frozen=True, kw_only=True):
-    """A formation that the drones of a cluster assemble; each is assigned one of its positions."""
+    """A formation into which the drones of a cluster assemble; each is assigned one of its positions."""
 
     at_s: NonNegative = 0.0
     values: Values = {}
 
 
 class ClusterPlan(Spec, frozen=True, kw_only=True):
-    """What the controller does without requests."""
+    """What the controller does of its own accord, without requests."""
 
     takeoff_s: NonNegative | None = None
     assemblies: Annotated[list[AssemblyPoint], Meta(min_length=1, max_length=STAGES_MAX)] | UnsetType = UNSET
-    """Unset: the drones keep the places in which they start; left out of the resolved text."""
+    """Unset: each drone keeps the formation position in which it starts; left out of the resolved text."""
     target: Values = {}
     target_over_s: Positive | None = None
     trajectory: Trajectory | None = None
@@ -375,7 +376,7 @@ class Cluster(Spec, frozen=True, kw_only=True):
     """Empty: every drone is a robot of the cluster."""
     space: SpaceName | None = None  # None: see `space_name`
     template_m: Template = []
-    """Robot positions, x ahead and y to the left of the formation; empty: their start positions."""
+    """Positions of the robots, x ahead and y to the left of the formation; empty: their start positions."""
     law: LawName | UnsetType = UNSET
     """Unset: proportional, and left out of the resolved text, whose hash identifies the scenario."""
     space_parameters: Given | UnsetType = UNSET
@@ -404,7 +405,7 @@ class Estimation(Spec, frozen=True, kw_only=True):
 
     algorithm: AlgorithmName | UnsetType = UNSET  # unset: left out of the resolved text
     madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
-    """rad/s; None: chosen from the accelerometer's noise."""
+    """rad/s; None: derived from the accelerometer's noise."""
     gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999
     magnetometer: bool = True
     flow: bool = True
@@ -419,7 +420,7 @@ class Estimation(Spec, frozen=True, kw_only=True):
 
 
 class Processes(Spec, frozen=True, kw_only=True):
-    """The processes of a run. `expect: null` means an estimator per drone and a controller per cluster."""
+    """The processes of a run. `expect: null` means all agents, the cameras that gate, and the programs that join."""
 
     expect: Annotated[list[Name], Meta(max_length=PROCESSES_MAX)] | None = None
     on_death: Annotated[dict[str, OnDeath], Meta(max_length=PROCESSES_MAX)] = {}
@@ -427,19 +428,19 @@ class Processes(Spec, frozen=True, kw_only=True):
     """Wall time after which an expected process that has not joined is overdue; unset: see docs/scenario.md."""
     return_s: Positive | None = None  # wall time within which a process that may restart must rejoin
     on_overdue: Annotated[dict[str, OnOverdue], Meta(max_length=PROCESSES_MAX)] | UnsetType = UNSET  # unset: end
-    snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s of messages
+    snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated time; 0: none. The world keeps 5 s of messages
     gating: Annotated[list[Literal["camera"]], Meta(max_length=1)] | UnsetType = UNSET
-    """Roles other than agents' for which the run waits; unset: none."""
+    """Roles, other than those of agents, that the run waits for; unset: none."""
 
     def gates(self, role: str) -> bool:
-        """Whether the run waits for the processes of a role other than agents'."""
+        """Whether the run waits for the processes of a role that is not an agent's."""
         return self.gating is not UNSET and role in self.gating
 
 
 class TimeSteps(Spec, frozen=True, kw_only=True):
-    """Steps of simulated time; all chosen."""
+    """Steps of simulated time; all are design choices."""
 
-    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, against the formation loop's 1.7 s
+    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, fast against the formation loop's 1.7 s
     physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5  # a twelfth of the rotors' lag, the fastest dynamics
     command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1  # the minimum that lets world and agents run in parallel
     max_command_age_ms: Positive = 500.0  # equals silence.hover_s: an older command counts as silence
@@ -449,8 +450,8 @@ class OwnProgram(Spec, frozen=True, kw_only=True):
     """A program in any language that is started with the run; it joins as a process under its own name."""
 
     command: Annotated[list[str], Meta(min_length=1, max_length=WORDS_MAX)]
-    """`{endpoint}`, `{federation}`, `{folder}` (of the run) and `{name}` are replaced."""
-    joins: bool = True  # the run waits for it, at its start and at every gate
+    """`{endpoint}`, `{federation}`, `{folder}` (of the run) and `{name}` are replaced by their values."""
+    joins: bool = True  # whether the run waits for it, at the start and at every gate
     start_timeout_s: Positive | UnsetType = UNSET  # unset: that of all processes
 
 
@@ -476,9 +477,9 @@ LinkTime = Annotated[float, Meta(ge=0, le=60_000)]  # ms, limits as for link fau
 
 
 class OwnAgent(Spec, frozen=True, kw_only=True):
-    """Agents whose processes are named after their drone, cluster or run: `pilot.drone1`, `watch.main`.
+    """Agents, whose processes are named after their role and drone, cluster or run: `pilot.drone1`, `watch.main`.
 
-    `class` names a user's class, or a formation law, which is replaced with its class when the scenario is resolved.
+    `class` names a user's class, or a formation law, which is replaced by its class when the scenario is resolved.
     """
 
     named: AgentClass = field(name="class")
@@ -498,7 +499,7 @@ Graph = Annotated[
 
 
 class Topology(Spec, frozen=True, kw_only=True):
-    """Whose messages the agents of a drone may hear. `topology: ring` and `topology: {a: [b, c]}` give only the graph.
+    """Which drones the agents of a drone may hear. `topology: ring` and `topology: {a: [b, c]}` give only the graph.
 
     A drone hears the drones that the graph allows, that are within `within_m` and that the radio reaches; of these
     only the `nearest`. Rings and paths follow the order of the scenario's drones.
@@ -513,25 +514,25 @@ class Topology(Spec, frozen=True, kw_only=True):
 class Radio(Spec, frozen=True, kw_only=True):
     """The radio that carries messages between the agents of different drones, and to a ground station.
 
-    At the true distance d, a message is received with the probability
-    (1 - loss) / (1 + exp((d - range_m) / spread_m)), the form of the faults of kind `radio`. Drones that receive less
-    than RECEPTION_MIN of each other are no neighbours.
+    At the true distance d, a message is received with probability (1 - loss) / (1 + exp((d - range_m) / spread_m)), the
+    form used by faults of kind `radio`. Drones that receive each other's messages with a probability below
+    RECEPTION_MIN are not neighbours.
     """
 
-    range_m: Positive | None = None  # None: any distance
+    range_m: Positive | None = None  # distance at which half of the messages arrive; None: unlimited
     spread_m: NonNegative = 0.0  # 0: everything is received up to range_m, and nothing beyond
     loss: Fraction = 0.0
-    line_of_sight: bool = False  # whether obstacles and surfaces block it
+    line_of_sight: bool = False  # whether obstacles and surfaces block the radio
     delay_ms: LinkTime = 0.0  # a message arrives at the first gate after this delay, at the earliest at the next gate
     jitter_ms: LinkTime = 0.0  # maximum of an additional delay, uniform from 0
-    bandwidth_kbit_s: Positive | None = None  # of each agent's transmitter; None: any
-    header_bytes: Annotated[int, Meta(ge=0, le=1000)] = 16  # per message; chosen: as in IEEE 802.15.4
+    bandwidth_kbit_s: Positive | None = None  # of each agent's transmitter; None: unlimited
+    header_bytes: Annotated[int, Meta(ge=0, le=1000)] = 16  # per message; design choice: as in IEEE 802.15.4
     queue_max: Annotated[int, Meta(ge=1, le=1000)] = 10  # messages waiting to be sent; when full, the oldest is lost
     station_m: Position | None = None
-    """Position of the antenna of the clusters' and the run's agents; None: they are wired to all."""
+    """Position of the ground antenna for the agents of clusters and of the run; None: they are wired to all others."""
 
 
-RECEPTION_MIN = 1e-3  # probability, chosen: two drones that receive less of each other are not neighbours
+RECEPTION_MIN = 1e-3  # probability; design choice: it is negligible for agents, and shortens the lists of neighbours
 
 RoleName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,14}\Z", description="a letter and up to 14 of a-z 0-9 _")]
 
@@ -544,7 +545,7 @@ Functions = Annotated[
 
 
 class Figures(Spec, frozen=True, kw_only=True):
-    """The report on a run. `window_s` of the statistics is in simulated time; None: the last two thirds."""
+    """The report on a run. `window_s` is the simulated time covered by its statistics; None: the last two thirds."""
 
     window_s: tuple[Real, Real] | None = None
     metrics: Functions | UnsetType = UNSET
@@ -577,7 +578,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
     """Programs of users, by the name of the process; unset: none, and left out of the resolved text."""
     topology: Topology | UnsetType = UNSET
     radio: Radio | UnsetType = UNSET
-    """Unset: all hear all; left out of the resolved text."""
+    """Unset: all agents hear each other; left out of the resolved text."""
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
     """Faults to inject, each a map; `zsim.scenario.faults.flaws` checks them."""
@@ -606,7 +607,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
 
     @property
     def radio_of_agents(self) -> Radio | None:
-        """The radio over which users' agents exchange messages; None where all hear all."""
+        """The radio over which users' agents exchange messages; None if all hear each other."""
         has_fault = bool(self.own_agents) and any(fault.get("kind") == "radio" for fault in self.faults)
         if self.radio is UNSET and self.topology is UNSET and not has_fault:
             return None
@@ -618,7 +619,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         return sorted(declared, key=lambda each: each.key)
 
     def own_code(self) -> list[str]:
-        """Return the users' classes, functions, sensors and vehicles that it names; a rerun needs their modules."""
+        """Return the users' classes, functions, sensors and vehicles that are named; a rerun needs their modules."""
         spaces = [part.space for cluster in self.clusters for part in (cluster, *cluster.groups)]
         names = [*spaces, *(cluster.law for cluster in self.clusters), self.estimation.chosen()]
         names += self.report.metric_names
@@ -655,7 +656,7 @@ SharedVehicle: Any = defstruct(
 )
 """The `vehicle:` section: fields shared by all drones that do not set them."""
 VEHICLE_NUMBERS = tuple(name for name in _SHARED if name in Vehicle.__struct_fields__ and name not in _SECTIONS)
-"""Fields of a drone that its model gives, besides the sections `limits` and `aerodynamics`."""
+"""Fields of a drone that its model gives, apart from the sections `limits` and `aerodynamics`."""
 
 
 class Document(Scenario, frozen=True, kw_only=True):
@@ -666,5 +667,5 @@ class Document(Scenario, frozen=True, kw_only=True):
 
 
 def space_name(space: str | None, robots: int, template: bool) -> str:
-    """Return the scenario's space; by default a template if one is given or there are five or more robots."""
+    """Return a formation's space; by default `template` if a template is given or there are five or more robots."""
     return space or ("template" if template or robots >= TEMPLATE_FROM else "triad")

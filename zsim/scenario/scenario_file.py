@@ -25,7 +25,7 @@ from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattene
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import DEFAULT_MODEL, MODELS, Aerodynamics, Vehicle, vehicle_of
 
-EXAMPLE = "scenarios/step.yaml"  # named in errors
+EXAMPLE = "scenarios/step.yaml"  # example of a scenario, named in errors
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 PATH_MAX = 1000  # characters; ten times the longest path in a scenario
 NOTHING: Mapping[str, Any] = {}
@@ -35,7 +35,7 @@ _PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
 AXES = ("x", "y", "z", "yaw")
 TERMS = 8
 HEADER = ("duration", *(f"{axis}^{power}" for axis in AXES for power in range(TERMS)))
-BYTES_MAX = 2_000_000  # size of a file with five thousand pieces
+BYTES_MAX = 2_000_000  # bytes; a file with five thousand pieces has about that
 
 
 def load(
@@ -45,11 +45,11 @@ def load(
     imports: bool = True,
     **values: Any,
 ) -> Scenario:
-    """Return the resolved scenario of a YAML file; its classes may be in modules in the same folder.
+    """Return the resolved scenario of a YAML file; the classes that it names may be in modules in its folder.
 
     Args:
         overrides: texts `a.b.c=value` as given to `--set`, applied in order.
-        modules: further folders of modules.
+        modules: further folders with modules.
         imports: whether to import the named modules; not needed for a resolved file.
         values: top-level fields that replace the file's (`seed=3`); None is ignored.
 
@@ -90,13 +90,13 @@ def sha256(text: str) -> str:
 def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
     """Return the scenario of a raw document; `lines` are faults found earlier.
 
-    For a drone, its own fields take precedence over the document's `vehicle:`, and this over the numbers of its model;
-    for its sensors, its own over the document's `sensors:`, and these over the preset. Faulty parts of the shared
-    sections are not passed to the drones, so that their faults are reported once.
+    A drone's own fields take precedence over the document's `vehicle:`, and those over the numbers of its model;
+    likewise the drone's own `sensors:` over the document's, and those over the preset. Faulty parts of the shared
+    sections are not passed to the drones, so that their faults are reported only once.
     """
-    misread: list[Fault] = []  # error models with unreadable units
-    unknown: list[Fault] = []  # models that are not vehicles
-    unsound: list[Fault] = []  # users' sensors, classes, files and generated obstacles
+    misread: list[Fault] = []  # sensor error models with unreadable units
+    unknown: list[Fault] = []  # drone models that are not vehicles
+    unsound: list[Fault] = []  # faults of users' sensors, classes, files and generated obstacles
     unread: set[str] = set()  # names of users' sensors that are faulty, or must not be imported
     vehicles = {name: vehicle_of(name) for name in MODELS}  # by model
 
@@ -180,7 +180,7 @@ def _in_channel_units(sensors: Any, where: str, misread: list[Fault]) -> Any:
 
 
 def _with_preset(sensors: Any, default: str) -> Any:
-    """Return a `sensors:` section with its preset, or the default one, as defaults."""
+    """Return a `sensors:` section completed from its preset, or from the default one."""
     if not isinstance(sensors, dict):
         return sensors
     name = sensors.get("preset", default)
@@ -191,7 +191,7 @@ def _with_preset(sensors: Any, default: str) -> Any:
 
 
 def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str], imports: bool) -> Any:
-    """Return a `sensors:` section with the users' sensors in `own`."""
+    """Return a `sensors:` section with the users' sensors moved into `own`."""
     if not isinstance(section, dict):
         return section
     rest, own, wrong = separate(section, imports)
@@ -201,7 +201,7 @@ def _separated(section: Any, where: str, unsound: list[Fault], unread: set[str],
 
 
 def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
-    """Return a drone's reference with the pieces of its file, which is in the scenario's folder or the current one."""
+    """Return a drone's reference with its file, in the scenario's folder or the current one, replaced by the pieces."""
     name = reference.get("file") if isinstance(reference, dict) else None
     if not isinstance(name, str):
         return reference
@@ -235,7 +235,7 @@ def _with_deaths(processes: Any, own: Any, action: str) -> Any:
 def _vehicle_of(
     drone: dict[str, Any], where: str, vehicles: dict[str, Vehicle], unknown: list[Fault], imports: bool
 ) -> Vehicle:
-    """Return the vehicle of a drone's model; the AR.Drone if it is unknown or must not be imported.
+    """Return the vehicle of a drone's model; the AR.Drone if the model is unknown or must not be imported.
 
     A drone with all its numbers, as in a resolved scenario, needs no user's module: readers of `world/info` import
     nothing.
@@ -267,16 +267,16 @@ def _whose(document: dict[str, Any], path: str) -> str:
     return f" ({match[1]} {name!r})" if isinstance(name, str) and len(name) <= 40 else ""
 
 
-# Overrides: `a.b.c=value`, entries of lists by index or name
+# Overrides: `a.b.c=value`, with list entries by index or name
 
 
 def apply_override(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> str | None:
     """Apply one override to a raw document; if it is faulty, return the fault and change nothing.
 
     Args:
-        document: changed in place.
-        text: as given, e.g. "drones[2].yaw_deg=90".
-        parse: converts the text of a value; its ValueError gives the fault.
+        document: modified in place.
+        text: the override, e.g. "drones[2].yaw_deg=90".
+        parse: converts the text of a value; its ValueError becomes the fault.
     """
     path, equals, value_text = text.partition("=")
     fault: object = None
@@ -342,7 +342,7 @@ def _fields(kind: Any) -> Sequence[Any]:
 
 
 def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
-    """Set the value at a path; missing or empty sections along it are created."""
+    """Set the value at a path, creating missing or empty sections along it."""
     place: Any = document
     for depth, step in enumerate(steps):
         if not isinstance(place, dict | list):
@@ -369,8 +369,8 @@ def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
 def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
     """Return the polynomial pieces in a file as in a scenario: `duration_s`, and lists `x`, `y`, `z`, `yaw`.
 
-    The format is that of uav_trajectories and Crazyswarm: a header line, then a line of 33 numbers for each piece: its
-    duration [s], and the coefficients of t^0 to t^7 in x, y, z [m] and yaw [rad], with the time t since the piece
+    The format is that of uav_trajectories and Crazyswarm: a header line, then for each piece a line of 33 numbers: its
+    duration [s], and the coefficients of t^0 to t^7 for x, y, z [m] and yaw [rad], where t is the time since the piece
     began. https://github.com/whoenig/uav_trajectories
 
     Args:

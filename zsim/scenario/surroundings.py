@@ -1,11 +1,12 @@
-"""The obstacles and surfaces around the drones: distances, directions, nearest points and crossings.
+"""Obstacles and surfaces around the drones: distances, directions, nearest points and crossings.
 
 An obstacle is a solid, given by a row of numbers: shape, centre in W, cosine and sine of yaw, and half of its size
-along its own axes (of a cylinder: radius, unused, half of the height; of a sphere: radius). Distances are negative
+along its own axes (for a cylinder: radius, unused, half of the height; for a sphere: radius). Distances are negative
 inside it.
 
-A surface is a mesh of triangles without thickness, with unsigned distances. Its rim consists of the edges of only one
-triangle. All results are exact, computed in a fixed order of plain operations, and compiled if numba is installed.
+A surface is a mesh of triangles without thickness; distances from it are unsigned. Its rim consists of the edges that
+belong to only one triangle. All results are exact up to rounding, computed by plain operations in a fixed order, and
+compiled if numba is installed.
 """
 
 import base64
@@ -28,31 +29,31 @@ BOX, CYLINDER, SPHERE = range(3)
 SHAPES = ("box", "cylinder", "sphere")
 SHAPE, CENTRE, COSINE, SINE, HALF = 0, 1, 4, 5, 6
 COLUMNS = 9
-TINY = 1e-12  # m, minimum length of a divisor, for points on an axis
+TINY = 1e-12  # m, minimum divisor, for points on an axis
 PAIRS_MAX = 1_000_000  # pairs of points and obstacles compared at once
-WIDE = 1e9  # m, half of a side that never limits a cylinder
+WIDE = 1e9  # m, half of a cylinder's unused side, which must never limit it
 
-TRIANGLES_MAX = 40_000  # of all surfaces: keeps a resolved scenario below a file's limit of 4 MB
+TRIANGLES_MAX = 40_000  # of all surfaces; keeps a resolved scenario below the file size limit of 4 MB
 SINGLE = np.dtype("<f4")  # number format of packed triangles
 TRIANGLE = 9  # numbers of a triangle: a corner and the two edges from it [m; W]
-LEAF = 4  # maximum number of parts in a leaf; chosen: a box costs about as much as a triangle
+LEAF = 4  # maximum number of parts in a leaf; design choice: testing a box takes about as long as a triangle
 DEPTH = 64  # maximum number of pending boxes while the tree is walked; each level halves the parts
 MARGIN_M = 1e-6  # m, margin of boxes around their contents, against rounding
-AREA_MIN_M2 = 1e-12  # m^2, minimum of twice the area; a smaller triangle has no defined normal and is left out
-WELD_M = 1e-6  # m, grid on which corners are merged; chosen: a resolved scenario has single precision
-EDGE = 1e-9  # relative widening of a triangle for crossings, so that no path slips between two
+AREA_MIN_M2 = 1e-12  # m^2, minimum of twice a triangle's area; a smaller one has no defined normal and is left out
+WELD_M = 1e-6  # m, grid on which corners are merged; design choice: about the single precision of a resolved scenario
+EDGE = 1e-9  # relative widening of a triangle for crossings, so that no path slips between neighbours
 FIRST_EDGE, FIRST_CORNER, FACE = 0, 3, 6  # features of a triangle: edges ab, bc, ca; corners a, b, c; interior
 
 Array = NDArray[np.float64]
 
 
 class Tree(NamedTuple):
-    """A tree of K bounding boxes over P parts; the first is the root."""
+    """A tree of K bounding boxes over P parts; the first box is the root."""
 
     bounds: NDArray  # (K, 6), minimum and maximum x, y, z [m]
     link: NDArray  # int32 (K, 2): second child (the first follows its parent) and 0; for a leaf, first part and count
-    part: NDArray  # int32 (P,)
-    waiting: NDArray  # int32 (DEPTH,), pending boxes while it is walked
+    part: NDArray  # int32 (P,), indices of the parts in the order of the leaves
+    waiting: NDArray  # int32 (DEPTH,), boxes pending during a walk
     away: NDArray  # (DEPTH,), their squared distances [m^2]
 
 
@@ -69,7 +70,7 @@ class Surroundings:
     """The obstacles and surfaces of a scenario's environment.
 
     Attributes:
-        is_empty: whether there are none.
+        is_empty: whether there is no obstacle and no surface.
     """
 
     def __init__(self, environment: Any) -> None:
@@ -78,7 +79,7 @@ class Surroundings:
         self.is_empty = not self._obstacles and self._sheet is None
 
     def distances_m(self, p_W: ArrayLike) -> Array:
-        """Return the distance [m] of each point (P, 3) to the nearest one; negative in an obstacle, inf if none."""
+        """Return the distance [m] of each point (P, 3) from the nearest one: negative in an obstacle, inf if empty."""
         least = least_distances(self._obstacles, p_W)
         if self._sheet is not None:
             least = np.minimum(least, nearest_points(self._sheet, p_W, np.maximum(least, 0.0))[0])
@@ -86,7 +87,7 @@ class Surroundings:
 
 
 def row_of(obstacle: Any) -> list[float]:
-    """Return the row of a scenario's obstacle, whose position is that of its base or of a sphere's centre."""
+    """Return the row of a scenario's obstacle, whose position is that of its base, or of its centre for a sphere."""
     x, y, z = obstacle.position_m
     if obstacle.shape == "box":
         half = [0.5 * side for side in obstacle.size_m]
@@ -126,7 +127,7 @@ def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, 
 
 
 def least_distances(obstacles: Iterable[Any], p_W: ArrayLike) -> NDArray[np.float64]:
-    """Return the distance [m] of each point (T, 3) to the nearest obstacle, as `nearest` does; inf if none."""
+    """Return the distance [m] of each point (T, 3) from the nearest obstacle, as `nearest` does; inf without any."""
     points, rows = np.asarray(p_W, dtype=float).reshape(-1, 3), np.array([*map(row_of, obstacles)]).reshape(-1, COLUMNS)
     least, step = np.full(len(points), np.inf), max(1, PAIRS_MAX // max(len(rows), 1))
     for first in range(0, len(points) if len(rows) else 0, step):
@@ -224,7 +225,7 @@ def outline_of(surface: Any) -> list[list[float]]:
 
 
 def _rim(corners: Array) -> NDArray[np.int8]:
-    """Return 1 for each edge and corner of triangles on the rim, (T, 6)."""
+    """Return 1 for each edge and corner of a triangle that is on the rim, otherwise 0, (T, 6)."""
     count = len(corners)
     if not count:
         return np.zeros((0, 6), dtype=np.int8)
@@ -239,7 +240,7 @@ def _rim(corners: Array) -> NDArray[np.int8]:
 
 
 def tree_over(low: Array, high: Array) -> Tree:
-    """Return the tree over P boxes, halved along the longest side, given minimum and maximum corners (P, 3) [m]."""
+    """Return the tree over P boxes with minimum and maximum corners (P, 3) [m], halved along the longest side."""
     low, high = low - MARGIN_M, high + MARGIN_M
     part, middle = np.arange(len(low), dtype=np.int32), 0.5 * (low + high)
     bounds: list[Array] = []
@@ -268,14 +269,14 @@ class Nearest(NamedTuple):
 
     distance: float  # m
     triangle: int  # index; -1: none within reach
-    feature: int  # of the triangle
+    feature: int  # feature of the triangle that contains the point
     point: Vector
 
 
 def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array, Array]:
     """Return distances (P,) and positions (P, 3) [m] of the points of a held sheet nearest to points (P, 3).
 
-    If no point is closer than `far_m`, they are `far_m` and the given point.
+    If no point is closer than `far_m`, return `far_m` and the given point instead.
     """
     points = np.ascontiguousarray(p_W, dtype=float).reshape(-1, 3)
     least, found = np.array(np.broadcast_to(far_m, len(points)), dtype=float), np.empty_like(points)
@@ -285,7 +286,7 @@ def nearest_points(sheet: Held, p_W: ArrayLike, far_m: ArrayLike) -> tuple[Array
 
 @kernel()
 def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -> None:
-    """Update the nearest point (P, 3) of each point (P, 3) and its distance (P,) if this decreases."""
+    """Fill `found` (P, 3) with the points nearest to `points`, and lower the limits `least` (P,) to their distances."""
     for k in range(points.shape[0]):
         nearest = nearest_point(held.content, (points[k, 0], points[k, 1], points[k, 2]), least[k])
         least[k] = nearest.distance
@@ -295,7 +296,7 @@ def _find_nearest(held: Held, points: NDArray, least: NDArray, found: NDArray) -
 
 @noinline
 def nearest_point(sheet: Sheet, x: Vector, far: float) -> Nearest:
-    """Return the nearest point closer than `far` [m]; of equally near points, the first found."""
+    """Return the point nearest to x if closer than `far` [m]; of equally near points, the first found."""
     tree = sheet.tree
     best, which, feature, point = far * far, -1, FACE, x
     if tree.bounds.shape[0] > 0 and _square(tree.bounds[0], x) < best:
@@ -373,7 +374,7 @@ def _square(bounds: NDArray, x: Vector) -> float:
 
 @noinline
 def crosses(sheet: Sheet, start: Vector, end: Vector) -> bool:
-    """Whether the segment between two points crosses a triangle; a point in its plane counts as in front of it."""
+    """Whether the segment between two points crosses a triangle; an end in its plane counts as in front of it."""
     tree = sheet.tree
     if tree.bounds.shape[0] == 0:
         return False
@@ -412,6 +413,6 @@ def _crosses_one(row: NDArray, start: Vector, end: Vector) -> bool:
 
 @inlined
 def side_of(row: NDArray, x: Vector) -> tuple[float, Vector]:
-    """Return the signed volume that x spans with a triangle, positive in front, and the normal; both unnormalized."""
+    """Return the signed volume that x spans with a triangle, positive in front, and its normal; both unnormalised."""
     normal = cross((row[3], row[4], row[5]), (row[6], row[7], row[8]))
     return dot(normal, subtract(x, (row[0], row[1], row[2]))), normal

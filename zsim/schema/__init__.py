@@ -1,1 +1,1 @@
-"""Handwritten documents: read within limits, checked against types, naming users' modules. Imports errors."""
+"""Handwritten documents: reading within limits, type checks, and users' modules named in them. Imports errors."""

@@ -15,10 +15,10 @@ from msgspec import inspect as types
 
 from zsim.errors import DocumentError
 
-SHOWN_MAX = 60  # characters of a value shown in an error
-FAULTS_MAX = 100  # faults listed; further ones are only counted
+SHOWN_MAX = 60  # maximum characters of a value shown in an error
+FAULTS_MAX = 100  # maximum faults listed; further ones are only counted
 COUNTED_MAX = 10_000  # maximum count of further faults: a document of 1 MB can have many more, and each takes time
-NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # limits of the number types
+NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # type ranges, omitted from errors
 
 Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the document itself is empty
 
@@ -211,7 +211,7 @@ def suggestion(name: Any, known: Iterable[str]) -> str:
 
 
 def field_path(path: str, name: Any) -> str:
-    """Return the path of a field within another; it is printable and short for any name."""
+    """Return the path of a field within another, printable and short whatever the name."""
     text = str(name)
     text = text if text.isprintable() and len(text) <= SHOWN_MAX else show(text)
     return f"{path}.{text}" if path else text

@@ -1,11 +1,11 @@
-"""Messages: field types, the first fields of all messages, and declarations by users.
+"""Messages: field types, the fields common to all messages, and users' declarations.
 
 Declarations name types independently of any programming language: number, number[3], whole, flag, text.
 
     field_types(State, Message)  →  {"position_m": "number[3]", "leader": "flag"}
     declared_type("State", {"position_m": "number[3]", "leader": "flag"}, Message)
 
-A process with the user's module has the class; others create one with the same name and fields from `world/info`.
+A process with the user's module uses its class; others create one with the same name and fields from `world/info`.
 """
 
 import sys
@@ -22,14 +22,14 @@ Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Vector3 = tuple[Number, Number, Number]
-COUNT_MAX = 16  # maximum fixed number of numbers in a field, as for a 4 x 4 matrix
+COUNT_MAX = 16  # maximum length of a fixed-length field of numbers, such as a 4 x 4 matrix
 TEXT_MAX = 10_000  # maximum number of characters in a text, or of numbers in a `number[]`
 if TYPE_CHECKING:
     FieldType = str
 else:
     SEVERAL = [f"number[{count}]" for count in range(1, COUNT_MAX + 1)]
     FieldType = Literal["number", "whole", "flag", "text", "number[]", *SEVERAL]
-"""Type of a field: a finite number, a whole number, a flag, text, any number of numbers, or a fixed number of them."""
+"""Type of a field: a finite number, a whole number, a flag, text, or a list of numbers of any or a fixed length."""
 FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
 MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
 _WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag", types.StrType: "text"}
@@ -92,7 +92,7 @@ def declared_type(
 ) -> Any:
     """Return a message class with these fields after those of its base; the same class for the same arguments.
 
-    `namespace`: further attributes of the class.
+    `namespace` gives further attributes of the class.
     """
     return _declared_type(name, tuple(fields.items()), base, namespace)
 

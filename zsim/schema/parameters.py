@@ -1,4 +1,4 @@
-"""Parameters of users' classes: a struct with units in its names, defaults and limits, filled in from the scenario.
+"""Parameters of users' classes: a struct of named quantities with defaults and limits, filled in from the scenario.
 
 class Pilot(zsim.Agent):
     class Parameters(zsim.Parameters):
@@ -25,7 +25,7 @@ Given = Annotated[dict[str, Any], Meta(max_length=COUNT_MAX)]
 
 
 class Parameters(Struct, kw_only=True, forbid_unknown_fields=True):
-    """Base of the parameters of a user's class, whose instances have them as `parameters`."""
+    """Base of the parameters of a user's class, whose instances have them in the attribute `parameters`."""
 
 
 def parameters_type(kind: Callable[..., Any], filled: tuple[str, ...] = ()) -> type[Struct]:
@@ -65,7 +65,7 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
     try:
         declared = parameters_type(kind, filled)
         wrong: list[Fault] = [*faults(given, declared, where)]
-    except (TypeError, NameError, NotImplementedError) as error:  # an annotation undefined or unsupported
+    except (TypeError, NameError, NotImplementedError) as error:  # an undefined or unsupported annotation
         raise DocumentError([f"{where}: {error}"]) from error
     if wrong:
         raise DocumentError([f"{path} {text}" for path, text in wrong])
@@ -75,10 +75,10 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
 def bound(kind: Any, given: Any, where: str) -> Any:
     """Return a subclass whose instances have these parameters, set before the constructor is called.
 
-    Without `Parameters`, the class itself is returned.
+    A class without `Parameters` is returned as it is.
 
     Raises:
-        DocumentError: as for `resolved`; or parameters are given, and the class has no `Parameters`.
+        DocumentError: as for `resolved`, or parameters are given although the class has no `Parameters`.
     """
     if not has_parameters(kind):
         if given:

@@ -34,7 +34,7 @@ from zsim.schema.checker import show
 
 Object = TypeVar("Object")
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes search there too
-IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, also for children; value to forbid imports
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value that forbids imports
 NO_LOOKUP = "unseen"  # value that also forbids looking up names
 WHERE = "install it, or put it on PYTHONPATH or in the scenario's folder"
 
@@ -102,8 +102,8 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
         is_constructed: whether its constructor must take the same arguments as that of `kind`.
 
     Raises:
-        DocumentError: the module or class does not exist, or a method is missing or takes other arguments; one line.
-        NotTrustedError: the class exists but must not be imported.
+        DocumentError: the module or class does not exist, or a method is missing or takes other arguments.
+        NotTrustedError: importing the class is not allowed.
     """
     loaded = _attribute(name, where, "Class", isclass)
     methods = [method for method in dir(kind) if not method.startswith("_") and callable(getattr(kind, method))]
@@ -167,7 +167,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
     Args:
         error: exception whose traceback begins in zsim, where it was caught.
-        where: process and simulated time.
+        where: process and simulated time, for the text.
     """
     if isinstance(error, UserCodeError):
         return UserCodeError(error.text, error.where or where)  # a new error, to be raised from `error`
@@ -184,7 +184,7 @@ def user_code_error(error: BaseException, where: str) -> UserCodeError | None:
 
 
 def innermost_line(frame: FrameType | None) -> str:
-    """Return file and line of the innermost user code on a frame's stack, in parentheses; empty if there is none."""
+    """Return file and line of the innermost user code on a frame's stack, in parentheses; empty without any."""
     while frame and not is_user_frame(frame):
         frame = frame.f_back
     return f" ({_place(frame.f_code.co_filename, frame.f_lineno)})" if frame else ""
@@ -207,9 +207,9 @@ def numbers(returned: Any) -> NDArray[np.float64]:
 
 
 def raised_by_user(failure: UserCodeError) -> BaseException | None:
-    """Return the exception that user code raised, with its traceback cut to begin there; None if there is none.
+    """Return the exception that user code raised, with its traceback cut to begin there; None if user code raised none.
 
-    For caught failures only, since it changes the traceback of the returned exception.
+    For caught failures only, since the traceback of the returned exception is modified.
     """
     raised: BaseException | None = failure
     while raised is not None:
@@ -230,7 +230,7 @@ def _place(path: str, line: int) -> str:
     cell = _CELL.fullmatch(path)
     if cell is None:
         return f"{path.removeprefix(f'{os.getcwd()}{os.sep}')}:{line}"
-    notebook = sys.modules.get("IPython")  # absent in other processes
+    notebook = sys.modules.get("IPython")  # absent outside IPython and notebooks
     shell = notebook.get_ipython() if notebook else None
     named = shell.compile.format_code_name(path) if shell else None
     number = f"In[{cell[1]}]" if cell[1] else named[1] if named else "of the notebook"
@@ -282,7 +282,11 @@ def _imported(name: str, what: str, attribute: str = "") -> ModuleType:
 
 
 def located(name: str, what: str) -> ModuleSpec:
-    """Locate a module without running it; DocumentError, beginning with `what`, if it does not exist."""
+    """Return the spec of a module without running it.
+
+    Raises:
+        DocumentError: the module does not exist; the text begins with `what`.
+    """
     spec: ModuleSpec | None = None
     for part in accumulate(name.split("."), "{}.{}".format):
         where = spec.submodule_search_locations if spec else None

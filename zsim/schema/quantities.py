@@ -1,4 +1,4 @@
-"""Types of the numbers in typed documents, with their limits, and physical constants for stating their values."""
+"""Number types of documents, with their limits, and physical constants."""
 
 from typing import Annotated
 

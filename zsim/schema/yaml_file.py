@@ -12,7 +12,7 @@ from yaml.error import MarkedYAMLError
 from zsim.errors import DocumentError
 from zsim.schema.checker import show
 
-FILE_SIZE_MAX = 4_000_000  # bytes; a resolved scenario of 1000 drones has 2.2 million
+FILE_SIZE_MAX = 4_000_000  # bytes; a resolved scenario of 1000 drones has 2.2 MB
 VALUES_MAX = 400_000  # keys and values of a document; a resolved scenario of 1000 drones has 280 000, read in 1 s
 DEPTH_MAX = 50  # nesting depth of maps and lists; a scenario has 6
 
@@ -22,7 +22,7 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
 
     Args:
         example: an example of such a file, named in errors.
-        refuse: the error class to raise, with a line for each fault.
+        refuse: class of the error to raise, with a line for each fault.
     """
     try:
         with path.open("rb") as file:
@@ -64,7 +64,7 @@ def value(text: str) -> Any:
         raise ValueError("is nested too deep") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
-        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml may name one line too many
+        where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml may count one too many
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
         if "nesting depth" in problem:  # PyYAML has its own limit since 6.0.4
             raise ValueError("is nested too deep") from None
@@ -75,15 +75,15 @@ _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # l
 
 
 class _Reader:
-    """Builds values from YAML events, stopping at the first refused one.
+    """Builds values from YAML events, stopping at the first that is refused.
 
-    It refuses aliases, which can expand without limit, tags, directives, duplicate keys, and excessive depths or
-    numbers of values, which the C library does not limit. Plain scalars follow the core schema of YAML 1.2 (section
+    It refuses aliases (which can expand without limit), tags, directives, duplicate keys, and excessive depths or
+    numbers of values (which the C library does not limit). Plain scalars follow the core schema of YAML 1.2 (section
     10.3.2): 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
     """
 
     def __init__(self, text: str) -> None:
-        if _DIRECTIVE.search(text):  # libyaml compares each with all previous ones
+        if _DIRECTIVE.search(text):  # libyaml compares each of them with all previous ones
             raise ValueError("directives are not allowed")
         self._events: Iterator[Any] = yaml.parse(text, Loader=_Base)
         self._count = 0
@@ -153,12 +153,12 @@ def _whole(text: str) -> int:
 
 
 def _real(text: str) -> float:
-    """Return a number; Python's inf and nan are .inf and .nan in YAML."""
+    """Return a number; YAML writes Python's inf and nan as .inf and .nan."""
     return float(text.replace(".", "", 1) if text[-1] in "fFnN" else text)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes texts that `_word` would read as another type."""
+    """Quotes strings that `_word` would read as another type."""
 
 
 _DIRECTIVE = re.compile(r"^\ufeff?%", re.MULTILINE)

@@ -1,6 +1,6 @@
-"""Sensors as declarations: message, settings with errors, channels, presets. Imports schema and math.
+"""Sensors as declarations: message, settings with error models, channels, presets. Imports schema and math.
 
-Scenario, faults, keys, messages and the world's arrays derive from them. `sensor` defines what a sensor is; the sensors
-are in `stock_sensors`, `scanner`, `camera` (its lens in `camera_model`), and users' modules, which `sensor_catalogue`
-finds.
+The scenario's fields, the faults, keys and messages, and the world's arrays derive from them. `sensor` defines what a
+sensor is. zsim's own sensors are in `stock_sensors`, `scanner` and `camera` (its lens in `camera_model`);
+`sensor_catalogue` finds those in users' modules.
 """

@@ -1,6 +1,6 @@
-"""The settings of cameras, sightings and hats in a scenario, and the frame header of a JPEG.
+"""Settings of cameras, sightings and hats in a scenario, and the frame header of a JPEG.
 
-The defaults are those of the AR.Drone 2.0. A section that the scenario omits is absent.
+The defaults are those of the AR.Drone 2.0. A drone has a camera or sightings only if the scenario has the section.
 """
 
 from typing import Annotated, Literal, NamedTuple
@@ -31,15 +31,15 @@ class Camera(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     latency_ms: LatencyMs = 0.0  # from the middle of the exposure to the picture's publication
     mount: Mount
     distortion: tuple[Real, Real, Real, Real, Real] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 of Brown and Conrady, in OpenCV's convention."""
-    exposure_ms: Annotated[float, Meta(ge=0, le=100)] = 8.0  # typical of daylight with a small aperture
-    noise: Annotated[float, Meta(ge=0, le=64)] = 3.0  # grey levels of 255 per pixel; typical of a small sensor outdoors
+    """Brown-Conrady coefficients k1, k2, p1, p2, k3 in OpenCV's convention."""
+    exposure_ms: Annotated[float, Meta(ge=0, le=100)] = 8.0  # typical of a small aperture in daylight
+    noise: Annotated[float, Meta(ge=0, le=64)] = 3.0  # sigma per pixel, of 255 grey levels; typical of small sensors
     blur_px: Annotated[float, Meta(ge=0, le=10)] = 0.6  # standard deviation of the lens blur; assumed
     jpeg_quality: Annotated[int, Meta(ge=10, le=100)] = 75  # gives about 18 kB per picture
 
 
 class FrontCamera(Camera, frozen=True, kw_only=True):
-    """Forward-looking: the 720p camera of the AR.Drone 2.0, at the size of its video stream."""
+    """A forward-looking camera; by default the 720p camera of the AR.Drone 2.0, at the size of its video stream."""
 
     width_px: WidthPx = 640
     height_px: HeightPx = 360
@@ -49,7 +49,7 @@ class FrontCamera(Camera, frozen=True, kw_only=True):
 
 
 class BottomCamera(Camera, frozen=True, kw_only=True):
-    """Downward-looking: the QVGA camera of the AR.Drone 2.0; the top of its picture is towards the nose."""
+    """A downward-looking camera; by default the AR.Drone 2.0's QVGA camera. The picture's top is towards the nose."""
 
     width_px: WidthPx = 320
     height_px: HeightPx = 240
@@ -63,15 +63,15 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
     latency_ms: LatencyMs = 0.0  # latency of the detector, in addition to the camera's
-    # the next four are fitted to the detector on rendered pictures
+    # the next four are fitted to the detector's results on rendered pictures
     centre_px: ErrorPx = 0.035
     """Error of a large hat's centre, standard deviation per axis."""
     diameter_px: ErrorPx = 0.11  # error of a large hat's apparent diameter, standard deviation
     noise_px2: NonNegative = 0.65
-    """Divided by the apparent diameter, an error added to both in quadrature; for a clear day, larger in low light."""
+    """Error times apparent diameter, added in quadrature to both above; on a clear day, and larger in low light."""
     blur_share: NonNegative = 0.018
-    """Error as a share of the hat's motion in the picture during the exposure, added to both in quadrature."""
-    diameter_min_px: Positive = 4.0  # hats measured as smaller are not reported
+    """Error as a share of the hat's motion in the picture during the exposure, likewise added in quadrature."""
+    diameter_min_px: Positive = 4.0  # hats with a smaller measured diameter are not reported
     misalignment_deg: Annotated[float, Meta(ge=0, le=30)] = 0.0
     """Misalignment of the camera's mount, constant over a run, standard deviation per axis."""
     miss: Fraction = 0.02  # probability that a hat in view is not detected in a picture
@@ -79,9 +79,9 @@ class SightingModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class Hats(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The magenta markers by which drones detect each other: a ball on every drone, and decoys."""
+    """Magenta markers by which drones detect each other: a ball on every drone, and decoys."""
 
-    diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # about the crown of a tennis cap on the AR.Drone's hull
+    diameter_m: Annotated[float, Meta(gt=0, le=2)] = 0.14  # about the crown of a tennis cap put on the AR.Drone's hull
     position_m: tuple[NearM, NearM, NearM] = (-0.03, 0.0, 0.11)  # m, in B: on top of the hull, behind the middle
     covered: Annotated[list[DroneName], Meta(max_length=1000)] = []  # drones whose hat cannot be seen
     false_m: Annotated[list[Vector3], Meta(max_length=100)] = []

@@ -1,7 +1,7 @@
-"""The camera model: projection by a pinhole camera with Brown-Conrady distortion, and its inverse.
+"""Camera model: projection by a pinhole camera with Brown-Conrady distortion, and its inverse.
 
 Camera frame K: x to the right in the picture, y down, z in the viewing direction. Pixel coordinates (u, v) start at the
-upper left of the picture, with whole numbers at pixel centres, as in OpenCV (calib3d, "Detailed description").
+upper left of the picture, with integers at pixel centres, as in OpenCV (calib3d, "Detailed description").
 """
 
 import math
@@ -19,7 +19,7 @@ from zsim.sensors.camera import Camera
 
 Array = NDArray[np.float64]
 Number = TypeVar("Number", float, NDArray[np.float64])
-R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # columns: K's axes in the mount's components
+R_SK = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # columns: K's axes in components of the mount S
 UNDISTORT_STEPS = 12  # Newton steps; enough for 1e-6 px in any picture that does not fold
 FOLD_GRID, FOLD_PX = 25, 1e-3  # grid points per side and samples per ray; maximum error of a pixel's ray [px]
 
@@ -84,7 +84,7 @@ def distorted(lens: Lens, x: Number, y: Number) -> tuple[Number, Number]:
 
 @portable
 def undistorted(lens: Lens, u: Number, v: Number) -> tuple[Number, Number]:
-    """Return x and y of the ray (x, y, 1) of K that falls on a pixel, by Newton's method."""
+    """Return x and y of the ray (x, y, 1) of K that the lens images on a pixel, by Newton's method."""
     a, b = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     x, y = a, b
     for _ in range(UNDISTORT_STEPS):
@@ -131,7 +131,7 @@ SINGULAR = 1e-9  # minimum determinant; below it the points do not determine a c
 
 @portable
 def spread(n: float, x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
-    """Return the standard deviations of a fitted circle's centre, per axis, and radius, relative to its edge points'.
+    """Return the standard deviations of a fitted circle's centre, per axis, and radius, over that of its edge points.
 
     They follow from the least-squares covariance (A^T A)^-1, where A has a row (x, y, 1) for each edge point in the
     direction (x, y) from the centre.

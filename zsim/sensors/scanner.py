@@ -20,7 +20,7 @@ from zsim.schema.quantities import Fraction, NonNegative, Positive
 from zsim.sensors.camera import CameraName
 from zsim.sensors.sensor import Mount, RateHz, Sample, Sensor
 
-RAYS_MAX = 100_000  # rays per message, which then has 400 kB
+RAYS_MAX = 100_000  # rays per message, which is then 400 kB long
 BEAMS_MAX = 64
 CHANNELS_MAX, COLUMNS_MAX = 128, 4096
 SINGLE = np.dtype("<f4")
@@ -115,14 +115,14 @@ def _without_zeros(data: bytes, rows: int) -> NDArray[np.float32]:
 
 
 class Scanner(Sensor, frozen=True, kw_only=True):
-    """Common settings: range and errors; the noise terms of a ray add in quadrature."""
+    """Settings common to scanners: range and errors; the noise terms of a ray add in quadrature."""
 
     min_m: Positive
     max_m: Positive
     noise_m: NonNegative = 0.0  # standard deviation of white noise, independent per ray
     noise_share: NonNegative = 0.0  # standard deviation divided by the distance
     noise_1_m: NonNegative = 0.0  # standard deviation divided by the distance squared, as for stereo cameras
-    bias_m: NonNegative = 0.0  # standard deviation over runs of a bias constant over a run and common to all rays
+    bias_m: NonNegative = 0.0  # standard deviation between runs of a bias constant in a run and common to all rays
     quantum_m: NonNegative = 0.0  # step of the converter; 0: none
     miss: Fraction = 0.0  # probability that a ray returns no echo, independent per ray
 
@@ -141,12 +141,12 @@ class RangeConfig(Scanner, frozen=True, kw_only=True):
     cone_deg: Annotated[float, Meta(ge=0, le=60)] = 0.0  # apex angle; the nearest point inside the cone is measured
     min_m: Positive = 0.04  # m, data sheet of the VL53L1X
     max_m: Positive = 4.0  # m, data sheet of the VL53L1X, in the dark
-    noise_m: NonNegative = 0.01  # m, chosen as half of the maximum error of 20 mm (data sheet of the VL53L1X)
+    noise_m: NonNegative = 0.01  # m, design choice: half of the maximum error of 20 mm (data sheet of the VL53L1X)
     bias_m: NonNegative = 0.01  # m, the other half of the maximum error
 
 
 class LidarConfig(Scanner, frozen=True, kw_only=True):
-    """Rows (channels) of rays at equal angles about the sensor's z axis; by default a 2D lidar, the RPLIDAR A1."""
+    """Rows (channels) of rays equally spaced in angle about the sensor's z axis; by default the 2D lidar RPLIDAR A1."""
 
     rate_hz: RateHz = 5.5
     channels: ChannelCount = 1
@@ -161,7 +161,7 @@ class LidarConfig(Scanner, frozen=True, kw_only=True):
 
 
 class DepthConfig(Scanner, frozen=True, kw_only=True):
-    """Depth images of some of the drone's cameras, with their lenses and mounts."""
+    """Depth images from the positions of the drone's cameras, with their lenses and mounts."""
 
     rate_hz: RateHz = 15.0
     cameras: Annotated[list[CameraName], Meta(min_length=1, max_length=2)] = field(default_factory=lambda: ["front"])
@@ -173,7 +173,7 @@ class DepthConfig(Scanner, frozen=True, kw_only=True):
 
 
 SCANNERS: dict[str, type[Sample]] = {"range": Range, "lidar": Lidar, "depth": Depth}
-"""Message classes by name of the sensor, in the order of the contract's keys."""
+"""Message classes by sensor name, in the order of the contract's keys."""
 
 
 def scanners(sensors: object) -> dict[str, Scanner]:

@@ -22,23 +22,23 @@ from zsim.sensors.camera import CAMERAS, PictureError, frame_of
 from zsim.sensors.camera_model import Lens, pixel, undistorted
 from zsim.transport.session import RawSample, Session
 
-ASKED_S = 15.0  # wall; a page silent for longer counts as asleep: a slow page takes seconds for a picture
-MESSAGE_BYTES = 1_000  # largest size of a picture's message without its data; chosen
-SIGHTINGS_KEPT = 8  # number of sightings per camera and key: half a second at 15 Hz
-MARKS_MAX = 40  # number of marks on a picture; more would hide it
-RADIUS_MIN_PX = 5.0  # radius of a circle; a smaller one goes unnoticed
-SIGMAS = 2.0  # uncertainty of the direction that is drawn around a hat, in standard deviations
-FOLD_MAX = 1e-3  # focal lengths; largest distance between a ray and the undistorted ray of its pixel
-NORM_MIN = 1e-6  # norm of a quaternion or a direction
-AGE_MAX_NS = 300_000_000  # simulated; between a picture and the sightings drawn on it; chosen: 3 pictures at 10 Hz
-PICTURE_BYTES_MAX = 1_000_000  # size of a picture that is shown; ten a second fill 80 Mbit/s
-PIXELS_MAX = 1920 * 1200  # chosen: the largest camera of a scenario; a browser needs 4 bytes per pixel
+ASKED_S = 15.0  # wall; a page silent for longer counts as asleep; a slow page may take seconds to show a picture
+MESSAGE_BYTES = 1_000  # maximum size of a picture's message without the image data
+SIGHTINGS_KEPT = 8  # number of sightings kept per camera and key: half a second at 15 Hz
+MARKS_MAX = 40  # maximum number of marks on a picture; more would hide it
+RADIUS_MIN_PX = 5.0  # minimum radius of a circle; a smaller one would go unnoticed
+SIGMAS = 2.0  # uncertainty of a hat's direction that its circle includes, in standard deviations
+FOLD_MAX = 1e-3  # maximum distance, in focal lengths, between a ray and the undistorted ray of its pixel
+NORM_MIN = 1e-6  # minimum norm of a quaternion, and minimum forward component of a ray relative to its norm
+AGE_MAX_NS = 300_000_000  # simulated; maximum time between a picture and sightings drawn on it: 3 pictures at 10 Hz
+PICTURE_BYTES_MAX = 1_000_000  # maximum size of a picture; ten such pictures a second fill 80 Mbit/s
+PIXELS_MAX = 1920 * 1200  # number of pixels of the largest camera in a scenario; a browser needs 4 bytes for each
 ENDS = b"\xff\xd9"  # last bytes of a JPEG; ITU-T T.81, table B.1
 SHOWN = frozenset({0xC0, 0xC1, 0xC2})  # markers of frames that browsers show: baseline, extended, progressive
 
 
 class CameraPicture(NamedTuple):
-    """A checked picture; its number is unique in the run."""
+    """A checked picture; `number` is unique in the run."""
 
     number: int
     image: CameraImage
@@ -47,7 +47,7 @@ class CameraPicture(NamedTuple):
 class Mark(Struct, frozen=True):
     """A circle on a picture [px], with a text beside it."""
 
-    u: float  # u, v: its centre
+    u: float  # u, v: the circle's centre
     v: float
     radius: float
     text: str
@@ -59,7 +59,7 @@ class _Watched:
     def __init__(self) -> None:
         self.payload: bytes | None = None  # a newer picture that is not decoded yet
         self.picture: CameraPicture | None = None
-        self.sightings: dict[str, deque[Sightings]] = {}  # newest ones by key
+        self.sightings: dict[str, deque[Sightings]] = {}  # the newest ones, by key
 
 
 class CameraFeed:
@@ -83,7 +83,7 @@ class CameraFeed:
         self._wall_s = wall_s
         self._lock = threading.Lock()
         self._infos: dict[str, CameraInfo] = {}
-        self._requests: dict[object, tuple[tuple[str, ...], float]] = {}  # cameras, and until when [s; wall], by page
+        self._requests: dict[object, tuple[tuple[str, ...], float]] = {}  # by page: cameras, and expiry [s; wall]
         self._watched: dict[str, _Watched] = {}
         self._undeclare: dict[str, Callable[[], None]] = {}  # by key
         self._number = 0
@@ -91,7 +91,7 @@ class CameraFeed:
         self.reasons: dict[str, str] = {}  # why the last picture of a camera was refused
 
     def open(self) -> None:
-        """Discover the cameras that exist or appear later."""
+        """Discover existing cameras, and those that appear later."""
         expression = keys.camera_info("*", "*")
         self._link.declare_subscriber(expression, self._on_info)
         try:
@@ -137,7 +137,7 @@ class CameraFeed:
             self._requests.pop(page, None)
 
     def picture(self, camera: str) -> CameraPicture | None:
-        """Return the newest picture of a watched camera, None before the first."""
+        """Return the newest picture of a camera; None before the first one, or if the camera is not watched."""
         with self._lock:
             watched = self._watched.get(camera)
             if watched is None:
@@ -183,7 +183,7 @@ class CameraFeed:
     def _on_info(self, sample: Any, kept: bool = False) -> None:
         camera = _camera_of(sample.key)
         if camera not in self._order or (kept and camera in self._infos):
-            return  # one that has arrived in the meantime is newer than a kept one
+            return  # a description that has arrived in the meantime is newer than the kept one
         try:
             info = messages.decode(sample.key, sample.payload)
         except DecodeError:
@@ -243,7 +243,7 @@ def _camera_of(key: str) -> str:
 
 
 def _sighting_keys(camera: str) -> tuple[str, str]:
-    """Return the keys of sightings by a camera's drone: a detector's, then the world's."""
+    """Return the keys of sightings from a camera's drone: first those of a detector, then those of the world."""
     drone = camera.split("/")[0]
     return keys.detections(drone), keys.sensor(drone, keys.SIGHTINGS)
 
@@ -272,7 +272,7 @@ def check_picture(data: bytes, width: int, height: int) -> None:
 
 
 def is_usable(info: CameraInfo) -> bool:
-    """Return whether a camera's description, which any program may have sent, permits computation."""
+    """Return whether a camera's description, which any program may have sent, is safe to compute with."""
     fx, fy = info.K[0], info.K[4]
     return fx > 0 and fy > 0 and math.sqrt(sum(q * q for q in info.orientation_wxyz)) > NORM_MIN
 
@@ -290,9 +290,9 @@ def sightings_of(picture_ns: int, candidates: Iterable[Sightings]) -> Sightings 
 
 
 def marks_of(info: CameraInfo, seen: Iterable[Seen], hat_m: float) -> tuple[Mark, ...]:
-    """Return the marks of sightings in B that fall on the picture of a usable camera.
+    """Return marks for those sightings that fall on the picture of a usable camera.
 
-    A mark is a circle around a hat of diameter `hat_m` [m], enlarged by SIGMAS of its direction's uncertainty.
+    A mark is a circle around a hat of diameter `hat_m`, enlarged by SIGMAS standard deviations of the hat's direction.
     """
     fx, _, cx, _, fy, cy, *_ = info.K
     lens = Lens(fx, fy, cx, cy, *info.D, info.width, info.height)

@@ -1,6 +1,7 @@
-"""The panels of the page in one run: forms, plots and tables shared by all pages, and those of each page.
+"""The panels of the page during one run: forms, plots and tables that all pages share, and those of each page.
 
-Each page has its own modes of the chosen drone (or of those selected for one command), table of drones, and events.
+Each page has its own mode buttons for the chosen drone (or for drones selected for one command), its own table of
+drones, and its own list of events.
 """
 
 import math
@@ -41,7 +42,7 @@ SWITCHES = {
     "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
     "trails": "Trails",
 }
-MANY = 12  # number of drones; more do not fit on a page, so the worst come first by default
+MANY = 12  # number of drones that fit on a page; if there are more, the worst come first by default
 FILTER_MAX = 80  # maximum length of the filter's text
 SEVERITIES = ("red", "amber", None)
 SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
@@ -51,7 +52,7 @@ SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
     "link, worst first": lambda row: (-row.link_badness,),
     "σ, largest first": lambda row: (-math.inf if row.drone.sigma_m is None else -row.drone.sigma_m,),
 }
-"""Sort keys of rows; equal ones stay in the scenario's order."""
+"""Sort keys of rows; rows with equal keys stay in the scenario's order."""
 FILTERS: dict[str, Callable[[DroneRow, "frozenset[str]"], bool]] = {
     ALL: lambda row, selected: True,
     "with an alarm": lambda row, selected: row.severity is not None,
@@ -67,19 +68,17 @@ DRONE_MODES = {
     "return": "Return",
     "emergency": "Emergency",
     "reset": "Reset",
-}  # the return to the start is not a mode of the firmware
+}  # `return`, to the start, is not a mode of the firmware
 IN_CONTROL = ("takeoff", "return", "reset")  # modes that need control; any page may land or stop a drone
 DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME, "reset": viser.Icon.REFRESH}
 
 
 class ConsolePage:
-    """The shared controls of one run, in two panels.
-
-    Its folders are for each page's own controls.
+    """The controls of one run that all pages share, in two panels; the folders are for each page's own controls.
 
     Args:
         gui: viser's controls; those of another run are removed.
-        report: called with the outcome of requests that are refused here.
+        report: called with the outcome of each request that is refused here, unsent.
         show: shows or hides one of `SWITCHES` in the scene.
         choose_trail: sets the length of trails [s].
         request_return: returns a formation to its start, and lands it.
@@ -88,7 +87,7 @@ class ConsolePage:
     Attributes:
         flights: history of single drones, for plots.
         chosen: name of the shown formation; empty if there is none.
-        parts: the part that a page must control to use a control, by the control's id.
+        parts: the part of the run that a page must be in control of to use a control, by the control's id.
     """
 
     def __init__(
@@ -152,7 +151,7 @@ class ConsolePage:
         panel.set_width(PANEL_PX)
 
     def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:
-        """Add a folder for every formation to two tabs; only that of the chosen one is visible."""
+        """Add a folder for each formation to two tabs; only the chosen formation's folders are visible."""
         fly, plots = tabs.add_tab("Fly"), tabs.add_tab("Plots")
         for cluster in self._run.scenario.clusters:
             name, space = cluster.name, self._run.spaces[cluster.name]
@@ -170,7 +169,7 @@ class ConsolePage:
 
     @contextmanager
     def _part(self, gui: viser.GuiApi, part: str) -> Iterator[None]:
-        """Assign the controls added in this context to a part."""
+        """Assign the controls added in this context to a part of the run."""
         before = control_ids(gui)
         yield
         self.parts |= dict.fromkeys(control_ids(gui) - before, part)
@@ -204,9 +203,9 @@ class PageForms:
     """Adds the per-page controls to each page of a run, and keeps them.
 
     Args:
-        shared: the controls of all pages, with folders for those of each page.
+        shared: the controls that all pages share, with folders for each page's own.
         names, radii_m: names and radii of the drones.
-        part_of: returns the part that a page must control to let a drone take off.
+        part_of: returns the part of the run that a page must be in control of to let a drone take off.
         request_return: returns drones to their starts, and lands them.
     """
 
@@ -253,7 +252,7 @@ class PageForms:
         return form.drone.chosen if form else ""
 
     def use(self, client_id: int | None, drone: str) -> str:
-        """Give a page control of a drone's formation, if it is free; otherwise return the reason."""
+        """Give a page control of a drone's part of the run if that is free; otherwise return why it cannot."""
         return self._desk.use(client_id, self._part_of(drone)) if client_id is not None else ""
 
     def move_rings(self, drones: DronePoses) -> None:
@@ -268,7 +267,7 @@ class PageForms:
     ) -> None:
         """Show on each page the sorted and filtered drones, the figures of the chosen one, and the filtered events.
 
-        `sensors_of` returns the sensors of a drone as HTML.
+        `sensors_of` returns the table of a drone's sensors as HTML.
         """
         chosen = {form.drone.chosen for form in list(self._forms.values())}
         contents = {drone: (figure_lines(figures.get(drone)), sensors_of(drone)) for drone in chosen}
@@ -281,7 +280,7 @@ class PageForms:
         self._update(show)
 
     def refresh(self, run: RunCondition, formation: str) -> None:
-        """Disable controls whose requests would be refused; show who controls the shown formation and the run."""
+        """Disable controls whose requests would be refused; show who is in control of the formation and the run."""
 
         def refresh(form: _PageForm) -> None:
             form.drone.refresh(run)
@@ -336,10 +335,11 @@ class PageForms:
 
 
 class DroneForm:
-    """Modes of one drone, or of all that are selected, on one page.
+    """The mode buttons on one page, for one drone or for all selected ones.
 
     Args:
-        may: returns why this page may not let a drone take off or reset it; if `use` is true, it takes control first.
+        may: returns why this page may not let a drone take off, return or reset; empty if it may. If the second
+            argument is true, the page takes control first.
         request_return: returns drones to their starts, and lands them.
     """
 
@@ -409,9 +409,9 @@ class DroneForm:
         self._reasons.content = refusal_lines(DRONE_MODES, common) + shown
 
     def _request(self, mode: str) -> None:
-        """Request an operation that needs control from all drones that would not refuse it."""
+        """Request an operation that needs control, from all drones that would not refuse it."""
         able = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
-        drones = able or self.targets  # if all would refuse, the request shows why, or the condition has changed
+        drones = able or self.targets  # if all would refuse, the answers state why, unless the condition has changed
         drones = [drone for drone in drones if not self._may(drone, True)]
         if not drones:
             return
@@ -431,7 +431,7 @@ class DroneForm:
 
 
 class FleetTable:
-    """The table of one page; `changed` is called when the selection changes."""
+    """The table of drones on one page; `changed` is called when the selection changes."""
 
     def __init__(self, gui: viser.GuiApi, names: Sequence[str], changed: Callable[[], None]) -> None:
         self._names = tuple(names)
@@ -479,7 +479,7 @@ def filtered_rows(
 ) -> list[DroneRow]:
     """Return rows sorted by one of `SORTINGS` and filtered by one of `FILTERS`.
 
-    Each word of the text must be in a row's name, state, commander, faults or link.
+    Each word of `text` must occur in a row's name, state, commander, faults or link.
     """
     words = text[:FILTER_MAX].lower().split()
 

@@ -53,26 +53,26 @@ REASON_S = 0.1  # wall time between two checks for a reason to end
 OFFER_S = 20.0  # wall time; how long pages may take to copy the files of a run: 100 MB over 40 Mbit/s Wi-Fi
 TABLE_S = 0.5  # wall time; period of tables, plots and trails: people cannot read faster
 STAMPS_PER_AGE = 5.0  # a command's maximum age divided by that of a new stamp, since stamps age in transit
-REFUSAL_S = 2.0  # wall time; between two notifications of a page: a dragged slider is refused many times
+REFUSAL_S = 2.0  # wall time; minimum between two refusals shown on a page: a dragged slider is refused many times
 NOTICE_S = 8.0  # wall time; how long a notification stays in the corner
-EVENTS_MAX = 20  # number of events in `state`
+EVENTS_MAX = 20  # maximum number of events in `state`
 SILENT = "silent"  # replaces the clock's state while the world does not answer
-FEW_DRONES = 20  # drones; from this number on the picture rate is halved
+FEW_DRONES = 20  # number of drones from which on the picture rate is halved
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # × real time; from this rate on the picture rate is halved, too: the run needs the processors
+FAST_RATE = 4.0  # × real time; rate from which on the picture rate is halved, too, since the run needs the processors
 
 
 class Console:
-    """One console.
+    """Serves the console's pages, which show one run after another.
 
     Args:
         token: the operators' token; None if only this machine can connect.
-        rate_hz: pictures a second; None: chosen from the number of drones and the rate of the run.
+        rate_hz: pictures per second; None: derived from the number of drones and the rate of the run.
         world: description of where the console looks for a run.
         folder: where the shown run is recorded, if known.
 
     Raises:
-        RunError: other machines could reach it, and there is no token.
+        RunError: other machines could reach the console, and there is no token.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class Console:
             page.close()
 
     def remain(self, end_reason: Callable[[], str | None], deserted: Callable[[], bool]) -> None:
-        """Serve the pages of a finished run until there is a reason to end and they have copies of its files.
+        """Serve the pages of a finished run until there is a reason to end and the pages have copies of its files.
 
         Args:
             end_reason: returns the reason, None while there is none.
@@ -176,7 +176,7 @@ class RunPage:
 
     Args:
         server: viser's server; the controls and nodes of another run are removed from it.
-        rate_hz: pictures a second; None: chosen from the number of drones and the rate of the run.
+        rate_hz: pictures per second; None: derived from the number of drones and the rate of the run.
         world: description of where the run is.
 
     Raises:
@@ -245,7 +245,7 @@ class RunPage:
         )
 
     def close(self) -> None:
-        """Stop sending."""
+        """Stop sending requests and receiving pictures, and remove callbacks."""
         self._client.close()
         self._page_forms.close()
         self.cameras.close()
@@ -267,7 +267,7 @@ class RunPage:
                 self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
                 pause.wait(next_s - time.monotonic())
-        # pages opened between two runs see the end of the run
+        # pages opened between two runs show the end of this run
         self.views.update()
         if self._observer.end_reason or self.views.end:
             self._monitor.end(self._observer.end_reason)
@@ -305,7 +305,7 @@ class RunPage:
         return self.orders.place(request)
 
     def permits(self, client_id: int, control: str) -> bool:
-        """Return whether a page may use a shared control; if not, show the reason on it."""
+        """Return whether a page may use a shared control; if not, show the reason on that page."""
         part = self._page.parts.get(control)
         refusal = "" if part is None else self.desk.use(client_id, part)
         if refusal and time.monotonic() - self._notified_s.get(client_id, -math.inf) > REFUSAL_S:
@@ -378,7 +378,7 @@ class RunPage:
         self._scene.trails.number += bool(instants)
 
     def _keep_past(self, t_s: float) -> None:
-        """Read the record around the time that a replay shows, and drop what is far from it."""
+        """Read the record around the time that a replay shows, and drop points far from that time."""
         self.record.fill(t_s)
         kept = t_s - KEPT_S, t_s + KEPT_S
         self._scene.trails.keep(*kept)
@@ -472,7 +472,7 @@ def picture_rate_hz(drones: int, rate: float) -> float:
 def console_state(
     run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
 ) -> dict[str, Any]:
-    """Return what is shown of a run as plain data; called from another thread than the one that draws.
+    """Return the shown state of a run as plain data; called from another thread than the one that draws.
 
     `shapes` are the formations' true shapes.
     """

@@ -39,7 +39,7 @@ EVENT_COLOURS = {
 }
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
-LEFT_MAX_S = 24 * 3600.0  # remaining time of a battery; a longer one is not shown
+LEFT_MAX_S = 24 * 3600.0  # a battery's maximum remaining time that is shown
 COLUMNS = 8  # number of columns of the table of drones
 PITCH_PX_PER_DEG, PITCH_MAX_PX = 0.9, 36.0  # scale and limit of the artificial horizon
 NO_FAULT = "no active fault"
@@ -49,7 +49,7 @@ BESIDE = "padding:2px 10px"  # padding of a text in a panel, equal to that of vi
 TABLE_BESIDE = "padding:2px 12px 2px 8px;overflow-x:auto"  # padding of a table; the panel's scroll bar is 12 px wide
 NAME_WHOLE = 8  # number of characters of a name that fit on one line of the table of drones
 WRAP = "white-space:normal"
-SPAN_NS = 1_000_000_000  # simulated; shortest time over which a sensor's rate is averaged
+SPAN_NS = 1_000_000_000  # simulated; minimum time over which a sensor's rate is averaged
 
 Counts = Mapping[str, tuple[int, int]]
 """Measurements (used, refused) by sensor."""
@@ -59,10 +59,10 @@ class DroneRow(NamedTuple):
     """A drone's row in the table of drones."""
 
     drone: DroneCondition
-    gps: str = "–"  # number of fixes used and refused
+    gps: str = "–"  # numbers of fixes used and refused
     faults: tuple[str, ...] = ()  # kinds of the active injected faults
-    link: tuple[str, str] = ("", "")  # description of a driver's link, and its colour
-    severity: Severity | None = None  # severity of its worst alarm
+    link: tuple[str, str] = ("", "")  # description of the driver's link, and the colour of that text
+    severity: Severity | None = None  # severity of the drone's worst alarm
 
     @property
     def name(self) -> str:
@@ -70,7 +70,7 @@ class DroneRow(NamedTuple):
 
     @property
     def link_badness(self) -> float:
-        """Badness of its link or its estimator's lag: 1 at the alarm threshold, infinite without a link."""
+        """How bad the drone's link, or its estimator's lag, is: 1 at the alarm threshold, infinite without a link."""
         drone = self.drone
         if not drone.is_external:
             return (drone.lag_ms or 0.0) / LATE_MS
@@ -123,7 +123,7 @@ class TableRows:
 
 
 class SensorRates:
-    """Sensor rates of one drone at a time, from irregular samples of its estimator's counts."""
+    """Derives one drone's sensor rates from irregular samples of its estimator's counts; drones may alternate."""
 
     def __init__(self) -> None:
         self._drone = ""
@@ -184,7 +184,7 @@ def drone_table(
 
 
 def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, chosen: bool) -> str:
-    """Return the rows of a drone: its figures, and notes on its commander, failsafe, faults and link."""
+    """Return a drone's rows: its figures, and notes on its commander, failsafe, faults and link."""
     drone = row.drone
     name = _coloured(drone.name, SEVERITY_COLOURS[row.severity]) if row.severity else escape(drone.name)
     if len(drone.name) > NAME_WHOLE:
@@ -220,7 +220,7 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, c
 
 
 def link_note(link: ReceivedLink | None) -> tuple[str, str]:
-    """Return a description of the link to an external drone and its colour; None: its driver has not published yet."""
+    """Return a description of the link to an external drone, and its colour; None: its driver has not published yet."""
     if link is None:
         return "external; no driver yet", AMBER
     state = link.state
@@ -313,7 +313,7 @@ def preflight_lines(checks: Mapping[str, Sequence[Check]]) -> str:
 
 
 def event_table(newest_first: Iterable[EventRow]) -> str:
-    """Return the table of events; the page uses the mark of a row to unfold its long text."""
+    """Return the table of events; each row has a mark, by which the page unfolds the row's long text."""
     lines = []
     for event, times, _ in newest_first:
         kind = _coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))

@@ -1,4 +1,4 @@
-"""Which page of the console controls which part: a formation, or the run itself.
+"""Decides which page of the console is in control of which part of the run: a formation, or the run itself.
 
 A page takes control of a free part by using one of its controls. Another page must request the part, and gets it when
 the controlling page grants the request, is closed or is lost. Emergencies, landings and holds need no control.
@@ -16,10 +16,10 @@ import viser
 
 from zsim_bridges.console.run_forms import assign
 
-RUN = "run"  # part with time, faults and single drones; a formation of that name shares it
-EVERY = ""  # part of the controls that affect all parts
+RUN = "run"  # the part with time, faults and single drones; a formation of that name shares it
+EVERY = ""  # the part of controls that affect all parts
 LOST_S = 10.0  # wall; a page that has not polled for so long counts as lost: its script or its machine has stopped
-SILENT_SHOWN_S = 3.0  # wall; shortest silence that is shown; pages poll twice a second
+SILENT_SHOWN_S = 3.0  # wall; minimum silence that is shown; pages poll twice a second
 HERE = ("", "127.0.0.1", "::1")  # addresses of pages on the console's machine
 OPERATOR, VIEWER = "operator", "viewer"
 Tell = Callable[[int, str], None]
@@ -39,7 +39,7 @@ class Holding(NamedTuple):
 
 @dataclass
 class _Page:
-    number: int  # in order of opening
+    number: int  # counts pages in the order in which they were opened
     role: str = OPERATOR
     address: str = ""
     looked_s: float | None = None  # when it last polled [s; wall]; None before the first poll
@@ -50,7 +50,7 @@ class _Page:
 
 
 class ControlDesk:
-    """Records which page, by viser's number, is in control; thread-safe.
+    """Records which page, by viser's number, is in control of each part; thread-safe.
 
     Args:
         parts: names of the formations; RUN is added.
@@ -90,7 +90,7 @@ class ControlDesk:
             known.role, known.address, known.looked_s = role, address, self._wall_s()
 
     def release_lost(self) -> None:
-        """Pass on requested parts of silent pages; a page keeps a part that no other page requests.
+        """Pass on requested parts of silent pages; a silent page keeps a part that no other page requests.
 
         A page whose socket is closed has released its parts already.
         """
@@ -192,7 +192,7 @@ def words(part: str) -> str:
 class ControlForm:
     """Shows on one page (viser's number) who is in control, with buttons to request, grant and release control.
 
-    `part_of` has the part of each shared control by its id, which is also that of its element on the page.
+    `part_of` maps the id of each shared control, which is also the id of its element on the page, to its part.
     """
 
     def __init__(self, gui: viser.GuiApi, desk: ControlDesk, page: int, part_of: Mapping[str, str]) -> None:

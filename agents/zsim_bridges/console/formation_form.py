@@ -1,6 +1,6 @@
-"""Controls of one formation: its phases, sliders of its variables with their ranges, and trajectories as text.
+"""Controls of one formation: buttons for its phases, sliders for its variables within ranges, and trajectories as text.
 
-Pages show lengths in metres and angles in degrees; requests have metres and radians.
+Pages show lengths in metres and angles in degrees; requests use metres and radians.
 """
 
 import math
@@ -38,11 +38,11 @@ from zsim_bridges.console.run_forms import (
 
 PREVIEW_STYLE = "font-size:12px;line-height:1.3;padding:2px 10px;color:#d9480f"
 REST_S = 1.0  # wall; sliders must rest this long before their values are sent, since people type slowly
-STILL_S = 2.0  # wall; if a formation's goal has not changed for this long, it is not moving: the slider shows its goal
-OVER_MAX_S = 3600.0  # simulated; longest duration of a move that controllers accept
+STILL_S = 2.0  # wall; if a formation's goal has not changed for this long, a moved slider shows the goal again
+OVER_MAX_S = 3600.0  # simulated; maximum duration of a move that controllers accept
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 SAFE = ("hold", "land")  # operations that need no control
-RETURN = "Return"  # flies above the middle of the starts, and lands there
+RETURN = "Return"  # the formation flies above the middle of its drones' starts, and lands there
 LABELS = {
     **{op: label for label, op in OPERATIONS.items()},
     "target": "sliders",
@@ -58,15 +58,15 @@ EXPRESSIONS = "x_c = 5 + 3*cos(0.1*t)\nyaw = 90 + 6*t"
 WAYPOINTS = "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6"
 EXPRESSION_UNITS = "t in seconds, lengths in metres, angles in degrees as on the sliders; sin and cos are of radians"
 WAYPOINT_UNITS = "seconds from the start, lengths in metres, angles in degrees as on the sliders"
-SIDEWAYS_M = 50.0  # horizontally around the drones' starts; chosen: as far as a page shows a formation well
-HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight
-SIDE_MAX_M = 20.0  # longest side of a formation; chosen
-DISPLACEMENT_M = 5.0  # largest displacement of a robot from its position in a template; chosen
-TILT_MAX_DEG = 29.0  # tilt of a formation; controllers accept less than 30 (flight_check.py)
-CORNER_DEG = 10.0  # smallest angle at a corner; at 0 and 180 degrees the robots are collinear
+SIDEWAYS_M = 50.0  # horizontal range around the drones' starts; design choice: as far as a page shows a formation well
+HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # range of heights; design choice: clear of the ground, and within sight
+SIDE_MAX_M = 20.0  # maximum side of a formation that a slider offers
+DISPLACEMENT_M = 5.0  # maximum displacement of a robot from its position in a template that a slider offers
+TILT_MAX_DEG = 29.0  # maximum tilt of a formation; controllers accept less than 30 (flight_check.py)
+CORNER_DEG = 10.0  # minimum angle at a corner; at 0 and 180 degrees the robots are collinear
 DIGITS = 6  # decimal digits of a displayed value: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}
-SHOWN_MAX = 16  # number of variables with sliders; of more, only those of the entire formation have one
+SHOWN_MAX = 16  # up to this number, all variables have sliders; otherwise only those of the entire formation
 WAYPOINT_STEP_S = 20.0  # time from the first to the second prefilled waypoint
 PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables in prefilled waypoints, if a formation has them
 
@@ -83,8 +83,8 @@ class FormationForm:
     """Controls of one formation.
 
     Args:
-        report: called with the outcome of requests that are refused here.
-        request_return: moves a formation above the middle of its starts, and lands it there.
+        report: called with the outcome of each request that is refused here, unsent.
+        request_return: moves a formation above the middle of its drones' starts, and lands it there.
         show_preview: shows in the scene the path that would be flown; None: removes it.
 
     Attributes:
@@ -110,9 +110,9 @@ class FormationForm:
         self._ranges = {each.name: each for each in slider_ranges(space, cluster, scenario)}
         self._previewed: _Flight | None = None
         self._shown: tuple[float, ...] | None = (
-            None  # desired variables, or estimated ones while it has no desired shape
+            None  # the formation's desired variables, or the estimated ones while it has no desired shape
         )
-        self._written: tuple[float, ...] | None = None  # variables at which the prefilled waypoints begin
+        self._written: tuple[float, ...] | None = None  # the formation's variables when the waypoints were prefilled
         self._edited = False
         self._controls: dict[str, Any] = {}
         for label, op in OPERATIONS.items():
@@ -184,7 +184,7 @@ class FormationForm:
         moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
         if self.request_target(moved):
             for name in moved:
-                self._sliders[name].hold(wall_s)  # unless it is requested, a previewed value returns to the goal
+                self._sliders[name].hold(wall_s)  # a value that is only previewed returns to the goal after a while
 
     def request_target(self, shown: dict[str, float]) -> bool:
         """Request values in the units of the page; return whether they are within their ranges."""
@@ -274,7 +274,7 @@ class FormationForm:
             add("Fly the waypoints", lambda: self._fly(lambda: parse_waypoints(points.value, self._ranges)))
 
     def _prefill(self) -> None:
-        """Fill in the formation's position as the first and as the second waypoint, which the operator edits.
+        """Fill in the formation's position as both the first and the second waypoint, for the operator to edit.
 
         The waypoints then follow the formation until they are edited.
         """
@@ -299,9 +299,9 @@ class _HeldValue(NamedTuple):
 
 
 class VariableSlider:
-    """A slider of one cluster variable; all values here are in the unit of its range.
+    """A slider of one cluster variable, which follows the formation while no operator moves it.
 
-    It follows the formation while no operator moves it.
+    Values are in the unit of the slider's range, unless stated otherwise.
     """
 
     def __init__(self, gui: viser.GuiApi, range_: "SliderRange") -> None:
@@ -317,17 +317,17 @@ class VariableSlider:
         assign(self._slider, disabled=locked)
 
     def pop_value(self) -> float | None:
-        """Return the value to which it was moved, once; None if it was not moved."""
+        """Return the value to which the slider was moved, once; None if it was not moved."""
         with self._lock:
             moved, self.moved = self.moved, None
         return None if moved is None else moved[0]
 
     def hold(self, wall_s: float) -> None:
-        """Keep its value while the formation moves there."""
+        """Keep the slider's value while the formation moves to it."""
         self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
 
     def follow(self, goal: float, wall_s: float) -> None:
-        """Show the formation's goal [m, rad], unless it was moved and the formation is still moving there.
+        """Show the formation's goal [m, rad], unless the slider was moved and the formation still moves to its value.
 
         The slider extends to the value that it shows; requests remain limited to the range.
         """
@@ -385,8 +385,8 @@ class SliderRange(NamedTuple):
     def to_display(self, value: float) -> float:
         """Return a value [m, rad] in the unit of the range, rounded to its step.
 
-        A value beyond a limit by up to half a step becomes the limit, which need not be a multiple of the step: those
-        of sides come from the scenario.
+        A value beyond a limit by up to half a step becomes the limit, which need not be a multiple of the step: the
+        limits of sides come from the scenario.
         """
         shown = self.in_unit(value)
         rounded = round(round(shown / self.step) * self.step, DIGITS)
@@ -412,7 +412,7 @@ def height_range_m(drones: Iterable[Drone]) -> tuple[float, float]:
 
 
 def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[SliderRange]:
-    """Return the ranges of all variables of a formation, in their order."""
+    """Return the ranges of all variables of a formation, in the space's order."""
     drones = [scenario.drone(name) for name in cluster.drones]
     x, y = (round(sum(drone.position_m[axis] for drone in drones) / len(drones)) for axis in range(2))
     apart_m = max(cluster.gains.separation_min_m, STEPS["m"])
@@ -436,7 +436,7 @@ def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> 
 
 
 def primary_variables(names: Sequence[str]) -> list[str]:
-    """Return the variables that have sliders: all up to SHOWN_MAX; of more, those of the entire formation."""
+    """Return the variables with sliders: all if there are at most SHOWN_MAX, otherwise those of the whole formation."""
     primary = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
     return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in primary]
 
@@ -477,7 +477,7 @@ def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, A
     """Return the arguments of a trajectory given as lines `seconds: variable = value, …` in the ranges' units.
 
     Raises:
-        InputError: a line has another form, or there is none.
+        InputError: a line has another form, or there are no lines.
     """
     points = []
     for number, line in _lines(text):
@@ -506,7 +506,7 @@ def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str
 def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
     """Return whether the prefilled waypoints at two states of a formation differ by more than a step.
 
-    Otherwise the text would change with every estimate.
+    If smaller differences counted, the text would change with every estimate.
     """
     return any(
         abs(round(each.in_unit(here - there), 2)) > each.step

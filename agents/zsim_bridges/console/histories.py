@@ -1,7 +1,7 @@
-"""The recent past of a run, in memory: trails of its drones, and points of variables as plots show them. Pure.
+"""The recent past of a run, in memory: trails of its drones, and points of variables, with the plots that show them.
 
-For a flight both cover a few minutes, and restart when time goes back. For a replayed record they hold whatever was
-read of it, in any order, until it is far from the shown time.
+In a flight, both cover a few minutes, and restart when time goes back. In a replay, they hold what was read of the
+record, in any order, as long as it is near the shown time.
 """
 
 import math
@@ -23,30 +23,30 @@ from zsim_bridges.console.picture import PLAN_DIGITS, Array, DronePoses
 
 Row = TypeVar("Row")
 
-SPAN_S = 180.0  # simulated; longest trails and curves
-INTERVAL_S = 0.25  # simulated, between two points of a curve; a formation answers within seconds
+SPAN_S = 180.0  # simulated; maximum length of trails and curves
+INTERVAL_S = 0.25  # simulated; minimum time between two points of a curve; formations take seconds to respond
 HISTORY_POINTS_MAX = int(SPAN_S / INTERVAL_S)
 SERIES = ("desired", "estimated", "true")
 
-TRAIL_POINTS_MAX = 6_000  # number of points of all trails together: 144 kB sent to a browser each time
+TRAIL_POINTS_MAX = 6_000  # maximum number of points of all trails together: 144 kB sent to a browser each time
 TRAILS_S = (10.0, 30.0, 60.0, SPAN_S)  # selectable lengths of trails, simulated
-TRAIL_S = 60.0  # initial length
-SPACING_M = 0.08  # shortest distance between two points of a trail: a sixth of a hull
-SPACING_S = 0.05  # simulated; shortest time between two points of a trail: the period of pictures at 1 × real time
-RECORD_GAP_S = 5.0  # simulated; a larger gap between points of a record was not read yet, so nothing is drawn across it
-STILL_M = 1e-3  # shortest segment that is drawn: a stationary drone leaves no trail
-PLOTS_SHOWN = 3  # number of plots
+TRAIL_S = 60.0  # initial length of trails, simulated
+SPACING_M = 0.08  # minimum distance between two points of a trail: a sixth of a hull
+SPACING_S = 0.05  # simulated; minimum time between two points of a trail: the period of pictures at 1 × real time
+RECORD_GAP_S = 5.0  # simulated; a larger gap in a record has not been read yet, so nothing is drawn across it
+STILL_M = 1e-3  # minimum length of a segment that is drawn: a stationary drone leaves no trail
+PLOTS_SHOWN = 3  # number of plots shown at once
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # colours of SERIES
 HEIGHT_PX = 150
-PADDING_PX = (8, 24, 0, 0)  # clockwise from the top, with space for the topmost number; right as viser's
+PADDING_PX = (8, 24, 0, 0)  # clockwise from the top, where the topmost number needs space; on the right as in viser
 AXIS_PX = 56  # wide enough for numbers such as -12.5
 CURSOR_COLOUR = "#7048e8"  # colour of the line at the time that a replay shows
-BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # data of a plot without points yet
+BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # data of a plot that has no points yet
 NONE = "none"
-STEPS_PER_WINDOW = 6  # number of steps of the time axis; chosen: plots are recreated every 30 s at most
-CURVE_POINTS_MIN = 2  # number of points of a curve
-VALUE_RANGE_MIN = 0.01  # range of the values on an axis, in their unit
-WINDOWS_S = (SPAN_S, 60.0, 20.0)  # simulated
+STEPS_PER_WINDOW = 6  # number of steps in which a time axis advances by its length; plots are recreated at each step
+CURVE_POINTS_MIN = 2  # minimum number of points of a curve that is drawn
+VALUE_RANGE_MIN = 0.01  # minimum range of values from which the steps of an axis are derived, in their unit
+WINDOWS_S = (SPAN_S, 60.0, 20.0)  # selectable lengths of plots, simulated
 FLIGHT = {
     "x": "m",
     "y": "m",
@@ -55,7 +55,7 @@ FLIGHT = {
     "roll": "deg",
     "pitch": "deg",
 }  # variables of each drone, with units
-ESTIMATED = 4  # number of the first of them: views of estimates have no roll and pitch
+ESTIMATED = 4  # only this many of them, the first ones, are estimated: views of estimates have no roll and pitch
 DESIRED, TRUE = SERIES.index("desired"), SERIES.index("true")
 
 
@@ -86,11 +86,11 @@ class CanvasTrails:
 
     Args:
         count: N.
-        around: whether they belong to a record, which is read on both sides of the shown time.
+        around: whether the trails are those of a record, which is read on both sides of the shown time.
 
     Attributes:
         length_s: length of the trails, simulated.
-        number: changes whenever the trails are more than an extension of the previous ones.
+        number: changes whenever the trails are not just the previous ones extended.
     """
 
     def __init__(self, count: int, around: bool = False) -> None:
@@ -129,17 +129,17 @@ class CanvasTrails:
         self.number += 1
 
     def segments(self, t_s: float, p_W: Array) -> tuple[Array, NDArray[np.int64], Array]:
-        """Return M segments that end at the drones' present positions (N, 3); many points are thinned out evenly.
+        """Return the trails as M segments, up to positions (N, 3) at `t_s`; many points are thinned out evenly.
 
         Returns:
-            ends (M, 2, 3), indices of the drones (M,), times at which they begin (M,).
+            the segments' ends (M, 2, 3), indices of their drones (M,), and times at which they begin (M,).
         """
         points = self._points
         begin, end = bisect_left(points.times, t_s - self.length_s), bisect_left(points.times, t_s)
         times = np.array(points.times[begin:end])
         rows = np.arange(len(times))
         if len(times) * self._count > TRAIL_POINTS_MAX:
-            # Trails would flicker if the step changed often, or other points were selected.
+            # Trails would flicker if the step changed often, or if other points were selected each time.
             step_s = 2.0 ** math.ceil(math.log2((times[-1] - times[0]) * self._count / TRAIL_POINTS_MAX))
             rows = np.flatnonzero(np.diff(np.floor(times / step_s), prepend=-math.inf))
         times = np.append(times[rows], t_s)
@@ -152,7 +152,7 @@ class CanvasTrails:
         return lines[drawn], owners, times[begins]
 
     def lines(self, t_s: float, p_W: Array) -> list[list[list[float]]]:
-        """Return the segments of each drone's trail in plan: x and y [m; W] and time [s] at which each begins."""
+        """Return the segments of each drone's trail in plan view: x and y [m; W] and time [s] at which each begins."""
         segments, owners, times = self.segments(t_s, p_W)
         points = np.round(np.column_stack((segments[:, 0, :2], times)), PLAN_DIGITS)
         return [points[owners == i].tolist() for i in range(self._count)]
@@ -162,7 +162,7 @@ class VariableHistory:
     """Points of some variables, each with the values of `SERIES`.
 
     Args:
-        around: whether they belong to a record, which is read on both sides of the shown time.
+        around: whether the points are those of a record, which is read on both sides of the shown time.
     """
 
     def __init__(self, size: int, around: bool = False) -> None:
@@ -172,7 +172,7 @@ class VariableHistory:
         self._lock = threading.Lock()  # pages read curves in their own threads
 
     def is_due(self, t_s: float) -> bool:
-        """Return whether a point of that time [s] would be added."""
+        """Return whether a point at a time [s] would be added."""
         if self._around:
             return not self._points.is_near(t_s, INTERVAL_S / 2.0)
         times = self._points.times
@@ -195,7 +195,8 @@ class VariableHistory:
                 return False
             points.insert(t_s, row)
             if not self._around:
-                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))  # a fast run has sparse points
+                # by age as well as by number, since the points of a fast run are sparse
+                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))
         return True
 
     def keep(self, from_s: float, to_s: float) -> None:
@@ -244,7 +245,7 @@ class PlottedVariable(NamedTuple):
 
 
 class FlightHistory:
-    """Points of all drones of a run, each with the variables of FLIGHT; `around` as of `VariableHistory`."""
+    """Points of all drones of a run, each with the variables of FLIGHT; `around` as in `VariableHistory`."""
 
     def __init__(self, names: Sequence[str], around: bool = False) -> None:
         self.names = tuple(names)
@@ -318,7 +319,7 @@ class VariablePlots:
             self._redraw()
 
     def _redraw(self) -> None:
-        """Send the chosen curves; operators may also change them after the end of a run."""
+        """Send the chosen curves; operators may choose others even after the end of a run."""
         with self._lock:
             shown = self._choices.get(self._choice.value, ())
             if shown != self._shown:
@@ -355,7 +356,7 @@ def shown_unit(variable: str) -> str:
 
 
 class AxisRange(NamedTuple):
-    """The shown range of an axis, in steps, since viser recreates a plot whenever its range changes."""
+    """The shown range of an axis, which changes in steps, since viser recreates a plot at each change."""
 
     low: float
     high: float
@@ -364,8 +365,8 @@ class AxisRange(NamedTuple):
     def of_times(cls, t_s: Array, span_s: float, at_s: float | None = None) -> "AxisRange":
         """Return the range of times (M,) [s], M > 0, in a window of `span_s`, around `at_s` if given.
 
-        Before the first range is committed, viser derives an automatic range from the previous data: a page that draws
-        slowly would keep showing an empty interval.
+        Without a range, viser would first derive one from the previous data, and a page that draws slowly would keep
+        showing an empty interval.
         """
         step_s = span_s / STEPS_PER_WINDOW
         if at_s is not None:
@@ -375,9 +376,9 @@ class AxisRange(NamedTuple):
 
     @classmethod
     def of_values(cls, values: Sequence[Array], always: bool = False) -> "AxisRange | None":
-        """Return the range of curves (M,) of one unit, NaN where unknown; None if uPlot derives it.
+        """Return the range of curves (M,) in one unit, NaN where unknown; None if uPlot can derive it.
 
-        uPlot cannot if a curve is entirely unknown. `always`: return the range in all cases with a known value.
+        uPlot cannot derive it if a curve is entirely unknown. `always`: return it whenever any value is known.
         """
         known = np.concatenate(values)
         known = known[np.isfinite(known)]

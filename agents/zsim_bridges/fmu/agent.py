@@ -1,6 +1,6 @@
 """An FMU as an agent: at a gate it reads messages, makes a communication step and sends commands or an estimate.
 
-At gate t the FMU receives the newest values of its inputs and steps from t to t + period; its outputs are then
+At gate t, the FMU receives the newest values of its inputs and steps from t to t + period; its outputs are then
 published with the time stamp t, like any agent's outputs at that gate.
 """
 
@@ -51,7 +51,7 @@ class Fmu:
         path: path of the FMU, which must be for co-simulation with FMI 2 or 3.
         drone: drone to which entries of `map` without a drone or cluster refer; None if there are no such entries.
         map: message fields by variable, `{"vx": "velocity_m_s.0"}`, or texts `vx=velocity_m_s.0`; see docs/fmu.md.
-        name: process name (default: `fmu.` and the drone's name, or `fmu.main`); a stock agent's name replaces it.
+        name: process name (default: `fmu.` and the drone's name, or `fmu.main`); replaces a stock agent of this name.
         period_s: communication step [s], a multiple of the gate period; default: the FMU's suggestion, or the gate
             period.
         param: start values of parameters and inputs, by variable name.

@@ -221,7 +221,7 @@ class FmuInstance:
         self._call(self._write, inputs)
 
     def step(self, t_s: float, step_s: float) -> None:
-        """Advance by step_s from simulated time t_s; raise a UserCodeError if the FMU requests the end."""
+        """Advance by step_s from simulated time t_s; raise a UserCodeError if the FMU ends the simulation."""
         result = self._call(self._unit.doStep, t_s, step_s)
         if result is not None and result[1]:
             raise UserCodeError(self._explained(f"{self.model.path}: requests the end of the simulation"))

@@ -24,7 +24,7 @@ COUNTED_KEYS = (
     keys.command("*", "*"),
     keys.estimate("*"),
     keys.cluster_state("*"),
-)  # keys of the messages that the contract counts in `sent` of a done
+)  # keys whose messages count in the field `sent` of a done
 CAMERA_KEYS = (keys.camera("*", "*"), keys.camera_info("*", "*"), keys.detections("*"))
 """Keys of clients' own cameras, renderers and detectors."""
 CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"), *CAMERA_KEYS)
@@ -325,9 +325,8 @@ class AskRequest(StreamRequest, tag="ask"):
 class JoinRequest(StreamRequest, tag="join"):
     """Joins the lockstep: a `gate` is sent every `period_s`, and simulated time waits for the client's `done`.
 
-    `reads` are the key expressions whose messages are sent with each gate. A gate is complete
-    once a message has arrived on each key of `gates`; by default, the keys matched by `reads` that have a message at
-    every gate.
+    `reads` are the key expressions whose messages are sent with each gate. A gate is complete once a message has
+    arrived on each key of `gates`; by default, these are the keys with a message at every gate that `reads` match.
     """
 
     name: str

@@ -62,7 +62,7 @@ class Outbox:
         self._closed = False
 
     def put(self, line: bytes, droppable: bool = False) -> None:
-        """Add a line, including its newline; call on the loop. A value that a newer one replaces is droppable."""
+        """Add a line with its newline; call on the loop. A line is droppable if a newer one of its kind replaces it."""
         if self._closed:
             return
         self._lines.append((line, droppable))

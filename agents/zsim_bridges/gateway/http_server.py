@@ -324,7 +324,7 @@ class KeyTrees:
 
 
 def methods_of(key: str) -> tuple[str, ...]:
-    """Return a key's methods: POST for control keys, GET for reserved, GET and PUT for other keys of the contract."""
+    """Return a key's methods: POST for control keys, GET for reserved ones; else GET, PUT and, for own keys, POST."""
     if is_control_key(key):
         return ("POST",)
     if is_reserved(key):

@@ -66,7 +66,7 @@ class RunAccess:
         link: an open session.
         info: description of the run.
         observer: the gateway's participant in the run.
-        secured: whether access control restricts where the gateway may publish.
+        secured: whether access control restricts the keys on which the gateway may publish.
 
     Attributes:
         values: last values of keys.
@@ -273,7 +273,7 @@ class EchoFilter:
     """Recognises clients' values that the world echoes when a newer value is already stored.
 
     After two values in quick succession, the echo of the first arrives when the second is already stored; after a
-    value and its deletion, the echo arrives when nothing should be stored. An echo that never arrives is forgotten
+    value and its deletion, the echo arrives when there should be no value. An echo that never arrives is forgotten
     with the next echo on its key. Echoes are expected for at most `keys_max` keys.
     """
 
@@ -612,7 +612,7 @@ def gate_keys_of(info: Info, reads: Sequence[str], name: str, required: Collecti
     """Return the keys with a message at every gate that match an expression of `reads`; `clock` if there are none.
 
     The world sends a drone's status and truth at every gate. The estimate of a drone and the state of a cluster arrive
-    at every gate if the run cannot start without another process than the joining one that serves this drone or
+    at every gate if the run cannot start without a process, other than the joining one, that serves this drone or
     cluster.
     """
     served = {thing for process, thing in required if process != name}

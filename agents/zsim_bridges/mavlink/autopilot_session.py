@@ -49,9 +49,9 @@ HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
 TIMESYNC_NS = 500_000_000  # design choice: ten round trips within the window of the clock offset
 REQUEST_NS = 3_000_000_000  # time after which a missing stream is requested again: three periods of the slowest one
 STRANGERS_MAX = 256  # other systems reported, each only once
-CLIMBED = 0.85  # fraction of the take-off height that counts as reached; design choice: allows for errors of both
+CLIMBED = 0.85  # fraction of the take-off height that counts as reached; allows for errors of the reported height
 REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopilot answers within about 0.1 s
-KILL_REPEAT_NS = 200_000_000  # shorter, since this is the one command that must not be lost
+KILL_REPEAT_NS = 200_000_000  # shorter than REPEAT_NS, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
 CHANGED_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period, in which one command arrives
 STREAMED_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
@@ -428,7 +428,7 @@ class TelemetryReadings(AircraftReadings):
             arrives, the origin of W.
 
     Attributes:
-        clock, unix_clock: clock offsets for messages with time since boot and since 1970.
+        clock, unix_clock: clock offsets for messages timestamped since boot and since 1970.
         has_origin: whether the origin of the vehicle's local frame is known.
     """
 

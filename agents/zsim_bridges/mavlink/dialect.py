@@ -496,7 +496,7 @@ class Signing:
     """Signs frames with a 32-byte key, and checks the signatures of received frames.
 
     Attributes:
-        timestamp: timestamp of the newest frame signed or accepted [10 us since 2015].
+        timestamp: time of the newest frame signed or accepted [10 us since 2015].
     """
 
     def __init__(self, key: bytes) -> None:

@@ -1,6 +1,6 @@
 """One drone presented as a MAVLink vehicle: handles messages from clients and the drone, and sends to both.
 
-Pure: no clock, no sockets. Sources: https://mavlink.io/en/services/command.html; for setpoints,
+Has neither clock nor sockets. Sources: https://mavlink.io/en/services/command.html; for setpoints,
 https://mavlink.io/en/messages/common.html#SET_POSITION_TARGET_LOCAL_NED.
 """
 

@@ -100,7 +100,7 @@ class Mission:
     """A mission and the progress through it.
 
     Args:
-        first: number of its first item; 1 for ArduPilot, whose item 0 is home.
+        first: number of the first item; 1 for ArduPilot, whose item 0 is home.
         turns: whether the vehicle turns to the yaw of a waypoint.
 
     Attributes:

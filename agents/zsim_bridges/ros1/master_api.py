@@ -113,7 +113,7 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
 
 
 class GraphEntry(NamedTuple):
-    """What a node registers: its name, the URIs of its slave API and services, topics with their types, services."""
+    """What a node registers: its name, the URIs of its slave API and services, its topics with types, its services."""
 
     caller: str
     slave_uri: str

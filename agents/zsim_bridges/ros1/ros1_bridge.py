@@ -220,7 +220,7 @@ class TiltCommand(NamedTuple):
 class DriverCommands:
     """Passes commands from ROS nodes to one drone, by the driver's rules.
 
-    Like the driver, it repeats the last cmd_vel until another arrives, or until the drone comes down.
+    Like the driver, it repeats the last cmd_vel until another arrives, or until the drone no longer flies.
     """
 
     def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:

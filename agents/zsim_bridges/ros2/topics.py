@@ -240,7 +240,7 @@ class OdometryTopic:
 
 
 class OnChange:
-    """Converts a status once in each simulated second, and whenever a value derived from it has changed."""
+    """Converts a status once per simulated second, and whenever a value derived from it has changed."""
 
     def __init__(self, convert: Callable[[Status], Any], value: Callable[[Status], object] = lambda _: None) -> None:
         self._convert = convert

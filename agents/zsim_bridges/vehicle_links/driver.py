@@ -366,7 +366,7 @@ class AircraftSocket(asyncio.DatagramProtocol):
     """A UDP socket to one port of the aircraft.
 
     Attributes:
-        fault: why the newest datagram could not be delivered, for instance because nobody listens; empty for none.
+        fault: why the newest datagram could not be delivered, for instance because nobody listens; empty otherwise.
     """
 
     def __init__(self, receive: Callable[[bytes], None]) -> None:
@@ -446,7 +446,7 @@ def position(text: str) -> Vector:
 
 
 def aircraft_host(text: str) -> str:
-    """Return the host of an aircraft, whose ports are fixed.
+    """Return the host that a text names, for an aircraft with fixed ports.
 
     Raises:
         RunError: the text is not just a host.
@@ -472,7 +472,7 @@ def check_run(info: Info, process: str, drone: str) -> None:
     """Check that a process can drive a drone of a run.
 
     Raises:
-        RunError: the drone takes no driver, the process has another name, or the run does not follow the wall clock.
+        RunError: the drone is not external, the process has another name, or the run does not follow the wall clock.
     """
     bodies = {each.name: each.body for each in info.drones}
     if drone not in bodies:

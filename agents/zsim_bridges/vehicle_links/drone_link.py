@@ -24,7 +24,7 @@ ModeName = Literal["takeoff", "land", "emergency", "reset"]
 
 
 class CommandSender:
-    """Sends commands to a drone in the name of a process, numbered separately for each key."""
+    """Sends a drone commands in the name of a process; they are numbered separately for each key."""
 
     def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
         self._source = source

@@ -115,7 +115,7 @@ Say = Callable[[str], None]
 
 
 class VehicleServer(ABC):
-    """One run's drones on a wire; `options` belong to the wire, and `serve` requests the pace `options.rate`."""
+    """One run's drones on a wire; `options` are those of the wire, and `serve` requests the pace `options.rate`."""
 
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: Any) -> None:
         self.link = link

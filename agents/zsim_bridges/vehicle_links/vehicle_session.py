@@ -42,14 +42,14 @@ Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
 TAKEOFF_S = 20.0  # time limit of a take-off: four times what an AR.Drone needs
 RESET_S = 2.0  # time limit of a reset: ten times what an AR.Drone needs to leave its emergency
 LINK_LOST_S = 1.0  # silence that means a lost link: telemetry comes ten times a second, heartbeats once
-BRAKING_M_S2 = 1.0  # half the acceleration of an AR.Drone at 12 deg of tilt; limits the speed towards a fence
-RETURN_M_S = 0.5  # speed of the return to the fence; slow, since nobody commanded it
+BRAKING_M_S2 = 1.0  # half the acceleration of an AR.Drone at 12 deg of tilt; limits the speed towards the fence
+RETURN_M_S = 0.5  # speed of the return into the fence; slow, since nobody commanded it
 BREACH_M = 1.0  # distance outside the fence at which the aircraft lands; a margin, since it should stop at the fence
 Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
 
 
 class AircraftPose(NamedTuple):
-    """Position and velocity [W] of an aircraft's centre of mass, its attitude and rate, at `taken_ns` of our clock."""
+    """Position and velocity of an aircraft's centre of mass in W, its attitude and angular rate, at `taken_ns`."""
 
     taken_ns: int
     position_m: Vector
@@ -305,7 +305,7 @@ def _is_lost(vehicle: AircraftState, now_ns: int) -> bool:
 
 
 class UdpChannel(NamedTuple):
-    """A UDP port of an aircraft, and the local port, 0 for any."""
+    """A UDP port of an aircraft, and the local port (0: any)."""
 
     host: str
     port: int
@@ -332,8 +332,8 @@ class VehicleSession(ABC):
 
     Args:
         channels: the aircraft's ports; a channel number is an index into them.
-        readings: collects the measurements in its telemetry.
-        modulus: value at which the sequence numbers of its telemetry wrap around.
+        readings: collects the measurements in the aircraft's telemetry.
+        modulus: value at which the sequence numbers of the telemetry wrap around.
 
     Attributes:
         texts: lines for the terminal, collected by the process.

@@ -22,7 +22,7 @@ _FIELD = re.compile(r"([\w,]+):(\d*)([a-zA-Z])(?:\[[^\]]*\])?(?:=(\S+))?")
 
 
 class WireField(NamedTuple):
-    """A field: `length` is None unless it is an array, `default` is the value of each of its numbers."""
+    """A field: `length` is None unless it is an array, `default` is that of each of its numbers."""
 
     name: str
     code: str

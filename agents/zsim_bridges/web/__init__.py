@@ -1,6 +1,6 @@
-"""Parts shared by the web servers: listening on a separate thread, access, connections, image streams.
+"""Parts shared by the web servers: event loop thread, listening, access, bounded connections.
 
-Console and gateway use it for HTTP. This module does not import aiohttp, since other bridges use it too.
+Console and gateway use them for HTTP. This module does not import aiohttp, since other bridges use it too.
 """
 
 from ipaddress import ip_address

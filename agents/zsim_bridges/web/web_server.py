@@ -51,7 +51,7 @@ class ServedSite(NamedTuple):
 
 
 async def start_site(app: web.Application, host: str, ports: Sequence[int], shutdown_s: float) -> ServedSite:
-    """Serve an application on the first free port, where ANY_PORT takes any, with a bounded number of connections.
+    """Serve an application on the first free port, where ANY_PORT stands for any, with a bounded number of connections.
 
     At shutdown, requests in progress may take `shutdown_s` [wall]. Raises an OSError if no port can be opened.
     """

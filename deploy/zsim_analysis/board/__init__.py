@@ -1,1 +1,1 @@
-"""Compares formation laws in the same scenarios with the same seeds and sensors, in one table and on one page."""
+"""Compares formation laws in the same scenarios with the same seeds and sensors, in tables and on one page."""

@@ -1,12 +1,12 @@
-"""Flies a board: every law in every scenario with every seed, on all cores; and its table of means.
+"""Flies a board (every law in every scenario with every seed, on all cores) and makes its tables of means.
 
 The folder of a board:
 
-    journal.jsonl    finished flights, a line of JSON each, from which the same command continues
+    journal.jsonl    finished flights, one line of JSON each, from which the same command resumes
     board.csv        the measures of each flight
-    board.md         their means over the seeds, a row for each law in each scenario
-    summary.json     the same, for programs
-    report.html      the table and the figures
+    board.md         their means over the seeds, a table for each scenario with a row for each law
+    summary.json     the means, minima and maxima, for programs
+    report.html      the tables and the figures
 
 A law is `cluster_space`, the stock controller with a template; one of `zsim.scenario.scenario.LAWS`; or a user's
 subclass of `zsim_agents.laws.pilot.Pilot`, `package.module:Class`. All fly the same drones from the same positions with
@@ -45,7 +45,7 @@ from zsim_analysis.sweep.sweep_run import Row, Task
 JOURNAL, CSV, MARKDOWN = "journal.jsonl", "board.csv", "board.md"
 OWN_FILES = (JOURNAL, CSV, MARKDOWN, "summary.json", "report.html", "figures", ".lock")
 TRACK_S = 0.5  # interval between the samples of a flight that are kept for the figures
-DECIMALS = 3  # decimals of the positions that are kept: a millimetre
+DECIMALS = 3  # decimals kept of times, positions and errors: to the millimetre
 CLUSTER_SPACE = "cluster_space"
 LAW_NAMES = (CLUSTER_SPACE, *LAWS)
 PILOT, CONTROLLER = "pilot", "main"
@@ -74,7 +74,7 @@ MEASURES = (
 
 
 class Entry(Struct, frozen=True):
-    """The flights of a law in a scenario: means of the measures over the seeds, with minima and maxima."""
+    """A law's flights in a scenario: means, minima and maxima of the measures over the seeds."""
 
     scenario: str
     law: str
@@ -86,7 +86,7 @@ class Entry(Struct, frozen=True):
 
 
 class Board(Struct, frozen=True):
-    """The results of all flights, in the order of the request."""
+    """The results of all flights; laws and scenarios are in the order of the request."""
 
     laws: list[str]
     scenarios: list[str]
@@ -111,10 +111,10 @@ class BoardRequest(Struct, frozen=True):
 
 
 def fly_board(request: BoardRequest) -> list[Row]:
-    """Fly the flights that are missing in the folder; return the rows of all flights.
+    """Make the flights that the folder lacks; return the rows of all flights.
 
     Raises:
-        ScenarioError: a law cannot be flown; with a line for each fault.
+        ScenarioError: a law cannot be flown; one line per fault.
         RunError: the folder holds something else or cannot be written, or workers cannot start.
         KeyboardInterrupt: the finished flights are in the journal.
     """
@@ -139,10 +139,10 @@ def fly_board(request: BoardRequest) -> list[Row]:
 
 
 def _tasks(request: BoardRequest) -> list[Task]:
-    """Return the flights of a board ordered by seed, so that a partial board has all laws."""
+    """Return the flights of a board ordered by seed, so that an unfinished board has all laws."""
     tasks: list[Task] = []
     faults: list[str] = []
-    for law in request.laws:  # one check each, in the first scenario, suffices
+    for law in request.laws:  # one check per law, in the first scenario, suffices
         try:
             check_classes(resolved(law, request.scenarios[0], 1), law)
         except ScenarioError as error:
@@ -160,7 +160,7 @@ def _tasks(request: BoardRequest) -> list[Task]:
 
 
 def columns(law: str, scenario: str, flight: RecordedFlight) -> dict[str, Any]:
-    """Return the measures of a flight, and the positions of its drones every TRACK_S."""
+    """Return the measures of a flight, and its drones' positions and shape errors every TRACK_S."""
     figure = planned_figure(scenario) if law == CLUSTER_SPACE else None
     flown = flown_of(flight, figure, whole=True)
     step = max(1, round(TRACK_S / float(np.median(np.diff(flown.t_s))))) if len(flown.t_s) > 1 else 1
@@ -175,14 +175,14 @@ def columns(law: str, scenario: str, flight: RecordedFlight) -> dict[str, Any]:
 
 
 def planned_figure(scenario: str) -> Figure:
-    """Return the figure that the stock controller is to fly."""
+    """Return the figure that the stock controller is to form in a scenario."""
     entry, flight = shipped()["scenarios"][scenario], shipped()["flight"]
     places = polygon(len(shipped()["base"]["drones"]), flight["radius_m"])
     return Figure(FormationReference(entry["centre_m"], 0.0, 1.0, flight["start_s"]), places, ("translation",))
 
 
 def board_of(request: BoardRequest, rows: Sequence[Row]) -> Board:
-    """Return the board with statistics over the seeds of the flights that did not fail."""
+    """Return the board, with statistics over the seeds of the flights that did not fail."""
     entries = []
     for scenario in request.scenarios:
         for law in request.laws:
@@ -198,7 +198,7 @@ def board_of(request: BoardRequest, rows: Sequence[Row]) -> Board:
 
 
 def cells(entry: Entry) -> list[str]:
-    """Return a law's measures as texts, in the order of MEASURES, or a dash each if all its flights failed."""
+    """Return the means of an entry as text, in the order of MEASURES, with a dash for each missing mean."""
     values = [(each, entry.means[each.name]) for each in MEASURES]
     return ["–" if value is None else f"{value:.{each.digits}f}" for each, value in values]
 
@@ -217,7 +217,7 @@ def _markdown(board: Board) -> Iterator[str]:
 
 
 def write_tables(out: Path, board: Board, rows: Sequence[Row]) -> None:
-    """Write board.csv and board.md; ReportError if the folder cannot be written."""
+    """Write board.csv and board.md; raise ReportError if the folder cannot be written."""
     names = ["scenario", "law", "seed", "failure", *(each.name for each in MEASURES), "truth_sha256"]
     text = io.StringIO()
     writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
@@ -247,7 +247,7 @@ def chosen(given: str | None, known: Sequence[str], option: str, open_to_classes
     """Return the names of a comma-separated list without repetitions; for None, all known names.
 
     Raises:
-        ScenarioError: with a line for each unknown name.
+        ScenarioError: the list is empty or has unknown names; one line per name.
     """
     names = [*dict.fromkeys(name.strip() for name in given.split(",") if name.strip())] if given else [*known]
     allowed = f"must be of {', '.join(known)}{', or package.module:Class' if open_to_classes else ''}"
@@ -260,12 +260,12 @@ def chosen(given: str | None, known: Sequence[str], option: str, open_to_classes
 
 
 def resolved(law: str, scenario: str, seed: int) -> Scenario:
-    """Return the resolved scenario of a flight; ScenarioError if a user's class cannot be flown."""
+    """Return the resolved scenario of a flight; raise ScenarioError if a user's class cannot be flown."""
     return scenario_file.resolve(document(law, scenario, seed), f"board, {law} in {scenario}")
 
 
 def document(law: str, scenario: str, seed: int) -> dict[str, Any]:
-    """Return the scenario of a law as a raw document."""
+    """Return the scenario of a flight as a raw document."""
     entry, flight = shipped()["scenarios"][scenario], shipped()["flight"]
     found = copy.deepcopy(shipped()["base"])
     found |= {"name": f"board-{scenario.replace('_', '-')}", "seed": seed, "report": {"window_s": entry["window_s"]}}
@@ -291,7 +291,7 @@ def document(law: str, scenario: str, seed: int) -> dict[str, Any]:
 
 
 def _cluster(names: list[str], centre_m: list[float | str], flight: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the equivalent cluster: a template of the pentagon, which gathers, then is led along the centre's path."""
+    """Return the equivalent cluster: a pentagon template that gathers, then is led along the centre's path."""
     places = [[*place, 0.0] for place in polygon(len(names), flight["radius_m"]).tolist()]
     start = {"x_c": 0, "y_c": 0, "z_c": flight["height_m"], "yaw": 0}
     expressions = {"x_c": centre_m[0], "y_c": centre_m[1]}

@@ -1,4 +1,4 @@
-"""Makes the report page of a board with its tables and figures, and its table for the terminal.
+"""Makes the report page of a board, with its tables and figures, and its tables for the terminal.
 
 Figures: all measures of all laws, the paths of the drones from above, and shape errors over time.
 """
@@ -30,8 +30,8 @@ from zsim_analysis.sweep.sweep_run import Row
 
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.VERMILION, style.SKY, style.PURPLE, style.BLACK, style.GREY)
 MARKS = "osD^vP*X"
-ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law, and of everything around the axes
-LEAST_IN = 0.5  # height of a row of paths
+ROW_IN, MARGIN_IN = 0.42, 0.9  # height of a law's line in a panel, and of everything around the axes
+LEAST_IN = 0.5  # minimum height of a row of path panels
 
 
 def make_board_report(
@@ -40,7 +40,7 @@ def make_board_report(
     progress: Callable[[str], None] = lambda _: None,
     formats: Sequence[str] = (),
 ) -> Board:
-    """Write all files of a board except its journal; return its means; ReportError if the folder cannot be written."""
+    """Write all files of a board except its journal; return the board; raise ReportError if `out` is not writable."""
     board = board_of(request, rows)
     write_tables(request.out, board, rows)
     figures = board_figures(board, rows)
@@ -120,7 +120,7 @@ def _ways(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigure
     shape = {"squeeze": False, "height_ratios": heights}
     panels = figure.subplots(len(board.scenarios), len(board.laws), **shape)
     for line, (scenario, (low, high)) in enumerate(zip(board.scenarios, boxes, strict=True)):
-        plan, flown = planned_figure(scenario), resolved("consensus", scenario, 1)  # with the obstacles of all laws
+        plan, flown = planned_figure(scenario), resolved("consensus", scenario, 1)  # same obstacles for all laws
         for axes, law in zip(panels[line], board.laws, strict=True):
             axes.set_aspect("equal")
             axes.set_xlim(low[0], high[0])
@@ -150,7 +150,7 @@ def _ways(board: Board, first: dict[tuple[str, str], Row]) -> style.ReportFigure
 
 
 def _box(board: Board, scenario: str, first: dict[tuple[str, str], Row]) -> tuple[Any, Any]:
-    """Return the corners of the bounding box of all paths of a scenario, with a margin of one metre [m]."""
+    """Return the lower and upper corners [m] of the box around all paths of a scenario, with a margin of 1 m."""
     rows = [first[scenario, law] for law in board.laws if (scenario, law) in first]
     places = np.concatenate([np.zeros((1, 2)), *(np.array(row["track_m"], float).reshape(-1, 2) for row in rows)])
     return np.nanmin(places, axis=0) - 1.0, np.nanmax(places, axis=0) + 1.0

@@ -1,12 +1,12 @@
-"""How well a formation was flown, in measures that all laws share, from the true motion within the report's window.
+"""Measures, shared by all laws, of how well a formation was flown, from the true motion within the report's window.
 
-`measures` is a function for `report.metrics`, so that sweeps over parameters of a law can have them, too:
+`measures` is a function for `report.metrics`, so that sweeps over a law's parameters can have them too:
 
     zsim sweep scenario.yaml --vary agents.pilot.parameters.gain_1_s=0.2,0.4 \
         --set report.metrics=zsim_analysis.board.measures:measures
 
 Only drones in the air are measured: if a formation has lost one, the measures are those of the others. The reference is
-always that of the plan, even while drones were held.
+always the plan's, even while drones are held.
 """
 
 from dataclasses import replace
@@ -29,16 +29,16 @@ class Figure(NamedTuple):
     """The desired figure of a formation."""
 
     reference: FormationReference
-    places: Array | None  # (n, 2) positions of the drones in the figure [m]; None for laws without them
-    invariances: tuple[str, ...]  # what of the places the law leaves open
+    places: Array | None  # (n, 2) positions of the drones in the figure [m]; None for laws without positions
+    invariances: tuple[str, ...]  # of "translation", "rotation" and "scale", those that the law leaves open
 
 
 class Wanted(NamedTuple):
     """The desired figure of a formation over time."""
 
     centre: Array  # (T, 2) desired centre [m; W]
-    places: Array | None  # (T, n, 2) desired positions [m; W]; None for laws without them
-    invariances: tuple[str, ...]  # what of the places the law leaves open
+    places: Array | None  # (T, n, 2) desired positions [m; W]; None for laws without positions
+    invariances: tuple[str, ...]  # as in `Figure`
 
 
 class Flown(NamedTuple):
@@ -50,21 +50,21 @@ class Flown(NamedTuple):
 
 
 def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, float | None]:
-    """Return the measures of a flight; None for those that it does not have.
+    """Return the measures of a flight; None for a measure that it does not have.
 
-    shape_error_m: root mean square distance of the drones from the figure's positions, after the best translation,
-        rotation or scaling that the law leaves open; for a lattice, the deviation of its sides from the spacing.
+    shape_error_m: RMS distance of the drones from the figure's positions, after the best translation, rotation and
+        scaling that the law leaves open; for a lattice, RMS deviation of its sides from the spacing.
     place_error_m: the same distance without any fit. None for flocks, which have no desired positions.
-    centre_error_m: root mean square distance of the drones' centre from the desired one.
+    centre_error_m: RMS distance of the drones' centre from the desired one.
     effort_m2_s: integral of the squared horizontal velocity command over the whole flight, mean over the drones.
-    separation_m: minimum distance of two drones in the air.
+    separation_m: minimum distance between two drones in the air.
     messages_per_drone_s: messages to others, per drone and simulated second: those of the pilots, or the estimates
-        that a controller needs and the commands that it gives.
+        that a controller reads and the commands that it sends.
     cpu_per_s: CPU time of the whole flight in one process, per simulated second; None for a record.
 
     Args:
         flight: the flight as arrays.
-        figure: the desired figure; None: that of the pilots' parameters.
+        figure: the desired figure; None: that in the pilots' parameters.
     """
     flown = flown_of(flight, figure)
     window_s, _ = window_of(flight)
@@ -89,7 +89,7 @@ def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, 
 
 
 def flown_of(flight: RecordedFlight, figure: Figure | None = None, whole: bool = False) -> Flown:
-    """Return the motion of all drones within the window of the report, or over the whole flight."""
+    """Return the motion of all drones within the report's window, or over the whole flight."""
     (start, end), _ = window_of(flight)
     if whole:
         start, end = flight.first_ns / 1e9, flight.last_ns / 1e9
@@ -109,8 +109,8 @@ def flown_of(flight: RecordedFlight, figure: Figure | None = None, whole: bool =
 def shape_errors(flown: Flown) -> Array:
     """Return the root mean square distance from the best-fitting positions over time (T,) [m].
 
-    The figure is translated, rotated and scaled as far as the law leaves it open. NaN without desired positions, and
-    with fewer than two drones in the air.
+    The figure is translated, rotated and scaled to fit, where the law leaves this open. NaN if there are no desired
+    positions or fewer than two drones are in the air.
     """
     wanted = flown.wanted
     if wanted is None or wanted.places is None:
@@ -128,7 +128,7 @@ def shape_errors(flown: Flown) -> Array:
 
 
 def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
-    """Return the root mean square deviation of the sides within range from the spacing over time (T,) [m]."""
+    """Return the root mean square deviation from the spacing of all sides below `reach_m`, over time (T,) [m]."""
     i, j = np.triu_indices(p.shape[1], 1)
     lengths = np.linalg.norm(p[:, i] - p[:, j], axis=2)
     squared = np.where(lengths < reach_m, (lengths - spacing_m) ** 2, np.nan)
@@ -136,7 +136,7 @@ def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
 
 
 def law_of(scenario: Scenario | None) -> tuple[type[Pilot], Any] | None:
-    """Return the law by which pilots fly a scenario, and its parameters; None if there is none."""
+    """Return the law by which pilots fly a scenario, and its parameters; None if no law flies it."""
     for own in scenario.own_agents.values() if scenario else ():
         kind: Any = plugin.load(own.named, "class", object)
         if issubclass(kind, Pilot):
@@ -196,7 +196,7 @@ def _within(track: Track, window_s: tuple[float, float]) -> Track:
 
 
 def _mean(values: Any) -> Any:
-    """Return the mean over the drones, the second axis; NaN if there are none."""
+    """Return the mean over the drones (second axis), ignoring NaN; NaN where all are NaN."""
     known = ~np.isnan(values)
     count = known.sum(axis=1)
     return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)

@@ -1,14 +1,14 @@
-"""Numbers and figures of the laws' papers, recomputed with the laws as flown, on ideal agents in place of drones.
+"""Numbers and figures of the laws' papers, recomputed with the flown laws on ideal agents instead of drones.
 
 margins     R. Olfati-Saber, R. M. Murray, Consensus problems in networks of agents with switching topology and
             time-delays, IEEE Trans. Automatic Control 49 (2004): errors decay at the rate lambda_2, and consensus
-            oscillates from a delay of pi / (2 lambda_n) on, if own states are as late as those of others
+            oscillates from a delay of pi / (2 lambda_n) on, if an agent's own state is as delayed as the others'
 flocking    R. Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic
             Control 51 (2006): relative connectivity, deviation energy and velocity mismatch of a flock in free space
-            with the paper's parameters, with and without the term of the group's aim
+            with the paper's parameters, with and without the term for the group's aim
 bearings    S. Zhao, D. Zelazo, Bearing rigidity and almost global bearing-only formation stabilization, IEEE Trans.
-            Automatic Control 61 (2016): centroid and scale are invariant, and the shape is reached from almost
-            everywhere
+            Automatic Control 61 (2016): centroid and scale are invariant, and the shape is reached from almost all
+            starts
 """
 
 import math
@@ -44,15 +44,15 @@ GRAPHS: dict[str, Graph] = {
 }
 STEPS_OF_DELAY = 120  # Euler steps per delay
 DELAYS = 80  # number of delays for which a network is integrated
-D, R, FLOCK, AREA_STD = 7.0, 8.4, 150, 50.0  # the paper's spacing and range [m], agents, spread of their starts [m]
-FLOCK_C1 = {"alpha": 3.0, "gamma": 0.1}  # chosen, since the paper leaves them open
+D, R, FLOCK, AREA_STD = 7.0, 8.4, 150, 50.0  # the paper's: spacing, range [m], agents, std of starts [m]
+FLOCK_C1 = {"alpha": 3.0, "gamma": 0.1}  # design choice, as the paper leaves these gains open
 REACHED_M = 1e-3
-STARTS = 10  # number of random starts of shapes by bearings
+STARTS = 10  # number of random starts of the formation by bearings
 FLOCK_H_S, FLOCK_S = 0.02, 30.0
 
 
 class Line(Struct, frozen=True):
-    """A number of a paper, and the one computed here."""
+    """A number from a paper, and its value computed here."""
 
     paper: str
     what: str
@@ -87,9 +87,9 @@ def consensus_rate(graph: Graph, h: float = 0.005) -> float:
 
 
 def delay_margin(graph: Graph) -> float:
-    """Return the smallest delay of all states at which consensus no longer settles [s].
+    """Return the smallest delay, common to all states, at which consensus no longer settles [s].
 
-    The network is integrated for many delays at once, each of them a dimension with its own step; the margin is where
+    The network is integrated for many delays at once, each a dimension with its own step; the margin is where
     the growth of the fastest mode changes sign.
     """
     near, values, vectors = [neighbours(graph, i) for i in range(N)], *np.linalg.eigh(laplacian(graph))
@@ -97,7 +97,7 @@ def delay_margin(graph: Graph) -> float:
     h, zero = delays / STEPS_OF_DELAY, np.zeros(DELAYS)
     past = [np.repeat(vectors[:, -1:], DELAYS, axis=1)] * (STEPS_OF_DELAY + 1)
     peaks = []
-    for _ in range(2):  # amplitude over ten periods of four delays, early and late
+    for _ in range(2):  # peak over ten periods (of four delays each), early and late
         peak = np.zeros(DELAYS)
         for _ in range(10 * 4 * STEPS_OF_DELAY):
             late = past.pop(0)
@@ -121,7 +121,7 @@ class FlockTrack(NamedTuple):
 
 @cache
 def free_flock(n: int = FLOCK, with_aim: bool = True, seed: int = 1) -> FlockTrack:
-    """Return the flock of the paper's section on simulations, with its scattered start and its parameters."""
+    """Return the track of the flock in the paper's simulation section, with its scattered start and parameters."""
     draw = stream(seed, "papers/flock")
     p, v = draw.normal(0.0, AREA_STD, (n, 2)), draw.uniform(-2.0, -1.0, (n, 2))
     rows = []
@@ -160,7 +160,7 @@ def _connectivity(pairs: list[list[int]]) -> float:
 
 
 class BearingTrack(NamedTuple):
-    """A shape by bearings from one start."""
+    """A formation controlled by bearings alone, from one start."""
 
     t_s: Array  # (T,)
     error: Array  # sum over the edges of |g - g*|
@@ -171,7 +171,7 @@ class BearingTrack(NamedTuple):
 
 @cache
 def bearing_flight(seed: int = 1, h: float = 0.05, duration_s: float = 80.0) -> BearingTrack:
-    """Return the pentagon with two diagonals from a random start, integrated by Runge–Kutta of fourth order."""
+    """Return the track of a pentagon with two diagonals from a random start, by fourth-order Runge–Kutta."""
     graph, c = [*RING, (0, 2), (0, 3)], polygon(N, 1.0)
     near = [neighbours(graph, i) for i in range(N)]
 
@@ -207,7 +207,7 @@ def _scale(p: Array) -> float:
 
 
 def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
-    """Yield the papers' numbers beside those computed with the laws here."""
+    """Yield the papers' numbers beside those computed here with the laws."""
     for name, graph in GRAPHS.items():
         progress(f"consensus, {name} …")
         values = np.linalg.eigvalsh(laplacian(graph))

@@ -1,1 +1,1 @@
-"""A flight in one file: written from the folder of a run, checked, and flown again on another machine."""
+"""A flight in one file: written from a run's folder, checked, and flown again on another machine."""

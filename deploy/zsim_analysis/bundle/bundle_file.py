@@ -1,8 +1,8 @@
-"""The file of a bundle: a zip archive with the same bytes for the same content, fully checked before any use.
+"""The bundle file: a zip archive with the same bytes for the same content, fully checked before any use.
 
 Members are stored, not compressed: zlib's output depends on its version, and a stored member cannot be larger than the
-file that contains it. `bundle.json` lists the content of a bundle, with the hash of each member and, as `seal`, of
-itself. This detects changes by accident or by hand; it is not a signature.
+file that contains it. `bundle.json` lists a bundle's content with the hash of each member and, as `seal`, its own.
+These hashes detect accidental and manual changes; they are not a signature.
 """
 
 import hashlib
@@ -32,11 +32,11 @@ MEMBERS_MAX = 5000
 MANIFEST_BYTES_MAX = 4 << 20
 NAME_MAX = 200  # longest name of a member [characters]
 PIECE_BYTES = 1 << 20
-DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can state
+DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can hold
 MODE = (stat.S_IFREG | 0o644) << 16
-UNIX = 3  # stated as the system that wrote the archive, on any system
+UNIX = 3  # stored as the creating system on every system, so that the bytes are the same
 PIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?==[A-Za-z0-9][A-Za-z0-9.!+_]*")  # a line of the lock
-EXTRAS = ("agents", "record", "report", "world")  # zsim's extras that fly a bundle again and draw its figures
+EXTRAS = ("agents", "record", "report", "world")  # extras that a rerun and its figures need
 PART = re.compile(r"\w[\w.+@ -]*(?<![ .])")  # part of a member's path: no `..`, no drive, nothing hidden
 
 
@@ -51,22 +51,22 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The content of a bundle, and the expected results of flying it again: `bundle.json`."""
 
     format: int
-    zsim: str  # version of zsim that flew it
-    commit: str  # commit of zsim when it was bundled; empty if unknown
+    zsim: str  # version of zsim that flew the bundled run
+    commit: str  # commit of zsim at bundling; empty if unknown
     name: str  # name of the scenario
     seed: int
     duration_s: float
     scenario_sha256: str
     truth_sha256: str
-    outputs: dict[str, str]  # SHA-256 of the agents' outputs by key, as in OutputHashes; empty: none are run again
-    until_ns: int  # last gate whose outputs are compared; those for later gates may be missing on record
+    outputs: dict[str, str]  # SHA-256 of the agents' outputs by key, as in OutputHashes; empty if none are run again
+    until_ns: int  # last gate whose outputs are compared; those of later gates may be missing from the record
     own_code: list[str]  # users' classes, functions and modules that the scenario names
-    needs: list[str]  # NAME==VERSION of packages that these import besides zsim's
-    not_run_again: str  # why commands are read from the record and no agents are run again; empty if they are
+    needs: list[str]  # NAME==VERSION of the packages other than zsim's that these import
+    not_run_again: str  # why commands are read from the record instead of running the agents again; else empty
     fingerprints: list[str]  # fingerprints of the world and its agents
-    machine: dict[str, str]  # machine that flew it; empty if it was bundled on another
+    machine: dict[str, str]  # machine that flew the run; empty if it was bundled on another
     files: dict[str, File]  # all other members by path
-    seal: str = ""  # SHA-256 of the manifest as text with this field empty
+    seal: str = ""  # SHA-256 of the manifest's text with this field empty
 
     def sealed(self) -> "Manifest":
         blank = msgspec.structs.replace(self, seal="")
@@ -84,7 +84,7 @@ class WrittenBundle(NamedTuple):
 
 
 def refuse_existing(out: Path, force: bool) -> None:
-    """Raise RunError if the file of a bundle exists, and `force` does not say to replace it."""
+    """Raise RunError if `out` exists and `force` does not allow replacing it."""
     if out.exists() and not force:
         raise RunError(f"{out}: already exists; --force replaces it, or {OTHER_OUT}")
 
@@ -95,11 +95,11 @@ def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | byt
     Args:
         out: path of the bundle.
         manifest: the manifest without `files`.
-        members: content, or the file with it, by path in the bundle.
+        members: by path in the bundle, the content or the file that holds it.
         force: whether to replace an existing file.
 
     Raises:
-        RunError: the file exists, or cannot be written.
+        RunError: the file exists or cannot be written.
     """
     refuse_existing(out, force)
     files = {name: File(*_hashed(content)) for name, content in sorted(members.items())}
@@ -125,10 +125,10 @@ def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | byt
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[Manifest, Path]]:
-    """Check a bundle; yield its manifest, and a folder with its members, which is removed afterwards.
+    """Check a bundle; yield its manifest and a temporary folder with its members.
 
     Raises:
-        RunError: the file is not a bundle, or was changed; the error names the member, and what was found and expected.
+        RunError: no bundle, or a changed one; the error names the member, and what was found and expected.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -165,7 +165,7 @@ def other_versions(lock: Iterable[str]) -> list[str]:
 
 
 def pins_of(text: str, where: str) -> list[str]:
-    """Return the lines of a lock; RunError if one is not NAME==VERSION but, for example, an option or a URL."""
+    """Return the lines of a lock; raise RunError if one is not NAME==VERSION but, for example, an option or a URL."""
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     for line in lines:
         if not PIN.fullmatch(line):
@@ -174,7 +174,7 @@ def pins_of(text: str, where: str) -> list[str]:
 
 
 def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
-    """Return the manifest of an archive after checking that it lists all members, which are plain files of its size."""
+    """Return an archive's manifest after checking its seal and that it lists all members, which must be plain files."""
     entries = archive.infolist()
     if len(entries) > MEMBERS_MAX:
         raise RunError(f"{path}: has {len(entries)} members; must be <= {MEMBERS_MAX}")
@@ -213,7 +213,7 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
 
 
 def _fault_of(entry: zipfile.ZipInfo, names: set[str]) -> str:
-    """Describe what is wrong with a member; empty if nothing is."""
+    """Return what is wrong with a member; empty if nothing is."""
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     parts = name.split("/")
     if len(name) > NAME_MAX or not all(PART.fullmatch(part) for part in parts) or name != entry.orig_filename:
@@ -243,7 +243,7 @@ def _extract(path: Path, archive: zipfile.ZipFile, name: str, expected: File, fo
 
 
 def _hashed(content: Path | bytes) -> tuple[str, int]:
-    """Return the SHA-256 and the size in bytes of a content."""
+    """Return the SHA-256 and the size in bytes of `content`."""
     digest, size = hashlib.sha256(), 0
     for piece in _pieces(content):
         digest.update(piece)

@@ -1,4 +1,4 @@
-"""Flies a bundle again, and compares the results with those that it states."""
+"""Flies a bundle again and compares the results with those it states."""
 
 import time
 from collections.abc import Callable
@@ -26,11 +26,11 @@ from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, conten
 from zsim_analysis.rerun import rerun_record
 
 Say = Callable[[str], None]
-SHOWN = 8  # most differences in a line
+SHOWN = 8  # most differences listed in a line
 
 
 def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
-    """Fly a bundle again; return how the truth or an agent's outputs differ, empty if all are identical to the bit.
+    """Fly a bundle again; return how the truth or an agent's outputs differ, empty if all are bit-identical.
 
     Args:
         path: path of the bundle.
@@ -38,7 +38,7 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
 
     Raises:
         RunError: the file is not a bundle, was changed, or names code of its own that may not be run.
-        ScenarioError, RecordError: this version cannot read its scenario or its record.
+        ScenarioError, RecordError: this version cannot read the bundle's scenario or record.
     """
     with opened(path) as (manifest, folder):
         scenario = check_content(path, manifest, folder)
@@ -62,7 +62,7 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
 
 
 def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
-    """Return the scenario of a bundle after checking that it matches the record, and may be flown here.
+    """Return the scenario of a bundle after checking that it matches manifest and record and may be flown here.
 
     Raises:
         RunError: the scenario does not match manifest and record, or names code that may not be run.
@@ -115,7 +115,7 @@ def _fly_again(manifest: Manifest, folder: Path, scenario: Scenario, say: Say) -
 
 
 class _Watch:
-    """Hashes the messages of a flight, as `make_bundle` does with those on record."""
+    """Hashes the messages of a flight, as `make_bundle` hashes those of a record."""
 
     def __init__(self, flight: InProcessFlight, manifest: Manifest, screen: Screen) -> None:
         self.hashes, self.digests = OutputHashes(manifest.until_ns), GateDigests(manifest.until_ns)
@@ -123,13 +123,13 @@ class _Watch:
         self._screen, self._throttle, self._start_s = screen, RateLimit(PERIOD_S), time.monotonic()
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Add an agent's output."""
+        """Hash an agent's output."""
         if recorded_run.is_answer(key):
             self.hashes.add(key, message.t_ns, content := content_of(message))
             self.digests.add(key, message.t_ns, content)
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
-        """Add the truth of a gate."""
+        """Hash the truth of a gate."""
         if self._throttle.spend():
             rate = gate.t_ns / 1e9 / max(1e-9, time.monotonic() - self._start_s)
             self._screen.clock({"t_s": gate.t_ns / 1e9, "rate": rate, "state": "again", "phase": "", "waiting_for": []})

@@ -1,4 +1,4 @@
-"""Makes the bundle of a run from its record, without absolute paths and host names."""
+"""Makes the bundle of a run from its record, without absolute paths or host names."""
 
 import ast
 import base64
@@ -48,28 +48,28 @@ from zsim_analysis.report.summary import judge
 from zsim_world.run.coordinator import FLIGHT_REQUESTS
 
 PROJECT = "zsim"
-BYTES_MAX = 50_000_000  # largest total size of users' modules, which are to be code, not data
+BYTES_MAX = 50_000_000  # largest total size of users' modules, which should hold code, not data
 MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 PATH = re.compile(r"(?<![\w./~-])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"()]+[/\\])+")  # the folders of an absolute path
-FREE_TEXT = ("text", "reason", "error", "failure")  # fields of messages that hold free text
+FREE_TEXT = ("text", "reason", "error", "failure")  # message fields that hold free text
 OF_THE_WALL_CLOCK = (
     *("run_id", "date", "changed", "versions", "fingerprint", "mode", "real_time_factor", "wall_s", "command_age_ms"),
     *("deadlines", "deadline_misses", "deadline_misses_by", "links", "participants", "events", "events_left_out"),
     *("record", "notes"),
-)  # fields of a summary about the circumstances of the flight, not its results
+)  # summary fields that describe the circumstances of a flight, not its results
 
 
 def make_bundle(
     place: Path, out: Path | None, with_record: bool, force: bool, note: Callable[[str], None]
 ) -> WrittenBundle:
-    """Write the bundle of the run in a folder, or of a record.
+    """Write the bundle of a run.
 
     Args:
         place: the folder of the run, or its record.
-        out: the file; None for the scenario's name in the working folder.
+        out: the bundle file; None: named after the scenario, in the working folder.
         with_record: whether to include the record; only a flight that its scenario alone reproduces can do without.
         force: whether to replace an existing file.
-        note: called with each line on what the bundle lacks.
+        note: called with a line for each thing that the bundle lacks or does not hide.
 
     Raises:
         RunError: the record is not that of a complete flight that can be flown again, the scenario names something
@@ -161,9 +161,9 @@ def _texts(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
 
 
 class _Expected:
-    """What flying a record again must give: `hashes` of the agents' outputs, and `digests` of all keys, gate by gate.
+    """Expected results of a rerun: `hashes` of the agents' outputs, and `digests` of outputs and truth, gate by gate.
 
-    `others` names the inputs of the flight that did not come from the scenario; empty if there were none.
+    `others` names the inputs of the flight that did not come from the scenario; empty if all did.
     """
 
     def __init__(self, run: RecordedRun, agents: RecordedAgents) -> None:
@@ -197,7 +197,7 @@ class _Expected:
 
 
 class _Hosts:
-    """The hosts of a run, and the placeholders of their names in a bundle."""
+    """The hosts of a run, and the placeholders for their names in a bundle."""
 
     def __init__(self, reader: RecordReader) -> None:
         joins = (key for key in reader.topics() if keys.matches("process/*/join", key))
@@ -211,7 +211,7 @@ class _Hosts:
         return set(self._names) == {name}
 
     def removed(self, value: Any, field: str = "") -> Any:
-        """Return a part of a message without host names and folders."""
+        """Return a part of a message with host names replaced and folders removed."""
         if isinstance(value, dict):
             return {name: self.removed(each, str(name)) for name, each in value.items()}
         if isinstance(value, list):
@@ -229,7 +229,7 @@ class _Hosts:
 def _copy_record(
     reader: RecordReader, into: Path, hosts: _Hosts, has_modules: bool, note: Callable[[str], None]
 ) -> None:
-    """Copy a record without host names and folders, except in what drones and agents have published."""
+    """Copy a record without host names and folders, but leave unchanged what drones and agents have published."""
     own_host = socket.gethostname().encode()
     noted: set[str] = set()
     with RecordWriter(into) as writer:
@@ -257,10 +257,10 @@ def _without_folders(payload: bytes, has_modules: bool) -> bytes:
     return messages.encode(msgspec.structs.replace(info, module_folders=folders, changed=changed))
 
 
-# What a flight needs of this machine: users' modules, and packages with their versions
+# What a flight needs from this machine: users' modules, and packages with their versions
 #
-# Nothing is imported: modules are located as Python does, and their imports are read from their source. Imports of
-# names that are assembled at run time are not found.
+# Nothing is imported: modules are located as Python locates them, and their imports are read from their source. Imports
+# whose names are assembled at run time are not found.
 
 
 class OwnModules(NamedTuple):
@@ -271,14 +271,14 @@ class OwnModules(NamedTuple):
 
 
 def own_modules(names: Iterable[str]) -> OwnModules:
-    """Return users' modules: those of the given classes, functions and modules, and all that they import in turn.
+    """Return users' modules: those of the given classes, functions and modules, and all that these import in turn.
 
     Args:
         names: as returned by `Scenario.own_code`.
 
     Raises:
         DocumentError: a module is not found.
-        RunError: the modules are too large, or cannot be read.
+        RunError: the modules are too large or cannot be read.
     """
     found = OwnModules({}, set())
     wanted = [(name.partition(":")[0], True) for name in names]
@@ -310,7 +310,7 @@ def own_modules(names: Iterable[str]) -> OwnModules:
 
 
 def _sources(package: str, places: Iterable[Path]) -> Iterator[tuple[Path, str]]:
-    """Yield the files of a module or a package, and their paths relative to the folder that contains it."""
+    """Yield the files of a module or a package, with their paths relative to the folder that contains it."""
     for place in places:
         if place.is_file() and place.name != "__init__.py":
             yield place, place.name
@@ -324,7 +324,7 @@ def _sources(package: str, places: Iterable[Path]) -> Iterator[tuple[Path, str]]
 
 
 def _imports(path: Path) -> set[str]:
-    """Return the modules that a module imports; for one generated for a notebook's class, those its pickle names."""
+    """Return the modules that a module imports; for one generated for a notebook's class, also those in its pickle."""
     try:
         tree = ast.parse(path.read_bytes())
     except (OSError, SyntaxError, ValueError) as error:
@@ -346,7 +346,7 @@ def _imports(path: Path) -> set[str]:
 
 
 def locked(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
-    """Return lines NAME==VERSION of installed packages: all that zsim and the given packages need, and the given ones.
+    """Return lines NAME==VERSION of all packages that zsim and the given packages need, and those of the given ones.
 
     A package that was not installed from an index has no line.
 
@@ -385,7 +385,7 @@ def _canonical(name: str) -> str:
 
 
 def _add_figures(members: dict[str, Path | bytes], record: Path) -> None:
-    """Add the figures of the report, the curves of each as a table, and the numbers of the summary."""
+    """Add the report's figures, the curves of each as a table, and the numbers of the summary."""
     flight, formations, summary = judge(record, answers=True)
     for figure in figures(flight, formations, summary):
         members[f"{names.FIGURES}/{figure.name}"] = figure.png()

@@ -1,7 +1,7 @@
 """Selected messages of a record as tables: which keys and times, which columns, and rows in batches.
 
 The columns of a message of the contract follow from its type: vectors become a column per component, variables and
-sensors a column per name, and content without a fixed shape becomes JSON text. All formats of tables use them.
+sensors a column per name, and content without a fixed shape becomes JSON text. All table formats use these columns.
 """
 
 import math
@@ -24,7 +24,7 @@ from zsim.scenario.faults import ROTORS
 from zsim.sensors.sensor import sensor_of
 from zsim_analysis.reading.recorded_run import decode_or_none
 
-CELLS = 100_000  # cells of a batch: some 5 MB as Python objects
+CELLS = 100_000  # cells per batch: about 5 MB as Python objects
 PROGRESS_EVERY = 10_000  # messages between two calls of `progress`
 WHOLE_MAX = 2**63 - 1
 QUATERNION, NO_WORD = "_wxyz", r"\W"
@@ -39,15 +39,15 @@ class MessageSelection(NamedTuple):
     """Keys and times to be exported."""
 
     expressions: tuple[str, ...] = ()  # key expressions as in Zenoh; empty: every key
-    from_s: float | None = None  # simulated time of the first message [s]; None: the start
-    to_s: float | None = None  # simulated time of the last message [s]; None: the end
+    from_s: float | None = None  # simulated time from which on to export [s]; None: from the start
+    to_s: float | None = None  # simulated time up to which to export [s]; None: to the end
 
     def keys(self, reader: RecordReader) -> list[str]:
         every = not self.expressions
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
     def messages(self, reader: RecordReader, wanted: list[str]) -> Iterator[Recorded]:
-        """Yield the messages of some keys within the times, in order of simulated time."""
+        """Yield the messages of the `wanted` keys within the times, in order of simulated time."""
         first = 0 if self.from_s is None else round(self.from_s * 1e9)
         last = 2**64 if self.to_s is None else round(self.to_s * 1e9)
         return (message for message in reader.messages(frozenset(wanted)) if first <= message.t_ns <= last)
@@ -76,13 +76,13 @@ class Columns(NamedTuple):
     # returns a value per row, or a table (rows, columns), with None or NaN for missing values
     values: Callable[[RowBatch], Values]
     names: tuple[str, ...] = ()  # names of variables with a column each; empty for other fields
-    keys: Mapping[str, slice] = {}  # columns of each key of a map; empty for other fields
+    keys: Mapping[str, slice] = {}  # columns of each key of a map field; empty for other fields
 
 
 def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tuple[Columns, ...]:
-    """Return the columns of the table of a message type, given the names or keys that occur in each open field."""
+    """Return the columns of a message type's table, given the names or keys that occur in each open field."""
     opens = open_fields(kind)
-    hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # other columns carry the `names`
+    hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # column names carry the `names`
     own = [field for field in _fields(kind) if field.name not in hidden]
     return (
         Columns("name", "text", ("name",), lambda batch: batch.names),
@@ -113,7 +113,7 @@ def as_array(kind: Kind, values: Values) -> NDArray[Any]:
 
 
 def open_fields(kind: type[Struct]) -> dict[str, Literal["named", "numbers", "pairs"]]:
-    """Return the fields of a message whose columns depend on content: named variables, maps of numbers or pairs."""
+    """Return the fields of a message whose columns depend on its content: named variables, maps of numbers or pairs."""
     opens: dict[str, Literal["named", "numbers", "pairs"]] = {}
     for field in _fields(kind):
         match field.type:
@@ -171,7 +171,7 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
 
 
 def _plain(name: str, kind: Kind, path: str = "", convert: Callable[[Any], Any] = lambda value: value) -> Columns:
-    """Return the column of a field, or of the value at a path from the message, converted."""
+    """Return the column of a field, or of the value at `path` within the message, converted by `convert`."""
     get = attrgetter(path or name)
 
     def values(batch: RowBatch) -> Values:
@@ -181,9 +181,9 @@ def _plain(name: str, kind: Kind, path: str = "", convert: Callable[[Any], Any] 
 
 
 def _open(name: str, names: Sequence[str], kind: str) -> Columns:
-    """Return a column for each name or key of an open field, or two for pairs: FIELD_KEY_used and FIELD_KEY_refused.
+    """Return a column for each name or key of an open field, or for pairs two: FIELD_KEY_used and FIELD_KEY_refused.
 
-    The messages' `names` may differ from message to message.
+    Messages may differ in their `names`.
     """
     ends = [f"_{end}" for end in COUNTS] if kind == "pairs" else [""]
     columns = tuple(f"{name}_{re.sub(NO_WORD, '_', each)}{end}" for each in names for end in ends)
@@ -193,7 +193,7 @@ def _open(name: str, names: Sequence[str], kind: str) -> Columns:
         table = np.full((len(batch.messages), len(columns)), np.nan)
         for row, message in zip(table, batch.messages, strict=True):
             content = getattr(message, name)
-            if kind == "named":  # at once, since large formations have thousands
+            if kind == "named":  # all at once, as large formations have thousands
                 row[[places[each].start for each in message.names]] = content
                 continue
             for each, value in content.items():
@@ -209,7 +209,7 @@ def _components(name: str, info: inspect.Type) -> list[str]:
     """Return the columns of a field with a fixed number of elements; empty for any other field."""
     if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
         parts = [f"{i}{j}" for i in range(6) for j in range(6)]
-    elif isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more rotors, the first four
+    elif isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # at most the first four
         parts = list(ROTORS)
     elif not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
         parts = []
@@ -219,14 +219,14 @@ def _components(name: str, info: inspect.Type) -> list[str]:
 
 
 def component_names(name: str, count: int) -> list[str]:
-    """Return the columns of a vector: `_x` to `_z` of three numbers, `_w` to `_z` of a quaternion, or else indices."""
+    """Return the columns of a vector: `_x` to `_z` for three numbers, `_w` to `_z` for a quaternion, else indices."""
     if name.endswith(QUATERNION) and count == len("wxyz"):
         return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
     return [f"{name}_{part}" for part in ("xyz" if count == 3 else range(count))]
 
 
 def json_text(value: Any) -> str:
-    """Return a value as JSON, with types unknown to JSON as their repr."""
+    """Return a value as JSON, in which values of types unknown to JSON become their repr."""
     try:
         return msgspec.json.encode(value, enc_hook=repr).decode()
     except REFUSALS:  # e.g. keys that are not text
@@ -242,7 +242,7 @@ class Foreign(Struct, frozen=True):
 
 
 class Sighting(Struct, frozen=True):
-    """A row for a hat that was seen in a picture, or for a picture without any, with NaN for its numbers.
+    """A row for a hat seen in a picture, or for a picture without hats, with NaN for the numbers of a hat.
 
     `hats` is the number of hats in the picture, `hat` the index of this one, from 0.
     """
@@ -263,8 +263,8 @@ class Sighting(Struct, frozen=True):
 class TableSurvey:
     """The tables of a selection, found in a first pass over the record: the `wanted` keys, and `kinds`, their types.
 
-    `pictures` is the number of pictures, which are in no table. `rows` is the number of messages by type, with None for
-    foreign keys, including messages that are outside the times or cannot be decoded.
+    `pictures` is the number of pictures, which are in no table. `rows` counts messages by type (None for foreign keys),
+    including those that are outside the times or cannot be decoded.
     """
 
     def __init__(self, reader: RecordReader, selection: MessageSelection) -> None:
@@ -274,16 +274,16 @@ class TableSurvey:
         chosen = selection.keys(reader)
         self.pictures = sum(counts[key] for key in chosen if messages.type_of(key) is CameraImage)
         if not selection.expressions:
-            chosen = [key for key in chosen if not keys.is_accepted(key)]  # these repeat commands that have rows
+            chosen = [key for key in chosen if not keys.is_accepted(key)]  # these repeat commands, which have rows
         self.wanted = [key for key in chosen if messages.type_of(key) is not CameraImage]
         if (info := reader.last(keys.INFO)) is not None:
-            decode_or_none(info)  # registers the messages of users' sensors
+            decode_or_none(info)  # registers the message types of users' sensors
         self.kinds = {key: kind for key in self.wanted if (kind := messages.type_of(key))}
         self.rows: Counter[type[Struct] | None] = Counter()
         for key in self.wanted:
             self.rows[self.kinds.get(key)] += counts[key]
         opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
-        self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # those in the open fields of all messages
+        self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # names in the open fields of all messages
             kind: {field: {} for field in opens} for kind, opens in opened.items()
         }
         wanted = [key for key, kind in self.kinds.items() if opened[kind]]
@@ -304,12 +304,12 @@ class TableSurvey:
         return sum(len(each.columns) for each in self.table(kind))
 
     def rows_within(self, kind: type[Struct]) -> int:
-        """Return the number of messages of a type within the times, which takes reading them all."""
+        """Return the number of messages of a type within the times, by reading them all."""
         wanted = [key for key, of in self.kinds.items() if of is kind]
         return sum(1 for _ in self._selection.messages(self._reader, wanted))
 
     def decode(self, recorded: Recorded) -> Any:
-        """Return a message, as Foreign if its key is foreign; None if it does not match the type of its key."""
+        """Return the message, a Foreign if its key is not in the contract; None if it does not match its key's type."""
         if recorded.key in self.kinds:
             return decode_or_none(recorded)
         try:
@@ -344,7 +344,7 @@ class DecodedMessages:
 def batches(
     decoded: Iterable[tuple[Recorded, Any]], width: Callable[[type[Struct]], int], by_name: bool = False
 ) -> Iterator[RowBatch]:
-    """Yield the rows of all tables, given messages in order of time, which each table keeps.
+    """Yield the rows of all tables from messages in order of time; each table keeps this order.
 
     Batches of wide tables have fewer rows. With `by_name`, each drone, cluster and process has its own tables.
     """

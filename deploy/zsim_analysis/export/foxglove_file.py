@@ -1,6 +1,6 @@
-"""Writes a record as a file for Foxglove, ordered by time and in bounded memory: its topics, and when each is written.
+"""Writes a record as a Foxglove file, in order of time and in bounded memory: its topics, and when each is written.
 
-Foxglove shows all of them; Rerun reads the transforms, poses, points, fixes, pictures, log and numbers.
+Foxglove shows all topics; Rerun reads the transforms, poses, points, fixes, pictures, log and numbers.
 """
 
 import math
@@ -41,11 +41,11 @@ from zsim_analysis.reading.recorded_run import decode_or_none, scenario_of, sear
 TF, LOG, DRONES, GROUND, TRAILS = "/tf", "/log", "/scene/drones", "/scene/ground", "/scene/trails"
 FORMATIONS, ESTIMATES = "/scene/formations", "/scene/estimates"
 POINTS, DESIRED = "/points/drones", "/points/desired"
-SCENE_STEP_NS = 100_000_000  # interval between messages of a scene or of points
+SCENE_STEP_NS = 100_000_000  # interval between messages with scenes or points
 DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event, CameraImage, CameraInfo)
 LATEST_NS = 2**32 * 10**9  # Foxglove stores seconds in 32 bits
 ARM_M = 0.1785  # arm length of the AR.Drone, for drones of an unknown scenario
-ROTOR_RADIUS = 0.57  # share of the arm length, for unknown rotors: the AR.Drone's 0.102 m / 0.1785 m
+ROTOR_RADIUS = 0.57  # fraction of the arm length, for unknown rotors: the AR.Drone's 0.102 m / 0.1785 m
 
 
 class ConvertedRun(NamedTuple):
@@ -60,7 +60,7 @@ class ConvertedRun(NamedTuple):
 def convert(
     reader: RecordReader, selection: MessageSelection, path: Path, progress: Callable[[int, int], None]
 ) -> ConvertedRun:
-    """Write the MCAP file; return its content. `progress` is called with the numbers of messages read and in all."""
+    """Write the MCAP file; return its content. `progress` is called with the number of messages read and the total."""
     wanted = [key for key in selection.keys(reader) if messages.type_of(key) in DRAWN or key == keys.INFO]
     total = sum(reader.topics()[key] for key in wanted)
     recorded = reader.last(keys.INFO)
@@ -94,7 +94,7 @@ def convert(
 def deferred_signals() -> Iterator[Callable[[], None]]:
     """Defer SIGINT and SIGTERM; yield a function that handles those received meanwhile.
 
-    An exception raised by their handlers within a call of the library would only be printed, and lost.
+    An exception that their handlers raise within a call into the Foxglove library would be printed, then lost.
     """
     came: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
@@ -136,7 +136,7 @@ def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, 
 
 @dataclass
 class Instant:
-    """The messages of one time: the last one of each key, but all events and all messages of cameras."""
+    """The messages of one time: the last one of each key, but all events and all camera messages."""
 
     t_ns: int
     truth: dict[str, Truth] = field(default_factory=dict)
@@ -175,7 +175,7 @@ def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
 
 
 def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: Iterable[str]) -> Iterator[Instant]:
-    """Yield the newest calibrations from before the selected times, since cameras may publish them only once."""
+    """Yield the latest calibrations from before the selected times, as cameras may publish them only once."""
     from_ns = round((selection.from_s or 0.0) * 1e9)
     of_cameras = [key for key in wanted if messages.type_of(key) is CameraInfo]
     known: dict[str, CameraInfo] = {}
@@ -208,12 +208,12 @@ class FoxgloveFile:
         self.counts: Counter[str] = Counter()  # number of messages by topic
 
     def close(self) -> None:
-        """Finish the file; OSError if it could not be written."""
+        """Finish the file; raise OSError if it could not be written."""
         self._file.close()
         self._checked_file.close()
 
     def write(self, instant: Instant) -> None:
-        """Write all messages of one time; OSError if they cannot be written."""
+        """Write all messages of one time; raise OSError if they cannot be written."""
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
@@ -275,14 +275,14 @@ class FoxgloveFile:
             kind = NumericMessageType(f"Cluster_{build.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
             self.variables[name] = kind
         numbers = self.variables[name]
-        true = [math.nan] * len(state.names)  # stays unless all drones' truth is known and their shape is not singular
+        true = [math.nan] * len(state.names)  # kept unless all drones' truth is known and their shape is not singular
         space, truths = self._spaces.get(name), [instant.truth[d] for d in state.drones if d in instant.truth]
         if space is not None and space.names == state.names and len(truths) == len(state.drones):
             yaw = heading([truth.orientation_wxyz for truth in truths])
             with suppress(SingularClusterError):
                 true = space.forward(np.array([truth.position_m for truth in truths]), yaw).tolist()
         values = [*state.desired, *state.value, *true, state.margin]
-        if len(values) == len(numbers.numbers):  # after a change of the number of variables, no more are written
+        if len(values) == len(numbers.numbers):  # nothing more is written once the number of variables has changed
             encoded = numbers.encode(values, (state.phase, state.reason))
             self._log(f"/cluster/{name}/variables", numbers, encoded, instant.t_ns)
 
@@ -321,7 +321,7 @@ class FoxgloveFile:
         return True
 
     def _log(self, topic: str, channel: Any, message: Any, t_ns: int) -> None:
-        """Log a message on a topic; the topic's first message decides its channel, or its type of numbers."""
+        """Log a message on a topic; the topic's first message decides its channel or numeric type."""
         if topic not in self._channels:
             if isinstance(channel, NumericMessageType):
                 schema = foxglove.Schema(name=channel.name, encoding="protobuf", data=channel.schema)
@@ -334,13 +334,13 @@ class FoxgloveFile:
 
 
 def _camera_of(key: str) -> tuple[str, str]:
-    """Return drone and frame of a camera from its key; in the frame, x points right in the picture, y down, z ahead."""
+    """Return a camera's drone and frame from its key; in the frame, x points right in the picture, y down, z ahead."""
     _, drone, what = keys.parts(key)
     return drone, f"{build.frame(drone)}/{what.split('/')[1]}_camera"
 
 
 class CheckedFile:
-    """A file for a library that prints failed writes, each time anew, instead of raising an error.
+    """A file for a library that prints every failed write instead of raising an error.
 
     After a failed write, nothing more is written.
 
@@ -351,7 +351,7 @@ class CheckedFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb")
         self._failure: OSError | None = None
-        self._at = self._end = 0  # position and end of the file as the library knows them
+        self._at = self._end = 0  # position and end of the file as the library sees them
 
     def write(self, data: bytes | bytearray) -> int:
         self._try(self._file.write, data)
@@ -373,7 +373,7 @@ class CheckedFile:
             raise self._failure
 
     def close(self) -> None:
-        """Close the file; OSError if a write has failed."""
+        """Close the file; raise OSError if a write has failed."""
         self.flush()
         try:
             self._file.close()

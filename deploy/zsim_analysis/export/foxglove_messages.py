@@ -2,7 +2,7 @@
 
 Numbers are typed messages, which Foxglove plots and Rerun keeps as scalars. They are encoded as protobuf,
 https://protobuf.dev/programming-guides/encoding, with a `FileDescriptorSet` of google/protobuf/descriptor.proto as
-schema. Since only two kinds of fields are needed, this does without protobuf's library.
+schema. As only two types of fields are needed, the protobuf library is not used.
 
 At any time, Foxglove shows only the last message of a topic, so each scene message is complete.
 """
@@ -27,11 +27,11 @@ from zsim_analysis.export.columns import Values
 PACKAGE: Final = "zsim"
 WORLD = "world"
 DISTORTION_MODEL = "plumb_bob"  # k1, k2, p1, p2, k3, as in OpenCV
-_BYTES, _EIGHT = 2, 1  # wire types: length and bytes, eight bytes
+_BYTES, _EIGHT = 2, 1  # wire types: length-delimited, eight bytes
 _DOUBLE, _STRING = 1, 9  # FieldDescriptorProto.Type
 _OPTIONAL = 1  # FieldDescriptorProto.Label
 _FLOAT = struct.Struct("<d")
-FRAME = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw")  # variables that give the position of a cluster's frame
+FRAME = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw")  # variables that give the pose of a cluster's frame
 DRONE_NUMBERS = (
     *(f"{what}_{axis}_m" for what in ("true", "estimated") for axis in "xyz"),
     *(f"true_v{axis}_m_s" for axis in "xyz"),
@@ -41,7 +41,7 @@ DRONE_NUMBERS = (
     "sigma_m",
     "battery_percent",
 )
-# kinds of events by log level; all others are information
+# event kinds by log level; all others are logged as information
 WARNINGS = ("refused", "fingerprint", "outputs_missing", "fault", "landing")
 FAILURES = ("collision", *INCIDENTS, "death", "failure", "overdue", "diverged")
 _POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 4)])
@@ -70,7 +70,7 @@ class NumericMessageType:
             + _bytes(4, _bytes(1, name.encode()) + described)
             + _bytes(12, b"proto3")
         )
-        self.schema = _bytes(1, file)  # a FileDescriptorSet of this message only
+        self.schema = _bytes(1, file)  # a FileDescriptorSet with this message only
 
     def encode(self, numbers: Iterable[float], texts: Iterable[str] = ()) -> bytes:
         parts = [key + _FLOAT.pack(value) for key, value in zip(self._number_keys, numbers, strict=True)]
@@ -98,7 +98,7 @@ def _varint(value: int) -> bytes:
 
 
 def tidy(name: str) -> str:
-    """Convert a name to a part of a protobuf identifier."""
+    """Return a name in a form that fits into a protobuf identifier."""
     return re.sub(r"\W", "_", name)
 
 
@@ -164,7 +164,7 @@ def transforms(t_ns: int, frames: Iterable[FramePose], parent: str = WORLD) -> f
 
 
 def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values, Values] | None:
-    """Return position and orientation of a cluster's frame; None if it has no frame or that is not yet known."""
+    """Return position and orientation of a cluster's frame; None if it has none or its pose is not yet known."""
     if not any(values) or not set(FRAME) <= set(names):
         return None
     x_c = np.array([values[names.index(name)] for name in FRAME])
@@ -302,7 +302,7 @@ def ground(t_ns: int) -> fox.SceneUpdate:
 def formations(
     t_ns: int, states: Mapping[str, ClusterState], truth: Mapping[str, Truth], desired_m: Mapping[str, Values]
 ) -> fox.SceneUpdate:
-    """Return each cluster's outline of its drones, and ghosts at their desired positions (n, 3), if known."""
+    """Return the outline of each cluster's drones, and ghosts at their desired positions (n, 3), where known."""
     at, entities = timestamp(t_ns), []
     for name, state in states.items():
         lines, ghosts = [], []
@@ -320,7 +320,7 @@ def formations(
 
 
 def ellipsoids(t_ns: int, estimates: Mapping[str, Estimate], colours: Mapping[str, str]) -> fox.SceneUpdate:
-    """Return the ellipsoids of two standard deviations of the estimated positions."""
+    """Return ellipsoids of SIGMAS standard deviations around the estimated positions."""
     at, entities = timestamp(t_ns), []
     for name, estimate in estimates.items():
         sigma_m, axes = principal_axes(np.array(estimate.covariance).reshape(6, 6)[:3, :3])
@@ -357,7 +357,7 @@ def _line(
     width: float = LINE_PX,
     scale_invariant: bool = True,
 ) -> fox.LinePrimitive:
-    """Return a line with its width in pixels, or in metres if it is not scale invariant."""
+    """Return a line whose `width` is in pixels if `scale_invariant`, otherwise in metres."""
     corners = [fox.Point3(x=x, y=y, z=z) for x, y, z in (map(float, each) for each in points)]
     look: dict[str, Any] = {"thickness": width, "scale_invariant": scale_invariant, "color": tint}
     return fox.LinePrimitive(type=kind, pose=pose((0, 0, 0)), points=corners, **look)

@@ -1,4 +1,4 @@
-"""Makes an export: record in, files of other tools out, which appear only when all of them are complete.
+"""Makes an export: a record in, files for other tools out, which appear only once all of them are complete.
 
 Tables are a folder of CSV or Parquet files, or one file for MATLAB. After Ctrl-C or on a full disk, no partial export
 remains.
@@ -46,13 +46,13 @@ DEFAULTS = {  # file names beside the record
 MANIFEST = "export.json"  # marks a folder of tables
 MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # first bytes of a file written by SciPy; MATLAB itself writes a comma there
 MCAP, MCAP_LIBRARY = b"\x89MCAP", b"foxglove-sdk"  # a Foxglove export names its library, a record names zsim
-HEAD_MAX = 200  # first bytes of an MCAP file, in which it names its library
+HEAD_MAX = 200  # number of first bytes of an MCAP file in which it names its library
 LAYOUT = "-layout.json"  # suffix of the layout file beside a Foxglove export
 BLUEPRINT = ".rbl"  # suffix of the blueprint beside a Rerun export
 RERUN = b"RRF2"  # first bytes of a Rerun file
 RUN_FILES = ("run.mcap", "scenario.yaml", "summary.json", "report.html")  # files that no export may replace
 
-Progress = Callable[[int, int], None]  # number of messages read so far, and in all
+Progress = Callable[[int, int], None]  # number of messages read so far, and the total
 
 
 class ExportResult(NamedTuple):
@@ -72,7 +72,7 @@ def export(
     progress: Progress = lambda done, of: None,
     by_name: bool = False,
 ) -> ExportResult:
-    """Write the record of a run in the format of another tool, all of it or nothing.
+    """Write the record of a run in the format of another tool, completely or not at all.
 
     Args:
         run: folder of the run, or its record.
@@ -86,7 +86,7 @@ def export(
     Raises:
         RunError, RecordError: there is no record.
         ReportError: the selection is empty, or the output cannot be written.
-        KeyboardInterrupt: nothing was written.
+        KeyboardInterrupt: Ctrl-C; nothing was written.
     """
     record, chosen = record_at(run), selection or MessageSelection()
     target = out or record.parent / DEFAULTS[form]
@@ -171,7 +171,7 @@ def check_free(target: Path, force: bool, record: Path) -> None:
     """Refuse a target that must not be replaced.
 
     Raises:
-        ReportError: the target exists and `force` is not set; or it is the record, or no export.
+        ReportError: the target exists, but `force` is not set, or it is the record, or it is not an export.
     """
     if not target.exists():
         return
@@ -212,7 +212,7 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
     Raises:
         ReportError: they cannot be written.
     """
-    # beside the target, so that files can be renamed; Ctrl-C during the creation of a TemporaryDirectory would leave it
+    # beside the target, so that files can be renamed; a TemporaryDirectory would remain after Ctrl-C in its creation
     folder, new_parents = targets[0].parent / f".export-{secrets.token_hex(4)}", list[Path]()
     try:
         new_parents += [parent for parent in targets[0].parents if not parent.exists()]
@@ -257,7 +257,7 @@ class WrittenTable(NamedTuple):
 
 
 class TableFolder:
-    """A folder of tables, one per message type, or per type and name; files are opened with their first rows."""
+    """A folder of tables, one per message type, or per type and name; each file is opened with its first rows."""
 
     def __init__(self, folder: Path, suffix: str, survey: TableSurvey) -> None:
         self._folder = folder
@@ -276,7 +276,7 @@ class TableFolder:
             opened = self._stack.enter_context((self._folder / file).open("wb"))
             self._sinks[file] = _Csv(opened, schema) if self._suffix == "csv" else _Parquet(opened, schema)
             self._stack.callback(self._sinks[file].close)
-        # messages never contain NaN, so it marks a missing value
+        # messages never contain NaN, so NaN marks a missing value
         rows = [pa.array(values, _TYPES[kind], from_pandas=True) for _, kind, values in column_values(table, batch)]
         self._sinks[file].write(pa.RecordBatch.from_arrays(rows, schema=schema))
         before = self._written[file].rows if file in self._written else 0
@@ -348,16 +348,16 @@ class MatFile:
     All rows are held in memory until the end, since the format stores each variable in one piece.
 
     Raises:
-        ReportError: a variable would be larger than MATLAB loads.
+        ReportError: a variable would be larger than MATLAB can load.
     """
 
     def __init__(self, path: Path, survey: TableSurvey) -> None:
         self._path = path
         self._survey = survey
-        self._blocks: dict[type[Struct], dict[str, list[dict[str, Any]]]] = {}  # arrays by field, by subject
+        self._blocks: dict[type[Struct], dict[str, list[dict[str, Any]]]] = {}  # arrays by field, per batch
         for kind, rows in survey.rows.items():
             row = 8 * (survey.width(kind) - 1) if kind else 0  # size of a row without the name [bytes]
-            if kind and rows * row > VARIABLE_MAX:  # unless the selected times reduce it
+            if kind and rows * row > VARIABLE_MAX:  # the selected times may exclude some rows
                 _check_size(table_name(kind), survey.rows_within(kind) * row)
 
     def write(self, batch: RowBatch) -> None:
@@ -369,14 +369,14 @@ class MatFile:
             block: dict[str, Any] = {}
             for each in self._survey.table(batch.kind)[1:]:  # the first column is the name
                 values = each.values(own)
-                if each.kind == "text":  # a list until all texts are known
+                if each.kind == "text":  # kept as a list until all texts are known
                     block[each.name] = ["" if value is None else value for value in values]
                 else:
                     block[each.name] = as_array(each.kind, values)
             subjects.setdefault(name, []).append(block)
 
     def finish(self) -> list[WrittenTable]:
-        """Write the file; return its variables. Raises ReportError: a variable is larger than MATLAB loads."""
+        """Write the file and return its variables; raise ReportError if one is larger than MATLAB can load."""
         from scipy.io import savemat
 
         variables, written = {}, []
@@ -437,7 +437,7 @@ def _bytes(value: Any) -> int:
     if isinstance(value, dict):
         return sum(map(_bytes, value.values()))
     if isinstance(value, np.ndarray) and value.dtype == object:
-        return sum(64 + 2 * len(text) for text in value.flat)  # the header of each cell, and two bytes per character
+        return sum(64 + 2 * len(text) for text in value.flat)  # a header per cell, and two bytes per character
     return value.nbytes if isinstance(value, np.ndarray) else 2 * len(value)
 
 

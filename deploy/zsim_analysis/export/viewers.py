@@ -2,8 +2,8 @@
 
 Both have the scene, the log, plots of the clusters' variables and of the drones' numbers, and the cameras. Rerun by
 itself neither draws scenes nor plots fields, so its blueprint contains meshes of the drones, placed at the recorded
-poses, and names the field of each curve. It contains nothing of the flight: any Foxglove file of the same name and
-drones can be viewed with it. Rerun's own library writes it, if that is installed (tested with 0.41).
+poses, and names the field of each curve. A blueprint contains nothing of the flight: any Foxglove file with the same
+name and drones can be viewed with it. Rerun's own library writes it, if installed (tested with 0.41).
 """
 
 import os
@@ -28,20 +28,20 @@ CURVES: tuple[tuple[str, str, Literal["solid", "dashed"]], ...] = (
     ("true", "#0072b2", "solid"),
 )
 DRONE_PLOTS = {"altitude (m)": "true_z_m", "error of the estimate (m)": "error_m", "battery (%)": "battery_percent"}
-PLOTS_MAX = 12  # most plotted variables of a cluster: those of the paper's three drones
+PLOTS_MAX = 12  # most plotted variables per cluster: as many as the paper's three drones have
 TAB = 3  # plots per tab
-DRONES_MAX = 12  # most plotted drones
+DRONES_MAX = 12  # largest number of plotted drones
 PICTURES, CALIBRATION = "_camera/image", "_camera/calibration"  # suffixes of topics
-PICTURES_MAX = 6  # most cameras that are shown: those of the paper's three drones
+PICTURES_MAX = 6  # most cameras shown: as many as the paper's three drones have
 TIMELINE = "message_log_time"  # Rerun's name of the MCAP file's log time: simulated time
 ROTOR_CORNERS = 16  # corners of a rotor's disc
-# position and target of the eye in W; chosen to show the paper's formation from the ground to 15 m
+# position and target of the eye in W; design choice: they show the paper's formation from the ground to 15 m
 EYE_M, TARGET_M = (14.0, -16.0, 14.0), (2.0, -2.0, 6.0)
 SPEED = 1.0  # simulated seconds per second of wall time
 
 
 class Curve(NamedTuple):
-    """A curve: topic, Rerun's component and the field of its numbers, and its name and look."""
+    """A curve: the topic, Rerun component and field of its numbers, and its name and look."""
 
     topic: str
     component: str
@@ -55,7 +55,7 @@ Plot = tuple[str, list[Curve]]  # title and curves
 
 
 def variable_plots(variables: Mapping[str, Sequence[str]]) -> dict[str, list[Plot]]:
-    """Return a plot for each of the first variables of each cluster, given its numeric fields."""
+    """Return plots by cluster, one for each of its first variables; `variables` are its numeric fields."""
     plots: dict[str, list[Plot]] = {}
     for cluster, fields in variables.items():
         topic, component = f"/cluster/{cluster}/variables", f"{PACKAGE}.Cluster_{tidy(cluster)}:message"
@@ -158,7 +158,7 @@ def has_rerun() -> bool:
 
 
 def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRun) -> None:
-    """Write Rerun's blueprint for a file; `application` is Rerun's name of it: the file name without suffix."""
+    """Write Rerun's blueprint for a file; `application` is Rerun's name for the file: its name without suffix."""
     os.environ.setdefault("RUST_LOG", "error")  # otherwise Rerun warns about unusual file names
     import rerun as rr
     import rerun.blueprint as rrb
@@ -167,7 +167,7 @@ def write_blueprint(path: Path, application: str, run: foxglove_file.ConvertedRu
     left = rrb.Vertical(_scene(run), rrb.TextLogView(name="log", origin=foxglove_file.LOG), row_shares=[3, 1])
     views = []
     for title, curves in plots(run):
-        series: dict[Any, list[Any]] = {}  # visualizers of curves by entity
+        series: dict[Any, list[Any]] = {}  # the curves' visualizers by entity
         for curve in curves:
             source = VisualizerComponentMapping(
                 target="Scalars:scalars",
@@ -229,7 +229,7 @@ def _scene(run: foxglove_file.ConvertedRun) -> Any:
 
 
 def _entity(topic: str) -> str:
-    """Return Rerun's entity path of a topic, in which dots are escaped."""
+    """Return Rerun's entity path for a topic, with dots escaped."""
     import rerun as rr
 
     return rr.new_entity_path(topic.strip("/").split("/"))

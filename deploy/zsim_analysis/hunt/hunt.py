@@ -46,20 +46,20 @@ PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml",
 BUNDLE = "violation.zsim"
 OWN_FILES = (PLAN, TABLE, SCENARIO, VIOLATION, BUNDLE, "summary.json", "report.html", "figures", ".lock")
 SEARCH, CAUSE, RECORD = "search", "each cause", "record"  # stages besides those of `shrink`
-SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the flight in which no process dies
-MISSES_MAX = 100  # successive draws that cannot be flown, after which --vary is taken to be wrong; chosen
+SAME_BITS = "same_bits"  # quantity: whether truth is bit-identical to that of the same flight with no process dying
+MISSES_MAX = 100  # successive draws that cannot be flown, after which --vary is deemed wrong; design choice
 DECIMALS = 6  # decimals of margins in the table
 
 
 class HuntRequest(Struct, frozen=True):
     """A hunt to fly: scenario, requirements, folder and limits.
 
-    `flights` and `budget_s` limit the search; shrinking a violation takes some hundred further flights.
+    `flights` and `budget_s` limit the search; shrinking a violation takes about a hundred more flights.
     """
 
     document: dict[str, Any]  # the scenario's document, with the overrides of the command line
     source: str  # name of the scenario's file, for messages
-    requirements: tuple[str, ...]  # comparisons, or `module:function` of the user's own
+    requirements: tuple[str, ...]  # comparisons, or functions of the user's own, `module:function`
     out: Path
     seed: int = 1  # seed of the draws
     flights: int | None = None
@@ -68,7 +68,7 @@ class HuntRequest(Struct, frozen=True):
     without: tuple[str, ...] = ()  # kinds of faults that are not drawn
     vary: tuple[str, ...] = (WIND,)
     changed: tuple[str, ...] = ()  # overrides `a.b.c=value` already applied to the document
-    most: int = 3  # most faults in one flight
+    most: int = 3  # largest number of faults in one flight
     workers: int | None = None  # number of processes; None: one per core
     force: bool = False  # whether the folder may hold other files
     console: Console | None = None  # where progress is shown; None: stderr
@@ -95,7 +95,7 @@ class HuntFlight(Struct, frozen=True):
 
 
 class Stage(Struct, frozen=True):
-    """The cost of a part of a hunt."""
+    """Number of flights and wall time of a stage of a hunt."""
 
     name: str
     flights: int
@@ -103,7 +103,7 @@ class Stage(Struct, frozen=True):
 
 
 class CauseFound(Struct, frozen=True):
-    """One cause of a violation, with the margins of the requirement in flights without it, and with it alone."""
+    """One cause of a violation, with the requirement's margins in a flight without it and in one with it alone."""
 
     text: str
     without: float | None
@@ -125,7 +125,7 @@ class Violation(Struct, frozen=True):
 
 
 class Tried(Struct, frozen=True):
-    """Number of combinations of `together` kinds of faults that were flown."""
+    """How many of the possible combinations of `together` kinds of faults were tried."""
 
     together: int
     tried: int
@@ -162,7 +162,7 @@ def hunt(request: HuntRequest) -> Hunted:
     """Search until a requirement is violated or the budget is spent; return the results, also after Ctrl-C.
 
     Raises:
-        ScenarioError: a requirement, a fault, a field or the scenario is wrong; one line each.
+        ScenarioError: a requirement, a fault, a field or the scenario is wrong; one line for each.
         RunError: the folder holds something else or cannot be written, or workers cannot start.
     """
     texts, document = _with_functions(request.requirements, request.document)
@@ -214,7 +214,7 @@ _requirement = lru_cache(maxsize=64)(Requirement)
 def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
     """Return the margins of a flight, or why they cannot be computed; called in the process that flew it.
 
-    `twin` is the same flight without deaths of processes, with which it is compared bit by bit; None: it has none.
+    `twin` is the same flight with no process dying, with which it is compared bit by bit; None if no process dies.
     """
     columns = {name: row[name] for name in row if name in FIXED or name.startswith((METRIC, "clusters."))}
     figures = {**columns, **dict(figures_of(msgspec.to_builtins(summary)))}
@@ -244,11 +244,11 @@ class _Hunt:
         self._strategy = Strategy(space, request.seed)
         self._screen = HuntScreen(request, self._strategy)
         self.flown: list[HuntFlight] = []
-        self._scales: list[float] = []  # margins of the flight without faults, by requirement
+        self._scales: list[float] = []  # absolute margins of the flight without faults, by requirement
         self._stages: Counter[str] = Counter()
         self._spent_s: defaultdict[str, float] = defaultdict(float)
         self._waiting: deque[Task] = deque()
-        self._cases: list[tuple[Case, str]] = []  # by number of the flight
+        self._cases: list[tuple[Case, str]] = []  # by flight number
         self._rows: dict[int, Row] = {}
         self._done = False
 
@@ -307,7 +307,7 @@ class _Hunt:
             yield self._waiting.popleft() if self._waiting else None
 
     def _submit(self, case: Case, stage: str, record: Path | None = None) -> int:
-        """Queue the flight of a case; return its number; ScenarioError if it cannot be flown."""
+        """Queue the flight of a case and return its number; raise ScenarioError if it cannot be flown."""
         scenario, number = self._space.scenario(case), len(self._cases)
         self._cases.append((case, stage))
         deadly = [fault for fault in case.faults if fault["kind"] == PROCESS_KILL]
@@ -327,7 +327,7 @@ class _Hunt:
         return number
 
     def _result(self, number: int) -> HuntFlight:
-        """Wait for the result of a flight, and add it to the table."""
+        """Wait for the result of a flight and add it to the table."""
         while number not in self._rows:
             row = next(self._flying)
             self._rows[row["run"]] = row
@@ -350,7 +350,7 @@ class _Hunt:
         return flown
 
     def _fly(self, cases: Sequence[Case], stage: str) -> list[HuntFlight | None]:
-        """Fly cases in parallel; None for one that cannot be flown."""
+        """Fly cases in parallel; return None for a case that cannot be flown."""
         numbers: list[int | None] = []
         for case in cases:
             try:
@@ -362,7 +362,7 @@ class _Hunt:
     # Stages
 
     def _search(self) -> HuntFlight | None:
-        """Return the first flight by number that violates a requirement; None if the budget is spent first."""
+        """Return the first flight by number that violates a requirement; None if the budget runs out first."""
         flights, budget_s = self._request.flights, self._request.budget_s
         until_s = None if budget_s is None else time.monotonic() + budget_s
         pending: deque[int] = deque()
@@ -464,7 +464,7 @@ def fault_text(fault: Mapping[str, Any]) -> str:
 
 
 def write(hunted: Hunted) -> None:
-    """Write hunt.json, flights.csv and violation.yaml; ReportError if the folder cannot be written."""
+    """Write hunt.json, flights.csv and violation.yaml; raise ReportError if the folder cannot be written."""
     request, summary = hunted.request, hunted.summary
     plan = {
         "scenario": request.source, "requirements": request.requirements, "seed": request.seed,

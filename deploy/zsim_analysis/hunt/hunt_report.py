@@ -1,4 +1,4 @@
-"""Makes the report of a hunt: the violation with its causes, margins over flights, combinations tried; and figures."""
+"""Makes the report of a hunt: the violation and its causes, margins over flights, combinations tried; with figures."""
 
 import shlex
 from collections.abc import Callable, Iterator, Sequence
@@ -29,17 +29,17 @@ from zsim_analysis.hunt.space import KindSpace
 from zsim_analysis.report import figure_style as style
 from zsim_analysis.report.make_report import Picture, make_report, rendered, write_report
 
-QUARTERS = 4  # parts of a range for which the number of flights is shown
-KINDS_DRAWN = 24  # largest matrix of pairs
+QUARTERS = 4  # parts of a range, each with its number of flights
+KINDS_DRAWN = 24  # most kinds for which the matrix of pairs is drawn
 
 
 def make_hunt_report(
     hunted: Hunted, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> list[str]:
-    """Write summary.json, figures and report.html of a hunt, and report and bundle of the violation.
+    """Write summary.json, figures and report.html of a hunt, and the report and bundle of its violation.
 
     Returns:
-        Notes on what the bundle lacks, or why there is none.
+        Notes on what the bundle lacks, or on why it could not be made.
 
     Raises:
         ReportError: the folder cannot be written.
@@ -157,7 +157,7 @@ def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
 
 
 def kind_row(space: KindSpace, searched: Sequence[HuntFlight]) -> list[str]:
-    """Return how often a kind was flown, its smallest margin, and the number of flights by quarter of each range."""
+    """Return a kind, how often it was flown, its smallest margin, and the flights per quarter of each range."""
     flown = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
     least = min((each.worst.share for each, _ in flown), default=None)
     targets = {fault["target"] for _, fault in flown}
@@ -175,7 +175,7 @@ def number(value: float | None) -> str:
 
 
 def command(hunted: Hunted) -> str:
-    """Return the command that repeats the violation; empty if there is none."""
+    """Return the command that repeats the violation; empty if nothing was violated."""
     request, found = hunted.request, hunted.summary.violation
     sets = [word for change in request.changed for word in ("--set", change)]
     return shlex.join(["zsim", "run", request.source, *sets, *found.options, "--in-process"]) if found else ""

@@ -1,13 +1,13 @@
-"""Requirements on flights: comparisons of quantities of the summary, `min_separation_m > 1.5 and not crashed`.
+"""Requirements on a flight: comparisons of its quantities, as in `min_separation_m > 1.5 and not crashed`.
 
-A requirement has numbers, texts, names, comparisons, `and`, `or`, `not`, + - * / and abs, min, max. Names are paths in
-`summary.json` and columns of a sweep: `errors.p.true_rms`, `clusters.main.engaged_share`, `collisions`,
+A requirement may use numbers, texts, names, comparisons, `and`, `or`, `not`, + - * / and abs, min, max. Names are paths
+in `summary.json` and columns of a sweep: `errors.p.true_rms`, `clusters.main.engaged_share`, `collisions`,
 `metrics.NAME`. Nothing else is accepted, and nothing is executed.
 
 The margin of a requirement is its distance from violation: the difference between the sides of a comparison, the
 minimum for `and`, the maximum for `or`; this is the robustness of Fainekos and Pappas (Theoretical Computer Science
 410, 2009) without time. So that margins with different units can be compared, each is also given as a share of the
-larger side.
+larger side of its comparison.
 """
 
 import ast
@@ -37,14 +37,14 @@ class Margin(NamedTuple):
     """The margin of a requirement in a flight."""
 
     holds: bool
-    # relative to the larger side of the comparison, from -2 to 2; in a hunt, to the margin of the flight without faults
+    # relative to the larger side of the comparison, from -2 to 2; in a hunt, relative to the margin without faults
     share: float
-    value: float | None  # in the unit of its quantities; None if one is unknown
-    unknown: str = ""  # the first quantity that the flight does not have
+    value: float | None  # in the unit of the quantities; None if one of them is unknown
+    unknown: str = ""  # the first quantity that the flight does not have; empty if it has all
 
     def __invert__(self) -> "Margin":
         if self.unknown:
-            return self  # an unknown requirement does not hold when negated, either
+            return self  # with an unknown quantity, the negation does not hold either
         return Margin(not self.holds, -self.share, None if self.value is None else -self.value)
 
 
@@ -55,7 +55,7 @@ class Requirement:
     """A parsed requirement.
 
     Raises:
-        ScenarioError: it cannot be parsed.
+        ScenarioError: the text cannot be parsed.
     """
 
     def __init__(self, text: str) -> None:
@@ -79,7 +79,7 @@ class Requirement:
         return self._margin(self._tree, figures)
 
     def faults(self, figures: Mapping[str, Any]) -> list[str]:
-        """Return a line for each name that is not a quantity of a flight, with the most similar one."""
+        """Return a line for each name that is no quantity of a flight, with the most similar quantity."""
         unknown = [self._unknown(name, figures) for name in self.names if name not in figures]
         return [fault for text in unknown for fault in self._fault(text).faults]
 
@@ -165,7 +165,7 @@ class Requirement:
         return Margin(holds, value / max(abs(left), abs(right), TINY), value)
 
     def _figure(self, node: ast.AST, figures: Mapping[str, Any]) -> Any:
-        """Return a number, a text or a truth value, or `Unknown`."""
+        """Return the value of a node: a number, a text or a truth value, or `Unknown`."""
         if isinstance(node, ast.Constant):
             return node.value
         if path := path_of(node):
@@ -226,5 +226,5 @@ def figures_of(document: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def worst(margins: list[Margin]) -> Margin:
-    """Return the worst margin: the smallest one, with violated requirements first."""
+    """Return the worst margin: the smallest, with violated requirements first."""
     return min(margins, key=lambda margin: (margin.holds, margin.share))

@@ -1,6 +1,6 @@
 """Shrinks a flight that violates a requirement: fewest causes, then smallest values, then the shortest flight.
 
-Causes are faults, and fields that differ from the scenario. Sets of causes are flown in order of size, so that the
+Causes are faults and fields that differ from the scenario. Sets of causes are flown in order of size, so that the
 result is minimal; if there are more than SUBSETS_MAX causes, single ones are removed first (delta debugging of Zeller
 and Hildebrandt, IEEE Transactions on Software Engineering 28, 2002, at its finest granularity). Every number is then
 bisected between its value and one without effect. The candidates of a step are flown in parallel, and the first one in
@@ -19,12 +19,12 @@ from msgspec.structs import replace
 from zsim.scenario.scenario_file import steps_of
 from zsim_analysis.hunt.space import Case, HuntSpace
 
-SUBSETS_MAX = 6  # most causes of which all subsets are flown: 62 flights
+SUBSETS_MAX = 6  # most causes of which all proper subsets are flown: at most 63 flights
 ROUNDS = 3  # rounds of a bisection, each of which reduces the interval to a quarter
 PASSES = 2  # passes over all numbers, since a smaller number may allow another to become smaller
 SHARES = (0.25, 0.5, 0.75)  # candidates of a round, as shares of the interval
 RATIO = 30.0  # ratio of two numbers from which on they are interpolated logarithmically
-SHORTEST_S = 1.0  # shortest duration of a flight; chosen
+SHORTEST_S = 1.0  # shortest duration of a flight; design choice
 CAUSES, NUMBERS, DURATION = "fewest causes", "smallest values", "shortest flight"  # stages
 
 Breaks = Callable[[Sequence[Case], str], list[bool]]
@@ -50,7 +50,7 @@ class Shrinker:
     # Causes
 
     def fewest(self, case: Case) -> Case:
-        """Return the case with the fewest causes."""
+        """Return the case reduced to the fewest causes that still violate the requirement."""
         causes = causes_of(case)
         while len(causes) > SUBSETS_MAX:
             without = [[*causes[:place], *causes[place + 1 :]] for place in range(len(causes))]
@@ -69,7 +69,7 @@ class Shrinker:
     # Numbers
 
     def smallest(self, case: Case) -> Case:
-        """Return the case with the effect of each number as small as still violates the requirement."""
+        """Return the case with every number as mild as possible while still violating the requirement."""
         for _ in range(PASSES):
             before = case
             for place in range(len(case.faults)):
@@ -115,7 +115,7 @@ class Shrinker:
             case = tried[broken.index(True)]
 
     def _bisected(self, case_of: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
-        """Return the case with the number closest to the mildest one that still violates, with few digits."""
+        """Return the case with the number closest to `mildest` that still violates, with few digits if possible."""
         low, high = 0.0, 1.0  # interval between the mildest number (0) and the one that violates (1)
         for _ in range(ROUNDS):
             shares = [low + share * (high - low) for share in SHARES]
@@ -142,7 +142,7 @@ class Shrinker:
     # Duration
 
     def shortest(self, case: Case) -> Case:
-        """Return the case with the shortest flight that violates the requirement, but only with the case's causes."""
+        """Return the case with the shortest flight that violates the requirement, but would not without its causes."""
         if not case.faults:
             return case
         length = case.duration_s or self._space.base.duration_s
@@ -181,7 +181,7 @@ def causes_of(case: Case) -> list[Cause]:
 
 
 def only(case: Case, causes: Sequence[Cause]) -> Case:
-    """Return a case with only these causes."""
+    """Return a case reduced to the given causes."""
     faults = tuple(fault for place, fault in enumerate(case.faults) if ("fault", place) in causes)
     return replace(case, faults=faults, values={p: v for p, v in case.values.items() if ("value", p) in causes})
 
@@ -207,7 +207,7 @@ def _round(x: float, digits: int = 4) -> float:
 
 
 def _outward(number: float, mildest: float, value: float, digits: int) -> float | None:
-    """Round a number to few digits, away from the mildest one; None if that is beyond the original value."""
+    """Round a number to few digits, away from the mildest; return None if that exceeds the original value."""
     if number == 0:
         return None
     unit = 10.0 ** (math.floor(math.log10(abs(number))) - digits + 1)

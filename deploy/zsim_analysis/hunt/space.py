@@ -9,9 +9,9 @@ ranges: `gust velocity_m_s=1..6 for_s=2..8`.
 
 The strategy covers all small combinations of kinds, and exploits low margins. Every second flight has a pair of kinds
 that has not been tried together, or a triple once all pairs have been (Kuhn, Wallace and Gallo, IEEE Transactions on
-Software Engineering 30, 2004: few simultaneous conditions suffice for software failures). The others are neighbours of
-the flights with the lowest margins, of which the best for each set of kinds is kept (MAP-Elites of Mouret and Clune,
-arXiv 1504.04909): numbers are moved slightly, or a fault is replaced, or taken from another elite. Draws depend on the
+Software Engineering 30, 2004: few simultaneous conditions suffice to make software fail). The others are neighbours of
+the flights with the lowest margins, of which the lowest for each set of kinds is kept (MAP-Elites of Mouret and Clune,
+arXiv 1504.04909): numbers are moved slightly, or a fault is replaced or taken from another elite. Draws depend on the
 seed, the number of the flight and the margins of flights at least LAG before it, but not on the number or speed of
 processes.
 """
@@ -43,17 +43,17 @@ from zsim_analysis.sweep.design import SEED, SEEDS, Draw, Grid, Seeds, parse, te
 
 OPTION = "--fault"
 SYNTAX = "a kind and NAME=LOW..HIGH or NAME=VALUE, as in 'gust velocity_m_s=1..6 for_s=2..8'"
-WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # default of --vary, chosen
-LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # see the module's docstring; chosen
-LEAST_S = 0.5  # shortest duration of a fault; chosen: shorter ones last only a few samples
+WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # default of --vary; design choice
+LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # design choice; see the module docstring
+LEAST_S = 0.5  # shortest duration of a fault; design choice: shorter ones would last only a few samples
 DECADES = 30.0  # ratio of the ends of a range from which on all decades are equally likely
-ONE_WAY_SHARE = 1 / 3  # probability that a flag of a fault is set; chosen
+ONE_WAY_SHARE = 1 / 3  # probability that a flag of a fault is set; design choice
 DIGITS = 4  # significant digits of drawn numbers, so that their texts represent them exactly
 _RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
-LAG = 32  # most pending flights; chosen: more than the processes of a machine
-TRIES = 24  # random sets of kinds, of which the one with most untried combinations is flown
-STEPS = (0.3, 0.1, 0.03)  # standard deviations of moves, as shares of a range; chosen
-AGAIN = 0.25  # probability of an untried combination in place of a neighbour, and of a random one when none is left
+LAG = 32  # most pending flights; design choice: more than a machine's processes
+TRIES = 24  # random sets of kinds, of which the one with the most untried combinations is flown
+STEPS = (0.3, 0.1, 0.03)  # standard deviations of moves, as shares of a range; design choice
+AGAIN = 0.25  # probability of an untried combination in place of a neighbour, and of a random one if all are tried
 
 
 class Case(Struct, frozen=True):
@@ -66,7 +66,7 @@ class Case(Struct, frozen=True):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Its distinct kinds of faults, sorted."""
+        """The distinct kinds of its faults, sorted."""
         return tuple(sorted({fault["kind"] for fault in self.faults}))
 
 
@@ -90,7 +90,7 @@ class Knob(Struct, frozen=True):
         return self._of(self._magnitude(rng.uniform()), _direction(rng, self.shape))
 
     def near(self, value: Any, rng: Generator, step: float) -> Any:
-        """Return a value at a normal distance with standard deviation `step` of the range; for a choice, a new draw."""
+        """Return a value moved by a normal draw with a deviation of `step` of the range; for a choice, a new draw."""
         if self.shape == "choice" or value is None:
             return self.draw(rng)
         place = self.place(value) + step * rng.normal()
@@ -174,10 +174,10 @@ class HuntSpace:
         rules: texts of `--fault`, each a kind with narrower ranges; empty: all kinds except deaths of processes.
         without: kinds that are not drawn.
         vary: texts of `--vary`; seeds are always drawn.
-        most: most faults in one flight.
+        most: largest number of faults in one flight.
 
     Raises:
-        ScenarioError: with one line for every fault in the arguments and the scenario.
+        ScenarioError: the arguments or the scenario are invalid; one line per fault.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class HuntSpace:
         self.most = min(most, len(self.kinds))
 
     def scenario(self, case: Case) -> Scenario:
-        """Return the resolved scenario of a flight; ScenarioError if it cannot be flown."""
+        """Return the resolved scenario of a flight; raise ScenarioError if it cannot be flown."""
         return scenario_file.resolve(self.changed(case), self.source)
 
     def changed(self, case: Case) -> dict[str, Any]:
@@ -345,7 +345,7 @@ def unknown_kind(kind: str, known: Mapping[str, FaultKind]) -> str:
 
 
 def _given(name: str, text: str, kind: FaultKind) -> Knob:
-    """Parse the range or value that a rule gives for a parameter; ValueError if it cannot be read."""
+    """Parse the range or value that a rule gives for a parameter; raise ValueError if it cannot be read."""
     parameter = next((p for p in kind.parameters if p.name == name), None)
     if (ends := _RANGE.fullmatch(text)) is None:
         return Knob(name, shape="choice", choices=(yaml_file.value(text),))
@@ -417,7 +417,7 @@ class Coverage:
         return len(self.possible[size]) - len(self.untried[size])
 
     def next(self, rng: Generator, most: int) -> tuple[str, ...] | None:
-        """Return kinds with untried combinations for a flight; None if all have been tried."""
+        """Return kinds for a flight, with untried combinations among them; None if all have been tried."""
         size = next((size for size in self.untried if self.untried[size]), None)
         if size is None:
             return None
@@ -436,7 +436,7 @@ class Coverage:
 
 
 class Strategy:
-    """Draws the flights of a hunt; `learn` must be called in the same order as `draw`."""
+    """Draws the flights of a hunt; `learn` must be called for them in the order drawn."""
 
     def __init__(self, space: HuntSpace, seed: int) -> None:
         self.space, self.seed = space, seed

@@ -1,4 +1,4 @@
-"""Errors of single drones: of estimates, against references, and of velocities; distances between drones."""
+"""Errors of each drone's estimates and of its motion against its reference; velocity responses; distances of drones."""
 
 from itertools import combinations
 from typing import NamedTuple
@@ -12,12 +12,12 @@ from zsim.vehicles.vehicle import vehicle_of
 from zsim_analysis.reading.formation import common_instants
 from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 
-SIGMAS = 2.0  # half the width of the drawn band in standard deviations
+SIGMAS = 2.0  # half-width of the drawn band in standard deviations
 DEGREES = 6  # degrees of freedom of a drone's NEES: position and velocity
-ESTIMATES_MAX = 200_000  # most estimates evaluated per flight, which takes a second
-FLOWN = ("approaching", "path", "holding")  # phases of a reference in the air
+ESTIMATES_MAX = 200_000  # most estimates evaluated per flight, which takes about a second
+FLOWN = ("approaching", "path", "holding")  # phases of a reference whose drone is to be in the air
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and of velocities: x, y, z, heading
-INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels
+INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels across
 
 
 class EstimateErrors(NamedTuple):
@@ -25,7 +25,7 @@ class EstimateErrors(NamedTuple):
 
     t_s: Array  # (K,) simulated time
     error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
-    sigma: Array  # (K, 4) standard deviations of these as stated by the estimator
+    sigma: Array  # (K, 4) standard deviations of the errors as stated by the estimator
     # (K,) normalised estimation error squared of position and velocity, eᵀ P⁻¹ e; NaN where P is singular. Its mean is
     # DEGREES for a consistent estimator [Bar-Shalom, Li, Kirubarajan 2001, 5.4.2].
     nees: Array
@@ -39,7 +39,7 @@ class VelocityResponse(NamedTuple):
     """Commanded and true velocity of one drone at the times of its C commands."""
 
     t_s: Array  # (C,) simulated time
-    # commanded, flown: (C, 4) forward, left, up [m/s], yaw rate [rad/s], by the true heading
+    # commanded, flown: (C, 4) forward, left, up by the true heading [m/s], yaw rate [rad/s]
     commanded: Array
     flown: Array
 
@@ -76,7 +76,7 @@ def nees(error: Array, covariance: Array) -> Array:
 
 
 class ReferenceErrors(NamedTuple):
-    """Truth − reference of one drone at K times, from the first to the last one in the air."""
+    """Truth − reference of one drone at the K times at which its reference is in a phase of FLOWN."""
 
     t_s: Array  # (K,) simulated time
     error: Array  # (K, 4) x, y, z in W [m], heading wrapped to ±π [rad]
@@ -144,7 +144,7 @@ def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
 
 
 class Distances(NamedTuple):
-    """True distances of the drones at K times."""
+    """True distances between drones at K times."""
 
     t_s: Array  # (K,) simulated time
     pairs: tuple[tuple[str, str], ...]  # names, in the order of the columns of `between`
@@ -161,7 +161,7 @@ class Separations(NamedTuple):
 
 
 def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
-    """Return the distances of simulated drones, of each pair if they are at most `pairs_max`; None below two drones."""
+    """Return the distances between simulated drones, by pair if at most `pairs_max`; None for fewer than two drones."""
     tracks = [track for track in flight.tracks if len(track.t_ns) and not track.external]
     t_ns, places = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):
@@ -182,7 +182,7 @@ def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
 
 
 def separations(flight: RecordedFlight) -> Separations:
-    """Return the limits of distances in a flight's scenario: the largest ones of its clusters and of any two hulls."""
+    """Return the limits of distances in a flight's scenario: the largest of its clusters and of any two hulls."""
     gains = [cluster.gains for cluster in flight.scenario.clusters] if flight.scenario else []
     margin_m = max((each.separation_min_m for each in gains), default=None)
     alarm_m = max((each.separation_alarm_m for each in gains), default=None)

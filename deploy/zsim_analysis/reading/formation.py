@@ -55,7 +55,7 @@ class Formation:
 
     @property
     def engaged_s(self) -> float | None:
-        """Time of the first engagement; None if there was none."""
+        """Time of the first engagement [s]; None if the cluster never engaged."""
         return next((float(t_s) for t_s, phase in zip(self.t_s, self.phases, strict=True) if phase == "engaged"), None)
 
     @property
@@ -64,18 +64,18 @@ class Formation:
 
     @property
     def since_engaged(self) -> NDArray[np.bool_]:
-        """Mask (K,) of the samples from the first engagement on; all samples if there was none."""
+        """Mask (K,) of the samples from the first engagement on; all samples if the cluster never engaged."""
         return self.t_s >= (-np.inf if self.engaged_s is None else self.engaged_s)
 
     def within(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
         return (self.t_s >= window_s[0]) & (self.t_s <= window_s[1])
 
     def judged(self, window_s: tuple[float, float]) -> NDArray[np.bool_]:
-        """Return a mask (K,) of a window's engaged samples; in others, the desired value may be just the estimate."""
+        """Return a mask (K,) of a window's engaged samples; in others, the desired value may merely be the estimate."""
         return self.within(window_s) & self.engaged
 
     def engaged_share(self, window_s: tuple[float, float]) -> float | None:
-        """Return the share of a window's samples in which it was engaged; None without samples."""
+        """Return the share of a window's samples in which the cluster was engaged; None without samples."""
         rows = self.within(window_s)
         return float(self.judged(window_s).sum() / rows.sum()) if rows.any() else None
 
@@ -111,13 +111,13 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
     if not len(states.t_ns):
         return None
     cluster = cluster_of(scenario, states.name)
-    try:  # if the cluster is unknown, the default space of that many drones
+    try:  # for an unknown cluster, the default space for its number of drones
         space = scenario_space(scenario, cluster) if scenario and cluster else cluster_space(len(states.drones))
     except (ValueError, NotTrustedError):
         return None
     if states.names != space.names:
         return None
-    # on the wire, all zeros means unknown
+    # on the wire, all zeros mean unknown
     value, desired = (
         np.where(rows.any(axis=1, keepdims=True), rows, np.nan) for rows in (states.value, states.desired)
     )
@@ -164,11 +164,11 @@ def common_instants(tracks: list[Track]) -> tuple[Times, list[NDArray[np.intp]]]
 
 
 def min_separation_m(tracks: list[Track]) -> float | None:
-    """Return the minimum true distance [m] of two drones in the air, with external ones at the times of their poses.
+    """Return the minimum true distance [m] between two drones in the air, external ones at the times of their poses.
 
     If no status ever shows two drones in the air, all samples count. None if there are fewer than two drones.
     """
-    simulated = [track for track in tracks if not track.external]  # whose truth has more samples
+    simulated = [track for track in tracks if not track.external]  # their truth has more samples
     each = (_least_m(tracks), _least_m(simulated) if len(simulated) < len(tracks) else None)
     return min((least for least in each if least is not None), default=None)
 

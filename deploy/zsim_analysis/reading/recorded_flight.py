@@ -32,7 +32,7 @@ from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
-CONNECTS = 0.5  # probability of reception from which a link counts as connected; it defines the range
+CONNECTS = 0.5  # reception probability from which a link counts as connected; this defines the range
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Track:
     status_t_ns: Times  # (S,) times of the status
     states: list[str]  # (S,) names of the firmware's state
     battery_percent: Array  # (S,)
-    # the body is external, so that `truth` is the pose published by its driver, which is an estimate
+    # whether the body is external; if so, `truth` is the pose published by its driver, which is an estimate
     external: bool = False
 
     @property
@@ -90,7 +90,7 @@ class DroneReferences:
 
 @dataclass
 class VelocityCommands:
-    """Velocity commands of one drone that were sent by its commander."""
+    """Velocity commands to one drone, sent by its commander."""
 
     t_ns: Times  # (C,) ascending and unique
     velocity: Array  # (C, 3) [m/s] as sent
@@ -110,12 +110,12 @@ class ClusterStates:
     value: Array
     desired: Array
     phases: list[str]
-    reasons: list[str]  # (K,) why it waits or is held
-    requests: list[ClusterRequest]  # accepted and refused ones, from sources other than its plan
+    reasons: list[str]  # (K,) why the controller waits or is held
+    requests: list[ClusterRequest]  # accepted and refused ones, from sources other than the cluster's plan
     orders: list[str] = field(default_factory=list)  # (K,) drones in the order of the robots, separated by spaces
 
     def robot_of(self, row: int, drone: str) -> int:
-        """Return the index of the robot that a drone is in a row, in the order of `drones` if none is on record."""
+        """Return a drone's index as a robot in a row, or its index in `drones` if no order is on record."""
         order = self.orders[row].split() if self.orders else []
         return order.index(drone) if drone in order else self.drones.index(drone)
 
@@ -147,12 +147,12 @@ class RadioHistory:
     Attributes:
         t_ns: times, ascending, (K,).
         heard: expected number of other drones whose messages arrive, (K, N).
-        connected: whether the graph of links of at least CONNECTS, before loss, was strongly connected, (K,).
+        connected: whether the graph of links of at least CONNECTS, without `loss`, was strongly connected, (K,).
         share: probability that a message of drone j arrives at drone i, mean over time, (N, N).
 
     Args:
-        links: those at each time.
-        drones: N.
+        links: the links at each time.
+        drones: number of drones, N.
         loss: share of messages lost at any distance.
     """
 
@@ -192,7 +192,7 @@ def _graph(
 
 @dataclass
 class RecordedFlight:
-    """All that a report needs of a flight; fields that are not on record are None or empty."""
+    """Everything that a report needs of a flight; fields that are not on record are None or empty."""
 
     info: Info | None
     scenario: Scenario | None
@@ -225,7 +225,7 @@ class RecordedFlight:
 
     @property
     def first_ns(self) -> int:
-        """Time of the first truth message."""
+        """Time of the first truth message [ns]."""
         return min((int(track.t_ns[0]) for track in self.tracks if len(track.t_ns)), default=0)
 
     @property
@@ -234,7 +234,7 @@ class RecordedFlight:
 
 
 def read_flight(path: Path, answers: bool = False, motion: bool = True) -> RecordedFlight:
-    """Return the flight of a record; RecordError if there is no record.
+    """Return the flight of a record; raise RecordError if there is no record.
 
     With `answers`, it includes the drones' estimates and velocity commands; without `motion`, truth, status and
     reference messages only once per second.
@@ -390,7 +390,7 @@ class FlightReader:
         store(keys.parts(key)[1], message)
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Add a message of a flight in this process, which is not encoded."""
+        """Add a message of a flight in this process, where messages are not encoded."""
         if handler := self.handler(key):
             handler[1](keys.parts(key)[1], message)
         else:
@@ -515,10 +515,10 @@ class FlightReader:
         )
 
     def _flown_commands(self) -> dict[str, VelocityCommands]:
-        """Return the commands of each drone that were obeyed, by time.
+        """Return the commands that each drone obeyed, by time.
 
-        A command was obeyed if the latest status names its source as commander, or if that names no commander and the
-        next status names none or this source.
+        A command was obeyed if the latest status names its source as commander, or if the latest status names no
+        commander and the next one names none or this source.
         """
         kept: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
         for (drone, source), rows in self._commands.items():

@@ -1,6 +1,6 @@
 """The record of a run, opened to be replayed or flown again: its messages, its processes, and the inputs of each gate.
 
-A record has the order in which messages passed the world: messages before the clock of a gate were received before
+A record keeps the order in which messages passed the world: those before a gate's clock message were received before
 that gate was integrated. Two flights are compared by hashes of their messages: `OutputHashes`, of all outputs of agents
 by key, show whether they are identical; `GateDigests`, checksums by key and gate, show where they first differ.
 """
@@ -48,7 +48,7 @@ class RecordedRun(NamedTuple):
 
 @contextmanager
 def open_run(place: Path) -> Iterator[RecordedRun]:
-    """Yield the record in a run's folder, or in a file.
+    """Open the record of a run, given its folder or the record file.
 
     Raises:
         RunError: there is no record.
@@ -68,7 +68,7 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
 
 
 def search_modules(record: Path, info: messages.Info | None) -> None:
-    """Let modules of a run's scenario be found where the run found them, beside its record, and in this folder."""
+    """Let a scenario's modules be found where the run found them, beside the record, or in the working folder."""
     recorded = info.module_folders if info and info.module_folders is not UNSET else ()
     plugin.search(*(record.parent / each for each in recorded), record.parent, Path.cwd())
 
@@ -87,7 +87,7 @@ def is_answer(key: str) -> bool:
 
 
 def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
-    """Return the last gate of which all answers are on record, without which the last gate could not be flown [ns].
+    """Return the last gate [ns] whose answers are all on record, as the last recorded gate needed them.
 
     Raises:
         RecordError: there is no gate on record.
@@ -166,7 +166,7 @@ def driver_links(path: Path) -> dict[str, DriverLink]:
     """Return the links of a record by drone, from the reports that drivers published once a second.
 
     Raises:
-        RecordError: no such record.
+        RecordError: there is no such record.
     """
     by_drone: defaultdict[str, list[LinkState]] = defaultdict(list)
     with RecordReader(path) as reader:
@@ -208,10 +208,10 @@ class RecordedAgents(NamedTuple):
 
     processes: tuple[AgentProcess, ...]  # those whose agents can be run again; empty if `why_not`
     why_not: str  # why no agents can be run again; empty if they can
-    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to their controllers and pilots, in order for each
+    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]  # to controllers and pilots, in order for each
     fingerprints: frozenset[str]  # numeric fingerprints of these processes
     truth_sha256: str | None  # as the world reported it at the end of the run; None if the record has no end
-    failure: str  # failure of a user's code in these processes by which the run ended; empty if there was none
+    failure: str  # failure of a user's code in these processes that ended the run; empty if none did
 
     @property
     def names(self) -> frozenset[str]:
@@ -222,7 +222,7 @@ class RecordedAgents(NamedTuple):
 def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenario) -> RecordedAgents:
     """Return the agents that took part in the run of a record.
 
-    Other processes announce no fingerprint, or serve names that are not agents of the scenario.
+    Processes that announce no fingerprint, or serve names that are not agents of the scenario, are left out.
     """
     known = set(agents_of(scenario)) if scenario.drones else set()
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
@@ -292,7 +292,7 @@ class GateInputs(NamedTuple):
 
 
 def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
-    """Yield the inputs of each gate of a record that has truth."""
+    """Yield the inputs and truth of each gate for which a record has truth."""
     truth_keys = {keys.truth(drone): drone for drone in drones}
     wanted = {keys.CLOCK, keys.EVENT, *truth_keys}
     for key in reader.topics():
@@ -329,7 +329,7 @@ class OutputHashes:
     """SHA-256 of the outputs of agents up to a gate, by key.
 
     Args:
-        until_ns: the last gate whose outputs are hashed; those for later gates may be missing on record.
+        until_ns: the last gate whose outputs are hashed; those of later gates may be missing from the record.
     """
 
     def __init__(self, until_ns: int) -> None:

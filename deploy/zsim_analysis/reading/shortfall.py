@@ -28,19 +28,19 @@ from zsim_analysis.reading.formation import cluster_of
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
 NOT_AS_PLANNED = "NOT AS PLANNED"
-ENGAGES_S = 20.0  # time from take-off within which a formation must engage; chosen: it takes 4 to 12 s
-MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # a reference that moves less (m or rad) in this time is at rest; chosen
-HELD_MAX_S = 2.0  # longest total hold that still follows the plan; chosen: four times the wait after a fault
-LATE_MAX_S = 1.0  # longest missing part of a reference that is not reported; chosen: two attempts at a step of the plan
+ENGAGES_S = 20.0  # time from take-off within which a formation must engage; design choice: engaging takes 4 to 12 s
+MOVES_NS, MOVES_MIN = 500_000_000, 1e-3  # a reference that moves less (m or rad) in this time is at rest; design choice
+HELD_MAX_S = 2.0  # longest total hold that still follows the plan; design choice: four times the wait after a fault
+LATE_MAX_S = 1.0  # longest missing part of a reference left unreported; design choice: two attempts at a plan step
 SAMPLE_NS = 100_000_000  # sampling interval of a reference that is compared with the plan's
-# a drone that is farther off for that many successive seconds has strayed; chosen: twice the minimum separation
+# a drone farther off for that many successive seconds has strayed; design choice: over twice the minimum separation
 STRAYED_M, STRAYED_S = 5.0, 3
-SETTLED_S = 10.0  # time from the engagement until drones must be at their positions; chosen
+SETTLED_S = 10.0  # time from the engagement until drones must be at their positions; design choice
 SAME = 1e-3  # m or rad; tolerance of the reference against the plan's, which is computed by the same formulas
 CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # name prefixes of plans' controllers, and of operators
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents that bring a drone down
-ONE_HIT_NS = 500_000_000  # a touchdown within this time of an impact belongs to it; chosen
-REFUSED_NS = 5_000_000_000  # a command refused within this time before a landing explains it; chosen
+ONE_HIT_NS = 500_000_000  # a touchdown within this time of an impact belongs to it; design choice
+REFUSED_NS = 5_000_000_000  # a command refused within this time before a landing explains it; design choice
 LEADS = ("hold", "land", "target", "trajectory", "assemble")  # requests that make a formation leave its plan
 
 
@@ -50,13 +50,13 @@ class Shortfall(Struct, frozen=True):
     # drones: emergency, flip, impact, touchdown, battery, landing (the first incident), mission (incomplete),
     # strayed (far from its position or reference), reference (no take-off), override (flown by others); clusters:
     # plan (a step refused to the end, or flown in part), engagement (never), held (too long), request (commanded by
-    # others), early (the run ended before a step was due), window (not engaged in all of it); and collision, process
+    # others), early (the run ended before a step was due), window (not engaged throughout it); and collision, process
     # (an expected one died, failed, or never joined), record (incomplete)
     kind: str
     subject: str  # the cluster, drone, process, or "record"; for a collision both parties, as "drone1, drone2"
     t_s: float  # simulated time at which it began
     text: str
-    fails: bool  # whether the flight did not follow its plan; the command then ends with code 1
+    fails: bool  # whether the flight did not follow its plan, so that the command ends with exit code 1
 
 
 class Verdict(Struct, frozen=True):
@@ -101,7 +101,7 @@ def window_of(flight: RecordedFlight) -> tuple[tuple[float, float], str]:
 def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple[float, float], str]:
     """Return the window of a run's statistics [s], and a note if it is not the scenario's.
 
-    If the scenario has none, it is the last two thirds of the run.
+    If the scenario has no window, the last two thirds of the run are used.
     """
     default = (length_s / 3, length_s)
     if wanted_s is None:
@@ -195,7 +195,7 @@ def _incidents(flight: RecordedFlight) -> Iterator[Shortfall]:
 
 
 def _refusal_before(event: Event, flight: RecordedFlight) -> str:
-    """Return the reason of a drone's latest refused command if that may explain an event; empty otherwise.
+    """Return why a drone's latest refused command was refused, if that may explain an event; otherwise empty.
 
     Only the first of many equal refusals are events; the last of these says that further ones are only counted.
     """
@@ -231,7 +231,7 @@ def _incident_text(event: Event, refused: str) -> str:
 
 
 def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> str:
-    """Describe the faults of a drone or the world that were active at a time: (t_ns, sequence number of the event)."""
+    """Describe the faults of a drone or the world that were active at an event, given as (t_ns, sequence number)."""
     active: dict[object, str] = {}
     for each in flight.events:
         if (each.t_ns, each.seq) > at:
@@ -392,7 +392,7 @@ def _refused(states: ClusterStates) -> Iterator[Shortfall]:
         op, why = step
         begun = begun if begun and begun[0] == op else (op, float(states.t_ns[place]) / 1e9)
         last = place + 1 == len(states.reasons)
-        flown = engaged or (was_engaged and states.phases[place] == "assembling")  # also while formations change
+        flown = engaged or (was_engaged and states.phases[place] == "assembling")  # also while the formation changes
         if flown and (last or states.phases[place + 1] == "landing"):
             yield _line(states, "plan", begun[1], f"the {op} of the plan was refused to the end: {why}", True)
 
@@ -402,7 +402,7 @@ def _strayed(
 ) -> Iterator[Shortfall]:
     """Yield the drones whose true positions were far from those desired in the engaged formation.
 
-    The estimates that the controller uses may differ. Interventions are excluded.
+    The controller sees estimates, which may differ from the truth. Interventions are excluded.
     """
     engaged = np.array([phase == "engaged" for phase in states.phases], bool)
     settled = states.t_ns >= states.t_ns[engaged][0] + round(SETTLED_S * 1e9)
@@ -524,7 +524,7 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
     refusals = _waits(states, "trajectory", planned.start_s)
     begin_s = 0.0
     if duration_s is None and on.any() and not refusals:
-        begin_s = float(at_s[on][0])  # an endless one is joined in motion once the formation reaches it
+        begin_s = float(at_s[on][0])  # an endless trajectory is joined in motion once the formation reaches it
     flown_s = float(np.diff(np.r_[at_s, due_s])[on].sum())
     if due_s - begin_s - flown_s <= LATE_MAX_S:
         return

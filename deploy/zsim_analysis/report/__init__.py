@@ -16,5 +16,5 @@ FORMATS = ("pdf", "svg")  # formats of figures besides PNG
 
 
 def indented_json(content: Any, order: Literal["sorted"] | None = None) -> bytes:
-    """Return the bytes of a file such as summary.json."""
+    """Return content as indented JSON, as in summary.json."""
     return msgspec.json.format(msgspec.json.encode(content, order=order), indent=2) + b"\n"

@@ -1,6 +1,6 @@
-"""The comparison of several runs: the differences of their scenarios and results, their page, and its figures.
+"""The comparison of several runs: differences between their scenarios and results, and the page with its figures.
 
-In the figures runs are overlaid where lines remain distinguishable, otherwise side by side.
+In the figures, runs are overlaid where lines remain distinguishable, otherwise side by side.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -43,8 +43,8 @@ from zsim_analysis.report.summary import STATISTICS, RunSummary, flies_paper_tes
 ABSENT = "–"
 RUNS_PER_TABLE = 2  # runs side by side with all their statistics; more do not fit the page
 THERE = "there"  # cell of a named item, such as a drone, that another run does not have
-NAMED, NAMES_MAX = 3, 100  # runs in the page's file name, and characters of their names
-MARK, MARK_WITHIN = b": comparison</title>", 4_000  # identifies our pages, within their first bytes
+NAMED, NAMES_MAX = 3, 100  # number of runs in the page's file name, and of characters of their names
+MARK, MARK_WITHIN = b": comparison</title>", 4_000  # identifies comparison pages, within that many first bytes
 UNPLANNED = "†"  # after the name of a run that was not flown as planned
 
 
@@ -58,11 +58,11 @@ class ComparedRun:
 
     @property
     def label(self) -> str:
-        """Its name in tables and figures, marked if it was not flown as planned."""
+        """The run's name in tables and figures, marked if it was not flown as planned."""
         return self.name if self.summary.as_planned else f"{self.name} {UNPLANNED}"
 
     def formation(self, cluster: str) -> Formation | None:
-        """Return a cluster's formation, None if this run has none that can be judged."""
+        """Return a cluster's formation; None if this run has none that can be judged."""
         return next((formation for formation in self.formations if formation.name == cluster), None)
 
 
@@ -76,7 +76,7 @@ def compare(
 
     Raises:
         RecordError: a run has no record, or its record contains no truth of any drone.
-        ReportError: a run is given twice, or the page cannot be written, or would replace something else.
+        ReportError: a run is given twice, or the page cannot be written or would replace something else.
     """
     places = [directory.resolve() for directory in directories]
     for number, directory in enumerate(directories):
@@ -128,7 +128,7 @@ def run_names(directories: Sequence[Path]) -> list[str]:
 
 
 def runs_id(directories: Sequence[Path]) -> str:
-    """Return an identifier of these runs in this order; it does not change if their folders are moved together."""
+    """Return an identifier of these runs in this order; it stays the same if their folders are moved together."""
     paths = [directory.resolve() for directory in directories]
     places = "\0".join(relpath(path, paths[0].parent) for path in paths)
     return sha256(places.encode(errors="surrogateescape")).hexdigest()[:16]
@@ -152,7 +152,7 @@ def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) ->
 
 
 class ComparisonRow(NamedTuple):
-    """A row of a table with a cell per run."""
+    """A row of a table with one or more cells per run."""
 
     name: str
     cells: tuple[str, ...]
@@ -191,7 +191,7 @@ def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[Compariso
 
 
 def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
-    """Return the fields in which the resolved scenarios differ, by path; a field missing in a run is ABSENT there.
+    """Return the fields in which the resolved scenarios differ, by path; a field that a run lacks is ABSENT.
 
     Named items that some runs lack, such as drones, are listed without their fields.
     """
@@ -203,7 +203,7 @@ def scenario_rows(runs: Sequence[ComparedRun]) -> list[ComparisonRow]:
         ComparisonRow(path, tuple(_text(each[path]) if path in each else ABSENT for each in flat))
         for path in paths
         if not path.startswith(items)
-        and (path in partial_paths or any(each[path] != flat[0][path] for each in flat))  # equal texts do not suffice
+        and (path in partial_paths or any(each[path] != flat[0][path] for each in flat))  # texts may coincide
     ]
 
 
@@ -235,7 +235,7 @@ def _text(value: Any) -> str:
 
 
 def notes(runs: Sequence[ComparedRun]) -> list[str]:
-    """Return remarks: shortfalls, identical flights, drones and clusters of only some runs, and each run's notes."""
+    """Return remarks: shortfalls, identical flights, drones and clusters of only some runs; then each run's notes."""
     lines = [
         f"{run.name}: {'not as planned: ' * each.fails}{each.text}" for run in runs for each in run.summary.shortfalls
     ]
@@ -291,7 +291,7 @@ def clusters(runs: Iterable[ComparedRun]) -> list[str]:
 
 
 def parameters(runs: Iterable[ComparedRun], cluster: str) -> list[str]:
-    """Return the variables of a cluster in all runs."""
+    """Return the variables of a cluster that any run has."""
     judged = (run.summary.clusters.get(cluster) for run in runs)
     return list(dict.fromkeys(name for each in judged if each for name in each.errors))
 
@@ -340,7 +340,7 @@ def comparison_figures(runs: Sequence[ComparedRun]) -> Iterator[style.ReportFigu
 
 
 def _across(runs: Sequence[ComparedRun]) -> int:
-    """Return the number of runs in a row, balanced over the rows."""
+    """Return the number of runs in a row, with rows of about equal length."""
     rows = -(-len(runs) // COLUMNS)
     return -(-len(runs) // rows)
 
@@ -433,7 +433,7 @@ def _draw_errors(
     style.letter_panels(grid[0])
     for name, axes in zip(names, grid[:, 0], strict=True):
         axes.set_ylabel(style.label(name), fontsize=style.PAPER_PT)
-        limit = 0.0  # the largest error within the window of any run
+        limit = 0.0  # largest error within the window, over all runs
         for run in runs:
             formation = run.formation(cluster)
             if formation and name in formation.names:
@@ -488,7 +488,7 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
     style.letter_panels(lanes)
     first = grid[0][0]
     first.plot([], [], label="desired, while engaged", **DESIRED)
-    for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):  # in no run's colour
+    for kind in dict.fromkeys(band.kind for each in marks for band in each.marks.bands):  # in neutral colours
         face = style.DARK if kind == style.FAULT else GREY_FACE
         first.fill_between(
             [], [], facecolor=face, edgecolor=style.DARK, hatch=HATCHES.get(kind, ""), lw=0.8, label=kind

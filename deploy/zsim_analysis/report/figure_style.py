@@ -22,12 +22,12 @@ from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 COLUMN_IN, PAGE_IN = 3.5, 7.16  # widths of a column and of a page of IEEE's conference papers
 DPI = 200  # resolution of PNG files
 PAPER_PT = 8.0  # text size [pt], that of a paper's captions
-LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of a legend entry without its name, in text sizes
+LETTER_EMS, ENTRY_EMS = 0.6, 3.4  # width of a letter, and of a legend entry without its name [em]
 LETTER_PAD_PT = 3.0  # distance between a panel's letter and its axes
-MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter and height of a line, in text sizes
-MARK_LINES, MARK_PAD_IN = 4, 0.05  # most lines of a mark's reason, and margin above a mark
+MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter, and height of a line [em]
+MARK_LINES, MARK_PAD_IN = 4, 0.05  # most lines of a warning's reason, and margin above a warning
 FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE does not accept Type 3
-POINTS = 2000  # most points per line: more than a page has pixels
+POINTS = 2000  # most points per line: more than a page has pixels across
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
@@ -36,14 +36,14 @@ AMBER = "#9a6a00"  # an orange that is legible as small print on white
 DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.0, "ls": (0, (5, 3)), "zorder": 4}
 MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 1.1, "zorder": 2}  # wide enough to be visible behind the truth
 TRUE: dict[str, Any] = {"color": BLUE, "lw": 0.6, "zorder": 3}
-SPREAD = (5.0, 50.0, 95.0)  # percentiles that are drawn
+SPREAD = (5.0, 50.0, 95.0)  # percentiles drawn
 SPREAD_INSTANTS = 1000  # number of times at which percentiles are computed
 SYMBOLS = {"x_c": "$x_c$", "y_c": "$y_c$", "z_c": "$z_c$", "p": "$p$", "q": "$q$", "beta": "$\\beta$"}
 GREEK = {"phi": "\\phi", "rho": "\\rho"}
 
 
 class ReportFigure(Struct, frozen=True):
-    """A figure with its file name, and with its title and caption on the page."""
+    """A figure with its file name, and its title and caption on the page."""
 
     name: str
     title: str
@@ -52,17 +52,17 @@ class ReportFigure(Struct, frozen=True):
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of its PNG file, for a browser's layout before the image is loaded."""
+        """Width and height of the PNG file, for a browser's layout before the image is loaded."""
         width, height = self.drawing.get_size_inches() * self.drawing.dpi
         return round(width), round(height)
 
     @property
     def is_column(self) -> bool:
-        """Whether it is as wide as a column, two of which fit on a page."""
+        """Whether the figure is at most a column wide, so that two fit side by side on a page."""
         return self.drawing.get_size_inches()[0] <= COLUMN_IN
 
     def png(self) -> bytes:
-        """Return the figure as a PNG file, which fixes the layout for all its files."""
+        """Return the figure as a PNG file; this fixes the layout for its files in other formats."""
         file = io.BytesIO()
         self.drawing.savefig(file, format="png")
         self.drawing.set_layout_engine("none")
@@ -106,13 +106,13 @@ def label(name: str) -> str:
 
 
 def scale(axes: Axes, *values: Array, pad: float = 0.06) -> None:
-    """Set the range of a y axis to that of `values`, unless that is empty or a single value."""
+    """Set the range of a y axis to that of `values`, padded, unless it is empty or a single value."""
     if limits := padded_range(np.concatenate(values), pad):
         axes.set_ylim(limits)
 
 
 def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
-    """Return the range of the finite samples, padded at each end by a share of it; None if there are none."""
+    """Return the range of the finite samples, padded at each end by `share` of it; None if empty or a single value."""
     known = samples[np.isfinite(samples)]
     if not len(known) or known.max() <= known.min():
         return None
@@ -133,7 +133,7 @@ def thinned(x: Array, y: Array) -> tuple[Array, Array]:
     starts = np.arange(0, len(x), size)
     bins = np.full((len(starts), size), np.nan)
     bins.flat[: len(x)] = y
-    unknown = np.isnan(bins)  # chosen only in bins without a known value
+    unknown = np.isnan(bins)  # picked only in bins without a known value
     least, greatest = (np.where(unknown, worst, bins) for worst in (np.inf, -np.inf))
     kept = np.unique((starts + least.argmin(axis=1), starts + greatest.argmax(axis=1)))
     return x[kept], y[kept]
@@ -182,7 +182,7 @@ def finish(figure: Figure, lettered: Iterable[Axes], grid: Any, legend_columns: 
 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
-    """Put a legend above a figure with each name of all axes once, those of `axes` first."""
+    """Put a legend above a figure, with every name of all axes once, those of `axes` first."""
     named: dict[str, Any] = {}
     for each in (axes, *figure.axes):
         for handle, name in zip(*each.get_legend_handles_labels(), strict=True):
@@ -195,7 +195,7 @@ def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
 
 
 def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
-    """Write a warning about the flight above a complete figure, and enlarge the figure by its height.
+    """Write a warning about the flight above a complete figure, which grows by the warning's height.
 
     `head` is the first line; `reason` is wrapped below it, and cut off after MARK_LINES lines.
     """
@@ -212,7 +212,7 @@ def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
         if box.y0 > figure.bbox.height / 2:  # a legend above the axes
             room_px = max(room_px, box.height + figure.dpi * PAPER_PT / 72)
             legend.set_bbox_to_anchor((0.0, 0.0, 1.0, top), figure.transFigure)
-    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):  # it ignores anchored legends
+    if isinstance(engine := figure.get_layout_engine(), ConstrainedLayoutEngine):  # the engine ignores anchored legends
         engine.set(rect=(0.0, 0.0, 1.0, top - room_px / figure.bbox.height))
 
 
@@ -221,7 +221,7 @@ def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
 FAULT, TAKE_OVER = "fault", "taken over"
 COLOURS = {"assembly": SKY, "held": ORANGE, "landing": GREEN, FAULT: VERMILION, TAKE_OVER: PURPLE}
 ALPHA = 0.22
-SHORT, HAIRLINE_PT = 0.005, 0.8  # bands shorter than this share of the axis are drawn as a line of this width
+SHORT, HAIRLINE_PT = 0.005, 0.8  # bands shorter than this share of the axis also get a line of this width
 WINDOW = "window of the statistics"
 WINDOW_GREY = "#e7ebf0"  # lighter than the grid lines
 ASSEMBLY = {"taking_off": "assembly", "assembling": "assembly"}
@@ -288,7 +288,7 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield when others than the scenario's agents flew a drone, from its acquisition or the first command on."""
+    """Yield when processes other than the scenario's agents flew a drone, from acquisition or first command on."""
     since_ns: dict[str, int] = {}
     planned = {"controller", PILOT, *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:
@@ -307,7 +307,7 @@ def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def draw_marks(axes: Iterable[Axes], marks: TimeMarks, whole: bool = True) -> None:
-    """Draw marks into time axes that already contain their data; with `whole`, extend these to the whole run."""
+    """Draw marks into time axes that already contain their data; with `whole`, extend the axes to the whole run."""
     for each in axes:
         if whole and marks.span_s:
             each.update_datalim([(t_s, 0.0) for t_s in marks.span_s], updatey=False)

@@ -2,7 +2,7 @@
 
 Formations: errors (Figure 5), position (6), orientation (7) and shape (8). Drones: plan view; altitude, state and
 battery; errors of estimates; velocities; errors against references; distances; radio. A few drones get a line or a
-column each; larger fleets are drawn as their spread.
+column each; larger fleets are drawn as a spread.
 """
 
 import math
@@ -41,8 +41,8 @@ POSITION = ("x_c", "y_c", "z_c")
 ORIENTATION = ("roll", "pitch", "yaw")
 ROWS_MAX = 16  # most parameters in one figure: those of 4 drones, which fill the height of a page
 ROW_IN = 1.0  # height of a parameter's panel, with its letter [in]
-ROWS_IN = 8.4  # most height of all rows [in], on a page of 9.25 in
-MOVED_MAX = 3  # parameters of a large formation that are drawn individually
+ROWS_IN = 8.4  # maximum height of all rows [in], on a page of 9.25 in
+MOVED_MAX = 3  # number of parameters of a large formation drawn individually
 
 
 def parameter_groups(names: Sequence[str]) -> list[tuple[str, int, str, list[str]]]:
@@ -64,7 +64,7 @@ def numbered(number: int, paper: bool) -> str:
 def draw_errors(
     formation: Formation, window_s: tuple[float, float], marks: style.TimeMarks, goal: GoalErrors | None = None
 ) -> Figure:
-    """Draw Figure 5: a row per parameter, errors against the final goal, the reference, and within the window.
+    """Draw Figure 5: a row per parameter, its errors against the final goal and the reference, and within the window.
 
     A large formation has rows for position and orientation, and one for all other parameters of each unit.
     """
@@ -79,7 +79,7 @@ def draw_errors(
     every = np.ones(len(rows), bool)
     for name, axes in zip(names, grid, strict=False):
         i = formation.column(name)
-        if goal and np.isfinite(goal.goal[i]):  # on an axis that includes its truth during the climb
+        if goal and np.isfinite(goal.goal[i]):  # on an axis that includes the truth during the climb
             _draw_error(axes[0], formation.t_s, goal.true[:, i], goal.est[:, i])
             style.scale(axes[0], goal.true[:, i], goal.est[formation.since_engaged, i])
         elif goal:
@@ -192,7 +192,7 @@ def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
     """Return desired, measured and true values of a parameter, angles without jumps at ±π.
 
     Angles are unwrapped from the engagement on. Before it, the desired value is the noisy estimate, which may wind up
-    by whole revolutions; there each value is brought within half a turn of the first desired one.
+    by whole revolutions; there each value is brought within half a turn of the first desired value after it.
     """
     i = formation.column(name)
     desired = formation.desired[:, i].copy()
@@ -214,7 +214,7 @@ def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
 ROOM = 0.06  # margin at each end of the plan, as a share of its range, so that marks at its edge are not cut off
 OUTLINES = 7  # most outlines of a formation in the plan, few enough to be distinguishable
 APART = 0.6  # smallest distance between outlines, as a share of the formation's size; closer ones would overlap
-RING_MAX = 4  # most drones whose outline connects them in order; that of more drones is their convex hull
+RING_MAX = 4  # most drones whose outline connects them in order; the outline of more drones is their convex hull
 
 
 def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
@@ -317,7 +317,7 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
 
 # Altitude, state and battery
 
-LANES_IN = 5.0  # most height of the panel of states relative to the other panels; on the page it takes half of it [in]
+LANES_IN = 5.0  # maximum height of the panel of states, in units of 0.5 in
 LANES_NAMED = 12  # most drones named beside their states
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {
@@ -392,7 +392,7 @@ def name_states(figure: Figure, tracks: Sequence[Track]) -> None:
 # Errors of estimates
 
 ERRORS = ("x (m)", "y (m)", "z (m)", "yaw (rad)")
-INSIDE = 0.9545  # share of a normal error within SIGMAS standard deviations
+INSIDE = 0.9545  # probability of a normally distributed error within SIGMAS standard deviations
 CONSISTENT = "95 % of χ²"  # range of NEES that contains 95 % of the samples of a consistent estimator
 BAND_GREY = "#9aa5b1"  # different from the colours of all time marks
 FLOOR = 0.1  # smallest NEES drawn on its logarithmic axis
@@ -427,7 +427,7 @@ def draw_estimates(
         for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no data
             axes.set_title(note, loc="right", fontsize=SMALL_PT, pad=2.0)
         style.draw_marks(column, marks)
-    since_s = -np.inf if marks.engaged_s is None else marks.engaged_s  # large initial sigmas leave the axes
+    since_s = -np.inf if marks.engaged_s is None else marks.engaged_s  # large initial sigmas may leave the axes
     for i, row in enumerate(grid[:-1]):
         reach = 0.0
         for each in errors.values():
@@ -514,7 +514,7 @@ def _draw_many_estimates(
 # Velocities and distances
 
 VELOCITIES = ("forward (m/s)", "left (m/s)", "up (m/s)", "yaw rate (rad/s)")
-GAP_S = 0.5  # lines break where a drone has no velocity commands for longer
+GAP_S = 0.5  # lines break where a drone has no samples for longer than this
 
 
 def draw_velocities(
@@ -595,7 +595,7 @@ def draw_distances(
     colours: Mapping[str, str],
     marks: style.TimeMarks,
 ) -> Figure:
-    """Draw the distance of each pair in both its colours, and the limits; for many drones, that to the nearest one."""
+    """Draw each pair's distance in both drones' colours, and the limits; for many drones, distances to the nearest."""
     figure = style.new_figure(style.COLUMN_IN, 2.5)
     axes = figure.subplots()
     if distances.pairs:
@@ -624,7 +624,7 @@ def draw_distances(
 
 # Radio
 
-CELLS_MAX = 6  # most drones at which cells have room for a number
+CELLS_MAX = 6  # most drones for which cells have room for a number
 DARK_SHARE = 0.6  # share above which a cell is dark and its number white
 
 

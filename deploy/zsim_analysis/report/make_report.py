@@ -55,7 +55,7 @@ from zsim_analysis.report.summary import (
     tracking_table,
 )
 
-FAULTS_MAX = 6  # most faults listed at the top of a page
+FAULTS_MAX = 6  # largest number of faults listed at the top of a page
 REFERENCE = (
     "Estimate − desired is what the controller sees; truth − desired is what the drones do. Until the formation is "
     "engaged, the controller takes its own estimate as the desired value."
@@ -69,7 +69,7 @@ Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 def make_report(
     directory: Path, progress: Callable[[str], None] = lambda _: None, formats: Sequence[str] = ()
 ) -> RunSummary:
-    """Read DIR/run.mcap, and write DIR/summary.json, DIR/figures/*.png and DIR/report.html, as `write_report` does.
+    """Read DIR/run.mcap and write DIR/summary.json, DIR/figures/*.png and DIR/report.html, as `write_report` does.
 
     Raises:
         RecordError: there is no record, or it contains no truth of any drone.
@@ -291,7 +291,7 @@ def date_text(date: str | None) -> str:
 
 
 def rendered(name: str, pictures: Iterable[Picture], package: str = "zsim_analysis.report", **values: Any) -> str:
-    """Return a page from a template of a package, which may use this package's templates, with figures and `values`."""
+    """Return the page that a template of `package` makes of figures and `values`; it may use the report's templates."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
         autoescape=True,
@@ -315,7 +315,7 @@ def write_report(
 ) -> None:
     """Write DIR/summary.json, DIR/figures/*.png and DIR/report.html, all or none of them.
 
-    Files of these figures in other formats, from an earlier report, are removed because they are outdated.
+    Outdated files of these figures in other formats, left by an earlier report, are removed.
 
     Args:
         directory: directory of the run or the sweep.
@@ -358,7 +358,7 @@ def write_page(
 def _render(
     figures: Iterable[ReportFigure], folder: Path, progress: Callable[[str], None], formats: Sequence[str]
 ) -> list[Picture]:
-    """Render figures one by one, and write their files in other formats into a new folder."""
+    """Render figures one by one and write their files in other formats into a new folder."""
     folder.mkdir()
     pictures = []
     for figure in figures:
@@ -371,7 +371,7 @@ def _render(
 
 
 def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[str]) -> None:
-    """Remove the files of figures in formats other than these."""
+    """Remove the figures' files in those of FORMATS that are not given."""
     for figure, _ in pictures:
         for form in set(FORMATS) - set(formats):
             if (earlier := (folder / figure.name).with_suffix(f".{form}")).is_file():
@@ -380,7 +380,7 @@ def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[
 
 @contextmanager
 def _put_in_place(directory: Path, report: Path, figures: Path) -> Iterator[Path]:
-    """Yield a folder whose files are moved into a directory once all are complete, or none on a full disk or Ctrl-C.
+    """Yield a folder; move its files into a directory once all are complete, or none on a full disk or Ctrl-C.
 
     Raises:
         ReportError: the directory cannot be written (the error names `report`), or `figures` in it is a symbolic link,

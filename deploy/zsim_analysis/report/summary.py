@@ -1,6 +1,6 @@
-"""summary.json: the facts and the errors of a flight; and its tables of errors, for the page and the terminal.
+"""The content of summary.json: facts and errors of a flight; and its error tables, for the page and the terminal.
 
-Errors of the paper's Test 1 are shown beside those that the paper prints: I. Mas, S. Curi, R. Sanchez Pena, Open-source
+Errors in the paper's Test 1 are shown beside those printed in the paper: I. Mas, S. Curi, R. Sanchez Pena, Open-source
 Multi-UAV Simulator for the ROS Environment.
 """
 
@@ -65,13 +65,13 @@ class ClusterErrors(Struct, frozen=True):
     drones: tuple[str, ...]  # names of the cluster's drones
     # over the samples of the window in which the cluster was engaged; values are None if it never was
     errors: dict[str, ParameterErrors]
-    paper_std: dict[str, float] = {}  # Table I for a flight of Test 1, otherwise empty
-    engaged_share: float | None = None  # share of the window's samples in which it was engaged; None if there are none
+    paper_std: dict[str, float] = {}  # the paper's Table I for a flight of Test 1, otherwise empty
+    engaged_share: float | None = None  # share of the window's samples in which it was engaged; None without samples
     phases: dict[str, float] = {}  # shares of the window's samples by phase
 
     @property
     def part(self) -> str:
-        """Describe the part of the window that the errors cover; empty if it is all of it."""
+        """The part of the window that the errors cover, in words; empty if they cover all of it."""
         if self.engaged_share in (None, 1.0):
             return ""
         if not self.engaged_share:
@@ -87,7 +87,7 @@ class RecordFacts(Struct, frozen=True):
     state: str  # the same in words, with what is missing
     gates: int  # number of gates on record
     gates_missing: int  # according to the clocks
-    gaps: list[dict[str, float]]  # runs of missing gates: their number, and the first and the last one
+    gaps: list[dict[str, float]]  # stretches of missing gates: number of gates, time of the first and the last
     messages_missing: int  # messages of the world that are missing according to sequence numbers
     undecoded: int  # messages that do not match the type of their key
     truth_instants: int  # truth messages in the hash: those of simulated drones
@@ -96,7 +96,7 @@ class RecordFacts(Struct, frozen=True):
 
 
 class RunSummary(Struct, frozen=True):
-    """The content of summary.json; None if the record does not show a value."""
+    """The content of summary.json; a value is None if the record does not show it."""
 
     scenario: str | None
     seed: int | None
@@ -118,7 +118,7 @@ class RunSummary(Struct, frozen=True):
     command_age_ms: dict[str, float] | None
     links: dict[str, DriverLink]  # links to the aircraft that flew as external drones, by drone
     window_s: tuple[float, float]
-    window_note: str  # why the window is not that of the scenario; empty if it is
+    window_note: str  # why the window is not the scenario's; empty if it is
     errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
@@ -410,7 +410,7 @@ def terminal_text(summary: RunSummary) -> Group:
 
 
 def table(summary: RunSummary, cluster: str) -> FittedTable:
-    """Return the errors of one cluster for the terminal, for Test 1 with the paper's Table I."""
+    """Return the errors of one cluster for the terminal; for Test 1, beside the paper's Table I."""
     judged = summary.clusters[cluster]
     content = error_table(judged)
     title = f"Formation errors of {cluster} from {span_text(summary.window_s)}"
@@ -427,7 +427,7 @@ def table(summary: RunSummary, cluster: str) -> FittedTable:
 
 # The paper's printed values, and which flights are comparable with them, judged by their scenarios
 
-# Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
+# Table I: standard deviations of the formation parameters in Test 1 after reaching steady state; m and rad.
 PAPER_TABLE_1 = {
     "x_c": 0.11, "y_c": 0.22, "z_c": 0.13, "roll": 0.004, "pitch": 0.0025, "yaw": 0.044,
     "p": 0.032, "q": 0.035, "beta": 0.012,
@@ -458,9 +458,9 @@ TEST_2_REFERENCE = {
     "q": "4",
     "beta": "pi/4",
 }
-COMPARED_S = (0.0, 7.0, 31.0, 88.0, 140.0)  # expressions with equal values at these times count as the same; chosen
+COMPARED_S = (0.0, 7.0, 31.0, 88.0, 140.0)  # expressions equal at these times count as the same; design choice
 ROBOTS = 3
-TOLERANCE = 1e-3  # [m or rad] of values written with fewer digits
+TOLERANCE = 1e-3  # m or rad, as values may be written with fewer digits
 # shortest time from the take-off to the window, and shortest window, as in scenarios/step.yaml
 SETTLED_S, JUDGED_S = 100.0, 200.0
 GUST_MAX_M_S = 0.5  # as in scenarios/step.yaml; the paper names no wind
@@ -520,7 +520,7 @@ def _is_along_equation_4(plan: ClusterPlan) -> bool:
             for t_s in COMPARED_S
         )
     except ExpressionError:
-        return False  # it was refused in flight
+        return False  # the trajectory was refused in flight
 
 
 def _is_printed(drone: Drone) -> bool:
@@ -545,6 +545,6 @@ def _is_led(cluster: Cluster) -> bool:
     try:
         target = named_values(space, plan.target, "target", np.full(len(space.names), np.inf))
     except (TrajectoryError, ExpressionError):
-        return False  # it was refused in flight
+        return False  # the target was refused in flight
     wanted = [TEST_1_TARGET.get(name, np.nan) for name in space.names]
     return all(abs(target[k] - value) <= TOLERANCE for k, value in enumerate(wanted) if not np.isnan(value))

@@ -21,7 +21,7 @@ from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_analysis.sweep.sweep_run import Row, Task, failed_row, fly
 
-AHEAD = 2  # tasks per thread of the cluster, so that none of them idles
+AHEAD = 2  # tasks per thread of the cluster, so that no thread idles
 CONNECT_S = 5.0  # wall time within which a scheduler must answer
 
 _alone = threading.Lock()
@@ -142,7 +142,7 @@ class DaskPool:
 
 
 def _checked(client: Any) -> Any:
-    """Return `client` if it is a connected synchronous Client; RunError otherwise."""
+    """Return `client` if it is a connected synchronous Client; raise RunError otherwise."""
     if not isinstance(client, Client) or client.asynchronous or client.status != "running":
         found = "that is closed" if isinstance(client, Client) and client.status != "running" else "asynchronous"
         shown = f"a Client {found}" if isinstance(client, Client) else show(str(type(client).__name__))

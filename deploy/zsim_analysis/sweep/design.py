@@ -1,4 +1,4 @@
-"""The plan of a sweep, and its design: the axes that vary, the values of each run, and their scenarios.
+"""The plan of a sweep, and its design: the axes that vary, and the values and scenario of each run.
 
 An axis is seeds, a list of values of a field, or values drawn for each run. The combinations of all listed values are
 the points of the grid.
@@ -30,11 +30,11 @@ from zsim.schema.checker import first_fault, first_lines, show
 from zsim_agents.hosting import check_classes
 
 PLAN = "plan.json"
-METRICS = "report.metrics"  # field that names the user's functions that compute metrics of a run
+METRICS = "report.metrics"  # field that names the user's functions for metrics of a run
 RUNS_MAX = 1_000_000
 SEED = "seed"
 SHOWN_MAX = 24  # most characters of a value in a table or figure
-SEEDS = 2**32  # drawn seeds are smaller: at most ten digits
+SEEDS = 2**32  # drawn seeds are below this: at most ten digits
 SYNTAX = "seed, seed=paired, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
 PAIRED = "paired"
 FieldPath = tuple[str | int, ...]  # steps to a field of a scenario from the top
@@ -87,10 +87,10 @@ def is_sweep(folder: Path) -> bool:
 
 
 class Seeds(Struct, frozen=True):
-    """A distinct seed for every run or, if paired, for every run of a combination, the same in all combinations."""
+    """A distinct seed for every run or, if paired, for every run of a combination, the same in every combination."""
 
     path: str = SEED
-    paired: bool = False  # if so, drawn values are also the same for all combinations
+    paired: bool = False  # whether all combinations have the same seeds, and the same drawn values
     values: tuple[int, ...] = ()  # empty: drawn with the scenario's seed
 
     def draw(self, seed: int, count: int) -> list[int]:
@@ -140,7 +140,7 @@ class Draw(Struct, frozen=True):
     second: float
 
     def draw(self, seed: int, count: int) -> list[float]:
-        """Return the values of the first runs; each field has its own random stream."""
+        """Return the values of the first `count` runs; each field has its own random stream."""
         rng = stream(seed, f"sweep/{self.path}")
         draw = rng.uniform if self.kind == "uniform" else rng.normal
         return draw(self.first, self.second, count).tolist()
@@ -207,15 +207,15 @@ def text_of(value: Any) -> str:
 
 
 def without_made(value: Any) -> str:
-    """Format a value; the name of a notebook's or script's class without the module generated for it."""
+    """Format a value; the name of a notebook's or script's class is given without its generated module."""
     text = text_of(value)
     return text.partition(":")[2] if text.startswith(plugin.MADE) else text
 
 
 def distinct(texts: Sequence[str], generated: Mapping[int, str]) -> list[str]:
-    """Return `texts` with those of `generated` at their indices, numbered if already in use: `Law-2`.
+    """Return `texts` with those of `generated` at their indices, numbered if already in use, as in `Law-2`.
 
-    All classes that a function creates have the same name.
+    Classes that one function creates all have the same name.
     """
     found = [*texts]
     known = {text for place, text in enumerate(texts) if place not in generated}
@@ -318,7 +318,7 @@ class SweepDesign:
         """Return the resolved scenario of a run, which flies in lockstep.
 
         Raises:
-            ScenarioError: with one line for every fault.
+            ScenarioError: the scenario is invalid; one line per fault.
         """
         document, faults = copy.deepcopy(self.plan.document), []
         for path, value in self.values(run).items():
@@ -386,7 +386,7 @@ def make_plan(
         earlier_faults: faults of the overrides, which are reported with the others.
 
     Raises:
-        ScenarioError: with one line for every fault of the variations and of the resulting scenarios.
+        ScenarioError: the variations or the resulting scenarios are invalid; one line per fault.
     """
     fields: dict[FieldPath, str] = {}  # the valid texts of `--vary`
     vary_faults = []
@@ -432,7 +432,7 @@ def _refuse_overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -
 
 
 def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
-    """Return the faults of the number of runs; `all_known`: no axis was refused, which might have drawn its values."""
+    """Return the faults of the number of runs; `all_known`: no axis, perhaps of drawn values, was refused."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 READY, _END = "ready", "end"
 SAFE_PATH = "PYTHONSAFEPATH"  # environment variable that keeps the working folder off Python's module search path
-DEATHS_MAX = 3  # most worker deaths in the same run, or in succession before any worker is ready
+DEATHS_MAX = 3  # maximum number of worker deaths in the same run, or in succession before any worker is ready
 EXIT_S = 5.0  # wall time granted to an idle worker to exit on its own
 
 

@@ -40,8 +40,8 @@ NEW_PLAN = f".{PLAN}.new"
 PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata
 PLAIN_S = 10.0  # wall time between progress lines if there is no terminal
 BAR = 20  # width of the progress bar [characters]
-FAILURES_MAX = 5  # most reasons for failed runs that are printed
-UNMEASURED_MAX = 5  # most runs without the user's metrics that are printed
+FAILURES_MAX = 5  # maximum number of failure reasons printed
+UNMEASURED_MAX = 5  # maximum number of runs without the user's metrics printed
 _TYPES: dict[Any, pa.DataType] = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 
@@ -183,7 +183,7 @@ class SweepScreen:
             self.say(f"run {run}: {reason}{more}")
 
     def line(self) -> str:
-        """Describe the finished runs, the runs per hour since the start, and the remaining time at that rate."""
+        """Return a text on the finished runs, the runs per hour since the start, and the time left at that rate."""
         filled = int(BAR * self._done / self._total)
         text = f"{'█' * filled}{'░' * (BAR - filled)} {self._done} / {self._total} runs"
         flown, elapsed_s = self._done - self._before, self._now_s() - self._start_s

@@ -32,9 +32,9 @@ from zsim_analysis.sweep.sweep_summary import (
     share_interval,
 )
 
-PANELS_MAX = 24  # most quantities in one figure; enough for a formation of 6 drones
+PANELS_MAX = 24  # maximum number of quantities in one figure; enough for a formation of 6 drones
 COLUMNS = 3  # columns of panels
-NARROW_MAX = 8  # most points side by side in a panel one third of the page wide
+NARROW_MAX = 8  # maximum number of points side by side in a panel one third of the page wide
 SLICES = 6  # number of groups of runs, sorted by a randomly drawn value, each with its own mean
 LEGEND_COLUMNS = 4
 ONE_RUN, BEYOND_AXIS, TABLE_I = "one run", "the interval goes beyond the axis", "the paper's Table I"
@@ -44,7 +44,7 @@ SHARES = (
     ("of these, as planned", "D", style.BLUE),
     ("of these, without collision", "s", style.BLACK),
 )
-LEVEL_LETTERS, UPRIGHT_LETTERS = 28, 25  # characters of size PAPER_PT that fit the width and height of a panel
+LEVEL_LETTERS, UPRIGHT_LETTERS = 28, 25  # characters of size PAPER_PT that fit the width and height of a narrow panel
 FORMULA = re.compile(r"\$[^$]*\$")
 
 
@@ -57,7 +57,7 @@ class Panel(Struct, frozen=True):
 
 
 def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
-    """Yield the figures for which there are data; quantities have a panel each."""
+    """Yield the figures for which there are data, with one panel per quantity."""
     own = [Panel(column, str(field_name(column))) for column in results.metrics[:PANELS_MAX]]
     rms, std = list[Panel](), list[Panel]()
     for prefix, each in list(results.parameters.items())[:PANELS_MAX]:
@@ -202,7 +202,7 @@ def most_runs(results: SweepResults) -> int:
 
 
 def mean_label(results: SweepResults) -> str:
-    """Return the legend entry of the means, with the number of runs (of seeds if only these vary)."""
+    """Return the legend entry of the means, with the number of runs (called seeds if only these vary)."""
     counts = {results.ended_well(point)[0] for point in range(results.design.points)} - {0}
     many = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
     what = "runs" if results.drawn or not results.has_seeds else "seeds"
@@ -261,7 +261,7 @@ def wrapped(text: str, letters: int) -> str:
 
 # One quantity in a panel
 
-DOTS_MAX = 400  # most runs of a point that are drawn individually
+DOTS_MAX = 400  # maximum number of runs of a point that are drawn individually
 BINS = (5, 30)  # minimum and maximum number of bins in a histogram
 GOLDEN = 0.6180339887  # fractional part of the golden ratio; its multiples modulo 1 spread dots evenly and reproducibly
 
@@ -381,15 +381,15 @@ def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"]
 
 # The x axis of a grid
 
-POINTS_MAX = 24  # most points side by side in one panel; the tables have all
+POINTS_MAX = 24  # maximum number of points side by side in one panel; the tables have all
 # colours of the combinations of those fields that are not on the axis
 SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
-DECADES_MIN = 30.0  # least ratio of the largest to the smallest value for a logarithmic axis
-TURNED_FROM = 34  # most characters of all labels together, with a space each, that fit side by side in a panel
+DECADES_MIN = 30.0  # smallest ratio of the largest to the smallest value for a logarithmic axis
+TURNED_FROM = 34  # maximum length of all labels together, with a space each, that fits side by side in a panel
 ABOVE = 1.1  # height of the marks drawn above runs and intervals, as a share of the axes' height
 MARK = style.VERMILION
 GROUP_MAX = 0.3  # largest share of the axis range for the combinations at one value; leaves room for six marks
-TICKS_MAX = 8  # most labelled values on an axis; if there are more values, only every n-th is labelled
+TICKS_MAX = 8  # maximum number of labelled values on an axis; if there are more values, only every n-th is labelled
 
 
 class Place(Struct, frozen=True):
@@ -406,7 +406,7 @@ class GridAxis:
     Attributes:
         field: path of the field on the axis; None if the points stand side by side.
         series: labels of the combinations of the other fields; [""] if there are no other fields.
-        places: the place of each point.
+        places: position of each point, by its number.
     """
 
     def __init__(self, design: SweepDesign) -> None:

@@ -38,11 +38,11 @@ from zsim_analysis.sweep.sweep_summary import (
     field_name,
 )
 
-POINTS_MAX = 200  # most points in a table of the page; sweep.parquet has all
-DETAILED_MAX = 24  # most points with a table of their own
+POINTS_MAX = 200  # maximum number of points in a table on the page; sweep.parquet has them all
+DETAILED_MAX = 24  # maximum number of points with a table of their own
 OVERVIEW = ("runs", "ended well", "as planned", "engaged", "no collision", "separation (m)", "least (m)")
 OWN = "figures of your own"
-BLOCK_COLUMNS = 6  # most columns that fit the page, including those of the grid's fields
+BLOCK_COLUMNS = 6  # maximum number of columns that fit the page, including those of the grid's fields
 QUANTILES = "true RMS, 5 to 95 %"
 
 
@@ -279,9 +279,9 @@ def _noted(text: str, note: str) -> str:
 TERMINAL_POINTS_MAX = 40
 BETWEEN = 3  # width between two columns of a table [characters]
 EDGE = 1  # width saved after a table's last column, net of the table's edges [characters]
-ERRORS_MAX = 9  # most parameters shown on a terminal, as many as in the paper's Table I
-HEAD = 8  # least width to which a heading is wrapped [characters]
-AXES_MAX = 3  # most grid fields with a column each; if there are more, all share one
+ERRORS_MAX = 9  # maximum number of parameters shown on a terminal, as many as in the paper's Table I
+HEAD = 8  # smallest width to which a heading is wrapped [characters]
+AXES_MAX = 3  # maximum number of grid fields with a column each; if there are more, all share one
 
 
 class TerminalColumn(Struct, frozen=True):

@@ -50,7 +50,7 @@ from zsim_analysis.sweep.design import METRICS
 
 METRIC = "metrics."  # prefix of the columns of the user's metrics
 FLIGHT = "flight"  # name of an argument that takes a RecordedFlight
-METRICS_MAX = 100  # most metrics that one function may return
+METRICS_MAX = 100  # maximum number of metrics that one function may return
 _NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
 
 Row = dict[str, Any]
@@ -86,8 +86,8 @@ class RunResult(Struct, frozen=True, kw_only=True):
     real_time_factor: float | None = None
     min_separation_m: float | None = None
     collisions: int | None = None  # number of contacts of drones with each other and with obstacles
-    min_obstacle_distance_m: float | None = None  # least over all drones' centres; None without obstacles and surfaces
-    # whether a drone was stopped in the air, flipped, hit something hard, or touched the ground in flight
+    min_obstacle_distance_m: float | None = None  # of the closest drone's centre; None without obstacles and surfaces
+    # whether a drone had its rotors stopped in the air, flipped, hit something hard, or touched the ground in flight
     crashed: bool | None = None
     # whether every cluster was engaged at some time within the judged window; None without a cluster
     engaged: bool | None = None

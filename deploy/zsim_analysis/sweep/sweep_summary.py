@@ -25,7 +25,7 @@ from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, engaged_column
 Samples = NDArray[np.float64]
 
 LEVEL = 0.95  # confidence level of all intervals
-RUNS_MIN = 5  # fewest runs for an interval; design choice: the interval of 2 runs is 13 times as wide as they differ
+RUNS_MIN = 5  # minimum number of runs for an interval; design choice: that of 2 runs is 13 times their difference
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
 _FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1
@@ -131,7 +131,7 @@ class GridPoint(Struct, frozen=True):
 
     label: str
     values: dict[str, Any]  # by path; empty if only seeds and drawn values vary
-    names: dict[str, str]  # abbreviated values by path, distinct for each field
+    names: dict[str, str]  # abbreviated values by path, distinct within each field
     runs: int  # number of finished runs
     ended_well: ConfidenceInterval | None  # share of the finished runs; None if no run is finished
     # share of the runs that ended well in which no drone collided or crashed
@@ -195,7 +195,7 @@ class SweepSummary(Struct, frozen=True):
 
 
 class SweepResults:
-    """The rows of the finished runs of a sweep, in columns."""
+    """The rows of a sweep's finished runs, as columns."""
 
     def __init__(self, design: SweepDesign, rows: Sequence[Row]) -> None:
         self.design = design
@@ -248,7 +248,7 @@ class SweepResults:
         return int((at_point & self.well).sum()), int(at_point.sum())
 
     def without_collision(self, point: int) -> tuple[int, int]:
-        """Of a point's runs that ended well, return how many had no collision or crash, and how many there are."""
+        """Return how many of a point's runs that ended well had no collision or crash, and how many ended well."""
         collisions, crashed = self.values("collisions", point), self.values("crashed", point)
         return int(((collisions == 0) & (crashed != 1)).sum()), len(collisions)
 

@@ -21,7 +21,7 @@ POLL_S = 0.05  # polling interval of a subscription, wall time
 LINE_S = 1.0  # interval between lines of `hz`, wall time
 SILENCE_S = 1.0  # wall time without a message after which `hz` reports silence; twice the longest gap if that is longer
 UNHEARD_S = 3.0  # wall time after which a key without any message is reported; live keys have at least one a second
-NAMED_MAX = 5  # number of similar keys suggested for a key without a publisher
+NAMED_MAX = 5  # maximum number of similar keys suggested for a key without a publisher
 OUTCOME_S = 3.0  # wall time for the world to report the outcome of a command; a paused world does not report it
 UNKNOWN_SENDER = "somebody"  # source in the world's event about a message that it could not decode
 PUB, ASK = "zsim.pub", "zsim.ask"
@@ -267,7 +267,7 @@ def _refuse_wildcards(key: str, command: str) -> None:
 
 
 def _map(what: str, text: str, example: str) -> dict[str, Any]:
-    """Parse a JSON text that must be a map; RunError, beginning with `what`, if it is not."""
+    """Parse a JSON text that must be a map; raise RunError, beginning with `what`, if it is not."""
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:

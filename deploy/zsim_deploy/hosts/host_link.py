@@ -107,7 +107,7 @@ class HostLink:
 
     @contextlib.asynccontextmanager
     async def channel(self, retry: bool = False) -> AsyncIterator[Connection]:
-        """Yield a connection for one channel; `retry`: try until the host is reached, else HostsError as for `open`."""
+        """Yield a connection for one channel; `retry`: try until the host is reached; otherwise errors as in `open`."""
         while True:
             try:
                 connection = await self.open()
@@ -220,7 +220,7 @@ class HostLinks:
             self._loop.spawn(link.measure_round_trips())
 
     def on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
-        """Run a coroutine for all hosts at once; return the results by host.
+        """Run a coroutine for all hosts concurrently; return the results by host.
 
         Raise HostsError with a line for each host for which the coroutine failed or took longer than `within_s`.
         """

@@ -372,7 +372,7 @@ class HostPlan:
         return [role, "--launched", self._run_id, *journal, *options]
 
     def files(self, host: str) -> dict[str, bytes]:
-        """Return the files that a host needs, by path below the run's folder; HostsError as for `identity`."""
+        """Return the files that a host needs, by path below the run's folder; errors as in `identity`."""
         contents: dict[str, bytes] = {}
         for name, process in self.processes.items():
             if process.host == host:

@@ -28,10 +28,10 @@ PINGS = 9  # number of empty transfers; their median time is the round trip
 SIZE_BYTES = 8  # length of the size prefix
 BULKS_BYTES = tuple(16_384 << power for power in range(9))  # transfers of up to 4 MB, which take 0.3 s at 100 Mbit/s
 BULK_S = 1.0  # wall time of a transfer that is long enough to measure the bandwidth
-CHUNK_BYTES = 65_536  # most bytes read at a time
+CHUNK_BYTES = 65_536  # maximum number of bytes read at a time
 TIMEOUT_S = 10.0  # wall time for a transfer; the smallest one takes this long at 13 kbit/s
 SERVE_S = 60.0  # wall time without a connection after which a server ends by itself
-SHORTEST_S = 1e-4  # lower bound of a transfer's time without the round trip; 4 MB in that time are 300 Gbit/s
+SHORTEST_S = 1e-4  # lower bound on a transfer's time without the round trip; 4 MB in that time are 300 Gbit/s
 DONE = b"."  # byte that confirms a transfer
 
 

@@ -26,7 +26,7 @@ WAITED_S = 0.5  # wall time after which a wait for a process is shown; shorter w
 SILENT_PROCESS_S = 1.8  # wall time of silence; health arrives once a second, so a stopped process is shown within 2 s
 STALE_S = 3.0  # wall time after which a process's health is no longer shown; it arrives once a second
 AROUND = 4  # lines of a terminal besides the rows: progress, two of the table's head, and the count of hidden rows
-NAMED_MAX = 8  # most roles named in an error
+NAMED_MAX = 8  # maximum number of roles named in an error
 LONGEST_S = float("inf")  # age and lag of a process that has sent no health yet, so that it is shown first
 ATTENTION = (  # prefixes of states, the most urgent first; all other states follow, and NOTHING_AMISS comes last
     "ended (",

@@ -1,11 +1,11 @@
-"""The samples of a fleet at a gate, as rows of arrays that are held back until their latency has passed.
+"""Samples of a fleet's sensors at a gate, as rows of arrays, held back until their latency has passed.
 
 Values are in the order of the contract's fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude,
 longitude [deg], altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m];
-sonar: range [m], valid (0 or 1); flow: forward, left, up [m/s], quality. The numbers of a user's sensor are computed in
-Python after the gate, from the truth that the kernel logged.
+sonar: range [m], valid (0 or 1); flow: forward, left, up [m/s], quality. The values of a user's sensor are computed in
+Python after the gate, from the true state logged by the kernel.
 
-Sightings and scans are also computed after the gate, from the poses of all drones at their sampling times
+Sightings and scans are also computed after the gate, from the poses of all drones at the sampling times
 (`Exposures`, `poses_between`), and held back (`released`).
 """
 
@@ -37,10 +37,10 @@ VALUE_COLUMNS = 9  # number of values of a GPS fix, the longest sample
 
 
 class Sampled(NamedTuple):
-    """Measurements in the order of (t_ns, drone, sensor)."""
+    """Measurements, sorted by (t_ns, drone, sensor)."""
 
     whose: NDArray[np.int64]  # (M, WHOSE.size)
-    values: NDArray[np.float64]  # (M, VALUE_COLUMNS); each sensor uses the first columns
+    values: NDArray[np.float64]  # (M, VALUE_COLUMNS); each sensor uses as many columns as it has values
 
 
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
@@ -52,12 +52,12 @@ class SampledLog(NamedTuple):
     whose: NDArray[np.int64]  # (M, 3): sensor, drone, tick
     value: NDArray[np.float64]  # (M, CHANNELS_MAX)
     latency_ns: NDArray[np.int64]  # (N, sensors)
-    rows: NDArray[np.float64]  # this and `place` are the results of frames.anchor
+    rows: NDArray[np.float64]  # `rows` and `place` are the results of frames.anchor
     place: NDArray[np.float64]
 
 
 class Sampler:
-    """Converts the kernel's log to samples, and holds back delayed ones."""
+    """Converts the kernel's log to samples, and holds back those that are not due yet."""
 
     SAVED: ClassVar[Saved] = {"_later": Sampled, "_user_sensors": PART}
 
@@ -74,7 +74,7 @@ class Sampler:
         self._later = NONE
 
     def due(self, logged: int, now_ns: int) -> Sampled:
-        """Return the samples due up to now, from the log and from those held back.
+        """Return the samples due by `now_ns`, from the first `logged` rows of the log and from those held back.
 
         Raises:
             UserCodeError: the equation of a user's sensor fails.
@@ -98,12 +98,11 @@ class Sampler:
 
 @kernel()
 def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
-    """Return `whose` and `values` of Sampled for the first rows of a log.
+    """Return the fields `whose` and `values` of Sampled for the first `count` rows of a log.
 
     Args:
-        held: a SampledLog, held by `hold`.
-        count: number of rows.
-        tick_ns: interval between two ticks [ns].
+        held: the SampledLog, wrapped by `hold`.
+        tick_ns: interval between ticks [ns].
     """
     whose, value, latency_ns, rows, place = held.content
     index, values = np.empty((count, WHOSE.size), np.int64), np.empty((count, VALUE_COLUMNS))
@@ -121,7 +120,7 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
 
 @inlined
 def _is_before(a: NDArray, b: NDArray) -> bool:
-    """Return whether `a` comes before `b`, or with it, in the order of (t_ns, drone, sensor)."""
+    """Return whether `a` does not come after `b` in the order of (t_ns, drone, sensor)."""
     if a[WHOSE.t] != b[WHOSE.t]:
         return a[WHOSE.t] < b[WHOSE.t]
     if a[WHOSE.drone] != b[WHOSE.drone]:
@@ -131,11 +130,11 @@ def _is_before(a: NDArray, b: NDArray) -> bool:
 
 @kernel()
 def with_more(whose: NDArray, values: NDArray, more: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Insert rows without values into measurements; return `whose`, `values` and the positions of the inserted rows.
+    """Return measurements with rows of zero values inserted: `whose`, `values` and the indices of the inserted rows.
 
     Args:
-        whose, values: fields of Sampled, in its order.
-        more: rows to insert, in the same order, (K, WHOSE.size).
+        whose, values: fields of Sampled, sorted as there.
+        more: rows of `whose` to insert, sorted likewise, (K, WHOSE.size).
     """
     count, extra = whose.shape[0], more.shape[0]
     index, numbers = np.empty((count + extra, WHOSE.size), np.int64), np.zeros((count + extra, VALUE_COLUMNS))
@@ -173,10 +172,10 @@ class UserSensors:
         return [*self._sensors.values()]
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return whose (M, 3) and values (M, 6) of the exposures logged in a gate, without lost samples.
+        """Return the readings logged in a gate, except lost ones: sensor, drone and tick, (M, 3); values, (M, 6).
 
         Raises:
-            UserCodeError: an equation fails, or does not return a reading.
+            UserCodeError: an equation fails, or returns no valid reading.
         """
         senses, kept = self._senses, []
         count = int(senses.exposed_count[0])
@@ -221,7 +220,7 @@ class _UserSensor:
         place(self.rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
-        """Return the truth at an exposure of the sensor, from a row of EXPOSED."""
+        """Return the truth at a sampling time of the sensor, from a row of EXPOSED."""
         state, accel = row[EXPOSED.state : EXPOSED.accel].copy(), row[EXPOSED.accel : EXPOSED.air].copy()
         return SensorTruth(
             t_s=t_s,
@@ -237,8 +236,8 @@ class _UserSensor:
         )
 
     def measure(self, truth: SensorTruth, environment: object, values: NDArray[np.float64]) -> None:
-        """Write the values without errors into a row (6,)."""
-        assert self._kind.equation is not None  # modules without an equation are refused
+        """Write the error-free values into `values`, (6,)."""
+        assert self._kind.equation is not None  # the catalogue refuses user modules without an equation
         count = self._kind.values
         equation, where = self._kind.equation, f"{self._what} at {truth.t_s:.3f} s"
         name = f"{equation.__module__}:{getattr(equation, '__qualname__', type(equation).__qualname__)}"
@@ -260,7 +259,7 @@ Array = NDArray[np.float64]
 
 
 class Between(NamedTuple):
-    """States of all drones at two gates, (N, STATE.size) each, as arguments of `poses_between`."""
+    """States of all drones at two gates, (N, STATE.size) each; the first arguments of `poses_between`."""
 
     former: Array
     former_ns: int
@@ -269,7 +268,7 @@ class Between(NamedTuple):
 
 
 class Exposures:
-    """The sampling times n / rate of some sensors, gate by gate."""
+    """The sampling times n / rate of several sensors, gate by gate."""
 
     SAVED: ClassVar[Saved] = {
         "_counts": list[int],
@@ -288,7 +287,9 @@ class Exposures:
         self._former_ns = 0
 
     def until(self, state: Array, now_ns: int) -> tuple[list[tuple[int, int]], Between | None]:
-        """Return the sorted samples due by a gate, as (time [ns], index of the sensor), and the states around them.
+        """Return the samples due by a gate and the states around them; without samples, an empty list and None.
+
+        Samples are (time [ns], index of the sensor), in this order.
 
         Args:
             state: states of all drones at the gate, (N, STATE.size or more).
@@ -306,13 +307,13 @@ class Exposures:
             self._next_ns = min(self._due_ns)
             former, former_ns = (self._former, self._former_ns) if len(self._former) else (now, now_ns)
             between = Between(former, former_ns, now, now_ns)
-        if self._next_ns <= now_ns + self._gate_ns:  # a sample before the next gate needs this state
+        if self._next_ns <= now_ns + self._gate_ns:  # a sample by the next gate needs this state
             self._former, self._former_ns = state[:, : STATE.size].copy(), now_ns
         return due, between
 
 
 def released(later: list[Any], now_ns: int) -> list[Any]:
-    """Remove the messages that are due by their t_ns from a list of delayed messages, and return them."""
+    """Remove the messages with a t_ns of at most `now_ns` from a list of delayed messages, and return them."""
     due = [each for each in later if each.t_ns <= now_ns]
     if due:
         later[:] = [each for each in later if each.t_ns > now_ns]
@@ -324,7 +325,7 @@ def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_
     """Return the poses of all drones at t_ns between two gates, as rows like `former`.
 
     Args:
-        former, now: states at the gates, (N, STATE.size or more); other columns are interpolated linearly.
+        former, now: states at the gates, (N, STATE.size or more); columns beside the pose are interpolated linearly.
         former_ns, now_ns: times of the gates [ns].
     """
     if t_ns >= now_ns or now_ns <= former_ns:

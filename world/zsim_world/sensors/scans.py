@@ -1,8 +1,8 @@
-"""Distances along the rays of beams, lidars and depth cameras, from true poses, with errors. Compiled.
+"""Distances measured by range beams, lidars and depth cameras: rays cast from true poses, with errors. Compiled.
 
-All rays of a message are cast at one instant, possibly between two gates. They meet ground, obstacles and the hulls of
-other drones (zsim_world.physics.rays). Each sensor has a random stream, from which every message takes the same number
-of values: two for each distance, one for the message.
+All rays of a message are cast at one instant, possibly between two gates. They hit the ground, obstacles and the hulls
+of other drones (zsim_world.physics.rays). Each sensor has its own random stream, from which every message draws the
+same number of values: two for each distance and one for the message.
 """
 
 import math
@@ -31,12 +31,11 @@ from zsim_world.sensors.noise import WORDS, fill, words
 from zsim_world.sensors.sampler import Between, Exposures, poses_between, released
 from zsim_world.sensors.sensor_set import rounded
 
-CONE_RAYS = 8  # rays around the axis of a beam with a cone, in addition to the one along it
-SHARE_MIN = 0.2  # lower bound of depth / length of a ray; at the edge of a picture of 150 deg it is 0.26
-MOUNT_MAX_M = 2.0  # m, chosen: largest assumed distance of a sensor from its drone's centre, to skip far drones
-RAY = columns(
-    "RayColumns", (Field("direction_B", "1", 3), Field("share", "1"))
-)  # share of a ray's length that is measured (depth)
+CONE_RAYS = 8  # rays on the cone of a beam that has one, in addition to the ray along its axis
+SHARE_MIN = 0.2  # lower bound of a ray's depth over its length, which is 0.26 at the edge of a 150 deg picture
+MOUNT_MAX_M = 2.0  # m, generous bound on the distance of a sensor from its drone's centre, used to skip far drones
+# share: fraction of a ray's length that is measured; below 1 for a depth, which is along the optical axis
+RAY = columns("RayColumns", (Field("direction_B", "1", 3), Field("share", "1")))
 SCANNER = columns(
     "ScannerColumns",
     (
@@ -45,17 +44,17 @@ SCANNER = columns(
         Field("apart", "1"),  # 1: each value has its own origin; 0: all share one
         Field("first", "1"),  # index of its first ray
         Field("values", "1"),
-        Field("rays", "1"),  # rays per value, which is the smallest of their distances
+        Field("rays", "1"),  # rays per value; the value is their smallest distance
         Field("min", "m"),
         Field("max", "m"),
-        Field("noise", "m"),
+        Field("noise", "m"),  # standard deviation at distance d: root of noise^2 + (share d)^2 + (square d^2)^2
         Field("share", "1"),
         Field("square", "1/m"),
-        Field("bias", "m"),  # constant in a run
+        Field("bias", "m"),  # constant during a run
         Field("quantum", "m"),
-        Field("miss", "1"),  # a ray is missed when its standard normal number is below this
-        Field("drop", "1"),  # likewise for a message
-        Field("stuck", "1"),  # 1: a fault repeats its first message
+        Field("miss", "1"),  # a value is missed when its standard normal number is below this
+        Field("drop", "1"),  # likewise, a message is lost
+        Field("stuck", "1"),  # 1: stuck by a fault, repeats the first message since then
     ),
 )
 
@@ -63,14 +62,14 @@ Array = NDArray[np.float64]
 
 
 class Scan(NamedTuple):
-    """A message of a scanner, without its number."""
+    """A message of a scanner, without its sequence number."""
 
     t_ns: int
     drone: int
     t_sample_ns: int
     kind: type[Sample]
     sensor: str
-    camera: str  # of a depth image
+    camera: str  # camera of a depth image, otherwise empty
     values: bytes  # float32
     fixed: dict[str, Any]  # fields that are the same in every message
 
@@ -99,14 +98,14 @@ class Mounted(NamedTuple):
     kind: type[Sample]
     camera: str
     settings: Scanner
-    origins: Array  # m, one for all values or one for each, (1 or values, 3)
-    rays: Array  # (values * k, RAY.size)
+    origins: Array  # m in B, one for all values or one for each, (1 or values, 3)
+    rays: Array  # k for each value, (values * k, RAY.size)
     values: int
     fixed: dict[str, Any]
 
 
 class ScanScene(NamedTuple):
-    """The W sensors and the objects in their surroundings, for compiled code; N drones."""
+    """W sensors on N drones, and the objects around them, for compiled code."""
 
     scene: Scene
     hulls: NDArray[np.float64]  # (N,), hull radii [m]
@@ -141,14 +140,14 @@ class ScanSampler:
         gate_ns = round(scenario.time.gate_ms * 1e6)
         self._exposures = Exposures([each.settings.rate_hz for each in self._mounted], gate_ns)
         self._later: list[WaitingScan] = []
-        self._stuck: dict[int, bytes] = {}  # the repeated message, by index of the sensor
+        self._stuck: dict[int, bytes] = {}  # the message that each stuck sensor repeats, by index of the sensor
 
     def recover(self) -> None:
         """Remove the effects of faults from all sensors."""
         self._rows[:] = self._sound
 
     def rows_of(self, drone: int, sensor: str) -> Iterator[Array]:
-        """Yield the rows of a sensor of a drone, (SCANNER.size,), one for each of its cameras, for faults to change."""
+        """Yield the rows of a drone's sensor, (SCANNER.size,), one per depth camera, for faults to modify in place."""
         for row, each in zip(self._rows, self._mounted, strict=True):
             if (each.drone, each.sensor) == (drone, sensor):
                 yield row
@@ -162,7 +161,7 @@ class ScanSampler:
 
     def _scan(self, at_ns: int, place: int, between: Between | None) -> None:
         """Take a sample and hold it until it is due."""
-        assert between is not None  # where there are samples
+        assert between is not None  # as always when samples are due
         poses = poses_between(*between, at_ns)
         values = scan(self._held, place, poses, self._streams[place])
         if len(values):
@@ -200,7 +199,7 @@ def _pose(mount: Mount) -> tuple[Array, Array]:
 
 
 def _turned(R: Array, vectors: Array) -> Array:
-    """Return R v for vectors (M, 3), summed in a fixed order."""
+    """Return R v for each row v of `vectors`, (M, 3), summed in a fixed order."""
     return (R * vectors[:, None, :]).sum(axis=2)
 
 
@@ -214,7 +213,7 @@ def _beams(i: int, name: str, settings: RangeConfig, p_BS: Array, R_BS: Array) -
     half, turn = math.radians(0.5 * settings.cone_deg), 2.0 * math.pi / CONE_RAYS
     rim = [(el.cos(half), el.sin(half) * el.cos(k * turn), el.sin(half) * el.sin(k * turn)) for k in range(CONE_RAYS)]
     cone = np.array([(1.0, 0.0, 0.0), *(rim if half else ())])
-    names = sorted(settings.beams)  # sorted, like the resolved scenario
+    names = sorted(settings.beams)  # as in the resolved scenario
     poses = [_pose(settings.beams[beam]) for beam in names]
     origins = np.array([p_BS + _turned(R_BS, p[None])[0] for p, _ in poses])
     rays = _rays(np.concatenate([_turned(R_BS, _turned(R, cone)) for _, R in poses]))
@@ -235,7 +234,7 @@ def _lidar(i: int, name: str, settings: LidarConfig, p_BS: Array, R_BS: Array) -
 
 
 def _depth(i: int, name: str, settings: DepthConfig, camera: str, of: Camera) -> Mounted:
-    """Return the rays through the centres of a depth image's pixels, each a block of camera pixels."""
+    """Return a depth camera with a ray through the centre of each depth pixel, which is a block of camera pixels."""
     pose, lens, rows, count = camera_pose(of), lens_of(of), settings.rows, settings.columns
     wide, high = lens.width / count, lens.height / rows  # size of a depth pixel in camera pixels
     places: Any = np.meshgrid((np.arange(count) + 0.5) * wide - 0.5, (np.arange(rows) + 0.5) * high - 0.5)
@@ -250,7 +249,7 @@ def _depth(i: int, name: str, settings: DepthConfig, camera: str, of: Camera) ->
 
 
 def _fill_row(row: Array, mounted: Mounted, first: int, origin: int, rng: np.random.Generator) -> None:
-    """Write the row of a sensor; its bias is the first draw from its stream."""
+    """Fill the row of a sensor; its bias is the first draw from its random stream."""
     own, values = mounted.settings, mounted.values
     row[SCANNER.drone], row[SCANNER.first], row[SCANNER.origin] = mounted.drone, first, origin
     row[SCANNER.apart], row[SCANNER.values] = len(mounted.origins) > 1, values
@@ -263,13 +262,13 @@ def _fill_row(row: Array, mounted: Mounted, first: int, origin: int, rng: np.ran
 
 @kernel()
 def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
-    """Return the values of a message of one sensor [m], 0 without an echo; no values if the message is lost.
+    """Return the values [m] of one sensor's message, 0 where there is no echo; empty if the message is lost.
 
     Args:
-        held: a ScanScene, by `hold`.
+        held: the ScanScene, wrapped by `hold`.
         place: index of the sensor.
         poses: states of all drones, (N, STATE.size or more).
-        stream: words of its random stream, (WORDS.size,), advanced.
+        stream: words of the sensor's random stream, (WORDS.size,), advanced in place.
     """
     scene, hulls, scanners, origins, rays = held.content
     row = scanners[place]
@@ -309,7 +308,7 @@ def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
 
 @inlined
 def _measured(row: NDArray, distance: float, noise: float, chance: float) -> float:
-    """Return the measured value of a distance, given two standard normal numbers."""
+    """Return the value measured at a true distance; `noise` and `chance` are standard normal numbers."""
     if distance == math.inf or chance < row[SCANNER.miss]:
         return 0.0
     share, square = row[SCANNER.share] * distance, row[SCANNER.square] * distance * distance

@@ -1,14 +1,14 @@
-"""The stock sensors of a fleet: errors, mounts and schedules as arrays, measurement equations, errors and faults.
+"""The stock sensors of a fleet: settings and schedules as arrays, measurement equations, errors and faults.
 
-The arrays have a row per drone and sensor. From `sample` on, all is compiled.
+The arrays have a row per drone and sensor. All functions from `sample` on are compiled.
 
-A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). An equation is a function
-of body, mount and site, and returns two vectors of errorless values; unused elements are zero. `n` numbers of a reading
-have separate errors.
+A sensor is at p_BS in the body, rotated by R_BS (q_BS: sensor components to body components). A measurement equation is
+a function of body, mount and site that returns two vectors of error-free values, with unused elements zero. The first
+`n` values of a reading have errors of their own.
 
-Sonar and optical flow may see an obstacle or a drone below. A flow camera measures the motion of its picture, from
-which the board computes a velocity with the distance measured by the sonar. A picture with two motions, of the ground
-and of a drone below, gives that of the larger part, as does the largest peak of a histogram of block motions (PX4/Flow,
+Sonar and optical flow may see an obstacle or another drone below. A flow camera measures the motion of its picture,
+which the board scales by the sonar's distance to obtain a velocity. If a picture shows two motions, of the ground and
+of a drone below, that of the larger part prevails, as does the largest peak of a histogram of block motions (PX4/Flow,
 src/modules/flow/flow.c).
 """
 
@@ -47,19 +47,19 @@ from zsim_world.physics.rigid_body import pose, velocity_at
 
 SENSORS = tuple(STOCK)  # in the contract's order; users' sensors are numbered after these
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
-CHANNELS = tuple(kind.width for kind in STOCK.values())  # numbers with separate errors
+CHANNELS = tuple(kind.width for kind in STOCK.values())  # number of values with errors of their own, by sensor
 CHANNELS_MAX = VALUES_MAX
 NEVER = 2**63 - 1  # a tick that is never reached
 
-CONFIG = columns(  # settings of each drone and sensor
+CONFIG = columns(  # settings of one sensor of one drone
     "SensorColumns",
     (
         Field("white", "channel's", CHANNELS_MAX),  # standard deviation per sample
-        Field("walk", "channel's", CHANNELS_MAX),  # standard deviation of the bias's step per sample
+        Field("walk", "channel's", CHANNELS_MAX),  # standard deviation of the bias step per sample
         Field("quantum", "channel's", CHANNELS_MAX),
         Field("correlated", "1"),  # 0: no channel has a Gauss-Markov error
-        Field("decay", "1", CHANNELS_MAX),  # factor of that error from sample to sample
-        Field("kick", "channel's", CHANNELS_MAX),  # standard deviation of its increment per sample
+        Field("decay", "1", CHANNELS_MAX),  # factor applied to that error from sample to sample
+        Field("kick", "channel's", CHANNELS_MAX),  # standard deviation of that error's increment per sample
         Field("p_BS", "m", 3),
         Field("q_BS", "1", 4),
         Field("drop", "1"),  # a sample is lost when its standard normal number is below this
@@ -68,30 +68,30 @@ CONFIG = columns(  # settings of each drone and sensor
         Field("faulty", "1"),  # 0: the row of FAULT has no effect
     ),
 )
-FAULT = columns(  # effects of faults on each drone and sensor
+FAULT = columns(  # effects of faults on one sensor of one drone
     "SensorFaultColumns",
     (
-        Field("offset", "channel's", CHANNELS_MAX),  # added to the errorless values
-        Field("hold", "1"),  # FREE; ARMED: the next sample is kept; HOLDING: it is repeated
-        Field("held", "channel's", CHANNELS_MAX),
+        Field("offset", "channel's", CHANNELS_MAX),  # added to the error-free values
+        Field("hold", "1"),  # FREE; ARMED: the next reading will be stored; HOLDING: the stored one is repeated
+        Field("held", "channel's", CHANNELS_MAX),  # the stored reading
     ),
 )
 FREE, ARMED, HOLDING = 0.0, 1.0, 2.0
 SCHEDULE = columns(  # sample n is due at the first physics tick >= n * numerator / denominator
     "ScheduleColumns", (Field("numerator", "1"), Field("denominator", "1"), Field("count", "1"), Field("due", "tick"))
 )
-FIELD_MIN_UT = 1.0  # uT, weakest horizontal field that gives a heading: a fifteenth of that at 50 deg N
-HEADING_SIGMA_MAX_RAD = 0.5  # rad, chosen: noisier samples wrap around, so their mean is not a heading
-DENOMINATOR_MAX = 1000  # of a rate [Hz]: matches any rate within 0.05 %; n * numerator stays below 2^63
+FIELD_MIN_UT = 1.0  # uT, weakest horizontal field from which a heading is derived: a fifteenth of that at 50 deg N
+HEADING_SIGMA_MAX_RAD = 0.5  # rad, design choice: noisier headings wrap around, so their mean is meaningless
+DENOMINATOR_MAX = 1000  # largest denominator of a rate [Hz]: matches any within 0.05 %; n * numerator stays below 2^63
 SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
 LAPSE_1_M = 2.25577e-5  # 1/m, 0.0065 K/m over 288.15 K, ISO 2533
 PRESSURE_EXPONENT = 5.25588  # g M / (R L), ISO 2533
-SONAR_COSINE_MIN = 0.5  # echoes return up to 60 deg from the vertical; beyond, they are scattered away
-# Tangents of half the picture's field of view, ahead and aside: 320 x 240 pixels, 64 deg across (data sheet of the
-# AR.Drone 2.0); assumed for every vehicle
+SONAR_COSINE_MIN = 0.5  # a beam returns an echo up to 60 deg off the vertical; beyond that, it is scattered away
+# Tangents of half the picture's field of view, ahead and aside: 320 x 240 pixels, 64 deg along the diagonal (data sheet
+# of the AR.Drone 2.0); assumed for every vehicle
 HALF_VIEW = (0.375, 0.5)
-# Centres of the cells of a picture divided into 3 x 3, without the central one; a hull covers more than half of the
-# picture if it covers the central cell and four of these
+# Centres of the outer cells of a picture divided into 3 x 3 cells; a hull covers more than half of the picture if it
+# covers the central cell and four of these
 CELLS = ((-1.0, -1.0), (-1.0, 0.0), (-1.0, 1.0), (0.0, -1.0), (0.0, 1.0), (1.0, -1.0), (1.0, 0.0), (1.0, 1.0))
 CELLS_MIN = 4
 
@@ -101,14 +101,14 @@ class FleetSensors(NamedTuple):
 
     names: tuple[str, ...]
     types: tuple[SensorType, ...]
-    settings: list[list[Sensor | None]]  # of each drone, in the order of the names; None: no such sensor
+    settings: list[list[Sensor | None]]  # per drone, in the order of `names`; None: no such sensor
 
 
 def fleet_sensors(scenario: Scenario) -> FleetSensors:
-    """Return the sensors of a scenario's drones; external drones have none here.
+    """Return the sensors of a scenario's drones; those of external drones are not simulated.
 
     Raises:
-        DocumentError: a user's module is missing, or differs from the one with which the scenario was resolved.
+        DocumentError: a user's module is missing, or has changed since the scenario was resolved.
     """
     sections = [list(drone.sensors.sections()) for drone in scenario.drones]
     kinds = {name: kind for of_drone in sections for name, kind, _ in of_drone if name not in STOCK}
@@ -120,17 +120,17 @@ def fleet_sensors(scenario: Scenario) -> FleetSensors:
 
 
 def rate_of(sensor: Sensor, name: str) -> float:
-    """Return the rate [Hz] at which a device samples; the IMU samples at the rate of the board."""
+    """Return the rate [Hz] at which a sensor samples; the IMU samples at the board's rate."""
     return BOARD_RATE_HZ if name == "imu" else sensor.rate_hz
 
 
 def channels(sensors: Sensors, name: str) -> list[ErrorModel]:
-    """Return the error models of the channels of a stock sensor, in the order of its values and in SI units."""
+    """Return the error models of a stock sensor's channels, in the order of its values, in SI units."""
     return STOCK[name].errors(getattr(sensors, name))
 
 
 def config(sensors: FleetSensors) -> NDArray[np.float64]:
-    """Return errors and mounts of all sensors, shape (N, S, CONFIG.size)."""
+    """Return the error parameters and mounts of all sensors, (N, S, CONFIG.size)."""
     table = np.zeros((len(sensors.settings), len(sensors.names), CONFIG.size))
     for of_drone, own in zip(table, sensors.settings, strict=True):
         for row, name, kind, settings in zip(of_drone, sensors.names, sensors.types, own, strict=True):
@@ -141,9 +141,8 @@ def config(sensors: FleetSensors) -> NDArray[np.float64]:
                 row[CONFIG.white + k] = model.white_sigma(settings.rate_hz)
                 row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
                 row[CONFIG.quantum + k] = model.quantum
-                if (
-                    sigma := model.correlated_sigma
-                ):  # exact discretisation: Brown and Hwang, "Random signals", section 5.3
+                if sigma := model.correlated_sigma:
+                    # exact discretisation: Brown and Hwang, "Random signals", section 5.3
                     decay = el.exp(-1.0 / (rate * model.correlation_time_s))
                     row[CONFIG.correlated], row[CONFIG.decay + k] = 1.0, decay
                     row[CONFIG.kick + k] = sigma * math.sqrt(1.0 - decay * decay)
@@ -156,7 +155,7 @@ def config(sensors: FleetSensors) -> NDArray[np.float64]:
 
 
 def noise_width(numbers: int, models: Sequence[ErrorModel]) -> int:
-    """Return the number of normal numbers per sample: white, bias walk, one for drop-out, Gauss-Markov if any."""
+    """Return how many normal numbers a sample takes: white noise, bias walk, one for drop-out, Gauss-Markov if any."""
     correlated = any(model.correlated_sigma for model in models)
     return (3 if correlated else 2) * numbers + 1
 
@@ -176,13 +175,13 @@ def schedule(sensors: FleetSensors, tick_ms: float) -> NDArray[np.int64]:
 
 
 def latencies(sensors: FleetSensors) -> NDArray[np.int64]:
-    """Return t_ns - t_sample_ns of each drone and sensor [ns], (N, S)."""
+    """Return the latency t_ns - t_sample_ns [ns] of each sensor of each drone, (N, S)."""
     ms = [[0.0 if each is None else each.latency_ms for each in own] for own in sensors.settings]
     return np.array([[round(latency * 1_000_000) for latency in own] for own in ms])
 
 
 def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
-    """Return the largest number of samples that all drones together take in one gate."""
+    """Return the largest number of samples that all drones together can take in one gate."""
     rates = [
         rate_of(settings, name)
         for own in sensors.settings
@@ -193,14 +192,14 @@ def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
 
 
 def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:
-    """Return the standard deviation [rad] of a heading from one magnetometer sample, from the sideways field."""
+    """Return the standard deviation [rad] of a heading from one magnetometer sample in a horizontal field [uT]."""
     model = mag.field_ut
     sideways_ut = el.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0))
     return sideways_ut / max(horizontal_ut, FIELD_MIN_UT)
 
 
 def has_compass(mag: MagConfig, field_ut: Sequence[float]) -> bool:
-    """Return whether a magnetometer gives a heading in the magnetic field of the site [uT; W]."""
+    """Return whether a magnetometer gives a usable heading in the magnetic field of the site [uT; W]."""
     horizontal_ut = el.length(field_ut[:2])
     return horizontal_ut >= FIELD_MIN_UT and heading_sigma(mag, horizontal_ut) <= HEADING_SIGMA_MAX_RAD
 
@@ -229,7 +228,7 @@ class MountedSensor(NamedTuple):
 
 
 class Site(NamedTuple):
-    """The site of the flight."""
+    """Gravity and magnetic field at the site of the flight."""
 
     gravity: float  # m/s^2
     field_W: Vector  # uT, the Earth's magnetic field
@@ -237,7 +236,7 @@ class Site(NamedTuple):
 
 @inlined
 def sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, scene: Scene, value: NDArray) -> bool:
-    """Write a reading of sensor s of drone i into value (6,); return False if it is lost."""
+    """Write a reading of sensor `s` of drone `i` into `value`, (6,); return False if the reading is lost."""
     config, accel = senses.config[i, s], bodies.accel[i]
     p, v, q, rate = pose(bodies.state[i])
     x = BodyTruth(p, v, q, rate, vector(accel, 0), vector(accel, 3))
@@ -263,7 +262,7 @@ def sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, sce
 
 @inlined
 def _ideal(s: int, x: BodyTruth, mounted: MountedSensor, site: Site) -> Values:
-    """Return the errorless values of stock sensor number s."""
+    """Return the error-free values of stock sensor `s`."""
     if s == IMU:
         return imu(x, mounted, site)
     if s == GPS:
@@ -279,7 +278,7 @@ def _ideal(s: int, x: BodyTruth, mounted: MountedSensor, site: Site) -> Values:
 
 @inlined
 def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int, height: float) -> bool:
-    """Turn errorless values into a reading, in place; return False if it is lost."""
+    """Turn error-free values into a reading, in place; return False if it is lost."""
     n = CHANNELS[s]
     add_errors(n, value, config, bias, noise, at)
     if s == SONAR:
@@ -296,7 +295,7 @@ def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray
 def _read_faulty(
     s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
 ) -> bool:
-    """Do as `_read`, with the offset of a fault added before and the hold of a stuck sensor applied after."""
+    """Do the same as `_read`, but add the offset of a fault first and apply the hold of a stuck sensor last."""
     displace(CHANNELS[s], value, fault)
     kept = _read(s, value, config, bias, noise, at, height)
     if kept:
@@ -312,13 +311,13 @@ def sensor_velocity(x: BodyTruth, s: MountedSensor) -> Vector:
 
 @inlined
 def sensor_height(x: BodyTruth, s: MountedSensor) -> float:
-    """Return the height of the sensor over the origin of W [m]."""
+    """Return the height of the sensor above the origin of W [m]."""
     return x.p_WB[2] + rotate(x.q_WB, s.p_BS)[2]
 
 
 @inlined
 def imu(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
-    """Return specific force [m/s^2] and body rate [rad/s] at the sensor, both in S.
+    """Return the specific force [m/s^2] at the sensor and the body rate [rad/s], both in S.
 
     f_S = R_SB (R_BW (a_WB - g_W) + alpha × p_BS + w × (w × p_BS)),  w_S = R_SB w    (Titterton and Weston, ch. 3)
     """
@@ -329,7 +328,7 @@ def imu(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 
 @inlined
 def gps(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
-    """Return position [m] and velocity [m/s] of the antenna in W."""
+    """Return the position [m] and velocity [m/s] of the antenna in W."""
     return add(x.p_WB, rotate(x.q_WB, s.p_BS)), sensor_velocity(x, s)
 
 
@@ -341,7 +340,7 @@ def mag(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 
 @inlined
 def baro(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
-    """Return the height of the sensor over the origin of W [m]."""
+    """Return the height of the sensor above the origin of W [m]."""
     return (sensor_height(x, s), 0.0, 0.0), NONE
 
 
@@ -349,18 +348,18 @@ def baro(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 def pressure(altitude_m: float) -> float:
     """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533).
 
-    The law holds to 11 km, the limit of scenarios; beyond it is extrapolated, to vacuum at 44 km.
+    The law holds up to 11 km, the limit of scenarios; above, it is extrapolated and reaches vacuum at 44 km.
     """
     return SEA_LEVEL_PA * el.power(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
 
 
 @inlined
 def sonar(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
-    """Return the distance [m] to the ground along -z of the sensor, and 1 where there is an echo.
+    """Return the distance [m] to the ground along -z of the sensor, and 1 if there is an echo, otherwise 0.
 
-    Without an echo (beyond range_max, or the beam too far from the vertical) the distance is range_max.
+    Without an echo (ground beyond range_max, or beam too far off the vertical), the distance is range_max.
     """
-    upright = rotate(x.q_WB, z_axis(s.q_BS))[2]  # cosine between beam and vertical
+    upright = rotate(x.q_WB, z_axis(s.q_BS))[2]  # cosine of the angle between beam and vertical
     if upright < SONAR_COSINE_MIN:
         return (s.range_max, 0.0, 0.0), NONE
     distance = max(sensor_height(x, s), 0.0) / upright
@@ -371,8 +370,8 @@ def sonar(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
 def flow(x: BodyTruth, s: MountedSensor, site: Site) -> Values:
     """Return the sensor's velocity [m/s] in the heading frame, and the quality in [0, 1].
 
-    Heading frame: x forward and y left in the horizontal plane, z up. The quality is the cosine of the tilt: how much
-    of the picture is ground.
+    Heading frame: x forward and y left in the horizontal plane, z up. The quality is the cosine of the tilt, a
+    measure of how much of the picture shows the ground.
     """
     v = sensor_velocity(x, s)
     psi = heading(x.q_WB)
@@ -390,10 +389,10 @@ def rounded(value: float, bias: float, white: float, quantum: float) -> float:
 
 @inlined
 def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int) -> None:
-    """Add the errors of n channels to a value, in place.
+    """Add the errors of the first `n` channels to error-free values, in place.
 
-    `noise` has standard normal numbers from `at` on (sensor_set.noise_width); `bias` has the biases of all channels,
-    then their Gauss-Markov processes.
+    `noise` holds standard normal numbers from index `at` on, as counted by `noise_width`; `bias` holds the biases of
+    all channels, then the states of their Gauss-Markov processes, and is advanced in place.
     """
     if config[CONFIG.correlated] != 0.0:
         for k in range(n):
@@ -408,14 +407,14 @@ def add_errors(n: int, value: NDArray, config: NDArray, bias: NDArray, noise: ND
 
 @inlined
 def displace(n: int, value: NDArray, fault: NDArray) -> None:
-    """Add the offset of a fault to the errorless values of a sensor, in place."""
+    """Add the offset of a fault to the error-free values of a sensor, in place."""
     for k in range(n):
         value[k] += fault[FAULT.offset + k]
 
 
 @inlined
 def hold_reading(value: NDArray, fault: NDArray) -> None:
-    """Store the first reading (6,) of a stuck sensor, or replace a reading by the stored one, in place."""
+    """Store the first reading of a stuck sensor, (6,), or overwrite a later one with it, in place."""
     if fault[FAULT.hold] == ARMED:
         fault[FAULT.hold] = HOLDING
         for k in range(CHANNELS_MAX):
@@ -427,7 +426,7 @@ def hold_reading(value: NDArray, fault: NDArray) -> None:
 
 @kernel(makes_arrays=False)
 def read(n: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray) -> bool:
-    """Turn the errorless values of a user's sensor into a reading, in place; return False if it is lost."""
+    """Turn the error-free values of a user's sensor into a reading, in place; return False if it is lost."""
     displace(n, value, fault)
     add_errors(n, value, config, bias, noise, 0)
     kept = noise[2 * n] >= config[CONFIG.drop]
@@ -438,16 +437,16 @@ def read(n: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray,
 
 @inlined
 def _beam(x: BodyTruth, s: MountedSensor) -> tuple[Vector, Vector]:
-    """Return where a sensor is, and the unit vector along its -z, in W."""
+    """Return the position [m] of a sensor and the unit vector along its -z axis, both in W."""
     return add(x.p_WB, rotate(x.q_WB, s.p_BS)), scaled(rotate(x.q_WB, z_axis(s.q_BS)), -1.0)
 
 
 @inlined
 def _hull(state: NDArray, vehicle: NDArray, i: int, o: Vector, d: Vector, far: float) -> tuple[float, int]:
-    """Return the distance [m] at which a ray meets the hull of a drone other than i, and whose; `far` and -1 if none.
+    """Return the distance [m] to the first hull, other than that of drone `i`, on a ray, and its drone; or `far`, -1.
 
     Args:
-        state, vehicle: of all drones, as in Bodies.
+        state, vehicle: rows of all drones, as in Bodies.
     """
     nearest, whose = far, -1
     for j in range(state.shape[0]):
@@ -463,12 +462,12 @@ def _hull(state: NDArray, vehicle: NDArray, i: int, o: Vector, d: Vector, far: f
 def sonar_over(
     x: BodyTruth, s: MountedSensor, value: Vector, scene: Scene, state: NDArray, vehicle: NDArray, i: int
 ) -> Vector:
-    """Return distance [m] and echo of a sonar from the first object in its beam, given those over the bare ground.
+    """Return a sonar's distance [m] to the first object in its beam, and its echo, given those over bare ground.
 
-    As over the ground, there is no echo if the beam is too far from the vertical.
+    As over bare ground, there is no echo if the beam is too far off the vertical.
 
     Args:
-        state, vehicle: of all drones, as in Bodies; i: whose sonar it is.
+        state, vehicle: rows of all drones, as in Bodies; i: the drone that carries the sonar.
     """
     o, d = _beam(x, s)
     if -d[2] < SONAR_COSINE_MIN:
@@ -488,20 +487,20 @@ def flow_over(
     vehicle: NDArray,
     i: int,
 ) -> Vector:
-    """Return the velocity [m/s] that a flow sensor reports, given that over the bare ground.
+    """Return the velocity [m/s] that a flow sensor reports, given the one over bare ground.
 
-    It is the velocity relative to the surface in the picture, times the ratio of the distance measured by the sonar to
-    that of the surface: correct if both see the same surface. The surface is the one at the centre of the picture, a
-    drone's hull only if it covers most of the picture, with the velocity of the hull where the axis meets it.
+    It is the velocity relative to the surface in the picture, times the distance measured by the sonar over that of the
+    surface: correct if both sensors see the same surface. The surface is the one at the centre of the picture. A
+    drone's hull counts only if it covers most of the picture; it moves at its velocity where the optical axis hits it.
 
     Args:
-        ranging: the sonar; state, vehicle: of all drones, as in Bodies; i: whose sensor it is.
+        ranging: the sonar; state, vehicle: rows of all drones, as in Bodies; i: the drone that carries the sensor.
     """
     o, d = _beam(x, s)
     b, down = _beam(x, ranging)
     far = ranging.range_max
     if -d[2] < SONAR_COSINE_MIN or -down[2] < SONAR_COSINE_MIN:
-        return value  # without a distance the board keeps the last one
+        return value  # without an echo, the board keeps the last distance
     seen = cast_parts(scene, o, d, far)
     measured, _ = _hull(state, vehicle, i, b, down, cast_parts(scene, b, down, far))
     covered, whose = _hull(state, vehicle, i, o, d, seen)

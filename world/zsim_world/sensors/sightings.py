@@ -1,13 +1,13 @@
-"""Sightings of hats without pictures: what a camera has in view, from true poses, with a detector's errors.
+"""Sightings of hats without rendering: what a camera has in view, from true poses, with a detector's errors.
 
-A hat is a ball. It is in view if it is entirely within the picture and enough of its edge is visible, to which a
-detector fits a circle. It can be hidden by obstacles, surfaces, hulls (flat bodies of revolution about their drones' z
-axis) and, from below, by the rim of the drone's own rotors.
+A hat is a ball. It is in view if it is entirely within the picture and enough of its edge is visible for a detector to
+fit a circle. It can be hidden by obstacles, surfaces, hulls (flat bodies of revolution about their drones' z axes) and,
+from below, by the rotors of the drone that wears it.
 
-Each camera has a random stream; all pictures due in a gate is computed in one compiled call. The errors match those of
-the detector on rendered pictures (tests compare them): of a hat's centre and apparent diameter in pixels, larger for
-small hats, for motion during the exposure and in low light; misses and false alarms. Every picture of a camera takes
-the same number of random numbers.
+Each camera has its own random stream; all pictures due in a gate are computed in one compiled call. The errors match
+those of the detector on rendered pictures (tests compare them): noise of a hat's centre and apparent diameter in
+pixels, larger for small hats, for motion during the exposure and in low light; misses; false alarms. Every picture of a
+camera draws the same number of random numbers.
 """
 
 import math
@@ -48,41 +48,41 @@ from zsim_world.physics.rays import HULL_FLATNESS, Scene, cast_parts
 from zsim_world.sensors.noise import WORDS, fill, words
 from zsim_world.sensors.sampler import Between, Exposures, poses_between, released
 
-VIEW = columns(  # view of a hat in a camera
+VIEW = columns(  # a camera's view of a hat
     "ViewColumns",
     (
         Field("seen", "1"),  # 0 or 1
-        Field("direction_K", "1", 3),  # unit vector to its centre
+        Field("direction_K", "1", 3),  # unit vector to the hat's centre
         Field("share", "1"),  # visible share of its edge
-        Field("centre", "1"),  # error of the centre of a circle fitted to the visible edge, relative to a complete one
-        Field("radius", "1"),  # likewise for its radius
+        Field("centre", "1"),  # error of the centre of a circle fitted to the visible edge over that for the whole edge
+        Field("radius", "1"),  # likewise for the circle's radius
         Field("range", "m"),
-        Field("angle", "rad"),  # its apparent diameter
-        Field("scale", "px/rad"),  # scale of the picture at its position
-        Field("rate", "rad/s"),  # angular rate at which it moves over the picture
+        Field("angle", "rad"),  # apparent diameter of the hat
+        Field("scale", "px/rad"),  # scale of the picture at the hat
+        Field("rate", "rad/s"),  # angular rate at which the hat moves across the picture
     ),
 )
-CAMERA = columns(  # as mounted on a drone
+CAMERA = columns(  # a camera as mounted on a drone
     "CameraColumns", (Field("lens", "1, px", 11), Field("p_BK", "m", 3), Field("q_BK", "1", 4))
 )
-AHEAD_MIN = 0.05  # cosine to the optical axis; flatter rays miss even a picture of 150 deg
-RIM_WIDE, RIM_HIGH = 1.15, 0.14  # radius and height of the rotors' rim, in radii of a hull; fitted to pictures
-POINTS = 32  # points of a hat's edge that are checked for visibility
+AHEAD_MIN = 0.05  # cosine of the angle to the optical axis; rays farther off the axis miss even a 150 deg picture
+RIM_WIDE, RIM_HIGH = 1.15, 0.14  # radius and height of the rotors' disc, in hull radii; fitted to rendered pictures
+POINTS = 32  # number of points of a hat's edge that are checked for visibility
 COSINES, SINES = (np.array([f(2.0 * math.pi * k / POINTS) for k in range(POINTS)]) for f in (el.cos, el.sin))
-LEVEL_COSINE = 0.9  # cosine to the vertical; steeper rays need another basis
-SHARE_MIN = 0.3  # share of the edge; with less in view a detector does not recognise the circle
-EDGE_PX = 3.0  # px, blur of the rim: a hat closer to the picture's edge counts as cut off
-NOISY_LIGHT = 0.4  # of a clear day, at which a picture's noise is half again of what it is by day; measured
+LEVEL_COSINE = 0.9  # cosine of the angle to the vertical; steeper rays need another basis
+SHARE_MIN = 0.3  # visible share of the edge below which a detector does not recognise the circle
+EDGE_PX = 3.0  # px, blur of a hat's edge: a hat closer than this to the picture's edge counts as cut off
+NOISY_LIGHT = 0.4  # light, relative to a clear day, at which noise is sqrt(2) times that in unlimited light; measured
 DETECTOR = columns(  # detector of one camera, and the hats that it detects
     "DetectorColumns",
     (
-        Field("R_BK", "1", 9),  # including the unknown misalignment
-        Field("misaligned", "rad"),  # standard deviation
+        Field("R_BK", "1", 9),  # including the misalignment, which is unknown to the drone
+        Field("misaligned", "rad"),  # standard deviation of the misalignment
         Field("radius", "m"),  # radius of a hat
         Field("exposure", "s"),
         Field("centre", "px"),  # standard deviations, as in SightingModel
         Field("diameter", "px"),
-        Field("noise", "px^2"),  # at this light
+        Field("noise", "px^2"),  # at the light of the scenario
         Field("blur_share", "1"),
         Field("diameter_min", "px"),
         Field("miss", "1"),
@@ -100,13 +100,11 @@ SEEN = columns(  # a sighting
     ),
 )
 DRAWS = 4  # normal numbers per hat and picture: two for the centre, one for the diameter, one for a miss
-FALSE_DRAWS = 4  # normal numbers per false alarm: occurrence, position (2), size
-DIAMETER_NOISE, DIAMETER_BLUR = (
-    1.4,
-    2.8,
-)  # errors of a diameter over those of a centre, from noise and from blur; measured
-ANGLE_MAX = 3.0  # rad, largest apparent diameter; pi is that of a ball that touches the lens
-SMALLEST = 0.1  # smallest measured diameter, as a share of the apparent one
+FALSE_DRAWS = 4  # normal numbers per false alarm: one for its occurrence, two for its position, one for its size
+# Error of a measured diameter over that of a centre, due to noise and due to blur; measured
+DIAMETER_NOISE, DIAMETER_BLUR = 1.4, 2.8
+ANGLE_MAX = 3.0  # rad, largest apparent diameter; pi is that of a ball touching the lens
+SMALLEST = 0.1  # lower bound of a measured diameter over the true apparent one
 
 
 Array = NDArray[np.float64]
@@ -130,7 +128,7 @@ class PictureSightings(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """The W cameras and the objects in their surroundings, for compiled code; N drones."""
+    """W cameras with detectors on N drones, and the objects around them, for compiled code."""
 
     drones: NDArray[np.int64]  # (W,), drone of each camera
     cameras: Array  # (W, CAMERA.size)
@@ -200,7 +198,7 @@ class SightingSampler:
         return released(self._later, now_ns)
 
     def _look(self, pictures: list[tuple[int, int]], between: Between) -> None:
-        """Compute the sightings of pictures (instant, camera), and hold them until they are due."""
+        """Compute the sightings in pictures (instant [ns], camera), and hold them until they are due."""
         which = np.array(pictures, dtype=np.int64)
         seen: list[list[Seen]] = [[] for _ in pictures]
         for picture, x, y, z, range_m, sigma, sigma_m in look(which, *between, self._held, self._streams).tolist():
@@ -221,7 +219,7 @@ def _watching(scenario: Scenario) -> Iterator[tuple[int, str, Camera, SightingMo
 
 
 def _detector(camera: Camera, model: SightingModel, hats: Hats, light: float, rng: np.random.Generator) -> Array:
-    """Return the row of a detector; its camera's misalignment is the first draw from its stream."""
+    """Return the row of a detector; its camera's misalignment is the first draw from `rng`."""
     row = np.zeros(DETECTOR.size)
     misaligned_rad = math.radians(model.misalignment_deg)
     turn = rot.matrix(rot.from_rotation_vector(tuple((misaligned_rad * rng.standard_normal(3)).tolist())))
@@ -246,13 +244,14 @@ def look(
     held: Held,
     streams: NDArray,
 ) -> NDArray:
-    """Return the sightings in some pictures, (M, SEEN.size).
+    """Return the sightings in pictures taken between two gates, (M, SEEN.size).
 
     Args:
-        pictures: instant [ns] and camera of each, by instant, (P, 2).
-        former, now: states of all drones at two gates, (N, STATE.size).
-        held: Surroundings, by `hold`.
-        streams: words of the cameras' random streams, (W, WORDS.size); advanced.
+        pictures: instant [ns] and camera of each picture, sorted by instant, (P, 2).
+        former, now: states of all drones at the two gates, (N, STATE.size).
+        former_ns, now_ns: times of the two gates [ns].
+        held: the Surroundings, wrapped by `hold`.
+        streams: words of the cameras' random streams, (W, WORDS.size); advanced in place.
     """
     own = held.content
     hats = len(now) + len(own.balls)
@@ -287,22 +286,21 @@ def camera_row(camera: Camera) -> NDArray:
 @inlined
 def mounted(row: NDArray) -> MountedCamera:
     """Return the camera of a row."""
-    lens = Lens(
-        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], int(row[9]), int(row[10])
-    )  # as Lens has them
+    # in the order of Lens's fields
+    lens = Lens(row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], int(row[9]), int(row[10]))
     return MountedCamera(lens, vector(row, CAMERA.p_BK), four(row, CAMERA.q_BK))
 
 
 @inlined
 def _hull_hides(eye: Vector, ray: Vector, far: float, p_WB: Vector, q_WB: Quaternion, radius: float) -> bool:
-    """Return whether a hull is on a ray (unit vector, W) nearer than `far` [m]: an ellipsoid, scaled to a ball."""
+    """Return whether a hull, an ellipsoid scaled to a ball here, is on a ray (unit vector, W) nearer than `far` [m]."""
     o, d = rotate_back(q_WB, subtract(eye, p_WB)), rotate_back(q_WB, ray)
     stretch = 1.0 / HULL_FLATNESS
     o, d = (o[0], o[1], stretch * o[2]), (d[0], d[1], stretch * d[2])
     a, b, c = dot(d, d), dot(o, d), dot(o, o) - radius * radius
     root = b * b - a * c
     if c <= 0.0 or root <= 0.0:
-        return False  # the eye is inside, such as that of the hull's own camera, or the ray misses
+        return False  # the ray misses the hull, or the eye is inside it
     at = (-b - math.sqrt(root)) / a
     return 0.0 < at < far
 
@@ -320,14 +318,14 @@ def _rim_hides(eye: Vector, ray: Vector, p_WB: Vector, q_WB: Quaternion, radius:
 
 @inlined
 def _drone_hides(eye: Vector, ray: Vector, away: float, i: int, m: int, pose: NDArray, radius: float) -> bool:
-    """Return whether drone i is on a ray to a ball, the hat of drone m or of no drone."""
+    """Return whether drone `i` blocks a ray to a ball, which is the hat of drone `m` or, if `m` is no drone, no hat."""
     p, q = vector(pose, STATE.p_WB), four(pose, STATE.q_WB)
     return _rim_hides(eye, ray, p, q, radius) if i == m else _hull_hides(eye, ray, away, p, q, radius)
 
 
 @inlined
 def _passes(eye: Vector, ray: Vector, away: float, p: Vector, radius: float) -> bool:
-    """Return whether a sphere is beside or behind all rays to a ball."""
+    """Return whether a sphere is clear of the sight line to a point at distance `away` [m] along `ray`."""
     to = subtract(p, eye)
     along = min(max(dot(to, ray), 0.0), away)
     off = axpy(to, -along, ray)
@@ -336,13 +334,13 @@ def _passes(eye: Vector, ray: Vector, away: float, p: Vector, radius: float) -> 
 
 @inlined
 def _scale(lens: Lens, cosine: float) -> float:
-    """Return pixels per radian off the axis: the mean of along and across the radius, f / cos^2 and f / cos."""
+    """Return the pixels per radian off the axis: geometric mean of radial (f / cos^2) and tangential (f / cos)."""
     return lens.fx / (cosine * math.sqrt(cosine))
 
 
 @inlined
 def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
-    """Return whether a ball of an apparent diameter [rad] is entirely within the picture."""
+    """Return whether a ball of apparent diameter `angle` [rad] is entirely within the picture."""
     cosine = to_K[2] / norm(to_K)
     if cosine < AHEAD_MIN:
         return False
@@ -355,7 +353,7 @@ def _in_picture(lens: Lens, to_K: Vector, angle: float) -> bool:
 def _hidden(
     eye: Vector, ray: Vector, away: float, ball: float, own: int, m: int, poses: NDArray, hulls: NDArray, scene: Scene
 ) -> int:
-    """Return the hidden points of a ball's edge, one bit each."""
+    """Return which points of a ball's edge are hidden, one bit each."""
     e1 = (ray[1], -ray[0], 0.0) if abs(ray[2]) < LEVEL_COSINE else (0.0, ray[2], -ray[1])
     e1 = scaled(e1, 1.0 / norm(e1))
     e2 = cross(ray, e1)
@@ -380,11 +378,11 @@ def _hidden(
 
 @inlined
 def _write_outline(hidden: int, row: NDArray) -> None:
-    """Write the accuracy with which the visible points of a ball's edge determine it."""
+    """Write the visible share of a ball's edge, and how accurately the visible points determine its circle."""
     row[VIEW.share], row[VIEW.centre], row[VIEW.radius] = 1.0, 1.0, 1.0
     if hidden == 0:
         return
-    around = POINTS - 1  # a detector ignores the points beside hidden ones
+    around = POINTS - 1  # a detector ignores the points next to hidden ones
     hidden |= hidden << 1 | hidden >> 1 | hidden << around | hidden >> around
     n, x, y, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(POINTS):
@@ -409,10 +407,10 @@ def hats_in_view(
     scene: Scene,
     view: NDArray,
 ) -> None:
-    """Write the hats that a camera has in view.
+    """Compute which hats a camera has in view, and how it sees them.
 
     Args:
-        camera: the camera on its drone.
+        camera: the camera as mounted on its drone.
         own: index of its drone.
         poses: states of N drones at the instant of the picture, (N, STATE.size).
         hulls: radius of each hull [m], (N,).
@@ -421,7 +419,7 @@ def hats_in_view(
         balls: centres of balls that only look like hats [m; W], (M, 3).
         bare: whether the hat of each drone is uncovered, (N,).
         scene: obstacles and surfaces.
-        view: the result, (N + M, VIEW.size): drones, then balls.
+        view: filled by this function, (N + M, VIEW.size): hats of the drones, then balls.
     """
     row = poses[own]
     q_WB, w_B = four(row, STATE.q_WB), vector(row, STATE.w_WB_B)
@@ -471,7 +469,7 @@ def _unit(normal: float) -> float:
 
 @inlined
 def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
-    """Return the standard deviations of a hat's centre and apparent diameter."""
+    """Return the standard deviations of a hat's measured centre and diameter [px]."""
     scale = row[VIEW.scale]
     noise = model[DETECTOR.noise] / (row[VIEW.angle] * scale)
     blur = model[DETECTOR.blur_share] * row[VIEW.rate] * model[DETECTOR.exposure] * scale
@@ -483,7 +481,7 @@ def _sigmas_px(model: NDArray, row: NDArray) -> tuple[float, float]:
 
 @inlined
 def _put(model: NDArray, to_K: Vector, range_m: float, sigma: float, sigma_m: float, out: NDArray) -> None:
-    """Write a sighting in the direction of a vector in the camera frame K, of any length."""
+    """Write a sighting in the direction of `to_K`, a vector of any length in the camera frame K."""
     length = math.sqrt(to_K[0] * to_K[0] + to_K[1] * to_K[1] + to_K[2] * to_K[2])
     for k in range(3):
         at = DETECTOR.R_BK + 3 * k
@@ -499,7 +497,7 @@ def _range_m(model: NDArray, angle: float) -> float:
 
 @inlined
 def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
-    """Write the sighting of a hat in view; False if it is missed at random, or measured as too small."""
+    """Write the sighting of a hat in view; return False if it is missed at random, or measured as too small."""
     centre_px, diameter_px = _sigmas_px(model, row)
     scale, angle = row[VIEW.scale], row[VIEW.angle]
     measured = angle + diameter_px / scale * noise[2]
@@ -519,7 +517,7 @@ def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
 
 @inlined
 def _see_nothing(model: NDArray, lens: Lens, noise: NDArray, out: NDArray) -> bool:
-    """Write a false alarm, a small blob anywhere in the picture; False if this picture has none."""
+    """Write a false alarm, a small blob anywhere in the picture; return False if this picture has none."""
     if _unit(noise[0]) >= model[DETECTOR.false]:
         return False
     x, y = undistorted(lens, _unit(noise[1]) * lens.width - 0.5, _unit(noise[2]) * lens.height - 0.5)
@@ -546,14 +544,14 @@ def _sort(out: NDArray, first: int, end: int) -> None:
 
 @compiled
 def detect(model: NDArray, lens: Lens, view: NDArray, stream: NDArray, out: NDArray, first: int) -> int:
-    """Write a detector's sightings in a picture into rows of `out` from `first` on; return the end row.
+    """Write a detector's sightings in a picture into `out` from row `first` on; return the row after the last one.
 
     Args:
-        model: (DETECTOR.size,).
+        model: row of the detector, (DETECTOR.size,).
         lens: lens of the camera.
-        view: views of hats and similar balls, (M, VIEW.size).
-        stream: words of the camera's random stream (WORDS.size,), advanced.
-        out: (first + M + 1 or more, SEEN.size).
+        view: views of hats and of balls that look like hats, (M, VIEW.size).
+        stream: words of the camera's random stream, (WORDS.size,), advanced in place.
+        out: sightings, (first + M + 1 or more, SEEN.size).
     """
     drawn = np.empty(DRAWS * len(view) + FALSE_DRAWS)
     fill(drawn, stream)

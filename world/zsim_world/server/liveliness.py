@@ -19,24 +19,22 @@ from zsim.transport.session import Session
 from zsim_world.run.barrier import Participant
 from zsim_world.run.inputs import Run
 
-BYE_NS = 100_000_000  # wall time by which a bye may arrive after the loss of its process's token
-RETURN_NS = 5_000_000_000  # wall time in which a process rejoins a restarted world; 1 s measured
-START_NS = 60_000_000_000  # wall time in which a restarted process joins; a small computer needs 20 s
+BYE_NS = 100_000_000  # wall time within which a bye may still arrive after the loss of its process's token
+RETURN_NS = 5_000_000_000  # wall time within which a process rejoins a restarted world; 1 s measured
+START_NS = 60_000_000_000  # wall time within which a restarted process joins; a small computer needs 20 s
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
-SILENT_NS = 1_800_000_000  # wall time without health, published once a second; silence is thus reported within 2 s
-DEAD_NS = (
-    10_000_000_000  # wall time without health after which a process that only reads is dead; its link is then closed
-)
-STALL_NS = 300_000_000  # wall time between two checks that indicates that the world or its machine was stopped
-SHOWN = 5  # maximum number of key expressions shown per closed link
+SILENT_NS = 1_800_000_000  # wall time without health, which is published once a second: silence is reported within 2 s
+DEAD_NS = 10_000_000_000  # wall time without health after which a process that does not gate counts as dead
+STALL_NS = 300_000_000  # wall time between checks that shows that the world or its machine was stopped
+SHOWN = 5  # maximum number of key expressions shown for a closed link
 _decode_health = msgspec.msgpack.Decoder(Health).decode
 TOKEN_NS = 3_000_000_000  # wall time limit for a token to appear; behind routers it takes up to 1 s (measured)
-SHOWN_NS = 10_000_000_000  # wall time limit for a first done as proof; first steps take 1 s
+SHOWN_NS = 10_000_000_000  # wall time limit for a first done that proves a process; a first step takes 1 s
 HELD_NS = 1_000_000_000  # wall time for which a living process must block the clock before another may replace it
-DONE_NS = 10_000_000_000  # wall time for which a process without any done may block the clock; first steps take 1 s
-LOOK_NS = 200_000_000  # wall time between two checks of unproven processes
-WITHHELD_MAX = 1000  # maximum number of joins of unknown processes that await their tokens
+DONE_NS = 10_000_000_000  # wall time for which a process may block the clock before its first done; that takes 1 s
+LOOK_NS = 200_000_000  # wall time between checks of unproven processes
+WITHHELD_MAX = 1000  # maximum number of withheld joins of unknown processes
 NO_TOKEN = "has no liveliness token"
 NO_DONE = "has never published a done"
 
@@ -53,7 +51,7 @@ class LivelinessMonitor:
 
     Args:
         link: the listening session.
-        take_in: enters the messages that have arrived, among which may be a bye.
+        take_in: enters the messages that have arrived into the run; a bye may be among them.
     """
 
     def __init__(self, link: Session, run: Run, take_in: Callable[[], None]) -> None:
@@ -66,21 +64,21 @@ class LivelinessMonitor:
         self._health = HealthWatch(lambda name, since_ns: run.call("silence_changed", name, since_ns))
 
     def token_lost(self, name: str) -> None:
-        """Note the loss of a token, whose process's bye may still follow; callable from any thread."""
+        """Note the loss of a process's token; its bye may still follow. Callable from any thread."""
         self._lost.append(name)
 
     def health_received(self, name: str) -> None:
         self._health.received(name, time.monotonic_ns())
 
     def check_all(self) -> None:
-        """In a restarted world, schedule a check of all former participants after the time that a rejoin takes."""
+        """In a restarted world, schedule a check of each former participant for when it should have rejoined."""
         for name, participant in self._barrier.participants.items():
             wait_ns = RETURN_NS if participant.alive else START_NS
             if participant.away or participant.alive:
                 self._checks[name] = _Check(time.monotonic_ns() + wait_ns, again=False)
 
     def before_join(self, name: str, join: Join) -> None:
-        """Before a join is handled, report the death of a former process of that name whose token is lost."""
+        """Before a join is handled, report the death of a former process of the same name whose token is lost."""
         self._take_lost()
         former = self._barrier.participants.get(name)
         if name in self._checks and former and former.alive and not former.is_process_of(join):
@@ -91,9 +89,9 @@ class LivelinessMonitor:
         """Check the processes whose check is due.
 
         A process without a token is dead, unless its token may be too new to be known; in that case it is checked
-        again, as is a process that has a token. A process that only reads also counts as dead after a long time
-        without health, since Zenoh does not always report that it has closed the full link of a stopped process. A
-        gating process instead blocks the clock and is named in `clock`.
+        again, as is a process that has a token. A process that does not gate also counts as dead after DEAD_NS without
+        health, since Zenoh does not always report that it has closed the full link of a stopped process. A gating
+        process instead blocks the clock and is named in `clock`.
         """
         self._take_lost()
         now_ns = time.monotonic_ns()
@@ -109,7 +107,7 @@ class LivelinessMonitor:
             check = self._checks.pop(name, None)
             if participant is None or check is None:  # settled by a message just taken in
                 continue
-            participant.away = False  # it is dead, or alive without having rejoined
+            participant.away = False  # it is dead, or alive but has not rejoined
             if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=TOKENS_S):
                 if check.again:  # the token may be a successor's, or not yet forgotten by Zenoh
                     self._checks[name] = _Check(now_ns + NEW_TOKEN_NS, again=False)
@@ -150,18 +148,18 @@ class HealthWatch:
             self._handle_silence(name, None)
 
     def forget(self, name: str) -> None:
-        """Stop expecting health messages of a process that has left or died."""
+        """Stop expecting health messages from a process that has left or died."""
         self._last_wall_ns.pop(name, None)
         self._silent.discard(name)
 
     def look(self, wall_ns: int) -> dict[str, int]:
-        """Report silent processes; return the time since the last health message [ns] by process.
+        """Report processes that have fallen silent; return the time since each process's last health message [ns].
 
-        Must be called frequently.
+        Must be called more often than every STALL_NS.
         """
         stall_ns = wall_ns - self._look_wall_ns
         self._look_wall_ns = wall_ns
-        if stall_ns > STALL_NS:  # messages that arrived meanwhile have not been read
+        if stall_ns > STALL_NS:  # messages that arrived during the stall have not been read yet
             self._last_wall_ns = {name: min(last + stall_ns, wall_ns) for name, last in self._last_wall_ns.items()}
         for name, last_ns in list(self._last_wall_ns.items()):
             if name not in self._silent and wall_ns - last_ns >= SILENT_NS:
@@ -176,7 +174,7 @@ class SlowReaders:
     Args:
         link: the listening session.
         tokens: tokens of all processes.
-        run: the run, whose history contains health messages of readers.
+        run: the run; its history contains the readers' health messages.
 
     Attributes:
         watch: closes the links of readers that do not keep up.
@@ -193,7 +191,7 @@ class SlowReaders:
         return [Awaited((p.name, *p.join.serves), p.join.pid) for p in participants if p.is_waited_for]
 
     def report(self) -> None:
-        """Report the links closed since the last call, with the keys read according to the processes' health."""
+        """Report the links closed since the last call, with the keys that their processes read, as health states."""
         while self.watch.closed:
             closed = self.watch.closed.popleft()
             host = self._own_host if closed.process else closed.address.rpartition(":")[0].strip("[]")
@@ -218,7 +216,7 @@ class SlowReaders:
 
 @dataclass
 class _Withheld:
-    """A join that awaits a proof."""
+    """A join withheld until the process behind it is proved to exist."""
 
     join: Join
     since_ns: int  # wall time at which the first join of that name was withheld
@@ -244,9 +242,11 @@ class Admission:
         self._world = run.world
         self._barrier = run.world.barrier
         self._trusts = trusts
-        self._sessions: dict[str, Sessions] = {}  # sessions whose tokens have proved a process
+        self._sessions: dict[str, Sessions] = {}  # by process, the sessions whose tokens have proved it
         self._withheld: dict[str, _Withheld] = {}
-        self._standing_ns: dict[str, int] = {}  # how long each process without token or done has blocked the clock
+        self._standing_ns: dict[
+            str, int
+        ] = {}  # how long each process still without token or done has blocked the clock
         self._look_wall_ns = 0
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:
@@ -262,14 +262,14 @@ class Admission:
         self._check(name, wall_ns)
 
     def done_received(self, name: str, incarnation: int, wall_ns: int) -> None:
-        """Note a done of a process, before the world handles it."""
+        """Note a process's done before the world handles it."""
         withheld = self._withheld.get(name)
         if withheld is not None and withheld.join.incarnation == incarnation:
             withheld.has_done = True
             self._check(name, wall_ns)
 
     def check_due(self, wall_ns: int) -> None:
-        """Check the processes whose existence is not proved yet."""
+        """Check the processes that are not yet proved to exist."""
         passed_ns = wall_ns - self._look_wall_ns
         if passed_ns < LOOK_NS or not (self._withheld or self._standing_ns):
             return
@@ -290,11 +290,11 @@ class Admission:
         self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
     def _needs_no_proof(self, name: str, join: Join) -> bool:
-        """Return whether a join needs no proof: it replaces no process, and is not that of a stranger."""
+        """Return whether a join needs no proof: it replaces no process and is not a stranger's."""
         return not (self._barrier.would_replace(name, join) or self._is_stranger(name, join))
 
     def _is_stranger(self, name: str, join: Join) -> bool:
-        """Return whether time would wait for an unexpected newcomer without a token."""
+        """Return whether a join is from an unexpected newcomer without a token, for which time would wait."""
         stands = (join.period_ns > 0 or join.slack_ns > 0) and not self._barrier.join_refusal(name, join)
         if not stands or name in self._barrier.participants:
             return False
@@ -308,11 +308,11 @@ class Admission:
         self._run.call("join", name, join, wall_ns)
         participant = self._barrier.participants.get(name)
         if participant is not None and participant.join is join:
-            self._sessions[name] = (present & former) | frozenset(sorted(present - former)[:1])  # one per join
+            self._sessions[name] = (present & former) | frozenset(sorted(present - former)[:1])  # each join uses up one
             self._standing_ns[name] = 0
 
     def _check(self, name: str, wall_ns: int) -> None:
-        """Admit a withheld join once it is proved; reject it after its time limit."""
+        """Admit a withheld join once its process is proved to exist; reject it after its time limit."""
         withheld = self._withheld[name]
         join = withheld.join
         if self._needs_no_proof(name, join) or self._may_replace(name, withheld, wall_ns):
@@ -324,7 +324,7 @@ class Admission:
             self._run.call("falsely_joined", name, join, reason)
 
     def _may_replace(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
-        """Return whether a join may replace a process: it is proved to be real, or that process is gone or stuck."""
+        """Return whether a join may replace a process: the new one is proved, or the former one is gone or stuck."""
         if self._is_stranger(name, withheld.join):
             return False
         if self._trusts or withheld.has_done or self._tokens.sessions(name) - self._sessions.get(name, Sessions()):
@@ -338,8 +338,8 @@ class Admission:
     def _count_standing(self, passed_ns: int, wall_ns: int) -> None:
         """Count how long participants have owed their first done, and report those that exceed the limit.
 
-        In lockstep, time counts only while the world waits for no other process, which may be the cause; in realtime,
-        it counts whenever a done is due and time runs.
+        In lockstep, time counts only while the world waits for no other process, since that may be the cause; in
+        realtime, it counts whenever a done is due and time runs.
         """
         clock = self._world.clock
         if clock.mode == "realtime":

@@ -1,7 +1,7 @@
-"""The journal of a run on disk: all inputs of its world, in order, and checkpoints of its state.
+"""The journal of a run on disk: all inputs of its world, in order, and checkpoints of the world's state.
 
-A world is a function of its scenario and its inputs, so a restarted world continues to the same bits from a checkpoint
-and the inputs since. An entry is written to the file (not synced to disk) before any message that follows from it is
+A world is a function of its scenario and its inputs, so a restarted world continues bit for bit from a checkpoint and
+the inputs since then. An entry is written to the file (not synced to disk) before any message that follows from it is
 published, so killing the process loses no entry.
 
 The folder contains, with n counting from 0: `n.entries`, frames of entries; `n.checkpoint`, the state before those
@@ -29,9 +29,9 @@ from zsim_world.run.inputs import Entry
 
 VERSION = 4  # format of the files and of the states in them
 CHECKPOINT_NS = 5_000_000_000  # simulated time between checkpoints; equals the length of the message history
-CHECKPOINT_WALL_NS = 1_000_000_000  # minimum wall time between checkpoints, which have 20 MB for 1000 drones
-CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the second is more recent than the message history
-HASHED_BYTES = 1 << 20  # bytes of the truth hash's input per read
+CHECKPOINT_WALL_NS = 1_000_000_000  # minimum wall time between checkpoints, each of 20 MB for 1000 drones
+CHECKPOINTS_KEPT = 3  # the newest may not be on disk yet, and the second newest too recent to refill the history
+HASHED_BYTES = 1 << 20  # bytes of the truth hash's input read at a time
 _FRAME = struct.Struct("<II")
 
 
@@ -54,11 +54,11 @@ class Checkpoint(NamedTuple):
 
 
 class RunJournal:
-    """Reads and writes the journal of one run; without a folder, has no effect.
+    """Reads and writes the journal of one run; without a folder, does nothing.
 
     Args:
         folder: folder for this run alone; created if missing.
-        say: shows a line if the journal can no longer be written.
+        say: called with a line to show if the journal can no longer be written.
         all_died: whether all participants of a continued run must be restarted.
     """
 
@@ -105,7 +105,7 @@ class RunJournal:
         return due and (self._written is None or self._written.done())
 
     def add_checkpoint(self, state: State, now_ns: int, wall_ns: int) -> None:
-        """Begin the next part of the journal with a state, which a separate thread writes."""
+        """Begin the next part of the journal with a state, written by a separate thread."""
         self._due_ns, self._due_wall_ns = now_ns + CHECKPOINT_NS, wall_ns + CHECKPOINT_WALL_NS
         self.commit()
 
@@ -119,7 +119,7 @@ class RunJournal:
         self._guarded(begin)
 
     def _write_checkpoint(self, number: int, content: bytes, former: int) -> None:
-        """Write a checkpoint to disk after the files that it needs, and remove obsolete files."""
+        """Write a checkpoint to disk, after the files on which it depends, and remove obsolete files."""
         place = self._folder / f"{number}.checkpoint"
         os.fsync(former)
         os.close(former)
@@ -174,7 +174,7 @@ class RunJournal:
     def open(self) -> Checkpoint | None:
         """Create or open the journal; return the checkpoint to continue from, or None for a new run.
 
-        It is the second newest checkpoint, so that the inputs since then (`entries`) refill the message history.
+        The checkpoint is the second newest, so that the inputs since then (`entries`) refill the message history.
 
         Raises:
             RunError: the journal belongs to another run, is in use, or cannot be read or kept.
@@ -210,7 +210,7 @@ class RunJournal:
         return None
 
     def entries(self) -> Iterator[Entry]:
-        """Yield the inputs since the checkpoint.
+        """Yield the inputs since the checkpoint returned by `open`.
 
         An incomplete entry at the end is dropped: no message that follows from it was published.
         """
@@ -248,7 +248,7 @@ class RunJournal:
 
 
 def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
-    """Yield content and end offset of each complete frame from the beginning of a file."""
+    """Yield the content and end offset of each frame of a file's data, up to the first incomplete one."""
     at = 0
     while len(data) - at >= _FRAME.size:
         size, check = _FRAME.unpack_from(data, at)

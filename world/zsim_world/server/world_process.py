@@ -39,16 +39,16 @@ CLOCK_STANDING_NS = 1_000_000_000  # contract: `clock` is published once per wal
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 views per wall second
 HEALTH, OWN = keys.process(WORLD, "health"), keys.process(WORLD, "")
 BYE_S = 5.0  # contract: the world waits at most 5 s for byes
-SERVE_NS = 5_000_000  # interval [wall] at which a world that never waits handles requests and losses
+SERVE_NS = 5_000_000  # wall time after which a world that never waits handles requests and losses again
 RECOVERY_S = 1.0  # timeout of a request for outputs, which a living publisher answers within milliseconds
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin within which a process may be unable to answer requests
 PROCESSES, VIEWS = "process/", "view/"  # the world does not read views
-LAG_GATES = 2  # maximum number of gates that the slowest agent has yet to finish when a series of gates begins
+LAG_GATES = 2  # maximum number of gates by which the slowest agent lags when a series of gates begins
 GATES_SENT = 3  # number of gates sent together; more would leave agents idle
-DELAY_MAX_NS = 50_000_000  # maximum delay of a gate [wall]; by then even a slow agent has every gate it may receive
-STOOD_STILL_NS = 1_000_000_000  # lateness of a gate [wall] that indicates a standstill rather than a slow world
+DELAY_MAX_NS = 50_000_000  # maximum wall-time delay of a gate; by then even a slow agent has every gate it may receive
+STOOD_STILL_NS = 1_000_000_000  # lateness of a gate in wall time that indicates a standstill, not just a slow world
 STUCK_NS = 2_000_000_000  # wall time after which a turn of the loop is reported as stuck; a turn takes milliseconds
-STOPPED_NS = 1_000_000_000  # wall time between two checks that indicates a stopped process; ten times the usual
+STOPPED_NS = 1_000_000_000  # wall time between checks that indicates a stopped process; ten times the usual interval
 
 
 def run(
@@ -77,9 +77,9 @@ class WorldProcess:
 
     Args:
         link: a listening session.
-        stopped: called at every gate and every TICK_S; a returned text ends the run and is the reason.
+        stopped: called at every gate and every TICK_S; ends the run by returning the reason.
         journal: journal of the run; if a former world process left one, this process continues its run.
-        health: health of this process.
+        health: meter of this process's health.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class WorldProcess:
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
         self._clock_wall_ns = 0
-        self._turn_wall_ns = 0  # when the present turn began; 0 outside a turn
+        self._turn_wall_ns = 0  # when the current turn began; 0 outside a turn
         self._served_wall_ns = 0  # when requests and losses were last handled; 0 once the world has waited
         self._view_wall_ns = 0
         self._view_seq = 0
@@ -119,7 +119,7 @@ class WorldProcess:
         """Run to the end: wait for the participants, integrate, publish the end.
 
         Raises:
-            RunError: a failure ended the run, whose end was published, or the journal cannot be continued.
+            RunError: a failure ended the run (its end was still published), or the journal cannot be continued.
         """
         self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
         self._continue()
@@ -150,7 +150,7 @@ class WorldProcess:
             raise self._world.failure
 
     def _continue(self) -> None:
-        """Apply the journal without republishing anything, then wait for the former participants.
+        """Apply the journal without republishing anything, and have the run await its former participants.
 
         Raises:
             RunError: the journal belongs to another run, or its state does not fit this version of zsim.
@@ -183,7 +183,7 @@ class WorldProcess:
 
     def _turn(self) -> None:
         former_wall_ns, self._turn_wall_ns = self._turn_wall_ns, time.monotonic_ns()
-        if former_wall_ns and self._turn_wall_ns - former_wall_ns > STOOD_STILL_NS:  # usually TICK_S
+        if former_wall_ns and self._turn_wall_ns - former_wall_ns > STOOD_STILL_NS:  # TICK_S at most if all is well
             self._report_standstill(self._turn_wall_ns - former_wall_ns)
         self._take_in()
         if reason := self._stopped():
@@ -247,7 +247,7 @@ class WorldProcess:
         self.health.step(time.monotonic_ns() - wall_ns)
 
     def _stand_still(self, wall_ns: int) -> None:
-        """While time stands still, publish the clock once a second, and wait for an input."""
+        """While time stands still, publish the clock once a second and wait for input."""
         self._outputs.flush()
         self._pipelining.pause(wall_ns)
         self._publish_clock(wall_ns, self._world.waiting_for)
@@ -258,7 +258,7 @@ class WorldProcess:
         self._served_wall_ns = 0
 
     def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
-        """Publish `clock` with the processes that the world waits for, once a second."""
+        """Publish `clock` with the processes that the world waits for, at most once a second."""
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
             self._outputs.publish(Output(keys.CLOCK, self._world.clock_message(waiting_for(wall_ns))))
 
@@ -270,7 +270,7 @@ class WorldProcess:
             self._run.progress("event", message, self._run.phase)
 
     def _end(self) -> None:
-        """Publish the end, then wait at most BYE_S until all participants have left.
+        """Publish the end, then wait up to BYE_S for all participants to leave.
 
         A world that was restarted after the end of its run first waits until the former participants have rejoined.
         """
@@ -315,8 +315,8 @@ class WorldProcess:
     def _serve(self, query: Query) -> None:
         """Answer a query with last values, a page of the history, or the answer to a request.
 
-        Requests arrive on `world/control`; replay requests also on the process's own key, which access control can
-        restrict.
+        Requests arrive on `world/control`; replay requests also on the requesting process's own key, which access
+        control can restrict.
         """
         expression = query.expression
         process = keys.thing(expression) if keys.matches(keys.replay("*"), expression) else None
@@ -359,7 +359,7 @@ class WorldProcess:
             self._inputs.wake()
 
     def _tick(self) -> None:
-        """Wake the loop; show a stuck put only in the terminal, since no message about it could be published."""
+        """Wake the loop regularly; show a stuck put only in the terminal, since no message could be published."""
         watch = TurnWatch(time.monotonic_ns())
         while not self._over.wait(TICK_S):
             self._inputs.wake()
@@ -371,14 +371,14 @@ class WorldProcess:
 
 
 class DirectInputs:
-    """Reads on the loop's own thread and waits on the last subscription: fastest for an unpaced run."""
+    """Reads on the loop's own thread and waits on the last subscription: the fastest for an unpaced run."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._subscriptions = subscriptions
         self._received: list[ReceivedSample] = []
 
     def wait(self, timeout_s: float | None) -> None:
-        """Return when something has arrived, or after timeout_s; without a timeout, also return occasionally."""
+        """Wait for a message, for a limited time only; a timeout shorter than TICK_S is slept through."""
         if timeout_s is not None and timeout_s < TICK_S:
             time.sleep(timeout_s)
             return
@@ -398,7 +398,7 @@ class DirectInputs:
                 return
 
     def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
-        """Yield the received samples with the monotonic wall time of their arrival [ns]."""
+        """Yield the received samples, each with the monotonic wall time [ns] at which it was read."""
         last, self._received = [*self._received, *self._subscriptions[-1].drain()], []
         wall_ns = time.monotonic_ns()
         for subscription in self._subscriptions[:-1]:
@@ -467,7 +467,7 @@ def open_inputs(link: Session, realtime: bool) -> DirectInputs | TimedInputs:
 
 
 def recover_lost(link: Session, run: Run) -> None:
-    """Request the outputs that a participant has counted but that have not arrived, e.g. after a link was cut."""
+    """Request the outputs that participants have counted but that have not arrived, e.g. after a link was cut."""
     world = run.world
     for participant in world.barrier.incomplete():
         if participant.away:
@@ -509,7 +509,7 @@ class WorldOutputs:
         self._gate_keys = [keys.gate(name) for name in run.world.names]
 
     def gather(self) -> None:
-        """Encode the outbox for `send`: a gate whole and per drone, if anyone subscribes, and as single messages."""
+        """Encode the outbox for `send`: single messages and, for their subscribers, whole gates and gates by drone."""
         outbox = self._run.world.take_outbox()
         if not outbox:
             return
@@ -560,7 +560,7 @@ class WorldOutputs:
         self._on_message(output.key, message)
 
     def put_batch(self) -> None:
-        """Send all messages since the last call to the recorders, if there are any."""
+        """Send the recorders, if there are any, all messages published since the last call."""
         history = self._run.history
         passed, history.passed = history.passed, []
         if self._link.has_subscribers(keys.BATCH):
@@ -577,12 +577,12 @@ class Pacer:
 
     def __init__(self, clock: RunClock) -> None:
         self._clock = clock
-        self._pace = (0.0, 0)  # rate and number of time jumps for which the next two, the start of the pace, are valid
+        self._pace = (0.0, 0)  # rate and number of time jumps for which the two start times below are valid
         self._start_wall_ns = 0
         self._start_sim_ns = 0
 
     def due_ns(self, wall_ns: int) -> int:
-        """Return the wall time of the next gate [ns].
+        """Return the wall time at which the next gate is due [ns].
 
         The pace restarts after a change of rate, a time jump or, in lockstep, a standstill.
         """
@@ -606,8 +606,8 @@ class Pacer:
 class Pipelining:
     """Delays gates so that several are sent together and processes wake up less often.
 
-    If agents may lag several gates behind, time is delayed until the slowest agent has nearly caught up; then gates
-    follow one another until its done is required again. No agent idles meanwhile, since the first of these gates
+    If agents may lag several gates behind, the next gate is delayed until the slowest agent has nearly caught up; then
+    gates follow one another until its done is required again. No agent idles meanwhile, since the first of these gates
     arrives while agents still work on earlier ones. Only an unpaced world in lockstep is delayed.
     """
 
@@ -650,7 +650,7 @@ class Pipelining:
 class TurnWatch:
     """Distinguishes a stuck turn of the loop (a put that does not return) from a stopped process.
 
-    It is called on a separate thread, which a stuck put does not block. Times are monotonic wall times.
+    It runs on a separate thread, which a stuck put does not block. Times are monotonic wall times.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -659,10 +659,10 @@ class TurnWatch:
         self._reported_ns = 0
 
     def stuck_s(self, now_ns: int, turn_ns: int) -> float | None:
-        """Return how long a turn has been stuck [s], once every STUCK_NS at most; None if there is nothing to report.
+        """Return how long a turn has been stuck [s], at most once every STUCK_NS; None if there is nothing to report.
 
         Args:
-            turn_ns: when the present turn began; 0 outside a turn.
+            turn_ns: when the current turn began; 0 outside a turn.
         """
         if now_ns - self._looked_ns > STOPPED_NS:
             self._stopped_until_ns = now_ns

@@ -1,1 +1,1 @@
-"""The firmware of the aircraft: its state estimate, decisions and motor commands. Imports sensors and physics."""
+"""The firmware of the aircraft: state estimate, decisions and motor commands. Imports sensors and physics."""

@@ -1,16 +1,17 @@
-"""The firmware of the drones at 200 Hz: modes, velocity, attitude and rate loops, using only its own estimate.
+"""The drones' firmware, which runs at 200 Hz: modes and control loops, based only on its own state estimate.
 
-Loops from inside out, each about three times slower than the one it contains, with the AR.Drone's values:
+Loops from the inside out, each about three times slower than the one that it contains, with the AR.Drone's values:
     rotors   overdriven so that their lag halves (15 ms)
     rate     dw/dt = 28 (w_des - w)
-    tilt     w_des = 9 (z_B × z_des): closed loop about 0.12 s, inside the 0.143 s that tum_ardrone fitted
-    velocity a_des = 3 (v_des - v), vertically 4, estimated disturbance and drag cancelled
-    hold     v_des = 0.8 (p_hold - p), height 1.5
-A velocity in the heading frame is tracked in the instantaneous frame: while the drone yaws at r, it lags by r v / 3
-laterally. The gains follow from the rotors' lag and the design of `zsim.vehicles.vehicle.Firmware`, for any vehicle.
+    tilt     w_des = 9 (z_B × z_des): closed-loop time constant about 0.12 s, below the 0.143 s that tum_ardrone fitted
+    velocity a_des = 3 (v_des - v), vertically 4 (v_des - v); estimated disturbance and drag are cancelled
+    hold     v_des = 0.8 (p_hold - p), vertically 1.5 (p_hold - p)
+A velocity in the heading frame is tracked in the instantaneous frame: while the drone yaws at rate r, the velocity lags
+by r v / 3 laterally. For any vehicle, the gains follow from the rotors' lag and the design parameters in
+`zsim.vehicles.vehicle.Firmware`.
 
-Observation and decision are computed per drone; the attitude update and the loops of attitude and rate, which have no
-branches, for blocks of eight drones at once (physics/simd.py).
+Observation and decision are computed drone by drone; the attitude update, the tilt loop and the rate loop, which have
+no branches, for blocks of eight drones at once (physics/simd.py).
 """
 
 import math
@@ -58,22 +59,22 @@ from zsim_world.physics.simd import (
 from zsim_world.vehicles import observer
 from zsim_world.vehicles.observer import BELIEF, DEVICE, FLOOR_MIN_M, STEP_S, STILL_STEPS_MIN, lift, standing_height
 
-DRIVE = columns(  # settings of the attitude and rate loops, the first of SETTING
+DRIVE = columns(  # settings of the tilt and rate loops, the first columns of SETTING
     "DriveColumns",
     (
         Field("k_rate", "1/s"),
         Field("k_tilt", "1/s"),
-        Field("overdrive", "1"),  # commanded change of speed over the desired one
+        Field("overdrive", "1"),  # commanded change of a rotor's speed over the desired one
         Field("slope", "1"),  # tangent of the largest tilt
-        Field("yaw_share", "1"),
+        Field("yaw_share", "1"),  # gain of the rate loop about the yaw axis over k_rate
         Field("body_rate", "rad/s"),  # largest body rate that the tilt loop demands
     ),
 )
-SETTING = columns(  # limits of commands, and the design of vehicle.Firmware
+SETTING = columns(  # limits of commands, and the design parameters of vehicle.Firmware
     "SettingColumns",
     (
         Field("drive", "DRIVE", DRIVE.size),
-        Field("rotor_decay", "1"),  # remaining fraction of the rotors' lag after a step
+        Field("rotor_decay", "1"),  # fraction of a rotor's speed error that remains after a step
         Field("k_velocity", "1/s"),
         Field("k_climb", "1/s"),
         Field("speed", "m/s"),
@@ -105,7 +106,7 @@ MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "
 NONE, VELOCITY, VELOCITY_WORLD, ARDRONE, HOVER, ATTITUDE, ROTORS = range(7)  # kinds of setpoint
 # Values of a setpoint by its kind:
 #   velocity: vx, vy, vz [m/s], yaw rate [rad/s]; ardrone: forward, left, up, yaw_left in [-1, 1];
-#   attitude: w, x, y, z, thrust [N], yaw rate [rad/s]; rotors: their speeds [rad/s]
+#   attitude: w, x, y, z, thrust [N], yaw rate [rad/s]; rotors: speed of each rotor [rad/s]
 SETPOINT = columns("SetpointColumns", (Field("kind", "1"), Field("value", "see above", ROTORS_MAX)))
 MEMORY = columns(
     "MemoryColumns",
@@ -115,7 +116,7 @@ MEMORY = columns(
         Field("hold_xy", "m", 2),
         Field("hold_z", "m"),
         Field("holds_xy", "1"),
-        Field("holds_z", "1"),  # 0; RISING: the held height rises to that of the take-off; HOLDING: it is constant
+        Field("holds_z", "1"),  # 0: no; RISING: the held height rises to the take-off height; HOLDING: it is constant
         Field("touch", "1"),  # steps for which the ground has borne the weight
     ),
 )
@@ -126,35 +127,35 @@ BOARD_LANES = columns(
         Field("vehicle", "VEHICLE", VEHICLE.size),
         Field("drive", "DRIVE", DRIVE.size),
         Field("mount", "1", 4),  # q_BS of the gyro
-        Field("gyro", "rad/s", 3),  # the newest sample
-        Field("bias", "rad/s", 3),  # its estimated bias
-        Field("q_WB", "1", 4),  # estimated attitude; likewise the next
-        Field("w_WB_B", "rad/s", 3),
+        Field("gyro", "rad/s", 3),  # newest sample
+        Field("bias", "rad/s", 3),  # estimated bias of the gyro
+        Field("q_WB", "1", 4),  # estimated attitude
+        Field("w_WB_B", "rad/s", 3),  # estimated body rate
         Field("angle", "rad"),  # rotation of the body in the step
-        Field("sine", "1"),  # of half this angle; likewise the next
-        Field("cosine", "1"),
-        Field("north", "1"),  # horizontal direction of the nose
-        Field("east", "1"),
+        Field("sine", "1"),  # of half this angle
+        Field("cosine", "1"),  # of half this angle
+        Field("north", "1"),  # north component of the nose's direction
+        Field("east", "1"),  # east component of the nose's direction
         Field("heading", "rad"),
-        Field("own", "1", 4),  # heading frame in W
+        Field("own", "1", 4),  # orientation of the heading frame in W
         Field("z_H", "1", 3),  # desired z_B in the heading frame
         Field("thrust", "N"),
         Field("yaw_rate", "rad/s"),
-        Field("driven", "1"),  # 0 if the firmware itself has set the command
+        Field("driven", "1"),  # 0 if `decide` has already set the command
     ),
 )
 BOARD_ROTORS = columns(
     "BoardRotors",
     (Field("known", "ROTOR", ROTOR.size), Field("speed", "rad/s"), Field("command", "rad/s"), Field("drive", "rad/s")),
 )
-# followed by the fraction of the commanded speed that each rotor reaches (R), and the speed at which it is held (R)
+# followed by the fraction of its commanded speed that each of R rotors reaches, and the speed at which each is held
 ACTUATOR = columns("ActuatorColumns", (Field("faulty", "1"),))
-FOLLOWS = -1.0  # rad/s, marks a rotor that is not held
+FOLLOWS = -1.0  # rad/s, marks a rotor that follows its commands
 Gains = tuple[float, float, float, float, float, float]
 
 
 def settings(vehicle: Vehicle, drone: Drone) -> NDArray[np.float64]:
-    """Return limits and loop gains of one drone, shape (SETTING.size,)."""
+    """Return the limits and loop gains of one drone, (SETTING.size,)."""
     limits, design, row = drone.limits, vehicle.firmware, np.empty(SETTING.size)
     k_rate, k_tilt, row[SETTING.k_velocity] = loop_gains(design, drone.rotor_time_constant_s)
     row[SETTING.rotor_decay], overdrive = lag_shares(design, drone.rotor_time_constant_s)
@@ -177,13 +178,13 @@ def settings(vehicle: Vehicle, drone: Drone) -> NDArray[np.float64]:
 
 
 def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, float]:
-    """Return the gains of rate, tilt and velocity loop [1/s] for a lag of the rotors."""
+    """Return the gains of the rate, tilt and velocity loops [1/s] for a lag of the rotors."""
     rate = design.rate_per_lag / max(design.lag_lead * rotor_lag_s, design.lag_min_s)
     return rate, rate / design.loop_ratio, rate / el.square(design.loop_ratio)
 
 
 def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
-    """Return the fraction of a rotor's lag that remains after a step, and the overdrive that shortens it."""
+    """Return the fraction of a rotor's speed error left after a step, and the overdrive that shortens its lag."""
     decay = el.exp(-STEP_S / rotor_lag_s)
     return decay, (1.0 - el.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
 
@@ -196,7 +197,7 @@ def sound_actuators(drones: int, rotors: int) -> NDArray[np.float64]:
 
 
 def board_blocks(row: NDArray, rotors: NDArray, setting: NDArray, mounts: NDArray) -> NDArray[np.float64]:
-    """Return the blocks of N boards: parameters, those of their rotors, settings and mounts of the gyro (N, 4)."""
+    """Return the blocks of N boards, given parameters of vehicles and rotors, settings, and the gyros' q_BS (N, 4)."""
     each = rotors.shape[1] // ROTOR.size
     drive = setting[:, SETTING.drive : SETTING.drive + DRIVE.size]
     known = BOARD_LANES.size + BOARD_ROTORS.known * each
@@ -224,7 +225,7 @@ def steer(time: KernelTime, bodies: Bodies, boards: Boards) -> None:
 
 @inlined
 def _rotors(lanes: NDArray, group: int, k: int, each: tuple[int, ...]) -> PerRotor:
-    """Return a group of numbers per rotor of the drone in lane k, and those after it."""
+    """Return the groups of numbers per rotor of the drone in lane k, from `group` on."""
     return lane_rotors(lanes, BOARD_LANES.size + group * len(each), k, each)
 
 
@@ -239,7 +240,7 @@ def _line_up(boards: Boards, lanes: NDArray, i: int, k: int) -> None:
 
 @inlined
 def _turn(lanes: NDArray, count: int) -> None:
-    """Rotate the attitudes by the gyro readings; `count` lanes have a drone."""
+    """Rotate the estimated attitudes by the gyro readings; the first `count` lanes hold drones."""
     for k in range(LANES):
         mount, gyro = lane_four(lanes, BOARD_LANES.mount, k), lane_vector(lanes, BOARD_LANES.gyro, k)
         bias = lane_vector(lanes, BOARD_LANES.bias, k)
@@ -263,7 +264,7 @@ def _turn(lanes: NDArray, count: int) -> None:
 
 @inlined
 def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i: int, k: int) -> bool:
-    """Run observer and decision of drone i for lane k; return whether the drive must compute its command."""
+    """Run the observer and the decision of drone i, in lane k; return whether `drive` must compute its command."""
     each, memory, belief, row = bodies.each, boards.memory[i], boards.belief[i], bodies.vehicle[i]
     setting, heading = boards.setting[i], lanes[LANES * BOARD_LANES.heading + k]
     own, turned = lane_four(lanes, BOARD_LANES.own, k), heading - belief[BELIEF.heading]
@@ -295,7 +296,7 @@ def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i:
 
 @inlined
 def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
-    """Compute the commands of all drones of the block whose firmware has not set them itself."""
+    """Compute the commands of all drones of a block for which `decide` has not set them."""
     for k in range(LANES):
         own, attitude = lane_four(lanes, BOARD_LANES.own, k), lane_four(lanes, BOARD_LANES.q_WB, k)
         rate, z = lane_vector(lanes, BOARD_LANES.w_WB_B, k), lane_vector(lanes, BOARD_LANES.z_H, k)
@@ -312,7 +313,7 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
 
 @inlined
 def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None:
-    """Set the rotor commands of drone i, if its battery allows, and update its firmware's rotor model."""
+    """Set the rotor commands of drone i, or zero if its battery is empty, and update its firmware's rotor model."""
     charged, command = bodies.energy[i] > 0.0, bodies.command[i]
     observer.model_rotors(boards.belief[i], boards.setting[i, SETTING.rotor_decay], commands)
     for r in range(len(commands.each)):
@@ -323,7 +324,7 @@ def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None
 
 @noinline
 def _weaken(command: NDArray, actuator: NDArray) -> None:
-    """Apply rotor faults to a command [rad/s] (R,), in place."""
+    """Apply rotor faults to a command [rad/s], (R,), in place."""
     count = command.shape[0]
     for r in range(count):
         held = actuator[ACTUATOR.size + count + r]
@@ -334,7 +335,7 @@ class Decision(NamedTuple):
     """The firmware's decision for the next 5 ms."""
 
     driven: bool  # True: the drive computes the command from the fields below; False: it is already set
-    z_H: Vector  # along the desired z_B, in the heading frame
+    z_H: Vector  # along the desired z_B, in the heading frame; not normalised
     thrust_n: float
     yaw_rate: float  # rad/s
 
@@ -357,14 +358,14 @@ def decide(
     land_s: float,
     charge_percent: float,
 ) -> Decision:
-    """Decide on the rotors for the next 5 ms: set commands [rad/s], or return the wanted thrust and attitude.
+    """Decide what the rotors do for the next 5 ms: set their commands [rad/s], or return thrust, z_B and yaw rate.
 
     Args:
-        commands: rotor commands, set here if the drive need not compute them.
-        memory: modes and holds, in place; belief: estimate of observer.py.
-        own: the heading frame in W of the estimated attitude.
-        row, rotors: parameters; setting: limits and gains; setpoint: the commander's, cleared on landing.
-        silence_s: age of the setpoint; hover_s: age from which to hover, and land_s later to land.
+        commands: rotor commands, set by this function unless `drive` must compute them.
+        memory: mode and holds, modified in place; belief: the observer's estimate.
+        own: orientation in W of the heading frame of the estimated attitude.
+        row, rotors: parameters; setting: limits and gains; setpoint: cleared unless the drone hovers or flies.
+        silence_s: age of the setpoint; hover_s: age from which to hover; land_s: further time from which to land.
         charge_percent: charge of the battery.
     """
     _change_mode(memory, belief, setting, setpoint, silence_s, hover_s, land_s, charge_percent)
@@ -431,7 +432,7 @@ def _change_mode(
 
 @inlined
 def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
-    """Return the mode of a flying drone for this kind and age of setpoint."""
+    """Return the mode of a hovering or flying drone, given the kind and age of its setpoint."""
     if kind == NONE:
         return HOVERING
     if silence_s >= hover_s + land_s:
@@ -460,7 +461,7 @@ def _fly(
     setting: NDArray,
     setpoint: NDArray,
 ) -> Decision:
-    """Decide on the rotors in the air or during take-off."""
+    """Decide what the rotors do from take-off to touchdown."""
     kind = int(setpoint[SETPOINT.kind])
     if mode == FLYING and kind == ROTORS:
         for r in range(len(rotors.each)):
@@ -479,7 +480,7 @@ def _fly(
 
 @inlined
 def _from_attitude(own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float, float]:
-    """Return wanted z_B in the heading frame, thrust [N] and yaw rate of an attitude setpoint."""
+    """Return the desired z_B in the heading frame, thrust [N] and yaw rate [rad/s] of an attitude setpoint."""
     q = rot.normalised(four(setpoint, SETPOINT.value))
     z_des = rot.rotate_back(own, rot.z_axis(q))
     yaw_rate = _clip(setpoint[SETPOINT.value + 5], setting[SETTING.yaw_rate])
@@ -498,7 +499,7 @@ def _from_velocity(
     setpoint: NDArray,
     each: tuple[int, ...],
 ) -> tuple[Vector, float, float]:
-    """Return wanted z_B in the heading frame, thrust [N] and yaw rate of all velocity-controlled modes."""
+    """Return the desired z_B in the heading frame, thrust [N] and yaw rate [rad/s] in velocity-controlled modes."""
     v = vector(belief, BELIEF.v_H)
     v_des, yaw_rate = (0.0, 0.0, 0.0), 0.0
     if mode == FLYING:
@@ -521,7 +522,7 @@ def _from_velocity(
 
 @inlined
 def _commanded_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float]:
-    """Return the commanded velocity in the heading frame [m/s] and yaw rate [rad/s], within the limits."""
+    """Return the commanded velocity [m/s] in the heading frame and yaw rate [rad/s], within the limits."""
     if kind == ARDRONE:
         climb = setting[SETTING.climb] * _clip(setpoint[SETPOINT.value + 2], 1.0)
         return (0.0, 0.0, climb), setting[SETTING.yaw_rate] * _clip(setpoint[SETPOINT.value + 3], 1.0)
@@ -536,7 +537,7 @@ def _commanded_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: 
 
 @inlined
 def _held(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v_des: Vector) -> Vector:
-    """Return v_des with the horizontal velocity that holds the position of the odometry."""
+    """Return `v_des` with its horizontal part replaced by the velocity that holds the odometry's position."""
     v_W = rot.rotate(own, vector(belief, BELIEF.v_H))
     for k in range(2):
         if memory[MEMORY.holds_xy] == 0.0:
@@ -558,7 +559,7 @@ def _climb(
     setting: NDArray,
     each: tuple[int, ...],
 ) -> float:
-    """Return the wanted vertical velocity [m/s]: take-off, landing, height hold, or as commanded."""
+    """Return the desired vertical velocity [m/s] for take-off, landing, height hold or a commanded climb."""
     height = belief[BELIEF.height]
     if mode == LANDING:
         return -_descent(memory, belief, row, setting, each)
@@ -575,7 +576,7 @@ def _climb(
 
 @inlined
 def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
-    """Return the vertical velocity of a take-off [m/s], following a height that rises evenly."""
+    """Return the vertical velocity [m/s] of a take-off, which follows a steadily rising height."""
     height, standing = belief[BELIEF.height], standing_height(belief, row)
     final = min(setting[SETTING.takeoff_height] + (standing - row[VEHICLE.stand_height]), setting[SETTING.altitude])
     if memory[MEMORY.holds_z] == 0.0:
@@ -591,7 +592,7 @@ def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) ->
 
 @inlined
 def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray, each: tuple[int, ...]) -> float:
-    """Return the speed of descent [m/s], and count the steps for which the ground bears the weight."""
+    """Return the speed of descent [m/s], and count the steps for which the ground has borne the weight."""
     weak = lift(belief, row, each) < setting[SETTING.touch_share] * row[VEHICLE.gravity]
     borne = weak and belief[BELIEF.v_H + 2] > -setting[SETTING.touch_speed]
     memory[MEMORY.touch] = memory[MEMORY.touch] + 1.0 if borne else 0.0
@@ -618,14 +619,15 @@ def drive(
     yaw_rate: float,
     commands: PerRotor,
 ) -> None:
-    """Set rotor commands for a wanted direction of z_B (heading frame), thrust [N] and yaw rate [rad/s].
+    """Set rotor commands for a desired direction of z_B (heading frame), thrust [N] and yaw rate [rad/s].
 
     Branch-free, so that several drones are computed at once (`_drive`).
 
     Args:
-        row, rotors: parameters; gains: its settings in DRIVE.
-        own: the heading frame in W; q_WB, w_WB_B, speeds: estimated attitude, body rate and rotor speeds.
-        commands: [rad/s], to be set.
+        row, rotors: parameters; gains: the drone's columns of DRIVE.
+        own: orientation of the heading frame in W.
+        q_WB, w_WB_B, speeds: estimated attitude, body rate and rotor speeds.
+        commands: rotor commands [rad/s], filled by this function.
     """
     k_rate, k_tilt, overdrive, slope, yaw_share, body_rate_max = gains
     q_HB = rot.level(own, q_WB)
@@ -648,13 +650,13 @@ def drive(
 
 @inlined
 def clipped(rotors: PerRotor, r: int, speed: float) -> float:
-    """Return a speed [rad/s] of rotor r within its limits."""
+    """Return a speed [rad/s], clipped to the limits of rotor r."""
     return min(max(speed, of(rotors, ROTOR.low, r)), of(rotors, ROTOR.high, r))
 
 
 @inlined
 def limited_tilt(z: Vector, slope: float) -> Vector:
-    """Return the unit vector along z, with its tilt from the vertical limited to this tangent."""
+    """Return the unit vector along `z`, with the tangent of its tilt from the vertical limited to `slope`."""
     across = math.sqrt(z[0] * z[0] + z[1] * z[1])
     most = max(z[2], 1e-3) * slope
     s = 1.0 if across <= most else most / across

@@ -1,16 +1,18 @@
-"""The firmware's estimate of attitude, velocity, height and disturbance, from its own noisy sensors with fixed gains.
+"""The firmware's estimate of attitude, velocity, height and disturbance, from its noisy sensors, with fixed gains.
 
-The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected from the velocity, not from the
-accelerometer as a gravity sensor: in flight a multirotor's specific force is along its thrust at any tilt.
+The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected by the measured velocity. The
+accelerometer cannot sense it as the direction of gravity: in flight, a multirotor's specific force is along its thrust
+at any tilt.
 
-The gains are steady Kalman gains for the noises of the drone's sensors, computed once. The design model of one
+The gains are steady-state Kalman gains for the noise of the drone's sensors, computed once. Design model of one
 horizontal axis (heading frame), driven by white noise:
     dv/dt = -c v + g tilt + u      c: drag over mass; u: disturbance (wind, collisions, model error)
     dtilt/dt = rate + noise        rate: error of the gyro's bias
     drate/dt = noise, du/dt = noise
-measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is its drag and disturbance) and
-by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height and the accelerometer's bias besides (u -
-c v + bias; horizontally, a bias is indistinguishable from a tilt). Heading: psi and rate.
+measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is drag and disturbance) and by
+the optical flow (v). Vertical axis: dz/dt = v, dv/dt = -c v + u, with a measured height (z) and the accelerometer's
+bias as a further state (it measures u - c v + bias; horizontally, a bias is indistinguishable from a tilt). Heading:
+dpsi/dt = rate + noise, drate/dt = noise, measured by the magnetometer (psi).
 """
 
 import math
@@ -52,9 +54,9 @@ BELIEF = columns(  # followed by R modelled rotor speeds [rad/s]
         Field("gyro_bias", "rad/s", 3),  # in B
         Field("v_H", "m/s", 3),
         Field("disturbance", "m/s^2", 3),
-        Field("height", "m"),  # over the ground
-        Field("baro_zero", "m"),
-        Field("odometry", "m", 2),  # in W from power-up
+        Field("height", "m"),  # above the ground
+        Field("baro_zero", "m"),  # the barometer's reading at height zero
+        Field("odometry", "m", 2),  # displacement in W since power-up
         Field("w_WB_B", "rad/s", 3),
         Field("still_steps", "1"),
         Field("baro_samples", "1"),
@@ -62,10 +64,10 @@ BELIEF = columns(  # followed by R modelled rotor speeds [rad/s]
         Field("sonar_age", "1"),  # steps since the last good echo
         Field("lift_bias", "m/s^2"),  # vertical bias of the accelerometer
         Field("heading", "rad"),  # heading of q_WB
-        Field("stand_height", "m"),  # at which it has landed on what is not the ground; 0 on the ground
+        Field("stand_height", "m"),  # height of the obstacle on which the drone has landed; 0 on the ground
     ),
 )
-DEVICE = columns(  # the newest sample of each sensor, and a flag that it is new
+DEVICE = columns(  # newest sample of each sensor, and flags of new samples
     "DeviceColumns",
     (
         Field("accel", "m/s^2", 3),
@@ -82,7 +84,7 @@ DEVICE = columns(  # the newest sample of each sensor, and a flag that it is new
         Field("new_sonar", "1"),
     ),
 )
-CALIBRATION = columns(  # mounts and site as known to the board
+CALIBRATION = columns(  # mounts and site, as known to the board
     "CalibrationColumns",
     (
         Field("imu_turn", "1", 4),  # q_BS
@@ -92,17 +94,18 @@ CALIBRATION = columns(  # mounts and site as known to the board
     ),
 )
 
-STILL_STEPS_MIN = 50.0  # weight of the prior that the floor is level to 0.05 rad, at an accelerometer noise of 0.35 g
-STILL_STEPS_SWAY = 400.0  # slower averaging of the gyro's bias: in wind a standing drone sways on its feet
-STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks, so older samples get less weight
-FLOW_QUALITY_MIN = 0.3  # below it the picture shows more horizon than ground
-FLOOR_MIN_M = 0.3  # m, chosen: a landing estimated to be higher is on a roof; sonars measure from at most 0.25 m
-SONAR_AGE_MAX = 100.0  # steps, 0.5 s; after this time without echo, heights come from the barometer
+# Steps, weight of the prior that the floor is level to 0.05 rad, at an accelerometer noise of 0.35 g
+STILL_STEPS_MIN = 50.0
+STILL_STEPS_SWAY = 400.0  # steps, slow the averaging of the gyro's bias: in wind, a standing drone sways on its feet
+STILL_STEPS_MAX = 4000.0  # steps, 20 s: the bias walks, so older samples get less weight
+FLOW_QUALITY_MIN = 0.3  # below this quality, the picture shows more horizon than ground
+FLOOR_MIN_M = 0.3  # m, design choice: above this, a drone has landed on an obstacle; sonars measure from 0.25 m or less
+SONAR_AGE_MAX = 100.0  # steps, 0.5 s; after this time without an echo, the height comes from the barometer
 
 
 @inlined
 def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
-    """Rotate the estimated attitude by a small rotation vector [rad; heading frame]; return the new frame."""
+    """Rotate the estimated attitude by a small rotation vector [rad; heading frame]; return the new heading frame."""
     turn = rot.from_rotation_vector(rot.rotate(own, r_H))
     q = rot.normalised(rot.multiply(turn, four(belief, BELIEF.q_WB)))
     put_four(belief, BELIEF.q_WB, q)
@@ -112,20 +115,20 @@ def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
 
 @inlined
 def _take_bias(belief: NDArray, own: Quaternion, r_H: Vector) -> None:
-    """Correct the gyro's bias by a rate error [rad/s] given in the heading frame."""
+    """Correct the gyro's bias by a rate error [rad/s; heading frame]."""
     q_HB = rot.level(own, four(belief, BELIEF.q_WB))
     put(belief, BELIEF.gyro_bias, axpy(vector(belief, BELIEF.gyro_bias), -1.0, rot.rotate_back(q_HB, r_H)))
 
 
 @inlined
 def body_rate(mount: Quaternion, gyro: Vector, bias: Vector) -> Vector:
-    """Return the body rate [rad/s] measured by a gyro in this mount, without its bias."""
+    """Return the body rate [rad/s] measured by a gyro with the mount q_BS, less its bias."""
     return axpy(rot.rotate(mount, gyro), -1.0, bias)
 
 
 @inlined
 def step_turn(w: Vector) -> Vector:
-    """Return the rotation vector [rad] of a step at this body rate [rad/s]."""
+    """Return the rotation vector [rad] of one step at a body rate [rad/s]."""
     return (w[0] * STEP_S, w[1] * STEP_S, w[2] * STEP_S)
 
 
@@ -141,20 +144,20 @@ def observe(
     on_ground: bool,
     each: tuple[int, ...],
 ) -> Quaternion:
-    """Advance the estimate by one step of 5 ms and process the new samples of the devices.
+    """Advance the estimate by one step of 5 ms and process the sensors' new samples.
 
-    Body rate, attitude and heading are at the end of the step already, as the gyro has them (firmware.py).
+    The firmware has already advanced body rate, attitude and heading to the end of the step by the gyro (firmware.py).
 
     Args:
-        belief: (BELIEF.size + R,) in place.
-        own: the heading frame in W; turned: rotation of the body in this step [rad].
-        row: the vehicle's nominal parameters; gain: (GAIN.size,), see `gain_row`.
-        device: (DEVICE.size,) newest samples; the flags of new samples are cleared.
-        board: (CALIBRATION.size,).
-        on_ground: whether the drone stands: zero velocity, accelerometer measures gravity only.
+        belief: the estimate, (BELIEF.size + R,), modified in place.
+        own: orientation of the heading frame in W; turned: change of heading in this step [rad].
+        row: the vehicle's nominal parameters; gain: row of gains, see `gain_row`.
+        device: newest samples, (DEVICE.size,); the flags of new samples are cleared.
+        board: mounts and site, (CALIBRATION.size,).
+        on_ground: whether the drone stands, so that its velocity is zero and its accelerometer measures only gravity.
 
     Returns:
-        the heading frame in W of the new estimated attitude.
+        the orientation in W of the heading frame of the new estimated attitude.
     """
     f_B = rot.rotate(four(board, CALIBRATION.imu_turn), vector(device, DEVICE.accel))
     if on_ground:
@@ -181,7 +184,7 @@ def observe(
 
 @inlined
 def _stand(belief: NDArray, row: NDArray, own: Quaternion, f_B: Vector, w: Vector) -> Quaternion:
-    """Average gravity and the gyro's bias while standing; the first 20 s weigh alike. Return the new heading frame."""
+    """Average gravity and the gyro's bias while standing, evenly for the first 20 s; return the new heading frame."""
     n = min(belief[BELIEF.still_steps] + 1.0, STILL_STEPS_MAX)
     belief[BELIEF.still_steps] = n
     q_HB = rot.level(own, four(belief, BELIEF.q_WB))
@@ -212,7 +215,7 @@ def _fly(
     turned: float,
     each: tuple[int, ...],
 ) -> None:
-    """Predict velocity, height and odometry by one step with the accelerometer."""
+    """Predict velocity, height and odometry after one step, and correct the estimate by the accelerometer."""
     q_HB = rot.level(own, four(belief, BELIEF.q_WB))
     up = lift(belief, row, each)
     c = row[VEHICLE.drag] / row[VEHICLE.mass]
@@ -241,7 +244,7 @@ def lift(belief: NDArray, row: NDArray, each: tuple[int, ...]) -> float:
 
 @inlined
 def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
-    """Correct horizontal velocity and disturbance by an innovation with the gains at `at`."""
+    """Correct horizontal velocity and disturbance by an innovation, with gains from column `at` on."""
     for k in range(2):
         belief[BELIEF.v_H + k] += gain[at] * e[k]
         belief[BELIEF.disturbance + k] += gain[at + 3] * e[k]
@@ -249,7 +252,7 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
 
 @inlined
 def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
-    """Correct height, climb, vertical disturbance and accelerometer bias by an innovation with the gains at `at`."""
+    """Correct height, climb, vertical disturbance and accelerometer bias by an innovation, with gains from `at` on."""
     belief[BELIEF.height] += gain[at] * e
     belief[BELIEF.v_H + 2] += gain[at + 1] * e
     belief[BELIEF.disturbance + 2] += gain[at + 2] * e
@@ -262,9 +265,8 @@ def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -
     e = axpy(flow_H, -1.0, vector(belief, BELIEF.v_H))
     _correct(belief, gain, GAIN.flow_v, e)
     tilt, rate = gain[GAIN.flow_tilt], gain[GAIN.flow_rate]  # the accelerometer does not correct these
-    own = _turn_by(
-        belief, own, (-tilt * e[1], tilt * e[0], 0.0)
-    )  # faster forward than estimated: pitched further forward
+    # a drone that is faster forward than estimated is pitched further forward than estimated
+    own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))
     _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
     _lift_by(belief, gain, GAIN.climb_z, e[2])
     return own
@@ -272,7 +274,7 @@ def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -
 
 @inlined
 def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: float) -> None:
-    """Measure the height by the sonar if it has an echo, else by the barometer."""
+    """Correct the height by the sonar or, after SONAR_AGE_MAX without a good echo, by the barometer."""
     belief[BELIEF.sonar_age] += 1.0
     if device[DEVICE.new_sonar] > 0.0 and device[DEVICE.sonar_valid] > 0.0 and device[DEVICE.sonar] >= sonar_min:
         belief[BELIEF.sonar_age] = 0.0
@@ -294,7 +296,7 @@ def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) 
 
 @inlined
 def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, bearing: float) -> Quaternion:
-    """Correct heading and the gyro's bias about the vertical; the first samples are averaged. Return the new frame."""
+    """Correct heading and vertical gyro bias; average the first samples. Return the new heading frame."""
     field_H = rot.rotate(rot.level(own, four(belief, BELIEF.q_WB)), field_B)
     if field_H[0] * field_H[0] + field_H[1] * field_H[1] < FIELD_MIN_UT * FIELD_MIN_UT:
         return own
@@ -309,7 +311,7 @@ def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, b
 
 @inlined
 def model_rotors(belief: NDArray, decay: float, commands: PerRotor) -> None:
-    """Advance the modelled rotors by one step under commands [rad/s]; decay: remaining fraction of their lag."""
+    """Advance the modelled rotors by one step; `decay` is the fraction of their speed error [rad/s] that remains."""
     speeds = PerRotor(belief, BELIEF.size, 1, commands.each)
     for r in range(len(commands.each)):
         put_of(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
@@ -330,9 +332,9 @@ SIGMAS = {
     "mag": (0.01, 3.0),  # rad
 }
 DOUBLINGS = 24  # 2^24 steps of 5 ms are a day
-SAMPLE_RATE_MIN_HZ = 0.1  # Hz, slower meters are ignored
+SAMPLE_RATE_MIN_HZ = 0.1  # Hz, lower bound of a meter's sample rate in the design
 
-GAIN = columns(  # innovation -> state, in the units of the states over that of the innovation
+GAIN = columns(  # innovation -> state, in the unit of the state over that of the innovation
     "GainColumns",
     (
         Field("accel_v", ""),
@@ -427,7 +429,7 @@ def _gains(d: ObserverDesign) -> Array:
     row[GAIN.accel_v : GAIN.lift_z] = horizontal.ravel()
     row[GAIN.lift_z : GAIN.sonar_z] = by_baro.ravel()
     row[GAIN.sonar_z : GAIN.baro_zero] = by_sonar[2]
-    row[GAIN.baro_zero] = 1.0 / (10.0 * d.baro[1])  # averaged over ten seconds
+    row[GAIN.baro_zero] = 1.0 / (10.0 * d.baro[1])  # an average over ten seconds
     row[GAIN.mag_psi : GAIN.mag_rate + 1] = by_mag[0]
     row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits with any BLAS
     row.setflags(write=False)
@@ -435,7 +437,7 @@ def _gains(d: ObserverDesign) -> Array:
 
 
 def steady_gains(a: Array, walks: Array, meters: list[tuple[list[float], float, float]]) -> Array:
-    """Return the gain per sample of each meter in the steady state of a Kalman filter, shape (meters, states).
+    """Return the gain per sample of each meter in the steady state of a Kalman filter, (meters, states).
 
     A meter slower than the board is treated as a 200 Hz meter with the same information; its gain per sample is then
     P H^T / (H P H^T + sigma^2) with the resulting covariance.
@@ -470,10 +472,10 @@ def _carried(f: Array, p: Array) -> Array:
 
 
 def _riccati(f: Array, information: Array, noise: Array) -> Array:
-    """Return the steady prior covariance of x' = f x + noise, seen with `information` = H^T R^-1 H in every step.
+    """Return the steady prior covariance of x' = f x + noise, measured with `information` = H^T R^-1 H in every step.
 
     Structure-preserving doubling, 2^k steps after k rounds (Chu, Fan, Lin and Wang, Int. J. Control 77 (2004) 767-788):
-    scipy's solver fails on chains whose meters differ by ten decades.
+    scipy's solver fails on chains with meters that differ by ten orders of magnitude.
     """
     a, g, p = f.T, information, noise
     for _ in range(DOUBLINGS):
