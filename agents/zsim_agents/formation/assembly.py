@@ -95,7 +95,7 @@ def assembly_goal(
         p_W, yaw: positions (n, 3) [m] and headings (n,) [rad] of the robots.
 
     Raises:
-        RefusalError: without a base, a variable is not named that must be.
+        RefusalError: without a base, a variable that must be named is missing.
         TrajectoryError, ExpressionError: a value is not allowed.
     """
     if base is None:
@@ -154,7 +154,7 @@ def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
 
 
 def straight_separation(starts_m: Array, goals_m: Array) -> float:
-    """Return the minimum distance [m] between drones on straight paths, (n, 3) each, in the same function of time."""
+    """Return the minimum distance [m] between drones that fly straight, in unison, from starts to goals, (n, 3) each."""
     i, j = np.triu_indices(len(starts_m), 1)
     if not len(i):
         return math.inf

@@ -67,7 +67,7 @@ class Controller(Agent):
             self._grants.put(key, message)
         elif type(message) is flight_messages.Estimate:
             former = self._estimates[place]
-            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in real time, messages may arrive in wrong order
+            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in real time, messages may arrive out of order
                 self._estimates[place] = message
         elif message.t_ns >= self._status_ns[place]:  # as for estimates
             self._states[place], self._status_ns[place] = message.state, message.t_ns

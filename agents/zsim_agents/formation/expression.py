@@ -48,7 +48,7 @@ class Expression:
         self._evaluate, self.constant = self._build(self._parse(), 0)
 
     def __call__(self, t_s: float) -> Dual:
-        """Return the value and its rate [1/s] at `t_s`; ExpressionError: one of them is not finite there."""
+        """Return the value and its rate per second at `t_s`; ExpressionError: one of them is not finite there."""
         try:
             value, rate = self._evaluate(t_s)
         except (ArithmeticError, ValueError) as error:

@@ -60,7 +60,7 @@ class MoveTo:
     over_s: float | None = None
 
     def goal(self, space: ClusterSpace, base: Array) -> Array:
-        """Return the goal (4n,), base with the named values replaced; TrajectoryError, ExpressionError: not allowed."""
+        """Return base (4n,) with the named values replaced; TrajectoryError, ExpressionError: a value is not allowed."""
         if not self.values:
             raise TrajectoryError(f"target: no values; allowed: numbers by name of {', '.join(space.names)}")
         return named_values(space, self.values, "target", base)
@@ -163,7 +163,7 @@ class FlightPlan:
         self.note = ""
 
     def run(self, t_s: float, request: Callable[[FlightRequest], str | None]) -> None:
-        """Submit the requests due at `t_s` to `request`, which returns the reason of a refusal."""
+        """Submit the requests due at `t_s` to `request`, which returns the reason for a refusal."""
         for place in range(len(self._steps) - 1, self._next, -1):
             step = self._steps[place]
             if step.at_s <= t_s and step.request is Order.LAND:

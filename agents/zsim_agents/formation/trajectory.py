@@ -151,7 +151,7 @@ class WaypointTrajectory:
     """Waypoints joined by cubics with PCHIP slopes: C1, at rest at both ends, without overshoot.
 
     A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name stay as in the previous
-    waypoint, or before the first as in base. Angles that wrap turn by the shorter way round.
+    waypoint, or before the first as in base. Angles that wrap take the shorter way round.
 
     Raises:
         TrajectoryError: a waypoint is not allowed; the text names it and its fault.
@@ -285,7 +285,7 @@ class Variable(NamedTuple):
 
 
 def variable_of(space: Variables, name: object, where: str, at: str = "") -> Variable:
-    """Return the variable that a name stands for, an angle also with `_deg`; TrajectoryError: it is unknown."""
+    """Return the variable that a name denotes; an angle's may end in `_deg`. TrajectoryError: the name is unknown."""
     text = str(name)
     angle = text.removesuffix(DEGREES)
     if text not in space.names and angle in space.names and space.in_radians[space.index(angle)]:

@@ -9,7 +9,7 @@ A law is a subclass with one method:
     class Consensus(ShapePilot):
         def velocity(self, now: Sight) -> Array: ...  # (2,) [m/s; W]
 
-Neighbours are the engaged drones from which a drone receives messages over the topology and the radio of the scenario.
+Neighbours are the engaged drones from which a drone receives messages, as the scenario's topology and radio determine.
 They are sorted by name, and all sums use that order, so that results are bit-identical for any order of arrival.
 
 The reference of a formation is its centre, heading and scale as functions of time, and the drones' resulting positions:

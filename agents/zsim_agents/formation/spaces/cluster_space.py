@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 TAU = 2 * math.pi
 CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
 NAMES_SHOWN = 20  # maximum number of names in a message; the paper's cluster has 12
-LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
+LENGTH_MIN_M = 1e-9  # a nanometre: below it, a direction is rounding noise
 
 
 class SingularClusterError(ValueError):
