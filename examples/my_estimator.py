@@ -20,7 +20,7 @@ GPS_SIGMA_M, HEIGHT_SIGMA_M, SPEED_SIGMA_M_S, YAW_SIGMA_RAD = 2.0, 0.03, 0.1, 0.
 
 
 class MyEstimator:
-    """Position from GPS and the flow's velocity, height from the barometer, heading from gyro and magnetometer."""
+    """Position from GPS and flow sensor, height from the barometer, heading from gyro and magnetometer."""
 
     def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
         east, north, _ = environment.magnetic_field_ut

@@ -15,7 +15,7 @@ BAND_M = 0.5  # m; a side has settled once it stays this close to its desired le
 
 
 def settling(flight: RecordedFlight) -> dict[str, float | None]:
-    """Return when side p settled [s after engagement], and by how much it was too long at most [m].
+    """Return when side p settled [s after engagement], and its largest excess over the desired length [m].
 
     Both are None if the formation never engaged; the time is None if the side never settled.
     """

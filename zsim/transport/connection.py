@@ -74,7 +74,7 @@ def connect(
     federation: str,
     mode: Mode = "lockstep",  # mode of the run, if known
     wait_s: float | None = None,  # how long to keep trying; None: try once
-    # whether the run never waits for this process, whose silence for LEASE_READER_MS then counts as its death
+    # whether the run never waits for it: even in lockstep, a silence of LEASE_READER_MS then counts as its death
     reader: bool = False,
     identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
 ) -> Iterator[Session]:

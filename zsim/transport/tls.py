@@ -22,7 +22,7 @@ from msgspec import Struct
 
 from zsim.errors import NoListenerError, SessionError
 
-CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # in a folder of `zsim certs init`
+CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # files made by `zsim certs init`
 DAYS = 30.0  # validity of a certificate
 PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answers within milliseconds
 LATE_S = 1.0  # in TLS 1.3 a server checks the client's certificate after the client has finished

@@ -69,7 +69,7 @@ class ChildProcess:
     """A role, run as a child process.
 
     Args:
-        arguments: of the `zsim` command.
+        arguments: arguments of the `zsim` command.
         logs: folder of the log, which receives the role's standard error.
         on_line: called with each line of the role's standard output; None: standard output goes to the log too.
     """
@@ -440,7 +440,8 @@ class RunConsole:
 def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
     """Run a console for the duration of the `with` block; it waits for the world, and prints the links to its pages.
 
-    It connects to `endpoint`, with 127.0.0.1 in place of 0.0.0.0 (all addresses). `federation`: None: the record's.
+    It connects to `endpoint`, with 127.0.0.1 in place of 0.0.0.0 (all addresses); the default federation is the
+    record's.
     """
     if federation is None:
         from zsim_analysis.reading.recorded_run import open_run

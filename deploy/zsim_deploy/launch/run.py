@@ -99,7 +99,7 @@ def run_processes(options: RunOptions, screen: Shown) -> Outcome:
                 outcome = _run(options, screen, signals)
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                (options.out / "logs").rmdir()  # fails unless it is empty; without it, the run's folder can be reused
+                (options.out / "logs").rmdir()  # fails unless empty; once it is gone, the run's folder can be reused
                 run_folder.forget_launch(options.out)
             raise
         with contextlib.suppress(RecordError):

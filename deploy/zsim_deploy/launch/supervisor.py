@@ -100,7 +100,7 @@ class Supervisor:
         self._until_s: float | None = None  # monotonic time by which the processes must leave
         self._silent_s: float | None = None  # monotonic time at which a world without any output is reported
         self._dead: set[str] = set()
-        self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye, by name
+        self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye message, by name
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and when (monotonic, s)
         self._left: list[RunProcess] = []  # replaced processes that have ended or were killed
         self._world_watch = WorldWatch()

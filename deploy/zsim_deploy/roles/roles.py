@@ -69,7 +69,7 @@ Build = Callable[[Info, Scenario], Agent]
 Serve = Callable[[Session, Info, Participant, Stopped, Say], None]
 """Serves one run with (session, info, participant, stopped, say), until the run is over or the process is stopped."""
 StandsFor = Callable[[Info], tuple[str, ...]]  # names of the processes that a process replaces in a run
-SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0: it does not wait for that
+SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0: it does not wait
 Remain = Callable[[Callable[[], str | None], Callable[[], bool]], None]
 """Called after a run with (reason, deserted); returns when there is a reason to stop, at once if deserted."""
 

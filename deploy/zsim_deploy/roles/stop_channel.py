@@ -3,8 +3,8 @@
 The standard input of a launched process is a pipe from its launcher. The launcher writes "stop REASON"; when it dies,
 the pipe closes. So no process outlives its launcher, on any system, even after kill -9. A launcher on another host
 writes "orphan-after SECONDS" and then a "beat" every second, because the loss of a host closes no pipe. A launched
-process that receives SIGTERM also ends in an orderly way, but counts as dead, because its launcher did not
-request that.
+process that receives SIGTERM also ends in an orderly way, but counts as dead, because its launcher did not request
+that.
 
 A process that ends removes the private key that `zsim up` has copied to its host. This module also has
 `lower_priority`, for processes that no gate waits for.

@@ -149,9 +149,8 @@ class ReplayOptions(NamedTuple):
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     """Play a record until its end, or until the process is stopped.
 
-    `place`: folder of a run, or its run.mcap. Raises RunError or RecordError if there is no record or it has
-    nothing to play, and SessionError if an endpoint is in use, a key expression is invalid, or the identity cannot be
-    used.
+    `place`: folder of a run, or its run.mcap. Raises RunError or RecordError if there is no record or it has nothing to
+    play, and SessionError if an endpoint is in use, a key expression is invalid, or the identity cannot be used.
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run

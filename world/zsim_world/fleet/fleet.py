@@ -185,7 +185,7 @@ class Fleet:
         place = scenario.environment
         self.things = [each.name for each in (*place.obstacles, *(place.surfaces or ()))]
         self._watch = FlightWatch(self._w, self.names, self.things)
-        # Load or compile the function that the first command needs now: in realtime no gate may wait for it.
+        # Load or compile now what the first command needs, because in realtime no gate may wait for it.
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
     @property
@@ -328,14 +328,14 @@ class Fleet:
         yaw_rate_rad_s: float = 0.0,
         frame: Literal["heading", "world"] = "heading",
     ) -> str | None:
-        """Fly at a velocity in the heading frame, or in W by the firmware's own heading; return why it is refused."""
+        """Fly at a velocity in the heading frame, or in W, using the firmware's heading; return why it is refused."""
         kind = firmware.VELOCITY if frame == "heading" else firmware.VELOCITY_WORLD
         return self._set(i, kind, (*velocity_m_s, yaw_rate_rad_s))
 
     def set_ardrone(
         self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
     ) -> str | None:
-        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return why it is refused."""
+        """Fly by tilt, climb and yaw rate, relative to their limits in [-1, 1], or hover; return why it is refused."""
         return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
 
     def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
@@ -456,7 +456,7 @@ class ExternalDrones:
     def command_refusal(self, i: int, kind: str, message: Any) -> str | None:
         """Return why a command is not passed on to the driver; None if it is.
 
-        Stopping the rotors is always passed on; others only if the newest state published by the driver allows it.
+        A stop of the rotors is always passed on, other commands only if the newest state from the driver allows it.
         """
         name, requested = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
         if requested == "emergency":
@@ -515,7 +515,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     number, above = np.zeros(1, dtype=np.int64), np.zeros(n, dtype=np.int8)
     near = NearPairs(pair=pairs, number=number, origin=np.full((n, 3), np.inf), above=above, eye=eye)
     own = rigid_body.half_decay
-    half_decay = getattr(own, "py_func", own)  # not compiled: for a few numbers, compiling would take too long
+    half_decay = getattr(own, "py_func", own)  # not compiled: for so few numbers, compiling would take longer
     return Bodies(
         each=tuple(range(each)),
         vehicle=row,

@@ -1,4 +1,4 @@
-"""Incidents of drones: stops and landings by themselves, flips, impacts, touchdowns, empty batteries.
+"""Incidents of drones: stops and landings of their own accord, flips, impacts, touchdowns, empty batteries.
 
 The kernel detects them in every step of the firmware (5 ms), regardless of the gate interval, without influencing the
 flight; they are described in words once per gate.
@@ -20,8 +20,8 @@ from zsim_world.physics.surfaces import FEET, PLANE, POINTS, contact_point, near
 from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, SETTING, TAKING_OFF
 from zsim_world.vehicles.observer import STEP_S
 
-IMPACT_STEPS = 4  # steps over which a change of velocity is measured: 20 ms, about half of a contact of the feet
-IMPACT_G = 5.0  # mean over these steps; design choice: twice what rotors and drag can cause, as in a fall from 0.4 m
+IMPACT_STEPS = 4  # steps over which a change of velocity is measured: 20 ms, about half of a foot contact
+IMPACT_G = 5.0  # mean over these steps; design choice: twice what rotors and drag cause; a fall from 0.4 m reaches it
 IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, largest change of velocity without an impact
 UPRIGHT_AGAIN = 0.5  # cosine of 60 deg of tilt; design choice: well below 90 deg, so that one flip counts once
 QUIET_STEPS = round(1.0 / STEP_S)  # design choice: contacts within 1 s of an impact count as its bounces

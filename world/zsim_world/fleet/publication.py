@@ -130,7 +130,7 @@ class GatePublication:
         publish(hold(state), *fleet.sampled, *payloads, 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
-        """Return the messages of the present gate; `commanders`: each drone's commander, or None."""
+        """Return the messages of the current gate; `commanders`: each drone's commander, or None."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + self._own_count
         payloads = self._payloads()

@@ -86,7 +86,7 @@ class RadioChannel:
         return RadioLinks(t_ns, seq, tuple(map(tuple, heard)), chances)
 
     def _of_target(self, target: str) -> Matrix:
-        """Return which indices are drones of a cluster; all drones if the target is no cluster, but the world."""
+        """Return which indices are drones of a cluster; all drones if the target is the world rather than a cluster."""
         of_target = np.zeros(len(self._allowed), dtype=bool)
         of_target[: self._count] = self._clusters.get(target, True)
         return of_target

@@ -25,7 +25,7 @@ WIND = columns(
     ),
 )
 JET_SPREAD = 0.107  # growth of a round jet's 1/e width (Fischer et al., Mixing in Inland and Coastal Waters, 1979)
-JET_WIDTHS = 3.0  # beyond three widths the jet has 1e-4 of its core speed
+JET_WIDTHS = 3.0  # beyond three widths the jet has about 1e-4 of its core speed
 
 
 @inlined
@@ -92,7 +92,7 @@ def downwash(thrust_n: float, density: float, start_m: float, below_m: float, as
 
 DISTANCE_MIN_M = 1e-9  # m; lower bound, so that two drones at the same position have a direction between them
 CLOSE = 1.0 + 1e-9  # factor on a squared distance that covers any rounding error
-STRAY_M = 0.25  # m; displacement of a drone after which near pairs are found again; 0.4 s at 0.6 m/s
+STRAY_M = 0.25  # m; displacement of a drone after which the near pairs are updated; 0.4 s at 0.6 m/s
 APPROACH_M = 0.501  # m; largest change of a pair's distance by then: twice STRAY_M, plus a margin for rounding
 
 
@@ -137,7 +137,7 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     depth = one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius] - distance
     normal = hull_force(stiffness, damping, depth, -dot(v, n))
     slip = axpy(v, -dot(v, n), n)
-    # Slip decays at the rate of the approach, although a tangential force meets less inertia, since it turns the hull.
+    # Slip decays at the rate of the approach, although a tangential force, which turns the hull, meets less inertia.
     straight = 1.0 / one[VEHICLE.mass] + 1.0 / other[VEHICLE.mass]
     turning = dot(arms[0], arms[0]) / _least_inertia(one) + dot(arms[1], arms[1]) / _least_inertia(other)
     viscous, limit = (

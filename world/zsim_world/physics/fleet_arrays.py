@@ -43,7 +43,7 @@ VEHICLE = columns(
         Field("rotor_inertia", "kg m^2"),
         Field("rotor_share", "1"),  # 1 / number of rotors
         Field("jet_start", "m"),  # width of the jet where it leaves the rotors
-        Field("contact_reach", "m"),  # distance from the centre of mass beyond any contact point
+        Field("contact_reach", "m"),  # distance from the centre of mass that no contact point exceeds
         Field("stand_height", "m"),  # height of the centre of mass of a standing drone
         Field("foot_stiffness", "N/m"),  # per contact point
         Field("foot_damping", "N s/m"),
@@ -228,7 +228,7 @@ class PerRotor(NamedTuple):
 
 
 class Aero(NamedTuple):
-    """Aerodynamics of one drone; with one of `parts` (Bodies.aero_parts), compiled code omits them."""
+    """Aerodynamics of one drone; if `parts` (Bodies.aero_parts) has length 1, compiled code omits them."""
 
     parts: tuple[int, ...]
     numbers: Row  # (AERO.size,)

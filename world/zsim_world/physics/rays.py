@@ -56,7 +56,7 @@ def scene(solid: Array, triangle: Array) -> Scene:
 
 
 def _bounds_of(row: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Return the minimum and maximum corner of an obstacle's bounding box."""
+    """Return the minimum and maximum corners of an obstacle's bounding box."""
     half, c, s = row[HALF : HALF + 3], abs(row[COSINE]), abs(row[SINE])
     if row[SHAPE] == BOX:
         half = [c * half[0] + s * half[1], s * half[0] + c * half[1], half[2]]

@@ -7,8 +7,7 @@ block; the loop's length and the columns are constants, so that neither an overl
 The operations of each drone keep their order, so the results are the same to the last bit in any block.
 
 Equations with branches, such as ground contact, are computed per drone: a block is stepped as in free air, and drones
-with the ground or an obstacle in reach, or in contact with another drone, are stepped again with these
-contacts.
+with the ground or an obstacle in reach, or in contact with another drone, are stepped again with these contacts.
 """
 
 from collections.abc import Iterable

@@ -109,7 +109,7 @@ def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) 
 HULL_BALLS = 16  # design choice: gaps of 2 cm between them on the AR.Drone; a thinner post meets the ball at the centre
 BALLS = POINTS + HULL_BALLS + 1
 BALL_SHARE = 0.35  # radius / height from feet to rim; design choice: in a landing tilted by 9 deg no hull ball touches
-BELOW_RIM_SHARE = 0.05  # of the same height; design choice: above a foot's sag: upside down, the rim bears the drone
+BELOW_RIM_SHARE = 0.05  # of the same height; design choice: more than a foot's sag, so the rim bears an upturned drone
 FEET = 4  # number of feet, which come first among the contact points
 SLOTS_MAX = 8  # solids within reach of one drone at a time; design choice: as many boxes as can meet in a corner
 LOOK_S = 0.01  # s; two of the longest steps: whatever a drone can touch within this time is within reach
@@ -117,7 +117,7 @@ _ANGLES = [2.0 * math.pi * (k + 0.5) / HULL_BALLS for k in range(HULL_BALLS)]
 _COSINES = (
     *(el.cos(angle) for angle in _ANGLES),
     0.0,
-)  # of the directions of the hull balls; 0 for the one at the centre
+)  # cosines of the directions of the hull balls; 0 for the ball at the centre
 _SINES = (*(el.sin(angle) for angle in _ANGLES), 0.0)
 
 nearest: Any = inlined(surroundings.nearest)
@@ -172,7 +172,7 @@ def _across(a: Vector, n: Vector) -> Vector:
 def touched(
     row: Row, touch: Touch, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
 ) -> tuple[Vector, Vector]:
-    """Return the force in W [N] and moment in B [N m] on one drone by obstacles and surfaces, with other hulls' moment.
+    """Return the force in W [N] and moment in B [N m] of obstacles and surfaces on one drone, plus other hulls' moment.
 
     Args:
         row: the drone's parameters; touch: its contacts.

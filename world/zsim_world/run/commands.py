@@ -263,7 +263,7 @@ class QueuedCommand(NamedTuple):
     priority: int
     source: str
     seq: int
-    drone: int  # with `kind`, makes the order independent of that of arrival
+    drone: int  # with `kind`, makes the order independent of arrival
     kind: str
     message: Any
 
@@ -312,7 +312,7 @@ class CommandQueue:
         return True
 
     def pop(self, t_ns: int, drones: Container[int] | None = None) -> list[QueuedCommand]:
-        """Remove and return the commands to `drones`, by default all, that take effect up to t_ns, in that order."""
+        """Remove and return, in order of effect, commands to `drones` (default: all) that take effect up to t_ns."""
         instants = sorted([instant for instant in self._queued if instant <= t_ns])
         due = [command for instant in instants for command in sorted(self._queued.pop(instant), key=_order)]
         if drones is None:

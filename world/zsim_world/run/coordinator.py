@@ -28,7 +28,7 @@ from zsim_world.run.run_clock import Operation, RunClock, RunStatistics, number
 
 RECORDER = "recorder"  # name and role
 START_TIMEOUT_S = 60.0  # wall time to join for expected processes that the launcher does not start
-START_TIMEOUT_OWN_S = 600.0  # wall time to join for processes that it starts; compiling may take minutes
+START_TIMEOUT_OWN_S = 600.0  # wall time to join for processes that the launcher starts; compiling may take minutes
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # operations that change a flight
 ARGS_BYTES_MAX = 4000  # maximum size of arguments that an event repeats in full; all operations need far less
 
@@ -317,7 +317,7 @@ class Coordinator(ABC):
             self.outbox.event("drop", name, f"{name} is waited for no longer", data)
 
     def overdue(self, wall_ns: int) -> str | None:
-        """Return a process that has not joined in time, or not returned in time after death or silence; else None."""
+        """Return a process that has not joined, or not returned after death or silence, in time, if any."""
         if self.clock.state == "waiting":
             waited_s = (wall_ns - self.start_wall_ns) / 1e9
             for name in self.barrier.absent():

@@ -23,7 +23,7 @@ from zsim.scenario import roles
 from zsim.schema.message import Count
 from zsim_world.run.coordinator import Coordinator
 
-PHASE_EVERY = 10  # cluster states from one reading of the phase for the display to the next
+PHASE_EVERY = 10  # one in this many cluster states is read for the phase on display
 OF_CAMERAS = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed from every process with a camera
 OF_DRIVERS = ("truth", "link")  # published by the driver of an external drone, beside its sensors
 

@@ -1,6 +1,6 @@
 """The messages and events that a run publishes, in order, and the limits on events, refusals and changes.
 
-Limits apply to simulated time, so that a rerun from a record and a continuation from the journal apply the same ones.
+Limits apply per simulated time, so that a rerun from a record and a continuation from the journal apply the same ones.
 """
 
 import re

@@ -190,7 +190,7 @@ class Playback(Coordinator):
         if role is None:
             return bool(live.names) and _author(recorded) in live.names
         _, drone, what = keys.parts(recorded.key)
-        if f"{role}.{drone}" in live.names:  # replaces the cameras of the scenario; if it has none, any
+        if f"{role}.{drone}" in live.names:  # replaces the scenario's cameras of that drone, or any if it has none
             cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
             if not cameras or camera == what or camera in cameras:
                 return True
