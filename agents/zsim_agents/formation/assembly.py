@@ -154,7 +154,7 @@ def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
 
 
 def straight_separation(starts_m: Array, goals_m: Array) -> float:
-    """Return the minimum distance [m] between drones that fly straight, in unison, from starts to goals, (n, 3) each."""
+    """Return the minimum distance [m] between drones that fly straight, in unison, from starts to goals (n, 3)."""
     i, j = np.triu_indices(len(starts_m), 1)
     if not len(i):
         return math.inf

@@ -60,7 +60,7 @@ class MoveTo:
     over_s: float | None = None
 
     def goal(self, space: ClusterSpace, base: Array) -> Array:
-        """Return base (4n,) with the named values replaced; TrajectoryError, ExpressionError: a value is not allowed."""
+        """Return base (4n,) with named values replaced; TrajectoryError, ExpressionError: a value is not allowed."""
         if not self.values:
             raise TrajectoryError(f"target: no values; allowed: numbers by name of {', '.join(space.names)}")
         return named_values(space, self.values, "target", base)
