@@ -17,7 +17,7 @@ class ZsimError(Exception):
     """Base of all errors that a user can cause; the command line prints them without a traceback."""
 
     def _render_traceback_(self) -> list[str]:
-        """Return the traceback for IPython, which calls this: only the user's frames, and the error's text."""
+        """Return the traceback for IPython, which calls this method: only the user's frames, and the error's text."""
         from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
 
         frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))

@@ -32,7 +32,7 @@ class Column(NamedTuple):
 
     Attributes:
         header: header; its lines are never broken; a table with only empty headers has no header row.
-        kind: kind of the cells; if space is short, a name keeps its end, text wraps between words, a figure is whole.
+        kind: kind of the cells; if space is short, a name keeps its end, text wraps between words, figures stay whole.
         worth: priority; columns of the lowest worth are omitted first; None: never omitted.
         right: whether cells are right-aligned.
     """

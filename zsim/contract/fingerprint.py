@@ -42,7 +42,7 @@ def fingerprint() -> str:
 
 @cache
 def machine() -> dict[str, str]:
-    """Return properties that may differ between machines with equal results: processor, libraries, versions."""
+    """Return what may differ between machines that give equal results: processor, libraries, versions."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "python": platform.python_version(),
@@ -77,7 +77,7 @@ def _version(package: str) -> str:
 
 
 def _cpu() -> str:
-    """Return the processor's model and a hash of its feature flags, which libraries and compilers use."""
+    """Return the processor's model and a hash of its feature flags, on which libraries and compilers depend."""
     found: dict[str, str] = {}
     try:
         with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
@@ -99,7 +99,7 @@ def _blas() -> str:
     found = set()
     for each in threadpoolctl.threadpool_info():
         folder = Path(each["filepath"]).parent
-        package = None  # package with the library in its wheel; None for a library of the system
+        package = None  # package whose wheel contains the library; None: the system's
         if folder.suffix == ".libs":  # as auditwheel and delvewheel name it
             package = folder.stem
         elif folder.name == ".dylibs":  # as delocate does

@@ -105,7 +105,10 @@ class Attitude(Command, frozen=True):
 @on("drone/*/cmd/rotors", is_output=True)
 @on("drone/*/accepted/rotors")
 class RotorSpeeds(Command, frozen=True):
-    """Turn the rotors at these speeds, in the vehicle's order; four: front left, front right, rear right, rear left."""
+    """Turn the rotors at these speeds, in the vehicle's order.
+
+    Four rotors in a cross are in the order front left, front right, rear right, rear left.
+    """
 
     speed_rad_s: Rotors
 

@@ -1,6 +1,6 @@
 """Many messages at once as bytes: those of a gate, written from rows of numbers, and several in one payload.
 
-    @gate, @gate/{drone}   the world's messages about its drones at one gate           GateMessages
+    @gate, @gate/{drone}   the world's messages about its drones at one gate         GateMessages
     @batch                 [key, payload] of all messages through the hub, in order  encode_batch, decode_batch
 
 If the messages of a gate were sent one by one, each would wake every reader and the hub. These keys are outside the
@@ -310,9 +310,9 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
     """Write one message into `out` at `start`; return its end. To be compiled by the caller.
 
     Args:
-        program: that of Layouts; words: the texts; kind: index of the message's class in the layouts.
+        program: `program` of Layouts; words: its texts; kind: index of the message's class in the Layouts.
         ints: the message's integers, (I,); bits: its floats as uint64, (F,).
-        out: bytes (uint8), large enough for `Layouts.room`.
+        out: bytes (uint8), with at least `Layouts.room` of them from `start` on.
     """
     at = np.uint64(start)  # unsigned indices need no test for negative values: byte loops become word copies
     for k in range(program.first[kind], program.first[kind + 1]):
@@ -356,7 +356,7 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
     Reads finite floats, booleans and non-negative integers, but no texts. To be compiled by the caller.
 
     Args:
-        program: that of Layouts; kind: index of the message's class in the layouts.
+        program: `program` of Layouts; kind: index of the message's class in the Layouts.
         data: bytes (uint8), with the message in [start, end).
         ints, bits: filled by this function with the message's integers, (I,), and its floats as uint64, (F,).
     """

@@ -42,7 +42,7 @@ from zsim.sensors.stock_sensors import Sonar as Sonar
 _KEY = re.compile(r"([a-z][a-z0-9_]{0,31})/\{(drone|cluster|run)\}/([a-z][a-z0-9_]{0,31})")
 KEY_ALLOWED = "swarm/{drone}/state: a word, {drone}, {cluster} or {run}, and a word, of a-z 0-9 _"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-CONTRACT_WORDS = frozenset({"drone", "cluster", "process", "world", "view", "clock"})  # first words of its keys
+CONTRACT_WORDS = frozenset({"drone", "cluster", "process", "world", "view", "clock"})  # first words of contract keys
 
 
 class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
@@ -249,7 +249,7 @@ class Info(Message, frozen=True):
 
 for _name, _message in {**{name: kind.message for name, kind in STOCK.items()}, **SCANNERS}.items():
     keys.on(f"drone/*/sensor/{_name}", writers="world")(_message)
-keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # also for users' sensors
+keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # including users' sensors
 TOPICS = keys.TOPICS
 """The contract's keys, with `*` in place of a name, and their messages; complete once this module is imported."""
 
@@ -258,7 +258,7 @@ RELAYED = (
     *(run_messages.ClusterRequest, AgentMessage),
 )
 """Messages, or their bases, that agents publish for each other; the world counts them like commands."""
-KEYS_KEPT = 65_536  # keys with cached types at most; 1000 drones have 15 000; garbage keys displace each other
+KEYS_KEPT = 65_536  # maximum number of keys with cached types; 1000 drones have 15 000; garbage keys are evicted
 _OWN: dict[str, type[Struct]] = {}  # users' message classes by shape of their key, from the newest Info
 
 
@@ -366,7 +366,7 @@ def encoding(key: str) -> str:
 
 
 def decode(key: str, payload: bytes) -> Any:
-    """Return the message on `key`, checked for types, shapes and finiteness; raise DecodeError that names a fault."""
+    """Return the message on `key`, checked for types, shapes and finiteness; raise DecodeError naming a fault."""
     kind, read = _reader_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")

@@ -134,7 +134,7 @@ class Done(Message, frozen=True):
 class Snapshot(Message, frozen=True):
     """The state of a participant after the gate `t_ns`, from which another incarnation of it can continue.
 
-    `version` is that of the layout of `state`, which is specific to the program.
+    `version` numbers the layout of `state`, which is specific to the program.
     """
 
     source: str
@@ -144,7 +144,7 @@ class Snapshot(Message, frozen=True):
 
 @on("process/*/bye", writers="each")
 class Bye(Message, frozen=True):
-    """A process leaves voluntarily; `failed`: it cannot continue, and would fail again after a restart.
+    """A process leaves voluntarily; `failed` if it cannot continue and would fail again after a restart.
 
     `run_id` and `incarnation` are those of the join that it ends. Clients of contract 1.0 name neither: their byes
     take effect once the liveliness token is lost as well, or the run is over.

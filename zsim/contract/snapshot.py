@@ -20,7 +20,7 @@ from zsim.errors import DecodeError, UserCodeError
 from zsim.schema import plugin
 from zsim.schema.checker import show
 
-VERSION = 1  # of the format of `pack`; the field `version` of an agent's Snapshot
+VERSION = 1  # version of the format of `pack`; the field `version` of an agent's Snapshot
 ARRAY = 1  # code of a msgpack extension: (type, shape, numbers) of an array
 TYPES = ("<f8", "<i8", "<i4", "<u8", "|i1", "|b1")  # numpy types allowed in arrays
 

@@ -35,8 +35,8 @@ class _Tables(NamedTuple):
 
     half_pi: tuple[float, float, float]
     ln2: tuple[float, float]
-    exp2: NDArray[np.float64]  # of 2^(k / _CELLS), (_CELLS, 2)
-    atan: NDArray[np.float64]  # of atan(k / _CELLS), (_CELLS + 1, 2)
+    exp2: NDArray[np.float64]  # 2^(k / _CELLS), (_CELLS, 2)
+    atan: NDArray[np.float64]  # atan(k / _CELLS), (_CELLS + 1, 2)
 
 
 def _tables() -> _Tables:

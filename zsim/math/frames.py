@@ -144,7 +144,7 @@ def quaternion_from_matrix(R: ArrayLike) -> Array:
 
 
 def principal_axes(covariance: ArrayLike) -> tuple[Array, Array]:
-    """Return standard deviations, (..., 3), of covariances, (..., 3, 3), along their principal axes, and quaternions.
+    """Return the standard deviations (..., 3) of covariances (..., 3, 3) along their axes, and the axes' quaternions.
 
     The quaternions turn components along the principal axes into components in the frame of the covariances.
     """
@@ -188,7 +188,7 @@ def heading(q: ArrayLike) -> Array:
 
 
 def turned_about_up(v: tuple[float, float, float], angle_rad: float) -> tuple[float, float, float]:
-    """Return a vector turned about z, counter-clockwise seen from above; by a heading, from heading frame to W."""
+    """Return `v` turned about z, counter-clockwise seen from above; a heading turns it from the heading frame to W."""
     c, s = el.cos(angle_rad), el.sin(angle_rad)
     return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
 

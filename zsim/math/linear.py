@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 SWEEPS_MAX = 60  # maximum number of sweeps of rotations over all pairs; ten suffice for the largest matrices here
 TERMS = 20  # terms of the series of e^A for |A| <= 1/2; the next is below 1e-25
-ORTHOGONAL = 1e-16  # off-diagonal element, relative to the diagonal ones, that needs no rotation
+ORTHOGONAL = 1e-16  # size of an off-diagonal element, relative to the diagonal ones, up to which it needs no rotation
 
 
 def product(A: ArrayLike, B: ArrayLike) -> Array:

@@ -204,7 +204,7 @@ def composed(A: Matrix, B: Matrix) -> Matrix:
 
 @portable
 def position_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1: Vector) -> tuple[float, float, float]:
-    """Return the position at fraction s of an interval dt [s], on the Hermite cubic with these ends and slopes."""
+    """Return the position at fraction s of an interval dt [s], on the Hermite cubic with these ends and velocities."""
     a, b = s * s * (3.0 - 2.0 * s), dt * s * (1.0 - s) * (1.0 - s)
     c = dt * s * s * (s - 1.0)
     x = p0[0] + a * (p1[0] - p0[0]) + b * v0[0] + c * v1[0]

@@ -213,7 +213,7 @@ def completeness(
 
 
 def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool_]:
-    """Return which messages, (M,), are the first of their channel in a second, or its first or last in these spans."""
+    """Return which messages, (M,), are the first of their channel in a second, or its first or last in `spans`."""
     second, last = spans.t_ns // SECOND_NS, len(spans.channel) - 1
     changes = np.ones(last + 2, bool)  # whether the channel changes before each message, and after the last
     changes[1:-1] = spans.channel[1:] != spans.channel[:-1]
@@ -233,7 +233,7 @@ def record_completeness(path: Path) -> Completeness:
 
 
 def _is_numbered(key: str, external: Container[str]) -> bool:
-    """Return whether only the world publishes on a key, numbering without gaps; not so on keys of external drones."""
+    """Return whether only the world publishes on a key, numbering without gaps; False for keys of external drones."""
     group, drone, what = keys.parts(key)
     if group != "drone":
         return key == keys.EVENT

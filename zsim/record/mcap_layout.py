@@ -56,7 +56,7 @@ CHUNK_MAX = 1 << 27  # maximum bytes of a chunk's content; zsim's has up to 1 MB
 SMALL_MAX = 1 << 20
 LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # minimum length of a body
 
-PIECE_BYTES = 1 << 24  # maximum bytes mapped while reading a whole file, since they count as memory in use
+PIECE_BYTES = 1 << 24  # maximum bytes mapped while reading a whole file; mapped pages count as memory in use
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
 
@@ -253,7 +253,7 @@ def crc_until(source: Source, end: int) -> int:
 
 
 def unmap(source: Source) -> None:
-    """Release the pages of a mapped file that were read; they are reloaded when needed."""
+    """Release the pages of a mapped file that have been read; they are reloaded when needed."""
     if isinstance(source, mmap) and hasattr(source, "madvise"):  # absent on Windows
         from mmap import MADV_DONTNEED
 

@@ -1,4 +1,4 @@
-"""Reads a record, complete or truncated at any byte, from a file or the folder of a run."""
+"""Reads a record, complete or truncated at any byte."""
 
 import struct
 from collections import Counter

@@ -33,7 +33,8 @@ CHUNK_BYTES = 1024 * 1024  # maximum bytes not yet on disk, besides the last mes
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s no message waits longer than 0.5 s
 CHANNELS_MAX = 65_535  # MCAP numbers channels in 16 bits
 _TIME_MAX = 2**64 - 1
-_MEDIA = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}  # to MCAP's
+# MCAP's message encoding by media type of the Zenoh encoding
+_MEDIA = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}
 _FOOTER_CRC = struct.Struct("<BQQQ")  # part of the footer covered by its checksum
 _FOOTER_LENGTH = 20
 _encode = messages.encode

@@ -141,7 +141,7 @@ class Agent(ABC):
         Outputs of a user's class are converted as they would be over Zenoh, to finite values of the contract's types.
 
         Raises:
-            UserCodeError: a user's class raised, or returned an invalid value.
+            UserCodeError: a user's class raised an exception or returned an invalid value.
         """
         try:
             self._answered_ns = t_ns
@@ -163,7 +163,7 @@ class Agent(ABC):
 
     @staticmethod
     def held_by(frame: FrameType | None) -> str:
-        """Return a text on the agent that has not returned and its line, given a frame of its thread; "" if none."""
+        """Return a text naming the agent that has not returned, and its line, by a frame of its thread; "" if none."""
         line = plugin.innermost_line(frame)
         while frame and frame.f_code is not Agent.answer.__code__:
             frame = frame.f_back
@@ -183,7 +183,7 @@ class Agent(ABC):
     def _checked(self, t_ns: int, output: Any) -> Output:
         """Return an output of a user's class as it would be received, with its source.
 
-        A message of the class's own types may lack its key, stamp and number.
+        A message of the class's own types may lack its key, stamp and sequence number.
         """
         try:
             if isinstance(output, AgentMessage):
