@@ -35,7 +35,7 @@ APT::Sandbox::User "";
 
 
 class LackingError(Exception):
-    """Something that this machine needs to provide such a Python is missing."""
+    """This machine lacks something that is needed to fetch or run such a Python."""
 
 
 class OtherPython(NamedTuple):

@@ -124,7 +124,7 @@ def info(scenario) -> messages.Info:
 
 
 def desired_at(flown: Flown, t_s: float) -> np.ndarray:
-    """Return c_des (12,) of the paper's tests, after a climb if `climb_s` is not 0."""
+    """Return c_des (12,) of the paper's tests, which begins with a climb if `climb_s` is not 0."""
     rise = min(1.0, t_s / flown.climb_s) if flown.climb_s else 1.0
     if flown.scenario == "step":
         return np.array([5, -5, 15 * rise, 0, 0, math.pi / 2, 0, 0, 0, 4, 4, math.pi / 4])
