@@ -69,7 +69,7 @@ def test_another_seed_gives_another_hash(federation: Federation, pair_sha256: st
 
 @pytest.mark.soak
 def test_a_paced_run_gives_the_same_hash(federation: Federation, pair_sha256: str) -> None:
-    """PAIR is paced at ten times real time, in lockstep all the same.
+    """PAIR is paced at ten times real time.
 
     Expected: a real-time factor no greater than requested, and the same hash.
     """

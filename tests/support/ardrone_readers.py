@@ -1,4 +1,4 @@
-"""Readers of the bytes that zsim sends as an AR.Drone; unmodified pyardrone reads them in a process of its own."""
+"""Decoding of what zsim sends as an AR.Drone: by unmodified pyardrone, in its own process, and by a plain parser."""
 
 import importlib.util
 import json

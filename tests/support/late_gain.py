@@ -12,10 +12,7 @@ from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 
 VICTIM = 1  # place of the affected drone in the cluster
-USUAL_S, USUAL_M_S = (
-    0.2,
-    0.1,
-)  # age of the latest sample of a GPS at 5 Hz, and speed of a formation that holds its position
+USUAL_S, USUAL_M_S = 0.2, 0.1  # greatest age of a GPS's latest sample at 5 Hz; speed of a formation that holds
 HELD_S, LOST_M = 6.0, 4.0
 GAIN = 6.0  # m/s per root of s^2 m/s; the correct value is 0
 

@@ -129,7 +129,7 @@ def documents(out: Path) -> list[dict]:
 @pytest.mark.parametrize("version", [OLDEST, NEWEST])
 def test_manifests_conform_to_the_kubernetes_api(tmp_path: Path, version: str, insecure: bool) -> None:
     found = documents(rendered(tmp_path, "kubernetes", insecure))
-    assert len(found) == 4 + 1 + 6 + 2  # volume claims and ConfigMaps; the Service; roles; routers
+    assert len(found) == 4 + 1 + 6 + 2  # Namespace, volume claim, Pod and ConfigMap; Service; roles; routers
     assert {kubernetes_validate.validate(one, version, strict=True) for one in found} == {version}
 
 
