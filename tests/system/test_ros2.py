@@ -283,7 +283,7 @@ def test_a_node_flies_a_drone(federation: Federation, ros: ROS) -> None:
 
 
 def test_the_bridge_sends_valid_messages_and_refuses_invalid_ones(federation: Federation, ros: ROS) -> None:
-    """Messages have the stamps, numbers and identities of rmw_zenoh; invalid ones are refused, counted and without effect.
+    """Messages have the stamps, numbers and identities of rmw_zenoh; invalid ones are refused and counted.
 
     Once the last subscriber has gone, the bridge reads nothing more.
     """
