@@ -1,4 +1,4 @@
-"""Decoding of what zsim sends as an AR.Drone, by unmodified pyardrone (in a process of its own) and by a plain parser."""
+"""Decoding of what zsim sends as an AR.Drone: by unmodified pyardrone, in its own process, and by a plain parser."""
 
 import importlib.util
 import json

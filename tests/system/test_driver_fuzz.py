@@ -23,7 +23,7 @@ pytestmark = pytest.mark.soak
 
 COUNT = 1_000_000
 CHUNK = 100  # datagrams that certainly fit into a socket's buffer
-LEAST_COUNTED = 0.95  # share of them: a truncated frame counts as one fault with the next
+LEAST_COUNTED = 0.95  # minimum share counted: a truncated frame is one fault with the next
 STEP_NS = 20_000_000
 STARTERS = {"Ref", "Pcmd"}  # AT commands that make an aircraft fly
 

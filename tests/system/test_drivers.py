@@ -45,5 +45,5 @@ def test_two_simulated_drones_and_a_hardware_drone_fly_in_formation(
     driver.line("left")
     hardware.ends()
     rms = true_rms(mixed, hardware, ["drone3"], (again_ns / 1e9 + 4, until_ns / 1e9), rate=1.0)
-    assert max(rms["x_c"], rms["y_c"], rms["p"], rms["q"]) < 1.0  # m: the GPS alone has 2
+    assert max(rms["x_c"], rms["y_c"], rms["p"], rms["q"]) < 1.0  # m; the GPS alone errs by 2 m
     assert max(rms["z_c"], rms["yaw"], rms["beta"]) < 0.3

@@ -61,7 +61,7 @@ class Waypoint(Agent):
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SHORTER = ("--duration", "45")
-C_DES = (5.0, -5.0, 15.0, 0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0, 4.0, 4.0, math.pi / 4)  # equation (3)
+C_DES = (5.0, -5.0, 15.0, 0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0, 4.0, 4.0, math.pi / 4)  # equation (3) of the paper
 CLUSTER_VARIABLES = f"""
 variable("c", [0.0] * 12, I)
 variable("c_des", {list(C_DES)!r}, P)

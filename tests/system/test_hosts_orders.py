@@ -43,7 +43,7 @@ def goes_on(deployment: Deployment) -> None:
 
 
 @pytest.mark.soak
-def test_simultaneous_restarts_and_moves_of_processes(lab: Lab) -> None:
+def test_processes_can_be_restarted_and_moved_during_a_run(lab: Lab) -> None:
     """One move is refused, as its host lacks the certificate; the other is to a host not used before."""
     with closing(Deployment(lab, ROLES)) as deployment:
         rmtree(lab.folder / "certs" / SPARE / "estimator.drone1", ignore_errors=True)

@@ -22,7 +22,7 @@ from said_lines import say
 pytestmark = pytest.mark.soak
 
 REPETITIONS = 5
-DURATION_S, RATE = 60.0, 8  # simulated s; simulated s per wall s
+DURATION_S, RATE = 60.0, 8  # simulated time; ratio of simulated to wall time
 LATEST_S = 30.0  # simulated time from the start to the latest fault
 CUTS_S = {"cut 1 s": 1.0, "cut 5 s": 5.0, "cut 20 s": 20.0}
 LOSING = ("estimator.drone1", "estimator.drone3", "controller.main")
@@ -74,7 +74,7 @@ def undisturbed() -> str:
 
 @pytest.mark.parametrize("repetition", range(REPETITIONS))
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_survives_a_fault_at_a_random_time(
+def test_a_run_ends_as_expected_after_a_fault_at_a_random_time(
     lab: Lab,
     small_disk: Callable[[Path, int], None],
     faketime: str,

@@ -34,7 +34,7 @@ MOVING = PAIR.replace(
     "{takeoff_s: 0.5, trajectory: {start_s: 9, waypoints: [{at_s: 0, values: {x_c: 0}}, {at_s: 8, values: {x_c: 2}}]}}",
 )
 STEP = (ROOT / "scenarios" / "step.yaml").read_text()
-UNWRITTEN_NS = 5_000_000_000  # may be lost, in simulated time at rate 4: a recorder holds data for 0.5 s or more
+UNWRITTEN_NS = 5_000_000_000  # simulated, at rate 4: may be unwritten, as a recorder holds data for 0.5 s or more
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +183,7 @@ def test_a_killed_participant_is_dropped_and_the_run_goes_on(federation: Federat
 
 
 @pytest.mark.parametrize("name", [*(pytest.param(each, marks=pytest.mark.soak) for each in PAIR_ROLES[1:]), "recorder"])
-def test_the_death_of_a_participant_ends_the_run(federation: Federation, name: str) -> None:
+def test_a_death_ends_the_run_if_the_scenario_says_so(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: end}}")
     federation.kill(name)
     flight.event("death", name)
@@ -240,7 +240,9 @@ def test_repeated_kills_of_the_recorder_leave_no_gap(
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.soak), signal.SIGKILL])
 @pytest.mark.soak
-def test_a_recorder_dies_just_before_the_run_ends(federation: Federation, number: signal.Signals) -> None:
+def test_a_recorder_that_dies_near_the_end_is_replaced_or_fails_the_run(
+    federation: Federation, number: signal.Signals
+) -> None:
     """Either its replacement writes the last gates, or the run fails and says why."""
     run = federation.run(PAIR, "--rate", "4", "--duration", "8")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= LATE_NS)
@@ -305,7 +307,7 @@ def test_lost_gates_are_reported(federation: Federation, name: str) -> None:
 
 
 @pytest.mark.soak
-def test_a_restarted_realtime_world_counts_deadline_misses_from_its_restart(federation: Federation) -> None:
+def test_a_restarted_realtime_world_does_not_count_lost_time_as_misses(federation: Federation) -> None:
     """The time lost by the death counts as one or two misses per agent, not as one at every later gate."""
     run = federation.run(PAIR, "--realtime", "--rate", "2", "--duration", "16")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= ENGAGED_NS // 2)

@@ -92,7 +92,7 @@ def echo(lab: Lab, name: str, from_: str = LAUNCHER) -> Iterator[Echo]:
 
 
 def udp_end(lab: Lab, name: str) -> socket.socket:
-    """Return an unbound UDP socket on the host, which reaches it even during a cut."""
+    """Return a UDP socket on the host itself, whose loopback is never cut."""
     with lab.inside(name):
         return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 

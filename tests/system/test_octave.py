@@ -204,7 +204,7 @@ def states(federation: Federation) -> list[dict[str, Any]]:
 
 
 def apart(ours: list[dict[str, Any]], theirs: list[dict[str, Any]], field: str) -> float:
-    """Return the largest difference over all gates between the values of a field, a list of numbers."""
+    """Return the largest difference of a field, a list of numbers, over all gates."""
     return float(np.abs(np.array([m[field] for m in ours]) - np.array([m[field] for m in theirs])).max())
 
 

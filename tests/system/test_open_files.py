@@ -10,7 +10,7 @@ from forked_commands import ROOT, USER_FAULT, ZSIM
 from refused import has_terms
 
 PATIENCE_S = 120.0  # wall time for a run of 1 s of simulated time on a busy machine
-TOO_FEW = (10, 16, 24)  # below what Python, Zenoh and zsim need, at different stages
+TOO_FEW = (10, 16, 24)  # unchecked limits that cause a traceback, a panic or a hang
 BRIEF = ONE.replace("expect: []", "expect: [estimator.drone1]").replace("duration_s: 10", "duration_s: 1")
 BRIEF_PAIR = PAIR.replace("duration_s: 12", "duration_s: 1")
 HOSTS = "hosts: {h1: {address: 192.0.2.1}}\nroles: {'*': h1}\nsecurity: {insecure: true}\n"

@@ -48,7 +48,7 @@ def beside(federation: Federation) -> Path:
     return Path(shutil.copy(ROOT / "examples/my_estimator.py", federation.folder))
 
 
-def test_a_user_estimator_flies_alike_in_several_processes_and_in_one(
+def test_a_user_estimator_gives_the_same_bits_in_several_processes(
     flights: Federations, federation: Federation, beside: Path
 ) -> None:
     flown = {"scenario": federation.write(PAIR), "set": {"estimation.algorithm": MINE}}
@@ -101,7 +101,7 @@ def same_samples(first: Record, second: Record) -> bool:
 
 
 @pytest.mark.soak
-def test_user_sensors_sample_alike_in_several_processes_and_in_one(federation: Federation) -> None:
+def test_user_sensors_give_the_same_samples_in_several_processes(federation: Federation) -> None:
     """The modules are next to the scenario, and the record can be exported without them."""
     for name in ("uwb_range.py", "airspeed.py"):
         shutil.copy(ROOT / "examples" / name, federation.folder)
@@ -144,7 +144,7 @@ def test_a_user_estimator_receives_a_user_sensor(federation: Federation) -> None
     federation.run(PAIR, *chosen).ends(with_code=0)
     record, one = federation.record(), federation.folder / "one"
     estimates = record.all("drone/drone1/estimate")
-    assert estimates[-1]["sensors"]["my_uwb"][0] >= 10 * SENSED_S - 2  # at 10 Hz; the last are in transit
+    assert estimates[-1]["sensors"]["my_uwb"][0] >= 10 * SENSED_S - 2  # 10 Hz, less those in transit
     path = federation.write(PAIR)
     federation.start("run", path, *chosen, "--in-process", "--no-report", "--out", str(one)).ends(with_code=0)
     with RecordReader(one / "run.mcap") as reader:
@@ -193,7 +193,7 @@ def test_a_sweep_compares_vehicles(tmp_path: Path, near: None) -> None:
 
 @pytest.mark.soak
 def test_crazyflies_fly_test_1_at_room_scale(federation: Federation) -> None:
-    """In the window of the report, the triangle keeps its place as well as its positioning, of 10 cm, allows."""
+    """In the window of the report, the triangle's errors are as small as a positioning accuracy of 10 cm allows."""
     path = str(ROOT / "scenarios/crazyflie.yaml")
     out = federation.folder / "crazyflie"
     federation.start("run", path, "--in-process", "--out", str(out)).ends(with_code=0)

@@ -171,7 +171,7 @@ def test_a_killed_test_or_script_leaves_nothing_running(compiled: None, tmp_path
 
 
 @pytest.mark.soak
-def test_side_by_side(compiled: None, tmp_path: Path) -> None:
+def test_user_tests_can_run_in_parallel(compiled: None, tmp_path: Path) -> None:
     process = pytest_run(tmp_path, SIDE_BY_SIDE, "-n", "2")
     output = output_of(process)
     assert process.returncode == 0, output

@@ -45,7 +45,7 @@ def test_the_client_is_one_page_with_only_zenoh_and_msgpack() -> None:
 
 
 def standing(clock: Subscription) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return two entries of `waiting_for` for the program at the same simulated time, when time has stopped."""
+    """Return two `waiting_for` entries of the program at one instant, once all that it sent has been used."""
     former = None
     while True:
         now = clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == [NAME]).message

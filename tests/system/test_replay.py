@@ -243,7 +243,7 @@ def test_a_replay_allows_time_control_and_refuses_flight(federation: Federation,
 
 
 def test_a_recorder_may_join_a_replay_late(federation: Federation, flown: Path) -> None:
-    """A recorder joins a replay that starts at 2 s after 6 s, when its beginning is no longer kept.
+    """A recorder joins a replay from 2 s once 6 s of it have been played and its beginning is no longer kept.
 
     Expected: the record names the original run; its end gives the duration that was played.
     """
@@ -262,7 +262,7 @@ def test_a_recorder_may_join_a_replay_late(federation: Federation, flown: Path) 
     (info,) = map(msgpack.unpackb, on_record["world/info"])
     assert info["replay_of"]
     stamps = [msgpack.unpackb(payload)["t_ns"] for payload in on_record["drone/drone1/truth"]]
-    assert 2_900_000_000 < stamps[0] < 3_100_000_000  # a world keeps the last 5 s
+    assert 2_900_000_000 < stamps[0] < 3_100_000_000  # only the last 5 s are kept
     assert stamps[-1] == 9_000_000_000
     end = next(m for m in map(msgpack.unpackb, on_record["world/event"]) if m["kind"] == "end")
     assert end["data"]["sim_s"] == 7.0

@@ -177,7 +177,7 @@ def test_rostopic_and_roscpp_fly_and_track_a_drone(graph: RosGraph):
     north = graph.start("rostopic", "pub", "-r", "10", "/drone1/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.15}}")
     truth.until(lambda line: (at := numbers(line)) and at[2] > y + 1.5)  # forward is north: yaw_deg 90
     north.end()
-    graph.start(ros1_graph.RELAY, "/pilot", "/drone1/cmd_vel")  # in C++, so with roscpp
+    graph.start(ros1_graph.RELAY, "/pilot", "/drone1/cmd_vel")  # relays through roscpp
     graph.start(ros1_graph.RELAY, "/drone1/ground_truth/state", "/copy")
     west = graph.start("rostopic", "pub", "-r", "10", "/pilot", "geometry_msgs/Twist", "{linear: {y: 0.15}}")
     copy = graph.watch("/copy/pose/pose/position")

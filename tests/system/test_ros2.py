@@ -283,7 +283,7 @@ def test_a_node_flies_a_drone(federation: Federation, ros: ROS) -> None:
 
 
 def test_the_bridge_sends_valid_messages_and_refuses_invalid_ones(federation: Federation, ros: ROS) -> None:
-    """Stamps, sequence numbers and identities are as in rmw_zenoh; others are refused and counted, and move no drone.
+    """Messages have the stamps, numbers and identities of rmw_zenoh; invalid ones are refused and counted.
 
     Once the last subscriber has gone, the bridge reads nothing more.
     """
@@ -410,7 +410,7 @@ def test_the_bridge_joins_a_secured_world_as_an_operator(federation: Federation,
     assert ours.lines[-1].text.startswith("operator.ros: ")
 
 
-def test_without_a_ros_router_only_clients_find_each_other(federation: Federation, ros: ROS) -> None:
+def test_without_a_ros_router_peers_do_not_find_each_other(federation: Federation, ros: ROS) -> None:
     """As docs/ros2.md states, peers, ROS's default, reach the drones but need rmw_zenohd to find each other."""
     federation.world(NEVER, "--rate", "2")
     bridge(federation)

@@ -67,7 +67,7 @@ def tell_last(link: Any, key: str) -> None:
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_publish(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_publish_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     fence = f"process/{role}/health"
     with reached(made, role, way) as (client, link):
         received, ready = KeyLog(), KeyLog()
@@ -86,7 +86,7 @@ def test_what_a_role_may_publish(made: Certificates, role: str, way: str) -> Non
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_read(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_read_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     fence = "world/event"
     with reached(made, role, way) as (client, link):
         received = KeyLog()
@@ -121,7 +121,7 @@ def test_a_wildcard_grants_no_more_than_the_keys_it_matches(made: Certificates, 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_get_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     fence = f"process/{role}/replay"
     with reached(made, role, way) as (client, link):
         asked, answered = KeyLog(), KeyLog()
@@ -144,7 +144,7 @@ def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_answer(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_answer_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     with reached(made, role, way) as (client, link):
         others = [key for key in KEYS if key != "clock"]
         for key in others:
@@ -159,7 +159,7 @@ def test_what_a_role_may_answer(made: Certificates, role: str, way: str) -> None
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_which_liveliness_tokens_a_role_may_declare(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_declare_exactly_the_permitted_tokens(made: Certificates, role: str, way: str) -> None:
     with reached(made, role, way) as (client, link):
         received = KeyLog()
         link.on_token("process/*", lambda key, alive: received.take(key))
@@ -169,7 +169,7 @@ def test_which_liveliness_tokens_a_role_may_declare(made: Certificates, role: st
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_which_liveliness_tokens_a_role_may_see(made: Certificates, role: str) -> None:
+def test_a_role_can_see_exactly_the_permitted_tokens(made: Certificates, role: str) -> None:
     with reached(made, role, WAYS[0]) as (client, link):
         received, fence = KeyLog(), KeyLog()
         client.subscribe_tokens("process/*", received)
@@ -303,7 +303,9 @@ def test_a_world_with_anothers_certificate_is_refused_before_it_compiles(made: C
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", [("estimator", "drone1"), ("keys",), ("echo", "clock")])
-def test_a_process_that_is_not_admitted_is_told_so_at_once(made: Certificates, role: tuple[str, ...], way: str) -> None:
+def test_a_process_that_is_not_admitted_ends_at_once_with_the_reason(
+    made: Certificates, role: tuple[str, ...], way: str
+) -> None:
     folder = made.of("estimator.drone1")
     with ExitStack() as stack:
         endpoint, _ = stack.enter_context(hub(made, ["recorder"], ["recorder"]))
@@ -447,7 +449,7 @@ def answer_plainly(server: socket.socket) -> None:
                 connection.sendall(b"HTTP/1.0 400 Bad Request\r\n\r\n")
 
 
-def test_the_listeners_objection_to_our_certificate_is_found(made: Certificates, tmp_path: Path) -> None:
+def test_peer_fault_finds_the_listeners_objection_to_a_certificate(made: Certificates, tmp_path: Path) -> None:
     past = Identity(HOST, made.of("recorder", days=-0.5, host="past"))
     foreign = Certificates(tmp_path).of("recorder")
     (foreign / "ca.pem").write_bytes((made.folder / "ca.pem").read_bytes())

@@ -87,7 +87,7 @@ def test_a_process_answers_a_forged_join_with_a_newer_one(watched: Watched) -> N
     watched.goes_on()
 
 
-def test_a_stopped_estimator_is_reported_but_not_the_controller_it_holds_up(watched: Watched) -> None:
+def test_a_stopped_estimator_is_reported_rather_than_its_controller(watched: Watched) -> None:
     watched.stop(ESTIMATOR)
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent", ESTIMATOR))
     wanted = {ESTIMATOR: [], CONTROLLER: [ESTIMATOR]}
@@ -107,7 +107,7 @@ def test_a_stopped_world_is_reported(watched: Watched) -> None:
 
 
 def test_an_idle_impostor_loses_its_place(watched: Watched) -> None:
-    """This is the last test: its tokens remain, lest their end be taken for the death of the new controller."""
+    """This test comes last: its tokens remain, as their end would count as the death of the new controller."""
     takes_a_place(watched, ("superseded", "death", "restart"))
     watched.goes_on()
 

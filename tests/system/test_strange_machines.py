@@ -94,7 +94,7 @@ ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \x
 def test_commands_accept_paths_with_any_characters(
     tmp_path: Path, flown: Path, several: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(make_bundle, "figures", lambda *_: iter(()))  # figures are written by `report`
+    monkeypatch.setattr(make_bundle, "figures", lambda *_: iter(()))  # skipped, as `report` writes figures
     folder = tmp_path / (ODD + "n" * 150)
     folder.mkdir()
     scenario, out = folder / f"{ODD}.yaml", folder / "run"
@@ -171,7 +171,7 @@ LACKING = {  # what is missing: shell commands before the run in a mount namespa
 
 @needs_root
 @pytest.mark.parametrize("lacking", LACKING)
-def test_a_run_on_a_machine_that_lacks_something(tmp_path: Path, flown: Path, lacking: str) -> None:
+def test_a_run_without_resources_succeeds_or_is_refused_cleanly(tmp_path: Path, flown: Path, lacking: str) -> None:
     before, code = LACKING[lacking]
     words = [*ZSIM, "run", str(flown.parent / "pair.yaml"), *SHORT, "--out", str(tmp_path / "run")]
     line = f"OUT={shlex.quote(str(tmp_path))}; {before} {shlex.join(words)}"

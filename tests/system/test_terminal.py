@@ -29,7 +29,7 @@ def shown(command: list[str], columns: int) -> str:
             while piece := os.read(leader, 65_536):
                 pieces.append(piece)
         except OSError:
-            pass  # on Linux, the last user has closed the terminal
+            pass  # on Linux, a terminal that no process has open raises this
         process.wait(PATIENCE_S)
     os.close(leader)
     return b"".join(pieces).decode()
