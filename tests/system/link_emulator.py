@@ -2,10 +2,10 @@
 
     python link_emulator.py INTERFACE INTERFACE DELAY_MS JITTER_MS LOSS SEED
 
-Each direction delays by DELAY_MS ± JITTER_MS and loses the share LOSS of its frames. The delay moves
-between random draws PERIOD_NS apart, so that frames keep their order, as on a radio link that retransmits lost frames.
+Each direction delays by DELAY_MS ± JITTER_MS and loses the share LOSS of its frames. The delay moves between random
+draws PERIOD_NS apart, so that frames keep their order, as on a radio link that retransmits before it hands frames on.
 The kernels of test machines often lack netem, which would do the same. The interfaces' offloads must be off, so that
-frames are those on the wire.
+the frames here are those on the wire.
 """
 
 import random

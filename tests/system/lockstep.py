@@ -36,7 +36,7 @@ class Lockstep:
             self.now_ns = received.message["t_ns"]
 
     def stands_at(self, t_ns: int, *names: str) -> Received:
-        """Wait until time stands still for exactly these processes, and check that it does at t_ns; skip older messages."""
+        """Wait until time stands still for exactly these processes; check that it does at t_ns. Skip older messages."""
         expected = set(names) or {ME}
         self.clock.now()
         received = self.clock.until(

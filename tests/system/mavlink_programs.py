@@ -1,7 +1,7 @@
 """Unmodified programs that fly MAVLink vehicles, as separate processes, and ports for them.
 
-The first test that needs MAVProxy or node-mavlink installs it into a cache folder of this machine;
-MAVProxy's own requirements would install a second OpenCV beside that of zsim.
+The first test that needs MAVProxy or node-mavlink installs it into a cache folder of this machine, since MAVProxy's own
+requirements would install a second OpenCV beside that of zsim.
 """
 
 import json

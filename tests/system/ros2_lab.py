@@ -36,7 +36,7 @@ with zenoh.open(config):
 
 
 def write_definitions(folder: Path) -> Path:
-    """Write the definitions of all message types for participants, which would otherwise fetch them from the network."""
+    """Write the definitions of all message types for participants, which otherwise fetch them from the network."""
     store = get_typestore(Stores.ROS2_JAZZY)
     texts = {name: store.gendefhash(name, {}, 2)[0] for name in store.fielddefs if "/msg/" in name}
     for name, text in {**texts, **MESSAGES}.items():

@@ -63,7 +63,7 @@ def tls_endpoint(host: str = "127.0.0.1") -> str:
 
 @contextmanager
 def hub(made: Certificates, clients: Iterable[str] = ROLES, behind: Iterable[str] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the endpoint and the session of a world that admits clients, and others behind a router."""
+    """Yield the endpoint and the session of a world that admits clients, and a router with those behind it."""
     rules = access_control(scenario_file.from_text(SCENARIO), clients, {SITE: behind} if behind else {})
     endpoint = tls_endpoint()
     with connection.listen([endpoint], "zsim", "lockstep", made.identity("world", rules)) as link:
@@ -83,7 +83,7 @@ def site(made: Certificates, upstream: str, clients: Iterable[str] = ROLES) -> I
 
 
 class RawClient:
-    """A program, with or without a certificate, that may use all of Zenoh."""
+    """A program, with or without a certificate, that uses Zenoh directly."""
 
     def __init__(self, endpoint: str, tls: Path | None, within_s: float = PATIENCE_S) -> None:
         config = zenoh.Config()

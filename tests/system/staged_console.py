@@ -24,7 +24,7 @@ from zsim_bridges.console.console_server import Console
 from zsim_bridges.console.page_server import ListenAddress
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
-PICTURES_HZ = 100.0  # while the past is performed; each picture adds one point to the plots
+PICTURES_HZ = 100.0  # picture rate while the past is performed; each picture adds one point to the plots
 PAST_STEP_S = 0.5  # simulated time between two pictures of the past
 PRESENT_S = 0.5  # wall and simulated time between two later pictures: a browser without a graphics card renders slowly
 GATE_NS = 20_000_000
@@ -40,7 +40,7 @@ GPS = {
     "sonar": (0, 120),
 }  # numbers of samples used and refused
 APART_M = 4.0  # distance between drones unless the scenario's target sets another
-SWAY_M, SWAY_S = 0.4, 25.0  # amplitude and period of the sway about their positions that gives the plots curves
+SWAY_M, SWAY_S = 0.4, 25.0  # amplitude and period of the drones' sway, which gives the plots curves
 
 
 class StagedLink:

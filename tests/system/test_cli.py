@@ -21,7 +21,7 @@ LISTED = {"clock": "Clock", "drone/drone1/sensor/imu": "Imu", "cluster/main/stat
 
 
 def zsim(*arguments: str, code: int = 0) -> Completed:
-    """Run a command, which must exit with a code."""
+    """Run a command, which must exit with the given code."""
     done = run_here(*arguments)
     assert done.code == code, done
     return done

@@ -11,7 +11,7 @@ from test_console import TRIAD
 
 FLOWN = 1  # index of drone2
 STICK_S = 3.0  # simulated time for which a key is held
-BESIDE_M = 1.5  # distance from a drone of a click that misses it but is on the map
+BESIDE_M = 1.5  # distance from a drone at which a click misses it but is still on the map
 MOVED_M = 1.0  # farther than the wind moves a hovering drone
 SETTLE_S = 3.0  # simulated time in which a drone comes to rest
 BAR = "document.querySelector('#zsim-flight .bar').dataset.state"

@@ -1,4 +1,4 @@
-"""Orders that must not be lost, confirmations, ages and limits, in a real browser with page, console or world stopped."""
+"""Orders that must not be lost, confirmations, ages and limits, in a browser while page, console or world stalls."""
 
 import json
 import signal
@@ -40,7 +40,7 @@ def picture(page: BrowserPage, name: str) -> None:
 
 
 def note(page: BrowserPage, text: str) -> None:
-    """Wait for a note of the page."""
+    """Wait for a note on the page."""
     page.page.locator("#zsim-notes div").filter(has_text=text).first.wait_for()
 
 

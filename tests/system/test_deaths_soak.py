@@ -1,9 +1,9 @@
 """A search for events that change a bit of the truth: processes die, stop, move and lose their link. `make soak`.
 
-Each flight has rounds in which every process dies once and is stopped once and, on three hosts, processes move and hosts
-are cut off. The flight's number seeds order and times: an event strikes while processes still recover from others, and
-the orders are chosen so that in the end every event has followed every other. A flight must have the same bits as one
-without events, and its record must lack no gate and no message.
+Each flight has rounds in which every process dies once and is stopped once; on three hosts, processes also move and
+hosts are cut off. The flight's number seeds order and times: an event strikes while processes still recover from
+others, and the orders are chosen so that in the end every event has followed every other. A flight must have the same
+bits as one without events, and its record must lack no gate and no message.
 
     ZSIM_SOAK_BUDGET_S=28800 make soak         a night, half of it for each of the two tests
     ZSIM_SOAK_DRAWS=7                          further draws
@@ -165,7 +165,7 @@ def sha256_in_process(scenario: Scenario, record: Record, folder: Path) -> str:
 
 
 def flights(tally: Tally, share: int) -> Iterator[tuple[int, Callable[[], bool]]]:
-    """Yield flight numbers, each with a check of whether the budget or a share of the events is spent, until it is."""
+    """Yield flight numbers until the budget or a share of the events is spent, each with a function to check that."""
     until_s, most = time.monotonic() + BUDGET_S, tally.events + share
 
     def is_spent() -> bool:

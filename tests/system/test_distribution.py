@@ -80,7 +80,7 @@ def members(wheel: Path) -> dict[str, bytes]:
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="git lists what a checkout holds")
 def test_the_sdist_holds_the_checkout_and_the_wheel_its_packages(built: tuple[Path, Path], tmp_path: Path) -> None:
-    """A wheel built from the sdist equals that of the checkout, although the sdist has no git history for the commit."""
+    """A wheel built from the sdist equals that of the checkout, although the sdist has no git to state the commit."""
     sdist, wheel = built
     with tarfile.open(sdist) as archive:
         (top,) = {name.partition("/")[0] for name in archive.getnames()}
