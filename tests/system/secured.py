@@ -63,7 +63,7 @@ def tls_endpoint(host: str = "127.0.0.1") -> str:
 
 @contextmanager
 def hub(made: Certificates, clients: Iterable[str] = ROLES, behind: Iterable[str] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the endpoint and the session of a world that admits clients, some of them behind a router."""
+    """Yield the endpoint and the session of a world that admits clients, and a router with those behind it."""
     rules = access_control(scenario_file.from_text(SCENARIO), clients, {SITE: behind} if behind else {})
     endpoint = tls_endpoint()
     with connection.listen([endpoint], "zsim", "lockstep", made.identity("world", rules)) as link:

@@ -1,4 +1,4 @@
-"""Orders that must not be lost, confirmations, ages and limits, in a real browser while a process stalls."""
+"""Orders that must not be lost, confirmations, ages and limits, in a browser while page, console or world stalls."""
 
 import json
 import signal

@@ -165,7 +165,7 @@ def sha256_in_process(scenario: Scenario, record: Record, folder: Path) -> str:
 
 
 def flights(tally: Tally, share: int) -> Iterator[tuple[int, Callable[[], bool]]]:
-    """Yield flight numbers until the budget or a share of the events is spent, each with a function that checks this."""
+    """Yield flight numbers until the budget or a share of the events is spent, each with a function to check that."""
     until_s, most = time.monotonic() + BUDGET_S, tally.events + share
 
     def is_spent() -> bool:

@@ -133,7 +133,7 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def pages_with(*kinds: str, long: tuple[str, ...] = ()) -> list[Any]:
-    """Return, as parameters, the pages that contain a block of one of the kinds; those named in `long` are soak tests."""
+    """Return, as parameters, the pages with a block of one of the kinds; those named in `long` are soak tests."""
     pages = [p for p in PAGES if any(b.kind in kinds for b in blocks(p))]
     return [pytest.param(p, id=p.name, marks=[pytest.mark.soak] if p.name in long else []) for p in pages]
 
