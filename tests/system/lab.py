@@ -54,7 +54,7 @@ class Lab:
     """Hosts, and a launcher without sshd, on a network of their own.
 
     Args:
-        folder: for keys, logs and each host's folder.
+        folder: folder for keys, logs and each host's files.
         names: names of the hosts, at most 11 characters each.
     """
 

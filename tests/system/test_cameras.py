@@ -88,7 +88,7 @@ def publish_garbage(client: Client) -> None:
         client.put(PICTURES, t_ns=0, seq=0, t_sample_ns=0, source="stranger", data=data, **shape)
 
 
-def test_the_truth_is_bit_identical_with_cameras_and_their_death(flown: Flown) -> None:
+def test_neither_cameras_nor_their_death_change_a_bit_of_the_truth(flown: Flown) -> None:
     assert flown.record.sha256() == flown.without
     assert flown.record.recomputed_sha256(["drone1", "drone2"]) == flown.without
 
@@ -211,7 +211,7 @@ def disturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
 
 
 @amiss
-def test_the_truth_is_bit_identical_with_disturbed_cameras(disturbed: Flown) -> None:
+def test_disturbed_cameras_change_no_bit_of_the_truth(disturbed: Flown) -> None:
     assert disturbed.record.sha256() == disturbed.without
 
 

@@ -369,7 +369,7 @@ def test_a_page_keeps_report_and_record_after_the_console_ends(federation: Feder
 
 @pytest.fixture
 def waiting(federation: Federation) -> Iterator[Role]:
-    """A run that is over, whose console waits for a page that copies nothing."""
+    """A finished run whose console waits for a page that copies nothing."""
     run = federation.run(TRIAD, "--console", "--rate", "2")
     address = run.line("steer at").text.rpartition(" ")[2]
     client, over, leaves = federation.client(), threading.Event(), threading.Event()

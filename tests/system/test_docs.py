@@ -133,7 +133,7 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def pages_with(*kinds: str, long: tuple[str, ...] = ()) -> list[Any]:
-    """Return the pages that contain a block of one of the kinds as parameters; those named in `long` are soak tests."""
+    """Return, as parameters, the pages with a block of one of the kinds; those named in `long` are soak tests."""
     pages = [p for p in PAGES if any(b.kind in kinds for b in blocks(p))]
     return [pytest.param(p, id=p.name, marks=[pytest.mark.soak] if p.name in long else []) for p in pages]
 
@@ -420,7 +420,7 @@ NOT_IN_DEV = {"train_policy.py"}  # run by test_learning.py: it needs an extra t
 def test_every_example_is_run_by_a_page() -> None:
     run = "\n".join(b.text for p in PAGES for b in blocks(p) if b.kind in ("bash run", "bash terminals"))
     examples = sorted((ROOT / "examples").glob("*.*"))
-    named = set(re.findall(r"[=: ](\w+)", run))  # as a module
+    named = set(re.findall(r"[=: ](\w+)", run))  # run as modules
     left_out = [e.name for e in examples if f"examples/{e.name}" not in run and e.stem not in named]
     assert set(left_out) == NOT_IN_DEV
 
@@ -487,7 +487,7 @@ SECTIONS = {
     for name, section in {**vars(scenario), "Limits": vehicle.Limits, "Aerodynamics": vehicle.Aerodynamics}.items()
     if isinstance(section, type)
     and issubclass(section, (scenario.Spec, vehicle.Limits, vehicle.Aerodynamics))
-    and section not in (scenario.Spec, scenario.Piloted)  # bases
+    and section not in (scenario.Spec, scenario.Piloted)  # base classes
 } | {
     section.__name__: section
     for section in (
@@ -635,7 +635,7 @@ def test_the_preset_table_matches_the_code() -> None:
 
 
 def preset_rows() -> Iterator[list[str]]:
-    """Yield a row for each value that a preset sets: its path, then its value in each preset, – for the default."""
+    """Yield a row for each value that a preset sets: its path, then its value in each preset (– for the default)."""
     flat = {name: dict(_flat(preset)) for name, preset in PRESETS.items()}
     printed = dict(_flat(AS_PRINTED))
     paths = list(dict.fromkeys(path for values in flat.values() for path in values))
