@@ -6,7 +6,8 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from xmlrpc.client import ServerProxy
 
@@ -149,6 +150,13 @@ class RosGraph:
     def watch(self, topic: str) -> Tool:
         """Start `rostopic echo` of numbers, a line of them each time; times come first."""
         return self.start("rostopic", "echo", "-p", topic)
+
+    @contextmanager
+    def published(self, topic: str, *message: str) -> Iterator[None]:
+        """Publish a message, latched, while the block runs: `rostopic pub -1` leaves after 3 s, connected or not."""
+        tool = self.start("rostopic", "pub", topic, *message)
+        yield
+        tool.end()
 
     def generate(self, package: str, name: str, definition: str) -> None:
         """Let ROS's own generator make a message type for its tools, as building its package would."""
