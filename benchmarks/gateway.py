@@ -24,7 +24,7 @@ duration_s: 3600
 drones: [{name: drone1, position_m: [0, 0, 0]}]
 processes: {expect: [nobody.yet]}
 """
-"""Scenario of a world that stands still, as its process never joins, so that only the gateway is measured."""
+"""Scenario of a world that stands still, as the expected process never joins: only the gateway is measured."""
 LABELS = {
     "get": "zsim gateway, GET of a last value",
     "bare_get": "bare aiohttp, GET",

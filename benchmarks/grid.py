@@ -27,7 +27,7 @@ def document(
     Args:
         count: number of drones.
         duration_s: simulated duration.
-        cluster: drones per cluster; every cluster takes off; leftover drones stay on the ground. 0 means no clusters.
+        cluster: drones per cluster, 0 for no clusters; every cluster takes off, leftover drones stay on the ground.
         drone: fields of every drone in addition to its name and position.
     """
     places = _triangles(count) if cluster == CLUSTER else _rows(count, SPACING_M)

@@ -16,7 +16,7 @@ ONBOARD = {"plain": "extra `agents`, numba taken out", "numba": "extra `agents`"
 
 
 def measure(repeats: int) -> Sheet:
-    """Install both onboard estimators; then, in turn, fly every size in one process, start every role, fly both."""
+    """Install both onboard estimators; then repeatedly fly every size, start every role and fly both estimators."""
     sheet = Sheet("e", CPU)
     progress = Progress("e", repeats * (len(SIZES) + 1 + len(ONBOARD)))
     with tempfile.TemporaryDirectory() as folder:

@@ -183,7 +183,7 @@ def measure(drones: int, seconds: float) -> Figures:
 
 
 def quantile(values: list[float], share: float) -> float:
-    """Return the quantile of sorted values below which a `share` of 0 to 1 lies."""
+    """Return the `share` quantile (0 to 1) of sorted values."""
     return values[min(len(values) - 1, int(share * len(values)))]
 
 

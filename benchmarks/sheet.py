@@ -45,7 +45,7 @@ class Sheet:
         self.values.setdefault(contender, {}).setdefault(size, []).append(value)
 
     def refuse(self, contender: str, size: int, reason: str, rows: Sequence[str]) -> str:
-        """Note why a contender has no value at a size in this repeat, add None to each of `rows`; return the reason."""
+        """Note why a contender has no value at a size in this repeat; add None to each of `rows`; return the reason."""
         self.refused[f"{contender}@{size}"] = reason
         for row in rows:
             self.add(row, size, None)

@@ -48,7 +48,7 @@ def _cell(sheet: Sheet, name: str, reference: str, size: int) -> str:
 
 
 def lines(sheet: Sheet, labels: Mapping[str, str], path: Path, title: str, size_name: str, ours: str = "zsim") -> None:
-    """Draw medians with their spread as SVG, in bold for contenders whose name begins with `ours`."""
+    """Draw medians with their spread as SVG, in bold for contenders whose names begin with `ours`."""
     import matplotlib as mpl
 
     mpl.use("Agg")

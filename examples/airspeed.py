@@ -2,7 +2,7 @@
 
     zsim run scenarios/step.yaml --set 'sensors.pitot={module: airspeed, mount: {position_m: [0.15, 0, 0]}}'
 
-Errors are modelled on the differential pressure, after the data sheet of Sensirion's SDP31-500Pa.
+The error model applies to the differential pressure, and follows the data sheet of Sensirion's SDP31-500Pa.
 """
 
 import math
@@ -21,7 +21,7 @@ class Airspeed(Sample, frozen=True):
 
 
 class PitotConfig(Sensor, frozen=True, kw_only=True):
-    rate_hz: RateHz = 50.0  # Hz; an assumption, the sensor supports up to 2000
+    rate_hz: RateHz = 50.0  # Hz; an assumption: the SDP31 supports up to 2000
     pressure_pa: ErrorModel = ErrorModel(
         noise=0.1,  # Pa; zero-point repeatability of the SDP31
         bias=0.2,  # Pa; zero-point accuracy of the SDP31

@@ -14,10 +14,10 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 
 
 def effort(flight: RecordedFlight) -> dict[str, float | None]:
-    """Return the RMS over drones and time of the commanded velocity [m/s], and the mean NEES of their estimates.
+    """Return the RMS over drones and time of the commanded velocity [m/s], and the mean NEES of the estimates.
 
-    Both cover the time from the engagement on; None if the formation never engaged. The NEES of an estimator that
-    reports its true covariance is 6 on average.
+    Both cover the time from engagement onwards; None if the formation never engaged. The NEES (normalised estimation
+    error squared) of an estimator that reports its true covariance is 6 on average.
     """
     engaged_s = formations_of(flight)[0].engaged_s
     if engaged_s is None:

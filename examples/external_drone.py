@@ -1,6 +1,7 @@
 """A driver of an external drone that needs only zenoh and msgpack; the drone follows velocity commands with a lag.
 
-Where this file computes the motion, a real driver talks to an aircraft. Give the drone `body: external` in a scenario:
+Where this program computes the motion, a real driver would talk to an aircraft. Give the drone `body: external` in a
+scenario:
 
     zsim run SCENARIO --realtime          then          python examples/external_drone.py drone3 X Y Z
 """
@@ -18,7 +19,7 @@ ENDPOINT = WORDS.pop(0) if WORDS and "/" in WORDS[0] else "tcp/127.0.0.1:7447"
 _ = len(WORDS) in (1, 4) or sys.exit("usage: python examples/external_drone.py [ENDPOINT] DRONE [X Y Z]")
 DRONE, PLACE = WORDS[0], [float(x) for x in WORDS[1:]] or [0.0, 0.0, 0.05]
 ME, G_M_S2, LAG_S, TAKEOFF_M, CLIMB_M_S = f"driver.{DRONE}", 9.80665, 0.3, 1.0, 0.7
-HOVER_S, LAND_S = 0.5, 2.0  # time without a command before it hovers; further time before it lands
+HOVER_S, LAND_S = 0.5, 2.0  # time without a command before the drone hovers; further time before it lands
 
 
 class Aircraft:
@@ -26,7 +27,7 @@ class Aircraft:
 
     def __init__(self, p, yaw, state="landed"):
         self.p, self.v, self.a, self.yaw, self.yaw_rate, self.state = [*p], [0.0] * 3, [0.0] * 3, yaw, 0.0, state
-        self.wanted, self.commander, self.set_s = (0.0, 0.0, 0.0, 0.0), None, math.inf  # velocity in W, yaw rate
+        self.wanted, self.commander, self.set_s = (0.0, 0.0, 0.0, 0.0), None, math.inf  # wanted: v in W, yaw rate
 
     def obey(self, kind, m, t_s):
         if kind == "mode":
@@ -93,7 +94,7 @@ with zenoh.open(config) as session:
     clocks = session.declare_subscriber("zsim/clock", zenoh.handlers.FifoChannel(10_000))
     accepted = session.declare_subscriber(f"zsim/drone/{DRONE}/accepted/*", zenoh.handlers.FifoChannel(10_000))
     while (info := get("world/info")) is None:
-        clocks.recv()  # retry at the next clock, which comes once a second while the world waits
+        clocks.recv()  # retry at the next clock message, which comes once a second while the world waits
     place = next(drone for drone in info["drones"] if drone["name"] == DRONE)
     truth, status = get(f"drone/{DRONE}/truth"), get(f"drone/{DRONE}/sensor/status")  # left by an earlier driver
     own = truth or {"position_m": PLACE, "orientation_wxyz": [1, 0, 0, 0]}

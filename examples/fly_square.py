@@ -1,9 +1,9 @@
-"""Fly the formation in a square by waypoints, through the controller's control key.
+"""Fly the formation in a square by sending waypoints to the controller's control key.
 
     zsim run scenarios/step.yaml --set clusters.main.plan={} --duration 120
     python examples/fly_square.py
 
-With an empty plan the cluster stays on the ground; this program commands takeoff, engages it, and lands it at the end.
+With an empty plan the cluster stays on the ground; this program makes it take off, engages it, and lands it at the end.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def ask(link: Session, subscription: Subscription, op: str, **args: Any) -> None
 
 
 def waypoints() -> list[dict[str, Any]]:
-    """Return a square of SIDE_M at HEIGHT_M with a corner at the origin; variables not named keep their values."""
+    """Return waypoints of a square at HEIGHT_M, with a corner at the origin; variables not named keep their values."""
     return [{"at_s": i * LEG_S, "values": {"x_c": x, "y_c": y, "z_c": HEIGHT_M}} for i, (x, y) in enumerate(CORNERS)]
 
 
@@ -56,7 +56,7 @@ def newest(subscription: Subscription) -> flight_messages.ClusterState:
 
 
 def until(subscription: Subscription, phase: str) -> flight_messages.ClusterState:
-    """Wait for the first state in a phase."""
+    """Return the first state in a phase, when it arrives."""
     return next(state for state in states(subscription) if state.phase == phase)
 
 

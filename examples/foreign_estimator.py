@@ -1,4 +1,4 @@
-"""An estimator of drone1 in lockstep that does not import zsim, only zenoh and msgpack.
+"""A lockstep estimator for drone1 that needs only zenoh and msgpack, not zsim.
 
     zsim world scenarios/step.yaml --set 'processes.expect=[foreign.drone1]' --duration 60
     python examples/foreign_estimator.py tcp/127.0.0.1:7447
@@ -22,7 +22,7 @@ BEARING = math.atan2(17.8, -2.8)  # rad; bearing of the default environment.magn
 START_S = 60.0  # wall time; the world may still be starting and compiling its kernel
 SILENCE_S = 10.0  # wall time; even while simulated time stands still, the world publishes its clock once a second
 FIX_GAIN, HEIGHT_GAIN = 0.02, 0.1
-SIGMAS = (0.2, 0.2, 0.05, 0.1, 0.1, 0.1)  # m, m/s; what remains of the noise of preset `paper` with these gains
+SIGMAS = (0.2, 0.2, 0.05, 0.1, 0.1, 0.1)  # m, m/s; residual noise of preset `paper` with these gains
 YAW_SIGMA_RAD = 0.06
 
 
@@ -72,7 +72,7 @@ class Participant:
         self._gate_ns = info["gate_ns"]
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        # by default each subscriber has its own thread, so that messages of different keys may swap
+        # By default each subscriber has its own thread, so messages of different keys may arrive out of order.
         in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         self._kept = [
             session.declare_subscriber(f"{DRONE}/sensor/*", in_order),
@@ -118,7 +118,7 @@ class Participant:
 
 
 def world_info(session: zenoh.Session) -> dict[str, Any]:
-    """Return `world/info`; retry while the world listens but does not answer yet, SystemExit after START_S."""
+    """Return `world/info`; retry while the world listens but does not answer yet; raise SystemExit after START_S."""
     until_s = time.monotonic() + START_S
     while time.monotonic() < until_s:
         for reply in session.get("zsim/world/info", timeout=1.0):

@@ -1,14 +1,14 @@
-"""Five decentralised drones cross an unmapped forest: each pilot has its lidar, its estimate, and what the others send.
+"""Five decentralised drones cross an unmapped forest, each pilot using its lidar, its estimate and what others send.
 
 zsim run examples/forest.yaml
 zsim run examples/forest.yaml --seed 2
 python examples/forest.py
 
-Each pilot flies in the free direction of minimum cost: near the direction of its goal, and near its current course
-(after Borenstein and Koren, The vector field histogram, IEEE Trans. Robotics and Automation 7(3), 1991). A direction
-is free up to the first lidar return in a corridor as wide as the drone and its margins. The speed allows a stop within
-the free distance; the drone retreats from obstacles that are too near, and from nearby drones that it hears.
-Obstacles are kept in the axes of the drone that saw them, so that errors of the estimate do not move them.
+Each pilot flies in the direction of minimum cost: far from obstacles, near the direction of the goal, and near the
+current course (after Borenstein and Koren, The vector field histogram, IEEE Trans. Robotics and Automation 7(3), 1991).
+A direction is free up to the first lidar return in a corridor as wide as the drone plus margins. The speed allows a
+stop within the free distance; the drone retreats from obstacles that are too near, and from nearby drones that it
+hears. Obstacles are kept in the drone's own heading frame, so that errors of the estimate do not move them.
 """
 
 import math
@@ -24,7 +24,7 @@ SILENT_NS = 500_000_000  # drones not heard for this long are ignored
 DIRECTIONS = np.arange(72) * (2.0 * math.pi / 72)
 UNIT = np.stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)], axis=1)
 HEED_M = 5.0  # drones that are farther away are ignored
-DOUBT_M = 0.7  # other drones are assumed to be nearer by this, as estimates err
+DOUBT_M = 0.7  # other drones are assumed to be this much nearer, as estimates err
 FLOOR_M = 0.7  # returns from farther below the drone are taken for the ground
 
 
@@ -40,11 +40,11 @@ class Pilot(zsim.Agent):
     """Flies one drone east, past everything that its lidar sees."""
 
     class Parameters(zsim.Parameters):
-        east_m: Annotated[float, Meta(ge=-1000, le=1000)] = 30.0  # x in W at which it stops
+        east_m: Annotated[float, Meta(ge=-1000, le=1000)] = 30.0  # x in W at which the drone stops
         height_m: Annotated[float, Meta(gt=0.5, le=50)] = 2.0
         speed_m_s: Annotated[float, Meta(gt=0, le=5)] = 1.5
         brake_m_s2: Annotated[float, Meta(gt=0, le=5)] = 0.8
-        margin_m: Annotated[float, Meta(gt=0, le=5)] = 0.75  # half the width of a free corridor; the hull takes 0.26 m
+        margin_m: Annotated[float, Meta(gt=0, le=5)] = 0.75  # half the width of a free corridor; the hull needs 0.26 m
         apart_m: Annotated[float, Meta(gt=0, le=20)] = 2.0  # distance below which two drones avoid each other
         takeoff_s: Annotated[float, Meta(ge=0)] = 1.0
 
@@ -57,7 +57,7 @@ class Pilot(zsim.Agent):
         self._drone = drone
         self._heard: dict[str, tuple[int, Any]] = {}
         self._state, self._p_W, self._q_WB, self._yaw = "landed", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.0
-        self._seen = np.empty((0, 2))  # returns of the last scan, ahead and to the left [m]
+        self._seen = np.empty((0, 2))  # returns of the last scan: distances ahead and to the left [m]
         self._course = 0.0  # direction of the last command, in the heading frame [rad]
 
     def receive(self, key: str, message: Any) -> None:
@@ -84,7 +84,7 @@ class Pilot(zsim.Agent):
         return outputs
 
     def _levelled(self, scan: Any) -> np.ndarray:
-        """Return a scan's hits (n, 2) in the heading frame, ahead and to the left [m], without those of the ground."""
+        """Return a scan's hits (n, 2) in the heading frame, ahead and to the left [m], without those on the ground."""
         hits = np.isfinite(scan.ranges())
         points_B = scan.ranges()[hits][:, None] * scan.directions()[hits]
         w, x, y, z = self._q_WB
@@ -120,7 +120,7 @@ class Pilot(zsim.Agent):
         return v
 
     def _others(self, t_ns: int) -> list[tuple[np.ndarray, float]]:
-        """Return offset (2,) in W [m] and distance [m] of each near drone that was heard."""
+        """Return the offset (2,) in W [m] and the distance [m] of each nearby drone heard recently."""
         heard = [p_W for _, (at_ns, p_W) in sorted(self._heard.items()) if t_ns - at_ns <= SILENT_NS]
         ways = [np.subtract(p_W, self._p_W)[:2] for p_W in heard]
         return [(way, away) for way in ways if 0.0 < (away := float(np.hypot(*way))) < HEED_M]

@@ -1,4 +1,4 @@
-"""Draw a recorded formation, seen by a camera that follows it; docs/pictures/formation.jpg is an example.
+"""Draw a recorded formation, as seen by a camera that follows it; docs/pictures/formation.jpg is an example.
 
     python examples/formation_picture.py runs/first formation.jpg 60
 
@@ -33,12 +33,12 @@ from zsim_agents.cameras.scene import DroneStates, Scene, View, camera_motion, d
 Array = NDArray[np.float64]
 SIDE = Mount(position_m=(1.0, 0.0, 0.0))  # m; ahead of its carrier, which therefore stays out of the picture
 CAMERA = Camera(width_px=1440, height_px=720, diagonal_deg=60, rate_hz=1, mount=SIDE, noise=0, exposure_ms=2)
-AWAY, YAW_RAD, DOWN_RAD = 2.2, 0.35, 0.42  # distance in widths of the formation, heading, and downward tilt
+AWAY, YAW_RAD, DOWN_RAD = 2.2, 0.35, 0.42  # camera's distance in formation widths, heading, and downward tilt
 MAGENTA, INK, PAPER = (152, 17, 233), (40, 40, 40), (255, 255, 255)  # B, G, R
 
 
 class Instant(NamedTuple):
-    """Names, scene and states of the recorded drones at one time."""
+    """Names, scene and states of the recorded drones at one instant."""
 
     names: list[str]
     scene: Scene
@@ -46,7 +46,7 @@ class Instant(NamedTuple):
 
 
 def recorded(record: Path, t_ns: int | None) -> Instant:
-    """Return the drones at the first gate at or after t_ns, or at the last gate if it is None.
+    """Return the drones at the first gate at or after t_ns, or at the last gate if t_ns is None.
 
     Raises:
         SystemExit: the record ends before t_ns.
@@ -68,7 +68,7 @@ def recorded(record: Path, t_ns: int | None) -> Instant:
 
 
 def states(truths: Sequence[Truth]) -> DroneStates:
-    """Convert truths to the arrays that the renderer takes."""
+    """Convert truths to the arrays that the renderer expects."""
     return DroneStates(
         np.array([truth.position_m for truth in truths]),
         np.array([truth.velocity_m_s for truth in truths]),
@@ -79,7 +79,7 @@ def states(truths: Sequence[Truth]) -> DroneStates:
 
 
 def follower(of: DroneStates) -> DroneStates:
-    """Return the drones, and last the one that carries the camera."""
+    """Return the states of the drones, followed by that of the drone that carries the camera."""
     middle, width = of.p_WB.mean(axis=0), float(np.ptp(of.p_WB, axis=0).max())
     q = quaternion_from_rpy([0.0, DOWN_RAD, YAW_RAD])
     place = middle - rotation_matrix(q)[:, 0] * (AWAY * max(width, 1.0))
@@ -117,7 +117,7 @@ def sides(count: int) -> list[tuple[int, int]]:
 
 
 def label(drawn: Picture, text: str, at: Array) -> None:
-    """Write a text centred at a point of the picture [px]."""
+    """Draw a text centred at a point of the picture [px]."""
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.7, 1)
     x, y = int(at[0] - width / 2), int(at[1] + height / 2)
     cv2.rectangle(drawn, (x - 6, y - height - 6), (x + width + 6, y + 6), PAPER, -1)

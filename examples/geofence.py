@@ -15,7 +15,7 @@ import zsim
 class Geofence(zsim.Agent):
     """Sends `land` to every airborne drone whose estimated position is outside the circle."""
 
-    name = "fence.main"  # name of its process, as role.thing
+    name = "fence.main"  # name of the agent's process, as role.thing
     reads = ("drone/*/sensor/status", "drone/*/estimate")
 
     def __init__(self, radius_m: float) -> None:

@@ -1,4 +1,4 @@
-"""3DR Iris, `model: iris`, with the numbers of RotorS: its front rotors are farther from the centre than its rear ones.
+"""3DR Iris, `model: iris`, with the parameters of RotorS; its front rotors are farther out than its rear ones.
 
 Sources: RotorS (Furrer et al. 2016), rotors_gazebo/resource/iris.yaml (mass, inertia, rotors) and
 rotors_description/urdf/iris.xacro (motors, rotor drag); 3D Robotics' data sheet (battery).
@@ -41,7 +41,7 @@ VEHICLE = replace(
         _rotor("rear_left", REAR_M, REAR_RAD, -1),
     ),
     rotor_radius_m=0.1,  # m
-    rotor_inertia_kg_m2=1.7e-5,  # kg m^2; a rod, 0.2 m long, of 5 g
+    rotor_inertia_kg_m2=1.7e-5,  # kg m^2; a rod of 5 g, 0.2 m long
     airframe=Airframe(
         hull_radius_m=0.36,  # m; arm plus rotor radius
         foot_xy_m=0.15,  # m; an assumption

@@ -1,4 +1,4 @@
-"""A custom vehicle, `model: larger_battery`: the AR.Drone with the larger battery, as weighed.
+"""A custom vehicle, `model: larger_battery`: the AR.Drone with the larger, 1500 mAh battery.
 
     PYTHONPATH=examples zsim run scenarios/step.yaml --set drones.drone1.model=larger_battery
 

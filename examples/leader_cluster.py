@@ -42,7 +42,7 @@ def jacobian_error(space: ClusterSpace, p_W: Array, yaw: Array) -> float:
     """Return the largest entry of |J - central differences of `forward`| and |J J^-1 - identity|.
 
     Args:
-        p_W: (n, 3) [m]; yaw: (n,) [rad].
+        p_W, yaw: positions (n, 3) [m] and headings (n,) [rad] of the robots.
     """
     J, c = space.jacobian(p_W, yaw), space.forward(p_W, yaw)
     columns = []

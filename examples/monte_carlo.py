@@ -2,7 +2,7 @@
 
     python examples/monte_carlo.py scenarios/step.yaml --seeds 10 --duration 60
 
-The runs are those of `zsim sweep`, on all cores; see docs/sweep.md.
+Like `zsim sweep`, it runs on all cores; see docs/sweep.md.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import zsim
 from zsim_analysis.reading.drone_errors import estimate_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 
-SETTLED_S = 10.0  # s; earlier errors are excluded, as they stem from the first fixes
+SETTLED_S = 10.0  # s; earlier errors are excluded, because they stem from the first fixes
 
 
 def horizontal_rms_m(flight: RecordedFlight) -> float:

@@ -1,9 +1,9 @@
-"""A custom estimator, with fixed gains instead of a Kalman filter, in place of the stock one.
+"""A custom estimator that replaces the stock one, with fixed gains instead of a Kalman filter.
 
     zsim run scenarios/step.yaml --set estimation.algorithm=my_estimator:MyEstimator
 
-The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. Its methods are
-described in `zsim_agents.estimation.drone_estimator.DroneEstimator`.
+The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario file. The estimator's
+methods are described in `zsim_agents.estimation.drone_estimator.DroneEstimator`.
 """
 
 import math
@@ -14,13 +14,13 @@ from zsim.contract.keys import SENSORS
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation.drone_estimator import StateEstimate
 
-GPS_GAIN = 0.02  # minimum gain of a fix; the first 1 / GPS_GAIN fixes are averaged
-HEIGHT_GAIN, HEADING_GAIN = 0.1, 0.05  # minimum gains of a barometer and a magnetometer sample
+GPS_GAIN = 0.02  # minimum gain for a fix; the first 1 / GPS_GAIN fixes are averaged
+HEIGHT_GAIN, HEADING_GAIN = 0.1, 0.05  # minimum gains for barometer and magnetometer samples
 GPS_SIGMA_M, HEIGHT_SIGMA_M, SPEED_SIGMA_M_S, YAW_SIGMA_RAD = 2.0, 0.03, 0.1, 0.02  # with the noise of preset `paper`
 
 
 class MyEstimator:
-    """Position from GPS and the flow's velocity, height from the barometer, heading from gyro and magnetometer."""
+    """Position from GPS and flow sensor, height from the barometer, heading from gyro and magnetometer."""
 
     def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
         east, north, _ = environment.magnetic_field_ut

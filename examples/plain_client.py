@@ -15,7 +15,7 @@ seq, last, inbox, gates, t_ns = {}, {}, queue.SimpleQueue(), 0, 0
 
 with zenoh.open(zenoh.Config.from_json5(config)) as session:
 
-    def put(key, **fields):  # BLOCK, as the world would wait for ever for a message that zenoh drops
+    def put(key, **fields):  # BLOCK, as the world would wait for ever for a message dropped by zenoh
         seq[key] = seq.get(key, -1) + 1
         session.put(key, msgpack.packb({"seq": seq[key], **fields}), congestion_control=zenoh.CongestionControl.BLOCK)
 

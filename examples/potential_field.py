@@ -1,4 +1,4 @@
-"""A custom control law: each robot is attracted to its position in the formation and repelled by near robots.
+"""A custom control law: each robot is attracted to its position in the formation and repelled by nearby robots.
 
     PYTHONPATH=examples zsim run scenarios/step.yaml --set clusters.main.law=potential_field:PotentialField
 
@@ -15,7 +15,7 @@ PUSH_M3_S = 2.0  # two robots 2 m apart repel each other at 2 (1/2 - 1/3) / 2^2 
 
 
 class PotentialField(ControlLaw):
-    """Stateless, for each robot alone: v_i = v_des,i + k (p_des,i - p_i) + repulsion by its neighbours."""
+    """Stateless; separately for each robot: v_i = v_des,i + k (p_des,i - p_i) + repulsion by its neighbours."""
 
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
         space, k_1_s = self.space, self.gains.k_1_s

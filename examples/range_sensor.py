@@ -3,8 +3,8 @@
     zsim run scenarios/step.yaml --set 'processes.expect=[range.drone1]' --duration 60
     python examples/range_sensor.py tcp/127.0.0.1:7447
 
-Publishes `drone/drone1/range/drone2` five times a simulated second. The key is not part of the contract: only
-`zsim echo` and the recorder read it, and it does not count in `sent`, unlike commands, estimates and cluster states.
+Publishes `drone/drone1/range/drone2` five times per simulated second. The key is not part of the contract: only
+`zsim echo` and the recorder read it, and it is not counted in `sent`, unlike commands, estimates and cluster states.
 """
 
 import math
@@ -30,7 +30,7 @@ def measure(truths: dict[str, dict[str, Any]], rng: random.Random) -> float:
 
 
 class RangeSensor:
-    """Reads the truth of two drones, and reports each gate as done once its range has been published."""
+    """Reads the truth of two drones, and reports each gate as done once its range, if due, has been published."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
@@ -39,7 +39,7 @@ class RangeSensor:
         self._rng = random.Random(f"{info['seed']}/{ME}")  # a random stream of its own, reproducible from the seed
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        # by default each subscriber has its own thread, so that messages of different keys may swap
+        # By default each subscriber has its own thread, so messages of different keys may arrive out of order.
         in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         expressions = [*(f"zsim/drone/{drone}/truth" for drone in PAIR), "zsim/clock"]
         self._kept = [session.declare_subscriber(e, in_order) for e in expressions]
@@ -78,7 +78,7 @@ class RangeSensor:
 
 
 def world_info(session: zenoh.Session) -> dict[str, Any]:
-    """Return `world/info`; retry while the world listens but does not answer yet."""
+    """Return `world/info`, retrying while the world listens but does not answer yet."""
     while True:
         for reply in session.get("zsim/world/info", timeout=1.0):
             if reply.ok is not None:

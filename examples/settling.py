@@ -15,9 +15,9 @@ BAND_M = 0.5  # m; a side has settled once it stays this close to its desired le
 
 
 def settling(flight: RecordedFlight) -> dict[str, float | None]:
-    """Return when side p settled [s after the engagement], and the maximum by which it was too long [m].
+    """Return when side p settled [s after engagement], and its largest excess over the desired length [m].
 
-    Both are None if the formation never engaged; the time is None if it never settled.
+    Both are None if the formation never engaged; the time is None if the side never settled.
     """
     formation = formations_of(flight)[0]
     if formation.engaged_s is None:

@@ -1,11 +1,11 @@
 # pyright: reportMissingImports=false
-"""Train a policy that flies a drone home against the wind, with PPO of stable-baselines3; then fly it as an agent.
+"""Train a policy that flies a drone home against the wind, with stable-baselines3's PPO; then fly it as an agent.
 
     pip install -e '.[soak]'
     PYTHONPATH=examples python examples/train_policy.py --steps 30000 --out build/home
     PYTHONPATH=examples zsim run build/home/home.yaml --agent "train_policy:Trained file=build/home/policy.zip"
 
-Or as a process on any host: `zsim agent train_policy:Trained file=... --connect ...`; see docs/learning.md.
+A process on any host can fly it too: `zsim agent train_policy:Trained file=... --connect ...`; see docs/learning.md.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     zsim run scenarios/step.yaml --set 'sensors.my_uwb={module: uwb_range, anchor_m: [0, 0, 2]}'
 
-The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario's file. For
-several anchors, declare several sensors with this module.
+The module is found on Python's path (`PYTHONPATH=examples`) or in the folder of the scenario file. For several
+anchors, declare several sensors with this module.
 """
 
 from collections.abc import Sequence

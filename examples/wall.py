@@ -1,11 +1,12 @@
-"""A control law that keeps a formation off an unmapped wall, by the `range` sensors of its drones.
+"""A control law that keeps a formation off an unmapped wall, using the `range` sensors of its drones.
 
 zsim run examples/wall.yaml
 python examples/wall.py
 
-Each beam limits how fast the formation may approach what it sees: v . u <= a (r - keep), with r along u. If
-r >= keep initially, it remains so: a control barrier function of first order (Ames, Xu, Grizzle and Tabuada, Control
-barrier function based quadratic programs for safety critical systems, IEEE Trans. Automatic Control 62(8), 2017).
+Each beam limits how fast the formation may approach what it sees: v . u <= a (r - keep), where r is the range
+along the beam's direction u. If r >= keep initially, it remains so: a control barrier function of first order (Ames,
+Xu, Grizzle and Tabuada, Control barrier function based quadratic programs for safety critical systems, IEEE Trans.
+Automatic Control 62(8), 2017).
 """
 
 from pathlib import Path
@@ -23,7 +24,7 @@ TURNED = {"front": 0.0, "left": np.pi / 2, "back": np.pi, "right": -np.pi / 2}  
 
 
 class OffTheWall(zsim.ControlLaw):
-    """The proportional law, its approach speed limited by the beams; stateless."""
+    """The proportional law, with the approach speed limited by the beams; stateless."""
 
     class Parameters(zsim.Parameters):
         keep_m: Annotated[float, Meta(gt=0, le=10)] = 2.0

@@ -1,4 +1,4 @@
-"""An FMU of FMI 3 that flies a drone to a point, at a velocity proportional to the distance and at most 1 m/s.
+"""An FMI 3 FMU that flies a drone to a point, at a speed proportional to the distance, but at most 1 m/s.
 
     python -m pythonfmu3 build -f examples/waypoint_fmu.py --handle-state --serialize-state
     zsim fmu Waypoint.fmu --drone drone1 --map p=estimate.position_m --map v=velocity_m_s --frame world

@@ -10,18 +10,18 @@ from pathlib import Path
 from types import TracebackType
 
 PACKAGES = frozenset({"zsim", "zsim_world", "zsim_agents", "zsim_bridges", "zsim_analysis", "zsim_api", "zsim_deploy"})
-"""The packages of zsim; modules outside them are users' or libraries'."""
+"""The packages of zsim; all other modules belong to users or libraries."""
 
 
 class ZsimError(Exception):
     """Base of all errors that a user can cause; the command line prints them without a traceback."""
 
     def _render_traceback_(self) -> list[str]:
-        """Return the traceback for IPython, which calls this: only the user's frames, and the error's text."""
+        """Return the traceback for IPython, which calls this method: only the user's frames, and the error's text."""
         from IPython import get_ipython  # pyright: ignore[reportPrivateImportUsage]
 
         frames = list(takewhile(lambda each: _package(each) not in PACKAGES, _entries(self.__traceback__)))
-        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # by which zsim calls itself
+        while frames and _package(frames[-1]) in sys.stdlib_module_names:  # through which zsim calls itself
             frames.pop()
         way: TracebackType | None = None
         for each in reversed(frames):
@@ -138,24 +138,24 @@ OTHER_OUT = "give --out another folder"  # remedy
 
 @contextmanager
 def file_fault(path: Path, fault: str, remedy: str, kind: type[ZsimError] = RunError) -> Iterator[None]:
-    """Convert an OSError on a file to an error of one line: `PATH: FAULT (REASON); REMEDY`."""
+    """Convert an OSError on a file into an error of one line: `PATH: FAULT (REASON); REMEDY`."""
     try:
         yield
     except OSError as error:
         raise kind(f"{path}: {fault} ({error.strerror}); {remedy}") from error
 
 
-# control codes C0 (without tab and line feed) and C1, and bidirectional controls
+# control codes C0 (except tab and line feed) and C1, and bidirectional controls
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069]")
 
 
 def printable(text: str) -> str:
-    """Return a text for a terminal in which control codes, which network data may contain, are escaped."""
+    """Return a text for a terminal, with its control codes, which network data may contain, escaped."""
     return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 _FIGURE = re.compile(r"(?<![\w.:-])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w:]|\.\d)")  # a number that is not part of a name
-REASON_MAX = 300  # characters
+REASON_MAX = 300  # maximum number of characters of a reason
 
 
 def reason_of(error: BaseException) -> str:
@@ -165,7 +165,7 @@ def reason_of(error: BaseException) -> str:
 
 
 def without_figures(text: str) -> str:
-    """Return a reason with its numbers replaced by #, except in names, to compare reasons that differ only in these."""
+    """Return a reason with its numbers replaced by #, except in names, to compare reasons regardless of numbers."""
     return _FIGURE.sub("#", text)
 
 
@@ -211,7 +211,7 @@ def install_command(extras: Iterable[str]) -> str:
 
 
 def missing(error: ModuleNotFoundError) -> str | None:
-    """Return a line about a missing module with the command that installs it; None if no extra does."""
+    """Return a line about a missing module with the command that installs it; None if no extra installs it."""
     module = (error.name or "").partition(".")[0]
     extra = EXTRA_OF.get(module)
     return f"{module} is not installed; {install_command([extra])}" if extra else None
@@ -219,7 +219,7 @@ def missing(error: ModuleNotFoundError) -> str | None:
 
 @contextmanager
 def what_is_missing() -> Iterator[None]:
-    """Convert the error on a missing module to a RunError with the command that installs it, if an extra does."""
+    """Convert the error about a missing module into a RunError with the command that installs it, if an extra does."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -20,13 +20,13 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-OTHERS_NAMED = 3  # foreign files named in an error
+OTHERS_NAMED = 3  # maximum number of foreign files named in an error
 
 
 def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
     """Lock an open file until it is closed or the process ends; return False if another process holds the lock.
 
-    Always True on a file system without locks, see `no_locks`.
+    On a file system without locks (see `no_locks`), return True.
     """
     if fcntl is None:
         return True
@@ -40,7 +40,7 @@ def take_lock(file: IO[Any] | int, shared: bool = False) -> bool:
 
 
 def wait_for_lock(file: IO[Any]) -> None:
-    """Wait for the lock of an open file, held until it is closed; no effect on a file system without locks."""
+    """Lock an open file until it is closed, waiting if necessary; do nothing on a file system without locks."""
     if fcntl is not None:
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -65,8 +65,7 @@ def held_folder(folder: Path, mark: str, own: Collection[str], force: bool, use:
     Args:
         mark: file that identifies a folder of this command; `refuse_others` checks a folder without it.
         own, force, use: as for `refuse_others`.
-        others: for the error if the folder is locked, e.g. "another hunt is at work".
-        others: start of the error if the folder is locked: "another hunt is at work".
+        others: beginning of the error if the folder is locked, e.g. "another hunt is at work".
 
     Raises:
         RunError: the folder has foreign content, is locked, or cannot be created.
@@ -91,7 +90,6 @@ def refuse_others(folder: Path, own: Collection[str], force: bool, use: str) -> 
         own: names of files that the command may overwrite.
         force: whether to accept other files, which are kept.
         use: intended use of the folder, for the error, e.g. "fly into".
-        use: intended use of the folder, for the error: "fly into".
 
     Raises:
         RunError: there are other files; the error names some.
@@ -130,7 +128,7 @@ def _own_temporary(_pid: int) -> Path:
 
 
 def _remove_left() -> None:
-    """Remove temporary folders of killed processes: those that are not locked."""
+    """Remove the temporary folders of killed processes, which are those that are not locked."""
     place = Path(gettempdir())
     if fcntl is None or no_locks(place):
         return
@@ -145,7 +143,7 @@ def _remove_left() -> None:
                     os.close(opened)
 
 
-RECORD = "run.mcap"  # in the folder of a run
+RECORD = "run.mcap"  # name of the record in a run's folder
 
 
 def record_in(folder: Path) -> Path:

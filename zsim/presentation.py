@@ -1,9 +1,9 @@
 """Tables that fit a terminal, and a colour for each drone.
 
-On a narrow terminal a table omits columns instead of breaking names, units and numbers. A drone has the same colour in
-reports, the console and exports, and colours are distinguishable with every kind of colour vision. Few drones have the
-colours of Okabe and Ito (2008); more have those of viridis (van der Walt, Smith 2015) in the order of the scenario,
-without yellow, which is hard to see on white paper.
+On a narrow terminal, a table omits columns instead of breaking names, units and numbers. A drone has the same colour in
+reports, the console and exports, and the colours are distinguishable with every kind of colour vision. Up to six drones
+have the colours of Okabe and Ito (2008); more have those of viridis (van der Walt, Smith 2015), in the order of the
+scenario, without yellow, which is hard to see on white paper.
 """
 
 import os
@@ -31,8 +31,8 @@ class Column(NamedTuple):
     """A column of a table.
 
     Attributes:
-        header: header, whose lines are never broken; a table with only empty headers has no header row.
-        kind: kind of the cells; without room a name keeps its end, text wraps between words, a figure is not broken.
+        header: header; its lines are never broken; a table with only empty headers has no header row.
+        kind: kind of the cells; if space is short, a name keeps its end, text wraps between words, figures stay whole.
         worth: priority; columns of the lowest worth are omitted first; None: never omitted.
         right: whether cells are right-aligned.
     """
@@ -146,7 +146,7 @@ def shortened(name: str, width: int) -> str:
 class NameCell(NamedTuple):
     """A name, truncated at its beginning because the end distinguishes names such as `estimator.drone2`.
 
-    All characters of names are assumed to be one cell of the terminal wide.
+    Every character of a name is assumed to be one terminal cell wide.
     """
 
     name: str

@@ -30,7 +30,7 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
     """Return the known names that are listed or match a pattern such as `drone*`, in the order of `known`.
 
     Raises:
-        RunError: a pattern matches none; `what` names its kind in the message.
+        RunError: a pattern matches no name; `what` names the kind of name in the text.
     """
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in known):
@@ -50,11 +50,11 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
     """Check that the classes named in a scenario can be loaded here.
 
     Args:
-        source: name of the scenario's file, with which each fault starts.
-        elsewhere: whether the controllers run on other hosts; only there are spaces and laws needed.
+        source: name of the scenario's file, with which each fault begins.
+        elsewhere: whether controllers and users' agents run on other hosts; only there are their classes needed.
 
     Raises:
-        ScenarioError: the fault of each name or of its class, one per line.
+        ScenarioError: names are wrong or their classes cannot be loaded; one fault per line.
     """
     from zsim_agents.estimation.drone_estimator import estimator_class
 
@@ -82,7 +82,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
         try:
             load()
         except NotTrustedError:
-            continue  # it is there
+            continue  # the class exists
         except DocumentError as error:
             faults += error.faults
     if faults:
@@ -90,7 +90,7 @@ def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> N
 
 
 def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
-    """Check that the class of agents can be loaded, and check its parameters by its method `flaws`, if any."""
+    """Check that the class of an agent can be loaded, and check its parameters with its method `flaws`, if any."""
     kind: Any = plugin.load(own.named, f"{where}.class", Agent)
     flaws = getattr(kind, "flaws", None)
     if flaws and (found := [f"{where}.parameters.{path} {text}" for path, text in flaws(own.parameters, scenario)]):
@@ -100,10 +100,10 @@ def _check_agent(own: OwnAgent, where: str, scenario: Scenario) -> None:
 def check_plans(scenario: Scenario, source: str) -> None:
     """Check the plans of a scenario as its controllers and pilots do: expressions, names, templates, references.
 
-    In a run of processes, these check the plans, as they load the mathematics anyway.
+    In a run of several processes, controllers and pilots check the plans themselves: they load the mathematics anyway.
 
     Raises:
-        ScenarioError: the reasons, one line per cluster.
+        ScenarioError: a plan cannot be flown; one fault per line.
     """
     from zsim_agents.formation.engagement_setup import check_plan
 
@@ -116,7 +116,7 @@ def check_plans(scenario: Scenario, source: str) -> None:
         try:
             check_plan(scenario, cluster)
         except NotTrustedError:
-            continue  # its space says what a plan may name
+            continue  # only the class of its space knows which variables a plan may name
         except RunError as error:
             faults.append(f"{source}: {error}")
     if faults:
@@ -159,7 +159,7 @@ class AgentSpec(NamedTuple):
 
     @classmethod
     def parse(cls, words: Sequence[str], name: str = "") -> "AgentSpec":
-        """Return the agent given by words, after loading its class here.
+        """Return the agent that the words describe, after loading its class in this process.
 
         Raises:
             RunError: a setting or a name is malformed.
@@ -179,7 +179,7 @@ class AgentSpec(NamedTuple):
         return cls(named, settings, keys.name(name or given or process_name(made)))
 
     def words(self) -> list[str]:
-        """Return the words from which `parse` creates it."""
+        """Return the words from which `parse` creates this spec."""
         named = f"{self.name}={self.named}"
         return [named, *(f"{setting}={json.dumps(value)}" for setting, value in self.settings.items())]
 
@@ -201,9 +201,9 @@ def without_map(info: Info, scenario: Scenario) -> tuple[Info, Scenario]:
 
 
 def with_own_agents(scenario: Scenario, names: Sequence[str]) -> Scenario:
-    """Return a resolved scenario that waits for users' agents, and ends if one of them fails.
+    """Return a resolved scenario changed to wait for users' agents, and to end if one of them dies.
 
-    Its own entries for them in `processes.on_death` take precedence.
+    The scenario's entries for these agents in `processes.on_death` take precedence.
     """
     processes = scenario.processes
     expect = [*dict.fromkeys((*expected_processes(scenario), *names))]
@@ -224,13 +224,13 @@ def own_agent(
     Args:
         made: the agent; or a class or function that creates it from `settings`, its parameters, and from `info`,
             `scenario` and the name of its `drone` or `cluster`, if it takes arguments of these names.
-        name: name of its process; empty for the agent's own.
-        per: "drone" or "cluster" for an agent of one.
+        name: name of its process; empty for the agent's own name.
+        per: "drone" or "cluster" for an agent of a single one, "run" for others.
 
     Raises:
-        UserCodeError: the class raised.
-        RunError: the settings do not fit its arguments, or it does not return an agent.
-        DocumentError: its parameters or its messages are not allowed.
+        UserCodeError: the class or function raised an error.
+        RunError: the settings do not fit the arguments of the class or function, or it does not return an agent.
+        DocumentError: the agent's parameters or messages are not allowed.
     """
     if not isinstance(made, Agent):
         if not callable(made):
@@ -266,5 +266,5 @@ def own_agent(
 
 
 def agent_class(role: str) -> Callable[..., Agent]:
-    """Return the class of a role's agents; its module is imported only here: hosts of other roles do not need it."""
+    """Return the class of a role's agents; its module is imported only now, since hosts of other roles do without."""
     return plugin.load(AGENTS[role].agent, role, Agent)

@@ -1,7 +1,7 @@
 """The recorder as a process: writes every message on every key to `run.mcap`.
 
-The run does not wait for it gate by gate, but the world is never further ahead of the record on disk than its history
-reaches back. A recorder that rejoins, or replaces a dead one, therefore continues without a gap.
+The run does not wait for the recorder gate by gate, but the world is never further ahead of the record on disk than the
+world's history reaches back. A recorder that rejoins, or replaces a dead one, therefore continues without a gap.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ JOIN_S = 1.0  # wall time after which a join is repeated if no event confirms it
 SLACK_NS = 4_000_000_000  # maximum lead of the world over the record on disk; the world's history covers 5 s
 DRAIN_S = 1.0  # time to wait for the byes of other processes after the clock has stopped
 STOP_DRAIN_S = 0.5  # time to wait for the end of the run after a requested stop, since both may be stopped together
-QUIET_S = 1.5  # time without a clock that indicates a missed one; when time stands still, it comes once a second
+QUIET_S = 1.5  # time without a clock after which one must have been missed: even a paused world sends one per second
 REPLAY_S = 5.0  # timeout of queries, which a hub answers within milliseconds
 FLUSH_NS = 1_000_000_000  # simulated time between writes to disk
 REPEATED_NS = 1_000_000_000  # simulated time after catching up within which other processes may repeat messages
@@ -91,7 +91,7 @@ class Recorder:
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
         self._held: list[Passed] = []  # received messages, to be written after missed ones
-        self._is_back = False  # in realtime, a lost link is restored and missed messages are not fetched yet
+        self._is_back = False  # in realtime, whether a lost link is restored but missed messages are not yet fetched
         self._quiet_since_s: float | None = None  # since when no clock has arrived after a lost link in realtime
         self._on_disk_ns = 0  # simulated time of the last write to disk
         self._left_out = 0
@@ -100,8 +100,8 @@ class Recorder:
         """Record until the run ends; return why it ended.
 
         Raises:
-            RunError: the world has started another run; the record has no gap.
-            RecordError: the disk is full or the file cannot be written; the record is readable up to there.
+            RunError: the world has started another run; the record of the former run has no gap.
+            RecordError: the disk is full or the file cannot be written; what was written is readable.
             SupersededError: another recorder of this name has taken over.
         """
         self._traffic = Traffic(self._link, run_key_table(self._info), self._on_refused)
@@ -161,7 +161,7 @@ class Recorder:
             self._writer.tick(time.monotonic_ns())
             if self._part.now_ns - self._on_disk_ns >= FLUSH_NS:
                 self._put_on_disk()
-            self.health.refused += self._writer.refused - self._left_out  # for lack of channels
+            self.health.refused += self._writer.refused - self._left_out  # messages refused for lack of channels
             self._left_out = self._writer.refused
             if not self._part.admitted and time.monotonic() - self._joined_s > JOIN_S:
                 self._join()
@@ -236,7 +236,7 @@ class Recorder:
                 held.clear()
 
     def _fetch_missed(self, before: Clock | None = None) -> None:
-        """Write the messages since the newest one on record, up to a clock if given, that the world still has."""
+        """Write the messages that the world still has since the newest one on record, up to a clock if given."""
         self._writer.flush()
         self._known.add_tail(self._writer.path)
         self._catch_up(before)
@@ -352,7 +352,7 @@ class Recorder:
                 self._others.pop(name, None)
 
     def _clock_in(self, payload: bytes) -> Clock | None:
-        """Return the decoded clock of this run, None for any other message."""
+        """Return the decoded clock of this run; None for any other message."""
         try:
             clock = self._clock.decode(payload)
         except messages.REFUSALS:

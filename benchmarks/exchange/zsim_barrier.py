@@ -104,7 +104,7 @@ def _scenario(count: int) -> Any:
 
 @contextmanager
 def _transport(low_latency: bool) -> Iterator[None]:
-    """If asked to, let sessions use Zenoh's low-latency transport, which zsim itself does not offer.
+    """With `low_latency`, let sessions use Zenoh's low-latency transport, which zsim itself does not offer.
 
     Zenoh 1.10.2 panics when a listener for transport events is declared on this transport, so the agents declare none
     and would not notice a lost link.

@@ -1,4 +1,4 @@
-"""zsim's world alone, its drones following the paths as peers' do: firmware, all sensors with noise, gusts, contacts.
+"""zsim's world alone, following the paths as the peers do: firmware, all sensors with noise, gusts, contacts.
 
 At every gate, a position controller that knows the truth (path velocity plus a gain times the position error) gives
 velocity commands, and the samples and truth of all drones are produced. No estimators, cluster controller, messages or

@@ -23,7 +23,8 @@ TIMEOUT_S = 900.0
 def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, float]:
     """Fly a sweep over seeds; return wall and CPU seconds, start-up included, and the drones' closest approach.
 
-    RefusedError is raised if the sweep or one of its runs failed.
+    Raises:
+        RefusedError: the sweep or one of its runs failed.
     """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "sweep"

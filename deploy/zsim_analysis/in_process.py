@@ -177,7 +177,8 @@ class InProcessFlight:
     def send(self, commands: Sequence[tuple[str, Struct]]) -> None:
         """Publish the caller's commands for the newest gate, as pairs of drone and command; the world waits for them.
 
-        Raises RunError, before anything is sent, if one of them is not a command.
+        Raises:
+            RunError: one of them is not a command; nothing is sent.
         """
         caller, t_ns = self._caller, self.world.now_ns
         assert caller is not None

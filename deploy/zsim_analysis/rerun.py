@@ -45,7 +45,7 @@ class RerunResult(NamedTuple):
 
     compared: "TruthComparison"  # comparison with the truth on record
     sha256: str  # hash of the truth
-    until: str  # why the comparison ended before the record; empty if it did not
+    until: str  # why the comparison ended before the record did; empty if it did not
     refused: list[str]  # requests that were carried out in the recorded run but are refused now
     first_output: str  # the first output of an agent that differs, with its field; empty if none does
     outputs: dict[str, str]  # SHA-256 of the agents' outputs by key, as in OutputHashes
@@ -339,7 +339,7 @@ class RerunBus(Bus):
         self._rerun = agents.names
         self.truth: dict[str, bytes] = {}  # payloads at the newest gate, by drone
         self.refused: list[str] = []  # requests that were carried out in the recorded run but are refused now
-        self._admitted: set[_Joined] | None = None  # in this gate; None before the start: all are admitted
+        self._admitted: set[_Joined] | None = None  # at this gate; None before the start: all are admitted
         self._withheld: dict[_Joined, run_messages.Join] = {}
         self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
@@ -441,7 +441,7 @@ def _joined(event: run_messages.Event) -> _Joined:
 
 
 def _admitted(inputs: Sequence[Recorded]) -> set[_Joined]:
-    """Return the processes that were admitted in a gate, by the events among its inputs.
+    """Return the processes that were admitted at a gate, by the events among its inputs.
 
     Their joins are repeated in place. A join that was withheld for longer has its event in a later gate.
     """

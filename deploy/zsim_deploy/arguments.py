@@ -309,13 +309,13 @@ flight_options = option_group(
 observer_options = option_group("reach", WorldAccess, _OBSERVER)
 """Decorator for interactive commands, with an argument `reach`."""
 participant_options = option_group("reach", WorldAccess, _PARTICIPANT)
-"""Decorator for commands that run a process of a federation, with an argument `reach`; it waits for a world."""
+"""Decorator for commands that run a process that waits for a world and joins it, with an argument `reach`."""
 several_options = option_group(
     "reach",
     lambda connect, federation, wait, *more: WorldAccess(connect, federation, wait, None, *more),
     {name: each for name, each in _PARTICIPANT.items() if name != "tls"},
 )
-"""The same for a process that hosts several agents; it cannot have a certificate, which is for a single name."""
+"""Like `participant_options`, for a process that hosts several agents: no certificate, which is for a single name."""
 listener_options = option_group(
     "who",
     identity,

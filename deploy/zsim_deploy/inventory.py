@@ -1,6 +1,6 @@
-"""Inventories: the hosts, how to reach them, which role runs where; and the command lines of processes.
+"""Inventories (the hosts, how to reach them, and which role runs where), and the command lines of processes.
 
-Pure apart from reading the file. docs/deployment.md explains the fields.
+No side effects other than reading the inventory file. docs/deployment.md explains the fields.
 """
 
 import fnmatch
@@ -33,18 +33,18 @@ from zsim_api.programs import filled
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME
 
-EXAMPLE = "examples/hosts.yaml"  # suggested if the inventory does not exist
+EXAMPLE = "examples/hosts.yaml"  # suggested if the inventory file is missing
 ZENOH_PORT = 7447  # default port of Zenoh
 SSH_PORT = 22  # IANA
-HOSTS_MAX = DRONES_MAX  # with more hosts, some would have no drone
+HOSTS_MAX = DRONES_MAX  # with more, some hosts would have no drone
 ROLES_MAX = PROCESSES_MAX  # each entry stands for at least one process
 ROUTER_PORT = 7448  # differs from ZENOH_PORT, for a world on the same host
-MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # arguments of the interpreter
-NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # extras by process name, in the order of placement
+MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # arguments for the Python interpreter
+NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # extras by process name, in placement order
 OF_CAMERAS = ("camera", "detector")  # roles that a run waits for only if the scenario names them
-COMMANDS = {RECORDER: "record", "detector": "detect"}  # commands of roles, where the names differ
+COMMANDS = {RECORDER: "record", "detector": "detect"}  # commands that are not named after their role
 KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # extras by prefix of the process name
-MODULES = {  # module that is imported to check an extra; "": the installation without extras
+MODULES = {  # module imported to check that an extra is installed; "": the installation without extras
     "": "zsim.transport.session",
     "agents": "zsim_agents.estimation.estimator",
     "record": "zsim_agents.recorder",
@@ -61,53 +61,53 @@ class Host(Spec, frozen=True, kw_only=True):
     """A computer on which roles run."""
 
     address: Address
-    """Address at which the other hosts reach it."""
+    """Address at which other hosts reach this one."""
     ssh: Address | None = None
-    """Address at which the launcher reaches it, if that differs."""
+    """Address at which the launcher reaches this host, if different."""
     port: Port = SSH_PORT
     user: Text | None = None
     key: Text | None = None
-    """Private key file; None: the keys of the ssh agent and of ~/.ssh."""
+    """Private key file; None: the keys of the SSH agent and in ~/.ssh."""
     known_hosts: Text | None = None
-    """File with its host key; None: ~/.ssh/known_hosts."""
+    """Known-hosts file that lists this host's key; None: ~/.ssh/known_hosts."""
     folder: Text = ".zsim"
-    """Folder for zsim's installation and files; a relative path starts at the home folder."""
+    """Folder for zsim's installation and files; a relative path is taken from the home folder."""
     python: Text | None = None
-    """Absolute path of an interpreter that has zsim; None: that of `zsim push`."""
+    """Absolute path of a Python interpreter with zsim installed; None: the one that `zsim push` sets up."""
     router: Name | None = None
-    """Router through which its roles reach the world; None: they connect to the world directly."""
+    """Router through which this host's roles reach the world; None: they connect to the world directly."""
 
 
 class Router(Spec, frozen=True, kw_only=True):
-    """A Zenoh router, run as a process of zsim."""
+    """A Zenoh router that zsim runs as one of its processes."""
 
     host: Name
     port: Port = ROUTER_PORT
     upstream: Name | None = None
-    """Router to which it connects; None: the world."""
+    """Router to which this one connects; None: it connects to the world."""
 
 
 class Security(Spec, frozen=True, kw_only=True):
-    """Settings of TLS and access control."""
+    """TLS and access-control settings."""
 
     certificates: Text = "certs"
-    """Folder of `zsim certs init`, relative to the inventory."""
+    """Folder created by `zsim certs init`, relative to the inventory's folder."""
     insecure: bool = False
-    """Whether to do without TLS and access control, on a network of your own."""
+    """Whether to run without TLS and access control; only for a network of your own."""
 
 
 class Inventory(Spec, frozen=True, kw_only=True):
     hosts: Annotated[dict[Name, Host], Meta(max_length=HOSTS_MAX)]
     roles: Annotated[dict[Text, Name | Annotated[list[Name], Meta(max_length=HOSTS_MAX)]], Meta(max_length=ROLES_MAX)]
-    """Host of each process, by name or pattern; a list of hosts is used in turn for the processes that match."""
+    """Host of each process, by name or pattern; the hosts in a list are assigned in turn to the matching processes."""
     routers: Annotated[dict[Name, Router], Meta(max_length=HOSTS_MAX)] = msgspec.field(default_factory=dict)
     port: Port = ZENOH_PORT
-    """Port of the world."""
+    """Port on which the world listens."""
     security: Security = Security()
 
 
 class InventoryFile(NamedTuple):
-    """An inventory on disk; relative paths in it refer to its folder."""
+    """An inventory read from disk; its relative paths start at `folder`."""
 
     inventory: Inventory
     folder: Path
@@ -115,12 +115,12 @@ class InventoryFile(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Return the path of the file, quoted as a word for a shell."""
+        """Return the path of the file, quoted for a shell."""
         return shlex.quote(str(self.folder / self.source))
 
 
 def load(path: Path) -> InventoryFile:
-    """Read an inventory from a YAML file; InventoryError with one line for every fault."""
+    """Read an inventory from a YAML file; raise InventoryError with a line for each fault."""
     document = yaml_file.read(path, EXAMPLE, InventoryError)
     flaws = chain(faults(document, Inventory), _cross_faults(document))
     lines = first_lines(f"{path.name}: {where} {text}" for where, text in flaws)
@@ -130,16 +130,16 @@ def load(path: Path) -> InventoryFile:
 
 
 def insecure(placed: InventoryFile) -> InventoryFile:
-    """Return an inventory with `security: {insecure: true}`."""
+    """Return a copy of the inventory with `security: {insecure: true}`."""
     security = msgspec.structs.replace(placed.inventory.security, insecure=True)
     return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
 
 
 def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
-    """Yield the faults that concern several fields: unknown hosts and routers, and cycles of routers."""
+    """Yield the faults that a check of single fields misses, such as unknown hosts and cycles of routers."""
 
     def entries(name: str) -> list[tuple[Any, Any]]:
-        """Return the entries of a field; empty if it is not a map, or has too many entries to compare."""
+        """Return the entries of a field; none if it is not a map, or has too many entries to compare."""
         value = document.get(name)
         return list(value.items()) if isinstance(value, dict) and len(value) <= ROLES_MAX else []
 
@@ -182,10 +182,11 @@ def roles(scenario: Scenario) -> list[str]:
 
 
 def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
-    """Return the host of every process, by `spread`.
+    """Return the host of every process, as assigned by `spread`.
 
-    A program of the scenario may have none: then `zsim up` starts it on the launcher's machine. InventoryError if
-    another process has no host, an entry matches no process, or two processes listen on the same port.
+    A program of the scenario may have no host: `zsim up` then starts it on the launcher's machine. Raises
+    InventoryError if any other process has no host, an entry matches no process, or two processes listen on the same
+    port.
     """
     names, inventory = roles(scenario), placed.inventory
     entries = inventory.roles
@@ -210,10 +211,10 @@ def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
 
 
 def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
-    """Return the hosts of processes by name, where they have one; the hosts of an entry are used in turn.
+    """Return the host of each process that has one, by name; the hosts of an entry are assigned in turn.
 
-    A name takes precedence over a pattern, and a longer pattern over a shorter one. The recorder's default host is that
-    of the world.
+    A name takes precedence over a pattern, and a longer pattern over a shorter one. By default the recorder runs on the
+    world's host.
     """
     places: dict[str, str] = {}
     turns: Counter[str] = Counter()
@@ -231,19 +232,19 @@ def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict
 
 
 def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
-    """Return the endpoint to which the roles on a host connect: that of their router, or of the world."""
+    """Return the endpoint to which the roles on a host connect: that of their router or of the world."""
     return listening(placed, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
 
 
 def listening(placed: InventoryFile, host: str, port: int) -> str:
-    """Return the endpoint of a process that listens on a host, with the address that other hosts use."""
+    """Return the endpoint of a process that listens on a host, with the address at which other hosts reach it."""
     address = placed.inventory.hosts[host].address
     shown = f"[{address}]" if ":" in address else address
     return f"{'tcp' if placed.inventory.security.insecure else 'tls'}/{shown}:{port}"
 
 
 def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
-    """Return, for host and port of each listening process, the other hosts whose roles and routers connect to it."""
+    """Return, by host and port of the listening process, the other hosts whose roles or routers connect to it."""
     inventory = placed.inventory
     links = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
     links += [(router.host, router.upstream) for router in inventory.routers.values()]
@@ -266,7 +267,7 @@ def below_home(path: str) -> str:
 
 
 def python(host: Host) -> str:
-    """Return the path of the interpreter on a host that has zsim: as given, or that of `zsim push`."""
+    """Return the path of a host's Python interpreter with zsim: the one given, or that of `zsim push`."""
     return host.python or f"{below_home(host.folder)}/venv/bin/python"
 
 
@@ -276,17 +277,17 @@ def python(host: Host) -> str:
 class PlannedProcess(NamedTuple):
     """One process of a run."""
 
-    name: str  # `role.thing`
+    name: str  # the role, or `role.thing`
     host: str
     words: tuple[str, ...]  # words of the command, without file paths and `thing`
-    thing: str | None  # argument of the command: name of a drone, a cluster or a router; None: no argument
+    thing: str | None  # argument of the command, such as the name of a drone, cluster or router; None: no argument
     port: int | None  # port on which it listens; None: it does not listen
-    secure: bool  # uses TLS
+    secure: bool  # whether it uses TLS
     on_death: OnDeath
 
     @property
     def is_restarted(self) -> bool:
-        """Whether its service restarts it; never for a world, which has no journal as a service."""
+        """Whether its service restarts it; never the world's, because a world run as a service keeps no journal."""
         return self.on_death == "restart" and self.name != WORLD
 
     @property
@@ -299,18 +300,18 @@ class PlannedProcess(NamedTuple):
 
 
 class ProcessFiles(NamedTuple):
-    """Paths of the files of a process, as given in its command line."""
+    """Paths of a process's files, as given on its command line."""
 
     scenario: str
     identity: str  # folder with ca.pem, certificate.pem and key.pem
-    access: str  # file with the access control of a listening process
-    out: str  # folder of the record
+    access: str  # access-control file of a listening process
+    out: str  # folder for the record
 
 
 def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
     """Return the processes that zsim can start: the world, the recorder, agents, cameras, then routers.
 
-    `pace`: command line options of the world. InventoryError as for `placement`.
+    `pace`: command-line options that set the world's pace. Raises InventoryError as `placement` does.
     """
     inventory, places = placed.inventory, placement(placed, scenario)
 
@@ -329,7 +330,7 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
             return planned(name, host, ("agent", *reach), name, None)
         if role in OF_CAMERAS:
             words = (*words, "--name", name)
-            thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # empty: all with cameras
+            thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # empty: all with a camera
         return planned(name, host, words, thing or None, None)
 
     def router(name: str) -> PlannedProcess:
@@ -349,7 +350,7 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
 
 
 def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
-    """Return a line on each program of the user's own, with its command.
+    """Return a line about each of the user's own programs, with its command.
 
     `host`: only programs placed on that host; None: all, including those without a host.
     """
@@ -366,13 +367,13 @@ def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = N
 
 
 def programs_here(placed: InventoryFile, scenario: Scenario) -> list[str]:
-    """Return the programs of a scenario that have no host; `zsim up` starts them on this machine."""
+    """Return the names of a scenario's programs without a host; `zsim up` starts them on this machine."""
     places = placement(placed, scenario)
     return [name for name in programs(scenario) if name not in places]
 
 
 def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
-    """Return the command line of a program of the scenario; the user fills in `{folder}`, that of the run."""
+    """Return a scenario program's command line, empty for others; the user replaces `{folder}` by the run's folder."""
     if name not in scenario.own_programs:
         return ""
     values = {"endpoint": endpoint, "federation": scenario.federation, "name": name, "folder": "{folder}"}
@@ -391,11 +392,11 @@ def command(process: PlannedProcess, files: ProcessFiles) -> list[str]:
     if process.secure and process.port is not None:
         words += ["--access", files.access]
     argument = files.scenario if process.name == WORLD else process.thing
-    return [*words, "--", argument] if argument is not None else words  # the name may begin with a dash
+    return [*words, "--", argument] if argument is not None else words  # the argument may begin with a dash
 
 
 def access_file(process: PlannedProcess) -> str:
-    """Return the name of the file with the access control of a listening process, in its host's certificate folder."""
+    """Return the name of a listening process's access-control file, in its host's certificate folder."""
     return f"{process.name}.access.json"
 
 
@@ -413,7 +414,7 @@ def extras(names: Sequence[str]) -> list[str]:
 
 
 def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:
-    """Return the extras that every host needs, and those of `more`.
+    """Return the extras that each host needs, including `more`.
 
     A pattern counts for every role that it can match, because the scenario is unknown here. Routers and the user's own
     programs need no extra.

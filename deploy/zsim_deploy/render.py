@@ -1,8 +1,8 @@
-"""`zsim render`: the processes of an inventory and a scenario as systemd units, compose files or Kubernetes manifests.
+"""`zsim render`: the processes of a run, from inventory and scenario, as systemd, Compose or Kubernetes files.
 
-Templates are in templates/, with `$name` for values. YAML templates are filled in as data and dumped again, so that
-every value is quoted correctly. Restart limits and exit codes are those of the supervisor, so that a role is restarted
-in the same cases as by `zsim run`.
+The templates in templates/ have `$name` in place of values. YAML templates are filled in as data and dumped again, so
+that every value is quoted correctly. Restart limits and exit codes are those of the supervisor, so that a role is
+restarted in the same cases as under `zsim run`.
 
 Zenoh's endpoints and the certificates name the hosts of the inventory, so containers and Pods use their host's network.
 """
@@ -36,32 +36,32 @@ TEMPLATES = Path(__file__).with_name("templates")
 
 STATE = "/var/lib/zsim"  # folder that StateDirectory=zsim stands for
 CACHE = "/var/cache/zsim"  # folder that CacheDirectory=zsim stands for
-PATH_MAX = 4000  # length of a folder's path, bytes; Linux allows 4095, including the names of the files in it
-STOP_S = 15  # time to stop before SIGKILL; a world waits 5 s for byes, and a recorder may wait for its disk
+PATH_MAX = 4000  # maximum length of a folder's path, bytes; Linux allows 4095, file names included
+STOP_S = 15  # time to stop before SIGKILL; the world waits 5 s for bye messages, and the recorder may wait for its disk
 BASE = "python:3.11-slim"  # base image, with the oldest Python that zsim runs on
 WHEEL = f"zsim-{RELEASE}-py3-none-any.whl"
 IMAGE = f"zsim:{RELEASE}"
-USER = 1000  # user and group id in images, those of Debian's first ordinary user
+USER = 1000  # user and group id in images; those of Debian's first ordinary user
 CERTIFICATES, ACCESS, SCENARIO, RUNS = "/certs", "/access/access.json", "/scenario/scenario.yaml", "/runs"
 ENVIRONMENT = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
 IN_A_CONTAINER = {
     "cache": CACHE, "scenario": SCENARIO, "runs": RUNS, "certificates": CERTIFICATES, "access": ACCESS, "user": USER,
     "stop_s": STOP_S,
 }  # fmt: skip
-NAME_MAX = 63  # length of a label; RFC 1123
-CONFIG_BYTES_MAX = 1_048_576  # size of a ConfigMap; Kubernetes documentation, "ConfigMaps"
+NAME_MAX = 63  # maximum length of a label; RFC 1123
+CONFIG_BYTES_MAX = 1_048_576  # maximum size of a ConfigMap; Kubernetes documentation, "ConfigMaps"
 FINAL_CODES = [USER_FAULT, SUPERSEDED]  # exit codes after which no restart helps: a user's mistake, a name taken over
 
 
-# systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops the units together
+# systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops them together
 
 
 def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
-    """Return `HOST/zsim-PROCESS.service` and `HOST/zsim.target`, and the scenario for the world's host.
+    """Return the files `HOST/zsim-PROCESS.service` and `HOST/zsim.target`, and the scenario for the world's host.
 
     The options are those of systemd.exec(5) and systemd.service(5), without MemoryDenyWriteExecute (numba compiles) and
-    ProcSubset (libraries read /proc/cpuinfo). `pace`: command line options of the world. InventoryError if a process
-    has no host, or if a host has no user, or a relative path to its interpreter.
+    ProcSubset (libraries read /proc/cpuinfo). `pace`: command-line options that set the world's pace. Raises
+    InventoryError if a process has no host, or if a host has no user, or a relative path to its interpreter.
     """
     planned, hosts = inv.processes(placed, scenario, pace), placed.inventory.hosts
     _refuse(placed, [f"hosts.{name}.{text}" for name in inv.used_hosts(planned) for text in _lacks(hosts[name])])
@@ -91,7 +91,7 @@ def _lacks(host: Host) -> Iterator[str]:
 
 
 def _home(user: str | None) -> str | None:
-    """Return the usual home of a user; None for an invalid name (systemd, "User/Group Name Syntax", relaxed mode)."""
+    """Return a user's usual home folder; None for an invalid name (systemd, "User/Group Name Syntax", relaxed mode)."""
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_.-]{0,30}", user or ""):
         return None
     return "/root" if user == "root" else f"/home/{user}"
@@ -102,7 +102,7 @@ def _absolute(host: Host, path: str) -> str:
 
 
 def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequence[PlannedProcess]) -> str:
-    """Return the unit of a process; units stop in reverse order: first the world, which ends the run, last routers."""
+    """Return the unit of a process; units stop in reverse order: the world first, which ends the run, routers last."""
     rank = {ROUTER: 0, WORLD: 2}
     earlier = [each.unit for each in here if rank.get(each.role, 1) < rank.get(process.role, 1)]
     folder = _absolute(host, host.folder)
@@ -112,7 +112,7 @@ def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequ
         access=f"{folder}/certs/{inv.access_file(process)}",
         out=f"{STATE}/runs/{scenario.name}-{RUN_ID}",
     )
-    # ":" disables variable substitution; doubling "$" would not help, since it stays doubled in the program's path.
+    # The ":" disables variable substitution; doubling "$" would not help, since it stays doubled in the program's path.
     words = (f":{_absolute(host, inv.python(host))}", *inv.command(process, files))
     remarks = []
     if not host.folder.startswith("/"):
@@ -148,9 +148,9 @@ def _systemd_word(text: str) -> str:
 
 
 def compose(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
-    """Return `HOST/compose.yaml` and `HOST/Dockerfile`, and the scenario for the world's host.
+    """Return the files `HOST/compose.yaml` and `HOST/Dockerfile`, and the scenario for the world's host.
 
-    `pace`: command line options of the world. InventoryError if a process has no host.
+    `pace`: command-line options that set the world's pace. Raises InventoryError if a process has no host.
     """
     planned = inv.processes(placed, scenario, pace)
     head, (project,) = _yaml_template("compose.yaml")
@@ -158,7 +158,7 @@ def compose(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ())
     texts: Rendered = {}
     for host in inv.used_hosts(planned):
         here = inv.on_host(planned, host)
-        values = {"project": scenario.federation.replace(".", "-").lstrip("-_") or "zsim"}  # a-z, 0-9, - and _
+        values = {"project": scenario.federation.replace(".", "-").lstrip("-_") or "zsim"}  # allowed: a-z, 0-9, - and _
         services = {process.name: _compose_service(service, scenario, process) for process in here}
         remarks = [*_filled(head, {"restarts_max": RESTARTS_MAX}), *_unused(placed, host)]
         remarks += [f"# {line}" for line in inv.own_programs(placed, scenario, host)]
@@ -210,7 +210,7 @@ def _unused(placed: InventoryFile, host: str) -> list[str]:
 
 
 def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
-    """Return the Dockerfile of an image with the extras of processes; it expects zsim's wheel beside it."""
+    """Return the Dockerfile of an image with the extras that processes need; zsim's wheel must lie beside it."""
     extras = inv.extras([process.name for process in planned])
     wanted = f"[{','.join(extras)}]" if extras else ""
     return _text("Dockerfile", {**IN_A_CONTAINER, "wheel": WHEEL, "base": BASE, "extras": wanted})
@@ -220,11 +220,11 @@ def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
 
 
 def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
-    """Return `namespace.yaml`, `zsim.yaml`, `records.yaml`, a Dockerfile, and with TLS also `secrets.sh`.
+    """Return the files `namespace.yaml`, `zsim.yaml`, `records.yaml`, a Dockerfile, and with TLS also `secrets.sh`.
 
-    The hosts must be named like the nodes, which must find the Dockerfile's image as `image`. `pace`: command line
-    options of the world. InventoryError if a process has no host, Kubernetes does not allow a name, or the scenario is
-    too large.
+    The hosts must be named like the Kubernetes nodes, which must find the Dockerfile's image under the name `image`.
+    `pace`: command-line options that set the world's pace. Raises InventoryError if a process has no host, Kubernetes
+    does not allow a name, or the scenario is too large.
     """
     planned, text = inv.processes(placed, scenario, pace), scenario_file.to_text(scenario)
     _refuse(placed, _kubernetes_faults(planned, text))
@@ -248,7 +248,7 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
         texts[name] = _dump(head, _filled(lasting, shared))
     texts["Dockerfile"] = _dockerfile(planned)
     if not placed.inventory.security.insecure:
-        puts = []  # lines that copy the certificates of `zsim certs init` into the cluster
+        puts = []  # lines that copy the certificates of `zsim certs init` into Kubernetes
         for process in planned:
             files = [f'--from-file="$certs/{process.host}/{process.name}"']
             if process.port is not None:
@@ -335,7 +335,7 @@ def _yaml_template(name: str) -> tuple[list[str], list[Any]]:
 
 
 def _filled(node: Any, values: Mapping[str, Any]) -> Any:
-    """Return a part of a template with its values; a text that is just `$name` becomes the value itself."""
+    """Return a part of a template with its values filled in; a text that is just `$name` becomes the value itself."""
     if isinstance(node, dict):
         return {key: _filled(value, values) for key, value in node.items()}
     if isinstance(node, list):
@@ -346,14 +346,14 @@ def _filled(node: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _dump(remarks: Sequence[str], documents: Sequence[Any]) -> str:
-    """Return YAML documents as one text, with remarks at the top; the same text for the same input."""
+    """Return YAML documents as one text, with remarks at the top; the same input gives the same text."""
     options: dict[str, Any] = {"sort_keys": False, "default_flow_style": False, "width": 1000}
     texts = [yaml.dump(plain, Dumper=_Dumper, **options) for plain in documents]
     return "".join(f"{line}\n" for line in remarks) + "---\n".join(texts)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes multi-line texts as blocks, and no aliases."""
+    """Writes multi-line texts as block scalars, and never writes aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -369,11 +369,12 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 
 
 def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False) -> list[str]:
-    """Write texts into a folder; return the files of an earlier rendering for this target that were removed.
+    """Write texts into a folder; return the removed files, which an earlier rendering for this target had written.
 
-    A list beside the files has their digests, in the format of `sha256sum`. By it a later rendering for the same target
-    removes the files of an earlier one. RunError if a file cannot be written, a path leads out of the folder, a file to
-    remove was changed since, or, without `force`, a file to replace was not rendered or was changed since.
+    A list beside the files has their digests, in the format of `sha256sum`, so that a later rendering for the same
+    target can remove the files of an earlier one. Raises RunError if a file cannot be written, a path leads out of the
+    folder, a file to be removed was changed since its rendering, or, without `force`, a file to be replaced was not
+    rendered or was changed since.
     """
     root, record = out.resolve(), out / f".zsim-render-{target}.sha256"
 

@@ -2,5 +2,5 @@
 
 Packages from the bottom up: physics, sensors, vehicles (the firmware), fleet (the compiled kernel over all drones), run
 (the rules of a flight or a replay, without session or wall clock), server (the process). Each imports those below it,
-and zsim. The world interacts with agents and bridges by messages only.
+and zsim. The world interacts with agents and bridges through messages only.
 """

@@ -1,8 +1,9 @@
 """Reproducibility: the fingerprint of a process's code, stated in its join, and the hash of a flight.
 
-A flight is computed with zsim.math.elementary, randomness and linear, which give the same bits on every processor
-and with every version of Python and the numeric packages. So a fingerprint covers only code and contract. Other
-differences between machines are in `machine`, for diagnosis: only users' classes and camera pictures may depend on it.
+A flight is computed with zsim.math.elementary, randomness and linear, which give the same bits on every processor and
+with every version of Python and the numeric packages, so a fingerprint covers only the code and the contract. For
+diagnosis, `machine` lists other differences between machines, on which only users' classes and camera pictures may
+depend.
 """
 
 import hashlib
@@ -23,7 +24,7 @@ from zsim import CONTRACT, __version__
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite")  # numeric packages
 CODE = ("zsim", "zsim_world", "zsim_agents")  # packages whose sources determine a flight
 COLUMNS = 13  # position, velocity, orientation, angular velocity of a drone
-HELD_BYTES = 16_384  # hashed at once, which takes as long as a few small updates
+HELD_BYTES = 16_384  # bytes hashed at once, which takes no longer than a few small updates
 
 
 @cache
@@ -41,7 +42,7 @@ def fingerprint() -> str:
 
 @cache
 def machine() -> dict[str, str]:
-    """Return properties that may differ between machines with equal results: processor, libraries, versions."""
+    """Return what may differ between machines that give equal results: processor, libraries, versions."""
     versions = {package: _version(package) for package in PACKAGES}
     return {
         "python": platform.python_version(),
@@ -55,7 +56,7 @@ def machine() -> dict[str, str]:
 
 
 def _code() -> str:
-    """Return a hash of the sources of the packages in CODE, independent of line ends and folder."""
+    """Return a hash of the sources of the packages in CODE, independent of line endings and folder."""
     found = hashlib.sha256()
     for package in CODE:
         spec = importlib.util.find_spec(package)
@@ -76,7 +77,7 @@ def _version(package: str) -> str:
 
 
 def _cpu() -> str:
-    """Return the processor's model and a hash of its feature flags, which libraries and compilers use."""
+    """Return the processor's model and a hash of its feature flags, on which libraries and compilers depend."""
     found: dict[str, str] = {}
     try:
         with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
@@ -98,7 +99,7 @@ def _blas() -> str:
     found = set()
     for each in threadpoolctl.threadpool_info():
         folder = Path(each["filepath"]).parent
-        package = None  # package whose wheel contains it
+        package = None  # package whose wheel contains the library; None: the system's
         if folder.suffix == ".libs":  # as auditwheel and delvewheel name it
             package = folder.stem
         elif folder.name == ".dylibs":  # as delocate does
@@ -111,8 +112,8 @@ def _blas() -> str:
 class TruthHash:
     """SHA-256 over all truth messages of a flight (docs/protocol.md, "Bit-identical results").
 
-    Each row is t_ns (int64), then position, velocity, orientation and angular velocity (float64); little-endian, in
-    order of time, at equal times drone by drone in scenario order.
+    A row is t_ns (int64), position, velocity, orientation and angular velocity (float64), little-endian. Rows are in
+    order of time and, at equal times, in the scenario's order of drones.
 
     Args:
         rows: number of rows per `add`: the drones at one time, or all rows of a flight.
@@ -145,8 +146,8 @@ class TruthHash:
         """Add rows.
 
         Args:
-            t_ns: of all rows, or of each (rows,) [ns].
-            state: (rows, 13 or more): position, velocity, orientation, angular velocity.
+            t_ns: time of all rows, or of each row, (rows,) [ns].
+            state: (rows, 13 or more), beginning with position, velocity, orientation, angular velocity.
         """
         self._t[self._held] = t_ns
         self._x[self._held] = state[:, :COLUMNS]
@@ -155,7 +156,7 @@ class TruthHash:
             self.flush()
 
     def flush(self) -> None:
-        if not self._held or not self._rows.size:  # empty if all drones are external
+        if not self._held or not self._rows.size:  # no rows if all drones are external
             self._held = 0
             return
         self._hash.update(data := self._rows[: self._held].data)

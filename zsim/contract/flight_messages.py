@@ -1,7 +1,7 @@
 """Messages of a flight, contract version 1: drones, commands, estimates, formations, cameras, and views for displays.
 
-In SI units and radians, with the unit in the name. W is the world frame (ENU), B the body frame (FLU); quaternions are
-w first and rotate B to W.
+Numbers are in SI units and radians, with the unit in the name. W is the world frame (ENU), B the body frame (FLU);
+quaternions have w first and rotate B to W.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ Connection = Literal["waiting", "connected", "armed", "lost"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
 ReferencePhase = Literal["waiting", "approaching", "path", "holding", "over"]
 PICTURE_MAX = 4_000_000  # bytes; larger than a JPEG of 1920 x 1080 at full quality
-SEEN_MAX = 1000  # hats seen in one picture
+SEEN_MAX = 1000  # maximum number of hats seen in one picture
 JPEG_BEGINS = b"\xff\xd8\xff"  # SOI, then the next marker: ISO/IEC 10918-1, B.1
 
 SidePx = Annotated[int, Meta(ge=1, le=16_384)]
@@ -34,10 +34,10 @@ SidePx = Annotated[int, Meta(ge=1, le=16_384)]
 
 @on("drone/*/sensor/status", writers="world driver", readers="estimator controller reference", last="world")
 class Status(Message, frozen=True):
-    """The state of a drone, its last message in every gate.
+    """The state of a drone, published as its last message in every gate.
 
-    `commander` is the source whose commands it accepts; `count` is the number of messages on its `sensor/*` since the
-    last status, including this one.
+    `commander` is the source whose commands the drone accepts; `count` is the number of messages on the drone's
+    `sensor/*` since the last status, including this one.
     """
 
     state: DroneState
@@ -49,7 +49,7 @@ class Status(Message, frozen=True):
 
 @on("drone/*/truth", writers="world driver", last="world")
 class Truth(Message, frozen=True):
-    """The true state of a drone: position, velocity, acceleration in W, attitude B to W, rate in B, rotor speeds."""
+    """The true state of a drone: position, velocity, acceleration in W; attitude B to W; rate in B; rotor speeds."""
 
     position_m: Vector3
     velocity_m_s: Vector3
@@ -70,9 +70,9 @@ class Command(Message, frozen=True):
 @on("drone/*/cmd/velocity", is_output=True)
 @on("drone/*/accepted/velocity")
 class Velocity(Command, frozen=True):
-    """Fly with a velocity [m/s] and turn at a rate [rad/s], counter-clockwise seen from above.
+    """Fly at a velocity [m/s] and turn at a rate [rad/s], counter-clockwise seen from above.
 
-    `frame`: "heading", x forward and y left by the sender's estimate of the yaw; "world", W by the firmware's estimate.
+    `frame` is "heading" (x forward, y left, by the sender's yaw estimate) or "world" (W, by the firmware's estimate).
     """
 
     velocity_m_s: Vector3
@@ -83,7 +83,7 @@ class Velocity(Command, frozen=True):
 @on("drone/*/cmd/ardrone", is_output=True)
 @on("drone/*/accepted/ardrone")
 class Ardrone(Command, frozen=True):
-    """The AR.Drone's own command: tilt forward and left, climb, yaw rate, each in [-1, 1] of its limit."""
+    """The AR.Drone's own command: tilt forward and left, climb, yaw rate, each in [-1, 1], relative to its limit."""
 
     forward: Number
     left: Number
@@ -95,7 +95,7 @@ class Ardrone(Command, frozen=True):
 @on("drone/*/cmd/attitude", is_output=True)
 @on("drone/*/accepted/attitude")
 class Attitude(Command, frozen=True):
-    """Hold the tilt of an orientation B to W (its heading is ignored) with a thrust [N] and a yaw rate [rad/s]."""
+    """Hold the tilt of an orientation B to W, whose heading is ignored, with a thrust [N] and a yaw rate [rad/s]."""
 
     orientation_wxyz: Quaternion
     thrust_n: Number
@@ -105,7 +105,10 @@ class Attitude(Command, frozen=True):
 @on("drone/*/cmd/rotors", is_output=True)
 @on("drone/*/accepted/rotors")
 class RotorSpeeds(Command, frozen=True):
-    """Turn the rotors at these speeds, in the order front left, front right, rear right, rear left."""
+    """Turn the rotors at these speeds, in the vehicle's order.
+
+    Four rotors in a cross are in the order front left, front right, rear right, rear left.
+    """
 
     speed_rad_s: Rotors
 
@@ -113,7 +116,10 @@ class RotorSpeeds(Command, frozen=True):
 @on("drone/*/cmd/mode", is_output=True)
 @on("drone/*/accepted/mode")
 class Mode(Command, frozen=True):
-    """Take off, land, stop the rotors at once, or leave the emergency state; for all with the commander's priority."""
+    """Take off, land, stop the rotors at once, or leave the emergency state.
+
+    Accepted from every source with at least the commander's priority.
+    """
 
     mode: Literal["takeoff", "land", "emergency", "reset"]
 
@@ -125,7 +131,7 @@ class LinkState(Message, frozen=True):
     `state`: `waiting` for the first datagram; `connected`, but disarmed: no command that starts or steers a motor is
     sent; `armed`; `lost` after silence. `peer` is the address whose datagrams are accepted. `age_ms` is the wall time
     since its newest datagram, `loss_percent` the share of its recent datagrams that were lost, `clock_offset_ms` its
-    clock minus the driver's; None if unknown. `refused` counts datagrams that are invalid or from another address.
+    clock minus the driver's; each is None if unknown. `refused` counts datagrams that are invalid or from elsewhere.
     """
 
     source: str
@@ -152,7 +158,7 @@ class Estimate(Message, frozen=True):
     """The estimated state of a drone: position and velocity in W, attitude B to W.
 
     `covariance` is that of position and velocity, 6 x 6, row-major, SI units; `gyro_bias_rad_s` is in B; `sensors`
-    gives by name the numbers of readings used and rejected.
+    gives, by sensor, the numbers of readings used and rejected.
     """
 
     position_m: Vector3
@@ -170,11 +176,11 @@ class Estimate(Message, frozen=True):
 class ClusterState(Message, frozen=True):
     """The estimated and the desired state of a formation.
 
-    `drones` are in the order of the robots, which an assembly changes. `names` are the 4n cluster variables of n
+    `drones` are in the order of the robots, which an assembly may change. `names` are the 4n cluster variables of n
     drones, in the order of `value`, `desired` [m, rad] and `desired_rate` [m/s, rad/s]. `trajectory_t_s` is the
-    trajectory's own time, None if none is running; `margin` is the distance to a singularity in the metric of the
-    cluster space; `reason` is why it waits or is held. `plan_step` is the number of steps of the scenario's plan that
-    a restarted controller skips.
+    trajectory's own time, None if no trajectory is running; `margin` is the distance to a singularity in the metric of
+    the cluster space; `reason` is why the formation waits or is held. `plan_step` is the number of steps of the
+    scenario's plan that a restarted controller skips.
     """
 
     phase: Phase
@@ -198,7 +204,7 @@ class Reference(Message, frozen=True):
     """The reference of a drone with its own pilot: position and velocity in W, heading.
 
     `phase`: `waiting` on the ground, `approaching` the start of its path or a position, on the `path`, `holding` a
-    position, `over` once it is to land. `path_t_s` is the path's own time, None if none is flown.
+    position, `over` once the drone is to land. `path_t_s` is the path's own time, None off the path.
     """
 
     phase: ReferencePhase
@@ -236,10 +242,10 @@ class CameraImage(Message, frozen=True, kw_only=True):
 @on("drone/*/camera/front/info", is_output=True)
 @on("drone/*/camera/bottom/info", is_output=True)
 class CameraInfo(Message, frozen=True, kw_only=True):
-    """The intrinsics and pose of a camera; its last value is kept.
+    """The intrinsics and pose of a camera; the last value is kept.
 
-    `K` is row-major; `D` is k1, k2, p1, p2, k3. `position_m` is the camera's in B; `orientation_wxyz` rotates K (x
-    right, y down, z ahead) to B. `exposure_s` is the exposure time, `gate_ns` the run's gate.
+    `K` is row-major; `D` is k1, k2, p1, p2, k3. `position_m` is the camera's position in B; `orientation_wxyz` rotates
+    the camera frame (x right, y down, z ahead) to B. `gate_ns` is the interval of the run's gates.
     """
 
     source: str = ""
@@ -257,8 +263,8 @@ class CameraInfo(Message, frozen=True, kw_only=True):
 class Seen(Struct, frozen=True, gc=False):
     """A sighted hat, without the identity of its drone.
 
-    `direction_B` is the unit vector from the camera to the hat's centre in B. The sigmas are standard deviations,
-    that of the direction about each of the two axes across it.
+    `direction_B` is the unit vector from the camera to the hat's centre in B. The sigmas are standard deviations, that
+    of the direction about each of two axes perpendicular to it.
     """
 
     direction_B: Vector3
@@ -278,7 +284,7 @@ class Sightings(Message, frozen=True, kw_only=True):
     seen: Annotated[tuple[Seen, ...], Meta(max_length=SEEN_MAX)] = ()
 
 
-# For displays: no gate waits for these, and they may skip gates
+# For displays: no gate waits for these messages, and they may skip gates
 
 
 class DroneView(Struct, frozen=True):
@@ -351,7 +357,7 @@ def cluster_view(state: ClusterState, t_ns: int, seq: int) -> ViewCluster:
 
 
 def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | None:
-    """Return the fault of the first of the named fields without `length` entries; None if all have them."""
+    """Return the fault of the first named field that does not have `length` entries; None if all do."""
     for name in names:
         entries = len(getattr(message, name))
         if entries != length:
@@ -359,7 +365,7 @@ def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | 
     return None
 
 
-# Commands that a drone accepts, and plausible truths of a driver
+# Commands that a drone accepts, and plausible truths from a driver
 
 _ALL: frozenset[DroneState] = frozenset(get_args(DroneState))
 _RULES: dict[str, tuple[str, frozenset[DroneState]]] = {
@@ -372,32 +378,35 @@ _SETPOINT = ("a setpoint needs it hovering or flying", AIRBORNE)
 
 
 def state_refusal(name: str, state: str, asked: str) -> str | None:
-    """Return why a drone refuses a command in its state; None if it accepts it.
+    """Return why a drone refuses a command in its current state; None if it accepts the command.
 
     Args:
-        name: of the drone.
-        asked: the requested mode; any other word for a setpoint.
+        name: name of the drone.
+        asked: the requested mode; any other text stands for a setpoint.
     """
     need, states = _RULES.get(asked, _SETPOINT)
     return None if state in states else f"{name} is {state}; {need}"
 
 
-POSE_AGE_MAX_NS = 500_000_000  # contract; 25 gates, the limit for an estimate in flight too: 1 m at 2 m/s
-DISTANCE_MAX_M = 100_000.0  # of each coordinate, as in scenarios: a tangent plane is no map of a larger area
-SPEED_MAX_M_S = 200.0  # chosen: twice the speed of the fastest racing drones
-RATE_MAX_RAD_S = 100.0  # chosen: more than twice the range of a gyroscope of 2000 deg/s
+POSE_AGE_MAX_NS = 500_000_000  # contract: 25 gates, 1 m at 2 m/s; also the limit for an estimate in flight
+DISTANCE_MAX_M = 100_000.0  # of each coordinate, as in scenarios: a tangent plane cannot represent a larger area
+SPEED_MAX_M_S = 200.0  # design choice: twice the speed of the fastest racing drones
+RATE_MAX_RAD_S = 100.0  # design choice: more than twice the range of a 2000 deg/s gyroscope
 UNIT_SLACK = 0.01  # tolerance of a quaternion's length; single precision stays within 1e-6
 
 
 def moved_on(p_W: Sequence[float], v_W: Sequence[float], age_ns: int) -> tuple[float, float, float]:
-    """Return a drone's position [m; W] from a pose of that age: constant velocity for POSE_AGE_MAX_NS, then at rest."""
+    """Return a drone's position [m; W] from an old pose, at constant velocity for POSE_AGE_MAX_NS, then at rest."""
     age_s = min(max(0, age_ns), POSE_AGE_MAX_NS) * 1e-9
     x, y, z = (p + v * age_s for p, v in zip(p_W, v_W, strict=True))
     return x, y, z
 
 
 def truth_fault(truth: Truth, rotors: int) -> str | None:
-    """Return the fault of the first implausible value in a driver's finite truth; None if all are plausible."""
+    """Return the fault of the first implausible field of a driver's truth; None if all are plausible.
+
+    The numbers are known to be finite.
+    """
     limits = (
         ("position_m", DISTANCE_MAX_M, "m"),
         ("velocity_m_s", SPEED_MAX_M_S, "m/s"),

@@ -1,10 +1,10 @@
-"""Many messages at a time as bytes: those of a gate, written from rows of numbers, and several in one payload.
+"""Many messages at once as bytes: those of a gate, written from rows of numbers, and several in one payload.
 
-    @gate, @gate/{drone}   the world's messages about its drones at one gate           GateMessages
+    @gate, @gate/{drone}   the world's messages about its drones at one gate         GateMessages
     @batch                 [key, payload] of all messages through the hub, in order  encode_batch, decode_batch
 
-Sent singly, each message of a gate would wake every reader and the hub. These keys are outside the contract and begin
-with `@`, which no wildcard of Zenoh matches: a subscriber to `**` receives only the single messages.
+If the messages of a gate were sent one by one, each would wake every reader and the hub. These keys are outside the
+contract and begin with `@`, which no wildcard of Zenoh matches: a subscriber to `**` receives only the single messages.
 
     rows of numbers ── write ──▶ bytes ── read ──▶ rows of numbers
 
@@ -31,18 +31,18 @@ from zsim.contract.messages import REFUSALS
 from zsim.errors import DecodeError
 from zsim.schema.message import Count
 
-KINDS = (*keys.SENSORS, "truth", "status")  # of messages about a drone
-BATCH_MAX = 5_000  # messages per batch; a flood is split into several
+KINDS = (*keys.SENSORS, "truth", "status")  # kinds of messages about a drone
+BATCH_MAX = 5_000  # maximum number of messages per batch; more are split into several batches
 Pairs = list[tuple[str, bytes]]  # keys and payloads in order of publication
 _INT = np.dtype("<i8")
-PATTERNS_MAX = 64  # key patterns of gates cached by a reader; sensors with six rates have fewer
+PATTERNS_MAX = 64  # maximum number of gates' key patterns cached by a reader; sensors with six rates have fewer
 T = TypeVar("T")
 
 LITERAL, FLOATS, INT, BOOL, TEXT = range(5)  # parts of a layout
 GAP = 31  # bytes reserved before each payload for a record's message head, `zsim.record.mcap_layout.MESSAGE`
 INT_BYTES_MAX, FLOAT_BYTES = 9, 9
 FLOAT64, FALSE, TRUE, MAP = 0xCB, 0xC2, 0xC3, 0x80  # msgpack's type bytes
-UINT8, INT8 = 0xCC, 0xD0  # followed by those of 16, 32 and 64 bits
+UINT8, INT8 = 0xCC, 0xD0  # followed by the type bytes for 16, 32 and 64 bits
 COUNT_MAX = 0x7F  # largest integer that is its own type byte
 INFINITE = np.uint64(0x7FF0_0000_0000_0000)  # exponent bits of infinities and NaN
 _encode = msgspec.msgpack.Encoder().encode
@@ -56,7 +56,7 @@ _WHOLE = {
 
 
 def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS.
+    """Return the keys of the world's messages about `drones`, drone by drone, each in the order of KINDS.
 
     `own` names the run's user sensors, sightings and scanners, whose keys follow those of KINDS.
     """
@@ -74,7 +74,7 @@ def _places(table: tuple[str, ...]) -> dict[str, int]:
 
 
 class _PackedGate(Struct, array_like=True, gc=False):
-    """GateMessages as sent; integers as little-endian int64."""
+    """GateMessages as sent; the columns are little-endian int64."""
 
     t_ns: Count
     seq: Count
@@ -93,7 +93,7 @@ class GateMessages:
     """The world's M messages about its drones at one gate, in order of publication, as columns and one buffer.
 
     Message m has the key table[which[m]], the stamp stamps[m] and the payload buffer[ends[m - 1] + GAP : ends[m]].
-    Columns received from another process may point outside table and buffer: `check` them, or check each index when
+    Columns received from another process may point outside table and buffer: `check` them, or check each index before
     using it.
     """
 
@@ -101,10 +101,10 @@ class GateMessages:
     seq: int  # number of the gate
     table: tuple[str, ...]  # keys; the same object at every gate
     which: NDArray[np.int64]  # index of each message's key in the table, (M,)
-    stamps: NDArray[np.int64]  # t_ns of each [ns], (M,)
-    ends: NDArray[np.int64]  # end of each in the buffer, (M,); GAP bytes before each payload are reserved
+    stamps: NDArray[np.int64]  # t_ns of each message [ns], (M,)
+    ends: NDArray[np.int64]  # end of each payload in the buffer, (M,); GAP bytes before each payload are reserved
     buffer: bytes | bytearray  # owned by this object
-    first: Sequence[int] = ()  # index of each drone's first message, and of the end, (N + 1,); empty if unknown
+    first: Sequence[int] = ()  # index of each drone's first message, then M, (N + 1,); empty if unknown
 
     @classmethod
     def of(
@@ -113,7 +113,7 @@ class GateMessages:
         seq: int,
         table: tuple[str, ...],
         pairs: Sequence[tuple[str, bytes]],  # keys in the table, and payloads
-        stamps: Sequence[int] | None = None,  # t_ns of each [ns]; None: the gate's
+        stamps: Sequence[int] | None = None,  # t_ns of each message [ns]; None: the gate's
         first: Sequence[int] = (),
     ) -> "GateMessages":
         """Return encoded messages as one object."""
@@ -126,7 +126,7 @@ class GateMessages:
 
     @classmethod
     def unpack(cls, payload: bytes, table: tuple[str, ...]) -> "GateMessages":
-        """Return the messages packed by `pack`, unchecked; DecodeError for any other payload."""
+        """Return the messages packed by `pack`, unchecked; raise DecodeError for any other payload."""
         try:
             p = _decode_gate(payload)
         except REFUSALS as error:
@@ -165,7 +165,7 @@ class GateMessages:
         return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
 
     def decoded(self) -> Iterator[tuple[str, Any]]:
-        """Yield keys and messages; DecodeError if a message does not fit its key."""
+        """Yield keys and messages; raise DecodeError if a message does not fit its key."""
         for key, payload in self.pairs:
             yield key, messages.decode(key, payload)
 
@@ -175,7 +175,7 @@ class GateMessages:
 
 
 class PerPattern(Generic[T]):
-    """A cache of what `learn` derives from the keys of a gate, since the same combinations recur."""
+    """A cache of what `learn` derives from the keys of a gate's messages, since the same sequences of keys recur."""
 
     def __init__(self, learn: Callable[[GateMessages], T]) -> None:
         self._learn = learn
@@ -204,7 +204,7 @@ def encode_batch(passed: Pairs) -> bytes:
 
 
 def decode_batch(payload: bytes) -> Pairs:
-    """Return the [key, payload] pairs of a batch; DecodeError if it is not a batch."""
+    """Return the [key, payload] pairs of a batch; raise DecodeError if the payload is no batch."""
     try:
         return _decode_batch(payload)
     except REFUSALS as error:
@@ -212,7 +212,7 @@ def decode_batch(payload: bytes) -> Pairs:
 
 
 def pairs_of(result: Any) -> Pairs:
-    """Return the [key, payload] pairs in the result of an answer; DecodeError for any other result."""
+    """Return the [key, payload] pairs in the result of an answer; raise DecodeError for any other result."""
     try:
         return msgspec.convert(result, Pairs, builtin_types=(bytes,))  # otherwise texts would pass as base64
     except REFUSALS as error:
@@ -220,15 +220,15 @@ def pairs_of(result: Any) -> Pairs:
 
 
 class Program(NamedTuple):
-    """The layouts of some kinds in the form used by `write`."""
+    """The layouts of some kinds of messages, in the form used by `write` and `read`."""
 
     ops: NDArray[np.int64]  # (K, 3): operation and its two arguments
-    first: NDArray[np.int64]  # (kinds + 1,), index of the first operation of each kind, and their number
+    first: NDArray[np.int64]  # (kinds + 1,), index of the first operation of each kind, then K
     literals: NDArray[np.uint8]
 
 
 class TextTable(NamedTuple):
-    """Texts that a message may contain, by number."""
+    """Encoded texts that a message may contain, referred to by index."""
 
     data: NDArray[np.uint8]
     ends: NDArray[np.int64]
@@ -237,12 +237,12 @@ class TextTable(NamedTuple):
 class Layouts:
     """The layouts of some kinds of messages.
 
-    One row holds a message's integers, booleans and texts (as indices in a TextTable), another its floats, both in the
-    order of its fields.
+    One row holds a message's integers, booleans and texts (as indices into a TextTable), another its floats, both in
+    the order of its fields.
 
     Args:
-        kinds: message classes, in the order in which `write` numbers them; a class with an array of variable length
-            comes with that length.
+        kinds: message classes, in the order in which `write` numbers them; a class with an array of variable length is
+            paired with that length.
 
     Raises:
         TypeError: a field has a type without a fixed layout.
@@ -301,18 +301,18 @@ def array_head(size: int) -> bytes:
 
 
 def words(texts: Iterable[str | None]) -> TextTable:
-    """Return the table of texts for `write`."""
+    """Return the table of some texts for `write`."""
     parts = [_encode(text) for text in texts]
     return TextTable(np.frombuffer(b"".join(parts), dtype=np.uint8), np.cumsum([len(part) for part in parts]))
 
 
 def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
-    """Write one message into `out` at `start`; return its end. To be compiled.
+    """Write one message into `out` at `start`; return its end. To be compiled by the caller.
 
     Args:
-        program, words: see Layouts.
-        ints: its integers (I,); bits: its floats (F,) as uint64.
-        out: uint8, large enough.
+        program: `program` of Layouts; words: its texts; kind: index of the message's class in the Layouts.
+        ints: the message's integers, (I,); bits: its floats as uint64, (F,).
+        out: bytes (uint8), with at least `Layouts.room` of them from `start` on.
     """
     at = np.uint64(start)  # unsigned indices need no test for negative values: byte loops become word copies
     for k in range(program.first[kind], program.first[kind + 1]):
@@ -353,12 +353,12 @@ def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: ND
 def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints: NDArray, bits: NDArray) -> bool:
     """Read a message written by `write`; return False for any other, even if valid.
 
-    Reads finite floats, booleans and non-negative integers, but no texts. To be compiled.
+    Reads finite floats, booleans and non-negative integers, but no texts. To be compiled by the caller.
 
     Args:
-        program: see Layouts.
-        data: uint8, with the message in [start, end).
-        ints: receives its integers (I,); bits: its floats (F,) as uint64.
+        program: `program` of Layouts; kind: index of the message's class in the Layouts.
+        data: bytes (uint8), with the message in [start, end).
+        ints, bits: filled by this function with the message's integers, (I,), and its floats as uint64, (F,).
     """
     at, stop = np.uint64(start), np.uint64(end)
     for k in range(program.first[kind], program.first[kind + 1]):

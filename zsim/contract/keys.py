@@ -1,8 +1,8 @@
 """The keys of the contract: construction, parsing, matching, and the table of their messages.
 
-Keys inside a process are without the federation's prefix ("drone/drone1/truth"); the session adds it.
-A message class declares its keys with `on`; decoders, access rights and the last values that the world answers are
-derived from the table of these declarations, TOPICS.
+Inside a process, keys lack the federation's prefix ("drone/drone1/truth"); the session adds it. A message class
+declares its keys with `on`; decoders, access rights and the last values that the world returns are derived from the
+table of these declarations, TOPICS.
 """
 
 import re
@@ -17,7 +17,7 @@ from zsim.errors import BadNameError
 from zsim.sensors.sensor_catalogue import STOCK
 
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
-PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a drone or cluster name of up to 32
+PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a drone or cluster name of up to 32 characters
 SENSORS = tuple(STOCK)
 SIGHTINGS = "sightings"  # a sensor of drones with cameras, computed by the world; its messages vary in length
 
@@ -39,13 +39,13 @@ class Topic(NamedTuple):
     """The declaration of a key in the contract."""
 
     message: Any  # type of its messages; None for a family of keys, whose members declare their own
-    writers: tuple[str, ...]  # roles that publish it; "each" means every process, on keys with its own name
-    readers: tuple[str, ...]  # roles that subscribe to it, besides recorders and operators, who read everything
-    last: str  # process that answers a get with the last message: "world", "writer", or none ("")
-    is_output: bool  # whether the world counts its messages against its publisher's done
+    writers: tuple[str, ...]  # roles that publish on it; "each" means every process, on keys with its own name
+    readers: tuple[str, ...]  # roles that subscribe to it, besides recorders and operators, which read everything
+    last: str  # process that answers a get with the last message: "world", "writer" or "" (none)
+    is_output: bool  # whether the world checks its messages against the count in the publisher's done
 
 
-TOPICS: dict[str, Topic] = {}  # topics by key, `*` in place of a name
+TOPICS: dict[str, Topic] = {}  # topics by key, with `*` in place of a name
 
 
 def on(
@@ -54,7 +54,7 @@ def on(
     """Return a decorator that declares a message class for a key; see Topic.
 
     Args:
-        key: with `*` in place of a name; a second `*` makes it a family, whose members are declared individually.
+        key: key with `*` in place of a name; a second `*` makes it a family, whose members are declared individually.
         writers, readers: roles, separated by spaces.
     """
 
@@ -125,7 +125,7 @@ def drone_request(drone: str) -> str:
 
 
 def control_of(request_key: str) -> str:
-    """Return the control key of a recorded request."""
+    """Return the control key on which a recorded request arrived."""
     return f"{request_key.rpartition('/')[0]}/control"
 
 
@@ -186,7 +186,7 @@ def token(process: str) -> str:
 
 
 def session_token(process: str, session: str) -> str:
-    """Return the token by which a process declares its Zenoh session."""
+    """Return the token with which a process declares its Zenoh session."""
     return f"process/{process}/session/{session}"
 
 
@@ -223,7 +223,7 @@ def is_accepted(key: str) -> bool:
 
 
 def is_sensor(expression: str) -> bool:
-    """Whether a key or expression concerns a drone's sensors."""
+    """Return whether a key or expression concerns a drone's sensors."""
     parts = expression.split("/")
     return len(parts) == 4 and parts[0] == "drone" and parts[2] == "sensor"
 
@@ -234,13 +234,13 @@ def is_status(key: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def is_picture(key: str) -> bool:
-    """Whether a key carries pictures, which are large and not needed in the lockstep."""
+    """Return whether a key carries pictures, which are large and not needed for lockstep."""
     kind, _, what = parts(key)
     return kind == "drone" and what.startswith("camera/") and what.count("/") == 1
 
 
 def may_drop(key: str) -> bool:
-    """Whether a full link may drop a key's messages in realtime, since newer ones follow."""
+    """Return whether a full link may drop a key's messages in realtime, since newer ones follow."""
     return "/sensor/" in key or key.startswith(GATE)
 
 
@@ -248,7 +248,7 @@ def may_drop(key: str) -> bool:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Whether a key expression matches a key, as in Zenoh; for the in-process bus and the history.
+    """Return whether a key expression matches a key, as in Zenoh; for the in-process bus and the history.
 
     `*` matches one chunk, `**` any number of chunks, `$*` a part of one; a chunk that begins with `@` matches only
     literally.
@@ -260,7 +260,7 @@ _CHUNK = "[^/@][^/]*/"
 _PART = "[^/]*"
 
 
-@lru_cache(maxsize=4096)  # expressions come from other processes too, in requests
+@lru_cache(maxsize=4096)  # bounded, since requests of other processes contain expressions too
 def _compiled(expression: str) -> re.Pattern[str]:
     """Return the pattern of an expression, for keys followed by "/".
 
@@ -279,7 +279,7 @@ def _compiled(expression: str) -> re.Pattern[str]:
 
 
 def _chunk(chunk: str) -> str:
-    """Return the pattern of one chunk of an expression, "/" included."""
+    """Return the pattern of one chunk of an expression, including its "/"."""
     if chunk == "*":
         return _CHUNK
     if chunk.startswith("@") or "$*" not in chunk:

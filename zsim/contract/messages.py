@@ -1,16 +1,16 @@
-"""The messages of the contract, version 1, and of users' agents by key: types, encoding and decoding.
+"""The messages of contract version 1 and of users' agents: types by key, encoding and decoding.
 
-Every message is a msgpack map with exactly these field names, in SI units and radians, with the unit in the name.
-`encode` encodes all messages; `decode` decodes them and checks types, shapes and finiteness.
+Every message is a msgpack map with exactly its class's field names; numbers are in SI units and radians, with the unit
+in the name. `encode` encodes all messages; `decode` decodes them and checks types, shapes and finiteness.
 
-Users' agents exchange classes with a key, declared in `world/info` for readers without the class:
+Users' agents exchange messages of classes with a key, which `world/info` declares for readers without the class:
 
 class State(zsim.AgentMessage, frozen=True):
-    key = "swarm/{drone}/state"  # each drone's agent publishes on its own drone's key
+    key = "swarm/{drone}/state"  # each agent publishes on its own drone's key
     position_m: tuple[float, float, float]
     is_leader: bool = False
 
-State.of()  # "swarm/*/state", the key expression of all
+State.of()  # "swarm/*/state", the key expression for all drones
 """
 
 import math
@@ -42,15 +42,15 @@ from zsim.sensors.stock_sensors import Sonar as Sonar
 _KEY = re.compile(r"([a-z][a-z0-9_]{0,31})/\{(drone|cluster|run)\}/([a-z][a-z0-9_]{0,31})")
 KEY_ALLOWED = "swarm/{drone}/state: a word, {drone}, {cluster} or {run}, and a word, of a-z 0-9 _"
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-CONTRACT_WORDS = frozenset({"drone", "cluster", "process", "world", "view", "clock"})  # that begin its keys
+CONTRACT_WORDS = frozenset({"drone", "cluster", "process", "world", "view", "clock"})  # first words of contract keys
 
 
 class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
     """Base of the messages of users' agents: `zsim.AgentMessage`.
 
     A subclass has `key`, in which `{drone}`, `{cluster}` or `{run}` stands for the name of the agent's drone, cluster
-    or run, and fields: numbers, tuples and lists of numbers, integers, booleans, text. zsim fills in t_ns, the gate of
-    its publication; seq, which counts the messages of a key from 0; and source, the agent that publishes it.
+    or run, and fields: numbers, tuples and lists of numbers, integers, booleans, text. zsim fills in t_ns, the gate at
+    which a message is published; seq, which counts the messages of a key from 0; and source, the publishing agent.
     """
 
     key: ClassVar[str] = ""
@@ -72,7 +72,7 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
         return f"{parts[1]}/{thing}/{parts[3]}"
 
     def fault(self) -> str | None:
-        """Return the fault of a received message; a class may declare its numbers as plain floats."""
+        """Return the fault of a received message; a plain float, which a class may declare, may also be NaN."""
         for name in self.__struct_fields__:
             value = getattr(self, name)
             if name in ("t_ns", "seq") and value < 0:
@@ -84,7 +84,7 @@ class AgentMessage(Struct, frozen=True, kw_only=True, gc=False):
 
 
 class MessageInfo(Struct, frozen=True, omit_defaults=True):
-    """A message of users' agents: `key` has `*` in place of a name; `fields` by name, besides t_ns, seq and source.
+    """A message of users' agents: `key` has `*` in place of a name; `fields` omits t_ns, seq and source.
 
     `role` is the first part of the names of the processes that publish it.
     """
@@ -95,24 +95,24 @@ class MessageInfo(Struct, frozen=True, omit_defaults=True):
     role: str = ""
 
     def declares(self, kind: object) -> bool:
-        """Whether a class matches this declaration."""
+        """Return whether a class matches this declaration."""
         if not (isinstance(kind, type) and issubclass(kind, AgentMessage)):
             return False
         return kind.__name__ == self.message and field_types(kind, AgentMessage) == self.fields
 
     def is_sound(self) -> bool:
-        """Whether a class can be created from it."""
+        """Return whether a class can be created from this declaration."""
         head, star, leaf = (*self.key.split("/"), "", "")[:3]
         key_is_sound = star == "*" and self.key.count("/") == 2 and head not in CONTRACT_WORDS
         return key_is_sound and all(map(_NAME.fullmatch, (head, leaf, self.message.lower(), *self.fields)))
 
 
 def message_info(kind: type[AgentMessage]) -> MessageInfo:
-    """Return the declaration of a class of messages for other processes.
+    """Return the declaration of a message class for other processes.
 
     Raises:
         TypeError: a field has a type not allowed in messages.
-        ValueError: its key or its name is not allowed.
+        ValueError: the class's key, its name or a field's name is not allowed.
     """
     parts = _KEY.fullmatch(kind.key)
     if not parts or parts[1] in CONTRACT_WORDS:
@@ -130,7 +130,7 @@ def type_of_info(info: MessageInfo) -> type[AgentMessage]:
 
 
 def about(kind: type[AgentMessage]) -> str:
-    """Return the scope of the agents that publish a class: "drone", "cluster" or "run"."""
+    """Return the scope of the agents that publish messages of a class: "drone", "cluster" or "run"."""
     parts = _KEY.fullmatch(kind.key)
     return parts[2] if parts else ""
 
@@ -149,7 +149,7 @@ class Origin(Struct, frozen=True):
 
 
 class RotorInfo(Struct, frozen=True):
-    """A rotor: its position in B and radius [m]; `turn` is 1 if it turns clockwise seen from above, otherwise -1."""
+    """A rotor: its position in B, its radius, and its sense: `turn` is 1 if clockwise seen from above, otherwise -1."""
 
     name: str
     x_m: Number
@@ -181,7 +181,7 @@ class ClusterInfo(Struct, frozen=True):
 class SensorInfo(Struct, frozen=True):
     """A user's sensor: the content of `drone/{d}/sensor/{name}` after `t_ns`, `seq` and `t_sample_ns`.
 
-    `message` is the name of the message; `fields` has the type of each by name.
+    `message` is the name of the message class; `fields` has the type of each field by name.
     """
 
     name: str
@@ -191,15 +191,15 @@ class SensorInfo(Struct, frozen=True):
 
 @keys.on("world/info", writers="world", readers="each", last="world")
 class Info(Message, frozen=True):
-    """What a process needs to take part: the resolved scenario and the settings of its time, on `world/info`.
+    """What a process needs to take part: the resolved scenario and the settings of time, on `world/info`.
 
     `rate` is simulated over wall time, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the run_id of
     the run that is played back; empty for a flight. Omitted are `user_sensors` if all sensors are the contract's,
-    `user_messages` if agents exchange none, `sightings` if the world computes none, and `scanners` if no drone has
-    range, lidar or depth. `module_folders` are the folders that the world searched for modules that the scenario names,
-    for readers of the record; omitted if it names none. `changed` holds the texts `a.b.c=value` with which the command
-    line changed the scenario's file; omitted if unknown. Creating or decoding an Info registers the messages of its
-    sensors and agents.
+    `user_messages` if agents exchange none, `sightings` if the world computes none, and `scanners` if no drone has a
+    range, lidar or depth sensor. `module_folders` are the folders in which the world searched for the modules that the
+    scenario names, for readers of the record; omitted if the scenario names none. `changed` holds the texts
+    `a.b.c=value` with which the command line changed the scenario's file; omitted if unknown. Creating or decoding an
+    Info registers the messages of its sensors and agents.
     """
 
     contract: Count
@@ -249,7 +249,7 @@ class Info(Message, frozen=True):
 
 for _name, _message in {**{name: kind.message for name, kind in STOCK.items()}, **SCANNERS}.items():
     keys.on(f"drone/*/sensor/{_name}", writers="world")(_message)
-keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # also for users' sensors
+keys.on("drone/*/sensor/*", writers="driver", readers="estimator")(Sample)  # including users' sensors
 TOPICS = keys.TOPICS
 """The contract's keys, with `*` in place of a name, and their messages; complete once this module is imported."""
 
@@ -258,8 +258,8 @@ RELAYED = (
     *(run_messages.ClusterRequest, AgentMessage),
 )
 """Messages, or their bases, that agents publish for each other; the world counts them like commands."""
-KEYS_KEPT = 65_536  # keys with cached types; 1000 drones have 15 000, garbage keys displace each other
-_OWN: dict[str, type[Struct]] = {}  # users' messages by shape of the key, from the newest Info
+KEYS_KEPT = 65_536  # maximum number of keys with cached types; 1000 drones have 15 000; garbage keys are evicted
+_OWN: dict[str, type[Struct]] = {}  # users' message classes by shape of their key, from the newest Info
 
 
 def _plain(value: Any) -> Any:
@@ -289,7 +289,7 @@ def type_of(key: str) -> type[Struct] | None:
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
-    """Register the messages of users' sensors in a run.
+    """Register the messages of a run's user sensors.
 
     A sensor with an invalid name, message name or field name is skipped: its messages remain unknown.
     """
@@ -301,7 +301,7 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
 def register_messages(kinds: Iterable[type[AgentMessage]]) -> None:
     """Register users' message classes, used in this process instead of the declarations in `world/info`.
 
-    TypeError and ValueError as for `message_info`.
+    Raises TypeError and ValueError as `message_info` does.
     """
     for kind in kinds:
         _register(message_info(kind).key, kind)
@@ -323,7 +323,7 @@ COMMANDS = {topic.message: shape for shape, topic in TOPICS.items() if topic.mes
 
 
 def command_key(drone: str, command: Struct) -> str:
-    """Return the key of a command to a drone; RunError if it is not a command."""
+    """Return the key of a command to a drone; raise RunError if it is not a command."""
     shape = COMMANDS.get(type(command))
     if shape is None:
         kinds = ", ".join(each.__name__ for each in COMMANDS)
@@ -333,18 +333,18 @@ def command_key(drone: str, command: Struct) -> str:
 
 @lru_cache(maxsize=KEYS_KEPT)
 def is_output(key: str) -> bool:
-    """Whether the world counts a key's messages against the done of the process that publishes them."""
+    """Return whether the world checks a key's messages against the count in their publisher's done."""
     topic = TOPICS.get(shape_of(key))
     return is_relayed(type_of(key)) if topic is None else topic.message is not None and topic.is_output
 
 
 def is_relayed(kind: type[Struct] | None) -> bool:
-    """Whether agents publish messages of a type for other agents."""
+    """Return whether agents publish messages of a type for other agents."""
     return kind is not None and issubclass(kind, RELAYED)
 
 
 def output_type(key: str) -> type[Struct]:
-    """Return the message type that an agent's step may return for a key; DecodeError if there is none."""
+    """Return the message type that an agent's step may return for a key; raise DecodeError for other keys."""
     kind = type_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
@@ -366,7 +366,7 @@ def encoding(key: str) -> str:
 
 
 def decode(key: str, payload: bytes) -> Any:
-    """Return the message on `key`, checked for types, shapes and finiteness; DecodeError names the fault."""
+    """Return the message on `key`, checked for types, shapes and finiteness; raise DecodeError naming a fault."""
     kind, read = _reader_of(key)
     if kind is None:
         raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
@@ -397,7 +397,7 @@ def _shown(where: str) -> str:
 _Reader = Callable[[bytes], Any]
 
 
-@lru_cache(maxsize=KEYS_KEPT)  # keys come from other processes too
+@lru_cache(maxsize=KEYS_KEPT)  # bounded, since keys come from other processes too
 def _reader_of(key: str) -> tuple[type[Struct] | None, _Reader]:
     kind = type_of(key)
     return kind, _reader(kind or Struct)
@@ -426,7 +426,7 @@ def _too_long(payload: bytes) -> NoReturn:
 
 
 def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -> DecodeError:
-    """Return a DecodeError that names the key, field, value found and values allowed."""
+    """Return a DecodeError that names the key, the field, the value found and the values allowed."""
     where = _shown(where)
     if not isinstance(error, msgspec.MsgspecError):
         return DecodeError(f"{where}: {str(error) or type(error).__name__}")
@@ -439,11 +439,11 @@ def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -
 
 
 class NoData(Struct, frozen=True):
-    """Unused data."""
+    """Data that processes do not use."""
 
 
 class RunEnd(Struct, frozen=True):
-    """The run is over; `last_ns` is its last gate."""
+    """The run has ended; `last_ns` is its last gate."""
 
     last_ns: Count
 
@@ -455,8 +455,8 @@ class ProcessEntry(Struct, frozen=True):
     host: str
     pid: int
     from_ns: Count  # first gate that waits for it
-    done_ns: Whole = -1  # newest gate that it, or its former incarnation, has done; -1 for none
-    former_pid: int | None = None  # of the incarnation that it replaces
+    done_ns: Whole = -1  # newest gate that it, or its former incarnation, has done; -1: none
+    former_pid: int | None = None  # pid of the incarnation that it replaces
 
 
 class WorldEvent(NamedTuple):
@@ -480,7 +480,7 @@ _EVENT_DATA: dict[str, type[Struct]] = {
 def read_event(payload: bytes) -> WorldEvent | None:
     """Return an event on which processes act, with checked data; None for an event of another kind.
 
-    DecodeError if it is not an event, or its data does not fit its kind.
+    Raises DecodeError if the payload is not an event, or its data does not fit its kind.
     """
     event: run_messages.Event = decode(keys.EVENT, payload)
     kind = _EVENT_DATA.get(event.kind)

@@ -9,17 +9,17 @@ from msgspec import UNSET, Struct, UnsetType, field
 from zsim.contract.keys import on
 from zsim.schema.message import Count, Message, Number, Whole
 
-GATES_MAX = 1_000_000  # per `step`: 5.5 hours at 20 ms
+GATES_MAX = 1_000_000  # per `step` request: 5.5 hours with gates of 20 ms
 RATE_MAX = 1000.0  # simulated per wall time; faster rates cannot be paced
 PRIORITY_MAX = 100  # programs use 0, operators 10
-SOON_S = 0.5  # wall time
-WAITING_SHOWN = 4  # processes named in a line
+SOON_S = 0.5  # wall time [s] for which waiting is normal
+WAITING_SHOWN = 4  # maximum number of processes named in a line
 
 
 class Waiting(Struct, frozen=True):
     """A process that the world waits for, its host, and for how long [s of wall time].
 
-    `held_by` names those of the others whose outputs it reads: it may only be waiting for them, and not be the cause.
+    `held_by` names the other awaited processes whose outputs it reads: it may merely be waiting for those.
     """
 
     name: str
@@ -34,16 +34,16 @@ class Waiting(Struct, frozen=True):
 
 
 def holding_up(state: str, waiting: Sequence[Waiting]) -> Sequence[Waiting]:
-    """Return the awaited processes that block a run whose clock is in `state`; only the causes, if known.
+    """Return the awaited processes that block a run with its clock in `state`; if known, only the causes.
 
-    Waits of up to SOON_S are normal in a running run, and do not count.
+    While the run is running, waits of up to SOON_S are normal and do not count.
     """
     late = [each for each in waiting if state == "waiting" or each.since_wall_s > SOON_S]
     return [each for each in late if not each.held_by] or late
 
 
 def waiting_text(state: str, waiting: Sequence[Waiting]) -> str:
-    """Return "waiting for" with the processes that hold up a run, empty if none does; see `holding_up`."""
+    """Return "waiting for" and the processes that hold up a run (see `holding_up`); empty if there are none."""
     late = holding_up(state, waiting)
     more = [f"{len(late) - WAITING_SHOWN} more"] if len(late) > WAITING_SHOWN else []
     return f"waiting for {', '.join([*map(str, late[:WAITING_SHOWN]), *more])}" if late else ""
@@ -51,7 +51,7 @@ def waiting_text(state: str, waiting: Sequence[Waiting]) -> str:
 
 @on("clock", writers="world", readers="each", last="world")
 class Clock(Message, frozen=True):
-    """The gate that the world has published; its `rate` is measured. `waiting_for` is filled while time is stopped."""
+    """The newest gate of the world, and the measured rate of time. `waiting_for` is filled while time is stopped."""
 
     run_id: str
     step: Count
@@ -76,8 +76,9 @@ class RadioLinks(Message, frozen=True):
     """The connectivity at a gate between the agents of drones that exchange messages, if the scenario has a radio.
 
     Drones are given by their indices in `world/info`; the index after the last one is the ground station of the agents
-    of clusters and of the run, if the radio has a `station_m`. `hears` has, for each index, those whose messages it
-    receives, ascending; `reception` has the probability of each, before the radio's `loss`, and is empty if all are 1.
+    of clusters and of the run, if the radio has a `station_m`. `hears` has, for each index, the indices from which it
+    receives messages, ascending; `reception` has the probability for each of these, before the radio's `loss`, and is
+    empty if all are 1.
     """
 
     hears: tuple[tuple[Count, ...], ...]
@@ -104,7 +105,7 @@ class Join(Message, frozen=True):
 
     `period_ns` is the interval of its dones: a multiple of the gate, 0 for never. `serves` names processes that need
     not join, since this one replaces them. `slack_ns` is how far the world may be ahead of the dones of a process
-    without a period, 0 for any.
+    without a period, 0 for any distance.
     """
 
     run_id: str
@@ -121,7 +122,7 @@ class Join(Message, frozen=True):
 
 @on("process/*/done", writers="each")
 class Done(Message, frozen=True):
-    """All messages up to `done_ns` are processed and answered; `sent` outputs were sent since the last done."""
+    """All messages up to `done_ns` have been processed and answered; `sent` outputs were sent since the last done."""
 
     run_id: str
     incarnation: int
@@ -133,7 +134,7 @@ class Done(Message, frozen=True):
 class Snapshot(Message, frozen=True):
     """The state of a participant after the gate `t_ns`, from which another incarnation of it can continue.
 
-    `version` is that of the layout of `state`, which is specific to the program.
+    `version` numbers the layout of `state`, which is specific to the program.
     """
 
     source: str
@@ -143,7 +144,7 @@ class Snapshot(Message, frozen=True):
 
 @on("process/*/bye", writers="each")
 class Bye(Message, frozen=True):
-    """A process leaves voluntarily; `failed`: it cannot continue, and would fail again after a restart.
+    """A process leaves voluntarily; `failed` if it cannot continue and would fail again after a restart.
 
     `run_id` and `incarnation` are those of the join that it ends. Clients of contract 1.0 name neither: their byes
     take effect once the liveliness token is lost as well, or the run is over.
@@ -175,7 +176,7 @@ class Health(Message, frozen=True):
 class Fault(Struct, frozen=True):
     """An injected fault: kind and parameters as in docs/faults.md; its target is a drone, link, cluster or process.
 
-    It acts in the gates after `from_ns` up to `until_ns`, or until it is cleared. `source` is "scenario" or the process
+    It acts in the gates after `from_ns`, up to `until_ns` or until it is cleared. `source` is "scenario" or the process
     that requested it. `rank` counts earlier faults of the same kind, target and start: each has its own random stream.
     """
 
@@ -191,7 +192,7 @@ class Fault(Struct, frozen=True):
 
 @on("world/faults", writers="world", readers="each", last="world")
 class Faults(Message, frozen=True):
-    """The planned and acting faults in order of their ids; published before the gate in which they change."""
+    """The planned and acting faults, in order of their ids; published before the gate in which they change."""
 
     faults: tuple[Fault, ...] = ()
 

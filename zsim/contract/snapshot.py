@@ -1,10 +1,10 @@
 """The state of an agent or a run as plain values (maps, lists, texts, numbers, arrays), and as bytes.
 
 Reading it runs no foreign code. An agent provides its own state (`snapshot`). An object of a world lists in its class's
-`SAVED` all attributes that change during a run and cannot be recomputed from the scenario, with how to restore each:
+`SAVED` all attributes that change during a run and cannot be recomputed from the scenario, and how to restore each:
 
     a type    the value, as this type (msgspec.convert)
-    IN_PLACE  numbers are copied into the array, or list of arrays, whose memory compiled code refers to
+    IN_PLACE  an array, or a list of arrays, to whose memory compiled code refers: the numbers are copied into it
     PART      another such object, a list of them, or None
 """
 
@@ -20,9 +20,9 @@ from zsim.errors import DecodeError, UserCodeError
 from zsim.schema import plugin
 from zsim.schema.checker import show
 
-VERSION = 1  # of the format of `pack`; field `version` of the message
+VERSION = 1  # version of the format of `pack`; the field `version` of an agent's Snapshot
 ARRAY = 1  # code of a msgpack extension: (type, shape, numbers) of an array
-TYPES = ("<f8", "<i8", "<i4", "<u8", "|i1", "|b1")  # allowed in arrays
+TYPES = ("<f8", "<i8", "<i4", "<u8", "|i1", "|b1")  # numpy types allowed in arrays
 
 State = dict[str, Any]  # names and values: numbers, texts, bytes, None, lists and maps of them, and arrays of numbers
 IN_PLACE, PART = "in place", "part"
@@ -36,12 +36,12 @@ class _Array(msgspec.Struct, array_like=True):
 
 
 def pack(state: State) -> bytes:
-    """Return a state as bytes, equal for equal states; TypeError if it contains values not allowed in a State."""
+    """Return a state as bytes, equal for equal states; raise TypeError for values that are not allowed in a State."""
     return _ENCODER.encode(state)
 
 
 def unpack(payload: bytes) -> State:
-    """Return the state in a payload; DecodeError if it was not written by `pack`."""
+    """Return the state in a payload; raise DecodeError if it was not written by `pack`."""
     try:
         return _DECODER.decode(payload)
     except REFUSALS as error:
@@ -52,7 +52,7 @@ def checked(state: Any, owner: type) -> State | None:
     """Return the checked result of a user's `snapshot`, a state or None.
 
     Raises:
-        UserCodeError: it is not a state; the line names the class, and the first invalid value with its path.
+        UserCodeError: it is not a state; the text names the class, and the first invalid value with its path.
     """
     if state is None:
         return None
@@ -121,7 +121,7 @@ def restore(part: Any, state: State) -> None:
     """Set the state of an object that was newly created from the same scenario.
 
     Raises:
-        KeyError, TypeError, ValueError: the state is of another scenario or version.
+        KeyError, TypeError, ValueError: the state is from another scenario or version.
     """
     for name, how in part.SAVED.items():
         value = state[name]

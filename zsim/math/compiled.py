@@ -1,20 +1,21 @@
-"""Compiles plain-float mathematics with numba, without which the same source runs as Python; and names columns of rows.
+"""Compilation of plain-float mathematics with numba, and named columns of rows.
 
-Without fast-math or fused operations, so that the same input gives the same bits, compiled or not.
+Without numba, the same source runs as Python. Compiled code uses no fast-math and no fused operations, so that the same
+input gives the same bits, compiled or not.
 
     inlined     part of a kernel that takes array views, floats and tuples, and allocates no array
-    noinline    the same, rarely run, and not inlined into its caller
+    noinline    the same, but rarely run, and so not inlined into its caller
     compiled    part of a kernel that may allocate arrays
     kernel      called from Python and cached on disk; 1 / 0 is inf, as in numpy
     portable    called from Python and cached on disk; 1 / 0 raises ZeroDivisionError, as in Python
     deferred    a kernel that runs as Python until other code has imported numba
     columns     names of the columns of a row of numbers, which compiled code reads as constants
 
-Numba's own disk cache depends only on the file of a function, although everything that it calls is compiled into it. So
-the name of a cache entry includes a digest of every file that its module imports, directly or indirectly.
+Numba's own disk cache depends only on the file of a function, although everything that the function calls is compiled
+into it. So the name of a cache entry includes a digest of every file that its module imports, directly or indirectly.
 
-An `inlined` function owns no reference-counted array: numba's atomic reference counts of views took a fifth of a gate's
-time, calls of functions that were not inlined another fifth.
+An `inlined` function owns no reference-counted array: numba's atomic reference counts of views would take a fifth of a
+gate's time, and calls of functions that are not inlined another fifth.
 """
 
 import hashlib
@@ -97,9 +98,9 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
 
 
 class Part:
-    """A function called by kernels, compiled without a Python entry point, which took a quarter of the compile time.
+    """A function called by kernels, compiled without a Python entry point, which takes a quarter of the compile time.
 
-    For calls from Python it is compiled separately with an entry point, and cached on disk like a kernel.
+    For calls from Python, it is compiled separately with an entry point, and cached on disk like a kernel.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -141,14 +142,14 @@ def noinline(function: Function) -> Function:
 
 
 def _kept(function: Function, options: dict[str, Any]) -> Function:
-    """Return a function whose compilation is cached on disk, under a name that changes with any of its sources."""
+    """Return a function whose compiled code is cached on disk, under a name that changes with any of its sources."""
     if not COMPILES:
         return function
     version = _digest_of_module(function.__module__)
     function.__qualname__ = f"{function.__qualname__}_{version}"
     try:
         dispatcher: Any = _compile(function, {**options, "cache": True})
-    except RuntimeError:  # neither its folder nor the user's cache is writable
+    except RuntimeError:  # neither the source's folder nor the user's cache is writable
         return _compile(function, options)
     if dispatcher is not function:  # equal if NUMBA_DISABLE_JIT is set
         dispatcher.compile = partial(_compile_once, dispatcher, dispatcher.compile)
@@ -173,11 +174,11 @@ def _compile_once(dispatcher: Any, compile_for: Callable[[Any], Any], signature:
         try:
             return compile_for(signature)
         finally:
-            lock.unlink(missing_ok=True)  # now cached
+            lock.unlink(missing_ok=True)  # no longer needed: the code is cached
 
 
 def kernel(makes_arrays: bool = True) -> Callable[[Function], Function]:
-    """Return the decorator; `makes_arrays` is False if the kernel and all that it calls allocate no arrays."""
+    """Return a decorator; `makes_arrays` is False if the kernel and all that it calls allocate no arrays."""
     options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
     return lambda function: _kept(function, options)
 
@@ -198,14 +199,14 @@ class Deferred(Part):
 
 
 def deferred(makes_arrays: bool = True) -> Callable[[Function], Function]:
-    """Return the decorator, as for a `kernel`; for mathematics also used while a run is set up."""
+    """Return a decorator as `kernel` does, for mathematics that is also used while a run is set up."""
     options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
     made: Any = lambda function: Deferred(function, options) if COMPILES else function  # noqa: E731
     return made
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Whether a kernel compiled from its current sources is on disk, so that it only needs to be loaded."""
+    """Return whether a kernel compiled from its current sources is on disk, so that it only needs to be loaded."""
     stats = getattr(function, "stats", None)  # of numba's dispatcher
     folder = stats and stats.cache_path
     return bool(folder) and any(Path(folder).glob(f"*{function.__qualname__}*.nbc"))
@@ -256,7 +257,7 @@ class Field(NamedTuple):
 
 
 class Columns(Protocol):
-    """The first column of each field by name, and `size`."""
+    """The first column of each field by name, and the number of columns as `size`."""
 
     def __getattr__(self, name: str) -> int: ...
 

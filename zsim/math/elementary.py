@@ -1,15 +1,15 @@
-"""Elementary functions with the same bits on every processor, C library and version of Python.
+"""Elementary functions that give the same bits on every processor, C library and version of Python.
 
-The functions of libm, of numpy and of numba differ in their last bits between processors and versions. Here each is one
-fixed sequence of additions, multiplications, divisions and square roots in double precision, which IEEE 754 defines to
-the bit; none of them is fused. Whatever decides about the flight of a drone or the output of an agent uses these:
+The functions of libm, numpy and numba differ in their last bits between processors and versions. Here, each is a fixed
+sequence of additions, multiplications, divisions and square roots in double precision, which IEEE 754 defines to the
+bit; none of them is fused. Whatever affects the flight of a drone or the output of an agent uses these:
 
     sin cos sin_cos tan asin acos atan atan2 exp log log1p power hypot length distance square
     elementwise(sin)(array)                     for arrays of any shape
 
 Results are within 2 units in the last place (ULP) of the true values, those of `power` within 2 + 2 |y ln x|:
 tests/authority/test_elementary_authority.py. Beyond 1e6 rad, sin, cos and tan lose accuracy in proportion to the
-angle. As in numba, and unlike in Python's `math`, arguments outside of the domain give nan, and overflow gives inf.
+angle. As in numba, and unlike in Python's `math`, arguments outside the domain give nan, and overflow gives inf.
 
 Methods: reduction of angles by pi/2 in three parts (W. J. Cody, W. Waite, Software Manual for the Elementary
 Functions, 1980); exp and atan from tables between whose points short Taylor series suffice (P. T. P. Tang, ACM
@@ -27,16 +27,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from zsim.math.compiled import deferred
 
-_CELLS = 32  # of the tables of 2^x over [0, 1] and of atan over [0, 1]; a cell's half is small for the series below
+_CELLS = 32  # cells of the tables of 2^x and of atan over [0, 1]; half a cell is small enough for the series below
 
 
 class _Tables(NamedTuple):
-    """Constants, each as a sum of doubles of falling size."""
+    """Constants, each as a sum of doubles of decreasing size."""
 
     half_pi: tuple[float, float, float]
     ln2: tuple[float, float]
-    exp2: NDArray[np.float64]  # of 2^(k / _CELLS), (_CELLS, 2)
-    atan: NDArray[np.float64]  # of atan(k / _CELLS), (_CELLS + 1, 2)
+    exp2: NDArray[np.float64]  # 2^(k / _CELLS), (_CELLS, 2)
+    atan: NDArray[np.float64]  # atan(k / _CELLS), (_CELLS + 1, 2)
 
 
 def _tables() -> _Tables:
@@ -48,7 +48,7 @@ def _tables() -> _Tables:
         return float(number), float(number - Decimal(float(number)))
 
     def atan_of(x: Decimal) -> Decimal:
-        """Return atan(x) by Euler's series, of which each term is less than half of the one before."""
+        """Return atan(x) by Euler's series, in which each term is less than half of the one before."""
         term = x / (1 + x * x)
         total, n = term, 0
         while term > Decimal("1e-50"):
@@ -74,30 +74,30 @@ def _tables() -> _Tables:
 
 _TABLES = _tables()
 _PI_A, _PI_B, _PI_C = _TABLES.half_pi
-_HALF_PI_LOW = float((Decimal(_PI_A) - Decimal(math.pi / 2)) + Decimal(_PI_B) + Decimal(_PI_C))  # pi/2 less its double
+_HALF_PI_LOW = float((Decimal(_PI_A) - Decimal(math.pi / 2)) + Decimal(_PI_B) + Decimal(_PI_C))  # pi/2 minus its double
 _LN2_A, _LN2_B = _TABLES.ln2
-_CELLS_PER_E = _CELLS / (_LN2_A + _LN2_B)  # cells of 2^x for each unit of x in e^x
+_CELLS_PER_E = _CELLS / (_LN2_A + _LN2_B)  # cells of the table of 2^x per unit of x in e^x
 _EXP2, _ATAN = _TABLES.exp2, _TABLES.atan
 _scalar = deferred(makes_arrays=False)
-_LARGEST_EXPONENT = 1100.0  # beyond the powers of two of any double
-_ACCURATE_RAD = 1e6  # up to which products of the quarter turns counted and of the parts of pi / 2 are exact
+_LARGEST_EXPONENT = 1100.0  # beyond it, e^x exceeds the range of doubles
+_ACCURATE_RAD = 1e6  # up to it, products of the number of quarter turns and the parts of pi / 2 are exact
 _SQRT_HALF = math.sqrt(0.5)
 
 
 @_scalar
 def sin_cos(x: float) -> tuple[float, float]:
-    """Return sine and cosine of an angle [rad]."""
+    """Return the sine and cosine of an angle [rad]."""
     if not abs(x) < math.inf:
         return math.nan, math.nan
     if x == 0.0:
-        return x, 1.0  # with the sign of the zero
+        return x, 1.0  # preserves the sign of the zero
     if abs(x) > _ACCURATE_RAD:
         x = x % (2.0 * math.pi)
     turns = math.floor(x * (2.0 / math.pi) + 0.5)
     a = x - turns * _PI_A
     b = turns * _PI_B
     r = a - b
-    rest = ((a - r) - b) - turns * _PI_C  # of the reduced angle r + rest, |r| <= pi / 4
+    rest = ((a - r) - b) - turns * _PI_C  # the reduced angle is r + rest, |r| <= pi / 4
     z = r * r
     odd = z * (1.0 / 6227020800.0 + z * (-1.0 / 1307674368000.0 + z / 355687428096000.0))
     odd = z * z * (1.0 / 120.0 + z * (-1.0 / 5040.0 + z * (1.0 / 362880.0 + z * (-1.0 / 39916800.0 + odd))))
@@ -144,7 +144,7 @@ def atan2(y: float, x: float) -> float:
     if high > 0.0:
         cell = int(low / high * _CELLS + 0.5)
         slope = cell / _CELLS
-        t = (low - slope * high) / (high + slope * low)  # tan(a - b) of tan a and tan b
+        t = (low - slope * high) / (high + slope * low)  # tan(a - b) from tan a and tan b
         z = t * t
         series = z * (-1.0 / 3.0 + z * (1.0 / 5.0 + z * (-1.0 / 7.0 + z * (1.0 / 9.0 - z / 11.0))))
         angle = _ATAN[cell, 0] + (t + (t * series + _ATAN[cell, 1]))
@@ -183,7 +183,7 @@ def exp(x: float) -> float:
     series = r * r * (0.5 + r * (1.0 / 6.0 + r * (1.0 / 24.0 + r * (1.0 / 120.0 + r * (1.0 / 720.0)))))
     growth = r + (((a - r) - b) + series)  # e^r - 1
     significand = _EXP2[cell, 0] + (_EXP2[cell, 0] * growth + _EXP2[cell, 1])
-    if power >= 1024.0:  # where ldexp of Python raises an error, and that of numba does not
+    if power >= 1024.0:  # where Python's ldexp raises an error, but numba's does not
         return math.inf if power > 1024.0 else 2.0 * math.ldexp(significand, 1023)
     return math.ldexp(significand, int(power))
 
@@ -218,7 +218,7 @@ def log1p(x: float) -> float:
 
 @_scalar
 def power(x: float, y: float) -> float:
-    """Return x to the power of y; of whole y up to 64 by multiplications."""
+    """Return x to the power of y; for whole y from -64 to 64, by multiplications."""
     is_whole = y % 1.0 == 0.0
     if is_whole and abs(y) <= 64.0:
         left, product, factor = int(abs(y)), 1.0, x
@@ -256,7 +256,7 @@ def length(components: Iterable[float]) -> float:
 
 
 def distance(a: Iterable[float], b: Iterable[float]) -> float:
-    """Return the distance of two points."""
+    """Return the distance between two points."""
     return length(p - q for p, q in zip(a, b, strict=True))
 
 

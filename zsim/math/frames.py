@@ -43,7 +43,7 @@ def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
 
 
 def enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
-    """Return the unit vectors east, north and up as rows in Earth-fixed components, (3, 3)."""
+    """Return the unit vectors east, north and up in Earth-fixed components, as rows, (3, 3)."""
     (ns, nc), (es, ec) = el.sin_cos(math.radians(latitude_deg)), el.sin_cos(math.radians(longitude_deg))
     return np.array(
         [
@@ -55,7 +55,7 @@ def enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
 
 
 def anchor(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[Array, Array]:
-    """Return W's east, north and up as rows in Earth-fixed components, (3, 3), and W's origin in them [m], (3,)."""
+    """Return W's axes as rows in Earth-fixed components, (3, 3), and W's Earth-fixed origin [m], (3,)."""
     return enu_rows(latitude_deg, longitude_deg), geodetic_to_ecef((latitude_deg, longitude_deg, height_m))
 
 
@@ -63,8 +63,8 @@ def anchor(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[
 def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
     """Return WGS 84 latitude [deg], longitude [deg] and ellipsoidal height [m] of points in W.
 
-    Bowring's iteration on the parametric latitude, exact to 1e-9 m for heights between -10 km and 1000 km (Bowring,
-    Survey Review 23 (1976) 323-327).
+    By Bowring's iteration on the parametric latitude, accurate to 1e-9 m for heights between -10 km and 1000 km
+    (Bowring, Survey Review 23 (1976) 323-327).
 
     Args:
         position_m: p_W, (n, 3).
@@ -146,7 +146,7 @@ def quaternion_from_matrix(R: ArrayLike) -> Array:
 def principal_axes(covariance: ArrayLike) -> tuple[Array, Array]:
     """Return the standard deviations (..., 3) of covariances (..., 3, 3) along their axes, and the axes' quaternions.
 
-    The quaternions turn components along the axes into components in the frame of the covariances.
+    The quaternions turn components along the principal axes into components in the frame of the covariances.
     """
     variances, axes = np.linalg.eigh(np.asarray(covariance, dtype=float))  # noqa: TID251 - it is only displayed
     axes[..., :, 0] *= np.where(np.linalg.det(axes) < 0, -1.0, 1.0)[..., None]  # noqa: TID251
@@ -188,7 +188,7 @@ def heading(q: ArrayLike) -> Array:
 
 
 def turned_about_up(v: tuple[float, float, float], angle_rad: float) -> tuple[float, float, float]:
-    """Return a vector turned about z, counter-clockwise seen from above; a heading turns the heading frame to W."""
+    """Return `v` turned about z, counter-clockwise seen from above; a heading turns it from the heading frame to W."""
     c, s = el.cos(angle_rad), el.sin(angle_rad)
     return c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]
 

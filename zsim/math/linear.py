@@ -1,16 +1,16 @@
 """Linear algebra of small matrices with the same bits everywhere: every sum runs in the order of its index.
 
-BLAS and LAPACK, with which numpy and scipy compute, order and fuse their sums by the processor. Whatever decides about
-the flight of a drone or the output of an agent uses these instead; for tens of rows they are as fast. Matrices are
-arrays of float64; a singular system gives results that are not finite.
+BLAS and LAPACK, on which numpy and scipy rely, order and fuse sums differently from processor to processor. Whatever
+affects the flight of a drone or the output of an agent uses these functions instead; up to tens of rows, they are as
+fast. Matrices are arrays of float64; a singular system gives results that are not finite.
 
     product     A B of (m, k) and (k, n), or of (m, k) and (k,)
     solve       A^-1 B by elimination with partial pivoting
-    solve_banded        the same, of a matrix with few diagonals
+    solve_banded        the same, for a matrix with few diagonals
     eigen       eigenvalues, ascending, and eigenvectors of a symmetric matrix (Jacobi)
     singular_values     descending, by rotations of columns (Hestenes, J. SIAM 6 (1958) 51-90)
-    pseudo_inverse      of a matrix with independent rows
-    exponential         e^A by Taylor's series, scaled and squared
+    pseudo_inverse      for a matrix with independent rows
+    exponential         e^A by Taylor's series, with scaling and squaring
 """
 
 import math
@@ -22,9 +22,9 @@ from zsim.math.compiled import deferred
 
 Array = NDArray[np.float64]
 
-SWEEPS_MAX = 60  # of rotations over all pairs; ten suffice for the largest matrices here
-TERMS = 20  # of the series of e^A for |A| <= 1/2: the next is below 1e-25
-ORTHOGONAL = 1e-16  # cosine of two columns that need no rotation
+SWEEPS_MAX = 60  # maximum number of sweeps of rotations over all pairs; ten suffice for the largest matrices here
+TERMS = 20  # terms of the series of e^A for |A| <= 1/2; the next is below 1e-25
+ORTHOGONAL = 1e-16  # size of an off-diagonal element, relative to the diagonal ones, up to which it needs no rotation
 
 
 def product(A: ArrayLike, B: ArrayLike) -> Array:
@@ -33,24 +33,24 @@ def product(A: ArrayLike, B: ArrayLike) -> Array:
 
 
 def solve(A: ArrayLike, B: ArrayLike) -> Array:
-    """Return A^-1 B of (n, n) and (n, m) or (n,)."""
+    """Return A^-1 B for A (n, n) and B (n, m) or (n,)."""
     a, b = _own(A), _own(B)
     return _solved(a.copy(), b.reshape(len(a), -1).copy()).reshape(b.shape)
 
 
 def solve_banded(diagonals: Array, below: int, B: Array) -> Array:
-    """Return A^-1 B (n, m) of a banded matrix.
+    """Return A^-1 B, (n, m), for a banded matrix A.
 
     Args:
-        diagonals: (n, below + 1 + above): element j - i + below of row i is A[i, j].
-        below: diagonals below the main one.
+        diagonals: A as (n, below + 1 + above); element j - i + below of row i is A[i, j].
+        below: number of diagonals below the main one.
     """
-    room = np.zeros((len(diagonals), below))  # which rows fill when they are exchanged
+    room = np.zeros((len(diagonals), below))  # filled when rows are exchanged
     return _banded_solved(_own(np.hstack([diagonals, room])), below, _own(B).copy())
 
 
 def eigen(A: ArrayLike) -> tuple[Array, Array]:
-    """Return eigenvalues (n,), ascending, and unit eigenvectors as columns (n, n)."""
+    """Return the eigenvalues, (n,), ascending, and unit eigenvectors as columns, (n, n), of a symmetric matrix."""
     values, vectors = _diagonalised(_own(A).copy())
     order = np.argsort(values, kind="stable")
     return values[order], vectors[:, order]
@@ -62,7 +62,7 @@ def singular_values(A: ArrayLike) -> Array:
 
 
 def pseudo_inverse(A: ArrayLike) -> Array:
-    """Return A^T (A A^T)^-1, (n, m), of m independent rows (m, n)."""
+    """Return A^T (A A^T)^-1, (n, m), for A (m, n) with independent rows."""
     a = _own(A)
     return solve(product(a, a.T), a).T
 
@@ -162,7 +162,7 @@ def _banded_solved(A: Array, below: int, B: Array) -> Array:
 
 @deferred(makes_arrays=False)
 def _rotation(pp: float, qq: float, pq: float) -> tuple[float, float]:
-    """Return cosine and sine of the rotation (Jacobi's) that makes ((pp, pq), (pq, qq)) diagonal."""
+    """Return the cosine and sine of the Jacobi rotation that diagonalises ((pp, pq), (pq, qq))."""
     theta = 0.5 * (qq - pp) / pq
     t = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
     c = 1.0 / math.sqrt(t * t + 1.0)
@@ -171,7 +171,7 @@ def _rotation(pp: float, qq: float, pq: float) -> tuple[float, float]:
 
 @deferred()
 def _diagonalised(A: Array) -> tuple[Array, Array]:
-    """Return diagonal and accumulated rotations of a symmetric matrix, which is overwritten."""
+    """Return the diagonal and the accumulated rotations of a diagonalised symmetric matrix, which is overwritten."""
     n = A.shape[0]
     V = np.eye(n)
     for _ in range(SWEEPS_MAX):
@@ -203,7 +203,7 @@ def _diagonalised(A: Array) -> tuple[Array, Array]:
 
 @deferred()
 def _column_lengths(A: Array) -> Array:
-    """Return the lengths of the columns once all are orthogonal; A (m, n), m >= n, is overwritten."""
+    """Return the lengths of the columns after rotating them to be orthogonal; A (m, n), m >= n, is overwritten."""
     m, n = A.shape
     for _ in range(SWEEPS_MAX):
         rotated = False

@@ -26,7 +26,8 @@ def stream(seed: int, name: str) -> np.random.Generator:
 def uniform(*what: object) -> float:
     """Return a random number in [0, 1) that depends only on the arguments.
 
-    The first 53 bits of BLAKE2b of their texts: uniform to the resolution of a double, and the same on every machine.
+    It is the first 53 bits of the BLAKE2b hash of their texts: uniform to the resolution of a double, and the same on
+    every machine.
     """
     digest = hashlib.blake2b("|".join(map(str, what)).encode(), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
@@ -40,7 +41,7 @@ _FARTHEST = 38.0  # standard deviations; beyond this, the density is below the s
 def normal_probability(x: float) -> float:
     """Return the probability that a standard normal variable is below x, within 1e-15.
 
-    1/2 + density times (x + x^3/3 + x^5/(3 5) + ...), a series whose terms all have the same sign (G. Marsaglia,
+    It is 1/2 + density times (x + x^3/3 + x^5/(3 5) + ...), a series whose terms all have the same sign (G. Marsaglia,
     Evaluating the normal distribution, J. Statistical Software 11 (2004) 4).
     """
     if not abs(x) < _FARTHEST:
@@ -63,7 +64,7 @@ def normal_quantile(probability: float) -> float:
 def chi_square_probability(x: float, dof: int) -> float:
     """Return the probability that a chi-square variable with `dof` degrees of freedom is below x >= 0.
 
-    The series of the incomplete gamma function, whose terms have the same sign (Abramowitz and Stegun, 6.5.29).
+    By the series of the incomplete gamma function, whose terms all have the same sign (Abramowitz and Stegun, 6.5.29).
     """
     a, half = 0.5 * dof, 0.5 * x
     gamma = 1.0 if dof % 2 == 0 else math.sqrt(math.pi)  # gamma(1) or gamma(1/2), raised below to gamma(a + 1)
@@ -87,7 +88,7 @@ def chi_square_quantile(probability: float, dof: int) -> float:
 
 
 def _bisected(function: Callable[[float], float], value: float, low: float, high: float) -> float:
-    """Return where an increasing function reaches a value, by bisection to the last bit."""
+    """Return the argument at which an increasing function reaches a value, by bisection to the last bit."""
     while True:
         middle = 0.5 * (low + high)
         if not low < middle < high:

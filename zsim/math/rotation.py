@@ -1,7 +1,7 @@
 """Vectors and quaternions as tuples of floats, for compiled code: no allocation, a fixed order of operations.
 
-A vector is (x, y, z). A quaternion is Hamilton (w, x, y, z) and turns body components into world components, as does
-a rotation matrix, a tuple of its rows.
+A vector is (x, y, z). A quaternion is Hamilton, (w, x, y, z), and turns body components into world components, as does
+a rotation matrix, which is a tuple of rows.
 """
 
 import math
@@ -13,7 +13,7 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)  # the identity rotation
-_SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
+_SMALL_ANGLE = 1e-8  # rad; below it, sin(x)/x is 1 to the last bit
 COSINE_MAX = 0.9995  # cosine of half the angle between attitudes; above it, linear interpolation errs by <= 1e-7 rad
 
 
@@ -204,7 +204,7 @@ def composed(A: Matrix, B: Matrix) -> Matrix:
 
 @portable
 def position_between(s: float, dt: float, p0: Vector, v0: Vector, p1: Vector, v1: Vector) -> tuple[float, float, float]:
-    """Return the position at fraction s of an interval dt [s]: the cubic with these end points and slopes (Hermite)."""
+    """Return the position at fraction s of an interval dt [s], on the Hermite cubic with these ends and velocities."""
     a, b = s * s * (3.0 - 2.0 * s), dt * s * (1.0 - s) * (1.0 - s)
     c = dt * s * s * (s - 1.0)
     x = p0[0] + a * (p1[0] - p0[0]) + b * v0[0] + c * v1[0]
@@ -242,7 +242,7 @@ def attitude_between(s: float, q0: Quaternion, q1: Quaternion) -> Quaternion:
 def pose_between(
     t: float, t0: float, p0: Vector, v0: Vector, q0: Quaternion, t1: float, p1: Vector, v1: Vector, q1: Quaternion
 ) -> tuple[Vector, Vector, Quaternion]:
-    """Return position, velocity and attitude at a time t in [t0, t1] [s]."""
+    """Return position, velocity and attitude at a time t [s] in [t0, t1]."""
     s = (t - t0) / (t1 - t0) if t1 > t0 else 1.0
     v = velocity_between(s, t1 - t0, p0, v0, p1, v1)
     return position_between(s, t1 - t0, p0, v0, p1, v1), v, attitude_between(s, q0, q1)

@@ -5,8 +5,8 @@
     completeness(reader)            returns the gaps of a record
     repair(path)                    completes a file whose writer died
 
-Topic = key without the federation's prefix, message encoding `msgpack`, log time = simulated time, publish
-time = wall clock of the recorder. Other MCAP tools can open the file. Imports contract.
+In the file, a topic is a key without the federation's prefix, the message encoding is `msgpack`, the log time is
+simulated time, and the publish time is the recorder's wall clock. Other MCAP tools can open it. Imports contract.
 """
 
 from zsim.record.completeness import Completeness, completeness

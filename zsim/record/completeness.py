@@ -47,7 +47,7 @@ class GateCount:
     def add(self, clock: run_messages.Clock) -> GateGap | None:
         """Count the gate of a clock message; return the gates missing before it, or None.
 
-        None are missing if its sequence number is the next one, even if a replay has jumped in time.
+        No gate is missing if the sequence number is the next one, even if a replay has jumped in time.
         """
         gap, missing = None, clock.step - self._step - 1
         if missing > 0 and clock.seq != self._seq + 1:
@@ -72,7 +72,7 @@ class Completeness(Struct, frozen=True):
     ended: bool = True  # whether the end of the run is on record
     closed: bool = True  # whether its writer has closed it
     last_ns: int = 0  # time of the last gate
-    damaged: tuple[str, ...] = ()  # unreadable parts with their positions
+    damaged: tuple[str, ...] = ()  # unreadable parts, with their positions
 
     @property
     def complete(self) -> bool:
@@ -105,14 +105,14 @@ class _Numbered(Struct):
     seq: int
 
 
-UNREAD = -1  # in place of a sequence number that is not encoded as zsim's encoder does
+UNREAD = -1  # in place of a sequence number that is not encoded as by zsim's encoder
 _WIDTH = np.full(256, -1, dtype=np.int64)  # bytes after the first of a MessagePack unsigned integer, by its first byte
 _WIDTH[:0x80] = 0
 _WIDTH[[0xCC, 0xCD, 0xCE, 0xCF]] = 1, 2, 4, 8
 _T_NS, _SEQ = (np.frombuffer(msgspec.msgpack.encode(name), np.uint8) for name in ("t_ns", "seq"))
 _MAP_16 = 0xDE  # first byte of a map of more than 15 fields
 SECOND_NS = 1_000_000_000
-_LOOKED_AT = 1 << 5  # bytes of padding; the first two fields of a message always end within so many
+_LOOKED_AT = 1 << 5  # bytes of padding; the first two fields of a message always end within this length
 
 
 def sequence_numbers(spans: MessageSpans) -> NDArray[np.int64]:
@@ -169,7 +169,7 @@ class _Numbers:
 def completeness(
     reader: RecordReader,
     keys_beside: Container[str] = (),  # keys whose messages are passed to `take`, which saves reading the record twice
-    # keys of which at least the first message in every simulated second and the last are passed to `take`
+    # keys of which at least the last message and the first in every simulated second are passed to `take`
     keys_sampled: Container[str] = (),
     # called with key and payload of each of these messages, in the order in which they were written
     take: Callable[[str, bytes], None] = lambda key, payload: None,
@@ -178,7 +178,7 @@ def completeness(
     info: messages.Info | None = None
     with suppress(DecodeError):
         info = messages.decode(keys.INFO, last.payload) if (last := reader.last(keys.INFO)) else None
-    # the record of a replay has the replay's clock messages, and sequence numbers of the replayed run
+    # the record of a replay has the replay's clock messages, but the sequence numbers of the replayed run
     is_replay = info is not None and bool(info.replay_of)
     external = {drone.name for drone in (info.drones if info else ()) if drone.body is not msgspec.UNSET}
     names = reader.channels()
@@ -213,7 +213,7 @@ def completeness(
 
 
 def _one_each_second(spans: MessageSpans, channels: set[int]) -> NDArray[np.bool_]:
-    """Return which messages, (M,), are the first of their channel in a second, or its first or last in these spans."""
+    """Return which messages, (M,), are the first of their channel in a second, or its first or last in `spans`."""
     second, last = spans.t_ns // SECOND_NS, len(spans.channel) - 1
     changes = np.ones(last + 2, bool)  # whether the channel changes before each message, and after the last
     changes[1:-1] = spans.channel[1:] != spans.channel[:-1]
@@ -233,7 +233,7 @@ def record_completeness(path: Path) -> Completeness:
 
 
 def _is_numbered(key: str, external: Container[str]) -> bool:
-    """Whether only the world publishes on a key, numbered without gaps; keys of external drones are excluded."""
+    """Return whether only the world publishes on a key, numbering without gaps; False for keys of external drones."""
     group, drone, what = keys.parts(key)
     if group != "drone":
         return key == keys.EVENT

@@ -3,8 +3,8 @@
     magic  header  { schemas and channels new in the next chunk   chunk   its message indexes }*
     data end  summary  footer  magic                             (absent if the writer was killed)
 
-Elsewhere in this package a record is the file of a run; the records of MCAP are the parts of that file. The mcap
-library packs and unpacks all parts except messages and chunks, for which it is too slow.
+Elsewhere in this package, a record is the file of a run; MCAP's records are the parts of that file. The mcap library
+packs and unpacks all parts except messages and chunks, for which it is too slow.
 """
 
 import struct
@@ -44,18 +44,19 @@ MESSAGE_HEAD = np.dtype(  # MESSAGE as a numpy type
 CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time, uncompressed size and CRC, length of compression's name
 SIZE = struct.Struct("<Q")  # size of a chunk's compressed content, after the compression's name
 ZSTD = b"zstd"  # name of the compression that zsim uses
-SIZE_UNSTATED = -1  # zstandard's value for a frame without its size
+SIZE_UNSTATED = -1  # zstandard's value for a frame that does not state its size
 LIBRARY = len(MAGIC) + HEAD.size + 8  # offset of the writer's name, after an empty profile and the name's length
 OURS = b"zsim "
 CUT_HEAD = CHUNK_HEAD.size + len(ZSTD) + SIZE.size  # bytes of a chunk before its content
-INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
+INDEX_HEAD = struct.Struct("<HI")  # channel, size of its entries in bytes
 INDEX_ENTRY = 16  # bytes: log time, offset in the chunk
 FOOTER_SIZE = HEAD.size + 20
-CHUNK_MAX = 1 << 27  # bytes of a chunk's content; zsim's has 1 MB and one message of at most 16 MB
-SMALL_MAX = 1 << 20  # bytes of a schema, a channel or a part of the summary; statistics of 65 535 channels take 0.7 MB
+CHUNK_MAX = 1 << 27  # maximum bytes of a chunk's content; zsim's has up to 1 MB and one message of at most 16 MB
+# Maximum bytes of a schema, a channel or a part of the summary; statistics of 65 535 channels take 0.7 MB
+SMALL_MAX = 1 << 20
 LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # minimum length of a body
 
-PIECE_BYTES = 1 << 24  # maximum bytes mapped while reading a whole file; they count as memory in use
+PIECE_BYTES = 1 << 24  # maximum bytes mapped while reading a whole file; mapped pages count as memory in use
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
 
@@ -64,7 +65,7 @@ _ANY_SIZE = frozenset({Opcode.MESSAGE, Opcode.ATTACHMENT})  # written outside ch
 
 
 class _Zstd(threading.local):
-    """Compressor and decompressor per thread: zstandard's objects crash if two threads use them at once."""
+    """A compressor and a decompressor per thread: zstandard's objects crash if two threads use them at once."""
 
     def __init__(self) -> None:
         self.compress = zstandard.ZstdCompressor(level=-1).compress
@@ -106,7 +107,7 @@ class Index(NamedTuple):
 
 
 class RecordGroup(NamedTuple):
-    """A schema, channel or chunk of the data section; a chunk with its message indexes."""
+    """A schema, channel or chunk of the data section; a chunk comes with its message indexes."""
 
     place: RecordSpan
     indexes: tuple[Index, ...]
@@ -124,7 +125,7 @@ def packed(record: McapRecord) -> bytes:
 
 
 def unpacked(kind: type[Known], source: Source, place: RecordSpan) -> Known:
-    """Return the schema or channel at a position; RecordError if it is damaged."""
+    """Return the schema or channel at a position; raise RecordError if it is damaged."""
     try:
         return kind.read(ReadDataStream(BytesIO(source[place.body : place.end])))
     except (struct.error, McapError, UnicodeDecodeError) as error:
@@ -147,7 +148,7 @@ def places(source: Source) -> Iterator[RecordSpan]:
 
 
 def is_cut(source: Source, at: int) -> bool:
-    """Whether the bytes after the last complete record are the beginning of another.
+    """Return whether the bytes after the last complete record are the beginning of another.
 
     Otherwise they are damaged: a wrong length makes everything after it unreadable.
     """
@@ -193,7 +194,7 @@ def groups(source: Source, found: Iterator[RecordSpan] | None = None) -> Iterato
 
 
 def is_complete(source: Source) -> bool:
-    """Whether a file has its footer."""
+    """Return whether a file has its footer."""
     foot = len(source) - len(MAGIC) - FOOTER_SIZE
     return foot >= len(MAGIC) and source[foot] == Opcode.FOOTER and source[-len(MAGIC) :] == MAGIC
 
@@ -252,7 +253,7 @@ def crc_until(source: Source, end: int) -> int:
 
 
 def unmap(source: Source) -> None:
-    """Release the pages of a mapped file that were read; they are reloaded when needed."""
+    """Release the pages of a mapped file that have been read; they are reloaded when needed."""
     if isinstance(source, mmap) and hasattr(source, "madvise"):  # absent on Windows
         from mmap import MADV_DONTNEED
 
@@ -260,12 +261,12 @@ def unmap(source: Source) -> None:
 
 
 def is_ours(source: Source) -> bool:
-    """Whether zsim wrote a record, given its first bytes; then every chunk has a checksum."""
+    """Return whether zsim wrote a record, given its first bytes; if so, every chunk has a checksum."""
     return source[LIBRARY : LIBRARY + len(OURS)] == OURS
 
 
 def indexes_of(content: bytes) -> dict[int, list[int]]:
-    """Return, by channel, log time and position of each of its messages in a chunk's content, alternating."""
+    """Return, by channel, the log times and positions of its messages in a chunk's content, alternating."""
     indexes: dict[int, list[int]] = defaultdict(list)
     at, end, unpack = 0, len(content) - MESSAGE.size, MESSAGE.unpack_from
     while at <= end:
@@ -277,7 +278,7 @@ def indexes_of(content: bytes) -> dict[int, list[int]]:
 
 
 def heads_at(content: bytes, places: NDArray[np.int64]) -> NDArray:
-    """Return the heads, of type MESSAGE_HEAD, of the messages at positions of a chunk's content."""
+    """Return the heads, of type MESSAGE_HEAD, of the messages at some positions in a chunk's content."""
     return np.ndarray(max(0, len(content) - MESSAGE.size + 1), MESSAGE_HEAD, content, strides=(1,))[places]
 
 

@@ -1,4 +1,4 @@
-"""Reads a record, complete or truncated at any byte, from a file or the folder of a run."""
+"""Reads a record, complete or truncated at any byte."""
 
 import struct
 from collections import Counter
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zsim.errors import RecordError
 from zsim.record import mcap_layout as layout
 
-SHOWN = 3  # gaps or damaged chunks listed in one line; others are counted
+SHOWN = 3  # maximum number of gaps or damaged chunks listed in one line; others are counted
 CRC = struct.Struct("<I")  # checksum of everything before the data end; 0 in MCAP if not computed
 OVERLAP_NS = 1_000_000_000  # simulated time; a chunk usually begins less than this before the previous one's end
 
@@ -48,7 +48,7 @@ class _Chunk(NamedTuple):
     indexes: tuple[layout.Index, ...]
 
 
-_Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, message
+_Held = tuple[int, int, Recorded]  # simulated time, number of the message's chunk, message
 
 
 class RecordReader:
@@ -64,7 +64,7 @@ class RecordReader:
     def __init__(self, path: str | Path) -> None:
         """Open a record and scan its chunks, without decompressing them.
 
-        RecordError if the file does not exist, is not an MCAP file, or the name of a channel is damaged.
+        Raises RecordError if the file does not exist, is not an MCAP file, or has a damaged channel name.
         """
         self.path = Path(path)
         self._counts: Counter[int] = Counter()
@@ -78,7 +78,7 @@ class RecordReader:
         self.complete = layout.is_complete(self._source)  # whether the record was closed
         self._keys: dict[int, str] = {}
         self._data_end: layout.RecordSpan | None = None
-        self._rest: int | None = None  # start of the unreadable end; None if there is none
+        self._rest: int | None = None  # start of the unreadable end; None if all is readable
         self._damaged: set[layout.RecordSpan] = set()  # chunks
         self._chunks = list(self._scan())
 
@@ -89,12 +89,12 @@ class RecordReader:
     def messages(
         self, keys: Collection[str] | None = None, by_time: bool = True, from_ns: int = 0
     ) -> Iterator[Recorded]:
-        """Yield the messages of some keys (None: of all).
+        """Yield the messages of some keys, by default of all.
 
         Args:
             keys: exact keys; chunks without any of them are not decompressed.
-            by_time: whether to sort by simulated time, and within the same time as written, instead of all as written.
-                Chunks that overlap in time are held in memory, and stragglers one by one.
+            by_time: whether to sort by simulated time, at equal times in the order written; otherwise, all are in the
+                order written. Sorting holds in memory chunks that overlap in time, and single stragglers.
             from_ns: chunks with only older messages are skipped; a chunk spans a quarter of a wall second.
         """
         wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
@@ -109,7 +109,7 @@ class RecordReader:
         return dict(self._keys)
 
     def spans(self, wanted: Collection[int]) -> Iterator[MessageSpans]:
-        """Yield the positions of some channels' payloads, chunk by chunk, for reading many messages as arrays."""
+        """Yield the positions of the payloads of some channels, chunk by chunk, to read many messages as arrays."""
         mapped = 0
         for chunk in self._chunks:
             if chunk.channels.isdisjoint(wanted):
@@ -131,11 +131,11 @@ class RecordReader:
             yield MessageSpans(content, channel[rows], starts + layout.MESSAGE.size, ends, times)
 
     def _indexed(self, chunk: _Chunk, content: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return channel and position of every message of a chunk, from its indexes if they cover all its content."""
+        """Return the channels and positions of a chunk's messages, from its indexes if they cover all its content."""
         head = layout.HEAD.size + layout.INDEX_HEAD.size
         at = [(index.start + head, layout.INDEX_ENTRY * index.messages) for index in chunk.indexes]
         data = b"".join([self._source[start : start + size] for start, size in at])
-        if data and len(data) == sum(size for _, size in at):  # a damaged size may lead beyond the end of the file
+        if data and len(data) == sum(size for _, size in at):  # a damaged size may point beyond the end of the file
             places = np.frombuffer(data, "<u8")[1::2].astype(np.int64)
             channel = np.repeat([index.channel for index in chunk.indexes], [index.messages for index in chunk.indexes])
             if places.min() >= 0 and places.max() <= len(content) - layout.MESSAGE.size:
@@ -157,7 +157,7 @@ class RecordReader:
         return tuple(chunks if self._rest is None else [*chunks, f"everything from byte {self._rest} on"])
 
     def differs(self) -> bool:
-        """Whether a closed record was changed after its writer closed it; reads the complete file.
+        """Return whether a record was changed after its writer closed it; read the whole file.
 
         Names of keys and indexes have no checksum of their own.
         """
@@ -175,9 +175,9 @@ class RecordReader:
         return None
 
     def last_chunk(self, key: str, is_it: Callable[[bytes], bool]) -> tuple[int, list[Recorded]] | None:
-        """Return the start of the chunk with the last matching message of a key, and its content before that message.
+        """Return the start of the chunk with the last matching message of a key, and the chunk's messages before that.
 
-        `is_it`: whether a payload matches.
+        `is_it` returns whether a payload matches.
         """
         channels = {number for number, name in self._keys.items() if name == key}
         for chunk in reversed([chunk for chunk in self._chunks if not chunk.channels.isdisjoint(channels)]):
@@ -236,7 +236,7 @@ class RecordReader:
                 self._damaged.add(chunk.place)
                 continue
             unpack, payload, head = layout.MESSAGE.unpack_from, layout.MESSAGE.size, layout.HEAD.size
-            if chunk.channels <= wanted.keys():  # without its indexes
+            if chunk.channels <= wanted.keys():  # read without the chunk's indexes
                 at, end = 0, len(content) - payload
                 while at <= end:
                     opcode, length, number, _, t_ns, wall_ns = unpack(content, at)
@@ -268,8 +268,8 @@ class RecordReader:
     def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Held], dict[int, int]]:
         """Return messages stamped long before the rest of their chunk, and by chunk the first time of the rest [ns].
 
-        A program that does not stamp its messages gives every chunk one of time 0. Ordered by their oldest messages,
-        all chunks would be read and held at the beginning.
+        A program that does not stamp its messages puts one of time 0 into every chunk. If chunks were ordered by their
+        oldest messages, all would be read and held at the beginning.
         """
         strays: list[_Held] = []
         floors: dict[int, int] = {}
@@ -278,7 +278,7 @@ class RecordReader:
             if chunk.first_ns >= chunks[number - 1].last_ns - OVERLAP_NS:
                 continue
             entries = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
-            floor_ns = 0  # below most of its times, robust against a few outliers on either side
+            floor_ns = 0  # below most times of the chunk, robust against a few outliers on either side
             if times := sorted(t_ns for t_ns, _, _ in entries):
                 middle, late = times[len(times) // 2], times[3 * len(times) // 4]
                 floor_ns = middle - 3 * (late - middle) - OVERLAP_NS  # 2 (late - middle) suffices for uniform times

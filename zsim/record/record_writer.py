@@ -1,7 +1,7 @@
 """Writes a record during a run, closes it, and repairs one whose writer died.
 
-Closing and repair use the same code to derive the end of a record (data end, summary and footer) from the file, so the
-writer needs no index in memory.
+Closing and repairing use the same code to derive the end of a record (data end, summary and footer) from the file, so
+the writer needs no index in memory.
 """
 
 import struct
@@ -29,11 +29,12 @@ from zsim.record import mcap_layout as layout
 from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE, MESSAGE_HEAD
 from zsim.record.record_reader import RecordReader
 
-CHUNK_BYTES = 1024 * 1024  # maximum not yet on disk, besides the last message
+CHUNK_BYTES = 1024 * 1024  # maximum bytes not yet on disk, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s no message waits longer than 0.5 s
 CHANNELS_MAX = 65_535  # MCAP numbers channels in 16 bits
 _TIME_MAX = 2**64 - 1
-_MEDIA = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}  # in MCAP
+# MCAP's message encoding by media type of the Zenoh encoding
+_MEDIA = {"": "msgpack", "application/msgpack": "msgpack", "application/json": "json", "text/json": "json"}
 _FOOTER_CRC = struct.Struct("<BQQQ")  # part of the footer covered by its checksum
 _FOOTER_LENGTH = 20
 _encode = messages.encode
@@ -42,26 +43,26 @@ _encode = messages.encode
 class RecordWriter:
     """Appends messages to a record; for use by one thread.
 
-    The file is readable at any time, even if this process dies: a chunk and its indexes are one write. Memory holds
-    only the open chunk and the names of the keys. If the disk is full or lost, every method raises RecordError; the
-    file is closed after its last complete chunk.
+    The file is readable at any time, even if this process dies: a chunk and its indexes are written at once. Memory
+    holds only the open chunk and the names of the keys. If the disk is full or lost, every method raises RecordError;
+    the file is closed after its last complete chunk.
     """
 
     def __init__(self, path: str | Path, goes_on: bool = False) -> None:
         """Create the file or, if `goes_on`, continue it after its last complete chunk; no file is overwritten.
 
-        RecordError if the file exists, cannot be continued, or cannot be written.
+        Raises RecordError if the file exists, cannot be continued, or cannot be written.
         """
         self.path = Path(path)
         self.has_former = False  # whether the file had messages of an earlier writer
         self.refused = 0  # messages on keys beyond the 65 535 that a record can hold
-        self._channels: dict[str, int] = {}  # by key, numbered from 1
+        self._channels: dict[str, int] = {}  # number of each key's channel, from 1
         self._gate_channels = PerPattern(self._channels_of)
         self._schemas: dict[str, int] = {}
         self._ahead: list[bytes] = []  # new schemas and channels of the open chunk, written before it
         self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4)
         self._seen = (0, 0)  # end of the file at an earlier tick, and wall time of that tick
-        self._end = 0  # of the last complete chunk
+        self._end = 0  # end of the last complete chunk in the file
         self._error = ""
         self._file = _opened(self.path, "r+" if goes_on else "x+")
         if not goes_on:
@@ -99,8 +100,8 @@ class RecordWriter:
         """Add a message.
 
         Args:
-            key: without the federation's prefix.
-            payload: as on the wire.
+            key: key without the federation's prefix.
+            payload: payload as on the wire.
             encoding: Zenoh's, e.g. `application/msgpack;Truth`; a key's first encoding applies to all its messages.
             t_ns: simulated time.
             wall_ns: wall clock of the recorder.
@@ -145,7 +146,7 @@ class RecordWriter:
     def tick(self, wall_ns: int) -> None:
         """Write the open chunk to disk once it is old; must be called every 0.1 s, even if no message arrives.
 
-        `wall_ns` is of a monotonic clock; it is compared only with its own earlier values.
+        `wall_ns` is from a monotonic clock; it is compared only with its own earlier values.
         """
         end, since_ns = self._seen
         if not self._open.size or end != self._end:
@@ -244,7 +245,7 @@ def _opened(path: Path, mode: str) -> FileIO:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a process is writing the record at a path; false if there is no record."""
+    """Return whether a process is writing the record at a path; False if there is no record."""
     if not path.exists():
         return False
     with path.open("rb") as file:
@@ -252,7 +253,7 @@ def is_being_written(path: Path) -> bool:
 
 
 def _time(value: int) -> int:
-    """Return a time [ns] limited to MCAP's range."""
+    """Return a time [ns] clipped to MCAP's range."""
     return value if type(value) is int and 0 <= value <= _TIME_MAX else min(max(int(value), 0), _TIME_MAX)
 
 
@@ -270,8 +271,8 @@ class OpenChunk:
         counted: number of messages of each channel in earlier chunks.
 
     Attributes:
-        size: bytes of its records.
-        since_ns: wall clock of the first of its messages.
+        size: size of its message records [bytes].
+        since_ns: wall clock of its first message.
     """
 
     def __init__(self, room: int, counted: Sequence[int] = (0,)) -> None:
@@ -301,9 +302,9 @@ class OpenChunk:
         self._published.append(wall_ns)
 
     def add_gate(self, channels: bytes, gate: GateMessages, wall_ns: int) -> None:
-        """Add the messages of a gate, whose buffer has room for a head before each message.
+        """Add the messages of a gate; its buffer has room for a head before each message.
 
-        `channels`: channel number of each message, int64.
+        `channels`: channel number of each message, as bytes of int64.
         """
         if not self.size:
             self.since_ns = wall_ns
@@ -320,7 +321,7 @@ class OpenChunk:
         self._data = self._data + bytes(max(size - len(self._data), self._room))
 
     def take(self) -> "Content":
-        """Return the messages so far and begin a new chunk; the content is valid until the next message."""
+        """Return the messages so far and begin a new chunk; the content is valid until a message is added."""
         columns = map(_column, (self._channels, self._ends, self._log, self._published))
         content = Content(memoryview(self._data)[: self.size], *columns)
         self._counted = content.write_heads(self._counted)
@@ -339,9 +340,9 @@ class Content:
         self._order = np.argsort(channels, kind="stable")  # by channel, in the order of arrival
 
     def write_heads(self, counted: NDArray) -> NDArray:
-        """Write the head of each message; return the number of messages of each channel so far.
+        """Write the head of each message; return the new number of messages of each channel.
 
-        `counted`: number of earlier messages of each channel.
+        `counted`: number of messages of each channel in earlier chunks.
         """
         heads = np.empty(len(self._ends), dtype=MESSAGE_HEAD)
         heads["opcode"], heads["channel"] = int(Opcode.MESSAGE), self._channels
@@ -372,10 +373,10 @@ def _column(values: array) -> NDArray:
 
 
 def cut_at_last(path: Path, key: str, is_it: Callable[[bytes], bool]) -> bool:
-    """Truncate a record before the last message of a key, to resume its run; return whether there was one.
+    """Truncate a record before the last matching message of a key, to resume its run; return whether there was one.
 
     Args:
-        is_it: whether a payload is that of the message sought.
+        is_it: returns whether a payload matches.
 
     Raises:
         RecordError: the file is not a record, cannot be written, or is being written by another process.
@@ -422,7 +423,7 @@ def repair(path: str | Path) -> bool:
 def _cut_off(file: FileIO, path: Path) -> None:
     """Truncate a record after its last complete chunk, or else its header, so that it can be continued from there.
 
-    RecordError if the file is not a record; OSError if it cannot be written.
+    Raises RecordError if the file is not a record, and OSError if it cannot be written.
     """
     end, tail = 0, layout.opening()
     if file.seek(0, 2):
@@ -434,7 +435,7 @@ def _cut_off(file: FileIO, path: Path) -> None:
                     break
                 if last is None or place.opcode == Opcode.CHUNK:
                     last = place
-            if last is not None:  # the indexes of its chunk may be cut off
+            if last is not None:  # the indexes of the last chunk may be cut off
                 content = layout.content_of(source, last) if last.opcode == Opcode.CHUNK else None
                 found = layout.indexes_of(content or b"").items()
                 end = last.end
@@ -445,7 +446,7 @@ def _cut_off(file: FileIO, path: Path) -> None:
 
 
 def _finish(file: FileIO) -> None:
-    """Write summary and footer at the end of a file opened for unbuffered reading and writing; OSError if full."""
+    """Write summary and footer to the end of a file open for unbuffered reading and writing; raise OSError if full."""
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary = _summary(source)
         data_end = layout.packed(DataEnd(layout.crc_until(source, len(source))))
@@ -462,7 +463,7 @@ def _finish(file: FileIO) -> None:
 
 
 def _summary(source: layout.Source) -> dict[Opcode, bytes]:
-    """Return the records of a data section's summary by kind, in the order of the file."""
+    """Return the records of the summary of a file's data section, by kind, in their order in the file."""
     schemas, channels, chunks = RecordBuilder(), RecordBuilder(), RecordBuilder()
     numbers: Counter[Opcode] = Counter()
     messages: Counter[int] = Counter()
@@ -512,6 +513,6 @@ def _summary(source: layout.Source) -> dict[Opcode, bytes]:
 
 
 def _finish_bare(file: FileIO) -> None:
-    """Write the shortest end that MCAP allows, 50 bytes without a summary; OSError if the disk is full."""
+    """Write the shortest end that MCAP allows, 50 bytes without a summary; raise OSError if the disk is full."""
     file.seek(0, 2)
     layout.write_all(file, layout.packed(DataEnd(0)) + layout.packed(Footer(0, 0, 0)) + layout.MAGIC)

@@ -4,7 +4,7 @@
     runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
 
 `zsim.runtime.runner` runs it as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both pass the same inputs
-in the same order, so that the outputs are identical to the bit.
+in the same order, so that the outputs are bit-identical.
 """
 
 import math
@@ -47,38 +47,38 @@ class Agent(ABC):
     """Base class of all agents in the lockstep."""
 
     name: str  # process name `role.thing`, e.g. `estimator.drone1`
-    period_ns: int  # how often it publishes done; a multiple of the gate
-    reads: tuple[str, ...]  # key expressions it subscribes to
-    gate_keys: tuple[str, ...]  # keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status
-    # drones all of whose sensors it reads: it waits for every message that their status counts
+    period_ns: int  # interval of its steps and dones; a multiple of the gate interval
+    reads: tuple[str, ...]  # key expressions to which it subscribes
+    gate_keys: tuple[str, ...]  # gate t closes once each of these keys has had a message stamped t, e.g. sensor/status
+    # drones of which it reads all sensors: it waits for every message that their status counts
     counted: tuple[str, ...] = ()
     # keys whose messages belong to no gate: a late one is delivered with the next gate
     uncounted: tuple[str, ...] = ()
-    writes: tuple[str, ...] = ()  # keys that it publishes at every gate and that others of its process may read
+    writes: tuple[str, ...] = ()  # keys that it publishes at every gate, which other agents of its process may read
     serves: tuple[str, ...] = ()  # names of the processes that it replaces, besides its own
     # whether it takes the world's messages of a gate as columns and one buffer, in `receive_gate`
     takes_gates: bool = False
     repeats: tuple[str, ...] = ()  # keys of its outputs that record the requests it accepted, for `repeat`
-    messages: tuple[type[AgentMessage], ...] = ()  # user's message classes that it publishes
+    messages: tuple[type[AgentMessage], ...] = ()  # a user's message classes that it publishes
     thing = ""  # name of its drone or cluster: the second part of its own name
     _flies = ""  # the only drone that it may command; empty: any
     _links: Links | None = None
     _transmitter: Transmitter | None = None
-    _answered_ns = 0  # the last gate whose inputs it received
+    _answered_ns = 0  # the last gate of which it received the inputs
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
         self._process = ""  # name of the group that it belongs to, under which it publishes
 
     def bind(self, info: Info, name: str = "", radio: Radio | None = None) -> None:
-        """Fill in the defaults of a user's class before its agent joins the run of `world/info`.
+        """Fill in what a user's class does not define, before its agent joins the run of `info`.
 
-        The name: `agent.` and the class's name; `period_ns`: every gate; `gate_keys`: the status of every drone, or of
-        its own drone, and the estimates and cluster states in `reads`, which are published at every gate. In `reads`,
-        `{drone}` and `{cluster}` stand for the name of the agent's drone or cluster.
+        By default, the name is `agent.` and the class's name; the agent steps at every gate; `gate_keys` are the status
+        of its own drone, or of every drone, and the estimates and cluster states in `reads`, which are published at
+        every gate. In `reads`, `{drone}` and `{cluster}` stand for the name of the agent's drone or cluster.
 
         Args:
-            name: name of the process, in place of the agent's own.
+            name: name of the process, instead of the agent's own.
             radio: radio for messages between users' agents; None: all are delivered.
         """
         if not hasattr(self, "_process"):  # a class whose constructor does not call this one's
@@ -141,7 +141,7 @@ class Agent(ABC):
         Outputs of a user's class are converted as they would be over Zenoh, to finite values of the contract's types.
 
         Raises:
-            UserCodeError: a user's class raised, or returned an invalid value.
+            UserCodeError: a user's class raised an exception or returned an invalid value.
         """
         try:
             self._answered_ns = t_ns
@@ -163,7 +163,7 @@ class Agent(ABC):
 
     @staticmethod
     def held_by(frame: FrameType | None) -> str:
-        """Return which agent has not returned, and its current line, given a frame of its thread; "" if none."""
+        """Return a text naming the agent that has not returned, and its line, by a frame of its thread; "" if none."""
         line = plugin.innermost_line(frame)
         while frame and frame.f_code is not Agent.answer.__code__:
             frame = frame.f_back
@@ -173,7 +173,7 @@ class Agent(ABC):
         return f"; {agent.name} has not returned at {agent._answered_ns / 1e9:.2f} s{line}"
 
     def failure(self, error: BaseException, t_ns: int) -> UserCodeError | None:
-        """Return an error raised by a user's code, with the agent's name and the gate; None for other errors."""
+        """Return an error raised by user code, with the agent's name and the gate; None for other errors."""
         return plugin.user_code_error(error, f"{self.name} at {t_ns / 1e9:.2f} s")
 
     @cached_property
@@ -183,7 +183,7 @@ class Agent(ABC):
     def _checked(self, t_ns: int, output: Any) -> Output:
         """Return an output of a user's class as it would be received, with its source.
 
-        A message of the class's own types may lack its key, stamp and number.
+        A message of the class's own types may lack its key, stamp and sequence number.
         """
         try:
             if isinstance(output, AgentMessage):
@@ -215,7 +215,7 @@ class Agent(ABC):
             raise UserCodeError(f"{plugin.full_name(type(self))}.step returns {error}") from error
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
-        """Receive the inputs of a gate in canonical order, after applying its link faults and radio."""
+        """Receive the inputs of a gate in canonical order, after applying the agent's link faults and radio."""
         if self._links is not None and self._links.act_at(t_ns):
             inputs = self._links.delivered(t_ns, self._router.one_by_one(inputs))
         elif not self.takes_gates and not self._process:
@@ -255,7 +255,7 @@ class Agent(ABC):
         return
 
     def control_keys(self) -> tuple[str, ...]:
-        """Return the keys at which `control` answers requests."""
+        """Return the keys on which `control` answers requests."""
         return ()
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
@@ -272,7 +272,7 @@ class Agent(ABC):
     def snapshot(self) -> State | None:
         """Return the state after the last gate stepped, as plain values; None if not supported.
 
-        A new agent given this state by `restore` continues with outputs identical to the bit.
+        A new agent given this state by `restore` continues with bit-identical outputs.
         """
         return None
 
@@ -283,7 +283,7 @@ class Agent(ABC):
         """Repeat a request that the predecessor published on a key of `repeats`; called before the message's gate."""
 
     def checkpoint(self) -> State | None:
-        """Return the snapshot with the state common to all agents: sequence numbers and messages held by links."""
+        """Return the snapshot and the state common to all agents: sequence numbers and messages held by links."""
         own = self.snapshot()
         if self._is_own:
             try:
@@ -310,17 +310,17 @@ class Agent(ABC):
             self._transmitter.restore(checkpoint["transmitter"])
 
     def command(self, t_ns: int, drone: str, command: Struct) -> Output:
-        """Return a command to a drone as an output of the gate t_ns, with stamp, number and source.
+        """Return a command to a drone as an output of the gate t_ns, with stamp, sequence number and source.
 
         Args:
-            command: from `zsim.velocity` or a similar function.
+            command: result of `zsim.velocity` or a similar function.
         """
         key = messages.command_key(drone, command)
         stamp = {"t_ns": t_ns, "seq": self.next_seq(key), "source": self.source}
         return Output(key, replace(command, **stamp))
 
     def message(self, t_ns: int, message: AgentMessage) -> Output:
-        """Return a message to agents, which read it a gate later, as an output with stamp, number and source."""
+        """Return a message to agents as an output with stamp, sequence number and source; it is read a gate later."""
         key = message.of(self.thing)  # the source is the agent even in a group, since readers may depend on it
         return Output(key, replace(message, t_ns=t_ns, seq=self.next_seq(key), source=self.name))
 
@@ -342,18 +342,18 @@ def default_name(made: Any) -> str:
 
 
 class AgentGroup(Agent):
-    """Several agents that share a process, its name, its join and its done; steps them one after the other.
+    """Several agents that share a process, its name, its join and its done; they step one after the other.
 
         AgentGroup([estimators, controller], output_hold_ns(info))     sensors in, estimates and commands out
 
-    A process costs more than its agents: three estimators and a controller run about twice as fast in one process.
+    A process has more overhead than an agent: three estimators and a controller run about twice as fast in one process.
 
     A member receives each message at the gate at which a separate process would: outputs of other members that close
     its gate (in their `writes` and its `gate_keys`) immediately; all others through the transport, `hold_ns` after
     their stamp. The group takes the name of its last member, which is also the source of all its messages.
 
     Args:
-        members: in any order; each steps at the gates of its own period.
+        members: the agents, in any order; each steps at the gates of its own period.
         hold_ns: `output_hold_ns` of the run.
 
     Raises:
@@ -379,7 +379,7 @@ class AgentGroup(Agent):
         self.uncounted = _joined(member.uncounted for member in members)
         self.repeats = _joined(member.repeats for member in members)
         self._waiting: list[list[Input]] = [[] for _ in members]
-        self._held: list[tuple[int, int, Input]] = []  # until when [ns], index of the member, input
+        self._held: list[tuple[int, int, Input]] = []  # time of release [ns], index of the member, input
         self._routes = RoutingTable([member.reads for member in self._members])
         self._places: dict[str, list[tuple[int, int]]] = {}  # by key: (receiving member, hold time [ns])
         self._relays = {key: [i for i, closing in enumerate(self._closing) if key in closing] for key in inner}
@@ -400,7 +400,7 @@ class AgentGroup(Agent):
             places = self._places[key] = []
             for place in self._routes.readers(key):
                 closing = self._closing[place]  # what closes one member's gate may be a plain input of another
-                if key not in self._inner & closing:  # otherwise it has been relayed
+                if key not in self._inner & closing:  # otherwise, it has been relayed
                     held = is_held(key, closing, self._members[place].uncounted)
                     places.append((place, self._hold_ns if held else 0))
         for place, hold_ns in places:
@@ -484,7 +484,7 @@ def _joined(parts: Any) -> tuple[str, ...]:
 
 
 def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
-    """Return the members, each after those whose outputs close its gate; RunError if there is no such order."""
+    """Return the members, each after those whose outputs close its gate; raise RunError if no such order exists."""
     if not members:
         raise RunError("a group has no members; must have at least one")
     writers = {key: place for place, member in enumerate(members) for key in member.writes}

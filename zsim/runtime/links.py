@@ -155,7 +155,7 @@ def total_delay_ns(
 ) -> int | None:
     """Return the total delay that several faults cause a message [ns]; NEVER if it is lost.
 
-    Under a radio fault, a message over the distance d arrives with probability 1 / (1 + exp((d - range) / spread)).
+    Under a radio fault, a message sent over distance d arrives with probability 1 / (1 + exp((d - range) / spread)).
     """
     total_ns = 0
     for fault in faults:
@@ -232,7 +232,7 @@ def senders(key: str, message: Any, roles: Mapping[str, str] = {}) -> tuple[str,
     else:
         return (whose,) if kind == "process" else (WORLD,)
     is_shared = source.partition(".")[0] in ("estimator", "controller", "reference")
-    return (named,) if is_shared or not source else (named, source)  # a process of another name may replace it
+    return (named,) if is_shared or not source else (named, source)  # `source` may have replaced the agent
 
 
 class Receiver:

@@ -33,7 +33,7 @@ ANOTHER_RUN = "the world has begun another run"
 REPLAY_S = 2.0  # wall-time limit of a replay; a hub answers within milliseconds, or never if the link is lost
 REJOINS_MAX = 6  # unanswered joins after which one is assumed to have arrived; a new router forwards nothing at first
 RETRY_S = 0.5  # wall time between attempts at an unanswered request to the world
-ASKED_MAX = 10  # replays requested for a lost message: the first lacks a message still on its way to the world
+ASKED_MAX = 10  # maximum replays for a lost message, which may still be on its way to the world at the first
 RESUME_NS = 4_000_000_000  # maximum simulated age of a usable snapshot: the world keeps 5 s of history
 GATES_KEPT = 2  # gates whose outputs are kept for queries, as the contract demands; more if the world runs ahead
 
@@ -256,7 +256,7 @@ class AgentParticipant(Participant):
         return None
 
     def warm_start(self) -> int | None:
-        """Pass the last values of its predecessor to the agent; return the newest one's time, or None."""
+        """Pass the last values of its predecessor to the agent; return the time of the newest, or None."""
         for key in self._agent.warm_start_keys():
             for sample in self._last_values(key):
                 try:

@@ -19,7 +19,7 @@ from zsim.errors import printable, without_figures
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time until the notice; compiled code loads within 2 s unless the machine is busy
 SLOW_NOTICE = "loading compiled code; the first time on a machine it is compiled, which takes one to three minutes"
-REPEATED_S = 10.0  # simulated time over which equal events are counted, like the interval of plain clock lines
+REPEATED_S = 10.0  # simulated time over which equal events are counted; also the interval of plain clock lines
 REASON_NS = 5_000_000_000  # simulated time after which a reason is shown; in a normal take-off one lasts 3 s
 DRIVERS, COMINGS = "driver.", ("join", "leave")  # shown because people start drivers by hand and watch this screen
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
@@ -116,7 +116,7 @@ class JsonProgress:
 
     @staticmethod
     def read(text: str) -> tuple[str, Any]:
-        """Return the kind and content of a line from this class; the kind is empty for a line from a library."""
+        """Return the kind and content of a line from this class; the kind is empty for other output."""
         try:
             line = json.loads(text)
         except ValueError:

@@ -378,7 +378,7 @@ class RunnerInputs:
                 yield key, request
 
     def ignore_estimates(self, process: str) -> None:
-        """Stop waiting for the estimates last published by a process, or if none arrived, those its name implies."""
+        """Stop waiting for the estimates last published by a process or, if none arrived, those its name implies."""
         for key, stock in self._stock.items():
             if process == (self._estimated_by.get(key) or stock):
                 self.inbox.expect(key, NEVER_NS)

@@ -57,7 +57,7 @@ AIR_M_S = 2.0
 INERTIA_MAX_MR2 = 10.0
 LEAST_K1 = -4 / 27  # minimum of k1 tan^2(diagonal / 2); below it r + k1 r^3 peaks within the picture
 RESERVED_ROLES = (OPERATOR, "agent", "python", "test")  # roles of zsim's own processes in addition to ROLES
-SIGHTED_MAX = 12  # maximum drones in a sighted cluster: each estimator holds the states of all, at quadratic cost
+SIGHTED_MAX = 12  # maximum drones of a cluster with sightings: each estimator holds all states, at quadratic cost
 
 
 def cross_faults(

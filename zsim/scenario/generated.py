@@ -27,7 +27,7 @@ from zsim.scenario.surroundings import TRIANGLE, TRIANGLES_MAX, packed, unpacked
 from zsim.schema import plugin
 from zsim.schema.checker import Fault, faults, faults_in, show, sound
 
-TRIES_MAX = 500  # attempts to place a trunk before the forest counts as full; design choice, bounds the time
+TRIES_MAX = 500  # attempts to place a trunk before the forest counts as full; design choice: bounds the time it takes
 BYTES_MAX = 100_000_000  # maximum size of a file
 Entry = dict[str, Any]
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ _KINDS = {"forest": Forest, "corridor": Corridor, "cloud": Cloud}
 
 
 def with_generated(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a raw document with forest, corridor and cloud turned into obstacles and surfaces read, and the faults."""
+    """Return a raw document with generated obstacles and the triangles of surfaces filled in, and the faults."""
     environment = document.get("environment")
     if not isinstance(environment, dict):
         return document, []

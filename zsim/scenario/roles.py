@@ -16,7 +16,7 @@ from zsim.schema.checker import listed
 
 MAIN = "main"  # second part of the name of an agent that serves the whole run
 OPERATOR, RECORDER, WORLD, ROUTER, DRIVER = "operator", "recorder", "world", "router", "driver"
-PILOT = "reference"  # only for drones with a reference of their own
+PILOT = "reference"  # role of the pilots of drones with a reference of their own
 
 
 class Role(NamedTuple):
@@ -245,7 +245,7 @@ def _granted_own(agent: OwnAgent, thing: str, scenario: Scenario) -> Rights:
 def _granted(role: str, **names: Sequence[str]) -> Rights:
     """Return the rights that the contract's messages give a role on the keys of some drones, clusters or processes.
 
-    `names` are these by kind of key: `drone`, `cluster`, `process`, and `estimates` for the process itself.
+    `names` lists them by kind of key: `drone`, `cluster`, `process`, and `estimates` for the process itself.
     """
     reads, writes, asks, answers = [], [], [], []
     for key, topic in TOPICS.items():

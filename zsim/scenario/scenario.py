@@ -25,7 +25,7 @@ OBSTACLES_MAX = 1000  # every drone is checked against every obstacle in every s
 SURFACES_MAX = 100
 FAULTS_MAX = 1000  # injected faults, planned and active; all are examined whenever one begins or ends
 CLUSTERS_MAX = DRONES_MAX // 2  # each has at least two drones, which belong to no other
-PROCESSES_MAX = 4 * DRONES_MAX  # an estimator per drone, a controller per cluster, and twice as many of the user's
+PROCESSES_MAX = 4 * DRONES_MAX  # an estimator per drone, a controller per cluster, and 2500 processes of users
 WAYPOINTS_MAX = 10_000  # about an hour at 3 per second
 CONSTANTS_MAX = 100  # a user's constants in the expressions of a trajectory
 ROBOTS_MAX = 64  # drones of a cluster; above this, a dense 4n x 4n Jacobian no longer fits into a control gate of 20 ms
@@ -152,10 +152,10 @@ class Exchange(Piloted, frozen=True, kw_only=True):
 
 
 class Drone(Spec, frozen=True, kw_only=True):
-    """One aircraft. Unset fields default to its model (zsim/vehicles); the defaults here are the AR.Drone's."""
+    """One aircraft. Unset fields take the values of its model (zsim/vehicles); the defaults here are the AR.Drone's."""
 
     name: Name
-    model: str = "ardrone2"  # a stock vehicle, or the user's `package.module` that defines VEHICLE
+    model: str = "ardrone2"  # a stock vehicle, or a user's `package.module` that defines VEHICLE
     body: Literal["simulated", "external"] | UnsetType = UNSET
     """Unset: simulated, and left out of the resolved text. A driver publishes the messages of an external body."""
     position_m: Position
@@ -336,7 +336,7 @@ class AssemblyPoint(Spec, frozen=True, kw_only=True):
 
 
 class ClusterPlan(Spec, frozen=True, kw_only=True):
-    """What the controller does without being requested to."""
+    """What the controller does of its own accord, without requests."""
 
     takeoff_s: NonNegative | None = None
     assemblies: Annotated[list[AssemblyPoint], Meta(min_length=1, max_length=STAGES_MAX)] | UnsetType = UNSET
@@ -519,7 +519,7 @@ class Radio(Spec, frozen=True, kw_only=True):
     RECEPTION_MIN are not neighbours.
     """
 
-    range_m: Positive | None = None  # None: any distance
+    range_m: Positive | None = None  # distance at which half of the messages arrive; None: unlimited
     spread_m: NonNegative = 0.0  # 0: everything is received up to range_m, and nothing beyond
     loss: Fraction = 0.0
     line_of_sight: bool = False  # whether obstacles and surfaces block the radio

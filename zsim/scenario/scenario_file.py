@@ -25,7 +25,7 @@ from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattene
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import DEFAULT_MODEL, MODELS, Aerodynamics, Vehicle, vehicle_of
 
-EXAMPLE = "scenarios/step.yaml"  # named in errors
+EXAMPLE = "scenarios/step.yaml"  # example of a scenario, named in errors
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 PATH_MAX = 1000  # characters; ten times the longest path in a scenario
 NOTHING: Mapping[str, Any] = {}
@@ -90,8 +90,8 @@ def sha256(text: str) -> str:
 def _resolve(document: dict[str, Any], source: str, lines: list[str], imports: bool = True) -> Scenario:
     """Return the scenario of a raw document; `lines` are faults found earlier.
 
-    A drone's own fields take precedence over the document's `vehicle:`, and these over the numbers of its model;
-    likewise its own `sensors:` over those of the document, and these over the preset. Faulty parts of the shared
+    A drone's own fields take precedence over the document's `vehicle:`, and those over the numbers of its model;
+    likewise the drone's own `sensors:` over the document's, and those over the preset. Faulty parts of the shared
     sections are not passed to the drones, so that their faults are reported only once.
     """
     misread: list[Fault] = []  # sensor error models with unreadable units

@@ -18,7 +18,7 @@ from zsim.errors import DocumentError
 SHOWN_MAX = 60  # maximum characters of a value shown in an error
 FAULTS_MAX = 100  # maximum faults listed; further ones are only counted
 COUNTED_MAX = 10_000  # maximum count of further faults: a document of 1 MB can have many more, and each takes time
-NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # ranges of the number types: not stated
+NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # type ranges, omitted from errors
 
 Fault = tuple[str, str]  # (path, "is …; must be …"); the path of the document itself is empty
 

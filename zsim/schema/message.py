@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 else:
     SEVERAL = [f"number[{count}]" for count in range(1, COUNT_MAX + 1)]
     FieldType = Literal["number", "whole", "flag", "text", "number[]", *SEVERAL]
-"""Type of a field: a finite number, a whole number, a flag, text, or numbers of any or of a fixed count."""
+"""Type of a field: a finite number, a whole number, a flag, text, or a list of numbers of any or a fixed length."""
 FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
 MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
 _WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag", types.StrType: "text"}

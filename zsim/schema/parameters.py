@@ -75,7 +75,7 @@ def resolved(kind: Callable[..., Any], given: Any, where: str, filled: tuple[str
 def bound(kind: Any, given: Any, where: str) -> Any:
     """Return a subclass whose instances have these parameters, set before the constructor is called.
 
-    A class without `Parameters` is returned itself.
+    A class without `Parameters` is returned as it is.
 
     Raises:
         DocumentError: as for `resolved`, or parameters are given although the class has no `Parameters`.

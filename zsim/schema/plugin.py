@@ -34,7 +34,7 @@ from zsim.schema.checker import show
 
 Object = TypeVar("Object")
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that child processes search there too
-IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value to forbid imports
+IMPORTS, NO_IMPORTS = "ZSIM_PLUGIN_IMPORTS", "no"  # environment variable, likewise, and its value that forbids imports
 NO_LOOKUP = "unseen"  # value that also forbids looking up names
 WHERE = "install it, or put it on PYTHONPATH or in the scenario's folder"
 
@@ -103,7 +103,7 @@ def load(name: str, where: str, kind: type, is_constructed: bool = False) -> Cal
 
     Raises:
         DocumentError: the module or class does not exist, or a method is missing or takes other arguments.
-        NotTrustedError: the class must not be imported; its source was only looked up.
+        NotTrustedError: importing the class is not allowed.
     """
     loaded = _attribute(name, where, "Class", isclass)
     methods = [method for method in dir(kind) if not method.startswith("_") and callable(getattr(kind, method))]

@@ -146,7 +146,7 @@ class RangeConfig(Scanner, frozen=True, kw_only=True):
 
 
 class LidarConfig(Scanner, frozen=True, kw_only=True):
-    """Rows (channels) of rays at equal angles about the sensor's z axis; by default a 2D lidar, the RPLIDAR A1."""
+    """Rows (channels) of rays equally spaced in angle about the sensor's z axis; by default the 2D lidar RPLIDAR A1."""
 
     rate_hz: RateHz = 5.5
     channels: ChannelCount = 1

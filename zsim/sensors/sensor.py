@@ -1,4 +1,4 @@
-"""The definition of a sensor: message, settings, channels with error models, and, for a user's sensor, its equation.
+"""Definition of a sensor: message, settings, channels with error models, and, for a user's sensor, its equation.
 
     SENSOR = SensorType(message=Airspeed, settings=AirspeedConfig, channels=(...), equation=dynamic_pressure)
 
@@ -20,7 +20,7 @@ from zsim.math.linear import product
 from zsim.schema.message import FieldName, FieldType, Message, MessageName, Whole, declared_type, field_types
 from zsim.schema.quantities import Fraction, NonNegative, Vector3
 
-VALUES_MAX = 6  # numbers in one reading
+VALUES_MAX = 6  # maximum count of numbers in a reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
 LatencyMs = Annotated[float, Meta(ge=0, le=10_000)]
 CorrelationS = Annotated[float, Meta(ge=0, le=1e6)]
@@ -28,11 +28,11 @@ UNSENSED = ("text", "number[]")  # field types not allowed in a sensor's message
 
 
 class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Error of one channel, in its unit; `sensor_catalogue` converts the units of data sheets and of Kalibr."""
+    """Errors of one channel, in its unit; `sensor_catalogue` converts the units of data sheets and of Kalibr."""
 
     noise: NonNegative = 0.0  # standard deviation per sample; white, or with `correlation_s` a Gauss-Markov process
     density: NonNegative = 0.0  # white noise per sqrt(Hz); its standard deviation per sample is density * sqrt(rate)
-    bias: NonNegative = 0.0  # standard deviation over runs, per axis, of a bias that is constant over a run
+    bias: NonNegative = 0.0  # standard deviation between runs, per axis, of a bias that is constant in a run
     bias_walk: NonNegative = 0.0  # random walk of the bias, per sqrt(s)
     bias_instability: NonNegative | UnsetType = UNSET
     """Standard deviation of a Gauss-Markov process, added in quadrature to a correlated `noise`; unset: none."""
@@ -63,7 +63,7 @@ class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The settings common to all sensors."""
+    """Settings common to all sensors."""
 
     rate_hz: RateHz
     latency_ms: LatencyMs = 0.0
@@ -88,7 +88,7 @@ class Channel(Struct, frozen=True, omit_defaults=True):
             values in rad/s.
         part: first word of the channel's fault kinds; empty if they concern the whole sensor.
         label: display name of the part.
-        axes: phrase for the axes or quantity of a fault's bias, "east, north, up" or "of height".
+        axes: phrase for the axes or quantity of a fault's bias, e.g. "east, north, up" or "of height".
         bias_max: maximum bias that a fault may add to each number, in `unit`.
     """
 
@@ -165,7 +165,7 @@ class SensorType(Struct, frozen=True, kw_only=True):
         label: name of the sensor in tables; empty for its name in the scenario.
         equation: equation of a user's sensor; those of the stock sensors are compiled in zsim_world.sensors.
         convert: conversion of a user's sensor from reading to message; None if the values are the message's numbers.
-        presets: sections of a stock sensor by name of the preset.
+        presets: sections of a stock sensor by preset name.
     """
 
     message: type[Sample]
@@ -194,7 +194,7 @@ class SensorType(Struct, frozen=True, kw_only=True):
 
 
 class Declaration(Struct, frozen=True, omit_defaults=True):
-    """The description of a user's sensor for processes without its module; part of the resolved scenario."""
+    """Description of a user's sensor for processes without its module; part of the resolved scenario."""
 
     message: MessageName
     fields: dict[FieldName, FieldType]
@@ -234,7 +234,7 @@ def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
     """Return a flat sequence of numbers grouped into the values of a message's fields.
 
     Raises:
-        ValueError: the fields need another count of numbers.
+        ValueError: the fields need a different count of numbers.
     """
     values, at = [], 0
     for word in fields.values():

@@ -1,4 +1,4 @@
-"""The sensors of a drone: the stock sensors in the contract's order, and users' sensors by their modules.
+"""Sensors of a drone: the stock sensors in the contract's order, and users' sensors, found in their modules.
 
 A scenario may specify error models with the names and units of data sheets and of Kalibr; they are converted to the
 fields of `zsim.sensors.sensor.ErrorModel`, in the channel's unit:
@@ -45,7 +45,7 @@ STOCK: dict[str, SensorType] = {
 
 
 class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The sensors of one drone, after applying preset and overrides."""
+    """The sensors of one drone, after its preset and overrides have been applied."""
 
     preset: Literal["ardrone2", "paper", "crazyflie2"]
     as_printed: bool = False  # with `paper`: accelerometer noise of 0.35 g as printed, instead of 0.35 m/s^2
@@ -71,7 +71,7 @@ class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return {name: camera for name, camera in found.items() if camera is not UNSET}
 
     def sections(self) -> Iterator[tuple[str, SensorType, Sensor]]:
-        """Yield name, type and settings of every sensor, importing users' modules.
+        """Yield the name, type and settings of every sensor, importing users' modules.
 
         Raises:
             DocumentError: a module is missing, or differs from the one used to resolve the scenario.
@@ -98,7 +98,7 @@ AS_PRINTED = {"imu": stock_sensors.IMU_AS_PRINTED}
 
 MODULE, DECLARED = "module", "declared"  # keys of a user's sensor, in addition to its settings
 FIELDS = tuple(name for name in Sensors.__struct_fields__ if name != "own")
-RESERVED = ("status", "truth", "own", "accel", "gyro", "rotor", "link", "process")  # taken in keys and fault kinds
+RESERVED = ("status", "truth", "own", "accel", "gyro", "rotor", "link", "process")  # names used in keys and fault kinds
 NAME = r"[a-z][a-z0-9_]{0,31}"
 NAME_ALLOWED = f"a letter and up to 31 of a-z 0-9 _, none of {', '.join(RESERVED)}"
 
@@ -282,7 +282,7 @@ def in_channel_units(sensors: dict[str, Any], where: str) -> tuple[Any, list[Fau
     """Return a `sensors:` section with its error models converted to the fields of ErrorModel, and the faults.
 
     Args:
-        sensors: by name; users' sensors, and values that are not maps, are returned unchanged.
+        sensors: sections by sensor name; those of users' sensors, and values that are not maps, are returned unchanged.
         where: path of the section.
     """
     wrong: list[Fault] = []

@@ -1,7 +1,7 @@
-"""The stock sensors: message, settings, channels and presets of each.
+"""Stock sensors: message, settings, channels and presets of each.
 
-Their equations are compiled in zsim_world.sensors. For what the paper does not specify, the preset `paper` has the
-values of the AR.Drone unless a comment states another source.
+Their equations are compiled in zsim_world.sensors. The preset `paper` follows the paper of Mas, Curi and Sánchez Peña;
+where it specifies nothing, the values are those of the AR.Drone unless a comment states another source.
 """
 
 import math
@@ -14,7 +14,7 @@ BOARD_RATE_HZ = 200.0  # Hz, rate of IMU samples and firmware steps on the AR.Dr
 
 
 class Imu(Sample, frozen=True):
-    """Specific force [m/s^2] and body rate [rad/s] in the sensor's axes; the force at rest and level: (0, 0, +9.81)."""
+    """Specific force [m/s^2] and body rate [rad/s] in the sensor's axes; level at rest, the force is (0, 0, +9.81)."""
 
     accel_m_s2: Vector3
     gyro_rad_s: Vector3
@@ -135,7 +135,7 @@ class MagConfig(Sensor, frozen=True, kw_only=True):
     field_ut: ErrorModel = ErrorModel()
 
 
-_MAG_RATE_HZ = 25.0  # Hz, chosen equal to the sonar's rate; the aircraft's magnetometer is faster
+_MAG_RATE_HZ = 25.0  # Hz, design choice: the sonar's rate; the aircraft's magnetometer is faster
 MAG = SensorType(
     label="magnetometer",
     message=Mag,
@@ -163,7 +163,7 @@ class BaroConfig(Sensor, frozen=True, kw_only=True):
 
 
 _BARO_PRESET = {
-    "rate_hz": 25.0,  # Hz, chosen equal to the sonar's rate
+    "rate_hz": 25.0,  # Hz, design choice: the sonar's rate
     "altitude_m": {"noise": 0.1},  # m, twice that of Paparazzi's model of the ardrone2, to allow for rotor wash
 }
 BARO = SensorType(
@@ -203,7 +203,7 @@ SONAR = SensorType(
         "ardrone2": _SONAR_PRESET,
         "paper": _SONAR_PRESET,
         "crazyflie2": {
-            "rate_hz": 25.0,  # Hz, chosen equal to the AR.Drone's
+            "rate_hz": 25.0,  # Hz, design choice: the AR.Drone's rate
             "range_m": {"noise": 0.02},  # m, assumed, including floor and tilt; zranger2.c of its firmware has 2.5 mm
             "max_m": 4.0,  # m, VL53L1x; zranger2.c has a standard deviation of 0.2 m there
         },

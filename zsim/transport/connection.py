@@ -1,4 +1,4 @@
-"""Joining a federation: the hub listens, routers forward, all other processes connect to one of them.
+"""Joining a federation: the hub listens, routers forward, and all other processes connect to one of these.
 
 `find_world` connects and reads `world/info`; it waits, with progress messages, until there is a world.
 """
@@ -18,9 +18,9 @@ from zsim.transport.session import Query, Session, config_of, open_session
 from zsim.transport.tls import Identity, Permissions, permissions_of
 from zsim.transport.zenoh_settings import Mode, Settings
 
-ATTEMPT_S = 1.0  # one attempt to connect, so that waiting can be reported and interrupted
-PAUSE_S = 0.1  # between queries to a hub without a world's answer: another federation's, or one that is starting
-ANSWER_S = 1.0  # a hub answers within milliseconds, unless it is still compiling
+ATTEMPT_S = 1.0  # limit of one attempt to connect, so that waiting can be reported and interrupted
+PAUSE_S = 0.1  # between queries to a hub without an answer from a world, which may be starting or in another federation
+ANSWER_S = 1.0  # time limit of an answer; a hub answers within milliseconds, unless it is still compiling
 _OS_ERROR = re.compile(r"(?:os error |code: )(\d+)")
 _OTHER = "give another with --listen, and with --connect to the other commands"
 _LISTEN_FAULTS = {  # by errno
@@ -47,8 +47,10 @@ def listen(
 ) -> Iterator[Session]:
     """Open the hub: a listening router, of which every other role is a client.
 
-    A peer would suffice for clients, but does not forward between routers connected to it. SessionError if an
-    endpoint is in use or malformed, or the identity is unusable.
+    A peer would suffice for clients, but does not forward between routers connected to it.
+
+    Raises:
+        SessionError: an endpoint is in use or malformed, or the identity is unusable.
     """
     with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub(mode)) as session:
         session.use(mode)
@@ -70,9 +72,9 @@ def route(
 def connect(
     endpoint: str,  # e.g. "tcp/192.168.1.2:7447"
     federation: str,
-    mode: Mode = "lockstep",  # of the run, if known
-    wait_s: float | None = None,  # how long to try; None tries once
-    # whether the run never waits for it; then a silence of LEASE_READER_MS counts as its death, in lockstep too
+    mode: Mode = "lockstep",  # mode of the run, if known
+    wait_s: float | None = None,  # how long to keep trying; None: try once
+    # whether the run never waits for it: even in lockstep, a silence of LEASE_READER_MS then counts as its death
     reader: bool = False,
     identity: Identity | None = None,  # host and certificate; by default this host's name and no TLS
 ) -> Iterator[Session]:
@@ -133,9 +135,9 @@ def find_world(
     federation: str,
     wait_s: float | None = None,  # how long to wait for a world; None: forever
     say: Callable[[str], None] = lambda text: None,  # called at growing intervals while waiting
-    stopped: Callable[[], bool] = lambda: False,  # whether to stop waiting
+    stopped: Callable[[], bool] = lambda: False,  # returns whether to stop waiting
     reader: bool = False,
-    run_id: str | None = None,  # of the only acceptable run; None: any
+    run_id: str | None = None,  # id of the only acceptable run; None: any
     identity: Identity | None = None,
 ) -> Iterator[tuple[Session, messages.Info]]:
     """Yield a session and the `world/info` of its run.
@@ -212,7 +214,8 @@ def _no_link(endpoint: str) -> str:
 def read_permissions(link: Session) -> Permissions | None:
     """Return our permissions under access control at the other end; None without an answer.
 
-    SessionError if this process is not admitted.
+    Raises:
+        SessionError: this process is not admitted.
     """
     for sample in link.get(keys.access(link.process), timeout_s=ANSWER_S):
         permissions = messages.decode_as(Permissions, sample.payload, sample.key)
@@ -223,7 +226,11 @@ def read_permissions(link: Session) -> Permissions | None:
 
 
 def read_info(link: Session) -> messages.Info | None:
-    """Return the `world/info` answered by the hub; None without an answer."""
+    """Return the `world/info` with which the hub answers; None without an answer.
+
+    Raises:
+        NoWorldError: the answer cannot be decoded.
+    """
     for sample in link.get(keys.INFO, timeout_s=ANSWER_S):
         try:
             return messages.decode(keys.INFO, sample.payload)

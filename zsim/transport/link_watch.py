@@ -30,9 +30,9 @@ if sys.platform == "linux":
     import termios
 
 LOOK_S = 0.05  # wall time between checks
-# The Zenoh thread that closes links also forwards the participants' messages. Once a full link blocks it, that link
-# remains open for HUB_CLOSE_AFTER_US: so it must be closed earlier, while the kernel still accepts data.
-STALL_BYTES = 1 << 16  # unacknowledged bytes from which a link is watched; the kernel accepts 0.4 MB or more (measured)
+# The Zenoh thread that closes links also forwards the participants' messages. Once a full link blocks this thread, the
+# link remains open for HUB_CLOSE_AFTER_US; it must therefore be closed earlier, while the kernel still accepts data.
+STALL_BYTES = 1 << 16  # unacknowledged bytes at which a link is watched; the kernel accepts 0.4 MB or more (measured)
 STALL_S = 0.1  # wall time within which a live far end acknowledges something, in addition to …
 ROUND_TRIPS = 3.0  # … this many of its round trips
 HELD_BYTES, HELD_S = 1 << 20, 1.0  # limits for a reader that keeps reading, but never catches up
@@ -59,10 +59,10 @@ class Awaited(NamedTuple):
 class ClosedLink(NamedTuple):
     """A link that was closed."""
 
-    address: str  # of its far end
+    address: str  # address of its far end
     process: str  # pid and command of the process there, if on this machine
-    names: tuple[str, ...]  # of the processes with its session
-    held_bytes: int  # in the kernel's send queue
+    names: tuple[str, ...]  # names of the processes with its session
+    held_bytes: int  # bytes in the kernel's send queue
     times: int  # how often links of its session have been closed
 
 
@@ -189,7 +189,7 @@ Sessions = frozenset[str]  # Zenoh's identifiers, in hexadecimal
 
 
 class SessionTokens:
-    """The sessions of each process, known from liveliness tokens and updated in threads of Zenoh.
+    """The sessions of each process, known from liveliness tokens and updated on Zenoh's threads.
 
     A token `process/{p}` shows that a process is alive, but not its session: Zenoh does not name the holder, and a
     query of its admin space, which does, can block a router forever (eclipse-zenoh/zenoh#2619). So each process also
@@ -233,7 +233,7 @@ class SessionTokens:
 
 
 class Progress(NamedTuple):
-    """The bytes that a far end has acknowledged, -1 if it is gone, and its round-trip time [s]."""
+    """The bytes that a far end has acknowledged (-1 if it is gone), and its round-trip time [s]."""
 
     acknowledged: int
     round_trip_s: float
@@ -248,7 +248,7 @@ class LinkSockets:
     """
 
     def __init__(self) -> None:
-        self._far: dict[tuple[int, int], str] = {}  # address by file and inode; empty if not a connection
+        self._far: dict[tuple[int, int], str] = {}  # address by file descriptor and inode; empty if not a connection
 
     def queued(self) -> dict[str, int]:
         """Return the bytes in the kernel's send queue of each far end."""
@@ -284,7 +284,7 @@ class LinkSockets:
         raise OSError(f"{address}: no connection")
 
     def _connections(self) -> dict[int, str]:
-        """Return the address of each TCP connection's far end by file, and disable lingering on all of them."""
+        """Return the addresses of the TCP connections' far ends by file descriptor, and disable lingering on all."""
         far: dict[tuple[int, int], str] = {}
         for name in os.listdir(OWN_FILES):
             with suppress(OSError):
@@ -330,7 +330,7 @@ def local_socket(address: str) -> str:
 
 
 def owner(inode: str) -> str:
-    """Return the pid of the process with a socket open; empty if there is none, or it is not accessible."""
+    """Return the pid of a process that has a socket open; empty if no accessible process has."""
     for pid in filter(str.isdigit, os.listdir("/proc")) if inode else ():
         with suppress(OSError), os.scandir(f"/proc/{pid}/fd") as files:
             for file in files:

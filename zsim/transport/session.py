@@ -88,9 +88,9 @@ class Subscription:
     """All messages published on one expression, in order of arrival at this session.
 
     Args:
-        raw: the session.
-        prefix: prefix of its keys.
-        expression: keys to receive.
+        raw: Zenoh session.
+        prefix: prefix of the federation's keys.
+        expression: key expression to receive.
         without: prefixes of keys to exclude; if given, also excludes pictures and this session's own messages.
     """
 
@@ -107,9 +107,10 @@ class Subscription:
         self._handler = self._subscriber.handler
 
     def receive(self) -> ReceivedSample | None:
-        """Wait for one message; None when woken by `wake`.
+        """Wait for one message; return None when woken by `wake`.
 
-        SessionError if the session, or the subscription, was closed meanwhile.
+        Raises:
+            SessionError: the session or this subscription was closed meanwhile.
         """
         try:
             return self._take(self._handler.recv())
@@ -158,7 +159,7 @@ class Query:
         self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
 
     def request(self) -> ControlRequest:
-        """Decode its request; DecodeError if it has none."""
+        """Decode the request in its payload; DecodeError if there is no valid one."""
         return messages.decode_as(ControlRequest, self.payload, self.expression)
 
     def reply(self, key: str, payload: bytes) -> None:
@@ -205,14 +206,14 @@ class Session:
         # the name in its certificate; empty without one
         self.process = tls.own_name(identity) if identity.tls is not None else ""
         self.guarded = identity.access is not None  # whether access control is enforced here
-        # what access control at the other end permits this process; None if there is none, or it is unknown
+        # what access control at the other end permits this process; None if unknown or without access control
         self.permissions: Permissions | None = None
-        self.reads: list[str] = []  # expressions subscribed to so far
+        self.reads: list[str] = []  # expressions currently subscribed to
         self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._cached_publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._matching: dict[str, bool] = {}
-        self._declared: dict[int, Callable[[], Any]] = {}  # by id of a declaration, the function that undeclares it
+        self._declared: dict[int, Callable[[], Any]] = {}  # functions that undeclare a declaration, by its id
         self._realtime = False
 
     def use(self, mode: Mode) -> None:
@@ -239,7 +240,7 @@ class Session:
         return declared
 
     def _refusal(self, act: Act, expression: str) -> str | None:
-        """Return why access control at the other end would drop an action, None if it permits it."""
+        """Return why access control at the other end would drop an action; None if it permits the action."""
         if self.permissions is None:
             return None
         with _key_errors(expression):
@@ -264,7 +265,7 @@ class Session:
         publisher.put(payload)
 
     def put_all(self, encoded: Sequence[tuple[str, bytes]]) -> None:
-        for key, payload in encoded:  # not by put_raw: thousands of messages a gate
+        for key, payload in encoded:  # `put_raw` inlined: thousands of messages per gate
             publisher = self._publishers.get(key) or self._declare(key)
             publisher.put(payload)
 
@@ -289,7 +290,7 @@ class Session:
 
         self._matching[key] = False
         self._keep(publisher.declare_matching_listener(zenoh.handlers.Callback(note, indirect=False)))
-        status: Any = publisher.matching_status  # declared bool in the stub, but an object that has one
+        status: Any = publisher.matching_status  # a bool in Zenoh's stub, but in fact an object with one
         if status.matching:  # never set to False here: the listener's thread may have noted a subscriber meanwhile
             self._matching[key] = True
         return self._matching[key]
@@ -297,16 +298,18 @@ class Session:
     def put_sample(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload of any encoding without declaring a publisher, for publishing on many keys.
 
-        SessionError if `key` is not a key.
+        Raises:
+            SessionError: `key` is not a valid key.
         """
         picture = keys.is_picture(key)
         with _key_errors(key):
             self._raw.put(self._prefix + key, payload, encoding=zenoh.Encoding(encoding), **_flow(picture, picture))
 
     def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
-        """Return a function that publishes (payload, attachment) on one key; a full link drops it.
+        """Return a function that publishes (payload, attachment) on one key; a full link drops the message.
 
-        SessionError if `key` is not a key, or our certificate does not permit us to publish there.
+        Raises:
+            SessionError: `key` is not a valid key, or our certificate does not permit us to publish there.
         """
         self._check("publish", key)
         with _key_errors(key):
@@ -322,7 +325,7 @@ class Session:
         Samples are numbered, since sessions here add no timestamps.
 
         Raises:
-            SessionError: it is not a key.
+            SessionError: `key` is not a valid key.
         """
         with _key_errors(key):
             if key not in self._cached_publishers:
@@ -338,7 +341,7 @@ class Session:
             self._cached_publishers[key].put(payload, attachment=attachment)
 
     def delete(self, key: str) -> None:
-        """Publish that a key no longer has a value; SessionError if it is not a key."""
+        """Publish that a key no longer has a value; SessionError if the key is invalid."""
         with _key_errors(key):
             self._raw.delete(self._prefix + key)
 
@@ -347,7 +350,8 @@ class Session:
     def subscribe(self, expression: str) -> Subscription:
         """Return a subscription to all messages on an expression, in order.
 
-        SessionError if it is not a key expression, or our certificate does not permit reading it.
+        Raises:
+            SessionError: it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -363,9 +367,10 @@ class Session:
         return self._keep(Subscription(self._raw, self._prefix, "**", without))
 
     def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
-        """Call back, in a Zenoh thread, for every message on an expression until the returned function is called.
+        """Call back, on a Zenoh thread, for every message on an expression until the returned function is called.
 
-        SessionError if it is not a key expression, or our certificate does not permit reading it.
+        Raises:
+            SessionError: it is not a key expression, or our certificate does not permit reading it.
         """
         self._check("read", expression)
         self.reads.append(expression)
@@ -417,7 +422,8 @@ class Session:
     ) -> ControlAnswer:
         """Send a request to `key` and return its answer; `Unanswered` if none comes, or access control forbids it.
 
-        SessionError if `key` is not a key, or the arguments cannot be encoded.
+        Raises:
+            SessionError: `key` is not a valid key, or the arguments cannot be encoded.
         """
         try:
             payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
@@ -435,7 +441,7 @@ class Session:
         return Unanswered(ok=False, error=f"{key}: {what}; is it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:
-        """Call back for every query, in a Zenoh thread; `complete` if no other process needs to be queried."""
+        """Call back for every query, on a Zenoh thread; `complete` means that no other process needs to be queried."""
         queryable = self._raw.declare_queryable(
             self._prefix + expression, lambda query: callback(Query(query, self._prefix)), complete=complete
         )

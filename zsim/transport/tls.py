@@ -1,9 +1,9 @@
-"""The identity of a process on the network, diagnosis of failed TLS links, and the permissions of a certificate.
+"""Identity of a process on the network, diagnosis of failed TLS links, and permissions of a certificate.
 
 Zenoh reports only that it could not connect. Repeating the handshake with Python's ssl and the same files reveals the
 reason. Dates are checked here, so that the error can name an expired certificate.
 
-Zenoh silently drops messages that access control does not permit. So a listening process answers a get on
+Zenoh silently drops messages that access control does not permit. Therefore a listening process answers a get on
 `@access/NAME` with `Permissions` for every client with a certificate of its authority, and the client raises an error
 instead of sending.
 """
@@ -22,7 +22,7 @@ from msgspec import Struct
 
 from zsim.errors import NoListenerError, SessionError
 
-CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # in a folder of `zsim certs init`
+CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # files made by `zsim certs init`
 DAYS = 30.0  # validity of a certificate
 PROBE_S = 2.0  # timeout of each step of the handshake; a running listener answers within milliseconds
 LATE_S = 1.0  # in TLS 1.3 a server checks the client's certificate after the client has finished
@@ -109,7 +109,7 @@ def no_link(identity: Identity, endpoint: str, error: str) -> SessionError:
 def peer_fault(identity: Identity, endpoint: str) -> str | None:
     """Return why a handshake with the process listening on an endpoint fails.
 
-    None if it succeeds, or if no process listens or answers, which may change.
+    None if it succeeds, or if no process listens or answers yet.
     """
     place = _ENDPOINT.fullmatch(endpoint)
     if identity.tls is None or place is None:
@@ -196,7 +196,8 @@ def _name(certificate: dict[str, Any]) -> str:
 def _read_own(identity: Identity) -> dict[str, Any]:
     """Return the content of a process's own certificate, read from a handshake with itself in memory.
 
-    ssl.SSLError if key, certificate and authority do not match.
+    Raises:
+        ssl.SSLError: key, certificate and authority do not match.
     """
     server_side = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server_side.load_cert_chain(*identity.files[1:])
@@ -212,7 +213,7 @@ def _read_own(identity: Identity) -> dict[str, Any]:
 
 
 class Permissions(Struct, frozen=True):
-    """The permissions that a listening process grants to another; expressions include the federation's name."""
+    """Permissions that a listening process grants to another; expressions include the federation's name."""
 
     listener: str  # name of the listening process
     process: str  # name in the certificate

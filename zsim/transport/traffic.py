@@ -1,7 +1,7 @@
 """All traffic through the hub, received by one subscription or requested as a replay.
 
 traffic = Traffic(link, run_key_table(info))
-for entry in traffic.receive(): ...  # ReceivedSample(key, payload), or GateMessages of the world's drones
+for entry in traffic.receive(): ...  # ReceivedSample(key, payload), or GateMessages about the run's drones
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,7 +19,7 @@ class Traffic:
 
     Args:
         table: keys of the world's messages about the run's drones, see `run_key_table`.
-        refused: called for each batch, or gate in a batch, that cannot be decoded.
+        refused: called for each batch, and each gate in a batch, that cannot be decoded.
     """
 
     def __init__(self, link: Session, table: tuple[str, ...], refused: Callable[[], None] = lambda: None) -> None:

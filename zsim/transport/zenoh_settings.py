@@ -19,15 +19,15 @@ LEASE_REALTIME_MS = 1_000
 # The run does not wait for a process that only reads, so its loss need not be noticed within a second.
 LEASE_READER_MS = 10_000
 CLOSE_AFTER_US = 3_600_000_000  # -1 means forever, and panics in 1.10.2
-# A stopped reader (a recorder, `zsim echo`) fills its link and then blocks the hub for all; so it loses its link.
+# A stopped reader (a recorder, `zsim echo`) fills its link and then blocks the hub for all, so it loses its link.
 # A stopped participant does not: simulated time stops before its link is full.
 HUB_CLOSE_AFTER_US = 10_000_000
 CONNECT_RETRY_MS = 100
 # Silent connections block new ones once this many are open, until they time out: with Zenoh's defaults, 100 and 10 s, a
-# hundred blocked joins for 10 s. A handshake takes a few round trips: with TLS over a satellite, 2 s.
+# hundred of them blocked joins for 10 s. A handshake takes a few round trips: 2 s with TLS over a satellite link.
 ACCEPT_PENDING, ACCEPT_MS = 1000, 3_000
-SESSIONS_MAX = 4_000  # at a hub; Zenoh's default of 1000 is two too few for a run with 1000 drones
-QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's limit, 2 its default
+SESSIONS_MAX = 4_000  # at a hub; Zenoh's default of 1000 is two short of a run with 1000 drones
+QUEUE_LOCKSTEP = 16  # batches of 48 kB; Zenoh's maximum, its default is 2
 
 _CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
 _TLS = "transport/link/tls"
@@ -35,20 +35,20 @@ ACCESS = "access_control"
 # In Zenoh's wheel; a client that connects with another one would wait for ever, since Zenoh reports only a timeout.
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "ws", "unixsock-stream")
 
-SESSION_FILES = 32  # of a process with a session; 22 measured, the others for files read while it loads
-CLIENT_FILES = 3  # of a hub, for each process that connects; 2.2 measured, more while many connect at once
-ROLE_FILES = 2  # of a launcher, for each process that it starts: its standard input and its log
-HOST_FILES = 2  # of a launcher, for each host: its ssh connection, and a file being copied
-WORKER_FILES = 4  # of a sweep, for each worker: both ends of its pipe, and its end
-SERVER_FILES = 256  # of a gateway or console: a session, and 100 connections each for HTTP and lines
-SPARE_CLIENTS = 4  # of a hub, for clients besides the run's processes: a console, `zsim echo`
+SESSION_FILES = 32  # open files of a process with a session; 22 measured, the rest for files read while it loads
+CLIENT_FILES = 3  # open files of a hub for each process that connects; 2.2 measured, more while many connect at once
+ROLE_FILES = 2  # open files of a launcher for each process that it starts: its standard input and its log
+HOST_FILES = 2  # open files of a launcher for each host: its ssh connection, and a file being copied
+WORKER_FILES = 4  # open files of a sweep for each worker: both ends of its pipe, and its sentinel
+SERVER_FILES = 256  # open files of a gateway or console: a session, and 100 connections each for HTTP and lines
+SPARE_CLIENTS = 4  # clients of a hub in addition to the run's processes: a console, `zsim echo`
 
 Mode = Literal["lockstep", "realtime"]
 Settings = dict[str, str]
 
 
 def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
-    """Return the settings of every session; `mode` is Zenoh's (client, peer, router); no gate waits for a `reader`."""
+    """Return the settings of every session; `mode` is client, peer or router; no gate waits for a `reader`."""
     lease = LEASE_READER_MS if reader else LEASE_REALTIME_MS if timing == "realtime" else LEASE_LOCKSTEP_MS
     return {
         "mode": json.dumps(mode),
@@ -65,7 +65,8 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
 def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
     """Return the additional settings of a hub or router: it requires its port, and closes links of stalled readers.
 
-    SessionError if endpoints and identity do not match, or a file of the identity is unusable.
+    Raises:
+        SessionError: endpoints and identity do not match, or a file of the identity is unusable.
     """
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
@@ -148,9 +149,10 @@ def refusal(path: str, value: str, identity: Identity) -> str:
 
 
 def read_access(identity: Identity) -> Any:
-    """Return the access control in a file; Zenoh checks its content.
+    """Return the access control in the identity's file; Zenoh checks its content.
 
-    SessionError if it cannot be read or is not JSON.
+    Raises:
+        SessionError: the file cannot be read or is not JSON.
     """
     assert identity.access is not None
     try:
@@ -184,7 +186,7 @@ def host_launcher_files(roles: int, hosts: int) -> int:
 def require_files(needed: int, what: str) -> None:
     """Raise the soft limit to the needed number of files; SessionError if the hard limit does not allow it.
 
-    `what`: the cause, for the error: "12 processes".
+    `what` names the cause in the error, e.g. "12 processes".
     """
     allowed = allow_files(needed)
     if allowed is not None and allowed < needed:
@@ -192,7 +194,7 @@ def require_files(needed: int, what: str) -> None:
 
 
 def allow_files(wanted: int) -> int | None:
-    """Raise the soft limit to the wanted number as far as the hard limit allows; return it, None if unlimited."""
+    """Raise the soft limit to the wanted number if the hard limit allows it; return the limit, None if unlimited."""
     if sys.platform == "win32":
         return None
     import resource

@@ -1,9 +1,9 @@
-"""A vehicle: its parameters, and its name in a scenario: `ardrone2`, `crazyflie2`, or a module with a VEHICLE.
+"""Vehicles: their parameters, and their names in a scenario: `ardrone2`, `crazyflie2`, or a module with a VEHICLE.
 
 A scenario may override some parameters for a drone. Geometry is in B: x forward, y left, z up, origin at the centre of
 mass. Thrust, torque and drag apply at an air density of 1.225 kg/m^3. A drone with overridden `arm_m`, `thrust_n_s2` or
-`torque_nm_s2` is assumed to be similar in shape: airframe lengths scale with the arm, a rotor's radius with the fourth
-root of its thrust coefficient, and its inertia with its torque coefficient.
+`torque_nm_s2` is assumed to be geometrically similar: airframe lengths scale with the arm, a rotor's radius with the
+fourth root of its thrust coefficient, and its inertia with its torque coefficient.
 """
 
 import importlib
@@ -23,13 +23,13 @@ from zsim.schema import plugin
 from zsim.schema.checker import faults, show
 from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 
-ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hover at every heading; more do not fit into a message
-ARM_MISS_MAX = 0.01  # maximum mismatch over the arm, chosen: rounding in a drawing
-BALANCE_MAX = 1e-6  # maximum distance between the rotors' centre and the centre of mass, over the arm
-LIFT_MIN = 0.2  # minimum hover thrust of a rotor over the mean, chosen: with less it cannot contribute to control
-RANK_MIN = 1e-3  # minimum ratio of the weakest of thrust, roll, pitch and yaw to the strongest
+ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a heading in a hover; more do not fit into a message
+ARM_MISS_MAX = 0.01  # maximum mismatch relative to the arm; design choice: rounding in a drawing
+BALANCE_MAX = 1e-6  # maximum mean moment of the rotors at equal speeds, in the units of `allocation`
+LIFT_MIN = 0.2  # minimum ratio of a rotor's hover thrust to the mean; design choice: with less it cannot help control
+RANK_MIN = 1e-3  # minimum ratio of the weakest combination of thrust, roll, pitch and yaw to the strongest
 
-DEFAULT_MODEL, MODELS = "ardrone2", ("ardrone2", "crazyflie2")  # each a module of this package
+DEFAULT_MODEL, MODELS = "ardrone2", ("ardrone2", "crazyflie2")  # each is a module of this package
 ALLOWED = f"{', '.join(MODELS)}, or package.module of your own that defines VEHICLE"
 
 Mass = Annotated[float, Meta(gt=0, le=100)]
@@ -39,13 +39,13 @@ TakeoffHeight = Annotated[float, Meta(ge=0.3, le=5)]
 
 
 class Limits(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The limits of the firmware for a commander; defaults of the AR.Drone SDK's outdoor set if it has them.
+    """Limits that the firmware imposes on a commander; defaults of the AR.Drone SDK's outdoor set, where it has them.
 
-    Their ranges are chosen: they include larger and racing aircraft, and the loops remain stable.
+    Their ranges are design choices: they include larger and racing aircraft, and the loops remain stable.
     """
 
     tilt_deg: Annotated[float, Meta(gt=0, le=60)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
-    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=30)] = 5.0  # chosen, none in the SDK; 20 deg suffice for 6 m/s
+    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=30)] = 5.0  # design choice, not in the SDK; 20 deg gives 6 m/s
     vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=10)] = 1.0  # outdoor_control_vz_max
     yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0  # outdoor_control_yaw, 3.49 rad/s
     altitude_m: Positive = 100.0  # altitude_max, a value that the SDK treats as unlimited
@@ -55,13 +55,13 @@ PerAxis = tuple[NonNegative, NonNegative, NonNegative]
 
 
 class Aerodynamics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Aerodynamics besides `drag_n_s_m`; u is the velocity of the body, or of a rotor, relative to the air, in B.
+    """Forces in addition to `drag_n_s_m`; u is the velocity of the body, or of a rotor, relative to the air, in B.
 
-    Body: -linear u - quadratic |u| u, per axis, at the centre of mass. Each rotor with speed w, at its position:
-    -k_d w (u_x, u_y) across, (k_h (u_x^2 + u_y^2) - k_z w u_z) along its thrust. Svacha, Mohta and Kumar, Improving
-    quadrotor trajectory tracking by compensating for aerodynamic effects, ICUAS 2017, in the form of RotorPy (Folk et
-    al. 2023); the linear part per axis is the rotor drag of Faessler, Franchi and Scaramuzza, RA-L 3 (2018) 620-626.
-    The firmware models only `drag_n_s_m`: the rest is a disturbance.
+    On the body, at the centre of mass: -linear u - quadratic |u| u, per axis. On each rotor, at its position and with
+    speed w: -k_d w (u_x, u_y) across its thrust, (k_h (u_x^2 + u_y^2) - k_z w u_z) along it. Source: Svacha, Mohta and
+    Kumar, Improving quadrotor trajectory tracking by compensating for aerodynamic effects, ICUAS 2017, in the form of
+    RotorPy (Folk et al. 2023); the linear part per axis is the rotor drag of Faessler, Franchi and Scaramuzza, RA-L 3
+    (2018) 620-626. The firmware models only `drag_n_s_m`: the rest is a disturbance.
     """
 
     linear_drag_n_s_m: PerAxis = (0.0, 0.0, 0.0)
@@ -81,78 +81,78 @@ class Rotor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class Airframe(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The contact geometry: four feet, four points of the hull's rim, and the hull as a sphere."""
+    """Contact geometry: four feet, four corners of the hull's rim, and the hull as a sphere."""
 
     hull_radius_m: Positive
     foot_xy_m: Positive  # |x| and |y| of a foot
-    foot_depth_m: Positive  # below the centre of mass
+    foot_depth_m: Positive  # depth of the feet below the centre of mass
     foot_sag_m: Positive  # compression of the feet under the weight; sets their stiffness
-    foot_damping_ratio: NonNegative  # of critical, of the aircraft bouncing on its four feet
+    foot_damping_ratio: NonNegative  # relative to critical damping, for the aircraft bouncing on its four feet
     friction: NonNegative
-    rim_xy_m: Positive  # |x| and |y| of the upper corners
-    rim_height_m: Real  # of the upper corners above the centre of mass
+    rim_xy_m: Positive  # |x| and |y| of the rim's corners
+    rim_height_m: Real  # height of the rim's corners above the centre of mass
     reach_m: Positive  # exceeds the distance of all these points from the centre of mass
-    hull_frequency_rad_s: Positive  # of two equal drones pressed together
-    hull_damping_ratio: NonNegative  # of critical, of two equal drones pressed together
-    clearance_m: Positive  # free space around its centre at the start: hull and margin
+    hull_frequency_rad_s: Positive  # natural frequency of two equal drones pressed together
+    hull_damping_ratio: NonNegative  # relative to critical damping, for two equal drones pressed together
+    clearance_m: Positive  # free space required around the drone's centre at the start: hull and margin
 
 
 class Battery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The energy that rotors and electronics draw."""
+    """The battery that supplies rotors and electronics."""
 
     voltage_v: Positive
-    efficiency: Annotated[float, Meta(gt=0, le=1)]  # electric to shaft power
+    efficiency: Annotated[float, Meta(gt=0, le=1)]  # ratio of shaft power to electric power
     electronics_w: NonNegative
 
 
 class Firmware(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The design parameters of the firmware's loops, sequences and observer.
+    """Design parameters of the firmware's loops, sequences and observer.
 
-    The gains of rate, tilt and velocity loops follow from the rotors' lag: rate_per_lag over the overdriven lag, with
-    each outer loop slower than its inner loop by `loop_ratio`.
+    The loop gains follow from the rotors' lag: the rate gain is `rate_per_lag` over the lag that remains after
+    overdriving, and those of tilt and velocity are each smaller than that of their inner loop by `loop_ratio`.
     """
 
-    lag_lead: Annotated[float, Meta(gt=0, le=1)]  # share of the motors' lag that remains after overdriving
-    rate_per_lag: Positive  # rate gain times the overdriven lag
-    lag_min_s: Positive  # faster rotors do not speed up the loop
+    lag_lead: Annotated[float, Meta(gt=0, le=1)]  # share of the rotors' lag that remains after overdriving
+    rate_per_lag: Positive  # rate gain times the remaining lag
+    lag_min_s: Positive  # minimum of the remaining lag: faster rotors do not speed up the loops
     loop_ratio: Positive
-    yaw_share: Positive  # yaw rate gain over the rate gain
+    yaw_share: Positive  # ratio of the yaw rate gain to the rate gain
     body_rate_max_rad_s: Positive  # maximum demand of the tilt loop
-    climb_share: Positive  # vertical velocity gain over the rate gain
-    hold_1_s: Positive  # position gain on its own odometry
+    climb_share: Positive  # ratio of the vertical velocity gain to the rate gain
+    hold_1_s: Positive  # position gain of a hold, which uses the drone's own odometry
     height_1_s: Positive
-    brake_s: NonNegative  # look-ahead of a hold's position: about the stopping distance over speed
+    brake_s: NonNegative  # look-ahead of the position to hold: about the ratio of stopping distance to speed
     tilt_cut_cosine: Annotated[float, Meta(ge=-1, le=1)]  # cosine of the tilt at which the motors are cut
-    lift_share_min: Fraction  # minimum commanded thrust over the weight
-    spin_up_s: NonNegative  # rotors at minimum speed before the climb
+    lift_share_min: Fraction  # minimum ratio of commanded thrust to weight
+    spin_up_s: NonNegative  # time at minimum rotor speed before the climb
     takeoff_m_s: Positive
-    takeoff_s_max: Positive  # after this it hovers at its position
+    takeoff_s_max: Positive  # maximum duration of a take-off, after which the drone hovers at its position
     arrived_m: Positive
     arrived_m_s: Positive  # a take-off ends below this speed and with the height within arrived_m
     descent_m_s: Positive  # speed of a landing near the ground
     descent_far_1_s: NonNegative  # increase of that speed per metre above flare_m
     flare_m: NonNegative
-    touch_share: Fraction  # thrust over weight below which a drone that does not descend is on the ground
-    touch_m_s: Positive  # descent speed below which it does not descend
-    touch_s: NonNegative  # duration of both before the rotors stop
-    low_battery_percent: Annotated[float, Meta(ge=0, le=50)]  # below this it lands; below twice this, no take-off
-    disturbance_walk: Positive  # horizontal disturbance, m/s^2/sqrt(s)
-    lift_walk: Positive  # vertical disturbance, m/s^2/sqrt(s)
-    tilt_walk: Positive  # minimum for the attitude, rad/sqrt(s)
-    bias_walk: Positive  # minimum for the gyro bias, rad/s/sqrt(s)
-    lift_bias_walk: Positive  # minimum for the vertical accelerometer bias, m/s^2/sqrt(s)
+    touch_share: Fraction  # ratio of thrust to weight below which a drone that does not descend is on the ground
+    touch_m_s: Positive  # descent speed below which a drone counts as not descending
+    touch_s: NonNegative  # time for which both must hold before the rotors stop
+    low_battery_percent: Annotated[float, Meta(ge=0, le=50)]  # below this it lands; twice this is needed to take off
+    disturbance_walk: Positive  # random walk of the horizontal disturbance, m/s^2/sqrt(s)
+    lift_walk: Positive  # random walk of the vertical disturbance, m/s^2/sqrt(s)
+    tilt_walk: Positive  # minimum random walk of the attitude, rad/sqrt(s)
+    bias_walk: Positive  # minimum random walk of the gyroscope's bias, rad/s/sqrt(s)
+    lift_bias_walk: Positive  # minimum random walk of the vertical accelerometer's bias, m/s^2/sqrt(s)
 
 
 class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A multirotor. The first block of fields gives the defaults of a scenario's drone.
 
     Raises:
-        ValueError: the rotors cannot hold it level; one line.
+        ValueError: its rotors are inconsistent, or cannot hold it level.
     """
 
     mass_kg: Mass
     inertia_kg_m2: tuple[Positive, Positive, Positive]
-    arm_m: Arm  # centre to the farthest rotor; the scale of the airframe
+    arm_m: Arm  # distance from the centre to the farthest rotor; the scale of the airframe
     thrust_n_s2: Positive
     torque_nm_s2: Positive
     rotor_time_constant_s: RotorLag
@@ -202,11 +202,11 @@ def vehicle_of(model: str, where: str = "model") -> Vehicle:
     """Return the vehicle of a model.
 
     Args:
-        model: a stock name, or the `package.module` of one that defines VEHICLE.
-        where: file and path of the field that names it.
+        model: a stock name, or the `package.module` of a module that defines VEHICLE.
+        where: file and path of the field that names the model.
 
     Raises:
-        DocumentError: it does not exist, or its parameters are faulty; a line for each fault.
+        DocumentError: the vehicle does not exist, or its parameters are faulty; a line for each fault.
     """
     if model in MODELS:
         return importlib.import_module(f"zsim.vehicles.{model}").VEHICLE
@@ -239,7 +239,7 @@ def cross_layout(arm_m: float) -> tuple[Rotor, ...]:
 def allocation(vehicle: Vehicle) -> np.ndarray:
     """Return the roll, pitch and yaw moments per thrust of each rotor, (3, R).
 
-    Roll and pitch in units of arm_m / sqrt(2), yaw in units of the torque per thrust.
+    Roll and pitch are in units of arm_m / sqrt(2), yaw in units of the torque per thrust.
     """
     unit = vehicle.arm_m / math.sqrt(2.0)
     x, y = (np.array([getattr(rotor, axis) / unit for rotor in vehicle.rotors]) for axis in ("x_m", "y_m"))
@@ -247,14 +247,14 @@ def allocation(vehicle: Vehicle) -> np.ndarray:
 
 
 def is_balanced(vehicle: Vehicle) -> bool:
-    """Whether rotors at equal speed give no moment."""
+    """Whether the rotors give no moment at equal speeds."""
     return bool(np.abs(allocation(vehicle).sum(axis=1)).max() <= BALANCE_MAX * len(vehicle.rotors))
 
 
 def mixing(vehicle: Vehicle) -> np.ndarray:
     """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3), with zero total thrust.
 
-    The pseudo-inverse of `allocation`, for an unbalanced vehicle extended by a row for thrust.
+    It is the pseudo-inverse of `allocation`, extended by a row for thrust if the vehicle is unbalanced.
     """
     layout = allocation(vehicle)
     if is_balanced(vehicle):
@@ -263,7 +263,7 @@ def mixing(vehicle: Vehicle) -> np.ndarray:
 
 
 def lift_shares(vehicle: Vehicle) -> np.ndarray:
-    """Return each rotor's thrust over the mean when the total moment is zero, (R,): 1 if balanced."""
+    """Return the ratio of each rotor's thrust to the mean at zero total moment, (R,); 1 if balanced."""
     layout, count = allocation(vehicle), len(vehicle.rotors)
     if is_balanced(vehicle):
         return np.ones(count)

@@ -6,10 +6,10 @@ follow from the hat's circular outline, which rotors may partly hide: wherever a
 the picture, its apparent radius is the angle a with sin a = r / d.
 
 Edge points are found by searching inwards from outside, in all directions around the centroid of the covered pixels.
-Of the circles fitted to half of the edge points, consecutive ones, the circle that best explains all points determines
-which of them lie on the outline. Circles x^2 + y^2 = 2 a x + 2 b y + c are fitted by least squares (I. Kasa, IEEE
-Trans. Instrum. Meas. 25, 1976) in the tangent plane of the unit sphere at the ball, where the outline is a circle
-wherever the ball is in the picture.
+A circle is fitted to every run of consecutive points that contains half of them; the circle that best explains all
+points determines which of them lie on the outline. Circles x^2 + y^2 = 2 a x + 2 b y + c are fitted by least squares
+(I. Kasa, IEEE Trans. Instrum. Meas. 25, 1976) in the tangent plane of the unit sphere at the ball, where the outline is
+a circle wherever the ball is in the picture.
 """
 
 import math
@@ -38,7 +38,7 @@ AREA_MIN_PX = 2  # minimum area of a region's box at half the resolution
 BLOBS_MAX = 100  # maximum number of regions to examine, the largest first
 ROOM_PX = 4  # margin around a region, for its edge and the background
 CORE = 0.5  # minimum level of a hat's pixels, as a fraction of the maximum level
-CORE_MIN_PX = 12  # number of fully covered pixels above which they give the hat's level; otherwise the blur gives it
+CORE_MIN_PX = 12  # more fully covered pixels than this give the hat's level; with fewer, it is derived from the blur
 POINT_BLUR_PX2 = 1.1  # variance of a point's blur by lens, pixel, JPEG and the mean of nine pixels [px^2]; calibrated
 ROUND_MIN = 0.3  # minimum ratio of the smaller to the larger principal variance of a ball's image
 PIECE_GAP = 0.3  # maximum gap between two pieces of a ball over the ball's size; a rotor guard leaves a gap of 0.2
@@ -104,7 +104,7 @@ class _Box(NamedTuple):
     high: int
 
     def touches(self, other: "_Box") -> bool:
-        """Return whether the gap to another box is small enough, for this box's size, within a single ball."""
+        """Return whether the gap to another box is so small, for this box's size, that both are parts of one ball."""
         gap = 1 + PIECE_GAP * max(self.wide, self.high)
         across = max(self.u, other.u) - min(self.u + self.wide, other.u + other.wide)
         down = max(self.v, other.v) - min(self.v + self.high, other.v + other.high)
@@ -140,7 +140,7 @@ class HatDetector:
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         boxes = [_Box(*cv2.boundingRect(contour)) for contour in contours]
         large = [box for box in boxes if box.wide * box.high >= AREA_MIN_PX]
-        whole: list[_Box] = []  # with the pieces of each ball united, which a rotor guard may divide
+        whole: list[_Box] = []  # unites the pieces into which a rotor guard divides a ball
         for box in sorted(large, key=lambda box: (-box.wide * box.high, box))[:BLOBS_MAX]:
             for i, other in enumerate(whole):
                 if other.touches(box):
@@ -208,7 +208,7 @@ class Outline(NamedTuple):
 
 
 def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tuple[Outline, float] | None:
-    """Return a hat's outline and the pixels per radian there; None if invalid. `level` is above the background."""
+    """Return a hat's outline and the pixels per radian there, or None; `level` is relative to the background."""
     mean = cv2.blur(level, (3, 3), borderType=cv2.BORDER_REPLICATE)
     v, u = divmod(int(np.argmax(mean)), level.shape[1])
     peak = float(mean[v, u])
@@ -222,7 +222,7 @@ def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tup
     if _roundness(covered) / oblique < ROUND_MIN:
         return None
     scale = focal_px / (cosine * math.sqrt(cosine))  # geometric mean of the radial and tangential scales
-    circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # the layout compiled for in `rehearse`
+    circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # contiguous as in `rehearse`
     is_known = circle.share >= SHARE_OF_EDGE_MIN and 2 * circle.radius_rad * scale >= DIAMETER_MIN_PX
     return (circle, scale) if is_known else None
 
@@ -410,7 +410,7 @@ def _choose(points: NDArray, noise: float) -> bool:
         for k in range(count):
             off = abs(math.hypot(points[k, 0] - x, points[k, 1] - y) - r)
             near[k] = 1.0 if off < _near_px(r, noise) else 0.0
-        for k in range(count):  # the edge next to a hidden point is unreliable, because blurred
+        for k in range(count):  # blur makes edge points next to hidden ones unreliable
             points[k, EDGE_POINT.on] = near[k] * near[k - 1] * near[(k + 1) % count]
         if points[:, EDGE_POINT.on].sum() < POINTS_MIN:
             return False

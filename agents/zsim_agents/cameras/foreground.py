@@ -73,7 +73,7 @@ EDGE_PX = 3.0  # distance by which antialiased edges and blur may extend beyond 
 Levels = NDArray[np.float32]
 AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun, for matt foam outdoors
 STEPS_MAX = 6  # maximum number of times within an exposure at which a moving ball is drawn
-STEP_PX = 0.8  # motion between two consecutive ones of these times
+STEP_PX = 0.8  # motion between consecutive times of drawing
 ROUNDING = np.float32(0.5)
 AXIS = np.array([0.0, 0.0, 1.0])
 NEAR_M = 0.05  # depth below which nothing is drawn
@@ -186,7 +186,7 @@ class DroneImager:
         return {i: DroneImage(model, *row) for i, row in zip(near.tolist(), rows, strict=True) if has_pixels(row[0])}
 
     def _boxes(self, pixels: Fixed, ways_px: Array, scales: Array) -> list[list[int]]:
-        """Return for each drone, given by its points in sixteenths of a pixel, the box of the picture around it."""
+        """Return the box around each drone in the picture, from its points in sixteenths of a pixel."""
         u, v, wide, high = np.array([cv2.boundingRect(each) for each in pixels]).T / (1 << SHIFT)
         lowest, highest = np.stack([u, v], axis=-1), np.stack([u + wide, v + high], axis=-1)
         half_way = np.minimum(np.abs(ways_px), BLUR_MAX_PX) / 2
@@ -207,7 +207,7 @@ class _Poses(NamedTuple):
 
 
 class _DroneModel(NamedTuple):
-    """A drone's points, part by part, (P, 3) [m; B], its size relative to the AR.Drone, and its colours as lit."""
+    """A drone's points, part by part, (P, 3) [m; B], its size relative to the AR.Drone, and its lit colours."""
 
     points: Array
     parts: dict[str, slice]
@@ -273,7 +273,7 @@ class DroneImage(NamedTuple):
         box: the part of the picture that contains the drone: u0, v0, u1, v1.
         pixels: coordinates of the model's points, then of its blades' sweeps, in sixteenths of a pixel,
             (P + R BLADES (SECTOR + 1), 2).
-        scale: pixels per metre on an AR.Drone, from which drones of other sizes are scaled.
+        scale: factor from dimensions of the AR.Drone [m] to pixels, which includes the drone's relative size.
         blur: kernel of the drone's motion during the exposure; None if it hardly moves.
         from_above: whether the camera is above the drone's rotors.
         shows_lens: whether the camera is in front of the drone.
@@ -396,7 +396,7 @@ def ball_images(
     pixels = _Pixels(along, to_way, to_sun, to_axis, [len(part) for part in parts])
     steps = min(STEPS_MAX, max(1, math.ceil(ways_px[shown].max() / STEP_PX)))
     covered = _covered(pixels, centres, ways, radius_m, view.lens.fx, steps)
-    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # for where rays meet the ball's surface
+    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # constant term of a ray's intersection
     meets = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + rest, 0))
     cosine = (meets * pixels.to_sun - pixels.of_ball(centres @ sun_K)) * np.float32(DIFFUSE / radius_m)
     shade = np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))
@@ -529,7 +529,7 @@ def bgr(colour: Array) -> tuple[float, float, float]:
 
 
 class SurfaceImager:
-    """Draws surfaces for one camera: triangles (T, 9), in the format of zsim.scenario.surroundings, with two sides.
+    """Draws surfaces for one camera: triangles (T, 9) in the format of zsim.scenario.surroundings, with both sides.
 
     Each triangle has a uniform colour and is drawn, among drones and obstacles, in order of the distance to its centre.
     Edges are not antialiased, so that no gaps show between neighbours.

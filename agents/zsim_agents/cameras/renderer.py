@@ -69,7 +69,7 @@ class Renderer:
     def __init__(
         self, camera: Camera, scene: Scene, carrier: int, seed: int, name: str, ground: Ground | None = None
     ) -> None:
-        gain = 1.0 / math.sqrt(scene.light)  # compensates for half of the stops by which the light is below a clear day
+        gain = 1.0 / math.sqrt(scene.light)  # compensates for half of the light's deficit, in stops, from a clear day
         self._camera, self._scene, self._carrier = camera, scene, carrier
         self._exposure_s = camera.exposure_ms * 1e-3
         self._pose = camera_pose(camera)

@@ -55,7 +55,7 @@ LINK_S = 0.4  # s; design choice: latency that a radio and sparse telemetry add 
 LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
 CLONE_EVERY_S = 0.1  # s; design choice: process noise over half this interval is small against any sensor's noise
 CLONED_FROM = 0.01  # share of a reading's variance; design choice: less process noise since its sampling is negligible
-COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # design choice: noisier readings do not initialise the heading
+COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # rad; design choice: noisier readings do not initialise the heading
 ON_ROOF_M = 0.01  # m; design choice: a drone that starts this close to an obstacle stands on it
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest or in gentle flight
@@ -309,7 +309,7 @@ BiasName = str | tuple[UpdateChannel, bool]
 def biases_of(sensors: Sensors, estimation: Estimation) -> dict[BiasName, Bias]:
     """Return the estimated biases.
 
-    A Gauss-Markov process of an IMU channel is combined with the channel's other biases to a random walk with the same
+    A Gauss-Markov process of an IMU channel is combined with the channel's other biases into a random walk of the same
     driving noise, which is never overconfident. A Gauss-Markov process of an aiding channel has states of its own.
     """
 

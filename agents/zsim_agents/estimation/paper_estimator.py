@@ -73,7 +73,7 @@ class PaperEstimator:
         dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
         self._t_s = t_s
         yaw = float(frames.heading(self._q))
-        position = self._velocity_variance() * self._flow_period_s * dt  # a velocity error lasts one period of the flow
+        position = self._velocity_variance() * self._flow_period_s * dt  # a velocity error lasts one flow period
         drift = (el.square(self._gyro_sigma) * self._imu_period_s + el.square(self._gyro_bias) * DRIFT_S) * dt
         noise = np.diag([position, position, position, drift])
         self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, noise, dt)

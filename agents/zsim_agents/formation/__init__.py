@@ -1,1 +1,1 @@
-"""The cluster controller as an agent: phases, requests and plan, references, control law, limits of the robots."""
+"""The cluster controller as an agent: flight phases, requests and plans, references, control laws, robots' limits."""

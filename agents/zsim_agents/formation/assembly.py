@@ -1,11 +1,12 @@
 """Assembly of robots at arbitrary positions into a formation: all fly simultaneously to assigned positions.
 
-CAPT: Turpin, Michael and Kumar, Int. J. Robotics Research 33 (2014) 98-112. All fly straight from start to goal with
-a common function of time u, p_i = s_i + u (g_i - s_i). The assignment with the minimum sum of squared distances has
-(s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts a and goals b apart, no pair then comes closer than
-a b / sqrt(a^2 + b^2), at least the smaller of a and b over sqrt 2. The minimum sum of distances has no such bound.
+CAPT (concurrent assignment and planning of trajectories): Turpin, Michael and Kumar, Int. J. Robotics Research 33
+(2014) 98-112. All fly straight from start to goal with a common function of time u, p_i = s_i + u (g_i - s_i). The
+assignment with the minimum sum of squared distances has (s_i - s_j).(g_i - g_j) >= 0 for every pair; with starts a and
+goals b apart, no pair then comes closer than a b / sqrt(a^2 + b^2), which is at least min(a, b) / sqrt 2. The minimum
+sum of distances gives no such bound.
 
-The common time stops while a robot is far behind.
+The common time stops while a robot is far from its reference position.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from zsim_agents.formation.trajectory import named_values, variable_of
 
 PEAK_RATE = 1.875  # peak rate of the minimum-jerk function of time over its mean rate
 LEAST_S = 2.0  # minimum duration, as for a ramp of the reference
-BEHIND_M = 0.7  # distance of a robot from its path at which the others wait; chosen: a third of the minimum separation
-IN_PLACE_M = 0.5  # chosen distance from the goal on arrival: two sigma of an estimated side
+BEHIND_M = 0.7  # distance of a robot from its reference at which all wait; design choice: 1/3 of the minimum separation
+IN_PLACE_M = 0.5  # maximum distance from the goal on arrival; design choice: two sigma of an estimated side
 PLACE = ("x_c", "y_c", "z_c", "yaw")  # variables that are defined for robots in any arrangement
 
 
 class Assembly:
-    """Robots on straight paths from start_W to goal_W (n, 3) [m], their positions in formation c (4n,), in over_s."""
+    """Robots that fly straight from start_W (n, 3) [m] to goal_W, their positions in formation c (4n,), in over_s."""
 
     def __init__(self, start_W: Array, goal_W: Array, c: Array, over_s: float, gains: FormationGains) -> None:
         self.c, self.over_s = c, over_s
@@ -44,12 +45,12 @@ class Assembly:
         return self.over_s - self._flown_s
 
     def advance(self, p_W: Array, dt_s: float) -> None:
-        """Advance by dt_s, unless a robot at p_W (n, 3) is far behind."""
+        """Advance the common time by dt_s, unless one of the robots, at p_W (n, 3) [m], is far behind."""
         if float(np.linalg.norm(self._way()[0] - p_W, axis=1).max()) <= BEHIND_M:
             self._flown_s = min(self._flown_s + dt_s, self.over_s)
 
     def velocities(self, p_W: Array) -> Array:
-        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], before the guard."""
+        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], not yet guarded."""
         place_W, rate_W = self._way()
         v_W = rate_W + self._gains.k_1_s * (place_W - p_W)
         speed = np.sqrt(v_W[:, 0] ** 2 + v_W[:, 1] ** 2)
@@ -86,15 +87,15 @@ class Assembly:
 def assembly_goal(
     space: ClusterSpace, values: Mapping[str, str | float], base: Array | None, p_W: Array, yaw: Array
 ) -> Array:
-    """Return the formation (4n,) to fly to: the base with values replaced by name.
+    """Return the formation (4n,) to fly to: the base with the named values replaced.
 
     Args:
-        base: (4n,) of robots in a formation. None: their centre and mean heading, without departures from a template;
-            all other variables must then be named.
-        p_W, yaw: of the robots, (n, 3) [m] and (n,) [rad].
+        base: formation (4n,) to start from; None for the robots' centre and mean heading, with all neutral variables
+            zero. All other variables must then be named.
+        p_W, yaw: positions (n, 3) [m] and headings (n,) [rad] of the robots.
 
     Raises:
-        RefusalError: a variable without a value in the base is not named.
+        RefusalError: without a base, a variable that must be named is missing.
         TrajectoryError, ExpressionError: a value is not allowed.
     """
     if base is None:
@@ -137,7 +138,7 @@ def planned_assembly(
 
 
 def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
-    """Return the goal (n,) of each of n starts (n, 3), for the minimum sum of squared distances.
+    """Return the index of the goal assigned to each start, (n,), for the minimum sum of squared distances.
 
     Raises:
         ValueError: the numbers of goals and starts differ, or a position is not finite.
@@ -153,7 +154,7 @@ def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
 
 
 def straight_separation(starts_m: Array, goals_m: Array) -> float:
-    """Return the minimum distance [m] between drones that fly straight from starts to goals (n, 3) in common time."""
+    """Return the minimum distance [m] between drones that fly straight, in unison, from starts to goals (n, 3)."""
     i, j = np.triu_indices(len(starts_m), 1)
     if not len(i):
         return math.inf

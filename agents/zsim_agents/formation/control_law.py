@@ -1,8 +1,8 @@
 """Control laws of a formation: velocity commands from the estimates of the robots and a reference.
 
 Contains the base class of all laws (`law:` of a cluster may name a user's subclass), the stock law, the inputs that a
-scenario grants to a law besides the estimates, and the compiled saturation of the robots' velocities and guard of the
-distances between them.
+scenario grants to a law besides the estimates, and the compiled functions that saturate the robots' velocities and
+guard the distances between robots.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ GUARD_SWEEPS = 4  # passes over all pairs: one is enough for two robots; three c
 
 @dataclass(frozen=True)
 class FormationGains:
-    """Parameters of the law, validated with the scenario. For those not listed here see `RobotLimits`.
+    """Parameters of a law, validated with the scenario. For those not listed here, see `RobotLimits`.
 
     Attributes:
         k_1_s: proportional gain [1/s]; 0.5 to 0.8 works well; above about 2 a drone's velocity loop makes it unstable.
@@ -74,8 +74,8 @@ class FormationCommand(Struct, eq=False):
     """The commands to the robots.
 
     Attributes:
-        v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
-        factor: the common factor of the saturation, 1 without saturation.
+        v_W, yaw_rate: velocities (n, 3) [m/s, W] and yaw rates (n,) [rad/s].
+        factor: common factor of the saturation; 1 without saturation.
         guarded: pairs of robot indices that the guard keeps apart; alarmed: pairs closer than the alarm threshold.
     """
 
@@ -87,10 +87,10 @@ class FormationCommand(Struct, eq=False):
 
 
 class ControlLaw(ABC):
-    """A control law; the rates of every law are saturated and guarded here in the same way.
+    """Base class of control laws, which saturates and guards the rates of every law in the same way.
 
-    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A user's law
-    implements `rates` and, if it has state, `reset`, `followed`, `snapshot` and `restore`.
+    Saturation by one factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A
+    user's law implements `rates` and, if it has state, `reset`, `followed`, `snapshot` and `restore`.
 
     Args:
         space: cluster space of n robots.
@@ -98,7 +98,7 @@ class ControlLaw(ABC):
 
     Attributes:
         robots: names of the robots in messages, in order.
-        grants: inputs besides the estimates, read by `samples`, `map` and `now_ns`.
+        grants: inputs besides the estimates, read through `samples`, `map` and `now_ns`.
     """
 
     _granted: Grants | None = None
@@ -116,27 +116,28 @@ class ControlLaw(ABC):
         """Return the desired r_dot (4n,): (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, in W.
 
         Args:
-            c: (4n,) cluster variables of the estimates; p_W, v_W: the estimates, (n, 3) [m, m/s; W].
-            c_des, c_dot_des: (4n,) reference and its rate.
+            c: cluster variables of the estimates, (4n,).
+            p_W, v_W: estimated positions and velocities, (n, 3) each [m, m/s; W].
+            c_des, c_dot_des: reference and its rate, (4n,) each.
         """
 
     def samples(self, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
-        """Return the newest sample of a sensor of each robot, in order; None before the first sample.
+        """Return each robot's newest sample of a sensor, in the order of the robots; None before the first sample.
 
         `t_ns` of a sample is the gate at which it was published, `t_sample_ns` the time of measurement.
 
         Args:
-            sensor: name, one of `law_sensors` of the cluster.
+            sensor: name of the sensor, one of the cluster's `law_sensors`.
             kind: class of its messages, e.g. zsim.sensors.scanner.Range for "range".
 
         Raises:
-            UserCodeError: the scenario does not grant it, or its samples are of another class.
+            UserCodeError: the scenario does not grant the sensor, or its samples are of another class.
         """
         return self.grants.samples(type(self), sensor, kind)
 
     @property
     def map(self) -> Map:
-        """The obstacles and surfaces of the scenario; UserCodeError unless `law_map` of the cluster is true."""
+        """The obstacles and surfaces of the scenario; UserCodeError unless the cluster's `law_map` is true."""
         return self.grants.map_for(type(self))
 
     @property
@@ -145,7 +146,7 @@ class ControlLaw(ABC):
         return self.grants.t_ns
 
     def reset(self) -> None:  # noqa: B027 - a law may have no state
-        """Clear all state, when the formation is engaged or continues after a fault."""
+        """Clear all state; called when the formation is engaged or continues after a fault."""
 
     def followed(self, dt_s: float) -> None:  # noqa: B027
         """Advance the state by dt_s [s] after a gate whose rates were neither saturated nor guarded.
@@ -154,11 +155,11 @@ class ControlLaw(ABC):
         """
 
     def snapshot(self) -> State | None:
-        """Return all state as plain values and arrays: {} if there is none, None if it cannot be transferred."""
+        """Return all state as plain values and arrays: {} for a law without state, None if it cannot be transferred."""
         return {} if type(self).reset is ControlLaw.reset and type(self).followed is ControlLaw.followed else None
 
     def restore(self, state: State) -> None:  # noqa: B027
-        """Restore the `snapshot` of the law in another process, to continue bit-identically."""
+        """Restore a `snapshot` taken in another process, to continue bit-identically."""
 
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
@@ -166,7 +167,7 @@ class ControlLaw(ABC):
         """Return the command of this gate; arguments as in `rates`, and dt_s, the time since the last command [s].
 
         Raises:
-            UserCodeError: `rates` of a user's law returned an array of wrong size or a non-finite rate.
+            UserCodeError: `rates` of a user's law returned an array of the wrong size or a non-finite rate.
         """
         n, order = self.space.n, self._order
         r_dot = self.rates(c, p_W, v_W, c_des, c_dot_des)
@@ -238,7 +239,7 @@ class Grants:
     """The inputs of one law: the newest sample of each granted sensor of each drone, and the map if granted.
 
     Attributes:
-        t_ns: the present gate [ns].
+        t_ns: simulated time of the present gate [ns].
         keys: keys of the granted sensors, which the law's process must read.
     """
 
@@ -268,11 +269,11 @@ class Grants:
     def put(self, key: str, sample: Sample) -> None:
         name, place = self._places[key]
         former = self._newest[name][place]
-        if former is None or sample.t_ns >= former.t_ns:  # in real time an older sample may arrive later
+        if former is None or sample.t_ns >= former.t_ns:  # in real time, an older sample may arrive after a newer one
             self._newest[name][place] = sample
 
     def samples(self, law: type, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
-        """Implement `ControlLaw.samples`; a UserCodeError names the law's class."""
+        """Implement `ControlLaw.samples`; `law` is the law's class, for the text of a UserCodeError."""
         if sensor not in self._newest:
             listed = ", ".join([*self._newest, sensor])
             raise self._not_granted(law, f"sensor {sensor!r:.40}", "law_sensors", f"law_sensors: [{listed}]")
@@ -282,7 +283,7 @@ class Grants:
             raise UserCodeError(f"{what}; must be {received.__name__}, the class of its messages")
         newest = self._newest[sensor]
         for place, sample in enumerate(newest):
-            if sample is not None and type(sample) is not kind:  # built from its declaration in `world/info`
+            if sample is not None and type(sample) is not kind:  # its class was built from `world/info`
                 newest[place] = convert(sample, kind, from_attributes=True)
         return tuple(newest)  # type: ignore[return-value] - converted above
 
@@ -312,13 +313,13 @@ def grants_of(cluster: Cluster, environment: Environment) -> Grants:
 
 
 def granted(law: Any, grants: Grants) -> Any:
-    """Return a subclass of a law's class whose instances have these grants from the constructor of `ControlLaw` on."""
+    """Return a subclass of a law's class whose instances have these grants once `ControlLaw` is constructed."""
     own = {"_granted": grants, "__module__": law.__module__, "__qualname__": law.__qualname__, "__doc__": law.__doc__}
     return type(law.__name__, (law,), own)
 
 
 def _is_declared_as(received: Any, kind: Any) -> bool:
-    """Return whether a message class built from its declaration corresponds to a user's class."""
+    """Return whether a message class built from its declaration in `world/info` corresponds to a user's class."""
     names = [(getattr(each, "__name__", None), getattr(each, "__struct_fields__", None)) for each in (received, kind)]
     return names[0] == names[1]
 
@@ -327,7 +328,7 @@ def _is_declared_as(received: Any, kind: Any) -> bool:
 def put_cluster_rate(
     c_des: Array, c: Array, period: Array, c_dot_des: Array, integral: Array, k: float, error: Array, c_dot: Array
 ) -> None:
-    """Write the error c_des - c, angles by the shorter way, and the rate c_dot_des + k error + integral, each (4n,)."""
+    """Write c_des - c, angles by the shorter way round, to `error`, and c_dot_des + k error + integral to `c_dot`."""
     for i in range(c.size):
         apart = c_des[i] - c[i]
         error[i] = apart - period[i] * np.rint(apart / TAU)
@@ -344,7 +345,8 @@ class RobotLimits(NamedTuple):
     """Limits of the saturation and the guard, for compiled code.
 
     Attributes:
-        separation_min_m: minimum distance between two robots; separation_alarm_m: pairs closer than this are reported.
+        separation_min_m: minimum distance between two robots.
+        separation_alarm_m: distance below which pairs are reported.
         guard_horizon_s: prediction horizon of the guard.
         response_s: lag of a drone's velocity loop, during which the guard expects it to keep its velocity.
     """
@@ -361,10 +363,10 @@ class RobotLimits(NamedTuple):
 def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[Array, Pairs, Pairs]:
     """Return velocities limited to prevent dangerous approaches, the guarded pairs, and the pairs in alarm.
 
-    Two robots at distance d, with commanded rate d' along their line, are kept to d' >= -(d_near - separation_min) /
-    guard_horizon: the distance predicted over the horizon stays above the minimum, and below it the approach is
-    reversed. d_near allows for the present velocities, which last for the response time. Each robot of a pair takes
-    half of the change; a few sweeps settle several pairs.
+    The commanded rate d' of the distance between two robots is kept at d' >= -(d_near - separation_min) /
+    guard_horizon: the distance predicted over the horizon stays above the minimum, and robots that are already closer
+    separate. d_near is the distance after the response time, during which an approach at the present velocities goes
+    on. Each robot of a pair takes half of the change; a few sweeps settle several pairs.
     """
     parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
     guards, alarms = hold_apart(p_W, v_W, parted_W, order, *limits)
@@ -372,7 +374,7 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[
 
 
 def numbered(order: Order) -> Pairs:
-    """Return the pairs numbered above the diagonal, in numerical order."""
+    """Return the pairs that are numbered above the diagonal, in the order of their numbers."""
     numbers = order.tolist()
     places = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]
     return tuple((i, j) for _, i, j in sorted(places))
@@ -382,9 +384,9 @@ def numbered(order: Order) -> Pairs:
 def limited(
     r_dot: Array, p_W: Array, v_W: Array, v_cmd_W: Array, yaw_rate: Array, order: Order, *limits_of: float
 ) -> tuple[float, int, int]:
-    """Write the saturated and guarded velocities (n, 3) and yaw rates (n,) of r_dot (4n,).
+    """Write the saturated and guarded velocities (n, 3) and yaw rates (n,) for r_dot (4n,).
 
-    Returns the factor of the saturation, then the result of `hold_apart`. limits_of are the fields of RobotLimits:
+    Return the factor of the saturation, then the result of `hold_apart`. limits_of are the fields of a RobotLimits:
     passing a tuple to compiled code takes longer than the computation.
     """
     limits = RobotLimits(*limits_of)
@@ -421,7 +423,7 @@ def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
 
 @portable
 def near_pairs(p_W: Array, within_m: float) -> PairTable:
-    """Return the pairs (m, 2), i < j, sorted by j, then i, of positions (n, 3) closer than a distance."""
+    """Return the pairs (i, j), i < j, of positions (n, 3) closer than a distance, sorted by j, then i, (m, 2)."""
     n = p_W.shape[0]
     pairs, count = np.empty((n * (n - 1) // 2, 2), np.int64), 0
     for j in range(1, n):
@@ -435,10 +437,10 @@ def near_pairs(p_W: Array, within_m: float) -> PairTable:
 
 @portable
 def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
-    """Change commands in place until every pair separates at least at its required rate (see `guard`).
+    """Modify commands in place until every pair separates at least at its required rate (see `guard`).
 
-    Returns the numbers of changed pairs and of pairs closer than the alarm threshold. In order (n, n) it numbers the
-    former from 1 above the diagonal and the latter below it; all other entries are zero.
+    Return the numbers of modified pairs and of pairs closer than the alarm threshold. In `order`, (n, n), the former
+    are numbered from 1 above the diagonal and the latter below it; all other entries are zero.
     """
     limits = RobotLimits(*limits_of)
     order[:] = 0
@@ -461,7 +463,7 @@ def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of:
 
 @portable
 def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: Order) -> int:
-    """Number the pairs closer than the alarm threshold below the diagonal of order; return their count."""
+    """Number the pairs closer than the alarm threshold below the diagonal of `order`; return their count."""
     alarms = 0
     for k in range(near.shape[0]):
         i, j = near[k, 0], near[k, 1]
@@ -473,7 +475,7 @@ def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: O
 
 @portable
 def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
-    """Make robots i and j separate at least at the required rate, each by half; return whether commands changed."""
+    """Make robots i and j separate at least at the required rate, each by half; return whether that took a change."""
     line_W = subtract(row(p_W, j), row(p_W, i))
     distance = norm(line_W)
     if distance >= reach(limits):
@@ -506,7 +508,7 @@ def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
 
 @portable
 def direction(line_W: Vector, distance: float) -> Vector:
-    """Return the unit vector of a line; x_W if the robots coincide, so that they still separate."""
+    """Return the unit vector along a line; x_W if the robots coincide, so that they still separate."""
     if distance < NEAR_M:
         return 1.0, 0.0, 0.0
     return line_W[0] / distance, line_W[1] / distance, line_W[2] / distance

@@ -21,9 +21,9 @@ from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.flight_check import GateInput
 from zsim_agents.formation.flight_plan import RequestError, read_request
 
-REQUESTS_MAX = 1000  # maximum number between two gates, e.g. while paused; the next gate publishes them
+REQUESTS_MAX = 1000  # maximum number of requests between two gates, e.g. in a pause; the next gate publishes them
 
-_variances_of = itemgetter(0, 7, 14)  # variances of position in the row-major 6 x 6 covariance
+_variances_of = itemgetter(0, 7, 14)  # variances of the position in the row-major 6 x 6 covariance
 
 
 class Controller(Agent):
@@ -67,7 +67,7 @@ class Controller(Agent):
             self._grants.put(key, message)
         elif type(message) is flight_messages.Estimate:
             former = self._estimates[place]
-            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in real time an older message may arrive later
+            if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in real time, messages may arrive out of order
                 self._estimates[place] = message
         elif message.t_ns >= self._status_ns[place]:  # as for estimates
             self._states[place], self._status_ns[place] = message.state, message.t_ns
@@ -78,7 +78,7 @@ class Controller(Agent):
         self._seat(self._engagement.drones)
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
-        for request, answer in answered:  # published at the gate: a re-run repeats the requests before it
+        for request, answer in answered:  # published at this gate: a re-run repeats these requests before it
             key, of_request = self._request_key, (request.op, request.args, request.source)
             message = run_messages.ClusterRequest(
                 t_ns, self.next_seq(key), *of_request, answer.ok, answer.error, source

@@ -1,7 +1,7 @@
 """The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
 
-`Engagement` does no communication: each gate takes estimates and returns commands; requests arrive in between. Every
-engagement, resumption and reference is checked, every refusal gives a reason, and every reference starts at the
+`Engagement` does not communicate: at each gate it takes estimates and returns commands; requests arrive between gates.
+Every engagement, resumption and reference is checked, every refusal gives a reason, and every reference starts at the
 present state of the formation.
 """
 
@@ -62,14 +62,14 @@ from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
 DT_MAX_S = 0.1  # maximum integration step, which applies after a gap
 CLIMB_GAIN_1_S = 0.8  # proportional gain of the climb to the assembly height
-HOLD_APART_M = 0.1  # margin above the minimum separation for the robots of a held formation
+HOLD_APART_M = 0.1  # margin above the minimum separation while a formation is held
 
 
 class Engagement:
-    """The state machine of the phases of one formation.
+    """The state machine of a formation's flight phases.
 
     Args:
-        drones: names in the order of the robots.
+        drones: names of the drones, in the order of the robots.
         plan: requests of the scenario; a landing request drops the remaining ones.
 
     Raises:
@@ -150,11 +150,11 @@ class Engagement:
         """Continue in the phase and at the reference (4n,) of a previous process of this formation.
 
         The plan continues after the completed steps; a target or trajectory of the plan that was being flown is
-        requested again from that reference.
+        requested again, starting from that reference.
 
         Args:
             plan_step: last `GateOutput.plan_step` of the previous process.
-            drones: names in the order of the robots, if it differs from the scenario's.
+            drones: names of the drones in the order of the robots, if it differs from the scenario's.
         """
         self._phase = "engaged" if phase == "held" else phase
         self._name(drones or self.drones)
@@ -287,7 +287,7 @@ class Engagement:
         self.drones = self.law.robots = self.check.drones = tuple(drones)
 
     def _way_left(self, gate: GateInput) -> str | None:
-        """Return a text on the remaining flight of the drones to their positions, None after arrival."""
+        """Return how far the drones still are from their assigned positions, as a text; None after arrival."""
         if self._assembly is None or self._assembly.arrived(gate.p_W):
             return None
         i, away_m = self._assembly.farthest(gate.p_W)
@@ -297,11 +297,11 @@ class Engagement:
         return Places(p_W, self.gains, self._held_limits, SHAPE.share)
 
     def _unflyable(self, gate: GateInput) -> str | None:
-        """Return why the drones cannot be led individually."""
+        """Return why the drones cannot be led individually; None if they can."""
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
     def _mode_commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
-        """Return mode commands for drones in one of the states, at most once per RESEND_S each."""
+        """Return mode commands for the drones in one of the given states, each at most once per RESEND_S."""
         due = []
         for drone, state in zip(self.drones, gate.states, strict=True):
             if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= RESEND_S:
@@ -409,7 +409,7 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference the desired value is the estimate."""
+        """Return the output of a gate; without a reference, the desired value is the estimate."""
         if command and command.alarmed:
             near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
             reason = f"{TOO_NEAR}, {near}; {reason}"

@@ -1,9 +1,9 @@
 """Builds the engagement of a scenario's cluster from space, gains, law and plan, and rehearses it before the flight.
 
-A plan is checked before the flight, from the drones' start positions. Refused are plans that the guidance would
-certainly refuse throughout the flight, with the factor by which their times must be stretched, and plans that end
-before any formation could start them. Limits are slightly wider than in flight, since the formation is never exactly
-at its start position; the guidance decides on cases in between, twice a second while the formation hovers.
+A plan is checked before the flight, from the drones' start positions. It is refused if the guidance would certainly
+refuse it throughout the flight (the text then gives the factor by which its times must be stretched), or if it ends
+before any formation could start it. Limits are slightly wider than in flight, since the formation is never exactly at
+its start position; the guidance decides on cases in between, twice a second while the formation hovers.
 """
 
 from __future__ import annotations
@@ -55,15 +55,15 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, Shifted, ramp_onto
 
 APART_M = 2.0  # distance between robots in a rehearsal; any value well above zero
-READY_S = 3.0  # minimum from the take-off order to the engagement, when the drones hover; AR.Drones take 4 to 12 s
-ROOM = 1.05  # chosen factor on the speed limits: a drone's position in the formation is off by some centimetres
-WAY_ROOM = 1.25  # chosen factor on a path from the start, whose length changes as the drones drift in their climb
-NEAR_ROOM = 0.9  # chosen factor on the minimum separation and height
+READY_S = 3.0  # minimum time from the take-off order to hovering drones and engagement; AR.Drones take 4 to 12 s
+ROOM = 1.05  # factor on the speed limits; design choice: a drone's position in the formation is off by some centimetres
+WAY_ROOM = 1.25  # factor on a path from the start; design choice: its length changes as the drones drift in their climb
+NEAR_ROOM = 0.9  # factor on the minimum separation and height; design choice, for the same reasons
 STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # sampling of a checked reference
 
 
 def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
-    """Return the engagement of a cluster; raises RunError if its plan can never be flown."""
+    """Return the engagement of a cluster; RunError: its plan can never be flown."""
     with _refusals_of(scenario, cluster):
         space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
         name = cluster.law or "proportional"
@@ -83,7 +83,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
 
 
 def check_plan(scenario: Scenario, cluster: Cluster) -> None:
-    """Raise RunError for a plan that `engagement_of` refuses, without rehearsing a law."""
+    """Raise RunError for a plan that `engagement_of` would refuse, without rehearsing the law."""
     with _refusals_of(scenario, cluster):
         space = scenario_space(scenario, cluster)
         FlightPlan(space, plan_of(cluster))
@@ -91,7 +91,7 @@ def check_plan(scenario: Scenario, cluster: Cluster) -> None:
 
 
 class PlannedMotion(NamedTuple):
-    """The last reference of a plan, its earliest start and its landing."""
+    """The last reference of a plan, its earliest start `from_s`, and its end `until_s` by landing or end of the run."""
 
     space: ClusterSpace
     reference: Reference
@@ -105,7 +105,7 @@ class PlannedMotion(NamedTuple):
 
 
 def planned_motion(scenario: Scenario, cluster: Cluster) -> PlannedMotion | None:
-    """Return the last target or trajectory of a valid plan, None if it has none.
+    """Return the last target or trajectory of a valid plan; None if it has neither.
 
     Raises:
         RunError: as in `check_plan`.
@@ -149,7 +149,7 @@ def _hovers(scenario: Scenario, cluster: Cluster) -> tuple[Array, Array]:
 
 @contextmanager
 def _refusals_of(scenario: Scenario, cluster: Cluster) -> Iterator[None]:
-    """Re-raise faults as a RunError that names the cluster, and for its plan also the path in the scenario."""
+    """Re-raise faults as a RunError that names the cluster and, for faults in its plan, the path in the scenario."""
     try:
         yield
     except PlanError as error:
@@ -173,7 +173,7 @@ def _rehearse(
     gains: FormationGains,
     law: Callable[[ClusterSpace, FormationGains], ControlLaw],
 ) -> None:
-    """Step a gate of a separate formation, so that all code is compiled or loaded before the flight."""
+    """Step a separate engagement by one gate, so that all code is compiled or loaded before the flight."""
     p_W, yaw = space.inverse(space.specimen(max(gains.separation_min_m, APART_M)))
     c, none, still = space.forward(p_W, yaw), np.zeros((space.n, 3)), np.zeros(space.n)
     rehearsal = Engagement(space, drones, gains, law=law)
@@ -199,7 +199,10 @@ def gains_of(gains: Gains) -> FormationGains:
 
 
 def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
-    """Raise PlanError for a plan that these drones cannot fly; unchecked if they do not start in a valid formation."""
+    """Raise PlanError for a plan that these drones cannot fly.
+
+    A plan without assemblies is not checked if the drones do not start in a valid formation.
+    """
     plan = cluster.plan
     assembles = plan.assemblies is not UNSET
     if plan.takeoff_s is None or not (plan.target or plan.trajectory or assembles):
@@ -237,7 +240,7 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
 
 
 def _formation_at(space: ClusterSpace, p_W: Array, yaw: Array) -> Array | None:
-    """Return the cluster (4n,) of the robots, None if it cannot be engaged."""
+    """Return the cluster variables (4n,) of the robots; None if their formation cannot be engaged."""
     try:
         c = space.forward(p_W, yaw)
         return None if shape_fault(space, c, SHAPE) else c
@@ -304,7 +307,7 @@ class _Rehearsal:
             raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
 
     def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:
-        """Return the maximum share of a robot's speed limits used along a reference, and its time [s]."""
+        """Return the maximum share of a robot's speed limits used along a reference, and the time of this peak [s]."""
         return max(
             (load(*robot_rates(self._space, *reference.value(t_s)), self._limits), t_s)
             for t_s in _instants(from_s, to_s)

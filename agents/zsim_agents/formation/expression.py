@@ -1,4 +1,4 @@
-"""An expression of t as text, with its exact derivative.
+"""Expressions of t, given as text, with their exact derivatives.
 
 The text is parsed with Python's grammar, whitelisted nodes are converted into a tree of closures, and the tree is
 evaluated on dual numbers (value, rate): the text is never executed.
@@ -48,7 +48,7 @@ class Expression:
         self._evaluate, self.constant = self._build(self._parse(), 0)
 
     def __call__(self, t_s: float) -> Dual:
-        """Return value and rate per second at t_s; ExpressionError: one of them is not finite there."""
+        """Return the value and its rate per second at `t_s`; ExpressionError: one of them is not finite there."""
         try:
             value, rate = self._evaluate(t_s)
         except (ArithmeticError, ValueError) as error:
@@ -142,7 +142,7 @@ def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
 
 
 def finite_number(value: object) -> float | None:
-    """Return the value as a float, None if it is not a finite number (a bool is not a number)."""
+    """Return the value as a float; None if it is not a finite number (a bool is not a number)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -176,7 +176,7 @@ def _power(a: Dual, b: Dual) -> Dual:
 def _unary(
     function: Callable[[float], float], rate_of: Callable[[float, float, float], float]
 ) -> Callable[[Dual], Dual]:
-    """Return a function of a dual number; `rate_of` takes the argument, the value and the argument's nonzero rate."""
+    """Extend a function to dual numbers; `rate_of` takes the argument, the value and the argument's nonzero rate."""
 
     def apply(a: Dual) -> Dual:
         value = _in_domain(function(a[0]))

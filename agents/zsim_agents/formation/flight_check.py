@@ -1,6 +1,6 @@
-"""Checks of whether a formation may take off, engage or fly on, and where it may be led; faults are texts.
+"""Checks whether a formation may take off, engage or fly on, and where it may be led; faults are texts.
 
-The data of a gate are Structs, which are created in a fifth of the time of a named tuple or dataclass.
+The data of a gate are Structs, which are created in a fifth of the time that a named tuple or dataclass takes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ ROUNDING_M = 1e-9  # tolerance above the rounding of a computed position (1e-14 
 VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # findings of `estimate_flaw`
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
 DOWN = frozenset({"landed", "emergency"})  # states of a drone on the ground or falling
-HELD_ON_REQUEST = "held on request"  # reasons in the cluster state, from which a display derives the possible requests
+# Reasons in the cluster state, from which a display derives the possible requests
+HELD_ON_REQUEST = "held on request"
 READY_TO_ENGAGE = "ready to engage"
 GUARD_PARTS = "the guard parts"
 TOO_NEAR = "ALARM"
@@ -33,24 +34,24 @@ REJOINING = "rejoining"
 
 @dataclass(frozen=True)
 class ShapeLimits:
-    """Limits of the shape in which a formation may be engaged and to which a reference may lead it.
+    """Limits of the shapes in which a formation may be engaged and to which a reference may lead it.
 
     Attributes:
-        spread_min_m: minimum height of the shape.
+        spread_min_m: minimum `ClusterSpace.spread` of the shape.
         tilt_max_rad: maximum roll and pitch of the formation.
         condition_max: maximum condition number of J^-1.
         height_min_m: minimum height of a robot's reference above the ground, z_W = 0.
         share: share of the robots' speed limits that a reference may use; the rest is left to the control law.
     """
 
-    spread_min_m: float = 1.0  # chosen: five sigma of an estimated side, which keep the robots from being collinear
-    tilt_max_rad: float = math.radians(30.0)  # chosen: far from 90 deg, where Euler angles fail
-    condition_max: float = 20.0  # chosen: above it a small motion in cluster space moves a robot far
-    height_min_m: float = 0.5  # chosen: five rotor radii, clear of most of the ground effect
+    spread_min_m: float = 1.0  # five sigma of an estimated side, so that the robots are certainly not collinear
+    tilt_max_rad: float = math.radians(30.0)  # far from 90 deg, where Euler angles are singular
+    condition_max: float = 20.0  # above it, a small motion in cluster space moves a robot far
+    height_min_m: float = 0.5  # five rotor radii, above most of the ground effect
     share: float = 0.8
 
 
-# All limits are chosen; those of the shape keep every formation away from singularities
+# All limits in this module are design choices; those of the shape keep every formation away from singularities
 SHAPE = ShapeLimits()
 FLIGHT_SLACK = 1.5  # factor on spread and tilt limits in flight, so that noise at a limit does not hold the formation
 SHAPE_IN_FLIGHT = dataclasses.replace(  # a formation in flight is held outside these limits
@@ -59,13 +60,13 @@ SHAPE_IN_FLIGHT = dataclasses.replace(  # a formation in flight is held outside 
     tilt_max_rad=SHAPE.tilt_max_rad * FLIGHT_SLACK,
     condition_max=math.inf,
 )
-ASSEMBLY_HEIGHT_M = 1.5  # height of the vertical climb before engagement: many rotor radii, and a fall is survived
+ASSEMBLY_HEIGHT_M = 1.5  # height of the climb before engagement: many rotor radii, yet drones survive a fall from it
 ASSEMBLY_WITHIN_M = 0.3  # tolerance of that height, three sigma of the barometer
-ASSEMBLY_CLIMB_M_S = 0.5  # maximum; half of the firmware's limit, so that all drones climb equally
+ASSEMBLY_CLIMB_M_S = 0.5  # maximum climb rate: half of the firmware's limit, so that all drones climb equally fast
 AGE_MAX_S = 0.5  # maximum age of a usable estimate: 25 gates, as long as the firmware tolerates silence
-IN_FLIGHT_FACTOR = 2.0  # factor on the limits of sigma in flight; for a position 2 m, that of a single GPS fix
-HEAL_S = 0.5  # time without fault before a held formation continues: 25 gates rule out a coincidence
-RESEND_S = 1.0  # period of resending a mode command without effect: ten times its delay in the paper's scenario
+IN_FLIGHT_FACTOR = 2.0  # factor on the sigma limits in flight: 2 m for a position, the sigma of a single GPS fix
+HEAL_S = 0.5  # time without a fault before a held formation continues: 25 gates rule out coincidence
+RESEND_S = 1.0  # period of resending an ineffective mode command: ten times its delay in the paper's scenario
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class EngagementLimits:
     """Maximum standard deviations for take-off and engagement."""
 
     sigma_max_m: float = 1.0  # half of the minimum separation of 2 m
-    yaw_sigma_max_rad: float = math.radians(15.0)  # half of 30 deg, where three sigma turn a velocity by 90 deg
+    yaw_sigma_max_rad: float = math.radians(15.0)  # half of 30 deg, at which an error of three sigma is 90 deg
 
 
 class GateInput(Struct, eq=False):
@@ -83,7 +84,7 @@ class GateInput(Struct, eq=False):
         p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where unknown.
         sigma_m: (n, 3) standard deviations of position; yaw_sigma: (n,) of the heading [rad].
         age_s: (n,) ages of the estimates; infinite without an estimate.
-        states: (n,) `state` of each drone's sensor/status.
+        states: `state` in each drone's sensor/status message, (n,).
     """
 
     t_s: float
@@ -119,7 +120,7 @@ class Setpoint(Struct, eq=False):
 
 
 def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | None, ...]:
-    """Return setpoints from velocities (n, 3) and yaw rates (n,), None for drones that do not follow them."""
+    """Return setpoints from velocities (n, 3) and yaw rates (n,); None for drones that do not follow setpoints."""
     every = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
     if AIRBORNE.issuperset(gate.states):
         return tuple(every)
@@ -130,10 +131,10 @@ class GateOutput(Struct, eq=False):
     """Commands of a gate and the fields of the cluster state message.
 
     Attributes:
-        setpoints: (n,) velocity commands, None for a drone without a command.
+        setpoints: velocity commands, (n,); None for a drone without a command.
         phase, value, desired, desired_rate, trajectory_t_s, margin, reason, plan_step: as in the message; angles in
             value and desired are wrapped.
-        factor: common factor of the saturation, 1 without saturation.
+        factor: common factor of the saturation; 1 without saturation.
     """
 
     modes: tuple[ModeCommand, ...]
@@ -153,8 +154,8 @@ class FlightCheck:
     """Checks the estimates and states of a gate; each check returns a fault or None.
 
     Attributes:
-        value: (4n,) cluster of the newest estimates that had a frame, zero before the first.
-        margin: its `ClusterSpace.margin` [m], 0 while the estimates have no frame.
+        value: cluster variables (4n,) of the newest estimates that defined a frame; zero before the first.
+        margin: `ClusterSpace.margin` of the value [m]; 0 while the estimates define no frame.
     """
 
     def __init__(
@@ -184,9 +185,9 @@ class FlightCheck:
             self._no_frame = str(error)
 
     def take_off_fault(self, gate: GateInput, assembles: bool = False) -> str | None:
-        """Return why the drones may not take off; airborne drones are not checked for their positions.
+        """Return why the drones may not take off; if all are already airborne, their positions are not checked.
 
-        `assembles`: whether they will fly to assigned positions, so that they may start in any shape.
+        `assembles`: whether the drones will fly to assigned positions, so that they may start in any shape.
         """
         fault = self._start_fault(gate, AIRBORNE | {"landed"})
         if fault or "landed" not in gate.states:
@@ -227,7 +228,7 @@ class FlightCheck:
         return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
 
     def formation(self) -> Array | None:
-        """Return the cluster (4n,) of the observed gate, None if the robots are not in a flyable formation."""
+        """Return the cluster variables (4n,) of the observed gate; None if the robots form no flyable formation."""
         is_one = self._no_frame is None and shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread) is None
         return self.value if is_one else None
 
@@ -295,7 +296,7 @@ def estimate_flaw(
 ) -> tuple[int, int]:
     """Return the flaw of the first unusable estimate and the index of its drone; (VALID, 0) if all are usable.
 
-    UNCERTAIN: the sigma of the position is too large; TURNED: that of the heading.
+    UNCERTAIN means that the sigma of the position is too large; TURNED, that of the heading.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:

@@ -1,4 +1,4 @@
-"""Requests to a formation by a user or a scenario, and the plan of a scenario: requests with their due times."""
+"""Requests to a formation from a user or a scenario, and the plan of a scenario: requests with their due times."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RefusalError(ValueError):
 
 
 class PlanError(ValueError):
-    """An impossible plan; the message starts with the path of the wrong value, from `plan`."""
+    """A plan is impossible; the message begins with the path of the wrong value, starting at `plan`."""
 
 
 class RequestError(ValueError):
@@ -54,13 +54,13 @@ class Order(Enum):
 
 @dataclass(frozen=True)
 class MoveTo:
-    """Move the formation to values by name, in over_s or as fast as the limits allow; `target` on the wire."""
+    """Request to move to named values, in over_s or as fast as the limits allow; `target` on the wire."""
 
     values: Mapping[str, str | float] = field(default_factory=dict)
     over_s: float | None = None
 
     def goal(self, space: ClusterSpace, base: Array) -> Array:
-        """Return the goal (4n,): base with the named values replaced; raises TrajectoryError or ExpressionError."""
+        """Return base (4n,) with named values replaced; TrajectoryError, ExpressionError: a value is not allowed."""
         if not self.values:
             raise TrajectoryError(f"target: no values; allowed: numbers by name of {', '.join(space.names)}")
         return named_values(space, self.values, "target", base)
@@ -68,13 +68,13 @@ class MoveTo:
 
 @dataclass(frozen=True)
 class Follow:
-    """Move the formation to the start of a trajectory, then follow it; `trajectory` on the wire.
+    """Request to move to the start of a trajectory, then follow it; `trajectory` on the wire.
 
     Attributes:
-        expressions, constants, duration_s: see `ExpressionTrajectory`; or
-        waypoints: see `WaypointTrajectory`.
-        start_s: simulated time of the trajectory's t = 0; None: when the formation arrives at its start. A formation
-            that arrives later joins the moving trajectory.
+        expressions, constants, duration_s: see `ExpressionTrajectory`.
+        waypoints: see `WaypointTrajectory`; excludes expressions.
+        start_s: simulated time of the trajectory's t = 0; None for the formation's arrival at its start. A formation
+            that arrives after `start_s` joins the moving trajectory.
     """
 
     expressions: Mapping[str, str | float] = field(default_factory=dict)
@@ -84,7 +84,7 @@ class Follow:
     start_s: float | None = None
 
     def trajectory(self, space: ClusterSpace, base: Array) -> Reference:
-        """Return the trajectory; raises ExpressionError or TrajectoryError."""
+        """Return the trajectory; ExpressionError, TrajectoryError: it is not allowed."""
         if self.start_s is not None and finite_number(self.start_s) is None:
             raise TrajectoryError(f"trajectory: start_s is {self.start_s}; allowed: a finite number")
         if bool(self.expressions) == bool(self.waypoints):
@@ -97,7 +97,7 @@ class Follow:
 
 @dataclass(frozen=True)
 class Assemble:
-    """Move each drone to an assigned position in a formation; `assemble` on the wire.
+    """Request to move each drone to an assigned position in a formation; `assemble` on the wire.
 
     The formation is given by names and values, as in `MoveTo`. A separate request engages it.
     """
@@ -126,7 +126,7 @@ class FlightPlan:
     A restarted controller continues at the `resume_at` of its predecessor.
 
     Attributes:
-        note: which step of the plan waits and why, empty if none does.
+        note: which step of the plan waits, and why; empty if none does.
 
     Raises:
         PlanError: a request is invalid (unknown name, bad expression), or times decrease.
@@ -163,7 +163,7 @@ class FlightPlan:
         self.note = ""
 
     def run(self, t_s: float, request: Callable[[FlightRequest], str | None]) -> None:
-        """Submit the requests due at t_s."""
+        """Submit the requests due at `t_s` to `request`, which returns the reason for a refusal."""
         for place in range(len(self._steps) - 1, self._next, -1):
             step = self._steps[place]
             if step.at_s <= t_s and step.request is Order.LAND:

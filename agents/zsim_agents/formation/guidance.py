@@ -28,9 +28,11 @@ HORIZON_S = 600.0  # part of a trajectory that is checked in advance; the rest i
 RAMP_MIN_S, RAMP_MAX_S = 2.0, 3600.0
 RAMP_GROWTH = 1.2  # minimum growth factor in the search for a ramp that is slow enough
 RAMP_SAMPLES = 33  # odd, so that one falls on the middle of a ramp, where its rate peaks
-LOAD_TOLERANCE = 1.02  # factor on the allowed share: ramps are sampled, and a ramp may start at the limit
-BENEATH_M = 1.0  # chosen horizontal distance to its position within which a robot climbs or descends to it
-IN_PLACE_M = 1.0  # distance to its position at which a robot rejoins; chosen: half of the minimum separation
+LOAD_TOLERANCE = 1.02  # factor on the allowed share of the speed limits: ramps are sampled, and may start at the limit
+# Horizontal distance from its position within which a robot climbs or descends, and distance at which it has rejoined;
+# design choice: half of the minimum separation
+BENEATH_M = 1.0
+IN_PLACE_M = 1.0
 
 
 class Guidance:
@@ -61,7 +63,7 @@ class Guidance:
         return self._known[2]
 
     def trajectory_t_s(self, t_s: float) -> float | None:
-        """Return the time since the start of the trajectory [s], None without a running trajectory."""
+        """Return the time since the start of the trajectory [s]; None if no trajectory is running."""
         if not isinstance(self._home, Shifted) or self.paused:
             return None
         own_s, end_s = t_s - self._home.start_s, self._home.of.duration_s
@@ -114,7 +116,7 @@ class Guidance:
     def rejoin(self, c: Array, t_s: float) -> None:
         """Continue after a fault from rest at the estimate c (4n,); a paused formation stays there.
 
-        The path back is checked against the limits in flight, so that a formation near their edge can return.
+        The path back is checked against the limits in flight, so that a formation close to them can return.
         """
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
@@ -173,7 +175,7 @@ class RampPlanner:
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
-        """Return a fast ramp within the speed limits, its path unchecked; TrajectoryError: it takes over an hour."""
+        """Return a fast ramp within the speed limits, with unchecked path; TrajectoryError: it takes over an hour."""
         over_s = RAMP_MIN_S
         while over_s <= RAMP_MAX_S:
             ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
@@ -192,7 +194,7 @@ class RampPlanner:
         return load(*robot_rates(self._space, c, c_dot), self._gains.limits)
 
     def reference_fault(self, reference: Reference, from_s: float, to_s: float) -> str | None:
-        """Return why a reference is not allowed from from_s to to_s, or None; sampled 41 to 301 times."""
+        """Return why samples of a reference between from_s and to_s are not allowed, or None."""
         count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
         count = count if to_s > from_s else 1
         for t_s in np.linspace(from_s, to_s, count).tolist():
@@ -210,7 +212,7 @@ class Places:
 
     A robot far from its position (for example after landing and taking off again) distorts the shape so that it cannot
     be led as a formation. Each robot first flies horizontally at its own height, below or above the others, then
-    vertically, at a share of the robots' limits.
+    vertically, at `share` of the robots' speed limits at most.
     """
 
     def __init__(self, p_W: Array, gains: FormationGains, limits: RobotLimits, share: float) -> None:
@@ -219,7 +221,7 @@ class Places:
         self._speed_max_m_s, self._climb_max_m_s = share * limits.speed_max_m_s, share * limits.climb_max_m_s
 
     def velocities(self, p_W: Array) -> Array:
-        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], before the guard."""
+        """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], not yet guarded."""
         v_W = self._gain_1_s * (self.p_W - p_W)
         aside_m = np.linalg.norm((self.p_W - p_W)[:, :2], axis=1)
         speed_m_s = self._gain_1_s * aside_m

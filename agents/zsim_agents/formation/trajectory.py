@@ -1,8 +1,8 @@
 """References in cluster space: a value and its rate as functions of time.
 
-Time is in seconds from the start of the reference; outside [0, duration_s] a reference stays at the nearer
-end. Angles are continuous in time, not wrapped. Users give values by the names of variables: in metres and radians, or
-in degrees as NAME_deg.
+Time is in seconds from the start of the reference; outside [0, duration_s], a reference stays at the nearer end. Angles
+are continuous in time, not wrapped. Users give values by the names of variables, in metres and radians, or in degrees
+as NAME_deg.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from zsim_agents.formation.expression import Expression, ExpressionError, finite
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
 
 DEGREES = "_deg"
-ANGLE_MAX_RAD = TAU + 1e-3  # one turn as typed with four digits; a greater target was probably meant in degrees
+ANGLE_MAX_RAD = TAU + 1e-3  # one turn, rounded up to four digits; a larger angle was probably meant in degrees
 
 
 class TrajectoryError(ValueError):
     """A trajectory is not possible as written; the message names the value, finding and remedy.
 
-    `at` is the path of the value within the target or trajectory, empty if that is wrong as a whole.
+    `at` is the path of the value within the target or trajectory; empty if no single value is wrong.
     """
 
     def __init__(self, finding: str, where: str = "", at: str = "") -> None:
@@ -38,7 +38,7 @@ class TrajectoryError(ValueError):
 
 
 class Variables(Protocol):
-    """What a reference needs to know of its variables, which are those of a cluster space or one drone's position."""
+    """What a reference needs to know about its variables: those of a cluster space, or one drone's position."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -52,7 +52,7 @@ class Variables(Protocol):
 
 
 class Reference(Protocol):
-    """A motion in cluster space; duration_s is the time after which it stands still, None if it never does.
+    """A motion in cluster space; duration_s is the time after which it stands still; None if it never does.
 
     `value` returns c and its exact derivative c_dot, each (4n,), at t_s.
     """
@@ -91,12 +91,12 @@ class Shifted:
 
 
 class ExpressionTrajectory:
-    """Variables as expressions of t; those without an expression stay at base (4n,).
+    """Variables as expressions of t; variables without an expression stay at base (4n,).
 
     Args:
         expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4, "yaw_deg": "6*t"}.
         constants: user constants by name, e.g. {"f": 0.01}.
-        duration_s: end of the motion, None if it is endless.
+        duration_s: end of the motion; None if it is endless.
 
     Attributes:
         arguments: constructor arguments by name, as plain values.
@@ -151,10 +151,10 @@ class WaypointTrajectory:
     """Waypoints joined by cubics with PCHIP slopes: C1, at rest at both ends, without overshoot.
 
     A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; variables that it does not name stay as in the previous
-    one (in the first: as in base). Angles that wrap turn by the shorter way.
+    waypoint, or before the first as in base. Angles that wrap take the shorter way round.
 
     Raises:
-        TrajectoryError: names the waypoint and its fault.
+        TrajectoryError: a waypoint is not allowed; the text names it and its fault.
     """
 
     def __init__(self, space: Variables, waypoints: Sequence[Mapping[str, object]], base: Array) -> None:
@@ -206,8 +206,8 @@ class Ramp:
     """A smooth transition from a state of motion onto another, possibly moving reference; see `ramp_onto`.
 
     c(t) = onto(t) + the initial offset, which a quintic reduces to zero with its first and second derivatives. From
-    rest to a reference at rest, this is the minimum-jerk move. It runs during [start_s, start_s + over_s], in the time
-    of `onto`; offset and offset_rate, (4n,), are c and c_dot at start_s minus those of `onto`.
+    rest to a reference at rest, this is the minimum-jerk move. The ramp takes place during [start_s, start_s + over_s],
+    in the time of `onto`; offset and offset_rate, (4n,), are c and c_dot at start_s minus those of `onto`.
     """
 
     onto: Reference
@@ -246,7 +246,7 @@ def put_ramped(
 
 
 def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
-    """Return the ramp from c, moving at c_dot, at start_s onto a reference in over_s; angles by the shorter way."""
+    """Return the ramp from c and c_dot at start_s onto a reference in over_s; angles go the shorter way round."""
     c_onto, c_dot_onto = onto.value(start_s)
     return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)
 
@@ -261,7 +261,7 @@ _KINDS: dict[str, Any] = {
 
 
 def state_of(reference: Reference) -> State:
-    """Return a reference as plain values; TypeError: its class is not of this module."""
+    """Return a reference as plain values; TypeError: its class is not defined in this module."""
     for kind, known in _KINDS.items():
         if type(reference) is known:
             arguments = getattr(reference, "arguments", None) or vars(reference)
@@ -285,7 +285,7 @@ class Variable(NamedTuple):
 
 
 def variable_of(space: Variables, name: object, where: str, at: str = "") -> Variable:
-    """Return the variable of a name: one of the space or an angle with `_deg`; TrajectoryError: it is unknown."""
+    """Return the variable that a name denotes; an angle's may end in `_deg`. TrajectoryError: the name is unknown."""
     text = str(name)
     angle = text.removesuffix(DEGREES)
     if text not in space.names and angle in space.names and space.in_radians[space.index(angle)]:

@@ -1,1 +1,1 @@
-"""Formation laws of the literature, one per file: the equations of the paper, pure, and the agent that applies them."""
+"""Formation laws from the literature, one per module: a paper's equations as pure functions, and the agent."""

@@ -46,7 +46,7 @@ def bearing_rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array
 
 
 class BearingOnly(ShapePilot):
-    """By default the first two drones are informed: their pinned positions determine the scale."""
+    """By default, the first two drones are informed: their pinned positions determine the scale."""
 
     class Parameters(ShapeParameters):
         gain_m_s: Annotated[float, Meta(gt=0, le=20)] = 2.0

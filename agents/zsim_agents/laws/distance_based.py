@@ -3,12 +3,12 @@
     u_i = k sum_{j in N_i} (|z_ij|^2 - d_ij^2) z_ij,    z_ij = p_j - p_i       (1)
 
 Krick, Broucke, Francis, Stabilisation of infinitesimally rigid formations of multi-robot networks, Int. J. Control 82
-(2009). It is the gradient descent of V = 1/4 sum e_ij^2, e_ij = |z_ij|^2 - d_ij^2, over the edges:
+(2009). This is gradient descent on V = 1/4 sum e_ij^2 over the edges, e_ij = |z_ij|^2 - d_ij^2:
 dV/dt = -sum |u_i|^2 / k, and the centroid is constant. The shape must be infinitesimally rigid: the rank of its
-rigidity matrix R, with a row z_ij, z_ji for each edge, is 2 n - 3 in the plane and 3 n - 6 in space. If there are
-exactly that many edges, errors near the shape decay at the rate 2 k lambda_min(R R^T). Convergence is local: collinear
-drones stay collinear, and a vertex with only two edges may settle on the wrong side. Inconsistent distances at the two
-ends of an edge make the formation drift.
+rigidity matrix R, whose row for edge ij is z_ji at i and z_ij at j, is 2 n - 3 in the plane and 3 n - 6 in space. If
+there are exactly that many edges, errors near the shape decay at the rate 2 k lambda_min(R R^T). Convergence is local:
+collinear drones stay collinear, and a vertex with only two edges may settle on the wrong side. If the two ends of an
+edge desire different distances, the formation drifts.
 """
 
 from typing import Annotated
@@ -46,7 +46,7 @@ def rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
 class DistanceBased(ShapePilot):
     class Parameters(ShapeParameters):
         gain_1_s: Annotated[float, Meta(gt=0, le=5)] = 0.3
-        """Gain normalised by the formation's size: k is this divided by the mean squared distance in the shape."""
+        """Gain normalised by size: k is this gain over the mean squared distance to the neighbours in the shape."""
 
     invariances = ("translation", "rotation")
 

@@ -1,13 +1,13 @@
-"""Flocking by Olfati-Saber: a lattice of spacing d that is cohesive, aligns velocities, and splits around obstacles.
+"""Flocking by Olfati-Saber: a cohesive lattice of spacing d, which aligns velocities and splits around obstacles.
 
     u_i = c1 sum phi_alpha(|z_ij|_s) n_ij + c2 sum a_ij (v_j - v_i)                     alpha: flockmates
         + c1b sum phi_beta(|z_ik|_s) n_ik + c2b sum b_ik (v_k - v_i)                    beta: obstacles
         - c1g (p_i - p_r) - c2g (v_i - v_r)                                             gamma: the common objective
 
 Olfati-Saber, Flocking for multi-agent dynamic systems: algorithms and theory, IEEE Trans. Automatic Control 51 (2006),
-Algorithms 2 and 3. u is an acceleration; the pilot integrates it to the commanded velocity. Each drone receives the
-messages of others within r; the last term uses the drone's own knowledge of the objective. Since several
-lattices are possible, the quality measure is the deviation from d of the distances within r.
+Algorithms 2 and 3. u is an acceleration, which the pilot integrates to the commanded velocity. Each drone receives the
+messages of others within r; the last term uses the drone's own knowledge of the objective. Since several lattices are
+possible, the quality of the shape is measured by the deviation from d of the distances within r.
 """
 
 import math
@@ -28,7 +28,7 @@ H_ALPHA, H_BETA = 0.2, 0.9  # parameter h of the bump function, for flockmates a
 
 
 def sigma_norm(z: float) -> float:
-    """Return |z|_s = (sqrt(1 + epsilon z^2) - 1) / epsilon of a length; it is differentiable at 0."""
+    """Return |z|_s = (sqrt(1 + epsilon z^2) - 1) / epsilon for a length z; it is differentiable at 0."""
     return (math.sqrt(1.0 + EPSILON * z * z) - 1.0) / EPSILON
 
 
@@ -55,13 +55,13 @@ def phi(z: float) -> float:
 
 
 def phi_alpha(z: float, d: float, r: float) -> float:
-    """Return the force at a sigma-norm z between flockmates of spacing d and range r [m]; negative: repulsion."""
+    """Return the force at sigma-norm z between flockmates of spacing d and range r [m]; repulsion is negative."""
     r_alpha = sigma_norm(r)
     return bump(z / r_alpha, H_ALPHA) * phi(z - sigma_norm(d))
 
 
 def phi_beta(z: float, d: float) -> float:
-    """Return the force at a sigma-norm z from an obstacle to be kept at distance d [m]; never above 0."""
+    """Return the force at sigma-norm z from an obstacle to be kept at distance d [m], always repulsive (<= 0)."""
     d_beta = sigma_norm(d)
     return bump(z / d_beta, H_BETA) * (sigma_1(z - d_beta) - 1.0)
 
@@ -101,8 +101,8 @@ def gamma_force(p: Array, v: Array, p_r: Array, v_r: Array, c1: float) -> Array:
 def deviation_energy(p: Array, d: float, r: float) -> tuple[float, int]:
     """Return the normalised deviation energy of positions (n, dim) from a lattice [m^2], and the number of edges.
 
-    E = sum of (|z_ij| - d)^2 over the pairs within r, counting both directions, divided by (pairs + 1);
-    section II of the paper.
+    E = sum of (|z_ij| - d)^2 over the pairs within r, divided by (pairs + 1), where each pair counts twice, once per
+    direction; section II of the paper.
     """
     z = p[:, None] - p[None]
     lengths = np.sqrt(np.sum(z * z, axis=2))[np.triu_indices(len(p), 1)]
@@ -113,11 +113,11 @@ def deviation_energy(p: Array, d: float, r: float) -> tuple[float, int]:
 class OlfatiSaber(Pilot):
     class Parameters(PilotParameters):
         spacing_m: Positive = 3.5
-        """d."""
+        """Spacing d of the lattice."""
         range_ratio: Annotated[float, Meta(gt=1, le=10)] = 1.2
-        """r / d."""
+        """Range over spacing, r / d."""
         clearance_m: Positive = 1.5
-        """Distance d' from obstacles."""
+        """Distance to keep from obstacles."""
         alpha_1_s2: NonNegative = 0.2
         beta_1_s2: NonNegative = 1.0
         gamma_1_s2: NonNegative = 0.1

@@ -1,22 +1,22 @@
 """The base class of the pilots of all formation laws: one agent per drone, which uses the messages of the others.
 
 Each pilot sends the estimated position of its drone, receives those of others, and computes a horizontal velocity. It
-takes off, climbs, engages its law at the flight height, holds that height, and lands. Formations are therefore plane
-figures; the laws themselves are written for any number of dimensions.
+takes off, climbs, engages its law at the flight height, holds that height, and lands. Formations are therefore planar,
+although the laws themselves are written for any number of dimensions.
 
 A law is a subclass with one method:
 
     class Consensus(ShapePilot):
         def velocity(self, now: Sight) -> Array: ...  # (2,) [m/s; W]
 
-Neighbours are the engaged drones from which a drone receives messages, by the topology and the radio of the scenario.
-They are sorted by name, and all sums use that order, so that the bits do not depend on the order of arrival.
+Neighbours are the engaged drones from which a drone receives messages, as the scenario's topology and radio determine.
+They are sorted by name, and all sums use that order, so that results are bit-identical for any order of arrival.
 
-The reference of a formation is its centre, heading and scale as functions of time, and the resulting places:
+The reference of a formation is its centre, heading and scale as functions of time, and the drones' resulting positions:
 
     p_i*(t) = p_c(t) + s(t) R(psi(t)) c_i        v_i* = dp_i*/dt
 
-All of it is horizontal, in W; c_i are the places of the drones in the formation, [m].
+All quantities are horizontal, in W; c_i is the position of drone i in the formation [m].
 """
 
 import math
@@ -49,14 +49,14 @@ Array = NDArray[np.float64]
 ENGAGE_M = 0.3  # a drone this close to its flight height engages its law, and stays engaged
 CLIMB_1_S = 1.0  # gain of the height control
 CLIMB_MAX_M_S = 0.8  # below the 1 m/s that the AR.Drone's firmware allows
-ASK_NS = 1_000_000_000  # time between two take-off commands
+ASK_NS = 1_000_000_000  # time between two take-off or landing commands
 UNSTAMPED = (0, 0, "")  # t_ns, seq, source of a command, filled in on sending
 AIRBORNE = ("hovering", "flying")
 TINY = 1e-9  # m: closer drones have no defined direction to each other
 
 
 class Motion(AgentMessage, frozen=True):
-    """The message of a pilot: the estimated position of its drone in W, and whether its law is engaged."""
+    """The message of a pilot: estimated position and velocity of its drone in W, and whether its law is engaged."""
 
     key = "formation/{drone}/motion"
 
@@ -66,7 +66,7 @@ class Motion(AgentMessage, frozen=True):
 
 
 class Heard(NamedTuple):
-    """Another drone, as in its last message."""
+    """Another drone, as described by its last message."""
 
     name: str
     p_W: Array  # (2,) [m]
@@ -97,7 +97,7 @@ class Sight(NamedTuple):
 
 
 class PilotParameters(Parameters):
-    """Common parameters of all laws; times are simulated, lengths horizontal."""
+    """Common parameters of all laws; times are simulated, and speeds and distances horizontal."""
 
     height_m: Annotated[float, Meta(gt=0, le=1000)] = 2.0
     takeoff_s: NonNegative = 2.0
@@ -107,18 +107,18 @@ class PilotParameters(Parameters):
     message_rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0
     """At most one message is sent per gate."""
     silence_s: Annotated[float, Meta(gt=0, le=60)] = 1.0
-    """A drone without messages for longer is ignored; until then, its last message is used."""
+    """A drone that has been silent for longer is ignored; until then, its last message is used."""
     centre_m: tuple[Value, Value] = (0.0, 0.0)
     """Centre of the formation in W: numbers, or expressions of t, in seconds since `start_s`."""
     start_s: NonNegative = 0.0
     avoid_m: NonNegative = 1.5
-    """Drones, obstacles and surfaces closer than this repel; 0: no repulsion."""
+    """Drones, obstacles and surfaces closer than this repel the drone; 0: no repulsion."""
     avoid_m4_s: NonNegative = 1.0
     """Gain of the repulsion."""
 
 
 class Pilot(Agent):
-    """Flies one drone by a law; see the module.
+    """Flies one drone by a formation law; see the module's docstring.
 
     Raises:
         ExpressionError: a reference is not an expression of t.
@@ -144,7 +144,7 @@ class Pilot(Agent):
         self._heard: dict[str, Motion] = {}
         self._state = "landed"
         self._p_W = self._v_W = np.zeros(3)
-        self._estimate_ns = -1  # of these
+        self._estimate_ns = -1  # time of the estimate with this position and velocity
         self._is_engaged = self._has_flown = False
         self.begin(scenario)
 
@@ -232,9 +232,9 @@ class Pilot(Agent):
     def obstacles_near(self, p_W: Array, reach_m: float) -> list[tuple[float, Array]]:
         """Return distance [m] and direction away (2,) of the obstacles and surfaces within reach beside the drone.
 
-        The distance of a surface is the one after which level flight meets its tangent plane at the nearest point. For
-        a wall, that is the distance to the wall; a slope counts as farther away the flatter it is, and level ground
-        below does not count at all.
+        The distance of a surface is that after which level flight meets its tangent plane at the nearest point. For a
+        wall, this is the distance to the wall; a slope counts as farther away the flatter it is, and level ground below
+        does not count at all.
         """
         found = []
         for row in self._obstacles:
@@ -267,7 +267,7 @@ class Pilot(Agent):
         self._is_engaged, self._has_flown = state["is_engaged"], state["has_flown"]
 
 
-@lru_cache(maxsize=SURFACES_MAX)  # shared by the pilots of a process: it takes a second for 40 000 triangles
+@lru_cache(maxsize=SURFACES_MAX)  # shared by the pilots of a process: 40 000 triangles take a second
 def _sheet(surface: Surface) -> Callable[[Sequence[float], float], tuple[float, Array]]:
     """Return a function of a point (3,) and a reach [m] that finds the surface's distance and nearest point.
 
@@ -293,7 +293,7 @@ class FormationReference:
 
     Args:
         centre_m: x and y in W: numbers, or expressions of t, in seconds since start_s.
-        heading_deg, scale: as centre_m.
+        heading_deg, scale: likewise, numbers or expressions.
 
     Raises:
         ExpressionError: a text is not an expression of t, or has no value at its start.
@@ -330,17 +330,17 @@ def polygon(count: int, radius_m: float) -> Array:
     return radius_m * np.array([[el.cos(angle), el.sin(angle)] for angle in angles])
 
 
-# Vectors, in one order of operations on every processor
+# Vector functions, with the same order of operations on every processor
 
 
 def turned(matrix: Array, c: Array) -> Array:
-    """Return a matrix (2, 2) times c (2,), in one order of operations on every processor."""
+    """Return a matrix (2, 2) times c (2,), with the same order of operations on every processor."""
     return np.array([matrix[0, 0] * c[0] + matrix[0, 1] * c[1], matrix[1, 0] * c[0] + matrix[1, 1] * c[1]])
 
 
 def repulsion(d: float, D: float, eta: float) -> float:
     """Return -dV/dd of Khatib's V = eta/2 (1/d - 1/D)^2 for d < D, else 0 (Int. J. Robotics Research 5(1), 1986)."""
-    if d >= D or D <= 0.0:  # inside an obstacle d is negative
+    if d >= D or D <= 0.0:  # d may be negative, inside an obstacle
         return 0.0
     d = max(d, 0.05)  # m: at distances within the error of estimates, the speed limit applies anyway
     return eta * (1.0 / d - 1.0 / D) / (d * d)
@@ -362,7 +362,7 @@ def triple(v: Array) -> tuple[float, float, float]:
 
 
 def total(numbers: Array) -> float:
-    """Return the sum of numbers from the first to the last."""
+    """Return the sum of numbers, added from the first to the last."""
     result = 0.0
     for number in numbers.tolist():  # Python's sum() differs between versions
         result += number
@@ -370,7 +370,7 @@ def total(numbers: Array) -> float:
 
 
 def added(terms: Sequence[Array], size: int = 2) -> Array:
-    """Return the sum of vectors from the first to the last."""
+    """Return the sum of vectors, added from the first to the last."""
     return sum(terms, np.zeros(size))
 
 

@@ -1,7 +1,7 @@
 """Common parts of laws with a shape: the drones' positions in it, and the terms that tie it to the reference.
 
 Laws based on relative quantities do not control the position of the shape; some do not control its rotation either, and
-one does not control its scale. Two terms, common to all laws, tie it to the reference:
+one does not control its scale. Two terms, common to all these laws, tie the shape to the reference:
 
     u_i = law + v_i*                          feed-forward, for drones that know the reference's motion
               + b_i (p_i* - p_i)              pinning, for informed drones
@@ -36,7 +36,7 @@ class ShapeParameters(PilotParameters):
     feedforward: bool = True
     """Whether all drones know the reference's motion; otherwise only the informed ones do."""
     informed: list[str] | None = None
-    """Drones that know their own reference position in W; None: the first one."""
+    """Drones that know their own reference position in W; None: the first drone only."""
     pin_1_s: NonNegative = 1.0
     """Gain with which informed drones approach their reference positions."""
 
@@ -62,7 +62,7 @@ class ShapePilot(Pilot):
         return [(each.p_W - now.p_W, now.reference.place(self._places[each.name])[0] - own) for each in now.heard]
 
     def own_place(self, now: Sight) -> tuple[Array, Array]:
-        """Return p_i* [m; W] and its rate v_i* [m/s]."""
+        """Return the drone's reference position p_i* [m; W] and its rate v_i* [m/s]."""
         c, c_dot = now.reference.place(self._places[self._drone])
         return now.reference.p_W + c, now.reference.v_W + c_dot
 

@@ -7,12 +7,12 @@
     D(r, a, p) = 0 for r <= 0;  r p for r p < a / p;  sqrt(2 a r - a^2 / p^2) beyond    (4)
 
 Vasarhelyi, Viragh, Somorjai, Nepusz, Eiben, Vicsek, Optimized flocking of autonomous drones in confined environments,
-Science Robotics 3 (2018). D is the speed from which a drone stops within r, with deceleration a and finally
-exponentially at the rate p. A wall or an obstacle is a shill: a virtual drone at the nearest point that moves away from
-it at v_shill, to which (2) applies with C = 1 and v_frict = 0.
+Science Robotics 3 (2018). D is the speed from which a drone can stop within r, first with deceleration a and finally
+exponentially at the rate p. A wall or obstacle acts as a shill agent: a virtual drone at its nearest point, which moves
+towards the free side at v_shill and to which (2) applies with C = 1 and v_frict = 0.
 
-The arena of the paper, a square that contains the flock, is here centred on the reference and moves with it; its rate
-is added to all velocities. The law forms no lattice: it ensures separation and velocity alignment.
+The arena of the paper, a square that contains the flock, is here centred on the reference and moves with it; the
+reference's velocity is added to all velocities. The law forms no lattice: it ensures separation and velocity alignment.
 """
 
 import math
@@ -26,20 +26,20 @@ from zsim_agents.laws.pilot import Array, Pilot, PilotParameters, Sight, length,
 
 
 def braking(r: float, a: float, p: float) -> float:
-    """Return D(r, a, p) of (4) [m/s]: r [m], a [m/s^2], p [1/s]."""
+    """Return D(r, a, p) of (4) [m/s] for r [m], a [m/s^2] and p [1/s]."""
     if r <= 0.0:
         return 0.0
     return r * p if r * p < a / p else math.sqrt(2.0 * a * r - a * a / (p * p))
 
 
 def repelled(z: Array, r0: float, p: float) -> Array:
-    """Return (1) of z = p_j - p_i [m]: a velocity away from j [m/s]."""
+    """Return (1) for z = p_j - p_i [m]: a velocity away from j [m/s]."""
     r = length(z)
     return -p * (r0 - r) * unit(z) if r < r0 else np.zeros(len(z))
 
 
 def friction(difference: Array, allowed: float, gain: float) -> Array:
-    """Return (2) of v_j - v_i [m/s]: along it, so that |v_j - v_i| falls."""
+    """Return (2) for the difference v_j - v_i [m/s]: a velocity along it, which reduces |v_j - v_i|."""
     excess = length(difference) - allowed
     return gain * excess * unit(difference) if excess > 0.0 else np.zeros(len(difference))
 
@@ -62,7 +62,7 @@ class Vasarhelyi(Pilot):
         arena_m: NonNegative = 8.0
         """Side of the square around the reference; 0: no arena."""
         avoid_m: NonNegative = 0.0
-        """Drones, obstacles and surfaces closer than this repel in addition to the law; 0: no repulsion."""
+        """Drones, obstacles and surfaces closer than this repel the drone, in addition to the law; 0: no repulsion."""
 
     def velocity(self, now: Sight) -> Array:
         own = self.parameters

@@ -2,8 +2,8 @@
 
     p_i* = p_c + s R(psi) c_i,    u_i = dp_i*/dt + k (p_i* - p_i)      (1)
 
-Lewis, Tan, High precision formation control of mobile robots using virtual structures, Autonomous Robots 4 (1997), and
-in the form where each robot has a copy of the structure's state: Ren, Beard, Decentralized scheme for spacecraft
+Lewis, Tan, High precision formation control of mobile robots using virtual structures, Autonomous Robots 4 (1997), in
+the form in which each robot has a copy of the structure's state: Ren, Beard, Decentralized scheme for spacecraft
 formation flying via the virtual structure approach, J. Guidance 27 (2004). Every error decays at the rate k; drones
 are coupled only by collision avoidance.
 """
@@ -13,7 +13,7 @@ from zsim_agents.laws.shape import ShapePilot
 
 
 def virtual_structure(p: Array, place: Array, rate: Array, k: float) -> Array:
-    """Return u_i of (1) for position, reference position and its rate, (d,) [m, m, m/s]; k [1/s]."""
+    """Return u_i of (1) for a position [m], its reference [m], the reference's rate [m/s], (d,) each, and k [1/s]."""
     return rate + k * (place - p)
 
 

@@ -317,7 +317,7 @@ def _check_heights(path: Reference, altitude_max_m: float) -> None:
 def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight]:
     """Return the flights of an exchange, by drone.
 
-    In each stage, the drones are assigned to the goals and fly there in straight lines, all over the same time.
+    In each stage, the drones are assigned to the goals and fly there in straight lines, starting and ending together.
 
     Raises:
         FlightError: a stage is too fast, too low, or starts too early.
@@ -509,7 +509,7 @@ def _meetings(
         flights: flights by drone.
         until_s: landing times by drone.
     """
-    from zsim_agents.formation.engagement_setup import planned_motion  # imported here because few scenarios have both
+    from zsim_agents.formation.engagement_setup import planned_motion  # here, since few scenarios have both
 
     for index, cluster in enumerate(scenario.clusters if flights else ()):
         try:

@@ -36,7 +36,7 @@ HORIZON_S = 600.0  # initial part of an endless path that is searched for peaks
 DIFFERENCE_S = 1e-4  # step of central differences of rates; relative error 1e-7 for motions with time scales of 1 s
 FACTOR_DIGITS = 3  # decimals to which the factor of a fitted path is rounded up
 SHARE = 0.8  # share of the drone's limits that a path may use, as in formations; the rest is left to the feedback
-# Minimum duration of a move (25 gates), maximum duration, and factor by which the search lengthens it in each step
+# Minimum duration of a move (25 gates), maximum unless a longer one is requested, and its growth per step of the search
 LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1
 STILL = 1e-9  # value below which a quantity counts as zero
 RAMP = 0.25  # duration of speeding up from rest, and of slowing down, as a share of a lap's
@@ -237,8 +237,8 @@ def move(
     It lasts `over_s`, or longer if the limits require it. It begins and ends at rest or in the given motions.
 
     Raises:
-        TrajectoryError: no path of less than an hour satisfies the limits, usually since the motion at an end exceeds
-            them.
+        TrajectoryError: no path of an hour or less, or of `over_s`, satisfies the limits, usually since the motion at
+            an end exceeds them.
     """
     turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
     places = np.array([start, [*goal[:3], turned]])
@@ -262,7 +262,7 @@ def round_up(factor: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A path flown `factor` times as slowly and shifted to an origin (4,)."""
+    """A path slowed down by `factor` and shifted to an origin (4,)."""
 
     of: Reference
     factor: float

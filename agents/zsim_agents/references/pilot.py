@@ -49,7 +49,7 @@ REQUESTS_MAX = 1000  # maximum number of requests between two gates, as for a co
 PLAIN = ("takeoff", "land", "hold")
 OPERATIONS = (*PLAIN, "goto", "follow")
 OF_EXPRESSIONS = ("constants", "duration_s")
-FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # its other fields only make sense in a scenario
+FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # a reference's other fields are for scenarios
 
 
 class ReferencePilot(Agent):
@@ -72,7 +72,7 @@ class ReferencePilot(Agent):
         self._reference_key, self._request_key = keys.reference(drone), keys.drone_request(drone)
         self.writes, self.repeats = (self._reference_key,), (self._request_key,)
         self._flight = checked_flight(scenario, drone)
-        self._asked: tuple[float, str, dict[str, Any], list[float], list[float]] | None = None  # last request granted
+        self._asked: tuple[float, str, dict[str, Any], list[float], list[float]] | None = None  # last granted request
         self._takeoff_s, self._land_s = self._settings.takeoff_s, land_s_of(self._settings)
         self._has_flown = self._is_over = False
         self._mode_ns = -round(RESEND_S * 1e9)

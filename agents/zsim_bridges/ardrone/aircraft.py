@@ -410,7 +410,7 @@ class Pilot:
         self._pursue(mode)
 
     def _pursue(self, mode: ModeName) -> None:
-        """Request a mode whenever that is due, until it is entered or abandoned."""
+        """Request a mode whenever due, until it is entered or abandoned."""
         entered = {
             "takeoff": self.state in (*IN_THE_AIR, "emergency"),
             "land": self.state not in IN_THE_AIR,

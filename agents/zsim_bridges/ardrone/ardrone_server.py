@@ -63,6 +63,7 @@ class ArdroneOptions(NamedTuple):
     Attributes:
         addresses: the text that `drone_addresses` reads.
         peers: hosts that are obeyed on addresses other than loopback.
+        rate: rate to request for the run [× real time]; None to leave it.
     """
 
     addresses: str

@@ -46,7 +46,7 @@ ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = (
 GYRO_LSB_PER_DEG_S = 16.4  # scale of the raw gyro (measured on an aircraft)
 MAG_UT_PER_LSB = 0.3  # uT (AK8975 datasheet)
 MG_PER_UT = 10.0  # milligauss per microtesla
-PWM_MAX = 255  # at a motor's maximum speed; assumed to be proportional to the speed, since the curve is not published
+PWM_MAX = 255  # PWM at a motor's maximum speed; assumed proportional to speed, since the true curve is not published
 VOLTAGE_MV = (0.0, 10.0, 50.0, 100.0), (9000.0, 10_500.0, 11_686.0, 12_500.0)
 """Charges [%] and voltages [mV] of the battery: 0 % is the SDK's vbat_min, 50 % was measured on an aircraft, the others
 are assumed."""

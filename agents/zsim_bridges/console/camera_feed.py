@@ -32,7 +32,7 @@ FOLD_MAX = 1e-3  # maximum distance, in focal lengths, between a ray and the und
 NORM_MIN = 1e-6  # minimum norm of a quaternion, and minimum forward component of a ray relative to its norm
 AGE_MAX_NS = 300_000_000  # simulated; maximum time between a picture and sightings drawn on it: 3 pictures at 10 Hz
 PICTURE_BYTES_MAX = 1_000_000  # maximum size of a picture; ten such pictures a second fill 80 Mbit/s
-PIXELS_MAX = 1920 * 1200  # maximum: those of a scenario's largest camera; a browser needs 4 bytes per pixel
+PIXELS_MAX = 1920 * 1200  # number of pixels of the largest camera in a scenario; a browser needs 4 bytes for each
 ENDS = b"\xff\xd9"  # last bytes of a JPEG; ITU-T T.81, table B.1
 SHOWN = frozenset({0xC0, 0xC1, 0xC2})  # markers of frames that browsers show: baseline, extended, progressive
 
@@ -272,7 +272,7 @@ def check_picture(data: bytes, width: int, height: int) -> None:
 
 
 def is_usable(info: CameraInfo) -> bool:
-    """Return whether a camera's description, which any program may have sent, can safely be computed with."""
+    """Return whether a camera's description, which any program may have sent, is safe to compute with."""
     fx, fy = info.K[0], info.K[4]
     return fx > 0 and fy > 0 and math.sqrt(sum(q * q for q in info.orientation_wxyz)) > NORM_MIN
 

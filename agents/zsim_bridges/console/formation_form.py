@@ -112,7 +112,7 @@ class FormationForm:
         self._shown: tuple[float, ...] | None = (
             None  # the formation's desired variables, or the estimated ones while it has no desired shape
         )
-        self._written: tuple[float, ...] | None = None  # variables at which the prefilled waypoints begin
+        self._written: tuple[float, ...] | None = None  # the formation's variables when the waypoints were prefilled
         self._edited = False
         self._controls: dict[str, Any] = {}
         for label, op in OPERATIONS.items():
@@ -436,7 +436,7 @@ def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> 
 
 
 def primary_variables(names: Sequence[str]) -> list[str]:
-    """Return the variables that have sliders: all if there are at most SHOWN_MAX, or those of the entire formation."""
+    """Return the variables with sliders: all if there are at most SHOWN_MAX, otherwise those of the whole formation."""
     primary = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
     return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in primary]
 

@@ -30,12 +30,12 @@ SERIES = ("desired", "estimated", "true")
 
 TRAIL_POINTS_MAX = 6_000  # maximum number of points of all trails together: 144 kB sent to a browser each time
 TRAILS_S = (10.0, 30.0, 60.0, SPAN_S)  # selectable lengths of trails, simulated
-TRAIL_S = 60.0  # initial length
+TRAIL_S = 60.0  # initial length of trails, simulated
 SPACING_M = 0.08  # minimum distance between two points of a trail: a sixth of a hull
 SPACING_S = 0.05  # simulated; minimum time between two points of a trail: the period of pictures at 1 × real time
 RECORD_GAP_S = 5.0  # simulated; a larger gap in a record has not been read yet, so nothing is drawn across it
 STILL_M = 1e-3  # minimum length of a segment that is drawn: a stationary drone leaves no trail
-PLOTS_SHOWN = 3  # number of plots
+PLOTS_SHOWN = 3  # number of plots shown at once
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # colours of SERIES
 HEIGHT_PX = 150
 PADDING_PX = (8, 24, 0, 0)  # clockwise from the top, where the topmost number needs space; on the right as in viser
@@ -45,7 +45,7 @@ BLANK = (np.array([0.0, 1.0]), *(np.full(2, np.nan) for _ in SERIES))  # data of
 NONE = "none"
 STEPS_PER_WINDOW = 6  # number of steps in which a time axis advances by its length; plots are recreated at each step
 CURVE_POINTS_MIN = 2  # minimum number of points of a curve that is drawn
-VALUE_RANGE_MIN = 0.01  # minimum range of values that determines the steps of an axis, in their unit
+VALUE_RANGE_MIN = 0.01  # minimum range of values from which the steps of an axis are derived, in their unit
 WINDOWS_S = (SPAN_S, 60.0, 20.0)  # selectable lengths of plots, simulated
 FLIGHT = {
     "x": "m",
@@ -152,7 +152,7 @@ class CanvasTrails:
         return lines[drawn], owners, times[begins]
 
     def lines(self, t_s: float, p_W: Array) -> list[list[list[float]]]:
-        """Return the segments of each drone's trail in plan: x and y [m; W] and time [s] at which each begins."""
+        """Return the segments of each drone's trail in plan view: x and y [m; W] and time [s] at which each begins."""
         segments, owners, times = self.segments(t_s, p_W)
         points = np.round(np.column_stack((segments[:, 0, :2], times)), PLAN_DIGITS)
         return [points[owners == i].tolist() for i in range(self._count)]
@@ -172,7 +172,7 @@ class VariableHistory:
         self._lock = threading.Lock()  # pages read curves in their own threads
 
     def is_due(self, t_s: float) -> bool:
-        """Return whether a point of that time [s] would be added."""
+        """Return whether a point at a time [s] would be added."""
         if self._around:
             return not self._points.is_near(t_s, INTERVAL_S / 2.0)
         times = self._points.times
@@ -195,7 +195,8 @@ class VariableHistory:
                 return False
             points.insert(t_s, row)
             if not self._around:
-                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))  # a fast run's points are sparse
+                # by age as well as by number, since the points of a fast run are sparse
+                points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))
         return True
 
     def keep(self, from_s: float, to_s: float) -> None:

@@ -1,9 +1,9 @@
-"""Single drones on the pages of one run: flown by a stick or to waypoints, returned to their starts, shown in plan.
+"""Single drones on the pages of one run: flown by stick or to waypoints, returned to their starts, shown in plan view.
 
-A drone is acquired, commanded at a steady rate, and released. It hovers unless motion is requested continuously: if the
-stick is released, or the page is silent, hidden or gone. A return to launch flies a drone to a point above its start,
-and a formation, through its controller, above the middle of its starts; there they land. A later request ends a return.
-Positions and velocities are in W, unless the suffix of a name says otherwise.
+A page acquires a drone, commands it at a steady rate, and releases it. The drone hovers as soon as motion is no longer
+requested: when the stick is released, or the page is silent, hidden or gone. A return flies a drone to a point above
+its start, or a formation, through its controller, above the middle of its drones' starts; there they land. A later
+request ends a return. Positions and velocities are in W, unless the suffix of a name says otherwise.
 """
 
 import math
@@ -32,22 +32,22 @@ from zsim_bridges.console.picture import PLAN_DIGITS, plan_formations, plan_posi
 from zsim_bridges.console.run_monitor import RunMonitor
 from zsim_bridges.console.scene import RunScene
 
-PERIOD_S = 0.05  # wall; between commands: at 5 × real time, two in the 0.5 s simulated after which firmware hovers
-STALE_S = 0.5  # wall; a page silent for longer no longer flies its drone; equal to the firmware's limit of silence
-GONE_S = 5.0  # wall; after which the drone of a lost page is released, unless the page has been reloaded
-REPEAT_S = 1.0  # wall; after which an unanswered request for a drone is repeated
-SETTLED_S = 1.5  # wall; after which a view shows who has acquired a drone; views arrive 20 times a second
-RATE_MAX = 5.0  # × real time; chosen: above it nobody can fly manually, and the firmware takes pauses for silence
-CLIMB_SHARE = 0.5  # ratio of climb to horizontal speed; chosen: height is harder to see on a page
-YAW_RATE_RAD_S = math.radians(45.0)  # chosen: a full turn in 8 s
-SPEED_M_S = 1.5  # towards a waypoint; chosen: like the paper's formations
-NEAR_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one; chosen
-WAYPOINTS_MAX = 50  # number per drone; chosen: more would no longer be manual flight
-BRAKE_S = 1.0  # time in which a drone comes to rest before the fence; chosen: three times the lag of its velocity loop
-ABOVE_START_M = 0.5  # horizontal distance from a start, near enough to land; chosen: the size of a hull
-OVER_STARTS_M = 0.5  # distance of a formation from the middle of its starts, near enough to land
-OVERRULED_M = 1.0  # increase of its goal's distance from which a formation counts as sent elsewhere
-MIDDLE = ("x_c", "y_c")  # variables of a formation that a return sets
+PERIOD_S = 0.05  # wall; period of commands: at 5 × real time, two in the 0.5 s simulated after which firmware hovers
+STALE_S = 0.5  # wall; the drone of a page that is silent for longer hovers; equal to the firmware's limit of silence
+GONE_S = 5.0  # wall; time after which the drone of a lost page is released, unless the page has been reloaded
+REPEAT_S = 1.0  # wall; time after which an unanswered request for a drone is repeated
+SETTLED_S = 1.5  # wall; time after which a view must show who has acquired a drone; views arrive 20 times a second
+RATE_MAX = 5.0  # × real time; at a higher rate nobody can fly manually, and the firmware mistakes pauses for silence
+CLIMB_SHARE = 0.5  # ratio of climb to horizontal speed; design choice: height is harder to judge on a page
+YAW_RATE_RAD_S = math.radians(45.0)  # design choice: a full turn in 8 s
+SPEED_M_S = 1.5  # speed towards a waypoint; design choice: that of the paper's formations
+NEAR_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one
+WAYPOINTS_MAX = 50  # maximum number per drone; design choice: more would no longer be manual flight
+BRAKE_S = 1.0  # time constant of braking before the fence; design choice: three times the lag of the velocity loop
+ABOVE_START_M = 0.5  # horizontal distance from its start at which a drone lands; design choice: the size of a hull
+OVER_STARTS_M = 0.5  # distance from the middle of its drones' starts at which a formation lands
+OVERRULED_M = 1.0  # a returning formation counts as sent elsewhere when its goal recedes by more than this
+MIDDLE = ("x_c", "y_c")  # the variables of a formation that a return sets
 Point = tuple[float, float]  # x, y [m; W]
 
 
@@ -81,7 +81,7 @@ HOVER = FlownVelocity()
 
 
 class DroneSight(NamedTuple):
-    """A drone as seen from here: its firmware's state (empty before the first view), commander and current estimate."""
+    """What the console knows of a drone: its firmware's state (empty before the first view), commander and estimate."""
 
     state: str = ""
     commander: str | None = None
@@ -92,7 +92,7 @@ class RunSight(NamedTuple):
     """The part of a run's state that matters to manual flight."""
 
     off: str = ""  # why nothing can be flown; otherwise empty
-    rate: float = 1.0  # simulated per wall second, as measured
+    rate: float = 1.0  # simulated seconds per wall second, as measured
     paused: bool = False
     silence: str = ""  # description of a silent world, which does not prevent a request for a drone
 
@@ -102,12 +102,12 @@ class FlightAnswer(NamedTuple):
 
     drone: str = ""
     state: str = "none"  # none, taking or flying
-    text: str = ""  # why the page does not fly it, or what it is doing
-    over: bool = False  # whether the page may take it over from its commander
+    text: str = ""  # why the page does not fly the drone, or what the drone is doing
+    over: bool = False  # whether the page may take the drone over from its commander
     commander: str = ""
-    id: str = ""  # id of the page's request to take it
-    goal: Vector | None = None  # its present destination [m; W]
-    then: tuple[Vector, ...] = ()  # later destinations
+    id: str = ""  # id of the page's request to take the drone
+    goal: Vector | None = None  # the drone's present destination [m; W]
+    then: tuple[Vector, ...] = ()  # its later destinations [m; W]
 
 
 class Geofence(NamedTuple):
@@ -124,9 +124,9 @@ class Geofence(NamedTuple):
         return ""
 
     def within(self, velocity_W: Vector, p_W: Vector) -> Vector:
-        """Return a demanded velocity [m/s], slowed down so that a drone at p_W [m] comes to rest at the fence.
+        """Return a demanded velocity [m/s], slowed down so that a drone at `p_W` [m] comes to rest at the fence.
 
-        Braking begins BRAKE_S before the fence; a drone outside the fence may return.
+        Braking begins BRAKE_S before the fence would be reached; a drone outside the fence may return.
         """
         x, y, z = (
             min(max(v, min(0.0, (low - p) / BRAKE_S)), max(0.0, (high - p) / BRAKE_S))
@@ -153,7 +153,7 @@ def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofenc
 
 
 def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
-    """Return a velocity in W in the heading frame, without the components that lead out of the fence."""
+    """Convert a velocity from W to the heading frame, slowed down so that it does not lead out of the fence."""
     return turned_about_up(fence.within(velocity_W, pose.p_W), -pose.yaw_rad)
 
 
@@ -164,18 +164,18 @@ def _too_fast(rate: float) -> str:
 
 @dataclass
 class _Flight:
-    """A drone that a page flies or has requested; times in s, wall."""
+    """A drone that a page flies or has requested; times are wall times [s]."""
 
     drone: str
-    modes: int  # number of modes requested of the drone before; a later one ends the flight
+    modes: int  # number of modes requested of the drone so far; a further one ends the flight
     begun_s: float  # when the page requested it
     seen_s: float  # when the page last sent something
     id: str = ""  # id of the page's request
     owned_s: float | None = None  # when the world granted it; None before
-    sent_s: float = 0.0  # when it was last commanded
+    sent_s: float = 0.0  # when the drone was last commanded
     stick: Stick | None = None  # present deflection; None: hover, or fly to `waypoints_W`
-    waypoints_W: tuple[Vector, ...] = ()  # its destinations, in order
-    sent_W: Vector | None = None  # waypoint to which its course leads; None for none
+    waypoints_W: tuple[Vector, ...] = ()  # the drone's destinations, in order
+    sent_W: Vector | None = None  # waypoint to which the drone's course leads, or None
     lost: bool = False  # whether the page's connection is gone
     requested_s: float = 0.0  # when the drone was last requested from the world
     is_requested: bool = False  # whether the world's answer is outstanding
@@ -212,8 +212,8 @@ class ManualFlight:
         self._wall_s = wall_s
         self._lock = threading.RLock()
         self._flights: dict[Any, _Flight] = {}
-        self._texts: dict[Any, FlightAnswer] = {}  # why a page no longer flies a drone
-        self._released: dict[str, float] = {}  # released drones, and when to check their release [s; wall]
+        self._texts: dict[Any, FlightAnswer] = {}  # by page: why it does not, or no longer, fly a drone
+        self._released: dict[str, float] = {}  # by released drone: when to check its release [s; wall]
         self._ticked_s = wall_s()
         self._wake = threading.Event()  # set when something must be sent at once
 
@@ -241,7 +241,7 @@ class ManualFlight:
             self._give_back(self._wall_s())
 
     def take(self, page: Any, drone: str, over: bool, request: str = "") -> FlightAnswer:
-        """Acquire a drone for a page; with `over`, even from its present commander, by an operator's priority.
+        """Acquire a drone for a page; with `over`, even from its present commander, by the priority of operators.
 
         A request repeated with the same id is carried out once; a page that has reconnected keeps its drone.
         """
@@ -273,7 +273,7 @@ class ManualFlight:
         self._client.take(flight.drone, partial(self._on_taken, flight))
 
     def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
-        """Fly the page's drone by a stick; None: the dead-man key is released; hover, or continue to the waypoint."""
+        """Fly the page's drone by a stick; None: the dead-man key is released, so hover, or continue to a waypoint."""
         with self._lock:
             flight = self._flights.get(page)
             if flight is not None:
@@ -285,7 +285,7 @@ class ManualFlight:
         return self.answer(page)
 
     def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None, then: bool = False) -> FlightAnswer:
-        """Fly the page's drone to a point [m; W], at its present height unless z_m is given.
+        """Fly the page's drone to a point [m; W], at the drone's present height unless `z_m` is given.
 
         Args:
             then: append the point to the present waypoints instead of replacing them.
@@ -310,7 +310,7 @@ class ManualFlight:
             return flight is not None and bool(flight.waypoints_W)
 
     def leave(self, page: Any, text: str = "") -> FlightAnswer:
-        """Let the page's drone hover, and release it; `text` is the reason."""
+        """Release the page's drone, which then hovers; `text` is the reason."""
         with self._lock:
             flight = self._flights.pop(page, None)
             if flight is not None:
@@ -350,7 +350,7 @@ class ManualFlight:
     def tick(self) -> None:
         """Command every drone that is due; release those that may no longer be flown.
 
-        Everything is sent from here, in one thread, so that no command follows a newer one or the release of a drone.
+        All commands and releases are sent from here, in one thread: no command may follow a newer one or a release.
         """
         wall_s, run = self._wall_s(), self._run_sight()
         stalled_s, self._ticked_s = wall_s - self._ticked_s, wall_s
@@ -370,7 +370,7 @@ class ManualFlight:
         self._give_back(wall_s)
 
     def _give_back(self, wall_s: float) -> None:
-        """Release drones, again if a command that was accepted after the release made the console their commander."""
+        """Release drones, and again if a command accepted after the release made the console their commander."""
         with self._lock:
             due = [drone for drone, at_s in self._released.items() if wall_s >= at_s]
             flown = {flight.drone for flight in self._flights.values()}
@@ -425,7 +425,7 @@ class ManualFlight:
             return HOVER if pose is None or stick is None else stick_velocity(stick, pose, limits, self._fence)
         course, here, moving = self._courses[flight.drone], (*pose.p_W, pose.yaw_rad), (*pose.v_W, 0.0)
         if before is None:
-            course.leave()  # it would continue from the end of the last flight to a waypoint
+            course.leave()  # otherwise it would continue from the end of the previous flight to a waypoint
         if waypoint != before:
             climb_m_s = CLIMB_SHARE * min(SPEED_M_S, limits.horizontal_speed_m_s)
             course.send((*waypoint, None), pose.t_s, here, moving, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
@@ -433,7 +433,7 @@ class ManualFlight:
         return FlownVelocity(_fenced(velocity_W, pose, self._fence), turn)
 
     def _next_waypoint(self, flight: _Flight, pose: DronePose | None) -> Vector | None:
-        """Return the drone's next waypoint, without those that it has reached; the last one is kept."""
+        """Return the drone's next waypoint after dropping the one that it has reached, unless that is the last."""
         with self._lock:
             waypoints = flight.waypoints_W
             if pose is not None and len(waypoints) > 1 and el.distance(pose.p_W, waypoints[0]) <= NEAR_M:
@@ -447,9 +447,9 @@ class ManualFlight:
 
 
 class PageFlying:
-    """Single drones on the pages of one run; pages are identified by viser's number.
+    """Flies single drones for the pages of one run; pages are identified by viser's number.
 
-    `note` is called with each drone or formation whose return has ended otherwise than by landing, and the reason.
+    `note` is called with each drone or formation that ends its return without landing, and the reason.
     """
 
     def __init__(
@@ -479,7 +479,7 @@ class PageFlying:
         self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
 
     def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
-        """Return the plan view as plain data; with `whole`, including what does not change, and the past trails."""
+        """Return the plan view as plain data; with `whole`, including the constant part and the past trails."""
         drones, chosen = self._scene.drones, self.pages.chosen(client_id)
         if drones is None:
             return {"t_s": None, "chosen": chosen}
@@ -519,15 +519,15 @@ class PageFlying:
 
 
 class ReturningDrone(NamedTuple):
-    """Identifies a returning drone to ManualFlight, as a page does."""
+    """Identifies a returning drone to ManualFlight, in place of a page."""
 
     drone: str
 
 
 @dataclass
 class _ReturningFormation:
-    requests: int  # number of requests to it, including its return
-    nearest_m: float = math.inf  # smallest distance so far of its goal from the middle of its starts
+    requests: int  # number of requests made to the formation so far, including the return itself
+    nearest_m: float = math.inf  # minimum distance so far between its goal and the middle of its drones' starts
 
 
 class ReturnFlights:
@@ -567,7 +567,7 @@ class ReturnFlights:
                 self._drones.add(drone)
 
     def request_formation(self, cluster: str) -> None:
-        """Move a formation above the middle of its starts in its present shape, and land it there."""
+        """Move a formation, in its present shape, above the middle of its drones' starts, and land it there."""
         values = dict(zip(MIDDLE, self.middles[cluster], strict=True))
         self._client.request_cluster(cluster, "target", values=values)
         with self._lock:
@@ -592,7 +592,7 @@ class ReturnFlights:
                     self._formations.pop(name, None)
 
     def _continue_drone(self, drone: str) -> bool:
-        """Send a drone to its start, or land it above it; return whether it is still returning."""
+        """Send a drone to its start, or land it if it is above; return whether it is still returning."""
         key, pose = ReturningDrone(drone), self._sight_of(drone).pose
         answer = self._control.steer(key, None)  # keeps the flight alive, as an open page does
         if answer.state == "none":
@@ -610,7 +610,7 @@ class ReturnFlights:
         return True
 
     def _continue_formation(self, name: str, returning: _ReturningFormation) -> bool:
-        """Land a formation that has arrived above its starts; return whether it is still returning."""
+        """Land a formation once it has arrived above its drones' starts; return whether it is still returning."""
         view = self._clusters().get(name)
         if self._client.cluster_requests[name] != returning.requests or view is None:
             return False  # another request was made

@@ -1,8 +1,8 @@
-"""Requests of operators: sent outside the page's threads, and tracked until they have taken effect.
+"""Requests of operators: sent in threads of their own, and tracked until they have taken effect.
 
 `CommandClient` sends requests and modes, and reports the outcome of each. Orders must not be lost: `OrderBook` sends
 each until the world has carried it out or refused it. The page chooses the id of an order, and repeats the order until
-it is answered; the console carries out each id once, and repeats an order that the world has not confirmed: its answer
+it is answered; the console carries out each id once, and repeats an order that the world has not confirmed: the answer
 may be missing, a radio may have lost the command, or its stamp may have become too old while a process stalled. Other
 requests are sent once; `PendingRequests` reports when an accepted one is done.
 """
@@ -31,17 +31,17 @@ from zsim_bridges.console.view_buffer import ViewBuffer, arguments_text, command
 
 PRIORITY = 10  # priority of operators in the contract
 PRIORITY_EMERGENCY = 100  # highest in the contract: an operator who flies a drone must not keep others from stopping it
-THREADS_PER_POOL = 8  # pools are separate: unanswered requests must not delay modes
-ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
-EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone that is to be stopped; afterwards the mode is sent anyway
-ACCEPTANCE_TIMEOUT_S = 1.0  # for the world to accept a command before the drone is released
+THREADS_PER_POOL = 8  # pools are separate, since unanswered requests must not delay modes
+ANSWER_TIMEOUT_S = 5.0  # the world and controllers normally answer within a gate
+EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone that is to be stopped; then the mode is sent even without an answer
+ACCEPTANCE_TIMEOUT_S = 1.0  # for the world to accept a command, after which the drone is released
 OVERTAKEN = "superseded by a later emergency"
 Task = Callable[[], None]
 REPEAT_S = 1.0  # wall; an order without an effect for this long is sent again: the world answers within a gate
 KEPT = 200  # number of settled orders that are remembered: three minutes at one click a second
 SHOWN_S = 20.0  # wall; how long pages show a settled order
-NAME_MAX = 64  # characters of an id or a name
-REASONS_MAX = 2  # number of targets of an order whose reasons are shown
+NAME_MAX = 64  # maximum number of characters of an id or a name
+REASONS_MAX = 2  # maximum number of an order's targets for which reasons are shown
 STALE_STAMP = "age is "  # start of the world's refusal of a stamp that is too old; the command is then stamped anew
 OrderState = Literal["sent", "confirmed", "refused", "replaced"]
 _CARRIED_OUT = {
@@ -64,7 +64,7 @@ STATES_DONE = {
     "emergency": frozenset({"emergency"}),
     "reset": frozenset({"landed"}),
 }
-REACHED_M, REACHED_RAD = 0.2, 0.05  # error of a variable at its target; chosen: about the accuracy in the paper
+REACHED_M, REACHED_RAD = 0.2, 0.05  # error below which a target is reached; design choice: the accuracy in the paper
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
 
 
@@ -81,7 +81,7 @@ class RequestOutcome(NamedTuple):
 
 
 class NoAnswer(str):
-    """A refusal because there was no answer."""
+    """The text of a refusal that only means that there was no answer."""
 
     __slots__ = ()
 
@@ -155,7 +155,7 @@ class CommandClient:
         return {}
 
     def read(self, act: Task) -> bool:
-        """Run a reading task in another thread; return whether it was scheduled."""
+        """Run a task that reads data in another thread; return whether it was scheduled."""
         try:
             self._requests.submit(act)
         except RuntimeError:  # closed
@@ -163,7 +163,7 @@ class CommandClient:
         return True
 
     def past_views(self, from_s: float, to_s: float, every_s: float) -> list[PastInstant]:
-        """Return the views of a replay's record, one gate every `every_s`; empty if there is no answer."""
+        """Return the views in a replay's record, of one gate every `every_s`; empty if there is no answer."""
         args = {"from_s": from_s, "to_s": to_s, "every_s": every_s}
         found: dict[int, PastInstant] = {}
         with suppress(ZsimError, LookupError, TypeError, ValueError):
@@ -186,10 +186,10 @@ class CommandClient:
         self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
-        """Send drones a mode: to take off, land, stop at once or leave the emergency, whoever commands them.
+        """Make drones take off, land, stop at once or leave the emergency, whoever commands them.
 
-        Modes of one drone are sent in the order of the requests, except for an emergency: it does not wait for them,
-        and no earlier request is sent after it.
+        Modes of one drone are sent in the order in which they were requested, except for an emergency: it does not wait
+        for earlier ones, and these are not sent after it.
         """
         for drone in drones:
             self._modes[drone] += 1
@@ -245,7 +245,7 @@ class CommandClient:
         return NoAnswer(refusal) if isinstance(answer, Unanswered) else refusal
 
     def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
-        """Acquire a drone and send the mode, unless more emergencies than `stops` were requested meanwhile."""
+        """Acquire a drone and send the mode, unless more than `stops` emergencies have been requested meanwhile."""
         if self._emergencies[drone] > stops:
             return OVERTAKEN
         return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
@@ -261,7 +261,7 @@ class CommandClient:
         return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority}, timeout_s)
 
     def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
-        """Send a mode, unless more emergencies than `stops` were requested; release the drone afterwards."""
+        """Send a mode, unless more than `stops` emergencies have been requested; release the drone afterwards."""
         before, now_ns = self._views.answered_commands(drone), self._now_ns()
         with self._lock:
             overtaken = stops is not None and self._emergencies[drone] > stops
@@ -274,7 +274,7 @@ class CommandClient:
         return OVERTAKEN if overtaken else ""
 
     def _release(self, drone: str, before: int) -> None:
-        """Release a drone once the world has answered its mode, which needs the operator's priority until then."""
+        """Release a drone once the world has answered the mode, which needs the operator's priority until then."""
         self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
@@ -298,7 +298,7 @@ class _DroneTasks:
 class DroneQueue:
     """Runs the tasks of each drone in order of submission in `pool`, and urgent ones at once in `urgent`.
 
-    Tasks of different drones do not wait for each other. Submitting raises RuntimeError once closed.
+    Tasks of different drones do not wait for each other. Once the queue is closed, submitting raises RuntimeError.
     """
 
     def __init__(self, pool: Executor, urgent: Executor) -> None:
@@ -360,7 +360,7 @@ class OrderRequest(Struct, frozen=True, forbid_unknown_fields=True):
     id: Name = ""
     """Chosen by the page; carried out once per id. Empty: the order will not be repeated."""
     run: Name = ""
-    """The run for which it was given; it is refused in any other. Empty: the run that is shown."""
+    """The run for which the order was given; it is refused in any other. Empty: the run that is shown."""
     drone: Name = ""
     cluster: Name = ""
     """The target, a drone or a formation; all of them if both are empty."""
@@ -372,11 +372,11 @@ class _Target:
 
     is_drone: bool
     state: OrderState = "sent"
-    reason: str = ""  # why it is refused, or not yet confirmed
+    reason: str = ""  # why the order is refused, or not yet confirmed
     busy: bool = False  # whether an attempt is in progress
     attempts: int = 0
     sent_s: float = 0.0  # when the last attempt began [s; wall]
-    modes: int = 0  # number of modes requested of a drone, including this order's; a later one replaces it
+    modes: int = 0  # number of modes requested of a drone, including this order's; a further one replaces the order
     accepted: bool = False  # whether the world has accepted the last command
 
 
@@ -386,12 +386,12 @@ class _Order:
     op: Any
     subject: str
     targets: dict[str, _Target]  # by name
-    given_s: float  # when it was given [s; wall]
-    since_ns: int  # when it was given [simulated]
-    over_s: float | None = None  # when it was settled [s; wall]
+    given_s: float  # when the order was given [s; wall]
+    since_ns: int  # when the order was given [simulated]
+    over_s: float | None = None  # when the order was settled [s; wall]
     confirmed_ns: int | None = None
     refusal: str = ""
-    notified: set[str] = field(default_factory=set)  # targets of whose outcomes operators were notified
+    notified: set[str] = field(default_factory=set)  # targets with outcomes that operators were notified of
 
     @property
     def state(self) -> OrderState:
@@ -402,11 +402,11 @@ class _Order:
 
 
 class OrderBook:
-    """Carries out orders of one run; thread-safe.
+    """Carries out the orders of one run; thread-safe.
 
     Args:
         members: the drones of each formation.
-        refusal: returns why nothing can be flown, apart from a silent world; otherwise empty.
+        refusal: returns why nothing can be flown, empty if something can; a silent world does not count.
         now_ns: returns the simulated time of the newest clock.
         silent_s: returns for how long the world has not answered [s; wall].
         external: drones whose modes the world only forwards, so that only their states show an effect.
@@ -438,7 +438,7 @@ class OrderBook:
         self._lock = threading.RLock()
 
     def place(self, request: OrderRequest) -> dict[str, Any]:
-        """Carry out an order, unless one with its id has been carried out; return its progress as plain data."""
+        """Carry out an order, unless one with its id was placed before; return the order's progress as plain data."""
         order_id = request.id or uuid4().hex
         with self._lock:
             order = self._orders.get(order_id)
@@ -492,8 +492,8 @@ class OrderBook:
     def update(self, states: Mapping[str, str], t_ns: int, *, paused: bool) -> None:
         """Settle orders that have taken effect, and repeat the others.
 
-        `states` has the states of drones and the phases of formations at t_ns. A command that is accepted in a paused
-        run takes effect when the run continues.
+        `states` has the states of drones and the phases of formations at `t_ns`. A command that is accepted while the
+        run is paused takes effect when it continues.
         """
         with self._lock:
             self._paused = paused
@@ -502,7 +502,7 @@ class OrderBook:
                 for name, target in order.targets.items():
                     if target.state != "sent":
                         continue
-                    # A formation's controller answers: its phase counts only after a request without an answer.
+                    # A formation's controller answers requests: its phase counts only after one had no answer.
                     has_effect = states.get(name) in _CARRIED_OUT[order.op] and (target.is_drone or target.attempts > 1)
                     waits = target.busy or silent or (paused and target.accepted)
                     if ended:
@@ -597,7 +597,7 @@ class OrderBook:
 
 
 class PendingRequest(NamedTuple):
-    """An accepted request to a formation or drone, with its description."""
+    """An accepted request to a formation or drone; `text` describes it."""
 
     subject: str
     op: str

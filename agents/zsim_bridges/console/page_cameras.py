@@ -1,7 +1,7 @@
 """Cameras in the scenes of pages: the pages' own viewpoints, and frusta of drones' cameras.
 
-A page's camera follows the formation and keeps all of it in view, unless the page chooses otherwise. It may show the
-frustum of one drone's camera, with its picture.
+A page's camera follows the formation and keeps all of it in view, unless the page chooses otherwise. A page may also
+show the frustum of one drone's camera, with the camera's picture.
 """
 
 import math
@@ -22,24 +22,24 @@ from zsim_bridges.console.picture import Array, DronePoses
 
 OFFSET_M = np.array([-2.3, -3.9, 1.7])  # offset of a page's camera from its target, unless it must be farther away
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
-SLOPE_MIN = 0.05  # half width per distance on the narrowest page considered; a hidden page has no width
-REACH_M = 0.6  # radius of a drone with the name above it; chosen
-FAR_M = 15.0  # distance beyond which a drone is too small to count as in view; chosen: about 15 pixels
-MARGIN = 0.85  # share of half the page; points within it count as in view
+SLOPE_MIN = 0.05  # half the visible width per distance on the narrowest page considered; a hidden page has no width
+REACH_M = 0.6  # radius of a drone together with the name above it
+FAR_M = 15.0  # distance beyond which a drone is too small, less than about 15 pixels, to count as in view
+MARGIN = 0.85  # share of half the page within which points count as in view
 UP_W = np.array([0.0, 0.0, 1.0])
 DIRECTIONS = {  # directions from the target to the camera; not straight from above, where the up direction is undefined
     "reset": OFFSET_M / DISTANCE_MIN_M,
     "top": np.array([0.0, -0.02, 1.0]),
     "side": np.array([0.0, -1.0, 0.06]),
 }
-DEADBAND = 0.05  # share of the distance; the camera does not follow a shorter move, so that the page need not redraw
-SPARE = 1.15  # ratio to the distance at which everything is just in view
-NEARER = 0.6  # ratio to the present distance; the camera comes nearer if the fitting distance is less
+DEADBAND = 0.05  # share of the camera's distance; shorter moves are not followed, so that the page need not redraw
+SPARE = 1.15  # ratio of the camera's distance to that at which everything is just in view
+NEARER = 0.6  # the camera comes nearer if the fitting distance is less than this share of the present one
 NODE = "/camera_frustum"
-SCALE = 0.8  # size of a frustum, whose picture is about a metre wide; chosen: suits a hull of half a metre
+SCALE = 0.8  # size of a frustum, with a picture about a metre wide; design choice: suits a hull of half a metre
 EDGE_PX = 2.0
 COLOUR = (226, 0, 134)
-FIELD_MAX_RAD = 2.6  # largest angle of view that is drawn; the picture would otherwise be wider than the formation
+FIELD_MAX_RAD = 2.6  # maximum angle of view that is drawn; otherwise the picture might be wider than the formation
 PAGE_KEY_BYTES = 12
 
 
@@ -62,7 +62,7 @@ class CameraView(NamedTuple):
         return bool(0.0 < z <= FAR_M and abs(y) <= half and abs(x) <= half * self.aspect)
 
     def offset(self) -> Array:
-        """Return the camera's position relative to a new target [m; W]: the present one, at most |OFFSET_M| away."""
+        """Return an offset from a new target to the camera [m; W]: the present one, at most |OFFSET_M| long."""
         back = self.position - self.look_at
         return back * min(1.0, float(np.linalg.norm(OFFSET_M) / np.linalg.norm(back)))
 
@@ -71,10 +71,10 @@ def fit_distance_m(points_W: Array, centre_W: Array, back_W: Array, up_W: Array,
     """Return the distance at which a camera aimed at a centre has all points in view [m]; at least DISTANCE_MIN_M.
 
     Args:
-        points_W: (n, 3) m.
-        centre_W: target of the camera, (3,) m.
-        back_W: direction from the centre to the camera, (3,); not parallel to `up_W`.
-        up_W: (3,).
+        points_W: the points, (n, 3) m.
+        centre_W: the camera's target, (3,) m.
+        back_W: direction from the target to the camera, (3,); not parallel to `up_W`.
+        up_W: up direction of the camera, (3,).
         fov: vertical angle of view [rad].
         aspect: width / height.
     """
@@ -98,16 +98,16 @@ def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
 
 @dataclass
 class _Page:
-    """A page: how its camera looks at the scene, and the frustum in it; `key` identifies the page to its sockets."""
+    """A page: how its camera looks at the scene, and the shown frustum; sockets identify the page by `key`."""
 
     client: viser.ClientHandle
     key: str = field(default_factory=lambda: secrets.token_urlsafe(PAGE_KEY_BYTES))
     follows: bool = True  # whether its camera moves with the formation
-    fits: bool = True  # whether its distance is adjusted to keep all drones in view
+    fits: bool = True  # whether the camera's distance is adjusted to keep all drones in view
     direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)  # next viewing direction; None: unchanged
     moved: bool = True  # whether its camera must be aimed again
-    camera: str = ""  # the camera whose frustum is shown; empty for none
-    clicked: str = ""  # the drone last clicked in its scene, until it is taken
+    camera: str = ""  # the drone's camera whose frustum is shown; empty for none
+    clicked: str = ""  # the drone last clicked in the page's scene, until `take_click`
 
 
 @dataclass
@@ -118,7 +118,7 @@ class _Frustum:
 
 
 class PageCameras:
-    """The cameras with which all pages look at the scene, and the frusta within it.
+    """The cameras with which pages look at the scene, and the frusta of drones' cameras within it.
 
     A page's camera moves to a frustum that appears out of view.
     """
@@ -135,7 +135,7 @@ class PageCameras:
     def _on_connect(self, client: viser.ClientHandle) -> None:
         page = _Page(client)
         self._move(page)
-        page.moved = True  # aim again at the next picture: the present target may be of another run
+        page.moved = True  # aim again at the next picture: the present target may be that of another run
         with self._lock:
             self._pages[client.client_id] = page
         client.gui.add_html(f'<i data-zsim-page="{page.key}"></i>', order=-2.0)
@@ -160,7 +160,7 @@ class PageCameras:
                 page.moved = True
 
     def look(self, client_id: int, follows: bool, fits: bool, direction: str = "") -> None:
-        """Set whether a page's camera follows and keeps all in view, and look from a direction of `DIRECTIONS`."""
+        """Set whether a page's camera follows and keeps all in view; look from a direction in `DIRECTIONS`, if any."""
         with self._lock:
             page = self._pages.get(client_id)
             if page is None:
@@ -259,7 +259,7 @@ class PageCameras:
 
 
 def frustum_pose(info: CameraInfo, p_WB: Array, q_WB: Array) -> tuple[Array, Array]:
-    """Return position [m; W] and quaternion (K to W) of a usable camera; its drone is at p_WB (3,) [m], q_WB (4,)."""
+    """Return position [m; W] and quaternion (K to W) of a usable camera, on a drone at `p_WB` (3,) [m], `q_WB` (4,)."""
     p_WK = p_WB + frames.rotate(q_WB, info.position_m)
     return p_WK, frames.quaternion_multiply(q_WB, rotation.normalised(info.orientation_wxyz))
 

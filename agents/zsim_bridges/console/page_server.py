@@ -1,8 +1,8 @@
 """The console's HTTP server: serves the page to permitted clients, and relays between the page and a private viser.
 
-The page is viser's, extended in `frame/` by a head, tools over the scene and camera windows; viewers see its controls
-disabled. It may also show the files that its run has written, and copy them before the console exits. viser's own
-server cannot be reached otherwise, and the messages of pages to it are filtered.
+The page is viser's, extended by the parts in `frame/`: a head, tools over the scene, and camera windows. Viewers see
+its controls disabled. The page can also show the files that the run has written, and copy them before the console
+exits. viser's own server cannot be reached in any other way, and messages from pages to it are filtered.
 
 This is the only file that uses internals of viser 1.1 and websockets, which have no public interface to
 - refuse connections without a secret (`_requiring_secret`),
@@ -61,16 +61,16 @@ from zsim_bridges.web.web_server import (
 )
 
 VIEW_PATH = "/view"
-MESSAGE_MAX = 100_000  # bytes of one message of a page
+MESSAGE_MAX = 100_000  # maximum size of a message from a page [bytes]
 BACKEND_HOST = "127.0.0.1"  # where viser listens
 PAGE_HEADER = "X-Zsim-Page"  # name of a page; pages of other sites cannot send it without permission
 CLIENT_HEADER = "X-Zsim-Client"  # key of a page, which maps to viser's number
 COPIED_HEADER = "X-Zsim-Copied"  # sent once a page has its copies from a console that is exiting
-SECRET_HEADER = "X-Zsim-Console"  # demanded by viser's server
+SECRET_HEADER = "X-Zsim-Console"  # its value, a secret, is required by viser's server
 ALL_ADDRESSES = ("0.0.0.0", "::")
-PAGES_MAX = 50  # number open at once, counted separately for operators and viewers: viewers must not exclude operators
-HEARTBEAT_S = 20.0  # after which a page whose machine has gone is detected
-CLOSE_S = 0.3  # wall; used twice on exit: for requests in progress, and for pages to close their sockets
+PAGES_MAX = 50  # maximum open at once, counted separately for operators and viewers: viewers must not exclude operators
+HEARTBEAT_S = 20.0  # period of pings, which detect a page whose machine has disappeared
+CLOSE_S = 0.3  # wall; timeout used twice on exit: for requests in progress, and for pages to close their sockets
 POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
 HEADERS = {
     "Content-Security-Policy": POLICY,  # the page is one file and loads nothing from elsewhere
@@ -78,7 +78,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-PARTS = (  # parts of the page besides viser's; each may use those before it
+PARTS = (  # files added to viser's page; each may use what those before it define
     "layout.html",
     "orders.html",
     "head_bar.html",
@@ -90,13 +90,14 @@ PARTS = (  # parts of the page besides viser's; each may use those before it
     "map_view.html",
     "touch.html",
 )
-LOOKED_S = 5.0  # wall; without a poll for this long a page counts as closed; above GONE_MS + LOOK_MS of head_bar.html
-MTIME_S = 2.0  # largest amount by which a file's time may be too early: the resolution of FAT
-POLL_S = 0.1  # wall; between two checks whether all pages have their copies
-LOOKS_MAX = 200  # number of pages remembered; at most 50 of operators and 50 of viewers are open
+# wall; without a poll for this long a page counts as closed; above GONE_MS of head_bar.html + LOOK_MS of orders.html
+LOOKED_S = 5.0
+MTIME_S = 2.0  # maximum amount by which a file's time may be too early: the resolution of FAT
+POLL_S = 0.1  # wall; period of checking whether all pages have their copies
+LOOKS_MAX = 200  # maximum number of pages remembered; at most 50 of operators and 50 of viewers are open
 _ORDERS = msgspec.json.Decoder(OrderRequest)
-NAME_MAX = 64  # characters of a key that modifies a click
-VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
+NAME_MAX = 64  # maximum number of characters in the name of a key that modifies a click
+VALUE_MAX = 2_000  # maximum number of characters of a control's text: expressions of twelve variables, a line each
 EXACT_MAX = 2**53  # a page's numbers are exact up to this; larger ones do not fit any message
 Value = bool | message.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
 Permits = Callable[[int, str], bool]
@@ -104,7 +105,7 @@ Permits = Callable[[int, str], bool]
 
 
 class ListenAddress(NamedTuple):
-    """The address where pages are served; `or_any`: on another port if this one is taken."""
+    """The address where pages are served; `or_any`: use another port if this one is taken."""
 
     host: str
     port: int
@@ -135,7 +136,7 @@ class RunFiles:
         self._leaves = False
 
     def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
-        """Return the state of the files for a page (empty: none); `has_copies`: it has all that it wants to keep."""
+        """Return the state of the files for a page (empty: unnamed); `has_copies`: the page needs no more copies."""
         self._looked_s.pop(page, None)
         if page and not has_copies:
             while len(self._looked_s) >= LOOKS_MAX:
@@ -145,7 +146,7 @@ class RunFiles:
         return {"files": files, "leaves": self._leaves}
 
     def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
-        """Tell pages to copy the files, since the console exits; wait until all open ones have them, or `deserted`."""
+        """Tell pages to copy the files before the console exits; wait until all open ones have, or `deserted`."""
         self._leaves = True
         until_s = time.monotonic() + within_s
         while (now_s := time.monotonic()) < until_s and not deserted():
@@ -167,7 +168,7 @@ class ViserBackend(NamedTuple):
     """The services behind the HTTP server; sockets are served until they close."""
 
     port: int  # viser's port on BACKEND_HOST
-    secret: str  # demanded by viser in SECRET_HEADER
+    secret: str  # required by viser in SECRET_HEADER
     state: Callable[[], dict[str, Any]]  # returns what the console shows
     permits: Callable[[bytes, str], bool]  # returns whether a page's message, in a role, may reach viser
     serve_cameras: Callable[[web.Request], Awaitable[web.StreamResponse]]  # a socket of pictures
@@ -175,14 +176,14 @@ class ViserBackend(NamedTuple):
     head: Callable[[], dict[str, Any]]  # returns what the head of the page shows
     command: Callable[[OrderRequest], dict[str, Any]]  # takes an order; returns its progress
     files: RunFiles
-    looked: Callable[[str, str, str], None]  # called with key, role and address of a page that is alive
+    looked: Callable[[str, str, str], None]  # called with key, role and address of a page whenever it polls
 
 
 class HttpProxy:
     """The server of the pages; `token` is the operators' token, None if only this machine can connect.
 
     Raises:
-        RunError: other machines could reach it, and there is no token.
+        RunError: other machines could reach the server, and there is no token.
     """
 
     def __init__(self, address: ListenAddress, token: str | None, backend: ViserBackend) -> None:
@@ -192,7 +193,7 @@ class HttpProxy:
         self._tokens = self._tokens_at(address)
         self._backend = backend
         self._pages = {OPERATOR: _page(), VIEWER: _page("viewer.html")}
-        self._open_pages: Counter[str] = Counter()  # sockets, by purpose
+        self._open_pages: Counter[str] = Counter()  # number of open sockets, by purpose
         self._loop = asyncio.new_event_loop()
         self._client: ClientSession | None = None
 
@@ -205,7 +206,7 @@ class HttpProxy:
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Serve pages on a thread; raise RunError if the port is taken or the address is not of this machine."""
+        """Serve pages in a thread; raise RunError if the port is taken or the address is not this machine's."""
         with open_on_thread(self._loop, "console server", self._open, self._close):
             yield
 
@@ -234,7 +235,7 @@ class HttpProxy:
         await site.cleanup()
 
     def _permitted(self, serve: Callable[[web.Request, str], Awaitable[web.StreamResponse]]) -> Handler:
-        """Return a handler that lets `serve` answer a request in its role, and refuses others."""
+        """Return a handler that passes a request with its role to `serve`, and refuses requests without a role."""
 
         async def respond(request: web.Request) -> web.StreamResponse:
             role = self._tokens.role_of(_page_request(request))
@@ -248,7 +249,7 @@ class HttpProxy:
         if role is None:
             return _missing_token()
         if page_request.token:
-            # The token moves into a cookie; a reverse proxy may serve the page below another path.
+            # The token moves to a cookie. The path is relative, since a reverse proxy may serve the page below another.
             response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
             shown = self._tokens.role_of_address(page_request)
             if shown is not None:
@@ -376,14 +377,14 @@ def _page_request(request: web.Request) -> PageRequest:
 
 
 class PageTokens:
-    """Decides who may open pages in which role: by tokens, or on this machine alone by a request's origin.
+    """Decides who may open pages in which role: by tokens, or, if only this machine can connect, by a request's origin.
 
     Args:
         listen, port: the address at which pages are served.
-        operator, viewer: their tokens; that of operators is None if only this machine can connect.
+        operator, viewer: the tokens of the two roles; the operators' is None if only this machine can connect.
 
     Raises:
-        RunError: other machines could reach it, and there is no token.
+        RunError: other machines could reach the pages, and there is no token.
     """
 
     def __init__(self, listen: str, port: int, operator: str | None, viewer: str) -> None:
@@ -392,11 +393,11 @@ class PageTokens:
         self._port = port
 
     def cookie(self, role: str) -> str:
-        """Return the name of a role's cookie; browsers keep the cookies of all ports of a host together."""
+        """Return the name of a role's cookie; it has the port, since browsers share cookies between a host's ports."""
         return f"zsim_{role}_{self._port}"
 
     def role_of(self, request: PageRequest) -> str | None:
-        """Return the role in which the page of this path may be opened, None if it may not."""
+        """Return the role in which the request's path may be opened, None if it may not."""
         role = VIEWER if request.path.startswith(VIEW_PATH) else OPERATOR
         try:
             if request.origin is not None and urlsplit(request.origin).netloc != request.host:
@@ -413,7 +414,7 @@ class PageTokens:
         return None
 
     def role_of_address(self, request: PageRequest) -> str | None:
-        """Return the role whose token is in the address, to be set as a cookie; None without a valid token."""
+        """Return the role whose token is in the URL, for the cookie to be set; None without a valid token."""
         roles = (role for role in (OPERATOR, VIEWER) if self._is_token(request.token, role))
         return next(roles, None) if request.token else None
 
@@ -425,7 +426,7 @@ class PageTokens:
 class AnyThreadEvent(asyncio.Event):
     """An event that any thread may set; waiting tasks wake once the loop's own thread sets it.
 
-    An asyncio.Event iterates over its waiters, and fails if the loop changes them at the same time.
+    Setting an asyncio.Event iterates over its waiters, which fails if the loop changes them at the same time.
     """
 
     def set(self) -> None:
@@ -438,7 +439,7 @@ class AnyThreadEvent(asyncio.Event):
 
 
 class Buffer(AsyncMessageBuffer):
-    """viser's message buffer, with an event that any thread may set; it drops writes to closed pages silently."""
+    """viser's message buffer, with an event that any thread may set; silently drops writes to closed pages."""
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
@@ -450,7 +451,7 @@ viser.infra._infra.AsyncMessageBuffer = Buffer  # type: ignore[misc]
 
 
 class PrivateViser:
-    """A viser server on a port of loopback that refuses connections without a secret in SECRET_HEADER.
+    """A viser server on a loopback port that refuses connections without a secret in SECRET_HEADER.
 
     A control used without permission changes nothing, and its page shows the previous value again.
     """
@@ -466,7 +467,7 @@ class PrivateViser:
         return self.server.get_port()
 
     def close(self) -> None:
-        """Stop the server, without printing an address as viser does."""
+        """Stop the server, without the text that viser prints."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -490,7 +491,7 @@ def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
 
 @contextlib.contextmanager
 def _requiring_secret(secret: str) -> Iterator[None]:
-    """Let servers started in this context refuse connections without the secret."""
+    """Make servers started in this context refuse connections without the secret."""
     serve = websockets.asyncio.server.serve
 
     def serve_checked(*args: Any, process_request: Callable[..., Any] | None = None, **more: Any) -> Any:
@@ -554,7 +555,7 @@ class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unk
 
 
 class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
-    """A click into the scene; only the ray is used."""
+    """A click in the scene; only the ray is used."""
 
     event_type: Literal["click"]
     ray_origin: message.Vector3
@@ -564,11 +565,11 @@ class SceneClick(Struct, tag_field="type", tag="ScenePointerMessage"):
 
 
 _DECODER = msgspec.msgpack.Decoder(ViewerCamera | ControlUpdate | SceneClick)
-"""Other messages, such as those that share the page on the Internet or upload files, are refused."""
+"""Other messages are refused, such as those that upload files or share the page on the Internet."""
 
 
 class PageControls:
-    """The controls known to viser: those shared by all pages, and those of each of the open `pages`."""
+    """The controls known to viser: those that all pages share, and those of each of the open `pages`."""
 
     def __init__(self, gui: viser.GuiApi, pages: Callable[[], Sequence[viser.GuiApi]] = tuple) -> None:
         self._gui = gui

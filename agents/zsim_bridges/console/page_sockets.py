@@ -1,7 +1,7 @@
-"""The console's own sockets, opened by a page: one for actions, one for pictures of the drones' cameras.
+"""The two sockets that each page opens: one for actions, one for pictures from the drones' cameras.
 
-Pictures have a separate socket, since a megabyte of them on a slow link must not delay the answers to a stick. Both
-are closed on an invalid message. Viewers look and choose; operators also fly and play records.
+Pictures have a separate socket, since a megabyte of them on a slow link must not delay the answers to a stick. A socket
+is closed on an invalid message. Viewers may look and choose; operators may also fly and play records.
 """
 
 import asyncio
@@ -18,13 +18,13 @@ from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.page_server import HEARTBEAT_S, OPERATOR
 from zsim_bridges.console.run_monitor import RecordPlayer
 
-ACTION_MAX = 2_000  # bytes of an action
-NAME_MAX = 64  # characters of the name of a drone or camera, or of a page's key
-COORDINATE_MAX_M = 1e5  # largest coordinate on the plan view; the fence is much nearer
-SPEED_MAX_M_S = 100.0  # speed of a stick; the drones' own limits are much lower
-PERIOD_S = 0.1  # wall; shortest time between two messages with pictures
-WANTED_MAX = 16  # number of pictures on one page
-REQUEST_MAX = 10_000  # bytes of a request
+ACTION_MAX = 2_000  # maximum size of an action [bytes]
+NAME_MAX = 64  # maximum number of characters of a drone's or camera's name, or of a page's key
+COORDINATE_MAX_M = 1e5  # maximum coordinate on the plan view; the fence is much nearer
+SPEED_MAX_M_S = 100.0  # maximum speed that a stick may demand; the drones' own limits are much lower
+PERIOD_S = 0.1  # wall; minimum time between two messages with pictures
+WANTED_MAX = 16  # maximum number of pictures on one page
+REQUEST_MAX = 10_000  # maximum size of a request [bytes]
 
 Name = Annotated[str, Meta(max_length=NAME_MAX)]
 Deflection = Annotated[float, Meta(ge=-1.0, le=1.0)]
@@ -36,7 +36,7 @@ class _Action(Struct, frozen=True, forbid_unknown_fields=True, tag_field="do"):
 
 
 class LookFrom(_Action, frozen=True, tag="look"):
-    """Set whether the page's camera follows the formation and keeps all of it in view; look from a direction."""
+    """Set whether the page's camera follows the formation and keeps all of it in view, and look from `direction`."""
 
     page: Name
     follows: bool
@@ -45,21 +45,21 @@ class LookFrom(_Action, frozen=True, tag="look"):
 
 
 class LookAtPlan(_Action, frozen=True, tag="plan"):
-    """Request the plan view; with `whole`, including its constant part and the past trails."""
+    """Request the plan view; with `whole`, including the constant part and the past trails."""
 
     page: Name
     whole: bool = False
 
 
 class ChooseDrone(_Action, frozen=True, tag="choose"):
-    """Choose a drone on the page itself."""
+    """Choose a drone on this page only."""
 
     page: Name
     drone: Name
 
 
 class SelectDrone(_Action, frozen=True, tag="select"):
-    """Select a drone on the page itself for a command to several drones, or deselect it."""
+    """On this page only, select a drone for a command to several drones, or deselect it."""
 
     page: Name
     drone: Name
@@ -74,9 +74,9 @@ class PlayRecord(_Action, frozen=True, tag="play"):
 
 
 class TakeDrone(_Action, frozen=True, tag="take"):
-    """Take a drone to fly it; with `over`, even from its present commander; for operators only, like all below.
+    """Take a drone to fly it; with `over`, even from its present commander; for operators only, like all actions below.
 
-    The page repeats it until it is answered; it is carried out once per `id`.
+    The page repeats this action until it is answered; it is carried out once per `id`.
     """
 
     drone: Name
@@ -85,7 +85,10 @@ class TakeDrone(_Action, frozen=True, tag="take"):
 
 
 class SteerDrone(_Action, frozen=True, tag="steer"):
-    """Fly the taken drone, or let it hover unless `held`; the page repeats this, since a silent page does not fly."""
+    """Fly the taken drone while `held`; otherwise it hovers, or continues to its waypoints.
+
+    The page repeats this action, since the drone of a silent page hovers.
+    """
 
     held: bool = False
     forward: Deflection = 0.0
@@ -96,7 +99,7 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
 
 
 class GoToPlace(_Action, frozen=True, tag="go"):
-    """Send the taken drone to a point in W, at its present height unless `z_m` is given.
+    """Send the taken drone to a point in W, at the drone's present height unless `z_m` is given.
 
     `then`: append the point to the present waypoints instead of replacing them.
     """
@@ -131,7 +134,7 @@ class ActionSockets:
         self._cameras = cameras
         self._record = record
         self._flying = flying
-        self._keys: dict[Any, str] = {}  # keys of pages by their sockets
+        self._keys: dict[Any, str] = {}  # keys of pages, by their sockets
 
     async def respond(self, request: web.Request, role: str) -> web.StreamResponse:
         """Answer a request for a socket; return when it is closed."""
@@ -152,16 +155,16 @@ class ActionSockets:
         return socket
 
     def lose(self, page: Any) -> None:
-        """Record that a page's socket is closed, so that the drone that it flies hovers."""
+        """Record that a page's socket is closed, so that the drone that the page flies hovers."""
         self._keys.pop(page, None)
         flying = self._flying()
         if flying is not None:
             flying.control.lose(page)
 
     def act(self, text: str, role: str, page: Any = None) -> dict[str, Any] | None:
-        """Carry out an action (JSON) of a page in a role; return the answer, None if it is invalid or not permitted.
+        """Carry out an action (JSON) from a page in a role; return the answer, None if it is invalid or not permitted.
 
-        `page` identifies the page that flies a drone.
+        `page`, its socket, identifies the page that flies a drone.
         """
         try:
             action: _Look | _Operate = _ACTIONS.decode(text)
@@ -215,7 +218,7 @@ class ActionSockets:
 
 
 class PicturesRequest(Struct, frozen=True, forbid_unknown_fields=True):
-    """A page's request; it also confirms that the page has shown the previous message."""
+    """A page's request for pictures; it also confirms that the page has shown the previous message."""
 
     page: Name = ""
     want: Annotated[tuple[Name, ...], Meta(max_length=WANTED_MAX)] = ()
@@ -227,7 +230,7 @@ _PICTURES = msgspec.json.Decoder(PicturesRequest)
 
 
 class PageBatches:
-    """The messages to one page: each has all changes of the requested cameras since the last one.
+    """The messages with pictures for one page: each has all changes of the requested cameras since the last message.
 
     A message is the length of its header (4 bytes, big-endian), the header as JSON, and the JPEGs in succession.
     The header has `cameras` (name, width, height; null if unchanged), `pictures` (camera, size [bytes; 0: unchanged],

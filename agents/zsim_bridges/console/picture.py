@@ -1,4 +1,4 @@
-"""The picture of a run as arrays: poses, ellipsoids, formations, and previews of their flight. Pure.
+"""What pages draw of a run, as arrays: poses, ellipsoids, formations, and previews of their flight. Pure.
 
 Axes of W: east, north, up. Quaternions: w first, body to world.
 """
@@ -23,23 +23,23 @@ from zsim_agents.references.flight import FlightError, flight_of
 
 Array = NDArray[np.float64]
 
-ROTOR_SLOWDOWN = 50.0  # at 10 pictures a second the fastest rotors turn by 57 degrees, so none seems to turn backwards
+ROTOR_SLOWDOWN = 50.0  # the fastest rotors turn by 57 degrees from one picture to the next at 10 Hz: never backwards
 SIGMAS = 2.0  # half axes of an ellipsoid, in standard deviations
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
-"""Share of a Gaussian in three dimensions within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
-RADIUS_MAX_M = 60.0  # largest half axis of an ellipsoid, which would otherwise enclose the viewer before the first fix
-PATH_POINTS = 120  # number of points of a part of a drone's reference: smooth at the size of a page
+"""Share of a 3-D Gaussian within 2 sigma: the chi-squared distribution with three degrees of freedom at 4, 0.739."""
+RADIUS_MAX_M = 60.0  # maximum half axis of an ellipsoid, which would otherwise enclose the viewer before the first fix
+PATH_POINTS = 120  # number of points of one leg of a drone's reference: smooth at the size of a page
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has a desired shape
 CORNER_SHARE = 0.25  # position of an angle's label between its corner (0) and the opposite side (1), clear of names
-CLICK_RAD = 0.012  # half the angle within which a click hits a small, far drone; chosen: about five pixels
-LARGE_MAX = 12  # number of drones with full names at full size; more have short, smaller names
+CLICK_RAD = 0.012  # minimum half angle within which a click hits a drone; design choice: about five pixels
+LARGE_MAX = 12  # maximum number of drones whose names are shown in full and at full size
 PLAN_DIGITS = 2  # decimals of metres: finer than a pixel
 HEADING_DIGITS = 3  # decimals of radians
 SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at the ends of each side; docs/conventions.md
 
 
 class DronePoses(NamedTuple):
-    """The N drones of a run, in its order, at one time."""
+    """The N drones of a run, in the run's order, at one time."""
 
     t_ns: int
     names: tuple[str, ...]
@@ -50,7 +50,7 @@ class DronePoses(NamedTuple):
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """Return which drones are in the view, (N,)."""
+        """Whether each drone is in the view, (N,)."""
         return np.isfinite(self.p_W[:, 0])
 
 
@@ -63,7 +63,7 @@ class Ellipsoids(NamedTuple):
 
 
 class FormationSide(NamedTuple):
-    """A side of a formation's triangle, or of its pair."""
+    """A side of a formation's triangle, or the only side of a pair."""
 
     name: str
     ends_W: Array  # (2, 3) m
@@ -72,15 +72,15 @@ class FormationSide(NamedTuple):
 class FormationShape(NamedTuple):
     """A formation's true shape."""
 
-    c: Array  # (4n,)
-    p_c: Array  # (3,) m, its origin in W
+    c: Array  # (4n,), its variables
+    p_c: Array  # (3,) m, origin of its frame in W
     q_WC: Array  # (4,)
     sides: tuple[FormationSide, ...]
-    corner: tuple[Array, str] | None  # where beta is written
+    corner: tuple[Array, str] | None  # position [m; W] and text of the label of beta
 
 
 def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
-    """Return a view as arrays over the named drones, some of which a replay's view may lack."""
+    """Return a view as arrays over the named drones; the view of a replay may lack some of them."""
     count = len(names)
     p_W, q_WB = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
     rotor = np.zeros((count, ROTORS_MAX))
@@ -95,7 +95,10 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
 
 
 def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Array, Array]:
-    """Return the ends (n, 2, 3) [m] of the links between drones in the view: of bidirectional and of one-way ones."""
+    """Return the ends (n, 2, 3) [m] of links between drones in the view: of bidirectional, then of one-way ones.
+
+    `hears` has, for each drone, the indices of the drones that it hears.
+    """
     present = drones.present
     known = [(i, j) for i, heard in enumerate(hears) for j in heard if max(i, j) < len(present)]
     links = {(i, j) for i, j in known if present[i] and present[j]}
@@ -112,7 +115,7 @@ def drone_on_ray(
 
     Args:
         drones: N drones.
-        radii_m: (N,) m, radii of the spheres that count as hits; a distant one subtends at least CLICK_RAD.
+        radii_m: (N,) m, radii of the spheres that count as hits; a distant sphere is enlarged to subtend CLICK_RAD.
         origin_W, direction_W: origin and direction of the ray [m; W]; a zero direction hits nothing.
     """
     direction = np.array(direction_W)
@@ -127,7 +130,7 @@ def drone_on_ray(
 
 
 def shown_names(names: Sequence[str]) -> list[str]:
-    """Return names, without their common prefix if they are more than LARGE_MAX and none would become empty."""
+    """Return names, without their common prefix if there are more than LARGE_MAX and none would become empty."""
     if len(names) <= LARGE_MAX:
         return list(names)
     alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
@@ -137,7 +140,7 @@ def shown_names(names: Sequence[str]) -> list[str]:
 
 
 def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:
-    """Return the angles [rad] at which rotors are drawn dt_s later, slowed down to be visible.
+    """Return the angles [rad] at which rotors are drawn `dt_s` later, slowed down so that their turning is visible.
 
     Args:
         angles, speeds: (M,) rad, rad/s.
@@ -152,7 +155,7 @@ def rotor_poses(p_W: Array, q_WB: Array, hubs_B: Array, angles: Array) -> tuple[
     Args:
         p_W, q_WB: pose of each rotor's drone, (M, 3) m and (M, 4).
         hubs_B: centres of the rotors, (M, 3) m.
-        angles: (M,) rad.
+        angles: angles of the rotors, (M,) rad.
     """
     p = p_W + np.einsum("mij,mj->mi", frames.rotation_matrix(q_WB), hubs_B)
     w, x, y, z = q_WB.T
@@ -175,7 +178,7 @@ def reference_lines(scenario: Scenario) -> Array:
         try:
             legs = flight_of(scenario, drone).legs
         except FlightError:
-            continue  # its pilot decides where it flies
+            continue  # the flight is impossible as stated, so there is no line
         for leg in legs:
             length_s = leg.path.duration_s
             end_s = scenario.duration_s - leg.start_s if length_s is None else length_s
@@ -186,7 +189,7 @@ def reference_lines(scenario: Scenario) -> Array:
 
 
 def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None:
-    """Return the desired positions (n, 3) and quaternions (n, 4) of a formation's robots; None if it has none."""
+    """Return the desired positions (n, 3) [m] and quaternions (n, 4) of a formation's robots; None without a shape."""
     if view.phase not in SHAPED_PHASES:
         return None
     try:
@@ -197,13 +200,13 @@ def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None
 
 
 def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationShape | None:
-    """Return the shape of robots at p_W (n, 3) [m] with headings yaw (n,) [rad]; None if it has no frame."""
+    """Return the shape of robots at `p_W` (n, 3) [m] with headings `yaw` (n,) [rad]; None if it is singular."""
     try:
         c = space.forward(p_W, yaw)
     except SingularClusterError:
         return None
     roll, pitch, turn = (c[space.index(name)] if name in space.names else 0.0 for name in ("roll", "pitch", "yaw"))
-    of_groups = any("." in name for name in space.names)  # p and q are then between groups
+    of_groups = any("." in name for name in space.names)  # if so, p and q are distances between groups, not robots
     known = [name for name in SIDES if name in space.names and not of_groups]
     sides = [FormationSide(f"{name} {c[space.index(name)]:.2f} m", p_W[list(SIDES[name])]) for name in known]
     corner = None
@@ -220,7 +223,7 @@ def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationSha
 
 
 def surroundings(scenario: Scenario) -> dict[str, Any]:
-    """Return the constant part of the plan: names, labels and colours of drones, outlines of obstacles and surfaces."""
+    """Return the constant part of the plan: names, labels and colours of drones; outlines of obstacles and surfaces."""
     names = [drone.name for drone in scenario.drones]
     return {
         "names": names,
@@ -257,7 +260,7 @@ def plan_positions(drones: DronePoses, states: Mapping[str, str]) -> list[list[A
 def plan_formations(
     spaces: Mapping[str, ClusterSpace], members: Mapping[str, list[int]], views: Mapping[str, ViewCluster]
 ) -> list[dict[str, Any]]:
-    """Return phase, indices of drones, and desired positions (x, y) [m; W] of each formation."""
+    """Return the phase, the indices of drones, and the desired positions (x, y) [m; W] of each formation."""
     shown = []
     for name, view in views.items():
         desired = ghosts(spaces[name], view)
@@ -268,21 +271,21 @@ def plan_formations(
 
 # What a formation would fly
 
-POINTS = 121  # number of points of a path; chosen: a curve in 3-D looks smooth
-TRANSIT_SHARE = 0.25  # ratio of the points of the transit to a trajectory's start to POINTS
-ENDLESS_S = 120.0  # simulated; how much of a trajectory without an end is shown
+POINTS = 121  # number of points of a path; design choice: a curve in 3-D looks smooth
+TRANSIT_SHARE = 0.25  # number of points of the transit to a trajectory's start, as a share of POINTS
+ENDLESS_S = 120.0  # simulated; how much of an endless trajectory is shown
 
 
 class PreviewError(ValueError):
-    """A request that cannot be flown from the formation's present state."""
+    """A request cannot be flown from the formation's present state."""
 
 
 class FlightPreview(NamedTuple):
     """The paths of n drones.
 
     Attributes:
-        paths_W: (n, M, 3) m, from the present desired positions.
-        text: figures of the paths.
+        paths_W: (n, M, 3) m, from the present desired positions on.
+        text: length, heights, speed and distances of the paths, for operators.
     """
 
     paths_W: Array
@@ -290,12 +293,12 @@ class FlightPreview(NamedTuple):
 
 
 def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Array, apart_min_m: float) -> FlightPreview:
-    """Return the paths of a `target` or `trajectory`; the controller may still refuse it, or fly it slower.
+    """Return the paths of a `target` or `trajectory`; the controller may still refuse it, or fly it more slowly.
 
     Args:
         op, args: operation and arguments of the request, as sent.
         base: present desired variables of the formation, (4n,).
-        apart_min_m: smallest distance between two drones that the controller permits.
+        apart_min_m: minimum distance between two drones that the controller permits.
 
     Raises:
         PreviewError: the request is invalid, or no formation of this space can fly it.

@@ -1,7 +1,7 @@
 """The condition of the run that pages show: alarms, checks before a take-off, refusals, and the page's head. Pure.
 
-An alarm is amber or red. A control on a page is disabled, and shows the reason, while its request would be refused; an
-empty reason means that the request would be accepted.
+An alarm is amber or red. A control on a page is disabled, and shows the reason, while its request would be refused.
+Such reasons are called refusals here; an empty one means that the request would be accepted.
 """
 
 import math
@@ -27,11 +27,11 @@ from zsim_agents.formation.flight_check import (
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 
 Severity = Literal["amber", "red"]
-BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # alarm thresholds; the AR.Drone warns at the first
+BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # thresholds of amber and red; the AR.Drone warns at the first
 UPSIDE_DOWN_DEG = 90.0
-LATE_MS = 200.0  # lag of an estimator that raises an alarm: ten gates of 20 ms
-SIGMA_HIGH_M = 2.0  # σ of a position that raises an alarm; chosen: the largest distance between the paper's drones
-LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # alarm thresholds, chosen; PX4 leaves offboard mode after the first
+LATE_MS = 200.0  # an estimator's lag above which an alarm is raised: ten gates of 20 ms
+SIGMA_HIGH_M = 2.0  # σ of a position above which an alarm is raised: the largest distance between the paper's drones
+LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # alarm thresholds; PX4 leaves offboard mode after the first
 LOST = {
     "death": "dead",
     "no_show": "missing",
@@ -40,9 +40,9 @@ LOST = {
     "failure": "failed",
     "diverged": "diverged",
 }
-"""Kinds of events that report the loss of a process or drone, with the name of the alarm."""
-BACK = frozenset({*ADMISSIONS, "silent_end", "leave"})  # event kinds that end a loss, unlike a drop
-OFF_REFERENCE_M = 2.0  # error of a length of a formation; chosen: the smallest distance between the paper's drones
+"""Kinds of events that report the loss of a process or drone, with the names of the alarms."""
+BACK = frozenset({*ADMISSIONS, "silent_end", "leave"})  # kinds of events that end a loss; `drop` does not
+OFF_REFERENCE_M = 2.0  # alarm threshold of a length's error: the smallest distance between the paper's drones
 FLOWN_PHASES = frozenset({"assembling", "engaged"})  # phases in which a formation's controller flies all of its drones
 
 
@@ -56,7 +56,7 @@ class Alarm(NamedTuple):
 
 
 class DroneCondition(NamedTuple):
-    """The inputs of a drone's alarms and checks; None where unknown or not applicable."""
+    """The quantities from which a drone's alarms and checks follow; None where unknown or not applicable."""
 
     name: str
     state: str
@@ -120,7 +120,7 @@ def formation_alarms(
 
     Args:
         phases: phase and reason of each formation.
-        foreign: commanders other than its controller, by drone, of each formation.
+        foreign: for each formation, the commanders of its drones other than its controller, by drone.
         views: newest view of each formation.
     """
     found = []
@@ -143,11 +143,13 @@ def foreign_text(commanders: Mapping[str, str]) -> str:
 def foreign_commanders(
     controller: str, members: Iterable[str], commanders: Mapping[str, str | None], roles: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the commanders, other than its controller, of a formation's drones, by drone.
+    """Return the commanders of a formation's drones other than its controller, by drone.
 
     Args:
-        controller: expected name of the formation's process; if it flies no drone, the controller may have another
-            name, so only consoles count as foreign.
+        controller: expected name of the controller's process; if no drone is flown by a process of that name, the
+            controller may have another name, so only consoles count as foreign.
+        members: the formation's drones.
+        commanders: commander of each drone.
         roles: roles of the known processes, by name.
     """
     others = {drone: who for drone in members if (who := commanders.get(drone)) and who != controller}
@@ -157,7 +159,7 @@ def foreign_commanders(
 
 
 def _strayed(view: ViewCluster) -> str:
-    """Describe the length of an engaged formation that deviates most from its reference; empty if all are close."""
+    """Describe the length that deviates most from its reference in an engaged formation; empty if all are close."""
     errors = [
         (abs(value - desired), name, value, desired)
         for name, value, desired in zip(view.names, view.value, view.desired, strict=True)
@@ -187,7 +189,7 @@ class Losses:
         self.now: dict[str, Event] = {}
 
     def note(self, event: Event) -> None:
-        """Process an event: the loss of a process or drone, its return, or the join of a replacement."""
+        """Process an event: a process or drone may be lost, return, or be replaced."""
         is_false_join = event.kind == "no_show" and "incarnation" in event.data  # the process of that name is present
         if event.kind in LOST and not is_false_join:
             self.now = {**self.now, event.subject: event}
@@ -195,7 +197,7 @@ class Losses:
             self._remove({event.subject, *map(str, event.data.get("serves") or ())})
 
     def note_health(self, name: str, health: Health) -> None:
-        """Process a health message: a process with another host or pid replaces a lost one."""
+        """Process a health message: a process with another host or pid than the lost one replaces it."""
         lost = self.now.get(name)
         pid = None if lost is None else lost.data.get("pid")
         if lost is not None and pid and (lost.data.get("host"), pid) != (health.host, health.pid):
@@ -207,7 +209,7 @@ class Losses:
 
 @dataclass
 class _BoardEntry:
-    """An alarm on the board, with the number of times it was raised."""
+    """An alarm on the board; `times` counts how often it was raised."""
 
     alarm: Alarm
     since_s: float  # when it was last raised [s; wall]
@@ -217,7 +219,7 @@ class _BoardEntry:
 
 
 class AlarmBoard:
-    """The active alarms; a red one that has ended stays until it is acknowledged, since it may have gone unnoticed."""
+    """The active alarms, and ended red ones until they are acknowledged, since they may have gone unnoticed."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -244,7 +246,7 @@ class AlarmBoard:
             self.alarms = tuple(sorted(now.values(), key=_rank))
 
     def acknowledge(self) -> None:
-        """Acknowledge all alarms and remove ended ones; an alarm that turns red later needs a new acknowledgement."""
+        """Acknowledge all alarms and remove ended ones; an alarm that later turns red must be acknowledged again."""
         with self._lock:
             self._entries = {key: each for key, each in self._entries.items() if each.over_s is None}
             for entry in self._entries.values():
@@ -256,7 +258,7 @@ class AlarmBoard:
             self._entries, self.alarms = {}, ()
 
     def rows(self, wall_s: float) -> list[dict[str, object]]:
-        """Return the alarms as plain data, red ones first, and how long each has been active or over [s; wall]."""
+        """Return the alarms as plain data, red ones first, with how long each has been active or over [s; wall]."""
         with self._lock:
             ordered = sorted(self._entries.values(), key=lambda each: _rank(each.alarm, each.over_s is not None))
             return [
@@ -279,17 +281,17 @@ def _rank(alarm: Alarm, is_over: bool = False) -> tuple[bool, bool, str, str]:
     return alarm.severity != "red", is_over, alarm.subject, alarm.name
 
 
-TILT_MAX_DEG = 30.0  # tilt of a drone before take-off; chosen: above any slope, far below a drone on its side
+TILT_MAX_DEG = 30.0  # maximum tilt before take-off; design choice: above any slope, far below that of a toppled drone
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 LIMITS = EngagementLimits()  # limits within which a formation's controller lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
-STANDS_S = 2.0  # wall; a running world that waits for longer is shown as waiting
+STANDS_S = 2.0  # wall; a running world that has waited for a process for longer is shown as waiting
 NO_RUN = {"t_s": 0.0, "replay": False, "age_s": 0.0, "alarms": []}
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
 
 
 class ShownRun(NamedTuple):
-    """The constant properties of the run that pages show; cluster spaces by formation."""
+    """The constant properties of the run that pages show; `spaces` has the cluster space of each formation."""
 
     info: Info
     scenario: Scenario
@@ -323,18 +325,18 @@ def single_drones(scenario: Scenario) -> list[str]:
 class Check(NamedTuple):
     """One check of a drone before its take-off."""
 
-    name: str  # what is checked
+    name: str  # name of the checked property
     text: str  # the measured value, and the allowed range if the check fails
     ok: bool = True
     blocks: bool = False  # whether a failure disables the take-off
 
 
 def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "") -> tuple[Check, ...]:
-    """Return the checks of a drone.
+    """Return a drone's checks before a take-off.
 
     Args:
-        in_formation: whether a formation's controller flies it, which needs its estimate.
-        foreign: its commander, if this is neither this console nor its formation's controller; otherwise empty.
+        in_formation: whether a formation's controller flies the drone, and so needs its estimate.
+        foreign: the drone's commander if that is not its formation's controller; otherwise empty.
     """
     percent, tilt_deg = drone.battery_percent, drone.tilt_deg or 0.0
     checks = []
@@ -378,16 +380,16 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
 
 
 class RunCondition(NamedTuple):
-    """The condition on which the controls of a page depend."""
+    """The condition of a run, which determines what the controls of a page offer."""
 
     clock: str | None = None  # state of the run's clock; None before the first answer
-    silent_s: float = 0.0  # how long the world has not answered [s; wall]; 0 while it answers
+    silent_s: float = 0.0  # time since the world last answered [s; wall]; 0 while it answers
     ended: str = ""  # why the run is over; empty while it continues
-    replayed: bool = False  # whether it is a replay, in which nothing can be flown
+    replayed: bool = False  # whether the run is a replay, in which nothing can be flown
     at_end: bool = False  # whether the replay is at the end of its record
-    drones: Mapping[str, str] = {}  # state by name of the drones seen so far
-    phases: Mapping[str, tuple[str, str]] = {}  # phase and reason of each formation by name
-    members: Mapping[str, Collection[str]] = {}  # names of the drones of each formation
+    drones: Mapping[str, str] = {}  # states of the drones seen so far, by name
+    phases: Mapping[str, tuple[str, str]] = {}  # phase and reason of each formation, by name
+    members: Mapping[str, Collection[str]] = {}  # names of each formation's drones
     checks: Mapping[str, tuple[Check, ...]] = {}  # checks before take-off of each drone seen so far
 
     @property
@@ -430,7 +432,7 @@ def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
     unseen = run.grounded() or ("" if state else f"{drone} has not been seen yet")
     refused = {mode: unseen or state_refusal(drone, state or "", mode) or "" for mode in modes}
     refused["takeoff"] = refused["takeoff"] or preflight_refusal(run, [drone])
-    return {**refused, "emergency": run.grounded()}  # always enabled: the state shown may be outdated
+    return {**refused, "emergency": run.grounded()}  # whatever the drone's state, since the known one may be outdated
 
 
 def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
@@ -450,7 +452,7 @@ def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
 
 
 def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
-    """Return why each operation of a formation would be refused, to the extent that its phase determines this."""
+    """Return why each operation of a formation would be refused, as far as its phase and its drones' states tell."""
     phase, reason = run.phases.get(cluster, ("", ""))
     off = run.grounded() or ("" if phase else f"{cluster} has no controller yet")
     flown = "" if phase == "engaged" else f"{cluster} is {_words(phase)}, not engaged"
@@ -503,7 +505,7 @@ def _reset_first(stopped: Sequence[str]) -> str:
 
 
 def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str, str]:
-    """Return why each operation on all drones would have no effect; `single` are the drones without a formation."""
+    """Return why each operation on all drones would have no effect; `single` names the drones without a formation."""
     off = run.grounded()
     in_air = not run.all_down() or any(phase not in ("idle", "landing") for phase, _ in run.phases.values())
     in_emergency = "emergency" in run.drones.values()
@@ -543,8 +545,9 @@ def page_head(
     """Return the head of the page of a run as plain data.
 
     Args:
+        name: the scenario's name.
         t_ns: simulated time of the views that are shown.
-        alarms: as `AlarmBoard.rows`.
+        alarms: alarms as returned by `AlarmBoard.rows`.
         single: drones without a formation.
         world: description of where the run is.
         record_s: times of the first and the last recorded gate of a replay [s].
@@ -589,7 +592,7 @@ def no_run_head(world: str, ended: str = "") -> dict[str, Any]:
 
 
 def _waiting(clock: Clock | None, world: str) -> str:
-    """Describe which processes the world is waiting for, and where absent ones are expected."""
+    """Describe which processes the world is waiting for and, if some are absent, where they are expected."""
     if clock is None:
         return "waiting for the world's clock"
     text = waiting_text(clock.state, clock.waiting_for)

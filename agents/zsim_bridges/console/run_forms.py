@@ -1,6 +1,6 @@
-"""Controls of the run: its time, all drones together, injected faults; and the elements that all forms share.
+"""Controls of the run: its time, all drones together, and injected faults; also the elements that all forms share.
 
-viser sends every assigned property to all pages, so properties are set by `assign`, which leaves equal ones alone.
+viser sends every assigned property to all pages, so properties are set by `assign`, which skips unchanged ones.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -24,14 +24,14 @@ from zsim_bridges.console.run_condition import (
 )
 
 REASON_STYLE = "font-size:11px;line-height:1.3;color:#868e96;padding:0 10px 10px;overflow-wrap:anywhere"
-"""The padding at the bottom is for the row of tabs below, which overlaps the end of the text by 9 px."""
+"""The bottom padding is for the row of tabs below, which would overlap the end of the text by 9 px."""
 LIMITS_STYLE = "font-size:11px;line-height:1.2;color:#868e96;padding:0 12px 4px;text-align:right"
 HELD_HINT = "hold for 0.6 s, with the pointer, Space or Enter"  # equal to HOLD_MS in orders.html
-DURATION_MAX_S = 1e5  # duration of a fault; longer than any run
+DURATION_MAX_S = 1e5  # maximum duration of a fault; longer than any run
 DURATION_S = 30.0  # initial value of a fault's duration
-FIXES_LOST_PERCENT = 100.0  # initial value, as are the following
-THRUST_LEFT_PERCENT = 70.0  # thrust of a weak motor; with less, the controller cannot hold the aircraft level
-GUST_M_S = 4.0  # about the strongest gust that a formation's drones can withstand
+FIXES_LOST_PERCENT = 100.0  # this and the following are initial values
+THRUST_LEFT_PERCENT = 70.0  # remaining thrust of a weak motor; with less, the drone could not be held level
+GUST_M_S = 4.0  # about the strongest gust that the drones of a formation can withstand
 MESSAGES_LOST_PERCENT = 30.0
 STRIKES = {
     "drone": "a drone",
@@ -45,7 +45,7 @@ ORDERS = ("hold", "land", "emergency")  # operations with an `OrderButton`
 
 
 class RunForm:
-    """Pause or resume, single steps, and rate; `rate` is that with which the run was started."""
+    """Controls to pause, resume and step the run, and to set its rate; `rate` is the rate with which it was started."""
 
     def __init__(self, gui: viser.GuiApi, client: CommandClient, rate: float) -> None:
         pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
@@ -82,7 +82,7 @@ class RunForm:
 
 
 class FleetForm:
-    """Take-off and reset of all drones; landing and emergency of all are orders in the head of the page.
+    """Buttons to let all drones take off, and to reset them; landing and stopping all are orders in the page's head.
 
     Formations take off through their controllers, single drones individually.
     """
@@ -121,12 +121,12 @@ class FleetForm:
 
 
 class FaultForm:
-    """Controls of faults: the common ones of a chosen drone, and any fault.
+    """Controls to inject faults: common ones of a chosen drone, or any fault.
 
     Args:
-        report: called with the outcome of requests that are refused here.
+        report: called with the outcome of each request that is refused here, unsent.
         scenario: names the drones and processes.
-        drones: drones of the run, with the names of their rotors; without names, those of the AR.Drone are used.
+        drones: drones of the run, with the names of their rotors; without such names, those of the AR.Drone are used.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class FaultForm:
         gui.add_button("Clear all faults", color="green").on_click(lambda _: client.request_world("fault_clear"))
 
     def _common(self) -> dict[str, tuple[str, str, dict[str, Any], str]]:
-        """Return kind, target, parameters and description of each common fault by its button."""
+        """Return kind, target, parameters and description of each common fault, by its button's label."""
         drone = self._drone.value
         rotor = (self._rotors.get(drone) or ROTORS)[0]
         fixes, thrust, gust, messages = (
@@ -207,7 +207,7 @@ class FaultForm:
             )
 
             def choose() -> None:
-                """Describe the kind, and fill in a possible target and default magnitudes."""
+                """Describe the chosen kind, and fill in a possible target and default magnitudes."""
                 chosen = self._kinds[kind.value]
                 magnitudes = unstated(chosen, {})
                 lines = [
@@ -237,10 +237,10 @@ class FaultForm:
 def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
     """Return the parameters and times of a fault, typed as after TARGET KIND in a terminal.
 
-    Every magnitude must be given, even one with a default: an empty text must not affect all samples.
+    Every magnitude must be given, even one with a default: an empty text should not, say, affect all samples.
 
     Raises:
-        InputError: the text is not such a list, names something that the kind does not have, or omits a magnitude.
+        InputError: the text has another form, names a parameter that the kind does not have, or omits a magnitude.
     """
     where = f"parameters are {text[:40]!r}"
     try:
@@ -262,11 +262,11 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
 
 
 class OrderButton:
-    """A button for an order, which its page repeats until it is confirmed. It is HTML, not a control of viser.
+    """A button for an order, which its page repeats until it is confirmed; the button is HTML, not a control of viser.
 
     Args:
-        of: target of the order: {"drone": name}, several names separated by commas, or {"cluster": name}.
-        held: whether it must be held down for a while.
+        of: target of the order: {"drone": name}, with several names separated by commas, or {"cluster": name}.
+        held: whether the button must be held down for a while.
     """
 
     visible = True
@@ -294,11 +294,11 @@ class OrderButton:
 
 
 class InputError(ValueError):
-    """An operator's text that cannot be parsed; the message names the line and what is allowed."""
+    """An operator's text cannot be parsed; the message states the faulty part and what is allowed."""
 
 
 def range_refusal(name: str, value: float, low: float, high: float, unit: str = "") -> str | None:
-    """Return why a typed number is refused, None if it is within its limits; it is never clipped to them."""
+    """Return why a typed number is refused, None if it is within its limits; numbers are never clipped to them."""
     if low <= value <= high:
         return None
     in_unit = f" {unit}" if unit else ""

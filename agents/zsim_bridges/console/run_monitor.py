@@ -1,4 +1,4 @@
-"""The state of a run derived from its views and its clock: condition, alarms, flight, effects of faults, its record.
+"""The state of a run, derived from its views and clock: condition, alarms, flight, effects of faults; its record.
 
 `RunMonitor` derives the condition, `TimeMonitor` polls the clock, and `RecordPlayer` plays a record.
 """
@@ -39,27 +39,27 @@ from zsim_bridges.console.view_buffer import ViewBuffer
 
 ROUNDING_NS = 1_000.0  # rounding error of a time given in seconds
 SPEED_S = 0.2  # simulated; span over which a speed is averaged: a shorter one would show the rounding of positions
-FAULTS_KEPT = 8  # number of past faults that are still shown
-SIGMA_GROWN = 1.2  # ratio to the initial sigma; smaller changes occur without a fault
-LAG_GROWN_MS = 40.0  # increase that is shown: two gates
+FAULTS_KEPT = 8  # maximum number of past faults that are still shown
+SIGMA_GROWN = 1.2  # minimum ratio to the initial sigma that is shown; smaller changes occur without a fault
+LAG_GROWN_MS = 40.0  # minimum increase in lag that is shown: two gates
 LIFE = ("alive", "dead")  # states of a process
 DEATH_AND_RETURN = 3  # number of states: alive, dead, alive
-WIND_GROWN_M_S = 0.3  # increase that is shown; chosen: above the rounding of the display
+WIND_GROWN_M_S = 0.3  # minimum increase in wind that is shown; design choice: above the rounding of the display
 BATTERY_S = 20.0  # simulated; how long a battery must have been observed before its remaining time is shown
 BATTERY_POINTS_MAX = 120
-BATTERY_SPACING_S = 1.0  # simulated
-POLL_S = 0.25  # wall; clock messages of every gate would cost the world time
+BATTERY_SPACING_S = 1.0  # simulated; minimum time between two points of a battery's history
+POLL_S = 0.25  # wall; period of polling the clock; sending it at every gate would slow down the world
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
-BEAT_S = 0.1  # wall; between two beats of this process
-BEAT_MAX_S = 0.5  # wall; at most this much counts between two beats: a busy machine delays a thread by less
+BEAT_S = 0.1  # wall; period of this process's heartbeat
+BEAT_MAX_S = 0.5  # wall; at most this much time counts between two beats: a busy machine delays a thread by less
 STALL_S = 2.0  # wall; a longer time without a beat is a stall
 SILENT_S = 1.7  # wall; after this long without an answer the world counts as silent: a stop is shown within 2 s
 PIECE_S = 10.0  # simulated; span read in one request, which blocks a replay of thirty drones for 0.15 s
-INSTANT_DRONES_MAX = 9_000  # number of drone views in a piece; a replay returns fewer than 10 000
+INSTANT_DRONES_MAX = 9_000  # maximum number of drone views in a piece; a replay returns fewer than 10 000
 BEHIND_S, AHEAD_S = (
     SPAN_S,
     SPAN_S / 2.0,
-)  # simulated; read around the shown time, as far as trails and curves reach
+)  # simulated; spans read before and after the shown time, as far as trails and curves reach
 KEPT_S = 2.0 * SPAN_S  # simulated; span of the record that is kept on both sides of the shown time
 
 
@@ -157,7 +157,7 @@ class RunMonitor:
     def _reason(
         self, name: str, view: ViewCluster, drones: Mapping[str, DroneCondition], foreign: dict[str, str]
     ) -> str:
-        """Return the reason for a formation's phase: its controller's, other commanders, and failsafes."""
+        """Return the reason for a formation's phase: that of its controller, other commanders, and failsafes."""
         notes = [run_condition.foreign_text(foreign)] if foreign and view.phase in run_condition.FLOWN_PHASES else []
         members = (drones[drone] for drone in self._members[name] if drone in drones)
         notes += [d.failsafe for d in members if d.failsafe and d.state in ("landing", "emergency", "landed")]
@@ -165,7 +165,7 @@ class RunMonitor:
 
 
 class FlightFigures(NamedTuple):
-    """Figures of one drone; positions and velocities in W, heading counter-clockwise from east."""
+    """Figures of one drone; position and velocity in W, heading counter-clockwise from east."""
 
     position_m: tuple[float, float, float]
     speed_m_s: float
@@ -174,7 +174,7 @@ class FlightFigures(NamedTuple):
     pitch_deg: float
     heading_deg: float  # 0 to 360
     battery_left_s: float | None  # time left at the present drain; None while unknown
-    obstacle_m: float | None = None  # distance from its centre to the nearest obstacle or surface; None without any
+    obstacle_m: float | None = None  # distance from the drone's centre to the nearest obstacle or surface, if any
 
 
 class FlightMeter:
@@ -191,7 +191,7 @@ class FlightMeter:
         self._drones: tuple[DroneView, ...] = ()
 
     def update(self, view: ViewDrones) -> None:
-        """Process a view; an earlier one, as in a replay, restarts the history."""
+        """Process a view; one that is earlier than the last, as in a replay, restarts the history."""
         t_s = view.t_ns / 1e9
         if t_s < self._t_s:
             self._positions.clear()
@@ -212,7 +212,7 @@ class FlightMeter:
         distances_m = self._around.distances_m([drone.position_m for drone in self._drones]).tolist()
         for drone, obstacle_m in zip(self._drones, distances_m, strict=True):
             (first_s, first), (last_s, last) = self._positions[drone.name][0], self._positions[drone.name][-1]
-            span_s = max(last_s - first_s, 1e-9)  # a single view: at rest
+            span_s = max(last_s - first_s, 1e-9)  # after a single view, the drone appears at rest
             velocity_m_s = [(b - a) / span_s for a, b in zip(first, last, strict=True)]  # the mean over SPEED_S
             roll, pitch, yaw = np.degrees(frames.rpy_from_quaternion(np.array([drone.orientation_wxyz]))[0]).tolist()
             since_s, charge = self._charges[drone.name][0]
@@ -231,7 +231,7 @@ class FlightMeter:
 
 
 class FaultWatch:
-    """The targets of injected faults, and what has changed since they began. Pure."""
+    """Tracks what has changed at the targets of injected faults since these began. Pure."""
 
     def __init__(self) -> None:
         self._watched: dict[int, _WatchedFault] = {}
@@ -248,7 +248,7 @@ class FaultWatch:
         lost: Collection[str],
         wind_m_s: float,
     ) -> None:
-        """Update from the present condition: faults begun or active, processes dead or silent."""
+        """Update from the present condition; `begun` are recent faults, `lost` names dead or silent processes."""
         acting = {fault.id: fault for fault in active}
         known = {fault.id: fault for fault in begun} | acting
         for number in self._watched.keys() - known.keys():
@@ -267,7 +267,7 @@ class FaultWatch:
 
 @dataclass
 class _WatchedFault:
-    """A fault and the quantities of its target (drones, or processes named after them) that it may change."""
+    """A fault, and the quantities that it may change at its target: drones, or processes named after them."""
 
     fault: Fault
     before: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] at the target when the fault began
@@ -282,7 +282,7 @@ class _WatchedFault:
         lost: Collection[str],
         wind_m_s: float,
     ) -> None:
-        """Record the worst figures and all states while the fault is active; a killed process returns afterwards."""
+        """Record the worst figures and all states while the fault is active, and a killed process's return later."""
         parts = self.fault.target.split("/")
         things = {part.rpartition(".")[2] for part in parts}
         is_world = not things & (set(drones) | set(phases))
@@ -322,7 +322,7 @@ class _WatchedFault:
 
 
 class Stall(NamedTuple):
-    """An interval in which this process itself was stopped."""
+    """An interval in which this process itself was stopped or starved."""
 
     lasted_s: float  # wall
     ended_s: float  # monotonic
@@ -331,14 +331,14 @@ class Stall(NamedTuple):
 class AwakeClock:
     """Wall time while this process runs; of an interval in which it was stopped or starved, at most BEAT_MAX_S counts.
 
-    A stopped process receives nothing, which does not mean that the others were silent.
+    That a stopped process received nothing does not mean that other processes were silent.
     """
 
     def __init__(self, wall_s: Callable[[], float]) -> None:
         self._wall_s = wall_s
         self._lock = threading.Lock()
         self._beat_s, self._awake_s = wall_s(), 0.0
-        self.stall: Stall | None = None  # the last one
+        self.stall: Stall | None = None  # the last stall
 
     def beat(self) -> None:
         """Record that this process runs; to be called every BEAT_S."""
@@ -359,7 +359,7 @@ class AwakeClock:
 class TimeMonitor:
     """Polls the run's clock in a separate thread, so that drawing never waits for an answer.
 
-    It also updates the clock of the console's observer. `stamp_age_s` is the greatest age of a stamp [simulated].
+    It also updates the clock of the console's observer. `stamp_age_s` is the maximum age of a stamp [simulated].
     """
 
     def __init__(
@@ -409,7 +409,7 @@ class TimeMonitor:
                 thread.join(ANSWER_TIMEOUT_S)
 
     def poll(self) -> None:
-        """Poll once; one thread at a time."""
+        """Poll once; threads that call this at the same time take turns."""
         with self._poll_lock:
             start_s = self._wall_s()
             try:
@@ -422,7 +422,7 @@ class TimeMonitor:
                     self.clock, self._known_s, self._answered_s = clock, start_s, self._awake.now_s()
 
     def now_ns(self) -> int:
-        """Return simulated time for a stamp, after a poll if it may be too old; takes at most 2 ANSWER_TIMEOUT_S."""
+        """Return simulated time for a stamp, after a poll if it may be too old; takes 2 ANSWER_TIMEOUT_S at most."""
 
         def is_old() -> bool:
             rate = max(1.0, self.clock.rate) if self.clock else 1.0  # the measured rate is 0 at the beginning of a run
@@ -436,7 +436,7 @@ class TimeMonitor:
 
     @property
     def silent_s(self) -> float:
-        """How long the world has not answered [s; wall]; 0 below SILENT_S."""
+        """Time since the world last answered [s; wall]; 0 below SILENT_S."""
         return self.heard_s if self.heard_s >= SILENT_S else 0.0
 
     @property
@@ -456,7 +456,7 @@ class RecordPlayer:
         is_replay: whether the run is a replay; otherwise all methods do nothing.
 
     Attributes:
-        timeline: from_s, to_s [s] and marks (t_s, kind, text); empty before `load`.
+        timeline: `from_s`, `to_s` [s] and `marks` (t_s, kind, text); empty before `load`.
     """
 
     def __init__(self, client: CommandClient, time_monitor: TimeMonitor, is_replay: bool, drones: int = 1) -> None:
@@ -482,7 +482,7 @@ class RecordPlayer:
             self.play("seek", clock.t_ns / 1e9)
 
     def state(self, run: RunCondition) -> dict[str, Any]:
-        """Return the timeline, with the reasons why operations of `play` would be refused."""
+        """Return the timeline, with the reasons why operations of `play` would be refused; empty without a timeline."""
         return {**self.timeline, "refusals": run_refusals(run)} if self.timeline else {}
 
     def play(self, op: str, value: float) -> None:
@@ -497,7 +497,7 @@ class RecordPlayer:
             self._client.request_world(op, **args.get(op, {}))
 
     def fill(self, t_s: float) -> None:
-        """Read the missing pieces of the record around t_s in another thread, nearest first."""
+        """Read the missing pieces of the record around `t_s` in another thread, the nearest first."""
         if "to_s" not in self.timeline:
             return
         with self._lock:
@@ -508,7 +508,7 @@ class RecordPlayer:
             self._is_reading = self._client.read(self._read_missing)
 
     def take(self) -> list[PastInstant]:
-        """Return the views of the next piece read, each piece once; empty if there is none."""
+        """Return the views of the next piece that has been read, each piece once; empty if there is none."""
         return self._arrived.popleft() if self._arrived else []
 
     def _middle_s(self, piece: int) -> float:

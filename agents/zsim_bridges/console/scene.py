@@ -1,10 +1,10 @@
 """The 3-D scene of a run: its newest views as nodes of viser, which sends only changes.
 
-`RunScene` decides what is drawn, `SceneNodes` draws it for all pages; the ground follows each page's own theme, and the
-ring around the chosen drone belongs to one page.
+`RunScene` decides what is drawn, and `SceneNodes` draws it for all pages; the ground follows each page's own theme, and
+the ring around the chosen drone belongs to one page.
 
-Multirotors are meshes of simple solids in B: x ahead, y left, z up, its origin at the centre of mass. They look like
-the AR.Drone, scaled by the length of their arms, with their own rotors. Lengths are in metres; those of solids are the
+Multirotors are meshes of simple solids in B: x ahead, y left, z up, origin at the centre of mass. They look like the
+AR.Drone, scaled by the length of their arms, with their own rotors. Lengths are in metres; those of solids are the
 AR.Drone's. They are for display only and enter no computation.
 """
 
@@ -52,24 +52,24 @@ from zsim_bridges.console.picture import (
 from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
-NAMED_MAX = 60  # largest number of drones with names beside them; more would overlap
-SMALL = 0.8  # size of the names of many drones, relative to those of few
+NAMED_MAX = 60  # maximum number of drones with names beside them; more names would overlap
+SMALL = 0.8  # relative size of the names if there are many drones
 SOLID = (134, 142, 150)
-EDGE = (96, 102, 118)  # edges of the triangles of a surface, whose slopes differ little in shading
+EDGE = (96, 102, 118)  # edges of a surface's triangles, since shading hardly shows their slopes
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 PREVIEW = (217, 72, 15)
 PREVIEW_PX = 3.0  # width of a previewed path
 RADIO, ONE_WAY = (64, 192, 87), (250, 82, 82)  # radio links: bidirectional, one-way
 RADIO_PX = 1.5
 SIDE_PX = 2.0  # width of a formation's sides, at any distance
-WIND_M_PER_M_S = 0.5  # length of the wind's arrow
+WIND_M_PER_M_S = 0.5  # length of the wind's arrow per unit of wind speed
 WIND_MIN_M_S = 0.05  # a weaker wind has no arrow
 WIND_ABOVE_M = 1.5  # height of the arrow above the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; position of a name relative to its drone
 MIDDLE = "center-center"  # anchor of a label
-LABELS_MAX = 3  # figures of a formation: p, q and beta
-LUMINANCE_MIN = 0.12  # of a trail's colour: a contrast of 2.5 with the ground of the dark theme (WCAG 2.2)
-HIDDEN = (0.0, 0.0, -1000.0)  # m; position of hidden instances: viser cannot hide them one by one
+LABELS_MAX = 3  # maximum number of a formation's figures: p, q and beta
+LUMINANCE_MIN = 0.12  # minimum luminance of a trail: a contrast of 2.5 with the ground of the dark theme (WCAG 2.2)
+HIDDEN = (0.0, 0.0, -1000.0)  # m; position of hidden instances, since viser cannot hide them one by one
 HALF_M = 150.0  # half a side of the ground
 FIELD_BELOW_M = 0.15  # depth of the field below the grid; a depth buffer cannot order closer surfaces
 THICK_M = 0.02  # thickness of the field
@@ -77,8 +77,8 @@ LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # colours of the fi
 DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
 CHOSEN = (25, 113, 194)
 ARM_M = 0.1785  # distance from the centre to a rotor's axis
-ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
-RING = 1.31  # rotor radii, outer radius of a hull ring: half of the 0.515 m of the hull, less 0.126 m to its centre
+ROTOR_RADIUS_M = 0.10  # the AR.Drone's 8 inch propellers
+RING = 1.31  # outer radius of a hull ring, in rotor radii: half the hull's 0.515 m less the ring's offset of 0.126 m
 ROTOR_Z_M = 0.030  # height of the rotors above the centre of mass, as drawn
 COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to stand out in the dark theme too
     "cross": (104, 108, 116),
@@ -90,7 +90,7 @@ COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to sta
 
 
 class RunScene:
-    """The scene of one run; it replaces that of another run."""
+    """The scene of one run, which replaces that of the previous run."""
 
     def __init__(self, server: viser.ViserServer, run: ShownRun, views: ViewBuffer, cameras: PageCameras) -> None:
         self._run = run
@@ -116,7 +116,7 @@ class RunScene:
         return drone_on_ray(self.drones, self.nodes.radii_m, event.ray_origin, event.ray_direction)
 
     def store(self, view: ViewDrones) -> DronePoses:
-        """Store and return the drones' newest poses, at which the cameras of new pages are aimed."""
+        """Store and return the drones' newest poses, at which the cameras of new pages will be aimed."""
         drones = drone_poses(view, self._run.names)
         self.drones = drones
         self.trails.add(drones.t_ns / 1e9, drones.p_W)
@@ -148,7 +148,7 @@ class RunScene:
         return drones
 
     def preview(self, cluster: str, shown: FlightPreview | None) -> None:
-        """Replace a formation's preview; None: remove it."""
+        """Replace a formation's preview, or remove it (None)."""
         others = {name: paths_W for name, paths_W in self.previews.items() if name != cluster}
         self.previews = {**others, cluster: shown.paths_W} if shown else others
         self.nodes.previews(list(self.previews.values()))
@@ -160,7 +160,7 @@ class RunScene:
             self.nodes.wind(self.drones)
 
     def shapes_of(self, drones: DronePoses) -> dict[str, FormationShape | None]:
-        """Return the formations' true shapes by name; None if one of its drones is missing."""
+        """Return the formations' true shapes by name; None for a formation of which a drone is missing."""
         present, yaw = drones.present, frames.heading(drones.q_WB)
         return {
             name: formation_shape(space, drones.p_W[members], yaw[members]) if present[members].all() else None
@@ -169,13 +169,13 @@ class RunScene:
         }
 
     def _camera_targets(self, drones: DronePoses) -> Array:
-        """Return the positions (n, 3) that cameras follow: of the only formation, or of all drones."""
+        """Return the positions (n, 3) that cameras follow: those of the only formation, or of all drones."""
         members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
         return drones.p_W[members][drones.present[members]]
 
 
 class SceneNodes:
-    """The nodes of one run of N drones, of which `robots` are in formations and have a ghost each."""
+    """The nodes of a run of N drones; `robots` of them are in one of the `clusters` formations, each with a ghost."""
 
     def __init__(
         self,
@@ -272,9 +272,9 @@ class SceneNodes:
             self._scene.add_line_segments("/references", lines.astype(np.float32), GHOST, **look)
 
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
-        """Register a callback for viser's event of each click into the scene.
+        """Register a callback for viser's event of each click in the scene.
 
-        It is not on the drones' nodes: a page of viser 1.1.1 fails to open if a batched mesh is already clickable.
+        It is not registered on the drones' nodes: a page of viser 1.1.1 fails to open if a batched mesh is clickable.
         """
         self._scene.on_click()(act)
 
@@ -283,7 +283,7 @@ class SceneNodes:
         self._scene.remove_click_callback("all")
 
     def drones(self, drones: DronePoses, dt_s: float) -> None:
-        """Move the drones, and turn their rotors for dt_s."""
+        """Move the drones, and turn their rotors for `dt_s`."""
         drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
         for owners, node in self._airframes:
             node.batched_positions, node.batched_wxyzs = drones.p_W[owners], drones.q_WB[owners]
@@ -292,7 +292,7 @@ class SceneNodes:
             label.position = p_W + LABEL_B
 
     def wind(self, drones: DronePoses) -> None:
-        """Set the arrow of the wind, above the drones."""
+        """Draw the arrow of the wind above the drones."""
         speed = float(np.linalg.norm(drones.wind_W))
         present = drones.p_W[drones.present]
         blows = speed >= WIND_MIN_M_S and len(present) > 0
@@ -303,7 +303,7 @@ class SceneNodes:
             self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
 
     def radio(self, lines: tuple[Array, Array]) -> None:
-        """Set the lines of bidirectional and of one-way radio links between drones."""
+        """Draw the lines of bidirectional and of one-way radio links between drones."""
         points = np.concatenate([*lines, np.tile(HIDDEN, (1, 2, 1))]).astype(np.float32)
         count, weak = len(points), len(lines[0])
         colours = np.tile(linear(np.array(RADIO)), (count, 2, 1))
@@ -377,7 +377,7 @@ class SceneNodes:
 
 
 class _RotorNodes:
-    """The rotors of all drones as one node, each at its size."""
+    """The rotors of all drones as one node, each rotor at its own size."""
 
     def __init__(self, drones: Sequence[DroneInfo], looks: Sequence["DroneShape"], batch: Any) -> None:
         self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
@@ -391,7 +391,7 @@ class _RotorNodes:
         self._node.batched_scales = np.tile(np.array(scales)[self._owners, None], (1, 3))
 
     def move(self, drones: DronePoses, dt_s: float) -> None:
-        """Move the rotors, which have turned for dt_s."""
+        """Move the rotors with the drones, and turn them for `dt_s`."""
         speeds = drones.rotor[self._owners, self._rotor_indices]
         self._angles = rotor_angles(self._angles, speeds, self._turns, dt_s)
         p_W, q_WB = drones.p_W[self._owners], drones.q_WB[self._owners]
@@ -399,9 +399,9 @@ class _RotorNodes:
 
 
 def _padded(count: int, p_W: Array | None = None, q: Array | None = None) -> tuple[Array, Array, Array]:
-    """Return positions (count, 3), level attitudes (count, 4) and scales (count, 3), the first ones p_W and q.
+    """Return positions (count, 3), attitudes (count, 4) and scales (count, 3) of instances.
 
-    Those beyond p_W are hidden.
+    The first positions and attitudes are `p_W` and `q`; further instances are level and, beyond `p_W`, hidden.
     """
     positions, attitudes = np.tile(np.array(HIDDEN), (count, 1)), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
     if p_W is not None:
@@ -412,7 +412,7 @@ def _padded(count: int, p_W: Array | None = None, q: Array | None = None) -> tup
 
 
 class ChosenRing:
-    """A ring around the chosen drone in the scene of one page; `radii_m` are those of the drones, in order."""
+    """A ring around the chosen drone in the scene of one page; `radii_m` are the drones' radii, in the run's order."""
 
     def __init__(self, scene: viser.SceneApi, radii_m: Array) -> None:
         self._radii_m = radii_m
@@ -436,7 +436,7 @@ class ChosenRing:
 def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
     """Draw a field with a grid, replacing the previous ground.
 
-    It is opaque, without a background image: viser's grid plane, or a sky, would hide transparent objects.
+    The field is opaque, and there is no sky: viser's grid plane, or a background image, would hide transparent objects.
     """
     field, cells, sections = DARK if dark else LIGHT
     position = (0.0, 0.0, -FIELD_BELOW_M - THICK_M / 2.0)
@@ -448,7 +448,7 @@ def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
 
 
 def luminance(colour: Sequence[float]) -> float:
-    """Return the relative luminance of an sRGB colour, 0 to 255 (WCAG 2.2)."""
+    """Return the relative luminance (WCAG 2.2) of an sRGB colour with components from 0 to 255."""
     return float(np.dot((0.2126, 0.7152, 0.0722), linear(np.array(colour, float)) / 255.0))
 
 
@@ -459,7 +459,7 @@ def lightened(colour: Sequence[float]) -> Sequence[float]:
 
 
 def linear(colours: Array) -> NDArray[np.uint8]:
-    """Return sRGB colours, 0 to 255, in linear light, as viser expects the colours of lines; IEC 61966-2-1, 5.3."""
+    """Convert sRGB colours, 0 to 255, to linear light, as viser expects for lines (IEC 61966-2-1, 5.3)."""
     share = colours / 255
     return np.round(255 * np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)).astype(np.uint8)
 
@@ -472,7 +472,7 @@ class Mesh(NamedTuple):
 
 
 class DroneShape(NamedTuple):
-    """The appearance of a drone: the axes (x, y) of its rotors and their radius [m]."""
+    """The appearance of a drone: the positions (x, y) of its rotors' axes, and the rotors' radius [m]."""
 
     hubs_B: tuple[tuple[float, float], ...]
     radius_m: float
@@ -484,12 +484,12 @@ class DroneShape(NamedTuple):
 
     @property
     def reach_m(self) -> float:
-        """Distance of its hull's outer edge from the centre [m]."""
+        """Distance of the hull's outer edge from the centre [m]."""
         return self.size * ARM_M + RING * self.radius_m
 
 
 def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
-    """Return the appearance of a drone; without named rotors, it has four on arms of length arm_m [m]."""
+    """Return the appearance of a drone; if its rotors are not stated, it has four on arms of length `arm_m` [m]."""
     if not drone.rotors:
         hubs = tuple((rotor.x_m, rotor.y_m) for rotor in cross_layout(arm_m))
         return DroneShape(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
@@ -498,7 +498,7 @@ def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
 
 @cache
 def coloured_glb(shape: DroneShape) -> bytes:
-    """Return a drone without rotors as GLB, with one surface for each colour."""
+    """Return a drone without its rotors as GLB, with one surface for each colour."""
     scene = trimesh.Scene()
     for name, solids in _solids(shape).items():
         solid = _joined(solids)
@@ -515,7 +515,7 @@ def whole_mesh(shape: DroneShape) -> Mesh:
 
 
 def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
-    """Return the solids of a drone by colour: drawn at the size of the AR.Drone, then scaled."""
+    """Return the solids of a drone by colour, built at the AR.Drone's size and then scaled."""
     hubs = [(x / shape.size, y / shape.size) for x, y in shape.hubs_B]
     radius = RING * shape.radius_m / shape.size
     cross = []
@@ -525,7 +525,7 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
         cross.append(_moved(beam, (x / 2, y / 2, 0.004), math.atan2(y, x)))
         cross += [_moved(motor, (x, y, ROTOR_Z_M / 2)), _moved(foot, (0.92 * x, 0.92 * y, -0.029))]
     ahead = trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0))
-    lens = cylinder(0.013, 0.03, sections=14)  # lens of the front camera
+    lens = cylinder(0.013, 0.03, sections=14)  # of the front camera
     lens.apply_transform(ahead)
     rings = [annulus(radius - 0.016, radius, 0.042, sections=28) for _ in hubs]  # foam of the indoor hull
     body = capsule(height=0.19, radius=0.045, count=[14, 14])  # body with the battery, from nose to tail
@@ -543,7 +543,7 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
     }
     for solid in (solid for of_one in solids.values() for solid in of_one):
         solid.apply_scale(shape.size)
-    hats = Hats()  # drones detect each other by their hats, whose size cameras assume
+    hats = Hats()  # not scaled: drones detect each other by their hats, and cameras assume this size
     return {**solids, "hat": [_moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)]}
 
 

@@ -22,9 +22,9 @@ from zsim.transport.session import RawSample, Session
 from zsim_bridges.console.run_condition import BACK, LOST, DroneCondition, Losses
 
 FRESH_S = 1.0  # simulated or wall; views arrive 20 times a wall second: an older one shows a dead or stuck estimator
-FAULTS_KEPT = 8  # number of most recently begun faults
-EVENTS_KEPT = 200  # number of newest single events
-ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # rows of distinct events; rows of the console's own requests
+FAULTS_KEPT = 8  # number of most recently begun faults that are kept
+EVENTS_KEPT = 200  # number of newest single events that are kept
+ROWS_KEPT, OWN_ROWS_KEPT = 200, 100  # numbers of rows kept: of distinct events; of the console's own requests
 OWN_KINDS = frozenset({"accepted", "done", "control", "refused"})  # kinds of events that answer an operator's request
 ALL, OWN = "all", "own actions"
 KINDS: dict[str, frozenset[str]] = {
@@ -35,12 +35,12 @@ KINDS: dict[str, frozenset[str]] = {
     "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", "mission", *INCIDENTS}),
     "processes": frozenset({*LOST, *BACK, "drop"} - {"diverged"}),
 }
-"""Filters, and the kinds of events in them; empty: all kinds."""
+"""Filters, and the kinds of events that they pass; empty: all kinds."""
 _NUMBER = re.compile(r"\d[\d.e+-]*")
 
 
 class ReceivedEstimate(NamedTuple):
-    """A drone's newest estimate from a process; fresh if it is within FRESH_S of the drones' view."""
+    """A drone's newest estimate, from `process`; fresh if it is within FRESH_S of the drones' view."""
 
     process: str
     t_ns: int
@@ -53,7 +53,7 @@ class ReceivedEstimate(NamedTuple):
 
     @property
     def sigma_m(self) -> float:
-        """Root of the position variance averaged over the axes; 0 if that is negative, hence invalid."""
+        """Root of the position variance averaged over the axes; 0 if the average is negative, hence invalid."""
         xx, _, _, yy, _, zz = self.estimate.covariance_m2
         return math.sqrt(max(0.0, xx + yy + zz) / 3)
 
@@ -66,14 +66,14 @@ class ReceivedLink(NamedTuple):
 
 
 class ViewBuffer:
-    """Keeps the newest message of each key until the next update; earlier ones are never decoded.
+    """Keeps the newest message of each key until the next update, so that superseded ones are never decoded.
 
     Callbacks run in Zenoh's threads.
 
     Args:
         variables: names of each formation's variables; views of other formations or variables are refused.
-        refused: called with the event of each command of the console that the world refuses.
-        asked: called with a formation and a description of each request to it by another client.
+        refused: called with the event of each command from the console that the world refuses.
+        asked: called with a formation and a description of the request whenever another client makes one to it.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class ViewBuffer:
         samples = self._link.get(keys.FAULTS)
         with self._arrived:
             for sample in samples:
-                self._new.setdefault(sample.key, sample.payload)  # one that arrived meanwhile is newer
+                self._new.setdefault(sample.key, sample.payload)  # a message that arrived meanwhile is newer
 
     def update(self) -> bool:
         """Decode what was received since the last update; return whether there is a new view of the drones."""
@@ -138,7 +138,7 @@ class ViewBuffer:
         return keys.VIEW_DRONES in new
 
     def estimates(self) -> dict[str, ReceivedEstimate]:
-        """Return the newest estimate of each drone by name, from any estimator; none later than a rewound replay."""
+        """Return each drone's newest estimate by name, from any estimator; after a rewind, later ones are ignored."""
         now_ns = self.drones.t_ns if self.drones else 0
         newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
@@ -184,7 +184,7 @@ class ViewBuffer:
         return [f for f in self.faults if f.from_ns <= now_ns and (f.until_ns is None or f.until_ns > now_ns)]
 
     def lag_ms(self, received: ReceivedEstimate) -> float:
-        """Return an estimator's lag [ms]: by its health, or by the age of its view if that is not fresh."""
+        """Return an estimator's lag [ms]: from its health, or from the age of its view if that is not fresh."""
         health = self.healths.get(received.process)
         if health is not None and received.fresh:
             return health.lag_ns / 1e6
@@ -194,7 +194,7 @@ class ViewBuffer:
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
-        """Wait, up to a timeout, until more than `beyond` commands to a drone have been answered."""
+        """Wait, for at most `within_s`, until more than `beyond` commands to a drone have been answered."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
 
@@ -266,7 +266,7 @@ class ViewBuffer:
 
 
 def arguments_text(args: Mapping[str, Any]) -> str:
-    """Return the arguments of a request as text: names and values."""
+    """Return the names and values of a request's arguments as text."""
     return ", ".join(f"{name} {_value_text(value)}" for name, value in args.items())
 
 
@@ -282,12 +282,12 @@ def _value_text(value: Any) -> str:
 
 
 def commanded_drone(event: Event) -> str:
-    """Return the drone that an event about a command concerns; the subject of a refusal is the command's key."""
+    """Return the drone that an event about a command concerns; a refusal's subject is the command's key."""
     return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject
 
 
 class EventRow(NamedTuple):
-    """The newest of all events that differ only in numbers, and the number of those events."""
+    """The newest of events that differ only in the numbers in their texts, and how many there were."""
 
     event: Event
     times: int
@@ -297,7 +297,7 @@ class EventRow(NamedTuple):
 class EventLog:
     """Keeps the newest events, with one row for all that differ only in numbers; thread-safe.
 
-    Rows of events of the console's own process, `name`, are kept separately.
+    The rows of requests by the console's own process, `name`, are limited in number separately.
     """
 
     def __init__(self, name: str) -> None:
@@ -323,7 +323,7 @@ class EventLog:
 
 
 def chosen_rows(rows: Iterable[EventRow], drone: str = ALL, kind: str = ALL) -> list[EventRow]:
-    """Return the rows that concern a drone (or `ALL`) and belong to one of `KINDS`."""
+    """Return the rows that concern a drone (`ALL`: any drone or none) and pass a filter of `KINDS`."""
     kinds, name = KINDS[kind], re.compile(rf"(?<![\w-]){re.escape(drone)}(?![\w-])")
     return [
         row

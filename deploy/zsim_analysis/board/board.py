@@ -6,7 +6,7 @@ The folder of a board:
     board.csv        the measures of each flight
     board.md         their means over the seeds, a table for each scenario with a row for each law
     summary.json     the means, minima and maxima, for programs
-    report.html      the table and the figures
+    report.html      the tables and the figures
 
 A law is `cluster_space`, the stock controller with a template; one of `zsim.scenario.scenario.LAWS`; or a user's
 subclass of `zsim_agents.laws.pilot.Pilot`, `package.module:Class`. All fly the same drones from the same positions with

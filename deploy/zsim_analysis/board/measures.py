@@ -52,10 +52,10 @@ class Flown(NamedTuple):
 def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, float | None]:
     """Return the measures of a flight; None for a measure that it does not have.
 
-    shape_error_m: root mean square distance of the drones from the figure's positions, after the best translation,
-        rotation and scaling that the law leaves open; for a lattice, that of its sides from the spacing.
+    shape_error_m: RMS distance of the drones from the figure's positions, after the best translation, rotation and
+        scaling that the law leaves open; for a lattice, RMS deviation of its sides from the spacing.
     place_error_m: the same distance without any fit. None for flocks, which have no desired positions.
-    centre_error_m: root mean square distance of the drones' centre from the desired one.
+    centre_error_m: RMS distance of the drones' centre from the desired one.
     effort_m2_s: integral of the squared horizontal velocity command over the whole flight, mean over the drones.
     separation_m: minimum distance between two drones in the air.
     messages_per_drone_s: messages to others, per drone and simulated second: those of the pilots, or the estimates

@@ -34,7 +34,7 @@ NAME_MAX = 200  # longest name of a member [characters]
 PIECE_BYTES = 1 << 20
 DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can hold
 MODE = (stat.S_IFREG | 0o644) << 16
-UNIX = 3  # stored as the creating system, whatever it was
+UNIX = 3  # stored as the creating system on every system, so that the bytes are the same
 PIN = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?==[A-Za-z0-9][A-Za-z0-9.!+_]*")  # a line of the lock
 EXTRAS = ("agents", "record", "report", "world")  # extras that a rerun and its figures need
 PART = re.compile(r"\w[\w.+@ -]*(?<![ .])")  # part of a member's path: no `..`, no drive, nothing hidden
@@ -128,7 +128,7 @@ def opened(path: Path) -> Iterator[tuple[Manifest, Path]]:
     """Check a bundle; yield its manifest and a temporary folder with its members.
 
     Raises:
-        RunError: the file is not a bundle or was changed; the error names the member, what was found and expected.
+        RunError: no bundle, or a changed one; the error names the member, and what was found and expected.
     """
     try:
         with zipfile.ZipFile(path) as archive:

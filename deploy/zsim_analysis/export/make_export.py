@@ -171,7 +171,7 @@ def check_free(target: Path, force: bool, record: Path) -> None:
     """Refuse a target that must not be replaced.
 
     Raises:
-        ReportError: the target exists and `force` is not set, it is the record, or it is not an export.
+        ReportError: the target exists, but `force` is not set, or it is the record, or it is not an export.
     """
     if not target.exists():
         return

@@ -115,7 +115,7 @@ class Shrinker:
             case = tried[broken.index(True)]
 
     def _bisected(self, case_of: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
-        """Return the case with a number as close to `mildest` as still violates, with few digits if possible."""
+        """Return the case with the number closest to `mildest` that still violates, with few digits if possible."""
         low, high = 0.0, 1.0  # interval between the mildest number (0) and the one that violates (1)
         for _ in range(ROUNDS):
             shares = [low + share * (high - low) for share in SHARES]
@@ -142,7 +142,7 @@ class Shrinker:
     # Duration
 
     def shortest(self, case: Case) -> Case:
-        """Return the case with the shortest flight that violates the requirement, and does not without its causes."""
+        """Return the case with the shortest flight that violates the requirement, but would not without its causes."""
         if not case.faults:
             return case
         length = case.duration_s or self._space.base.duration_s

@@ -50,7 +50,7 @@ DECADES = 30.0  # ratio of the ends of a range from which on all decades are equ
 ONE_WAY_SHARE = 1 / 3  # probability that a flag of a fault is set; design choice
 DIGITS = 4  # significant digits of drawn numbers, so that their texts represent them exactly
 _RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
-LAG = 32  # most pending flights; design choice: more than a machine runs processes
+LAG = 32  # most pending flights; design choice: more than a machine's processes
 TRIES = 24  # random sets of kinds, of which the one with the most untried combinations is flown
 STEPS = (0.3, 0.1, 0.03)  # standard deviations of moves, as shares of a range; design choice
 AGAIN = 0.25  # probability of an untried combination in place of a neighbour, and of a random one if all are tried
@@ -90,7 +90,7 @@ class Knob(Struct, frozen=True):
         return self._of(self._magnitude(rng.uniform()), _direction(rng, self.shape))
 
     def near(self, value: Any, rng: Generator, step: float) -> Any:
-        """Return a value moved by a normal draw, with `step` of the range as deviation; for a choice, a new draw."""
+        """Return a value moved by a normal draw with a deviation of `step` of the range; for a choice, a new draw."""
         if self.shape == "choice" or value is None:
             return self.draw(rng)
         place = self.place(value) + step * rng.normal()

@@ -17,7 +17,7 @@ DEGREES = 6  # degrees of freedom of a drone's NEES: position and velocity
 ESTIMATES_MAX = 200_000  # most estimates evaluated per flight, which takes about a second
 FLOWN = ("approaching", "path", "holding")  # phases of a reference whose drone is to be in the air
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and of velocities: x, y, z, heading
-INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels
+INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels across
 
 
 class EstimateErrors(NamedTuple):

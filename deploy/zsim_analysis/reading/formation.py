@@ -117,7 +117,7 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
         return None
     if states.names != space.names:
         return None
-    # on the wire, all zeros means unknown
+    # on the wire, all zeros mean unknown
     value, desired = (
         np.where(rows.any(axis=1, keepdims=True), rows, np.nan) for rows in (states.value, states.desired)
     )

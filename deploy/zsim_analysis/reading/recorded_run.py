@@ -87,7 +87,7 @@ def is_answer(key: str) -> bool:
 
 
 def answered_until_ns(reader: RecordReader, info: messages.Info) -> int:
-    """Return the last gate [ns] whose answers are all on record, as the record's last gate was not flown without them.
+    """Return the last gate [ns] whose answers are all on record, as the last recorded gate needed them.
 
     Raises:
         RecordError: there is no gate on record.

@@ -235,7 +235,7 @@ def _text(value: Any) -> str:
 
 
 def notes(runs: Sequence[ComparedRun]) -> list[str]:
-    """Return remarks: shortfalls, identical flights, drones and clusters that only some runs have, each run's notes."""
+    """Return remarks: shortfalls, identical flights, drones and clusters of only some runs; then each run's notes."""
     lines = [
         f"{run.name}: {'not as planned: ' * each.fails}{each.text}" for run in runs for each in run.summary.shortfalls
     ]

@@ -27,7 +27,7 @@ LETTER_PAD_PT = 3.0  # distance between a panel's letter and its axes
 MARK_EMS, LINE_EMS = 0.75, 1.25  # width of a bold letter, and height of a line [em]
 MARK_LINES, MARK_PAD_IN = 4, 0.05  # most lines of a warning's reason, and margin above a warning
 FONTS: Any = {"pdf.fonttype": 42, "svg.hashsalt": "zsim"}  # TrueType: IEEE does not accept Type 3
-POINTS = 2000  # most points per line: more than a page has pixels
+POINTS = 2000  # most points per line: more than a page has pixels across
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
@@ -288,7 +288,7 @@ def _faults(flight: RecordedFlight) -> Iterator[Band]:
 
 
 def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
-    """Yield the times in which others than the scenario's agents flew a drone, from acquisition or first command on."""
+    """Yield when processes other than the scenario's agents flew a drone, from acquisition or first command on."""
     since_ns: dict[str, int] = {}
     planned = {"controller", PILOT, *(flight.scenario.own_agents if flight.scenario else ())}
     for event in flight.events:

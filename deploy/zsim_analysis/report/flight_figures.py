@@ -317,7 +317,7 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
 
 # Altitude, state and battery
 
-LANES_IN = 5.0  # maximum height of the panel of states [0.5 in]
+LANES_IN = 5.0  # maximum height of the panel of states, in units of 0.5 in
 LANES_NAMED = 12  # most drones named beside their states
 DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
 STATES = {

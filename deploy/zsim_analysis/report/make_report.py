@@ -291,7 +291,7 @@ def date_text(date: str | None) -> str:
 
 
 def rendered(name: str, pictures: Iterable[Picture], package: str = "zsim_analysis.report", **values: Any) -> str:
-    """Return the page of figures and `values` by a template of `package`, which may use this package's templates."""
+    """Return the page that a template of `package` makes of figures and `values`; it may use the report's templates."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
         autoescape=True,
@@ -371,7 +371,7 @@ def _render(
 
 
 def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[str]) -> None:
-    """Remove the figures' files in formats other than the given ones."""
+    """Remove the figures' files in those of FORMATS that are not given."""
     for figure, _ in pictures:
         for form in set(FORMATS) - set(formats):
             if (earlier := (folder / figure.name).with_suffix(f".{form}")).is_file():
@@ -380,7 +380,7 @@ def _remove_others(pictures: Iterable[Picture], folder: Path, formats: Sequence[
 
 @contextmanager
 def _put_in_place(directory: Path, report: Path, figures: Path) -> Iterator[Path]:
-    """Yield a folder whose files are moved into a directory once all are complete; none are on a full disk or Ctrl-C.
+    """Yield a folder; move its files into a directory once all are complete, or none on a full disk or Ctrl-C.
 
     Raises:
         ReportError: the directory cannot be written (the error names `report`), or `figures` in it is a symbolic link,

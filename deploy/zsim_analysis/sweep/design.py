@@ -87,7 +87,7 @@ def is_sweep(folder: Path) -> bool:
 
 
 class Seeds(Struct, frozen=True):
-    """A distinct seed for every run or, if paired, for every run of a combination, with the same seeds in all."""
+    """A distinct seed for every run or, if paired, for every run of a combination, the same in every combination."""
 
     path: str = SEED
     paired: bool = False  # whether all combinations have the same seeds, and the same drawn values
@@ -432,7 +432,7 @@ def _refuse_overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -
 
 
 def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
-    """Return the faults of the number of runs; `all_known`: no axis, perhaps one of drawn values, was refused."""
+    """Return the faults of the number of runs; `all_known`: no axis, perhaps of drawn values, was refused."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]

@@ -62,7 +62,7 @@ def push(
         list[str] | None, Option("--extra", help="Extra to install besides those of the host's roles. Repeatable.")
     ] = None,
 ) -> None:
-    """Install zsim on the hosts, with the extras that their roles need; they need ssh and Python, but no internet."""
+    """Install zsim on the hosts, with the extras that their roles need; hosts need ssh and Python, but no internet."""
     import asyncio
 
     from zsim_deploy import inventory

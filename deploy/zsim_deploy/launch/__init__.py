@@ -1,1 +1,1 @@
-"""A run on this host: starts, supervises and ends its processes. Imports roles and inventory."""
+"""Starts, supervises and ends the processes of a run on this host. Imports roles and inventory."""

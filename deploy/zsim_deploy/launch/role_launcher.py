@@ -1,11 +1,11 @@
-"""Starts, watches and stops the processes of a run on this host; their output goes to logs.
+"""Starts, watches and stops the processes of a run on this host; their output goes to log files.
 
-On Linux they are forked from a process that has imported everything, which is much faster. On other systems, and if
-this fork server has ended or does not answer, they are started as programs. Either way they are children of this
-process.
+On Linux they are forked from the fork server, a process that has already imported everything, which is much faster.
+On other systems, and if the fork server has ended or does not answer, they are started as programs. Either way they are
+children of this process.
 
-This file also has the users' programs, which are started and supervised like roles, and the console, which outlives the
-run.
+This module also launches users' programs, which are started and supervised like roles, and the console, which outlives
+the run.
 """
 
 import ctypes
@@ -36,22 +36,22 @@ SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
-}  # threads slow down matrices of a dozen rows, and would compete with the other roles
+}  # threads slow down operations on matrices of a dozen rows, and would compete with the other roles
 FORKSERVER = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli.forkserver")
 COMMAND = (sys.executable, SAFE_PATH, "-m", "zsim_deploy.cli")
 ZSIM = (sys.executable, SAFE_PATH, "-m", "zsim_deploy")  # as a user starts it: Ctrl-C while it loads prints one line
 ROOM = " " * 1024  # pads the fork server's command line, which each role overwrites with its own
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
-PACKET_MAX = 1 << 17  # size of a packet with a command line, bytes; a thousand names of drones take half of it
-REPLY_MAX = 32  # size of a reply, READY or a process id, bytes
-ANSWER_S = 5.0  # wall time for the fork server to reply, which takes 20 ms unless it is stopped
-POLL_S = 0.01  # polling interval of the end of a process, wall time
-UNKNOWN = 0  # exit code if the status was collected elsewhere, as in Popen
+PACKET_MAX = 1 << 17  # maximum size of a packet with a command line, bytes; a thousand drone names take half of it
+REPLY_MAX = 32  # maximum size of a reply (READY or a process id), bytes
+ANSWER_S = 5.0  # wall time for the fork server to reply, which takes 20 ms unless the server is stopped
+POLL_S = 0.01  # interval between checks whether a process has ended, wall time
+UNKNOWN = 0  # exit code if the status was collected elsewhere; Popen does the same
 HERE = "here"  # shown as the host of a program that `zsim up` starts itself
 LEAVES_S = 2.0  # wall time for a program to notice the end of the run before it is interrupted
-END_S = 10.0  # wall time for a console to end beside a replay
-COPIED_S = 22.0  # wall time for a console to end after a run; its pages may copy for 20 s
-INTERRUPTED_S = 1.0  # the same after Ctrl-C; the run may take 2 s, and 3 s in all are promised
+END_S = 10.0  # wall time for a replay's console to end
+COPIED_S = 22.0  # wall time for a run's console to end; its pages may take 20 s to copy the report and the record
+INTERRUPTED_S = 1.0  # the same after Ctrl-C; 3 s in all are promised, of which the run may take 2 s
 SLOW_S = 2.0  # wall time after which a notice says that a console has not ended yet
 
 
@@ -66,12 +66,12 @@ class RoleProcess(Protocol):
 
 
 class ChildProcess:
-    """A role as a child process.
+    """A role, run as a child process.
 
     Args:
-        arguments: of the `zsim` command.
-        logs: folder of the log, which has its standard error.
-        on_line: takes every line of its standard output; None: they go to the log too.
+        arguments: arguments of the `zsim` command.
+        logs: folder of the log, which receives the role's standard error.
+        on_line: called with each line of the role's standard output; None: standard output goes to the log too.
     """
 
     is_program = False
@@ -113,7 +113,7 @@ class ChildProcess:
 
     @property
     def code(self) -> int | None:
-        """Exit code; None while the process lives, negative after a signal."""
+        """Exit code: None until the process has ended, negative if a signal ended it."""
         return self._process.poll() if self._process else None
 
     def outcome(self) -> str:
@@ -123,7 +123,7 @@ class ChildProcess:
         return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
-        """Ask the process to leave; without effect once it has ended."""
+        """Ask the process to leave; no effect once it has ended."""
         if self._process is None or self._process.stdin is None or self._process.stdin.closed:
             return
         with suppress(OSError):  # the process has ended
@@ -159,9 +159,9 @@ class ChildProcess:
 
 
 class RoleLauncher:
-    """Starts roles; a context that the main thread must enter, which waits until roles can be started.
+    """Starts roles. A context manager for the main thread; entering it waits until roles can be started.
 
-    `say` takes a notice on slow steps; `run`: label of the fork server in the output of `ps`.
+    `say` is called with notices of slow steps; `run` labels the fork server in the output of `ps`.
     """
 
     def __init__(self, say: Callable[[str], None], run: str = "") -> None:
@@ -173,7 +173,7 @@ class RoleLauncher:
 
     def __enter__(self) -> "RoleLauncher":
         if sys.platform == "linux":
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a parent process may have set it to be ignored
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # it may be inherited as ignored
             try:
                 self._start_forkserver()
             except BaseException:  # including Ctrl-C
@@ -187,7 +187,7 @@ class RoleLauncher:
     def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> RoleProcess:
         """Start a `zsim` command with a pipe as standard input.
 
-        Standard error goes to the log, and so does standard output, unless `listened`: then it is a pipe.
+        Standard error goes to the log. So does standard output, unless `listened`: then it is a pipe too.
         """
         with self._lock:
             return self._fork(arguments, log, listened) or subprocess.Popen(
@@ -215,7 +215,7 @@ class RoleLauncher:
             start.over()
 
     def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> "ForkedProcess | None":
-        """Fork a role, and let it begin by writing a byte; None if the fork server cannot do that."""
+        """Fork a role, and start it by writing a byte; return None if the fork server cannot fork it."""
         packet = json.dumps(list(arguments)).encode()
         if self._line is None or len(packet) > PACKET_MAX:
             return None
@@ -243,7 +243,7 @@ class RoleLauncher:
         return ForkedProcess(int(reply), os.fdopen(stdin_write, "w"), None if out_read is None else os.fdopen(out_read))
 
     def _receive(self) -> bytes:
-        """Return a reply; if the fork server has ended or is silent, stop it and return an empty one."""
+        """Return the fork server's reply; if it has ended or is silent, stop it and return an empty reply."""
         reply = b""
         if self._line is not None:
             with suppress(OSError):
@@ -253,12 +253,12 @@ class RoleLauncher:
         return reply
 
     def _stop_forkserver(self) -> None:
-        """End the fork server, so that further roles are started as programs."""
+        """End the fork server, so that later roles are started as programs."""
         if self._line is not None:
             self._line.close()
             self._line = None
         if self._forkserver is not None:
-            self._forkserver.kill()  # it may be importing, or stopped
+            self._forkserver.kill()  # it may still be importing, or be stopped
             self._forkserver.wait()
 
 
@@ -282,7 +282,7 @@ class ForkedProcess:
             return self._code
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait for the process to end, and return its exit code; subprocess.TimeoutExpired after `timeout` seconds."""
+        """Return the exit code once the process ends; raise subprocess.TimeoutExpired after `timeout` seconds."""
         until_s = None if timeout is None else time.monotonic() + timeout
         while (code := self.poll()) is None:
             if until_s is not None and time.monotonic() >= until_s:
@@ -344,7 +344,7 @@ class ProgramProcess:
 
     @property
     def code(self) -> int | None:
-        """Exit code; None while the process lives, negative after a signal."""
+        """Exit code: None until the process has ended, negative if a signal ended it."""
         code = self._program.code if self._program else None
         return code if code is None or code <= 128 else 128 - code
 
@@ -355,7 +355,7 @@ class ProgramProcess:
         return last_line(self._log)
 
     def request_stop(self, reason: str) -> None:
-        """Interrupt the program, as Ctrl-C does, unless it ends by itself within LEAVES_S; `reason` is not used."""
+        """Interrupt the program, as Ctrl-C does, unless it ends on its own within LEAVES_S; `reason` is not used."""
         if self._program is not None and self._interruption is None:
             self._interruption = threading.Timer(LEAVES_S, self._program.interrupt)
             self._interruption.daemon = True
@@ -378,12 +378,12 @@ class ProgramProcess:
 def programs_of(
     scenario: Scenario, names: Iterable[str], endpoint: str, out: Path, launch: Launch
 ) -> list[ProgramProcess]:
-    """Return users' programs of a scenario; they run in the folder of its modules, which is that of its file.
+    """Return processes for a scenario's own programs; they run in the folder of the scenario's file and modules.
 
     Args:
-        names: the programs.
-        endpoint: of the run.
-        out: folder of the run.
+        names: names of the programs.
+        endpoint: the run's endpoint.
+        out: the run's folder.
     """
     folder, environment = next(map(Path, launch.modules), None), environment_of(endpoint, scenario.federation)
     values = {"endpoint": endpoint, "federation": scenario.federation, "folder": str(out.absolute())}
@@ -400,9 +400,9 @@ def programs_of(
 
 
 class RunConsole:
-    """Owns the console of a run, which goes on until the report is made and the console's pages have copied it.
+    """Owns the console of a run, which stays up until the report has been made and the console's pages have copied it.
 
-    A context that must be entered before the run, so that the console always ends. Ctrl-C ends the wait for the pages.
+    A context manager, to be entered before the run so that the console always ends. Ctrl-C ends the wait for the pages.
     """
 
     def __init__(self) -> None:
@@ -410,7 +410,7 @@ class RunConsole:
         self.outcome = Outcome("interrupted", interrupted=True)  # outcome of the run, set by the caller
 
     def own(self, process: RunProcess) -> None:
-        """Take over a process that has not been started, and end an earlier one."""
+        """Take over a console process that has not been started, and end the previous one."""
         if self.process is not None:
             self.process.close()
         self.process = process
@@ -438,9 +438,10 @@ class RunConsole:
 
 @contextmanager
 def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
-    """Run a console for the duration of the block; it waits for the world, and prints the links to its pages.
+    """Run a console for the duration of the `with` block; it waits for the world, and prints the links to its pages.
 
-    It connects to `endpoint`, on this machine if that stands for all addresses; the default federation is the record's.
+    It connects to `endpoint`, with 127.0.0.1 in place of 0.0.0.0 (all addresses); the default federation is the
+    record's.
     """
     if federation is None:
         from zsim_analysis.reading.recorded_run import open_run

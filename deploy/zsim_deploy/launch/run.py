@@ -1,4 +1,4 @@
-"""A complete run on this host: starts, supervises, records and ends the processes of a scenario."""
+"""A complete run on this host: starts a scenario's processes, including the recorder, supervises and ends them."""
 
 import contextlib
 import os
@@ -32,9 +32,9 @@ from zsim_deploy.launch.supervisor import EndSignals, Outcome, RunProcess, Super
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 RECORDER = "recorder"
-CONSOLE = "console.run"  # name of the run's console; one started by hand does not take it over
+CONSOLE = "console.run"  # name of the run's console, which a console started by hand does not take over
 DEFAULT_PORT = 7447  # Zenoh's default
-PORTS_TRIED = 5  # other runs may take a free port before our world listens on it
+PORTS_TRIED = 5  # attempts; another run may take a free port before our world listens on it
 
 
 Shown = Screen | JsonProgress
@@ -46,17 +46,17 @@ class RunOptions:
 
     scenario: Scenario
     out: Path
-    launch: Launch  # options that are stored, so that the run can be continued
-    order: Sequence[str] = ()  # names of processes in the order of their start; the others follow
+    launch: Launch  # stored options, with which the run can be continued
+    order: Sequence[str] = ()  # names of the processes to start first, in order
     console: RunConsole | None = None  # owner of the console; None: no console
     cameras: bool = False
     detect: bool = False
-    continued: bool = False  # continues an interrupted run
-    json_progress: bool = False  # writes progress as JSON, for the program that started this one
+    continued: bool = False  # whether this continues an interrupted run
+    json_progress: bool = False  # whether to write progress as JSON, for the program that started this one
     supervisor: Supervisor | None = None  # supervisor of the processes, once they are started
 
     def status(self) -> dict[str, Any]:
-        """Return what `zsim ps` shows of the run; callable from any thread."""
+        """Return what `zsim ps` shows about the run; callable from any thread."""
         if self.supervisor:
             rows, clock = self.supervisor.rows(), self.supervisor.clock
         else:
@@ -85,9 +85,9 @@ def fly(options: RunOptions) -> Outcome:
 
 
 def run_processes(options: RunOptions, screen: Shown) -> Outcome:
-    """Run a scenario as processes; the record is finished in any case.
+    """Run a scenario as separate processes, and repair its record if that was left unfinished.
 
-    KeyboardInterrupt, with the reason, if it was interrupted before the flight, or interrupted twice.
+    Raises KeyboardInterrupt, with the reason, if the run is interrupted before the flight, or twice.
     """
 
     def interrupt(number: int, _: object) -> None:
@@ -99,7 +99,7 @@ def run_processes(options: RunOptions, screen: Shown) -> Outcome:
                 outcome = _run(options, screen, signals)
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
-                (options.out / "logs").rmdir()  # fails unless it is empty; then the run's folder can be reused
+                (options.out / "logs").rmdir()  # fails unless empty; once it is gone, the run's folder can be reused
                 run_folder.forget_launch(options.out)
             raise
         with contextlib.suppress(RecordError):
@@ -108,7 +108,7 @@ def run_processes(options: RunOptions, screen: Shown) -> Outcome:
 
 
 def _run(options: RunOptions, screen: Shown, signals: EndSignals) -> Outcome:
-    """Prepare the folder and the fork server, and run on a free port; on another one if that was taken meanwhile."""
+    """Prepare the folder and the fork server, and run on a free port; try another one if it was taken meanwhile."""
     run_folder.prepare(options.out, options.scenario, options.launch, screen.say, options.continued)
     if options.camera_children() and not options.launch.rate and not options.scenario.gates("camera"):
         screen.say("an unpaced lockstep run is faster than its cameras; --rate 1 gives them time")
@@ -156,7 +156,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
         commands[names[-1]] = ["host", *reach, "--", *names]
     else:
         for role, _, thing in (name.partition(".") for name in names):
-            name = f"{role}.{thing}"  # -- precedes it below, since a name may begin with -
+            name = f"{role}.{thing}"  # preceded by -- below, because it may begin with -
             commands[name] = (
                 ["agent", *reach, "--", name] if role in scenario.own_agents else [role, *reach, "--", thing]
             )
@@ -198,9 +198,9 @@ def run_in_process(options: RunOptions, screen: Shown) -> Outcome:
 
 
 def options_of(folder: Path) -> RunOptions:
-    """Return the options that continue an interrupted run; RunError if it is over.
+    """Return the options that continue an interrupted run; raise RunError if that run is over.
 
-    The record of an in-process run is removed, because it is flown again from its start.
+    The record of an in-process run is removed, because such a run is flown again from the start.
     """
     launch = run_folder.launch_of(folder)
     if launch.in_process:
@@ -212,7 +212,7 @@ def options_of(folder: Path) -> RunOptions:
 
 
 def check_endpoint(endpoint: str | None, insecure: bool) -> None:
-    """Raise SessionError for an endpoint on which no world can listen: malformed, or without TLS unless `insecure`."""
+    """Raise SessionError for an endpoint on which no world can listen: malformed or, unless `insecure`, without TLS."""
     if endpoint is None:
         return
     from zsim.transport.connection import check_listening
@@ -232,7 +232,7 @@ def check_open_files(options: RunOptions) -> None:
 
 
 def free_port(screen: Shown) -> int:
-    """Return Zenoh's default port or, if that is in use, another free one, with a notice."""
+    """Return Zenoh's default port; if that is in use, show a notice and return another free port."""
     if is_free(DEFAULT_PORT):
         return DEFAULT_PORT
     with socket.socket() as probe:
@@ -256,7 +256,7 @@ def is_free(port: int) -> bool:
 
 
 class CameraChild(NamedTuple):
-    """A camera or detector process of a run. `drones`: those it serves; empty: all that have cameras."""
+    """A camera or detector process of a run. `drones`: the drones it serves; empty: all with cameras."""
 
     role: str
     name: str
@@ -264,7 +264,7 @@ class CameraChild(NamedTuple):
 
 
 def with_cameras(scenario: Scenario) -> Scenario:
-    """Return a scenario with cameras; if no drone has any, each drone gets the two of the AR.Drone."""
+    """Return the scenario with cameras: if no drone has any, every drone gets the two cameras of the AR.Drone."""
     if any(drone.sensors.cameras() for drone in scenario.drones):
         return scenario
     two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
@@ -273,10 +273,10 @@ def with_cameras(scenario: Scenario) -> Scenario:
 
 
 def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[CameraChild]:
-    """Return the camera and detector processes that the scenario expects by name, or the user wants.
+    """Return the camera and detector processes that the scenario expects by name or the user requests.
 
-    There is one for each drone named in `expect`, and ROLE.main for all others. `cameras`: render the cameras of all
-    drones; `detect`: detect hats in the images of all drones.
+    Each drone named in `expect` has its own process, and ROLE.main serves all others. `cameras`: whether to render the
+    cameras of all drones; `detect`: whether to detect hats in the images of all drones.
     """
     filmed = watched_drones("", scenario)
     everybody = [drone.name for drone in scenario.drones]  # images may come from cameras outside zsim

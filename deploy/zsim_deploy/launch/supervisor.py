@@ -1,6 +1,6 @@
-"""Supervises the processes of a run: reacts when one of them ends, and ends them all.
+"""Supervises the processes of a run: reacts when one of them ends, and finally ends them all.
 
-The processes run on this machine (`ChildProcess`) or on another one (`RemoteProcess`).
+The processes run on this machine (`ChildProcess`) or on others (`RemoteProcess`).
 """
 
 import signal
@@ -24,25 +24,25 @@ from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_b
 
 # Wall times
 POLL_S = 0.05  # polling interval of the processes
-END_S = 8.0  # time for the others to end after the world; the recorder may wait for its disk
+END_S = 8.0  # time for the others to end after the world; the recorder may have to wait for the disk
 WORLD_FIRST_S = 1.0  # time for the world to end the run after Ctrl-C
-INTERRUPT_S = 2.0  # time for all processes to end after Ctrl-C; 3 s in all are promised
-SILENT_S = 10.0  # time after which a silent world is reported; it takes 1 s to start, and announces that it compiles
-QUIET_WORLD_S = 1.8  # time after which the world counts as silent; it shows its clock every second, even while waiting
-TAKE_OVER_S = 60.0  # time after which a replaced process is killed; a slow successor starts in half of it
+INTERRUPT_S = 2.0  # time for all processes to end after Ctrl-C; zsim promises 3 s in all
+SILENT_S = 10.0  # time after which a world without output is reported; it starts in 1 s, and announces compilation
+QUIET_WORLD_S = 1.8  # time after which the world counts as silent; it writes its clock every second, even while waiting
+TAKE_OVER_S = 60.0  # time after which a replaced process is killed; even a slow successor starts in half that time
 RESTART_WINDOW_S = 20.0  # period in which restarts of a process are counted
-OUTPUT_LOOK_S = 0.1  # interval between checks whether the output is read
+OUTPUT_LOOK_S = 0.1  # interval between checks that the output is still read
 
-RESTARTS_MAX = 5  # restarts of a process within RESTART_WINDOW_S; if it needs more, restarts do not help
+RESTARTS_MAX = 5  # restarts allowed to a process within RESTART_WINDOW_S; if it needs more, restarting does not help
 SUPERSEDED = 3  # exit code of a role whose name another process has taken over
-UNREAD = "the output is no longer read"  # for example by `zsim run … | head`
+UNREAD = "the output is no longer read"  # for example after `zsim run … | head`
 
 
 class RunProcess(Protocol):
     name: str
     role: str
     restarts: int
-    is_program: bool  # whether it is a user's program, whose pid here may differ from the one with which it joins
+    is_program: bool  # whether it is a user's program, whose pid here may differ from the one known to the world
 
     @property
     def pid(self) -> int: ...
@@ -85,23 +85,23 @@ class Outcome:
 
 
 class Supervisor:
-    """Starts the processes of a run, supervises them, and ends them all; `show` takes the progress."""
+    """Starts the processes of a run, supervises them, and ends them all; `show` receives the progress."""
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
-        self.members: list[RunProcess] = []  # all processes, with the world; must be set before `run`
+        self.members: list[RunProcess] = []  # all processes, including the world; must be set before `run`
         self.lasting: RunProcess | None = None  # member that outlives the run; the caller must stop and close it
-        self.clock: dict[str, Any] | None = None  # the world's last clock line
+        self.clock: dict[str, Any] | None = None  # the world's latest clock line
         self._deaths = DeathPolicy(processes)
         self._show = show
         self._reason = ""
         self._failed = False
         self._flies = False
         self._interrupted: str | None = None
-        self._until_s: float | None = None  # monotonic time until which processes may leave
+        self._until_s: float | None = None  # monotonic time by which the processes must leave
         self._silent_s: float | None = None  # monotonic time at which a world without any output is reported
         self._dead: set[str] = set()
-        self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye, by name
-        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
+        self._lost: dict[str, int | None] = {}  # pid of each process that ended without a bye message, by name
+        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and when (monotonic, s)
         self._left: list[RunProcess] = []  # replaced processes that have ended or were killed
         self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
@@ -109,7 +109,7 @@ class Supervisor:
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
         """Start all processes, supervise them until the run ends, and end them all; call `look` at every poll.
 
-        Ctrl-C and SIGTERM end the run in order; after a second signal, KeyboardInterrupt is raised without waiting.
+        Ctrl-C and SIGTERM end the run in an orderly way; a second signal raises KeyboardInterrupt without waiting.
         """
         if self._interrupted:
             return Outcome(self._interrupted, interrupted=True)
@@ -137,7 +137,7 @@ class Supervisor:
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the rows of the processes for `zsim ps`; callable from any thread."""
+        """Return a row for each process, for `zsim ps`; callable from any thread."""
         rows = []
         for child in self.members:
             state = "running" if child.code is None else f"ended ({child.outcome()})" if child.code else "ended"
@@ -184,7 +184,8 @@ class Supervisor:
     def _on_death(self, name: str, pid: int | None) -> None:
         """Restart a process that the world reports dead, although its exit code does not show that.
 
-        It was superseded by a process that is now dead, or it ended with code 0 without a bye, as with `os._exit(0)`.
+        Either it was superseded by a process that has since died, or it ended with code 0 but without a bye message, as
+        after `os._exit(0)`.
         """
         for child in self.members:
             if child.name == name and (child.pid == pid or child.is_program) and child.code in (0, None):
@@ -255,7 +256,7 @@ class Supervisor:
             world.request_stop(self._reason)
 
     def _apply_on_death(self, child: RunProcess, flies: bool) -> OnDeath:
-        """Decide what to do after the death of a process, and restart it if so decided."""
+        """Decide what follows the death of a process, and restart it if that is the decision."""
         action, why = self._deaths.decide(child.name, child.code, flies)
         if child.role != "world" or action == "restart":
             self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
@@ -265,9 +266,9 @@ class Supervisor:
         return action
 
     def submit(self, act: Callable[[], Any]) -> Future[Any]:
-        """Have a function called between two polls of the processes; callable from any thread.
+        """Schedule a function to be called between two polls of the processes; callable from any thread.
 
-        The returned future is cancelled if the run ends before that.
+        The returned future is cancelled if the run ends first.
         """
         outcome: Future[Any] = Future()
         self._requests.put((act, outcome))
@@ -279,7 +280,8 @@ class Supervisor:
     def replace(self, new: RunProcess) -> None:
         """Start a process that replaces the one with the same name, which then leaves or is killed.
 
-        RunError while that one is itself replacing another: the last process started might not be the last to join.
+        Raises RunError while the old process is itself replacing another: the last one started might not be the last to
+        join.
         """
         self._release_replaced()
         if self.is_being_replaced(new.name):
@@ -290,7 +292,7 @@ class Supervisor:
         self._dead.discard(new.name)
         self._leaving[new.name] = (old, time.monotonic())
         if not old.pid:
-            old.kill()  # it waits for its host, and must not take the name back when that is reached
+            old.kill()  # if it is waiting for its host, it must not take the name back once the host is reachable
         new.start()
 
     def is_being_replaced(self, name: str) -> bool:
@@ -308,13 +310,13 @@ class Supervisor:
                 self._left.append(child)
 
     def _fail(self, reason: str, after_end: bool = False) -> None:
-        """Note a failure; `after_end`: it overrides an orderly end that was reported, but not an interruption."""
+        """Note a failure; `after_end`: it overrides an orderly end reported earlier, but not an interruption."""
         if after_end and not self._failed and not self._interrupted:
             self._reason = ""
         self._reason, self._failed = self._reason or reason, True
 
     def _finish(self) -> None:
-        """Let all processes leave; after an orderly end the recorder leaves last, by itself."""
+        """Let all processes leave; after an orderly end the recorder leaves last, on its own."""
         members = [child for child in self.members if child is not self.lasting]
         programs = [child for child in members if child.is_program and child.name not in self._dead]
         for program in programs:  # they may have died since the last poll
@@ -334,7 +336,7 @@ class Supervisor:
             self._fail(f"the recorder ended: {recorder.outcome()}", after_end=True)
 
     def _left_s(self) -> float:
-        """Return the wall time that the processes still have to leave; Ctrl-C shortens it."""
+        """Return how long the processes still have to leave, wall time; Ctrl-C shortens it."""
         now_s = time.monotonic()
         latest_s = now_s + (INTERRUPT_S if self._interrupted else END_S)
         self._until_s = latest_s if self._until_s is None else min(self._until_s, latest_s)
@@ -347,7 +349,7 @@ class DeathDecision(NamedTuple):
 
 
 class DeathPolicy:
-    """Decides what follows the death of a process, from the scenario and the number of its deaths."""
+    """Decides what follows the death of a process, from the scenario and the process's earlier deaths."""
 
     def __init__(self, processes: Processes) -> None:
         self._processes = processes
@@ -359,7 +361,7 @@ class DeathPolicy:
         action = on_death(processes.on_death, name)
         if action == "end":
             return DeathDecision("end", "on_death: end")
-        is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # the scenario decides
+        is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # the scenario's choice stands
         ends, why = False, ""
         if code == USER_FAULT and not is_settled:
             ends, why = is_needed(name), "a restart would not help"
@@ -390,7 +392,7 @@ class WorldWatch:
         self._ends_for: list[str] = []
 
     def clock(self, line: dict[str, Any]) -> None:
-        """Remember the processes for which an ended world waits: its links close once they have read everything."""
+        """Remember the processes for which an ended world waits: it closes its links once they have read everything."""
         if line.get("state") == "stopped":
             self._ends_for = [each["name"] for each in line.get("waiting_for", ())]
 
@@ -410,10 +412,10 @@ class WorldWatch:
 
 
 class EndSignals:
-    """A context that handles SIGTERM and SIGHUP; SIGHUP stays ignored under nohup.
+    """A context manager that handles SIGTERM and SIGHUP; SIGHUP stays ignored under nohup.
 
-    SIGTERM raises KeyboardInterrupt. SIGHUP, for a closed terminal, raises nothing, because shells send it more than
-    once: `hung_up` is called, and further output goes to the file `log`.
+    SIGTERM raises KeyboardInterrupt. SIGHUP, sent when the terminal closes, raises nothing, because shells send it more
+    than once; instead `hung_up` is called, and further output goes to the file `log`.
     """
 
     def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:
@@ -442,7 +444,7 @@ class EndSignals:
         self._hung_up()
 
     def look(self) -> str:
-        """Return why the output can no longer be seen, empty if it can; must be called repeatedly."""
+        """Return why the output can no longer be seen; empty if it can be. Must be called repeatedly."""
         if time.monotonic() - self._looked_s >= OUTPUT_LOOK_S:
             if unread := [stream for stream in STREAMS if is_unread(stream)]:
                 self.reason = self.reason or UNREAD

@@ -1,1 +1,1 @@
-"""The roles as processes, and how these are stopped. Imports arguments, and the packages of what they run."""
+"""Runs the roles as processes, and stops them. Imports arguments, and the packages that implement the roles."""

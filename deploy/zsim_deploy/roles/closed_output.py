@@ -18,7 +18,7 @@ CLOSED = "the terminal was closed"
 
 
 class _Output(io.FileIO):
-    """A standard stream that drops output which cannot be written; only BrokenPipeError is raised."""
+    """A standard stream that drops output it cannot write; it raises only BrokenPipeError."""
 
     _lost = False
 
@@ -27,7 +27,7 @@ class _Output(io.FileIO):
             return super().write(data)
         except BrokenPipeError:
             raise
-        except OSError as error:  # a full disk, a closed terminal
+        except OSError as error:  # such as a full disk or a closed terminal
             if not self._lost and self.fileno() != STREAMS[-1]:
                 write_error(f"standard output cannot be written ({error.strerror}); further output is lost")
             self._lost = True
@@ -43,7 +43,8 @@ def write_error(text: str) -> None:
 def renew_streams() -> None:
     """Reopen Python's standard streams, so that nothing fails because one is closed or its disk is full.
 
-    Must be called before any file is opened: that file would get the descriptor of a closed stream, and so its output.
+    Must be called before any file is opened: that file would otherwise get the descriptor of a closed stream, and with
+    it the stream's output.
     """
     for number in (0, *STREAMS):
         try:
@@ -56,7 +57,7 @@ def renew_streams() -> None:
     encodings = [getattr(stream, "encoding", None) for stream in (sys.stdin, sys.stdout, sys.stderr)]
     sys.stdin = os.fdopen(0, encoding=encodings[0], errors=getattr(sys.stdin, "errors", None), closefd=False)
     out, error = (io.BufferedWriter(_Output(number, "w", closefd=False)) for number in STREAMS)
-    # characters that the terminal's encoding lacks become question marks instead of errors
+    # Characters that the terminal's encoding lacks become question marks instead of raising errors.
     sys.stdout = io.TextIOWrapper(out, encodings[1], "replace", line_buffering=os.isatty(STREAMS[0]))
     sys.stderr = io.TextIOWrapper(error, encodings[2], "replace", line_buffering=True)
 
@@ -66,12 +67,12 @@ def is_unread(stream: int) -> bool:
         if stat.S_ISFIFO(os.fstat(stream).st_mode) and hasattr(select, "poll"):  # not on Windows
             poller = select.poll()
             poller.register(stream, 0)
-            return bool(poller.poll(0))  # errors are always reported
+            return bool(poller.poll(0))  # poll always reports errors
     return False
 
 
 def redirect_output(log: Path, streams: Sequence[int] = STREAMS, why: str = CLOSED) -> None:
-    """Redirect further output, meant for a terminal or pipe that may be closed, to a file."""
+    """Redirect further output to the file `log`, except from streams that already write to a file."""
     try:
         into = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     except OSError:

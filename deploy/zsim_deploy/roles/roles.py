@@ -1,6 +1,6 @@
-"""The roles of a run as processes: agents, recorder, router, and those that serve one run after another.
+"""Runs roles as processes: agents, the recorder, routers, and roles that serve one run after another.
 
-The latter (`serve_runs`) are console, gateway, bridges, drivers, cameras and detectors. The world is in `world_role`.
+The last (`serve_runs`) are the console, gateway, bridges, drivers, cameras and detectors. The world is in `world_role`.
 """
 
 import gc
@@ -55,13 +55,13 @@ from zsim_deploy.arguments import RUN_ID, WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel, lower_priority
 
 RUN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # run ids that may be part of a folder's name
-PATTERN = "*?["  # special characters in patterns; fnmatch
+PATTERN = "*?["  # special characters of patterns; fnmatch
 ANY = "*"  # stands for a number in a process name
-TICK_S = 0.1  # interval at which a router checks for a stop, wall time
-PROBE_S = 1.0  # interval at which a router that cannot connect upstream checks for the reason, wall time
-PAUSE_S = 0.2  # polling interval of a world whose run has ended and that waits for byes, wall time
-JOINS_MAX = 10_000  # joins remembered by a router; limited because names can be made up
-SLACK_GATES = 3  # an image between two gates needs the second one; one more lets world and cameras work in parallel
+TICK_S = 0.1  # interval at which a router checks whether it is stopped, wall time
+PROBE_S = 1.0  # interval at which a router that cannot connect upstream looks for the reason, wall time
+PAUSE_S = 0.2  # polling interval while a world whose run has ended waits for bye messages, wall time
+JOINS_MAX = 10_000  # maximum number of joins that a router remembers; limited because clients can invent names
+SLACK_GATES = 3  # an image between two gates needs the second; one more gate lets world and cameras work in parallel
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
@@ -69,13 +69,13 @@ Build = Callable[[Info, Scenario], Agent]
 Serve = Callable[[Session, Info, Participant, Stopped, Say], None]
 """Serves one run with (session, info, participant, stopped, say), until the run is over or the process is stopped."""
 StandsFor = Callable[[Info], tuple[str, ...]]  # names of the processes that a process replaces in a run
-SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0 if it does not wait for it
+SlackNs = Callable[[Info], int]  # how far the world of a run may be ahead of a process; 0: it does not wait
 Remain = Callable[[Callable[[], str | None], Callable[[], bool]], None]
 """Called after a run with (reason, deserted); returns when there is a reason to stop, at once if deserted."""
 
 
 def log_printer(launched: str | None) -> Say:
-    """Return a function that prints a line on standard error, with the time in a launched process, as for a log."""
+    """Return a function that prints a line to standard error; in a launched process, which has a log, with the time."""
 
     def say(text: str) -> None:
         if launched is not None:
@@ -86,9 +86,10 @@ def log_printer(launched: str | None) -> Say:
 
 
 def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
-    """Run one agent in the run of a world; `name`: that of the process, if known in advance.
+    """Run one agent in a world's run; `name`: the name of the process, if known in advance.
 
-    UserCodeError if a user's class raised an exception, or returned something unusable.
+    Raises UserCodeError if a user's class raises an exception or returns something unusable; a launched process prints
+    the error and exits instead.
     """
     launched, who = reach.launched, reach.who._replace(process=name)
     stop = StopChannel(launched, who)
@@ -115,14 +116,14 @@ def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
             print(printable("".join(format_exception(raised, chain=False))), end="", file=sys.stderr)
         sys.exit(USER_FAULT)  # so that the launcher does not restart it
     say(f"{member.name}: left, {reason}")
-    if runner.killed:  # end as by kill -9, so that the launcher sees a death; Windows has no SIGKILL
+    if runner.killed:  # end as if by kill -9, so that the launcher sees a death; Windows has no SIGKILL
         os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
     stop.exit_if_terminated()
 
 
 def agent_of(role: str, names: Sequence[str]) -> Build:
-    """Return a function that makes the agent of a role for drones or clusters; `names` may have patterns (`drone*`)."""
-    agent_class(role)  # imports its modules before the world is reached
+    """Return a function that makes a role's agent for drones or clusters; `names` may contain patterns (`drone*`)."""
+    agent_class(role)  # imports the role's modules before connecting to the world
 
     def build(info: Info, scenario: Scenario) -> Agent:
         wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
@@ -137,7 +138,7 @@ def host(names: Sequence[str]) -> Build:
 
 
 def recorder(out: Path, reach: WorldAccess) -> None:
-    """Record the run of a world into a folder, whose name may contain RUN_ID; RecordError if it cannot be written."""
+    """Record a world's run into a folder, whose name may contain RUN_ID; raise RecordError if that fails."""
     from zsim.output_folder import RECORD
     from zsim.record.completeness import record_completeness
     from zsim_agents.recorder import Recorder
@@ -160,7 +161,7 @@ def recorder(out: Path, reach: WorldAccess) -> None:
 
 
 def record_folder(out: Path, run_id: str) -> Path:
-    """Return the folder of a run's record; RecordError if the run id cannot be part of its name."""
+    """Return the folder of a run's record; raise RecordError if the run id cannot be part of its name."""
     if RUN_ID not in out.name:
         return out
     if not RUN_NAME.fullmatch(run_id):
@@ -177,7 +178,7 @@ def make_folder(folder: Path) -> None:
 def router(
     name: str, endpoint: str, upstream: str, federation: str, mode: Mode, launched: str | None, identity: Identity
 ) -> None:
-    """Run a router on an endpoint until it is stopped; SessionError if the port or a certificate cannot be used."""
+    """Run a router on an endpoint until stopped; raise SessionError if the port or a certificate cannot be used."""
     identity = identity._replace(process=f"{ROUTER}.{name}")
     stop = StopChannel(launched, identity)
     say = log_printer(launched)
@@ -197,10 +198,10 @@ def router(
 
 
 class RouterLinks:
-    """Watches the links of a router, because a client that stops reading would block the world through it.
+    """Watches the links of a router, because a client that stops reading would block the world through the router.
 
-    A router does not know the run. It recognizes the processes that the run does not wait for by their join, or by the
-    absence of a token for their session.
+    A router does not know the run. It recognizes the processes that the run does not wait for by their join message, or
+    by the absence of a token for their session.
     """
 
     def __init__(self, link: Session, say: Say) -> None:
@@ -243,18 +244,18 @@ def serve_runs(
     slack_ns: SlackNs = lambda info: 0,
     remain: Remain | None = None,
 ) -> None:
-    """Serve one run after another of the world on an endpoint, until stopped; a launched process serves only one.
+    """Serve the runs of the world on an endpoint, one after another, until stopped; a launched process serves only one.
 
     Args:
-        name: of the process; `role.*`: the role with the first free number, kept until another process takes it.
-        stands_for: returns the names of the processes that it replaces in a run.
-        slack_ns: returns how far the world of a run may be ahead of it; 0 if the world does not wait for it.
-        remain: called after the run, if the process is launched.
+        name: name of the process; `role.*`: the role with the first free number, until another process takes that over.
+        stands_for: returns the names of the processes that this one replaces in a run.
+        slack_ns: returns how far the world of a run may be ahead of this process; 0 if the world does not wait for it.
+        remain: called after the run, if the process was launched.
 
     Raises:
         NoWorldError: no world was found within `wait_s` of the start.
         SupersededError: another process has taken over the given name.
-        SystemExit: the process is launched, and was ended by SIGTERM from elsewhere than its launcher.
+        SystemExit: the process was launched, and was ended by a SIGTERM that did not come from its launcher.
     """
     launched, wait_s = reach.launched, reach.wait_s
     who = reach.who._replace(process="" if name.endswith(ANY) else name)
@@ -305,7 +306,7 @@ def _serve(serve: Serve, link: Session, participant: Participant, info: Info, st
     try:
         serve(link, info, participant, stop.stopped, say)
     except ZsimError as error:
-        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would count it as dead
+        participant.leave(str(error).removeprefix(f"{name}: "))  # otherwise the world would count this process as dead
         raise
     reason = participant.end_reason or stop.reason() or "stopped"
     participant.leave(reason)
@@ -315,10 +316,10 @@ def _serve(serve: Serve, link: Session, participant: Participant, info: Info, st
 def serve_pictures(
     role: str, drones: Sequence[str], name: str, reach: WorldAccess, diameter_m: float | None = None
 ) -> None:
-    """Serve one run after another as a camera or a detector of drones, given by names or patterns.
+    """Serve one run after another as the camera or detector of drones, given by name or pattern.
 
-    `diameter_m`: of the hats for which a detector looks; None: the scenario's. A detector's images may come from
-    outside zsim. RunError if a run has no such drone.
+    `diameter_m`: diameter of the hats that a detector looks for; None: the scenario's. A detector's images may come
+    from outside zsim. Raises RunError if a run has no such drone.
     """
 
     def drones_of(scenario: Scenario) -> list[str]:
@@ -361,9 +362,9 @@ def process_of(role: str, names: Sequence[str]) -> str:
 
 
 def process_name(role: str, name: str, who: Identity, thing: str = "main") -> str:
-    """Return the name of a process: `name` if given, else its certificate's, else ROLE.THING.
+    """Return the name of a process: `name` if given, else the one in its certificate, else ROLE.THING.
 
-    SessionError if the certificate cannot be used.
+    Raises SessionError if the certificate cannot be used.
     """
     if name or who.tls is None:
         return name or f"{role}.{thing}"
@@ -373,7 +374,7 @@ def process_name(role: str, name: str, who: Identity, thing: str = "main") -> st
 
 
 def check_certificate(member: Agent, identity: Identity) -> None:
-    """Raise RunError for an agent whose messages access control would drop silently: those of other processes."""
+    """Raise RunError if the certificate does not cover all messages of an agent; the others would be lost silently."""
     if not identity.tls:
         return
     if member.serves:

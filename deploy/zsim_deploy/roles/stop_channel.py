@@ -3,10 +3,11 @@
 The standard input of a launched process is a pipe from its launcher. The launcher writes "stop REASON"; when it dies,
 the pipe closes. So no process outlives its launcher, on any system, even after kill -9. A launcher on another host
 writes "orphan-after SECONDS" and then a "beat" every second, because the loss of a host closes no pipe. A launched
-process that receives SIGTERM also ends in order, but counts as dead, because its launcher did not request that.
+process that receives SIGTERM also ends in an orderly way, but counts as dead, because its launcher did not request
+that.
 
-A process that ends removes the private key that `zsim up` has copied to its host. This file also has `lower_priority`,
-for processes that no gate waits for.
+A process that ends removes the private key that `zsim up` has copied to its host. This module also has
+`lower_priority`, for processes that no gate waits for.
 """
 
 import atexit
@@ -29,25 +30,25 @@ from zsim_deploy.roles.closed_output import CLOSED, redirect_output, write_error
 REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
 HANGUP = (signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()  # not on Windows
 TWICE_INTERRUPTED = "interrupted twice, ended without waiting"
-TERMINATED = 128 + signal.SIGTERM  # exit code, as in shells
+TERMINATED = 128 + signal.SIGTERM  # exit code after SIGTERM, as in shells
 GRACE_S = 4.0  # wall time for a role to end after a request to stop; then it is killed or interrupted
-FOLDER = "identity"  # folder of the certificates, below the folder of a run on a host
+FOLDER = "identity"  # folder of certificates, in the folder of a run on a host
 NICE = 5  # nice value of processes that no gate waits for
 AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
 TRIES = 5  # attempts to write AUTOGROUP
-AGAIN_S = 0.12  # wall time between these; the kernel allows all ordinary users together ten writes a second
+AGAIN_S = 0.12  # wall time between attempts; the kernel allows all ordinary users together ten writes a second
 
 
 class StopChannel:
     """Receives the request to stop a process, and holds its reason.
 
     Args:
-        launched: id of the run that the process is part of: standard input is the pipe from its launcher, and Ctrl-C is
-            left to the launcher. None: started by hand.
-        identity: of the process; its key, if copied here by the launcher, is removed as soon as the launcher is lost.
-        held_by: for a process that itself runs a user's code: returns, for a frame of the main thread, which code is
-            running. If `reason` is not called within GRACE_S, or the user presses Ctrl-C again, KeyboardInterrupt is
-            raised in that code.
+        launched: id of the run for which a launcher started the process; standard input is then the pipe from the
+            launcher, to which Ctrl-C is left. None: started by hand.
+        identity: identity of the process; a key copied here by the launcher is removed as soon as the launcher is lost.
+        held_by: only for a process that itself runs a user's code; returns, for a frame of the main thread, which code
+            is running. If `reason` is not called within GRACE_S of the request, or the user presses Ctrl-C again,
+            KeyboardInterrupt is raised in that code.
     """
 
     def __init__(
@@ -82,11 +83,11 @@ class StopChannel:
         return self._reason is not None
 
     def orphaned(self) -> bool:
-        """Whether the launcher is lost, or did not request this end; to others it must then look like a death."""
+        """Whether the launcher is lost, or did not request this end; to others, the end must then look like a death."""
         return self._orphaned
 
     def exit_if_terminated(self) -> None:
-        """Exit, at the very end, with the code that tells the launcher that SIGTERM came from elsewhere."""
+        """Exit with the code that tells the launcher that SIGTERM came from elsewhere, if it did; to be called last."""
         if self._terminated:
             raise SystemExit(TERMINATED)
 
@@ -106,7 +107,7 @@ class StopChannel:
             return
         if hasattr(signal, "pthread_kill"):  # also wakes the main thread if it sleeps
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        else:  # Windows, where Python handles a signal from any thread in the main one
+        else:  # Windows, where Python handles a signal from any thread in the main thread
             signal.raise_signal(signal.SIGINT)
 
     def _on_kill(self, *_: object) -> None:
@@ -153,7 +154,7 @@ class StopChannel:
 
 
 class KeyLease:
-    """A key that was copied to this host for this process; it is removed when the process ends for any reason."""
+    """A key that was copied to this host for this process; it is removed at exit, or when the launcher is lost."""
 
     def __init__(self, folder: Path) -> None:
         self._key = folder / KEY
@@ -168,7 +169,7 @@ class KeyLease:
 
 
 def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
-    """Return the lease of the key that the launcher of a run has copied here; None if the key is this host's own."""
+    """Return a lease on the key that a run's launcher has copied here; None if the key is this host's own."""
     folder = identity.tls
     if launched is None or folder is None or folder.parts[-3:-1] != (launched, FOLDER):
         return None
@@ -176,7 +177,7 @@ def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """Return inode and change time [ns], which distinguish a file from a newer one at its path; None without a file."""
+    """Return inode and change time [ns], which tell a file from a newer one at its path; None if there is no file."""
     try:
         status = path.stat()
     except OSError:
@@ -186,7 +187,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 @contextmanager
 def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    """Handle SIGINT and SIGTERM with a function for the duration of the block."""
+    """Handle SIGINT and SIGTERM with a function for the duration of the `with` block."""
     former = {number: signal.signal(number, handler) for number in REASONS}
     try:
         yield

@@ -2,8 +2,8 @@
 
     python -m zsim_deploy.roles.warm_up EXTRA...
 
-compiles those of the roles that need these extras, and prints the name of each function; `zsim push` runs it on hosts.
-Without numba there is nothing to compile.
+compiles the kernels of the roles that need these extras, and prints the name of each compiled function; `zsim push`
+runs it on hosts. Without numba there is nothing to compile.
 """
 
 import importlib.util
@@ -25,13 +25,13 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 
 SIZES = {"pair": 2, "triad": 3, "template": 5}  # number of drones, by kind of cluster; each kind has its own kernels
-# scenario for the world, whose kernels are the same for any number of drones
+# Scenario for the world, whose kernels are the same for any number of drones.
 ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}
 NESTED = ("groups", 2, 3)  # a cluster of groups: its name, number of groups, drones per group
-WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras with which the world runs; pyproject.toml
+WITH_WORLD = {"world", "sweep", "all", "dev"}  # extras that include the world; pyproject.toml
 WITH_AGENTS = WITH_WORLD | {"agents"}
 WITH_CAMERAS = {"cameras"}
-RADIUS_M = 4.0  # radius of the circle of each formation, so that none is collinear; any value well above zero
+RADIUS_M = 4.0  # radius of the circle of each formation, so that none is collinear; any value well above 0 would do
 
 
 def main(extras: Collection[str]) -> None:
@@ -55,7 +55,7 @@ def main(extras: Collection[str]) -> None:
 
 
 def _compile_mathematics() -> None:
-    """Call the functions that scenarios, laws and references may use, but the formations below do not."""
+    """Call the mathematical functions that scenarios, laws and references may use but the formations below do not."""
     for function in (el.sin, el.cos, el.tan, el.asin, el.acos, el.atan, el.exp, el.log, el.log1p, el.square):
         function(0.5)
     for function in (el.atan2, el.power, el.hypot):
@@ -69,7 +69,7 @@ def _compile_mathematics() -> None:
 
 
 def _info(scenario: Scenario) -> Info:
-    """Return a `world/info` for making agents without a world, so that the world's kernel need not be compiled."""
+    """Return a `world/info` message that stands in for a world, whose kernel then need not be compiled."""
     time = scenario.time
     drones = tuple(DroneInfo(drone.name, drone.model) for drone in scenario.drones)
     clusters = tuple(ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in scenario.clusters)
@@ -95,7 +95,7 @@ def formations() -> dict[str, Any]:
 
 
 def _show_compilation() -> None:
-    """Print a line for each function called from Python that is compiled, not for those loaded from disk."""
+    """From now on, print a line for each function called from Python that is compiled rather than loaded from disk."""
     from numba.core import event
 
     class Shown(event.Listener):

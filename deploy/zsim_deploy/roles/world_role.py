@@ -24,8 +24,8 @@ from zsim_deploy.roles.stop_channel import StopChannel
 if TYPE_CHECKING:
     from zsim_world.run.playback import PlaybackRange
 
-SHOWN_EVENTS = 2000  # events shown per run, besides those of VITAL kinds; the record has all of them
-HEALTH_PERIOD_S = 0.5  # minimum interval at which the health of a process is shown; contract: 1 Hz, but some send more
+SHOWN_EVENTS = 2000  # maximum number of events shown per run, besides those of VITAL kinds; the record has all events
+HEALTH_PERIOD_S = 0.5  # minimum interval between lines on a process's health; the contract says 1 Hz, some send more
 VITAL = frozenset({"death", "doubled", "failure", "overdue", "end"})  # kinds of events that are always shown
 
 
@@ -45,14 +45,14 @@ def world(
 
     Args:
         rate: pace in simulated seconds per wall second; 0: as fast as possible.
-        launched: id of the run, if a launcher started this process.
+        launched: id of the run, if a launcher started this process; else None.
         expect: names of further processes to wait for.
         journal: folder of the run's journal, from which a restarted world continues; None: no journal.
         all_died: whether all participants are restarted as well when the world continues.
-        changed: overrides that the scenario contains, as values of `--set`.
+        changed: overrides that the scenario already contains, as values of `--set`.
 
     Raises:
-        RunError: the journal is that of another run.
+        RunError: the journal belongs to another run.
         SessionError: an endpoint is in use, or the identity cannot be used.
         RunFailedError: a process left early.
     """
@@ -106,7 +106,7 @@ class WorldProgress:
         self._healths = RateLimit(HEALTH_PERIOD_S)
         self._reasons = HoldReasons()
         self._shown = 0
-        self._links: dict[str, str] = {}  # state of the link of each drone
+        self._links: dict[str, str] = {}  # link state of each drone
 
     def show(self, kind: str, message: Any, about: str) -> None:
         sink = self._sink
@@ -137,20 +137,20 @@ class WorldProgress:
 
 
 class ReplayOptions(NamedTuple):
-    """How to play a record."""
+    """Options for playing a record."""
 
     choice: "PlaybackRange"  # the part to play
     rate: float  # simulated seconds per wall second; 0: as fast as possible
     expect: tuple[str, ...]  # names of the processes to wait for
     endpoints: tuple[str, ...]  # endpoints to listen on
-    federation: str | None = None  # None: that of the record
+    federation: str | None = None  # federation to play in; None: the record's
 
 
 def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     """Play a record until its end, or until the process is stopped.
 
-    `place`: folder of a run, or its run.mcap. RunError or RecordError if there is no record, or it has nothing to play;
-    SessionError if an endpoint is in use, a key expression is invalid, or the identity cannot be used.
+    `place`: folder of a run, or its run.mcap. Raises RunError or RecordError if there is no record or it has nothing to
+    play, and SessionError if an endpoint is in use, a key expression is invalid, or the identity cannot be used.
     """
     from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run

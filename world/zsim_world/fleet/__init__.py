@@ -1,1 +1,1 @@
-"""The fleet of all drones, one gate at a time: kernel, injected faults, messages of a gate. Imports vehicles."""
+"""The fleet of all drones, advanced gate by gate: kernel, injected faults, messages of a gate. Imports vehicles."""

@@ -1,4 +1,4 @@
-"""The effects of faults on the arrays of a fleet: sensors, rotors and wind. Without faults these are unchanged."""
+"""The effects of faults on the arrays of a fleet: sensors, rotors and wind. Without faults the arrays are unchanged."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,12 +26,12 @@ class Impairment:
     """Applies faults to the drones of a fleet and to its wind.
 
     Args:
-        arrays: arrays of the fleet before its first gate.
+        arrays: arrays of the fleet, as before its first gate.
         drones, vehicles: names and vehicles of the drones, in scenario order.
-        scans: sampler of the sensors that cast rays, None if no drone has one.
+        scans: sampler of the sensors that cast rays; None if no drone has any.
 
     Attributes:
-        rotors: names of the rotors of each drone.
+        rotors: rotor names by drone.
     """
 
     SAVED: ClassVar[Saved] = {"_held": dict[int, tuple[float, ...]], "_gusts": tuple[Fault, ...], "_calm": bool}
@@ -52,12 +52,12 @@ class Impairment:
         self._steady = arrays.wind[WIND.steady : WIND.steady + 3].copy()
         self.rotors = {name: vehicle.rotor_names for name, vehicle in zip(drones, vehicles, strict=True)}
         self._sound = sound_actuators(len(drones), len(arrays.bodies.each))
-        self._held: dict[int, tuple[float, ...]] = {}  # speeds at which a fault holds the rotors of its drone
+        self._held: dict[int, tuple[float, ...]] = {}  # speeds at which a fault holds its drone's rotors, by id
         self._gusts: tuple[Fault, ...] = ()
         self._calm = True
 
     def strike(self, acting: Sequence[Fault]) -> None:
-        """Make exactly these faults act from now on; those that acted already continue unchanged."""
+        """Make exactly these faults act from now on; those already acting continue unchanged."""
         self._w.senses.config[:] = self._config
         self._w.boards.actuator[:] = self._sound
         if self._scans:
@@ -68,7 +68,7 @@ class Impairment:
         for fault in acting:
             if fault.target in self._index:
                 self._impair(fault, self._index[fault.target], stuck)
-        # newly stuck sensors hold their next sample; those no longer stuck are released
+        # Newly stuck sensors hold their next sample; those no longer stuck are released.
         hold = self._w.senses.fault[:, :, FAULT.hold]
         kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
         hold[:] = ss.FREE
@@ -77,7 +77,7 @@ class Impairment:
         self._gusts = tuple(fault for fault in acting if fault.kind == "gust")
 
     def blow(self, from_ns: int, until_ns: int) -> None:
-        """Set the steady wind between two instants."""
+        """Set the wind between two instants: the steady wind plus the gusts."""
         if self._calm and not self._gusts:
             return
         at_ns = (from_ns + until_ns) // 2
@@ -110,7 +110,7 @@ class Impairment:
         else:
             row[CONFIG.faulty] = 1.0
             offset = self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + part.channel.width]
-            (bias,) = fault.parameters.values()  # one number or vector, whatever its unit
+            (bias,) = fault.parameters.values()  # the only parameter: a number or vector, named by its unit
             offset += np.multiply(bias, part.channel.to_si)
 
     def _impair_rotors(self, fault: Fault, i: int, how: str) -> None:
@@ -146,9 +146,9 @@ def dropped(limit: float, probability: float) -> float:
 
 
 def gust_m_s(fault: Fault, t_ns: int) -> NDArray[np.float64]:
-    """Return the velocity that a gust adds [m/s; W]: v (1 - cos(2 pi t / T)) / 2, as in CS 25.341(a)(2).
+    """Return the velocity that a gust adds [m/s], in W: v (1 - cos(2 pi t / T)) / 2, as in CS 25.341(a)(2).
 
-    Over its length T, twice the gust gradient distance there, it rises to v and falls again.
+    Over its duration T (in CS 25: twice the gust gradient distance) the gust rises to v and falls to zero again.
     """
     assert fault.until_ns is not None  # a gust always has an end
     phase = 2.0 * math.pi * (t_ns - fault.from_ns) / (fault.until_ns - fault.from_ns)

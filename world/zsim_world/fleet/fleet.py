@@ -1,11 +1,11 @@
-"""The fleet: all drones of a scenario, advanced gate by gate, at first on the ground with stopped rotors.
+"""The fleet: all drones of a scenario, advanced gate by gate, initially on the ground with stopped rotors.
 
-An external drone also has a row, for collisions and downwash; its pose is set, not integrated. Its driver publishes a
-pose from time to time. Between poses the drone is extrapolated with its velocity until the pose is too old; then it
-stands still.
+An external drone also has a row in the arrays, for collisions and downwash; its pose is set, not integrated. Its driver
+publishes a pose from time to time. Between poses, the drone moves on at the published velocity until the pose is too
+old; then it stands still.
 
-Heights: `baro` altitude_m is the height over the origin of W (zeroed at the field, as the aircraft does at power-up),
-and pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
+Heights: the altitude_m of `baro` is the height above the origin of W (zeroed on site, as the aircraft does at
+power-up), and its pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
 """
 
 import math
@@ -78,10 +78,10 @@ from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
 
 GPS_FIX = 3  # NMEA: a three-dimensional fix
 GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
-TAKEOFF_CHARGE = 2.0  # times the charge at which it lands; with less it refuses a take-off
+TAKEOFF_CHARGE = 2.0  # multiple of the low-battery charge; with less, a drone refuses a take-off
 UPRIGHT_COSINE = 0.87  # cosine of 30 deg, the largest tilt for a take-off
-QUATERNION_SQUARE_MIN = 1e-6  # a shorter quaternion gives no orientation
-NOISE_GATES = 8  # gates between two refills; the noise of 100 drones then fits a cache of 1 MB
+QUATERNION_SQUARE_MIN = 1e-6  # squared length; a shorter quaternion gives no orientation
+NOISE_GATES = 8  # gates between refills of the noise table; the noise of 100 drones then fits into a cache of 1 MB
 _TAKES_SETPOINT = {mode for mode, state in enumerate(firmware.MODES) if state_refusal("", state, "setpoint") is None}
 
 
@@ -103,7 +103,7 @@ class TrueState(NamedTuple):
     orientation_wxyz: NDArray[np.float64]  # (N, 4), B to W
     angular_velocity_rad_s: NDArray[np.float64]  # (N, 3), B
     accel_m_s2: NDArray[np.float64]  # (N, 3), W
-    rotor_rad_s: NDArray[np.float64]  # (N, R), 0 where a drone has fewer
+    rotor_rad_s: NDArray[np.float64]  # (N, R), 0 where a drone has fewer rotors
 
 
 class Fleet:
@@ -113,11 +113,11 @@ class Fleet:
         names: names of the drones in scenario order, the order of their indices.
         rotors: number of rotors of each drone.
         external: index of each external drone among the external ones, by its index in the fleet.
-        gps_sigma_m: standard deviation of each drone's fixes [m].
+        gps_sigma_m: standard deviation of each drone's GPS fixes [m].
         impairment: effects of faults.
         bodies, boards: arrays of the kernel, read-only for callers.
         things: names of the obstacles, then of the surfaces.
-        beside: names of the sightings and scanners, numbered after all of `sensors`.
+        beside: names of sightings and scanners, whose sensor numbers follow those of `sensors`.
         sampled: samples due for publication in the last gate.
         seen: messages of sightings and scanners, by row of `sampled`.
         closest_m: smallest distance between two drones during the last gate [m]; inf for a single drone.
@@ -143,7 +143,7 @@ class Fleet:
         """Place the drones and take the samples at t = 0.
 
         Raises:
-            DivergedError: the scenario's numbers cannot be integrated.
+            DivergedError: the initial state is not finite, or out of bounds.
             DocumentError: the module of a drone's model is not installed here.
         """
         self.names = [drone.name for drone in scenario.drones]
@@ -185,21 +185,21 @@ class Fleet:
         place = scenario.environment
         self.things = [each.name for each in (*place.obstacles, *(place.surfaces or ()))]
         self._watch = FlightWatch(self._w, self.names, self.things)
-        # loads or compiles the function that the first command needs: in realtime no gate may wait for it
+        # Load or compile now what the first command needs, because in realtime no gate may wait for it.
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
     @property
     def arrays(self) -> list[NDArray]:
-        """All arrays of the kernel but the near pairs of drones."""
+        """All arrays of the kernel except the near pairs of drones."""
         return list(state_arrays(self._w))
 
     def restored(self) -> None:
-        self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
+        self.bodies.near.origin.fill(math.inf)  # so that the near pairs are found anew
 
     # Time
 
     def advance(self) -> None:
-        """Integrate one gate with the present setpoints.
+        """Integrate one gate with the current setpoints.
 
         Raises:
             DivergedError: the state of a drone is no longer finite.
@@ -259,7 +259,7 @@ class Fleet:
 
     @property
     def wind_m_s(self) -> NDArray[np.float64]:
-        """Wind at each drone [m/s; W], steady wind and gusts without downwash, (N, 3)."""
+        """Wind at each drone, (N, 3) [m/s; W]: steady wind and gusts, without downwash."""
         return self._w.gust + self._w.wind[WIND.steady : WIND.steady + 3]
 
     def truth(self) -> TrueState:
@@ -267,12 +267,12 @@ class Fleet:
         return TrueState(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], accel, s[:, STATE.size :])
 
     def status(self, i: int) -> tuple[DroneState, float, bool]:
-        """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
+        """Return the firmware's mode, the charge [%], and whether the hull touched another drone's in the last gate."""
         charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, VEHICLE.capacity)
         return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
 
     def bumps(self) -> list[tuple[int, int]]:
-        """Return the pairs of a drone and an index in `things` that began to touch in the last gate."""
+        """Return the contacts that began in the last gate, as pairs of a drone's index and an index in `things`."""
         if not self.bodies.bumped.size:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
@@ -328,18 +328,18 @@ class Fleet:
         yaw_rate_rad_s: float = 0.0,
         frame: Literal["heading", "world"] = "heading",
     ) -> str | None:
-        """Fly a velocity in the heading frame, or in W by the firmware's own heading; return why it is refused."""
+        """Fly at a velocity in the heading frame, or in W, using the firmware's heading; return why it is refused."""
         kind = firmware.VELOCITY if frame == "heading" else firmware.VELOCITY_WORLD
         return self._set(i, kind, (*velocity_m_s, yaw_rate_rad_s))
 
     def set_ardrone(
         self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
     ) -> str | None:
-        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return why it is refused."""
+        """Fly by tilt, climb and yaw rate, relative to their limits in [-1, 1], or hover; return why it is refused."""
         return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
 
     def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
-        """Fly a tilt (q_WB, w first, without its heading), thrust [N] and yaw rate; return why it is refused."""
+        """Fly at a tilt (q_WB, w first; its heading is ignored), thrust [N] and yaw rate; return why it is refused."""
         if fault := self.orientation_fault(i, q_WB):
             return fault
         return self._set(i, firmware.ATTITUDE, (*q_WB, thrust_n, yaw_rate_rad_s))
@@ -351,13 +351,13 @@ class Fleet:
         return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
 
     def orientation_fault(self, i: int, q_WB: Sequence[float]) -> str | None:
-        """Return why an orientation is invalid, None if it is valid."""
+        """Return why an orientation is invalid; None if it is valid."""
         if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
             return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
         return None
 
     def rotors_fault(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
-        """Return why rotor speeds do not fit a drone, None if they do."""
+        """Return why rotor speeds do not fit a drone; None if they do."""
         if len(speed_rad_s) != self.rotors[i]:
             return f"{self.names[i]} was sent {len(speed_rad_s)} rotor speeds; it has {self.rotors[i]} rotors"
         return None
@@ -386,14 +386,14 @@ class Fleet:
 
 
 class Pose(NamedTuple):
-    """A row of a fleet's states, and its gate [ns]."""
+    """A published row of a fleet's states, and its time [ns]."""
 
     t_ns: int
     row: NDArray[np.float64]  # (STATE.size + rotors of the drone,)
 
 
 class ExternalDrones:
-    """The external drones of a fleet, which follow published poses; `i` is the index of a drone in the fleet."""
+    """The external drones of a fleet, which follow published poses; `i` is a drone's index in the fleet."""
 
     SAVED: ClassVar[Saved] = {"_poses": dict[int, Pose], "_statuses": dict[int, Status]}
 
@@ -408,9 +408,9 @@ class ExternalDrones:
         return i in self._fleet.external
 
     def take(self, drone: str, message: Any, now_ns: int) -> str | None:
-        """Handle a Truth or Status of a driver; return why it is refused, or None.
+        """Handle a driver's Truth or Status; return why it is refused, or None.
 
-        `now_ns` is the newest gate. For other messages only the stamp is checked.
+        `now_ns`: time of the newest gate. Of other messages, only the time stamp is checked.
         """
         i, t_ns = self._index[drone], message.t_ns
         former = self._poses.get(i) if isinstance(message, Truth) else self._statuses.get(i)
@@ -437,7 +437,7 @@ class ExternalDrones:
         return None
 
     def lead(self) -> None:
-        """Extrapolate every drone whose driver has published a pose to the present, before the fleet advances.
+        """Before the fleet advances, extrapolate to the present every drone whose driver has published a pose.
 
         The velocity is constant, and zero once the pose is too old.
         """
@@ -450,13 +450,13 @@ class ExternalDrones:
             self._fleet.lead(i, row)
 
     def status(self, i: int) -> Status | None:
-        """Return the newest status, None before the first."""
+        """Return the newest status; None before the first."""
         return self._statuses.get(i)
 
     def command_refusal(self, i: int, kind: str, message: Any) -> str | None:
-        """Return why a command is not passed on to the driver, None if it is.
+        """Return why a command is not passed on to the driver; None if it is.
 
-        Stopping the rotors is always passed on; other commands depend on the newest state published by the driver.
+        A stop of the rotors is always passed on, other commands only if the newest state from the driver allows it.
         """
         name, requested = self._fleet.names[i], message.mode if kind == "mode" else "setpoint"
         if requested == "emergency":
@@ -501,7 +501,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     surfaces = len(scenario.environment.surfaces or ())
     each, slots = rotors.shape[1] // ROTOR.size, min(len(obstacles), SLOTS_MAX)
     state, anchor = np.zeros((n, STATE.size + each)), np.zeros((n, POINTS, 2))
-    for i, drone in enumerate(drones):  # on the ground its feet carry its weight; from a position above, it falls
+    for i, drone in enumerate(drones):  # on the ground the feet carry the weight; a drone placed higher falls
         yaw = math.radians(drone.yaw_deg)
         state[i, STATE.p_WB : STATE.p_WB + 3] = drone.position_m
         state[i, STATE.p_WB + 2] += row[i, VEHICLE.stand_height]
@@ -510,12 +510,12 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
         anchor[i] = np.array(drone.position_m[:2]) + linear.product(contact_points(row[i])[:, :2], turn.T)
     aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
-    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # to be found in the first tick: no drone is at its origin
+    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # found in the first tick: no drone is at its origin
     eye = np.array([_look(drone) for drone in drones])
     number, above = np.zeros(1, dtype=np.int64), np.zeros(n, dtype=np.int8)
     near = NearPairs(pair=pairs, number=number, origin=np.full((n, 3), np.inf), above=above, eye=eye)
     own = rigid_body.half_decay
-    half_decay = getattr(own, "py_func", own)  # not compiled: for a few numbers, compiling would take longer
+    half_decay = getattr(own, "py_func", own)  # not compiled: for so few numbers, compiling would take longer
     return Bodies(
         each=tuple(range(each)),
         vehicle=row,

@@ -1,6 +1,6 @@
-"""Incidents of drones: stopping or landing by themselves, flips, impacts, touchdowns, an empty battery.
+"""Incidents of drones: stops and landings of their own accord, flips, impacts, touchdowns, empty batteries.
 
-The kernel detects them in every step of the firmware (5 ms), regardless of the gate interval, without influence on the
+The kernel detects them in every step of the firmware (5 ms), regardless of the gate interval, without influencing the
 flight; they are described in words once per gate.
 """
 
@@ -20,13 +20,13 @@ from zsim_world.physics.surfaces import FEET, PLANE, POINTS, contact_point, near
 from zsim_world.vehicles.firmware import EMERGENCY, FLYING, HOVERING, LANDING, MEMORY, SETTING, TAKING_OFF
 from zsim_world.vehicles.observer import STEP_S
 
-IMPACT_STEPS = 4  # steps over which a change of velocity is measured: 20 ms, about half of a contact on the feet
-IMPACT_G = 5.0  # mean over these steps; chosen: twice what rotors and drag can give; a fall from 0.4 m reaches it
+IMPACT_STEPS = 4  # steps over which a change of velocity is measured: 20 ms, about half of a foot contact
+IMPACT_G = 5.0  # mean over these steps; design choice: twice what rotors and drag cause; a fall from 0.4 m reaches it
 IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, largest change of velocity without an impact
-UPRIGHT_AGAIN = 0.5  # chosen: cosine of the tilt; once above it, a drone may flip again
-QUIET_STEPS = round(1.0 / STEP_S)  # chosen: contacts within 1 s after an impact are its bounces
-MODE, FLIP, IMPACT, EMPTY, TOUCHDOWN = 1, 2, 4, 8, 16  # bits of the incidents of a drone
-NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; then obstacles, surfaces, drones
+UPRIGHT_AGAIN = 0.5  # cosine of 60 deg of tilt; design choice: well below 90 deg, so that one flip counts once
+QUIET_STEPS = round(1.0 / STEP_S)  # design choice: contacts within 1 s of an impact count as its bounces
+MODE, FLIP, IMPACT, EMPTY, TOUCHDOWN = 1, 2, 4, 8, 16  # incident bits of a drone
+NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; from FIRST_OBSTACLE on: obstacles, surfaces, drones
 
 SEEN = columns(
     "SeenColumns",
@@ -36,7 +36,7 @@ SEEN = columns(
         Field("empty", "1"),
         Field("quiet", "steps"),  # remaining steps without detection of impacts
         Field("external", "1"),  # 1: external drone
-        Field("airborne", "1"),  # has been out of reach of ground and obstacles since it last touched one
+        Field("airborne", "1"),  # has been clear of ground and obstacles since it last touched one
         Field("grounded", "1"),  # its touchdown in flight has been detected
         Field("surface", "see NOTHING"),  # surface of that touchdown
         Field("touched", "see NOTHING"),  # what it touched last
@@ -47,7 +47,7 @@ SEEN = columns(
 
 
 class Incident(NamedTuple):
-    """An incident of a drone for an event; `data` has its cause or figures."""
+    """An incident of a drone, to be published as an event; `data` has its cause or numbers."""
 
     drone: int
     kind: str
@@ -89,7 +89,7 @@ class FlightWatch:
         return found
 
     def _own_mode(self, i: int, name: str) -> Incident:
-        """Return the mode that the firmware of a drone has entered by itself, and the reason."""
+        """Return the incident that a drone's firmware has entered a mode by itself, with the reason."""
         if self._boards.memory[i, MEMORY.mode] == EMERGENCY:
             tilt_deg = math.degrees(el.acos(self._boards.setting[i, SETTING.tilt_cut]))
             text = f"{name} stops its rotors: it finds itself tilted by more than {tilt_deg:.0f} deg"
@@ -104,7 +104,7 @@ class FlightWatch:
 
 @inlined
 def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
-    """Add the incidents (bits) of N drones in step number `step` of the firmware to those of the gate."""
+    """Add the incident bits of all drones in firmware step number `step` to those of the gate."""
     seen, found = watched
     oldest = SEEN.v_WB + 3 * (step % IMPACT_STEPS)
     for i in range(found.size):
@@ -142,7 +142,7 @@ def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
 
 @inlined
 def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
-    """Note what drone i touches; return TOUCHDOWN when it first touches ground or obstacle in flight."""
+    """Note what drone i touches; return TOUCHDOWN when it first touches the ground or an obstacle in flight, else 0."""
     if bodies.braced[i] == 0 and bodies.state[i, STATE.p_WB + 2] > bodies.vehicle[i, VEHICLE.contact_reach]:
         seen[i, SEEN.airborne], seen[i, SEEN.grounded] = 1.0, 0.0
         return 0
@@ -169,7 +169,7 @@ def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
 
 @inlined
 def _surface(bodies: Bodies, i: int) -> int:
-    """Return the surface that a contact point of drone i is in, see NOTHING."""
+    """Return the code (see NOTHING) of a surface that a contact point of drone i has penetrated."""
     row, state = bodies.vehicle[i], bodies.state[i]
     p_WB, q_WB = vector(state, STATE.p_WB), four(state, STATE.q_WB)
     if p_WB[2] <= row[VEHICLE.contact_reach]:

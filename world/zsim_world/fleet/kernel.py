@@ -68,7 +68,7 @@ def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> No
 
 @inlined
 def _meet(wind: NDArray, gust: NDArray, bodies: Bodies, sheet: Sheet) -> float:
-    """Set air velocities and contact forces for the next tick; return the smallest distance of two drones [m]."""
+    """Set air velocities and contact forces for the next tick; return the smallest distance between two drones [m]."""
     for i in range(gust.shape[0]):
         bodies.braced[i] = 0
         for k in range(3):
@@ -116,7 +116,7 @@ def _sense(
 ) -> int:
     """Take all samples that are due at this tick; return the length of the log.
 
-    The IMU samples in every step of the board; only the samples that are due are published.
+    The IMU samples in every step of the firmware; only the samples that are due are published.
     """
     for i in range(bodies.state.shape[0]):
         if step:
@@ -179,7 +179,7 @@ def _note(row: NDArray, s: int, i: int, tick: int) -> None:
 
 @inlined
 def _diverged(state: NDArray) -> int:
-    """Return the first drone whose state is not finite or out of bounds, or -1."""
+    """Return the first drone whose state is not finite or is out of bounds; -1 if none is."""
     for i in range(state.shape[0]):
         size = 0.0
         for k in range(state.shape[1]):
@@ -198,14 +198,14 @@ def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
 
 @kernel()
 def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
-    """Integrate physics ticks; 0 ticks: take the samples of the present instant.
+    """Integrate physics ticks; with 0 ticks, only take the samples of the present instant.
 
     Args:
-        held: the arrays, by `zsim.math.compiled.hold`.
+        held: the fleet's `Arrays`, wrapped by `zsim.math.held.hold`.
 
     Returns:
-        number of samples logged, smallest distance of two drones [m], diverged drone or -1, whether there was an
-            incident.
+        number of samples logged, smallest distance between two drones [m], index of a diverged drone or -1, whether
+            there was an incident.
     """
     return _advance(held.content, ticks)
 

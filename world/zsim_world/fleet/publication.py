@@ -1,6 +1,6 @@
 """The encoded messages of a gate, in the order of the contract.
 
-Per drone: its samples in time order, truth, and last the status, which counts them.
+Per drone: its samples in time order, its truth, and last its status, which counts the others.
 """
 
 import math
@@ -35,19 +35,19 @@ MESSAGES = (  # in the order of KINDS
 )
 STOCK_SENSORS = len(STOCK)
 TRUTH, STATUS = STOCK_SENSORS, STOCK_SENSORS + 1
-OWN_MESSAGES = 2  # truth and status of a simulated drone in every gate
+OWN_MESSAGES = 2  # messages of a simulated drone in every gate besides its samples: truth and status
 WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
 OTHER_TRUTHS = tuple((flight_messages.Truth, rotors) for rotors in range(ROTORS_MIN + 1, ROTORS_MAX + 1))
 LAYOUTS = Layouts((*MESSAGES, *OTHER_TRUTHS))
 INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
 OPS, FIRST, LITERALS = LAYOUTS.program  # constants of the compiled code
-COMMANDER = len(firmware.MODES)  # the first word for a commander: no commander
+COMMANDER = len(firmware.MODES)  # number of the first word after the modes: no commander
 
 write = inlined(framing.write)
 
 
 class PublicationBuffers(NamedTuple):
-    """M messages, and room for more."""
+    """Room for M encoded messages."""
 
     columns: NDArray[np.int64]  # (3, M): WHICH, STAMPS, ENDS
     first: NDArray[np.int64]  # (N + 1,), where the messages of each drone begin
@@ -57,11 +57,11 @@ class PublicationBuffers(NamedTuple):
 class MessageRow(NamedTuple):
     ints: NDArray[np.int64]
     floats: NDArray[np.float64]
-    bits: NDArray[np.uint64]  # the same floats
+    bits: NDArray[np.uint64]  # the bits of `floats`
 
 
 class PublishedArrays(NamedTuple):
-    """The arrays of a fleet that are published, see `zsim_world.physics.fleet_arrays`."""
+    """The arrays of a fleet that are published; see `zsim_world.physics.fleet_arrays`."""
 
     state: NDArray[np.float64]
     accel: NDArray[np.float64]
@@ -74,7 +74,7 @@ class PublishedState(NamedTuple):
     """The other published values of N drones."""
 
     touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
-    sigma_m: NDArray[np.float64]  # (N,), of each drone's GPS
+    sigma_m: NDArray[np.float64]  # (N,), standard deviation of each drone's GPS fixes
     commanders: NDArray[np.int64]  # (N,), number of the word that names each drone's commander
     counts: NDArray[np.int64]  # (N, kinds), messages published so far per key
     rotors: NDArray[np.int64]  # (N,), number of rotors
@@ -82,10 +82,10 @@ class PublishedState(NamedTuple):
 
 
 class UserPayloads(NamedTuple):
-    """Messages of users' sensors among the M samples of a gate, one after the other."""
+    """Messages encoded in Python (users' sensors, sightings, scans) among the M samples of a gate, concatenated."""
 
     data: NDArray[np.uint8]
-    ends: NDArray[np.int64]  # (M,), end of each sample's message; those of stock sensors are empty
+    ends: NDArray[np.int64]  # (M,), end of each sample's message; messages of stock sensors are empty here
 
 
 NO_PAYLOADS = UserPayloads(np.empty(0, dtype=np.uint8), np.empty(0, dtype=np.int64))
@@ -115,7 +115,7 @@ class GatePublication:
         self.counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
         own_messages = np.array([0 if i in fleet.external else OWN_MESSAGES for i in range(fleet.count)])
-        self._first = int(np.argmax(own_messages))  # a drone with a status, which numbers the gates
+        self._first = int(np.argmax(own_messages))  # a drone whose status numbers the gates
         self._own_count = int(own_messages.sum())
         sigmas_m = np.array(fleet.gps_sigma_m)
         self._fleetwide = PublishedState(fleet.touching, sigmas_m, commanders, self.counts, rotors, own_messages)
@@ -124,13 +124,13 @@ class GatePublication:
         payloads = self._payloads()
         self._room_beside = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
         self._make_room(16 * fleet.count)
-        # loads or compiles the functions that the first gate needs, without counting messages
+        # Load or compile the functions that the first gate needs, without counting messages.
         uncounted = self._fleetwide._replace(counts=self.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
         publish(hold(state), *fleet.sampled, *payloads, 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
-        """Return the messages of the present gate; `commanders` has the commander of each drone, None for none."""
+        """Return the messages of the current gate; `commanders`: each drone's commander, or None."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + self._own_count
         payloads = self._payloads()
@@ -153,7 +153,7 @@ class GatePublication:
         return self._encoder.encoded(self._fleetwide.counts) if self._encoder else NO_PAYLOADS
 
     def _number(self, commander: str | None) -> int:
-        """Return the number of a word, adding it if it is new."""
+        """Return the number of the word for a commander, adding the word if it is new."""
         if commander not in self._known:
             self._known[commander] = COMMANDER + len(self._known)
             self._words = framing.words((*firmware.MODES, *self._known))
@@ -175,7 +175,7 @@ class UserMessages:
         self._messages = [message_type(kind.message.__name__, fields) for kind, fields in kinds]
 
     def encoded(self, counts: NDArray[np.int64]) -> UserPayloads:
-        """Return the messages of a gate; counts (N, kinds) of messages that each key has had."""
+        """Return the messages of a gate; `counts`: messages published so far by drone and kind, (N, kinds)."""
         seen = self._fleet.seen
         if not (seen or self._messages):
             return NO_PAYLOADS
@@ -246,7 +246,7 @@ def _fill_truth(row: MessageRow, state: NDArray, accel: NDArray, rotors: int) ->
 
 @compiled
 def _by_drone(whose: NDArray, own: NDArray, first: NDArray) -> None:
-    """Set where the messages of each drone begin, (N + 1,): its samples, and `own` ones."""
+    """Set `first`, (N + 1,), to where the messages of each drone begin: its samples, then its `own` others."""
     first[:] = 0
     for m in range(whose.shape[0]):
         first[whose[m, WHOSE.drone] + 1] += 1
@@ -256,7 +256,7 @@ def _by_drone(whose: NDArray, own: NDArray, first: NDArray) -> None:
 
 @compiled
 def _in_order(whose: NDArray, own: NDArray, first: NDArray) -> NDArray:
-    """Return the sample, -1 for truth or -2 for status, at each place."""
+    """Return, for each message in order, the index of its sample, or -1 for a truth, or -2 for a status."""
     drones = len(first) - 1
     order, free = np.empty(first[drones], np.int64), first.copy()
     for m in range(whose.shape[0]):
@@ -271,13 +271,13 @@ def _in_order(whose: NDArray, own: NDArray, first: NDArray) -> NDArray:
 
 @inlined
 def _kind(sensor: int) -> int:
-    """Return the number of a sensor's kind of message: those of users' sensors follow the status."""
+    """Return the number of a sensor's kind of message; those of users' sensors come after the status."""
     return sensor if sensor < STOCK_SENSORS else sensor + 2
 
 
 @inlined
 def _copy(user: UserPayloads, m: int, out: NDArray, start: int) -> int:
-    """Copy the encoded message of sample m of a user's sensor; return where it ends."""
+    """Copy the message of sample m, encoded in Python; return where the copy ends."""
     begin = user.ends[m - 1] if m > 0 else 0
     for k in range(user.ends[m] - begin):
         out[start + k] = user.data[begin + k]
@@ -295,7 +295,7 @@ def _fill(
     now_ns: int,
     count: int,
 ) -> int:
-    """Put sample m of drone i, its truth or its status into a row, and count it; return its kind."""
+    """Put sample m of drone i (m = -1: its truth, -2: its status) into a row, and count it; return its kind."""
     kind = _kind(sampled.whose[m, WHOSE.sensor]) if m >= 0 else TRUTH if m == -1 else STATUS
     row.ints[0], row.ints[1] = now_ns, wide.counts[i, kind]
     if m >= 0:
@@ -315,9 +315,9 @@ def publish(held: Held, whose: NDArray, values: NDArray, data: NDArray, ends: ND
     """Write the messages of a gate, drone by drone, and count them; return the number of bytes.
 
     Args:
-        held: a PublicationState, by `hold`.
-        whose, values: of Sampled.
-        data, ends: of UserPayloads.
+        held: a PublicationState, wrapped by `hold`.
+        whose, values: fields of Sampled.
+        data, ends: fields of UserPayloads.
     """
     words, seen, wide, out = held.content
     sampled, user = Sampled(whose, values), UserPayloads(data, ends)

@@ -1,4 +1,4 @@
-"""Which drones receive which at a gate: the topology and radio of a scenario, by the true positions of the drones."""
+"""Which drones receive which others at a gate, from the scenario's topology and radio, and the true positions."""
 
 from collections.abc import Iterable
 
@@ -19,10 +19,10 @@ Matrix = NDArray[np.bool_]
 
 
 class RadioChannel:
-    """The links between N drones, and, at the last index, the ground station if there is one.
+    """The links between N drones and, at the last index, the ground station if there is one.
 
     Args:
-        scene: what blocks lines of sight.
+        scene: the obstacles and surfaces that block lines of sight.
 
     Raises:
         ValueError: the scenario has neither a radio nor a topology.
@@ -49,11 +49,11 @@ class RadioChannel:
         self._is_open = not len(scene.tree.part)
 
     def links(self, t_ns: int, seq: int, position_m: NDArray[np.float64], faults: Iterable[Fault] = ()) -> RadioLinks:
-        """Return the message of a gate.
+        """Return the links at a gate, as a message.
 
         Args:
             position_m: positions of the drones in W, (N, 3).
-            faults: active faults; those of kind `radio` lower the reception of the drones of their target.
+            faults: active faults; those of kind `radio` lower the reception of the drones that they target.
         """
         radio, topology, n = self._radio, self._topology, self._count
         place_m = np.concatenate([position_m, self._station])
@@ -86,7 +86,7 @@ class RadioChannel:
         return RadioLinks(t_ns, seq, tuple(map(tuple, heard)), chances)
 
     def _of_target(self, target: str) -> Matrix:
-        """Return which places are drones of a cluster, of the world all."""
+        """Return which indices are drones of a cluster; all drones if the target is the world rather than a cluster."""
         of_target = np.zeros(len(self._allowed), dtype=bool)
         of_target[: self._count] = self._clusters.get(target, True)
         return of_target

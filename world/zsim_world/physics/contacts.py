@@ -25,7 +25,7 @@ WIND = columns(
     ),
 )
 JET_SPREAD = 0.107  # growth of a round jet's 1/e width (Fischer et al., Mixing in Inland and Coastal Waters, 1979)
-JET_WIDTHS = 3.0  # beyond three widths the jet is 1e-4 of its core
+JET_WIDTHS = 3.0  # beyond three widths the jet has about 1e-4 of its core speed
 
 
 @inlined
@@ -45,12 +45,12 @@ def gust_noise(correlation: float, common: float, own: float) -> float:
 
 @inlined
 def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt: float) -> None:
-    """Advance the gust (3,) [m/s] at one drone by dt in place, by the exact discretisation of the filter.
+    """Advance the gust (3,) [m/s] at one drone by dt, in place, by exact discretisation of the filter.
 
     Args:
-        wind: the wind's parameters (WIND.size,); load them once for many drones, so that roots are computed once.
+        wind: wind parameters (WIND.size,); load them once for many drones, so that square roots are computed once.
         v_WB: the drone's velocity [m/s].
-        common, own: standard normal numbers shared by all drones, and of this drone.
+        common, own: standard normal numbers: shared by all drones, and this drone's own.
     """
     square = 0.0
     for k in range(3):
@@ -65,7 +65,7 @@ def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt
 
 @inlined
 def jet_reach(start_m: float, below_m: float) -> float:
-    """Return the radius [m] of a jet at a distance below its start, given its width there."""
+    """Return the radius [m] of a jet at a distance below its start, given its width at the start."""
     return JET_WIDTHS * (start_m + JET_SPREAD * below_m)
 
 
@@ -73,11 +73,12 @@ def jet_reach(start_m: float, below_m: float) -> float:
 def downwash(thrust_n: float, density: float, start_m: float, below_m: float, aside_m: float) -> float:
     """Return the downward speed [m/s] of the air below a hovering drone.
 
-    The far wake of momentum theory, 2 v_h = 2 sqrt(T / (2 rho A)), as a turbulent round jet that keeps its momentum:
+    The far wake of momentum theory, 2 v_h = 2 sqrt(T / (2 rho A)), as a turbulent round jet of constant momentum:
     w = 2 v_h (b0 / b) exp(-(r / b)^2), b = b0 + 0.107 z, A = pi b0^2, b0 = sqrt(n) R for n rotors of radius R.
 
     Args:
-        thrust_n, start_m: thrust and b0 of the drone above; density: of the air [kg/m^3].
+        thrust_n, start_m: thrust and b0 of the drone above.
+        density: air density [kg/m^3].
         below_m, aside_m: position relative to the drone above, both >= 0.
     """
     width = start_m + JET_SPREAD * below_m
@@ -89,10 +90,10 @@ def downwash(thrust_n: float, density: float, start_m: float, below_m: float, as
     return core * el.exp(-ratio * ratio)
 
 
-DISTANCE_MIN_M = 1e-9  # m, lower bound that gives two drones at one position a direction
-CLOSE = 1.0 + 1e-9  # factor of a squared distance that exceeds any rounding error
-STRAY_M = 0.25  # m, motion of a drone after which near pairs are found again: 0.4 s at 0.6 m/s
-APPROACH_M = 0.501  # m, largest change of a pair's distance by then: twice STRAY_M, and a margin for rounding
+DISTANCE_MIN_M = 1e-9  # m; lower bound, so that two drones at the same position have a direction between them
+CLOSE = 1.0 + 1e-9  # factor on a squared distance that covers any rounding error
+STRAY_M = 0.25  # m; displacement of a drone after which the near pairs are updated; 0.4 s at 0.6 m/s
+APPROACH_M = 0.501  # m; largest change of a pair's distance by then: twice STRAY_M, plus a margin for rounding
 
 
 @inlined
@@ -123,20 +124,20 @@ def _blow(bodies: Bodies, above: int, below: int, aside: float, drop: float) -> 
 def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     """Separate the hulls of drones i and j, d = p_j - p_i: spring and damper along d, dry friction across it.
 
-    Both forces act at one point, a = (R_i - dent) n from i, so that linear and angular momentum are kept.
+    Both forces act at one point, a = (R_i - dent) n from i, so that linear and angular momentum are conserved.
     """
     n = scaled(d, 1.0 / distance)
     one, other = bodies.vehicle[i], bodies.vehicle[j]
     share = distance / (one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius])
     arms = scaled(n, share * one[VEHICLE.hull_radius]), scaled(n, -share * other[VEHICLE.hull_radius])
     v = subtract(velocity_at(bodies.state[j], arms[1]), velocity_at(bodies.state[i], arms[0]))
-    # the softer of the two, so that the step stays short enough for a light drone
+    # The softer hull counts, so that the time step is short enough for a light drone.
     stiffness = min(one[VEHICLE.hull_stiffness], other[VEHICLE.hull_stiffness])
     damping = min(one[VEHICLE.hull_damping], other[VEHICLE.hull_damping])
     depth = one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius] - distance
     normal = hull_force(stiffness, damping, depth, -dot(v, n))
     slip = axpy(v, -dot(v, n), n)
-    # slip is damped at the rate of the approach: a tangential force also turns the hull and meets less inertia
+    # Slip decays at the rate of the approach, although a tangential force, which turns the hull, meets less inertia.
     straight = 1.0 / one[VEHICLE.mass] + 1.0 / other[VEHICLE.mass]
     turning = dot(arms[0], arms[0]) / _least_inertia(one) + dot(arms[1], arms[1]) / _least_inertia(other)
     viscous, limit = (
@@ -169,7 +170,7 @@ def _meet(bodies: Bodies, i: int, j: int) -> float:
     aside2 = dx * dx + dy * dy
     square = aside2 + dz * dz
     distance, hulls = math.inf, vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
-    if square < CLOSE * hulls * hulls:  # most pairs are farther apart, and the root is costly
+    if square < CLOSE * hulls * hulls:  # most pairs are farther apart, and the square root is costly
         distance = max(math.sqrt(square), DISTANCE_MIN_M)
     contact = distance < hulls
     if contact:
@@ -198,7 +199,7 @@ def _strayed(state: NDArray, origin: NDArray) -> bool:
 
 @inlined
 def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: float) -> bool:
-    """Return whether a hull dz higher may come into the view down of a drone until one strays: within a cone, a range.
+    """Return whether a hull dz higher may enter a drone's downward view, a cone of limited range, until one strays.
 
     Args:
         eye: row of the looking drone in `NearPairs.eye`.
@@ -209,7 +210,7 @@ def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: flo
 
 @inlined
 def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPairs) -> None:
-    """Note all pairs that can touch, be in downwash or be the closest until a drone strays, and who is above."""
+    """Note all pairs that can touch, be in downwash or be the closest until a drone strays, and who is above others."""
     count, least = 0, math.inf
     for i in range(state.shape[0]):
         near.above[i] = 0
@@ -239,11 +240,11 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
 
 @inlined
 def meet_drones(bodies: Bodies) -> float:
-    """Add downwash to `air`, the forces between hulls to `push`, and return the smallest distance [m].
+    """Add downwash to `air` and hull forces to `push`; return the smallest distance between two drones [m].
 
-    Only near pairs are examined, in the order of all pairs, which gives the same bits as all pairs. They are updated
-    when a drone has moved by STRAY_M. `touching[i, j]` is 1 where i < j are in contact now; `touched` is set to 1 where
-    contact begins.
+    Only near pairs are examined, in the order of all pairs, which gives the same bits as examining all. They are
+    updated when a drone has moved by STRAY_M. `touching[i, j]` is 1 where i < j are in contact now; `touched` is set to
+    1 where contact begins.
     """
     near = bodies.near
     if _strayed(bodies.state, near.origin):

@@ -1,10 +1,9 @@
-"""The arrays of a fleet, which the kernel reads and writes. N drones, a row each; R rotors.
+"""The arrays of a fleet, which the kernel reads and writes: a row for each of N drones, with room for R rotors.
 
 R is the largest number of rotors in the fleet. Numbers per rotor follow the columns of a row, R for each group; for a
-drone with fewer rotors the speeds and limits of the missing ones are zero. `each`, a tuple of R numbers, gives compiled
-code their number: it is compiled for each R, with unrolled loops over rotors. R is four only if all vehicles are
-four-rotor crosses, whose positions and mixing are then constants of the code; with any other four-rotor layout, R is
-five.
+drone with fewer rotors the speeds and limits of the missing ones are zero. Compiled code takes R from `each`, a tuple
+of R numbers: it is compiled for each R, with unrolled loops over rotors. R is four only if all vehicles are four-rotor
+crosses, whose positions and mixing are then constants of the code; with any other four-rotor layout, R is five.
 """
 
 import math
@@ -32,7 +31,7 @@ VEHICLE = columns(
         Field("mass", "kg"),
         Field("inertia", "kg m^2", 3),
         Field("rotor_unit", "m"),  # unit of the rotors' positions: arm / sqrt(2)
-        Field("thrust", "N s^2"),  # at the field's air density; likewise torque and drag
+        Field("thrust", "N s^2"),  # at the scenario's air density; so are torque and drag
         Field("torque", "N m s^2"),
         Field("rotor_lag", "s"),
         Field("rotor_min", "rad/s"),
@@ -44,7 +43,7 @@ VEHICLE = columns(
         Field("rotor_inertia", "kg m^2"),
         Field("rotor_share", "1"),  # 1 / number of rotors
         Field("jet_start", "m"),  # width of the jet where it leaves the rotors
-        Field("contact_reach", "m"),  # farther than any contact point from the centre of mass
+        Field("contact_reach", "m"),  # distance from the centre of mass that no contact point exceeds
         Field("stand_height", "m"),  # height of the centre of mass of a standing drone
         Field("foot_stiffness", "N/m"),  # per contact point
         Field("foot_damping", "N s/m"),
@@ -54,7 +53,7 @@ VEHICLE = columns(
         Field("rim_height", "m"),
         Field("friction", "1"),
         Field("hull_radius", "m"),
-        Field("hull_stiffness", "N/m"),  # between two hulls of this drone's mass
+        Field("hull_stiffness", "N/m"),  # between two drones of this mass
         Field("hull_damping", "N s/m"),
         Field("capacity", "J"),  # energy of a full battery
         Field("efficiency", "1"),  # from electric to shaft power
@@ -76,7 +75,7 @@ ROTOR = columns(  # parameters of the rotors: one group per parameter, one numbe
         Field("lift", "1"),  # thrust / mean thrust of all rotors at zero moment; 1 for balanced rotors
     ),
 )
-AERO = columns(  # zsim.vehicles.vehicle.Aerodynamics, at the field's air density
+AERO = columns(  # zsim.vehicles.vehicle.Aerodynamics, at the scenario's air density
     "AeroColumns",
     (
         Field("linear", "N s/m", 3),
@@ -91,10 +90,10 @@ STATE = columns(  # followed by R rotor speeds [rad/s]
 )
 CLOCK = columns(
     "ClockColumns", (Field("tick", "1"), Field("ticks_per_step", "1"))
-)  # present tick; ticks per step of the board
+)  # current tick; ticks per step of the firmware
 SPAN = columns(
     "SpanColumns", (Field("dt", "s"), Field("hover", "s"), Field("land", "s"))
-)  # tick; silence until hovering, then landing
+)  # length of a tick; silence until hovering, then until landing
 PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W above sea level
 EXPOSED = columns(  # truth that a user's sensor measures; accel as in Bodies
     "ExposedColumns", (Field("state", "STATE", 13), Field("accel", "m/s^2, rad/s^2", 6), Field("air", "m/s", 3))
@@ -114,13 +113,13 @@ class KernelTime(NamedTuple):
 
 
 class NearPairs(NamedTuple):
-    """Pairs of drones that can affect each other, and the positions at which they were found (contacts.py)."""
+    """Pairs of drones that can affect each other, and the drones' positions when they were found (contacts.py)."""
 
     pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
     number: NDArray  # int64 (1,), number of pairs
     origin: NDArray  # (N, 3), m
     above: NDArray  # int8 (N,), 1 if a drone's sonar or flow sensor may see another drone
-    eye: NDArray  # (N, 3), view down: offset from the drone's centre [m], range [m], cosine of the largest tilt
+    eye: NDArray  # (N, 3), downward view: offset from the drone's centre [m], range [m], cosine of the largest tilt
 
 
 class Bodies(NamedTuple):
@@ -134,22 +133,22 @@ class Bodies(NamedTuple):
     energy: NDArray  # (N,), J
     air: NDArray  # (N, 3), m/s
     push: NDArray  # (N, 3), N
-    touching: NDArray  # int8 (N, N), hulls in contact now
-    touched: NDArray  # int8 (N, N), contacts that began in this gate
+    touching: NDArray  # int8 (N, N), 1 where hulls are in contact now
+    touched: NDArray  # int8 (N, N), 1 where contact began in this gate
     near: NearPairs
     obstacle: NDArray  # (M, obstacle.COLUMNS)
-    bumping: NDArray  # int8 (N, M + surfaces), 1 if more than a drone's feet touches an obstacle or surface
-    bumped: NDArray  # int8 (N, M + surfaces), contacts that began in this gate
-    solid: NDArray  # int32 (N, K), obstacles within reach, see physics/surfaces.py
+    bumping: NDArray  # int8 (N, M + surfaces), 1 if more of a drone than its feet touches an obstacle or surface
+    bumped: NDArray  # int8 (N, M + surfaces), 1 where such contact began in this gate
+    solid: NDArray  # int32 (N, K), obstacles within reach; see physics/surfaces.py
     held: NDArray  # (N, K, BALLS, 3), m, anchors on these obstacles
-    plane: NDArray  # (N, BALLS, PLANE.size), nearest planes of surfaces, see physics/surfaces.py; no rows without any
+    plane: NDArray  # (N, BALLS, PLANE.size), nearest planes of surfaces (physics/surfaces.py); no rows without surfaces
     braced: NDArray  # int8 (N,), 1 if an obstacle or surface is within reach or a hull touches another
     twist: NDArray  # (N, 3), N m in W, moment of other drones' hulls; valid where braced
-    lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
+    lanes: NDArray  # (blocks, columns of a block); see physics/simd.py
     aero_parts: tuple[int, ...]  # length 2 if any drone has aerodynamics, else 1: compiled code then omits them
     aero: NDArray  # (N, AERO.size)
     external: NDArray  # int64 (E,), indices of the drones that are not integrated
-    pose: NDArray  # (E, STATE.size + R), their states, extrapolated with their velocities in every tick
+    pose: NDArray  # (E, STATE.size + R), their states, extrapolated at their velocities in every tick
 
 
 class Boards(NamedTuple):
@@ -162,16 +161,16 @@ class Boards(NamedTuple):
     belief: NDArray  # (N, observer.BELIEF.size + R)
     actuator: NDArray  # (N, firmware.ACTUATOR.size + 2 R), effects of faults on rotor commands
     device: NDArray  # (N, observer.DEVICE.size)
-    lanes: NDArray  # (blocks, columns of a block), see firmware.py
+    lanes: NDArray  # (blocks, columns of a block); see firmware.py
 
 
 class NoiseRows(NamedTuple):
-    """Standard normal numbers, a row per drone; the last row holds those of the wind common to all."""
+    """Standard normal numbers, a row per drone; the last row is for the wind that is common to all."""
 
     table: NDArray  # (N + 1, all streams)
     at: NDArray  # int64 (STREAMS.size,), where each stream begins in a row
     width: NDArray  # int64 (N + 1, STREAMS.size), numbers per sample
-    cursor: NDArray  # int64 (N + 1, STREAMS.size), used numbers of each stream
+    cursor: NDArray  # int64 (N + 1, STREAMS.size), count of numbers used from each stream
 
 
 class Senses(NamedTuple):
@@ -191,7 +190,7 @@ class Senses(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """The data for detecting incidents of N drones, see fleet/flight_watch.py."""
+    """The data for detecting incidents of N drones; see fleet/flight_watch.py."""
 
     seen: NDArray  # (N, flight_watch.SEEN.size)
     found: NDArray  # int64 (N,), bits of each drone's incidents in the last gate
@@ -211,7 +210,7 @@ class Arrays(NamedTuple):
 
 
 def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
-    """Yield the arrays that make up the state of a fleet, without near pairs (found anew), scene and sheet."""
+    """Yield the arrays that make up the state of a fleet: all but near pairs (found anew), scene and sheet."""
     for member in group:
         if isinstance(member, np.ndarray):
             yield member
@@ -220,7 +219,7 @@ def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
 
 
 class PerRotor(NamedTuple):
-    """Groups of numbers per rotor of one drone, in a row or in a block of drones, read by `of`."""
+    """One drone's groups of numbers per rotor, in a row or in a block of drones; read by `of`."""
 
     numbers: NDArray
     first: int
@@ -229,7 +228,7 @@ class PerRotor(NamedTuple):
 
 
 class Aero(NamedTuple):
-    """Aerodynamics of one drone; compiled code knows the number of `parts` (Bodies.aero_parts) and omits the rest."""
+    """Aerodynamics of one drone; if `parts` (Bodies.aero_parts) has length 1, compiled code omits them."""
 
     parts: tuple[int, ...]
     numbers: Row  # (AERO.size,)
@@ -257,13 +256,13 @@ def put_four(row: NDArray, at: int, a: Quaternion) -> None:
 
 @inlined
 def of(rotors: PerRotor, group: int, r: int) -> float:
-    """Return the number of rotor r in a group."""
+    """Return the value for rotor r in a group."""
     return rotors.numbers[rotors.first + rotors.step * (group * len(rotors.each) + r)]
 
 
 @inlined
 def place(rotors: PerRotor, r: int) -> tuple[float, float, float]:
-    """Return x, y [rotor_unit] and turn of rotor r, `rotors` being its parameters."""
+    """Return x, y [rotor_unit] and turn of rotor r, from the drone's rotor parameters."""
     if len(rotors.each) == CROSS_ROTORS:
         return _X[r], _Y[r], _TURN[r]
     return of(rotors, ROTOR.x, r), of(rotors, ROTOR.y, r), of(rotors, ROTOR.turn, r)
@@ -271,7 +270,7 @@ def place(rotors: PerRotor, r: int) -> tuple[float, float, float]:
 
 @inlined
 def mixed(rotors: PerRotor, r: int) -> tuple[float, float, float, float]:
-    """Return roll, pitch, yaw of rotor r and the inverse of yaw, `rotors` being its parameters."""
+    """Return the mixer's roll, pitch, yaw and inverse of yaw for rotor r, from the drone's rotor parameters."""
     if len(rotors.each) == CROSS_ROTORS:
         return _ROLL[r], _PITCH[r], _YAW[r], 1.0 / _YAW[r]
     inverse = of(rotors, ROTOR.yaw_inverse, r)
@@ -280,7 +279,7 @@ def mixed(rotors: PerRotor, r: int) -> tuple[float, float, float, float]:
 
 @inlined
 def lift_share(rotors: PerRotor, r: int) -> float:
-    """Return the thrust of rotor r over the mean, `rotors` being its parameters."""
+    """Return the ratio of rotor r's thrust to the mean, from the drone's rotor parameters."""
     if len(rotors.each) == CROSS_ROTORS:
         return 1.0
     return of(rotors, ROTOR.lift, r)
@@ -288,7 +287,7 @@ def lift_share(rotors: PerRotor, r: int) -> float:
 
 @inlined
 def put_of(rotors: PerRotor, r: int, value: float) -> None:
-    """Set the number of rotor r in the first group."""
+    """Set the value for rotor r in the first group."""
     rotors.numbers[rotors.first + rotors.step * r] = value
 
 

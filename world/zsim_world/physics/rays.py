@@ -3,7 +3,7 @@
 Every convex solid is an intersection of slabs, or a quadric between two of them, so a ray is inside from the last entry
 to the first exit (Kay and Kajiya, SIGGRAPH 1986). Triangles: Moeller and Trumbore, J. Graphics Tools 2 (1997), both
 sides. Obstacles and triangles are the leaves of one bounding volume hierarchy, traversed from near to far. Drones move
-and are few: a caster tests each ray against those in reach.
+and are few: a caster tests each ray against those within reach.
 """
 
 import math
@@ -56,7 +56,7 @@ def scene(solid: Array, triangle: Array) -> Scene:
 
 
 def _bounds_of(row: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Return the minimum and maximum corner of an obstacle's bounding box."""
+    """Return the minimum and maximum corners of an obstacle's bounding box."""
     half, c, s = row[HALF : HALF + 3], abs(row[COSINE]), abs(row[SINE])
     if row[SHAPE] == BOX:
         half = [c * half[0] + s * half[1], s * half[0] + c * half[1], half[2]]
@@ -73,7 +73,7 @@ def inverse(x: float) -> float:
 
 @inlined
 def _slab(o: float, per: float, half: float) -> tuple[float, float]:
-    """Return when a ray enters and leaves |x| <= half, given 1 / its speed along x."""
+    """Return when a ray enters and leaves |x| <= half; `per`: 1 / its speed along x."""
     a, b = (-half - o) * per, (half - o) * per
     return (a, b) if a < b else (b, a)
 
@@ -96,7 +96,7 @@ def _quadric(a: float, b: float, c: float) -> tuple[float, float]:
 
 @inlined
 def _met(first: float, last: float, far: float) -> float:
-    """Return the distance at which a ray between `first` and `last` enters the solid, 0 from inside, else `far`."""
+    """Return where a ray that is in a solid from `first` to `last` enters it: 0 from inside, `far` if not before."""
     if first > last or last < 0.0:
         return far
     return min(max(first, 0.0), far)
@@ -104,7 +104,7 @@ def _met(first: float, last: float, far: float) -> float:
 
 @inlined
 def cast_solid(row: NDArray, o: Vector, d: Vector, far: float) -> float:
-    """Return the distance at which a ray from o along the unit vector d meets an obstacle, `far` if not before."""
+    """Return the distance at which a ray from o along the unit vector d meets an obstacle; `far` if not before."""
     ox, oy, oz = o[0] - row[CENTRE], o[1] - row[CENTRE + 1], o[2] - row[CENTRE + 2]
     radius = row[HALF]
     if row[SHAPE] == SPHERE:
@@ -125,7 +125,7 @@ def cast_solid(row: NDArray, o: Vector, d: Vector, far: float) -> float:
 
 @inlined
 def cast_triangle(row: NDArray, o: Vector, d: Vector, far: float) -> float:
-    """Return the distance at which a ray meets a triangle, `far` if not before."""
+    """Return the distance at which a ray meets a triangle; `far` if not before."""
     ax, ay, az, bx, by, bz = row[3], row[4], row[5], row[6], row[7], row[8]
     px, py, pz = d[1] * bz - d[2] * by, d[2] * bx - d[0] * bz, d[0] * by - d[1] * bx
     det = ax * px + ay * py + az * pz
@@ -145,7 +145,7 @@ def cast_triangle(row: NDArray, o: Vector, d: Vector, far: float) -> float:
 
 @inlined
 def cast_ground(o: Vector, d: Vector, far: float) -> float:
-    """Return the distance at which a ray meets z = 0 from above, `far` if not before."""
+    """Return the distance at which a ray meets z = 0 from above; `far` if not before."""
     if d[2] >= 0.0 or o[2] < 0.0:
         return far
     return min(-o[2] / d[2], far)
@@ -153,7 +153,7 @@ def cast_ground(o: Vector, d: Vector, far: float) -> float:
 
 @inlined
 def cast_hull(p_WB: Vector, q_WB: Quaternion, radius: float, o: Vector, d: Vector, far: float) -> float:
-    """Return the distance at which a ray meets a drone's hull, a flat body of revolution about its z axis."""
+    """Return the distance at which a ray meets a drone's hull, a spheroid flattened along its z axis, or `far`."""
     away = subtract(o, p_WB)
     along, square = dot(away, d), dot(away, away) - radius * radius
     if square > 0.0 and (along > 0.0 or along * along < square):
@@ -167,7 +167,7 @@ def cast_hull(p_WB: Vector, q_WB: Quaternion, radius: float, o: Vector, d: Vecto
 
 @inlined
 def _box(bounds: NDArray, o: Vector, per: Vector, far: float) -> float:
-    """Return the distance at which a ray enters a box, `far` or more if not before."""
+    """Return the distance at which a ray enters a box; `far` or more if not before."""
     first, last = 0.0, far
     for k in range(3):
         a, b = (bounds[k] - o[k]) * per[k], (bounds[k + 3] - o[k]) * per[k]
@@ -180,7 +180,7 @@ def _box(bounds: NDArray, o: Vector, per: Vector, far: float) -> float:
 
 @noinline
 def cast_parts(scene: Scene, o: Vector, d: Vector, far: float) -> float:
-    """Return the distance [m] at which a ray meets obstacle or triangle; arguments as of `cast`."""
+    """Return the distance [m] at which a ray meets an obstacle or a triangle; arguments as for `cast`."""
     best, count, tree = far, scene.solid.shape[0], scene.tree
     waiting, entered = tree.waiting, tree.away  # boxes to visit, and the distances at which the ray enters them [m]
     if tree.bounds.shape[0] == 0:
@@ -214,7 +214,7 @@ def cast_parts(scene: Scene, o: Vector, d: Vector, far: float) -> float:
 
 @inlined
 def cast(scene: Scene, o: Vector, d: Vector, far: float) -> float:
-    """Return the distance [m] at which a ray meets ground, obstacle or triangle; `far` if not before.
+    """Return the distance [m] at which a ray meets the ground, an obstacle or a triangle; `far` if not before.
 
     Args:
         o, d: origin [m] and unit direction of the ray, in W.

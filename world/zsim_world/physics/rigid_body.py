@@ -1,8 +1,8 @@
-"""One drone as a rigid body under rotors, drag, ground and contact forces; one step of fourth-order Runge-Kutta.
+"""One drone as a rigid body under rotor, drag, ground and contact forces, stepped by fourth-order Runge-Kutta.
 
-Then the rotors (lag, thrust, torque, power), the mixer, which finds speeds for a thrust and a torque, and the battery.
-Rotor r is at (x, y) rotor_unit in B; seen from above it turns clockwise where its `turn` is 1. `PerRotor` holds groups
-of numbers per rotor, in the order of fleet_arrays.ROTOR.
+Then come the rotors (lag, thrust, torque, power), the mixer, which finds speeds for a thrust and a moment, and the
+battery. Rotor r is at (x, y) in B, in units of rotor_unit; seen from above, it turns clockwise if its `turn` is 1.
+`PerRotor` holds groups of numbers per rotor, in the order of fleet_arrays.ROTOR.
 """
 
 import math
@@ -44,7 +44,7 @@ def pose(state: NDArray) -> tuple[Vector, Vector, Quaternion, Vector]:
 
 @inlined
 def velocity_at(state: NDArray, r_W: Vector) -> Vector:
-    """Return the velocity in W [m/s] of the point of a drone that is r_W from its centre of mass."""
+    """Return the velocity in W [m/s] of a drone's point at r_W from its centre of mass."""
     turn_W = rot.rotate(four(state, STATE.q_WB), vector(state, STATE.w_WB_B))
     return add(vector(state, STATE.v_WB), rot.cross(turn_W, r_W))
 
@@ -74,11 +74,11 @@ def accelerations(
 
     Args:
         grounded: a compile-time constant. False omits the ground, which is valid only out of its reach; without the
-            branch several drones are computed at once (simd.py).
-        row, rotors: parameters; anchor: of its contact points (surfaces.py).
-        p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `wrench`.
+            branch, several drones can be computed at once (simd.py).
+        row, rotors: the drone's parameters; anchor: anchors of its contact points (surfaces.py).
+        p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: as for `wrench`.
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
-        touch: its other contacts, None without any; aero: its aerodynamics, None with `drag` only.
+        touch: the drone's other contacts, None without any; aero: its aerodynamics, None if it has only `drag`.
     """
     ground = NOTHING, NOTHING
     if grounded:
@@ -161,7 +161,7 @@ def step(
 ) -> None:
     """Advance one drone's state (STATE.size + R,) by dt [s] in place under rotor commands (R,) [rad/s].
 
-    The rotors' lag is integrated exactly, also within the step; air velocity and forces of other drones are held.
+    The rotors' lag is integrated exactly, also within the step; air velocity and other drones' forces stay constant.
     """
     decay = half_decay(row[VEHICLE.rotor_lag], dt)
     speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)
@@ -178,7 +178,7 @@ def step(
 
 @inlined
 def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
-    """Advance rotor speeds [rad/s] in place until `decay` is left of their lag."""
+    """Advance rotor speeds [rad/s] in place until the fraction `decay` of their error is left."""
     for r in range(len(speeds.each)):
         put_of(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
 
@@ -212,7 +212,7 @@ def stepped(
 
     Args:
         grounded, row, rotors, anchor, air_W, push_W, touch, aero: as for `accelerations`.
-        p, v, q, w: state; speeds, commands: of the rotors at the start; decay: of their lag, see `half_decay`.
+        p, v, q, w: state; speeds, commands: of the rotors at the start; decay: see `half_decay`.
     """
     h, reach = 0.5 * dt, row[VEHICLE.contact_reach]
 
@@ -246,8 +246,8 @@ def stepped(
     )
 
 
-LOW_SQUARE_MIN = 1e-12  # (rad/s)^2, lower bound of a squared speed limit, which may be zero
-GROUND_CLEARANCE_MIN = 0.5  # rotor radii, smallest height for which the formula is used
+LOW_SQUARE_MIN = 1e-12  # (rad/s)^2; lower bound of a squared speed limit, because the limit may be zero
+GROUND_CLEARANCE_MIN = 0.5  # in rotor radii; smallest height for which the formula is used
 
 
 @inlined
@@ -260,7 +260,7 @@ def lagged(speed: float, command: float, decay: float) -> float:
 def ground_effect(height_m: float, radius_m: float) -> float:
     """Return the ratio of the thrust near the ground to that in free air: 1 / (1 - (R / 4z)^2).
 
-    Cheeseman and Bennett, ARC R&M 3021 (1955); z is the rotor's height, not taken below R/2 (factor 4/3).
+    Cheeseman and Bennett, ARC R&M 3021 (1955); z is the rotor's height, limited to at least R/2 (ratio 4/3).
     """
     z = max(height_m, GROUND_CLEARANCE_MIN * radius_m)
     ratio = radius_m / (4.0 * z)
@@ -278,17 +278,17 @@ def wrench(
     commands: PerRotor,
     decay: float | None,
 ) -> tuple[float, Vector]:
-    """Return thrust along z_B [N] and moment in B [N m] of the rotors.
+    """Return the rotors' thrust along z_B [N] and moment in B [N m].
 
     Moment: arms × thrusts, drag torque k_M w^2, reaction to the rotors' own acceleration J dw/dt, and the
     gyroscopic moment of their spin when the body turns.
 
     Args:
         row, rotors: the drone's parameters.
-        q_WB, height_m: attitude, and height of the centre of mass over the ground.
+        q_WB, height_m: attitude, and height of the centre of mass above the ground.
         w_WB_B: body rate [rad/s].
-        speeds, commands: of the rotors [rad/s] at the start of the step; decay: remaining fraction of their
-            lag since then, or None at the start.
+        speeds, commands: of the rotors [rad/s] at the start of the step; decay: fraction of their difference
+            that remains, or None at the start.
     """
     unit, radius, inertia = row[VEHICLE.rotor_unit], row[VEHICLE.rotor_radius], row[VEHICLE.rotor_inertia]
     ex, ey = rotate(q_WB, (unit, 0.0, 0.0))[2], rotate(q_WB, (0.0, unit, 0.0))[2]
@@ -322,10 +322,10 @@ def in_flow(
 ) -> tuple[Vector, Vector]:
     """Return the force [N] and moment [N m] in B due to flow past the rotors (zsim.vehicles.vehicle.Aerodynamics).
 
-    Translational lift is given for flying rotors; below the lowest commanded speed it scales with the speed squared.
+    Translational lift is specified for rotors in flight; below the minimum speed it scales with the speed squared.
 
     Args:
-        aero: (AERO.size,); u_B: velocity of the centre of mass against the air, in B [m/s].
+        aero: (AERO.size,); u_B: velocity of the centre of mass relative to the air, in B [m/s].
         row, rotors, w_WB_B, speeds, commands, decay: as for `wrench`.
     """
     unit, (wx, wy, wz) = row[VEHICLE.rotor_unit], w_WB_B
@@ -369,7 +369,7 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
         by_roll, by_pitch, _, _ = mixed(rotors, r)
         reach = max(reach, abs(by_roll * roll + by_pitch * pitch))
         least, most_lift = min(least, lift_share(rotors, r)), max(most_lift, lift_share(rotors, r))
-    # find a mean with (low + reach) / least <= mean <= (high - reach) / most_lift; reduce the tilt until one exists
+    # Find a mean with (low + reach) / least <= mean <= (high - reach) / most_lift; reduce the tilt until one exists.
     room = (high * least - low * most_lift) * (2.0 / (least + most_lift))
     scale = room / (2.0 * reach) if 2.0 * reach > room else 1.0
     roll, pitch, reach = roll * scale, pitch * scale, reach * scale
@@ -389,7 +389,7 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
 
 @inlined
 def power(row: NDArray, speeds: PerRotor) -> float:
-    """Return the electric power [W] at these rotor speeds [rad/s]: of the shafts, sum of k_M w^3, and of the board."""
+    """Return the electric power [W] at given rotor speeds [rad/s]: of the shafts, sum of k_M w^3, and electronics."""
     cubes = 0.0
     for r in range(len(speeds.each)):
         speed = of(speeds, 0, r)
@@ -405,5 +405,5 @@ def drained(row: NDArray, energy_j: float, speeds: PerRotor, dt: float) -> float
 
 @inlined
 def charge_percent(row: NDArray, energy_j: float) -> float:
-    """Return the charge in percent of a full battery."""
+    """Return the charge as a percentage of a full battery."""
     return 100.0 * energy_j / row[VEHICLE.capacity]

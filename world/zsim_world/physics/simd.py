@@ -1,13 +1,13 @@
 """Bodies in blocks of eight drones, computed together by SIMD instructions.
 
 Processors operate on eight numbers with one instruction (single instruction, multiple data) if these are adjacent in
-memory. So the drones are divided into blocks of LANES; a block is an array with the values of a column adjacent for all
-its drones: `block[LANES * column + lane]`. The compiler vectorises a branch-free loop over the lanes of a block; its
-length and columns are constants, so that neither an overlap check nor a remainder loop is needed. The operations of
-each drone keep their order, so the results are the same to the last bit for any block.
+memory. So the drones are divided into blocks of LANES; a block is an array in which the values of a column are adjacent
+for all its drones: `block[LANES * column + lane]`. The compiler vectorises a branch-free loop over the lanes of a
+block; the loop's length and the columns are constants, so that neither an overlap check nor a remainder loop is needed.
+The operations of each drone keep their order, so the results are the same to the last bit in any block.
 
 Equations with branches, such as ground contact, are computed per drone: a block is stepped as in free air, and drones
-with the ground or an obstacle in reach, or in contact with another drone, are stepped again with these.
+with the ground or an obstacle in reach, or in contact with another drone, are stepped again with these contacts.
 """
 
 from collections.abc import Iterable
@@ -29,13 +29,13 @@ BODY_LANES = columns(
     "BodyLanes",
     (
         Field("vehicle", "VEHICLE", VEHICLE.size),
-        Field("decay", "1"),  # remaining fraction of a rotor's lag after half a tick
+        Field("decay", "1"),  # fraction of a rotor's speed error left after half a tick
         Field("state", "STATE", STATE.size),
         Field("air", "m/s", 3),
         Field("push", "N", 3),
         Field("accel", "m/s^2, rad/s^2", 6),  # acceleration in W, angular acceleration in B
         Field("aero", "AERO", AERO.size),
-        Field("clear", "1"),  # 1 if the ground was out of reach in the whole step, so that its result holds
+        Field("clear", "1"),  # 1 if the ground was out of reach in the whole step, so that the step's result is valid
     ),
 )
 BODY_ROTORS = columns(
@@ -49,7 +49,7 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
     Args:
         count: number of columns of a block.
         parts: pairs of a first column and the numbers (N, any) from there on. Lanes without a drone, which are
-            computed too, get those of the last drone and an initial attitude, to avoid division by 0 in Python.
+            computed too, get those of the last drone, to avoid division by 0 in Python.
     """
     listed = list(parts)
     drones = len(listed[0][1])
@@ -62,7 +62,7 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
 
 
 def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray, aero: NDArray) -> NDArray[np.float64]:
-    """Return the blocks of N bodies: parameters, rotors, their decay in half a tick (N, 1), aerodynamics."""
+    """Return the blocks of N level bodies: parameters, rotors, their `half_decay` (N, 1), aerodynamics."""
     each = rotors.shape[1] // ROTOR.size
     known = BODY_LANES.size + BODY_ROTORS.known * each
     level = (BODY_LANES.state + STATE.q_WB, np.tile(LEVEL, (len(row), 1)))
@@ -159,7 +159,7 @@ def line_up(bodies: Bodies) -> None:
 
 @inlined
 def lead(bodies: Bodies, dt: float) -> None:
-    """Move the external drones with their velocities by one tick of dt [s], overriding the physics."""
+    """Move the external drones at their velocities for one tick of dt [s], overriding the physics."""
     for e in range(bodies.external.shape[0]):
         i, pose = bodies.external[e], bodies.pose[e]
         for c in range(3):
@@ -179,10 +179,9 @@ def _put_state(lanes: NDArray, k: int, state: NDArray, each: tuple[int, ...]) ->
 
 @inlined
 def _load(bodies: Bodies, lanes: NDArray, first: int) -> bool:
-    """Copy commands, air and forces into the lanes from `first` on; return whether any drone is above the ground's
-    reach.
+    """Copy commands, air and forces into a block; return whether any of its drones is out of the ground's reach.
 
-    Lanes without a drone hold arbitrary numbers, which are never read.
+    `first`: index of the block's first drone. Lanes without a drone hold arbitrary numbers, which are never read.
     """
     airborne, at = False, _group(BODY_ROTORS.command, bodies.each)
     for i in range(first, min(first + LANES, bodies.state.shape[0])):
@@ -288,7 +287,7 @@ def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> Non
         for r in range(len(bodies.each)):
             state[STATE.size + r] = lanes[LANES * (_group(BODY_ROTORS.speed, bodies.each) + r) + k]
     else:
-        if not _in_reach(bodies, i):  # the anchors were not moved while it was high
+        if not _in_reach(bodies, i):  # its anchors were not moved while it was high
             drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))
         if bodies.braced[i] != 0:
             _step_braced(bodies, i, dt)

@@ -10,7 +10,7 @@ was put in. A drone has slots for the solids within its reach, each with an anch
 every step and held within it.
 
 At surfaces (sheets of triangles) each ball instead has a plane at the nearest point, found after every step and
-then held. A sheet has no inside. A ball starts in front of it and its side is stored: it changes sides when its path
+then held. A sheet has no inside. A ball starts in front of it, and its side is stored: it changes sides when its path
 from step to step crosses a triangle, and behind the sheet it is pushed back, however deep it is. Beside a rim a ball is
 always free. A closed mesh therefore acts from outside as a solid; like a box, it can be penetrated where a wall is
 thinner than the dent of a collision.
@@ -38,7 +38,7 @@ POINTS = 8  # ground contact points: four feet, four corners of the hull's rim
 
 @inlined
 def contact_point(row: Row, k: int) -> Vector:
-    """Return contact point k in B [m]: front left, front right, rear right, rear left; first the feet."""
+    """Return contact point k in B [m]: front left, front right, rear right, rear left; the feet come first."""
     foot, x, y = k < 4, 1.0 if k % 4 < 2 else -1.0, 1.0 if k % 4 in (0, 3) else -1.0
     xy = row[VEHICLE.foot_xy] if foot else row[VEHICLE.rim_xy]
     return (x * xy, y * xy, -row[VEHICLE.foot_depth] if foot else row[VEHICLE.rim_height])
@@ -52,7 +52,7 @@ def contact_points(row: NDArray) -> np.ndarray:
 
 @inlined
 def _tangential(row: Row, normal: float, gap: Pair, speed: Pair) -> Pair:
-    """Return the friction force [N] of one point, within the cone."""
+    """Return the friction force [N] on one point, within the friction cone."""
     fx = -row[VEHICLE.foot_stiffness] * gap[0] - row[VEHICLE.foot_damping] * speed[0]
     fy = -row[VEHICLE.foot_stiffness] * gap[1] - row[VEHICLE.foot_damping] * speed[1]
     size = math.sqrt(fx * fx + fy * fy)
@@ -66,7 +66,7 @@ def _tangential(row: Row, normal: float, gap: Pair, speed: Pair) -> Pair:
 def contact(
     row: Row, anchor: NDArray, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
 ) -> tuple[Vector, Vector]:
-    """Return force in W [N] and moment in B [N m] of the ground on one drone.
+    """Return the force in W [N] and moment in B [N m] that the ground exerts on one drone.
 
     Args:
         row: the drone's parameters.
@@ -93,7 +93,7 @@ def contact(
 
 @inlined
 def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) -> None:
-    """Move the anchors after a step: to the contact point in the air, along with it where it slides."""
+    """Move the anchors after a step: to a contact point that is in the air, and along with one that slides."""
     for k in range(POINTS):
         r_W = rotate(q_WB, contact_point(row, k))
         x, y = p_WB[0] + r_W[0], p_WB[1] + r_W[1]
@@ -106,18 +106,18 @@ def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) 
             anchor[k, 0], anchor[k, 1] = x - gx * keep, y - gy * keep
 
 
-HULL_BALLS = 16  # balls along the hull; chosen: 2 cm apart on the AR.Drone; a thinner post meets the ball at the centre
+HULL_BALLS = 16  # design choice: gaps of 2 cm between them on the AR.Drone; a thinner post meets the ball at the centre
 BALLS = POINTS + HULL_BALLS + 1
-BALL_SHARE = 0.35  # in heights from feet to rim; chosen: in a landing tilted by 9 deg no hull ball touches
-BELOW_RIM_SHARE = 0.05  # in the same height; chosen: upside down, the rim bears the drone; more than a foot's sag
+BALL_SHARE = 0.35  # radius / height from feet to rim; design choice: in a landing tilted by 9 deg no hull ball touches
+BELOW_RIM_SHARE = 0.05  # of the same height; design choice: more than a foot's sag, so the rim bears an upturned drone
 FEET = 4  # number of feet, which come first among the contact points
-SLOTS_MAX = 8  # solids within reach of one drone at a time; chosen: as many boxes as meet in a corner
-LOOK_S = 0.01  # s, two of the longest steps; whatever a drone can touch within this time is within reach
+SLOTS_MAX = 8  # solids within reach of one drone at a time; design choice: as many boxes as can meet in a corner
+LOOK_S = 0.01  # s; two of the longest steps: whatever a drone can touch within this time is within reach
 _ANGLES = [2.0 * math.pi * (k + 0.5) / HULL_BALLS for k in range(HULL_BALLS)]
 _COSINES = (
     *(el.cos(angle) for angle in _ANGLES),
     0.0,
-)  # directions of the hull balls, in units of the radius of the hull's centre line
+)  # cosines of the directions of the hull balls; 0 for the ball at the centre
 _SINES = (*(el.sin(angle) for angle in _ANGLES), 0.0)
 
 nearest: Any = inlined(surroundings.nearest)
@@ -128,7 +128,7 @@ PLANE = columns(  # plane of a ball, at the nearest point of a surface
     (
         Field("side", "1"),  # 1: in front; -1: behind, where the ball is pushed back; 0: no surface within reach
         Field("normal_W", "1", 3),  # points to the side where the ball is free
-        Field("distance", "m"),  # signed distance of the ball's centre, below 0 behind the plane
+        Field("distance", "m"),  # signed distance of the ball's centre, negative behind the plane
         Field("surface", "1"),
         Field("centre_W", "m", 3),  # the ball's centre when the plane was found
         Field("anchor_W", "m", 3),
@@ -137,7 +137,7 @@ PLANE = columns(  # plane of a ball, at the nearest point of a surface
 
 
 class Touch(NamedTuple):
-    """The contacts of one drone beside the ground."""
+    """The contacts of one drone other than with the ground."""
 
     obstacle: NDArray  # (M, obstacle.COLUMNS)
     solid: NDArray  # int32 (K,), indices in `obstacle` of those within reach; -1: empty slot
@@ -152,7 +152,7 @@ def obstacle_rows(environment: Environment) -> NDArray[np.float64]:
 
 @inlined
 def ball(row: Row, k: int) -> tuple[Vector, float]:
-    """Return centre in B and radius [m] of ball k: four feet, four corners of the rim, the hull, its centre."""
+    """Return the centre in B and the radius [m] of ball k: four feet, four corners of the rim, the hull, its centre."""
     if k < POINTS:
         return contact_point(row, k), 0.0
     height = abs(row[VEHICLE.rim_height] + row[VEHICLE.foot_depth])
@@ -172,7 +172,7 @@ def _across(a: Vector, n: Vector) -> Vector:
 def touched(
     row: Row, touch: Touch, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
 ) -> tuple[Vector, Vector]:
-    """Return the force in W [N] and moment in B [N m] of obstacles, and the moment of other hulls, on one drone.
+    """Return the force in W [N] and moment in B [N m] of obstacles and surfaces on one drone, plus other hulls' moment.
 
     Args:
         row: the drone's parameters; touch: its contacts.
@@ -210,10 +210,10 @@ def touched(
 
 @inlined
 def _pushed(row: Row, k: int, depth: float, n: Vector, gap: Vector, v: Vector) -> Vector:
-    """Return the force in W [N] on ball k that is `depth` [m] in something whose normal is n.
+    """Return the force in W [N] on ball k, which is `depth` [m] deep in a body with surface normal n.
 
     Args:
-        gap: from its anchor to its centre [m; W]; v: its velocity [m/s; W].
+        gap: vector from the ball's anchor to its centre [m; W]; v: the ball's velocity [m/s; W].
     """
     hull = k >= POINTS
     stiffness = row[VEHICLE.hull_stiffness] if hull else row[VEHICLE.foot_stiffness]
@@ -226,16 +226,16 @@ def _pushed(row: Row, k: int, depth: float, n: Vector, gap: Vector, v: Vector) -
 
 @inlined
 def plane_depth(plane: NDArray, radius: float) -> float:
-    """Return the depth [m] of a ball in a surface when its plane was found; at most 0 if no surface is in reach."""
+    """Return how deep [m] a ball was in a surface when its plane was found; at most 0 without contact."""
     return radius - plane[PLANE.distance] if plane[PLANE.side] != 0.0 else 0.0
 
 
 @noinline
 def meet_obstacles(bodies: Bodies) -> None:
-    """Find the obstacles within reach of every drone, move its anchors, and note contacts of hulls.
+    """Find the obstacles within each drone's reach, move the drone's anchors, and note hull contacts.
 
-    `braced[i]` is 1 if there are any; `bumping[i, m]` is 1 if more than the feet is in contact now; `bumped` is set
-    to 1 where such contact begins.
+    `braced[i]` is set to 1 if there are any; `bumping[i, m]` is 1 if more than the feet is in contact now; `bumped`
+    is set to 1 where such contact begins.
     """
     p, v = STATE.p_WB, STATE.v_WB
     for i in range(bodies.state.shape[0]):
@@ -283,7 +283,7 @@ def brace(bodies: Bodies, i: int) -> None:
 
 @inlined
 def _slot(bodies: Bodies, i: int, m: int, distance: float) -> int:
-    """Return the slot for obstacle m of drone i: its own, or that of the farthest one; -1 if all hold nearer ones."""
+    """Return the slot for obstacle m of drone i: its present one, or that of the farthest one; -1 if all are nearer."""
     solid, p = bodies.solid[i], STATE.p_WB
     x, y, z = bodies.state[i, p], bodies.state[i, p + 1], bodies.state[i, p + 2]
     chosen, farthest = -1, distance
@@ -300,8 +300,8 @@ def _slot(bodies: Bodies, i: int, m: int, distance: float) -> int:
 def _drag_anchors(row: NDArray, solid: NDArray, anchor: NDArray, state: NDArray, is_new: bool) -> bool:
     """Move the anchors of one drone on one obstacle after a step; return whether more than its feet touches it.
 
-    An anchor is at its ball's centre where there is no contact or `is_new`, and otherwise follows within the friction
-    cone.
+    An anchor is put at its ball's centre if there is no contact or `is_new`; otherwise it follows the ball within the
+    friction cone.
     """
     p_WB, q_WB = vector(state, STATE.p_WB), four(state, STATE.q_WB)
     hit = False
@@ -316,7 +316,7 @@ def _drag_anchors(row: NDArray, solid: NDArray, anchor: NDArray, state: NDArray,
 
 @inlined
 def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: bool) -> None:
-    """Move the anchor (3,) [m; W] of a ball at x that is `depth` [m] in something whose normal is n."""
+    """Move the anchor (3,) [m; W] of a ball at x, which is `depth` [m] deep in a body with surface normal n."""
     keep, gap = 0.0, (0.0, 0.0, 0.0)
     if depth > 0.0:
         if not is_new:
@@ -327,16 +327,16 @@ def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: 
         anchor[axis] = x[axis] - keep * gap[axis]
 
 
-LOST_M = 1.0  # m, chosen: depth at which a drone is beyond the sheet
+LOST_M = 1.0  # m; design choice: depth from which a sheet no longer pushes a drone back
 TINY_M = 1e-9  # m; within this distance of an edge or corner a ball keeps its normal
-ROOM_M = 1e-6  # m, margin above the rounding error of a distance
+ROOM_M = 1e-6  # m; margin above the rounding error of a distance
 
 
 @noinline
 def meet_surfaces(bodies: Bodies, sheet: Sheet) -> None:
     """Find the planes of all drones' balls, move their anchors, and note which hulls touch which surfaces.
 
-    `braced[i]` becomes 1 where a surface is in reach; `bumping` and `bumped` as in `meet_obstacles`, in the
+    `braced[i]` is set to 1 if a surface is within reach; `bumping` and `bumped` are as in `meet_obstacles`, in the
     columns after those of obstacles.
     """
     first = bodies.obstacle.shape[0]
@@ -368,8 +368,8 @@ def meet_surfaces(bodies: Bodies, sheet: Sheet) -> None:
 def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: Quaternion, away: float) -> None:
     """Find the plane of ball k of a drone whose centre is `away` [m] from the nearest surface, and move its anchor.
 
-    A ball without a plane starts in front of the surface, unless it is slightly behind it as seen from the drone's
-    centre, as the feet of a drone that stands on the surface are.
+    A ball without a plane starts in front of the surface, unless it is slightly behind as seen from the drone's
+    centre, like the feet of a drone that stands on the surface.
     """
     r_B, radius = ball(row, k)
     x = add(p_WB, rotate(q_WB, r_B))
@@ -377,7 +377,7 @@ def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: 
     is_new = plane[PLANE.side] == 0.0
     side = 1.0 if is_new else plane[PLANE.side]
     was = p_WB if is_new else vector(plane, PLANE.centre_W)
-    near = row[VEHICLE.foot_depth] if is_new else norm(subtract(x, was))  # else its way is too short
+    near = row[VEHICLE.foot_depth] if is_new else norm(subtract(x, was))  # if farther away, it has not crossed
     if found.distance <= near and crosses(sheet, was, x):
         side = -side
     triangle = sheet.triangle[found.triangle]

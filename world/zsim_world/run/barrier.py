@@ -1,7 +1,8 @@
 """The participants of the lockstep, their progress, and those that the world waits for.
 
-Pure bookkeeping without session or clock: wall times are passed in. To integrate from t, the world needs the done of
-every gating participant for t minus the command delay. The done of a participant with slack may be older by the slack.
+Pure bookkeeping without session or clock: wall times are passed in. To integrate from t, the world needs the done
+message of every gating participant for t minus the command delay. That of a participant with slack may be older by the
+slack.
 """
 
 from collections.abc import Callable
@@ -40,7 +41,7 @@ class Participant:
     away: bool = False  # it has not yet rejoined a restarted world
     silent_wall_ns: int | None = None  # when its last health message arrived, if it has been silent since
     # A bye that names no incarnation and may therefore come from another process: it takes effect when the token is
-    # lost, and the next done cancels it
+    # lost, and the next done cancels it.
     farewell: Bye | None = None
 
     def __str__(self) -> str:
@@ -79,7 +80,7 @@ class Participant:
         return self.missing > 0 or self.lost_done
 
     def required_ns(self, need_ns: int) -> int | None:
-        """Return the newest done that `need_ns` requires of it; None if none is required yet."""
+        """Return the gate whose done `need_ns` requires of this participant; None if none is required yet."""
         join = self.join
         if join.period_ns > 0:
             required = need_ns - need_ns % join.period_ns
@@ -90,7 +91,7 @@ class Participant:
         return required if required >= self.from_ns else None
 
     def blocks(self, need_ns: int) -> bool:
-        """Return whether its done for `need_ns`, or an output that a done counted, has not arrived."""
+        """Return whether the done required for `need_ns`, or an output counted by a done, has not arrived."""
         required = self.required_ns(need_ns)
         return required is not None and (self.done_ns < required or self.incomplete)
 
@@ -105,7 +106,7 @@ class Participant:
         return missing
 
     def waiting(self, wall_ns: int, held_by: tuple[str, ...] = (), since_ns: int | None = None) -> Waiting:
-        """Return its entry in `clock`, waited for since `since_ns`, by default since its last done, join or death."""
+        """Return its entry in `clock`; `since_ns`: start of the wait, by default the last done, join or death."""
         since_ns = self.since_wall_ns if since_ns is None else since_ns
         return Waiting(self.name, self.join.host, (wall_ns - since_ns) / 1e9, held_by)
 
@@ -194,7 +195,7 @@ class Barrier:
     def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> Refusal | None:
         """Note that a participant has completed the gate `done_ns` of its message; return the refusal, or None.
 
-        A gap in the sequence numbers shows that a done was lost. Outputs beyond its count belong to the next done.
+        A gap in the sequence numbers shows that a done was lost. Outputs beyond its `sent` belong to the next done.
         """
         participant = self.participants.get(name)
         if participant is None:
@@ -255,7 +256,7 @@ class Barrier:
         return participant is not None and participant.farewell is not None
 
     def take_back_bye(self, name: str) -> Refusal | None:
-        """Drop the bye of a participant that continues, since another process sent it; return its refusal, or None."""
+        """Drop the bye of a participant that continues, which another process has sent; return its refusal, or None."""
         participant = self.participants[name]
         if participant.farewell is None:
             return None
@@ -319,7 +320,7 @@ class Barrier:
         return [p for p in self.participants.values() if p.blocks(need_ns)]
 
     def incomplete(self) -> list[Participant]:
-        """Return the participants of which outputs or a done were lost or are still in transit."""
+        """Return the participants with outputs or a done that were lost or are still in transit."""
         return [p for p in self.participants.values() if p.incomplete]
 
     def waiting_for(
@@ -327,7 +328,7 @@ class Barrier:
     ) -> tuple[Waiting, ...]:
         """Return the processes that the world waits for, as entries of `clock`.
 
-        Absent ones come first, then the dead, then the others, longest waited for first. `feeds(writer, reader)`
+        Absent ones come first, then the dead, then the others, those waited for longest first. `feeds(writer, reader)`
         returns whether the reader may be waiting for the writer's outputs.
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]

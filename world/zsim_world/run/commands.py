@@ -2,7 +2,7 @@
 
 The first source to send a setpoint to a drone without a commander becomes its commander, until it releases the drone,
 leaves or dies. Commands that take effect at the same time are ordered by (priority of the source, source, seq): the
-last wins.
+last one wins.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from zsim_world.run.run_clock import Operation, number, refused_argument
 MISSION_STATES = ("active", "finished", "aborted")
 MISSION_ITEMS_MAX, MISSION_REASON_MAX = 1_000_000, 80  # far more items than autopilots store; one line of text
 PROGRAM = 0  # priority of a program, by the contract
-RECENT_PER_DRONE = 32  # commands remembered to recognise duplicates; after a rejoin, those of two gates are repeated
+RECENT_PER_DRONE = 32  # commands remembered to recognise duplicates; a rejoin repeats those of two gates
 
 
 class CommandIntake:
@@ -104,7 +104,7 @@ class CommandIntake:
     def _link_delay_ns(self, drone: str, kind: str, message: Any, gate_ns: int) -> int | None:
         """Return the delay due to faults of the link to the world [ns], in whole gates; None if the command is lost.
 
-        `gate_ns` is the gate that the command belongs to.
+        `gate_ns`: the gate to which the command belongs.
         """
         acting = self._faults_at(gate_ns)
         if not acting:
@@ -263,7 +263,7 @@ class QueuedCommand(NamedTuple):
     priority: int
     source: str
     seq: int
-    drone: int  # with `kind`, makes the order independent of the arrival
+    drone: int  # with `kind`, makes the order independent of arrival
     kind: str
     message: Any
 
@@ -289,7 +289,7 @@ class CommandQueue:
         self._names = drones
         self._commanders: list[Commander | None] = [None] * len(drones)
         self._priorities: dict[tuple[int, str], int] = {}
-        self._queued: dict[int, list[QueuedCommand]] = {}  # by the time at which they take effect
+        self._queued: dict[int, list[QueuedCommand]] = {}  # commands by the time at which they take effect
         self._recent: dict[tuple[int, str, int, str, int], Any] = {}  # messages by fields that are quick to compare
 
     def restored(self) -> None:
@@ -312,7 +312,7 @@ class CommandQueue:
         return True
 
     def pop(self, t_ns: int, drones: Container[int] | None = None) -> list[QueuedCommand]:
-        """Remove and return the commands, of all or some drones, that take effect up to t_ns, in order of effect."""
+        """Remove and return, in order of effect, commands to `drones` (default: all) that take effect up to t_ns."""
         instants = sorted([instant for instant in self._queued if instant <= t_ns])
         due = [command for instant in instants for command in sorted(self._queued.pop(instant), key=_order)]
         if drones is None:
@@ -376,7 +376,7 @@ class CommandQueue:
         return drones
 
     def _drop_setpoints(self, source: str, drones: Container[int]) -> None:
-        """Remove the queued setpoints of a source to some drones; modes stay queued."""
+        """Remove the queued setpoints of a source to some drones; mode commands stay queued."""
         for instant, queued in self._queued.items():
             kept = [c for c in queued if c.kind == "mode" or c.source != source or c.drone not in drones]
             self._queued[instant] = kept

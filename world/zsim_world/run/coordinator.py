@@ -27,8 +27,8 @@ from zsim_world.run.outbox import STRANGERS_MAX, Budgets, KeyedMessage, Refusal,
 from zsim_world.run.run_clock import Operation, RunClock, RunStatistics, number
 
 RECORDER = "recorder"  # name and role
-START_TIMEOUT_S = 60.0  # wall time for expected processes that the launcher does not start
-START_TIMEOUT_OWN_S = 600.0  # wall time for processes that the launcher starts; compiling may take minutes
+START_TIMEOUT_S = 60.0  # wall time to join for expected processes that the launcher does not start
+START_TIMEOUT_OWN_S = 600.0  # wall time to join for processes that the launcher starts; compiling may take minutes
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # operations that change a flight
 ARGS_BYTES_MAX = 4000  # maximum size of arguments that an event repeats in full; all operations need far less
 
@@ -37,7 +37,7 @@ class Coordinator(ABC):
     """A run from its participants' point of view.
 
     Args:
-        rate: real-time factor, simulated seconds per wall second; 0 = as fast as possible.
+        rate: real-time factor, simulated seconds per wall second; 0: as fast as possible.
         run_id: set by a launcher, and by tests that compare records; None: random.
         expected: names of the processes required at the start.
 
@@ -249,7 +249,7 @@ class Coordinator(ABC):
             self.clock.stop(f"the recorder left: {bye.reason}")
 
     def _cannot_continue(self, participant: Participant, reason: str, wall_ns: int) -> None:
-        """Handle the bye of a process that failed, which is not restarted since it would fail again."""
+        """Handle the bye of a process that failed, which is not restarted because it would fail again."""
         name, action = participant.name, self._on_death(participant)
         action = "end" if action == "restart" else action
         self.outbox.event("failure", name, reason, {**participant.place, "on_death": action}, name)
@@ -317,7 +317,7 @@ class Coordinator(ABC):
             self.outbox.event("drop", name, f"{name} is waited for no longer", data)
 
     def overdue(self, wall_ns: int) -> str | None:
-        """Return a process that has not joined, or not returned after death or silence, in time; None if none."""
+        """Return a process that has not joined, or not returned after death or silence, in time, if any."""
         if self.clock.state == "waiting":
             waited_s = (wall_ns - self.start_wall_ns) / 1e9
             for name in self.barrier.absent():
@@ -386,7 +386,7 @@ class Coordinator(ABC):
     def falsely_joined(self, name: str, join: Join, fault: str) -> None:
         """Report a withheld join without a process behind it; an existing participant of that name stays.
 
-        It is published as an event within the budget; beyond it, it is only counted as a refusal.
+        Within the budget, it is published as an event; beyond, it is only counted as a refusal.
         """
         if not self.budgets.strangers.spend("no_show"):
             self.outbox.refusals.count += 1
@@ -480,7 +480,7 @@ class Coordinator(ABC):
         return self.blocking() if waits else []
 
     def must_wait_for(self, participant: Participant) -> bool:
-        """Return whether the scenario needs a participant, so that its first step may take any time."""
+        """Return whether the scenario needs a participant, so that its first step may take any length of time."""
         if participant.served_names <= self.unpaced:
             return True
         return not participant.successor and not participant.served_names.isdisjoint(self._expected)
@@ -554,6 +554,6 @@ class DataFlow:
                 if name not in self._rights:
                     self._rights[name] = roles.rights_for(name, self._scenario)
             reads, writes = self._rights[reader], self._rights[writer]
-            read = {*reads.reads} - {*reads.writes}  # keys that it also writes are read for their last values only
+            read = {*reads.reads} - {*reads.writes}  # keys that the reader also writes are read for last values only
             self._known[pair] = any(roles.permits(read, key) for key in writes.writes if "*" not in key)
         return self._known[pair]

@@ -84,7 +84,7 @@ class FaultInjector:
         self._effects.blow(now_ns, next_ns)
 
     def _begin_and_end(self, now_ns: int) -> None:
-        """Begin and end faults, and remove those that ended before every gate that may still be worked on."""
+        """Begin and end faults, and remove those that ended before any gate that is still worked on."""
         for fault in self.all:
             kind = fault_kinds.KINDS.get(fault.kind)
             is_instant = kind is not None and kind.lasts == "once"  # begins and ends at the same gate
@@ -211,7 +211,7 @@ class FaultInjector:
     def _publish(self) -> None:
         """Publish the list of faults before the next gate.
 
-        Faults that have not begun and have the same kind, target and start are numbered by their rank.
+        Faults that have not begun and have the same kind, target and start are numbered by `rank`.
         """
         equal: Counter[tuple[str, str, int]] = Counter()
         for fault in self.all:

@@ -23,13 +23,13 @@ from zsim.scenario import roles
 from zsim.schema.message import Count
 from zsim_world.run.coordinator import Coordinator
 
-PHASE_EVERY = 10  # cluster states per reading of the phase for the display
+PHASE_EVERY = 10  # one in this many cluster states is read for the phase on display
 OF_CAMERAS = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed from every process with a camera
 OF_DRIVERS = ("truth", "link")  # published by the driver of an external drone, beside its sensors
 
 ProgressCallback = Callable[[str, Any, str], None]
-"""Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every tenth ("state",
-message, cluster), ("link", message, drone), and ("resumed", simulated time in ns, process); shows progress."""
+"""Shows progress. Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every
+tenth ("state", message, cluster), ("link", message, drone), and ("resumed", simulated time in ns, process)."""
 
 Sample = tuple[str, bytes]  # key and payload
 
@@ -49,10 +49,10 @@ CALLS: dict[str, Any] = {  # methods of the world that are inputs, with the type
 }
 encode = msgspec.msgpack.Encoder().encode
 KEEP_NS = 5_000_000_000  # simulated time kept for replays
-KEEP_BYTES = 500_000_000  # limit of the payloads kept: 1000 drones have about 300 MB in KEEP_NS
+KEEP_BYTES = 500_000_000  # limit on the kept payloads; 1000 drones produce about 300 MB in KEEP_NS
 FOREIGN_BYTES = 50_000_000  # share of KEEP_BYTES for messages outside the contract
 LAST_MAX = 200_000  # keys whose last value is kept: 1000 drones have about 12 000
-PAGE_BYTES = 8_000_000  # payloads of one answer
+PAGE_BYTES = 8_000_000  # limit on the payloads of one answer
 EXPRESSIONS_MAX = 1000  # key expressions of one replay; a controller of hundreds of drones reads two keys of each
 _Entry = tuple[int, int, Pairs, int, bool]
 """Messages kept together: the world's time at arrival, their stamp, keys and payloads, the size of the payloads
@@ -60,7 +60,7 @@ _Entry = tuple[int, int, Pairs, int, bool]
 
 
 class _Head(msgspec.Struct):
-    """The fields that the world reads of messages that it only relays."""
+    """The fields that the world reads from messages that it only relays."""
 
     t_ns: int
     seq: int
@@ -211,7 +211,7 @@ class Run:
         self.world.outbox.refuse(source, key[:80], messages.fault_at(key, error))
 
     def refuse_sample(self, sample: Sample, error: DecodeError) -> None:
-        """Refuse a message; if its sender is known, it is an output of that sender, whose done counts it."""
+        """Refuse a message; if its sender is known, still count it as an output, because the sender's done does."""
         key, payload = sample
         self.refuse("somebody", key, error)
         with suppress(DecodeError):
@@ -226,7 +226,7 @@ class Entry(msgspec.Struct, array_like=True, tag_field="kind", tag=True):
     """One input."""
 
     def apply(self, run: Run) -> Any:
-        """Apply it to the world; return the answer to a request."""
+        """Apply the input to the world; return the answer to a request."""
         raise NotImplementedError
 
 
@@ -298,8 +298,8 @@ class MessageHistory:
     It keeps the messages of the world and of all participants, dead ones included.
 
     Args:
-        keep_bytes: limit of the payloads kept for replays.
-        page_bytes: limit of the payloads of one page.
+        keep_bytes: limit on the payloads kept for replays [bytes].
+        page_bytes: limit on the payloads of one page [bytes].
 
     Attributes:
         passed: messages not yet sent to recorders, in order.
@@ -319,7 +319,7 @@ class MessageHistory:
     def add(self, key: str, payload: bytes, t_ns: int) -> None:
         """Keep a message; t_ns is its stamp.
 
-        Its age counts from the world's clock at its arrival: a sender's stamp may be wrong.
+        Its age is measured from the world's time at its arrival, because a sender's stamp may be wrong.
         """
         if key == keys.CLOCK:
             self._now_ns = t_ns
@@ -370,7 +370,7 @@ class MessageHistory:
             start: 0, or the position returned with the previous page.
 
         Returns:
-            (key, payload) in order of arrival, and the position of the next page, None after the last page.
+            (key, payload) in order of arrival, and the position of the next page; None after the last page.
         """
         passed: list[tuple[str, bytes]] = []
         known: dict[str, bool] = {}

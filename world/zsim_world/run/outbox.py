@@ -1,6 +1,6 @@
-"""The messages and events that a run publishes, in order, and the limits of events, refusals and changes.
+"""The messages and events that a run publishes, in order, and the limits on events, refusals and changes.
 
-Limits count simulated time, so that a rerun from a record and a continuation from the journal apply the same ones.
+Limits apply per simulated time, so that a rerun from a record and a continuation from the journal apply the same ones.
 """
 
 import re
@@ -17,9 +17,9 @@ CHANGES_MAX = 1000  # changes of a source at once, as many as there may be fault
 UNJOINED = 10  # all sources that have not joined may together do as much as this number of joined sources
 STRANGERS_MAX = 100  # newcomers, and reports about unknown processes, at once; then one per simulated second
 SECOND_NS = 1_000_000_000
-EVENTS_MAX = 20  # events per source, subject and reason; further refusals are only counted
-REASONS_MAX = 10  # distinct reasons of a source and subject; all further ones count as one
-REFUSED_MAX = 1000  # events of all sources at once, since names can be invented; then one per simulated second
+EVENTS_MAX = 20  # refusal events per source, subject and reason; further refusals are only counted
+REASONS_MAX = 10  # distinct reasons per source and subject; all further ones count as one
+REFUSED_MAX = 1000  # refusal events of all sources at once, since names can be invented; then one per simulated second
 
 _FIGURE = re.compile(r"\d[\d.e+-]*")
 
@@ -115,9 +115,9 @@ class RefusalLog:
         self._counts: dict[tuple[str, str], dict[str, int]] = {}
 
     def add(self, source: str, subject: str, reason: str) -> str | None:
-        """Count a refusal; return the text of its event, None beyond the limits.
+        """Count a refusal; return the text of its event; None beyond the limits.
 
-        Reasons that differ only in figures, such as an age, count as one.
+        Reasons that differ only in numbers, such as an age, count as one.
         """
         self.count += 1
         if len(self._counts) > SUBJECTS_MAX:
@@ -135,7 +135,7 @@ class RefusalLog:
 
 
 class ChangeBudget(RateLimit):
-    """Limits the changes of each source: a number at once, then one per period of simulated time."""
+    """Limits the changes of each source: `most` at once, then one per period of simulated time."""
 
     SAVED: ClassVar[Saved] = {"_spent": dict[str, tuple[float, int]]}
 

@@ -37,12 +37,12 @@ RECORD_OVER = "the record is over"  # why a replay of the whole record ended
 NOT_FLYABLE = "a replay: nobody can be flown"
 SEEK_MAX_S = 1e9  # limit that keeps nanoseconds within an int64
 VIEWED_MAX = 10_000  # drones times time steps in one answer to `views`: 2 MB
-VIEWED_MAX_S = 60.0  # simulated, in one answer to `views`; chosen: the replay stands still while it reads them
+VIEWED_MAX_S = 60.0  # simulated time in one answer to `views`; design choice: the replay stands still while reading
 BEFORE_NS = 1_000_000_000  # time within which every source of a view is published at least once
 OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish them
 MARKS_MAX = 400  # marks on a timeline; more would be narrower than a pixel
 LEFT_OUT = frozenset({"command", "end"})  # kinds of events without a mark; commands are too many
-TEXT_MAX = 120  # characters
+TEXT_MAX = 120  # maximum length of a mark's text, characters
 SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # messages that name their publisher
 
 
@@ -50,14 +50,14 @@ class PlaybackRange(NamedTuple):
     """The part of a record that is played."""
 
     from_ns: int = 0  # first gate
-    to_ns: int | None = None  # last gate, None for the end
+    to_ns: int | None = None  # last gate; None: that of the record
     keys: tuple[str, ...] = ("**",)  # expressions; keys that match none are not played
     paused: bool = False  # stand still after the first gate
     holds: bool = False  # pause after the last gate instead of ending, so that users can seek back
 
 
 class _Live(NamedTuple):
-    """The names of all processes whose work participants do at a gate, so that their outputs are not played."""
+    """Names of all processes whose work participants do at a gate; their recorded outputs are not played."""
 
     names: set[str]
     by_name: set[str]  # names of participants that declare no camera and no detector of a drone
@@ -71,8 +71,8 @@ class Playback(Coordinator):
 
     Args:
         reader: reader of the record; it stays open.
-        scenario, info: those on record.
-        rate: simulated per wall seconds; 0 = as fast as possible.
+        scenario, info: scenario and `world/info` on record.
+        rate: simulated seconds per wall second; 0: as fast as possible.
         run_id: set by tests that compare records.
 
     Raises:
@@ -112,7 +112,7 @@ class Playback(Coordinator):
         self._viewed = self._view_sources & wanted
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
-        # published only on change: the last ones before the first gate are played with it
+        # Published only on change: the last ones before the first gate are played with it.
         self._standing = {key for key in wanted if key == keys.FAULTS or messages.type_of(key) is CameraInfo}
         gate_keys = wanted | ({keys.VIEW_DRONES} & topics.keys())
         self._recorded_gates = RecordedGates(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
@@ -190,7 +190,7 @@ class Playback(Coordinator):
         if role is None:
             return bool(live.names) and _author(recorded) in live.names
         _, drone, what = keys.parts(recorded.key)
-        if f"{role}.{drone}" in live.names:  # of the cameras that the scenario has; where it has none, of any
+        if f"{role}.{drone}" in live.names:  # replaces the scenario's cameras of that drone, or any if it has none
             cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
             if not cameras or camera == what or camera in cameras:
                 return True
@@ -201,7 +201,7 @@ class Playback(Coordinator):
         self._pending = []
         self._last.update((m.key, m.payload) for m in gate.messages if m.key in self._view_sources)
         for recorded in played:
-            if recorded.key == keys.FAULTS:  # known before the gate
+            if recorded.key == keys.FAULTS:  # must be known before the gate
                 self._publish(recorded)
         if of_drones := [m for m in gate.messages if m.key in self._place]:
             self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
@@ -228,7 +228,7 @@ class Playback(Coordinator):
     def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
         """Return the world's messages about its drones in the order of publication: drone by drone, status last.
 
-        The count of each status is corrected to the sensor messages played: agents would wait for the others.
+        The count in each status is corrected to the sensor messages played, because agents would wait for the others.
         """
         of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
         which = np.array([self._place[m.key] for m in of_drones])
@@ -278,7 +278,7 @@ class Playback(Coordinator):
             yield Output(keys.estimates_view(process), ViewEstimates(t_ns, seq, tuple(of_process)))
 
     def result(self) -> dict[str, Any]:
-        """Return the figures of the replay so far."""
+        """Return the statistics of the replay so far."""
         statistics = self.statistics.result(self.barrier.participants.values())
         about = {"replay_of": self._recorded.run_id, "refused": self.outbox.refusals.count}
         return {"reason": self.ended, "last_ns": self.now_ns, **statistics, **about}
@@ -301,7 +301,7 @@ class Playback(Coordinator):
         return ControlAnswer(False, NOT_FLYABLE) if request.op in FLIGHT_REQUESTS else super()._answer(request)
 
     def _seek(self, request: ControlRequest) -> Refusal | None:
-        """Continue from another gate. Refused while a participant gates: it would miss the gates between."""
+        """Continue from another gate. Refused while a participant gates: it would miss the gates in between."""
         t_s = number(request.args.get("t_s"))
         if t_s is None or not 0 <= t_s < SEEK_MAX_S:
             return refused_argument(request, "t_s", "a time on record [s]")
@@ -322,7 +322,7 @@ class Playback(Coordinator):
         return None
 
     def _timeline(self, _: ControlRequest) -> ControlAnswer:
-        """Answer the time range of the record [s] and its events except commands, thinned out evenly if many."""
+        """Answer with the record's time range [s] and its events except commands, thinned out evenly if many."""
         last = self._reader.last(keys.CLOCK)
         first = next(self._reader.messages([keys.CLOCK]), last)
         span = {"from_s": first.t_ns / 1e9, "to_s": last.t_ns / 1e9} if first and last else {}
@@ -336,7 +336,7 @@ class Playback(Coordinator):
         return ControlAnswer(True, result={**span, "marks": marks[:: -(-len(marks) // MARKS_MAX) or 1]})
 
     def _views_of_past(self, request: ControlRequest) -> Refusal | ControlAnswer:
-        """Answer the views at instants on record, `every_s` apart, for curves and trails."""
+        """Answer with the views at instants on record, `every_s` apart, for curves and trails."""
         from_s, to_s, every_s = (number(request.args.get(name)) for name in ("from_s", "to_s", "every_s"))
         if from_s is None or not 0.0 <= from_s < SEEK_MAX_S:
             return refused_argument(request, "from_s", "a time on record [s]")
@@ -378,8 +378,8 @@ class RecordedGates:
     """Reads a record gate by gate, starting anywhere.
 
     An answer to a gate is written a few gates later, since the world runs ahead of the agents; it is played at the gate
-    of its stamp. A message whose stamp is further from its place in the record (from a program that does not stamp, or
-    in realtime) is played at its place.
+    of its stamp. A message whose stamp is further from its position in the record (from a program that does not stamp,
+    or in realtime) is played at that position.
 
     Args:
         delay_ns: command delay of the run, by which the world may be ahead [ns].
@@ -404,7 +404,7 @@ class RecordedGates:
         newest = None
 
         def take(t_ns: int) -> Gate:
-            """Return a gate, with the messages of earlier gates that the record lacks."""
+            """Return a gate, including the messages due at earlier gates that are missing from the record."""
             due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
             return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
 
@@ -430,7 +430,7 @@ class RecordedGates:
         """Yield each instant with the last payload by key since the previous instant.
 
         Args:
-            instants_ns: ascending.
+            instants_ns: instants in ascending order [ns].
             wanted: keys to read.
             back_ns: time before the first instant from which to read [ns].
         """
@@ -467,7 +467,7 @@ def _is_played(key: str) -> bool:
 
 
 def _author(recorded: Recorded) -> str:
-    """Return the name of the process that published a message, empty for the world and unknown roles."""
+    """Return the name of the process that published a message; empty for the world and unknown roles."""
     kind = messages.type_of(recorded.key)
     if kind is flight_messages.Estimate:
         return f"estimator.{keys.thing(recorded.key)}"
@@ -494,7 +494,7 @@ def _without_kills(payload: bytes) -> bytes:
 
 
 def _read(last: Mapping[str, bytes], key: str) -> Any:
-    """Return the last message on a key, None if there is none or it cannot be decoded."""
+    """Return the last message on a key; None if there is none, or if it cannot be decoded."""
     payload = last.get(key)
     try:
         return messages.decode(key, payload) if payload is not None else None

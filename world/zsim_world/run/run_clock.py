@@ -18,25 +18,25 @@ from zsim_world.run.outbox import Refusal
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Carries out a request; returns why it is refused, an answer with a result, or None when done."""
-GATES_KEPT = 256  # gates whose publication time is kept for the age of commands; 5 s, older ones are refused
+GATES_KEPT = 256  # gates whose publication times are kept for command ages; 5 s: older commands are refused
 AGES_KEPT = 1_000_000  # ages kept for the percentiles; 8 MB
-MARK_NS = 10_000_000  # wall time between two marks of the rate, which covers the last second
+MARK_NS = 10_000_000  # wall time between marks from which the rate over the last second is computed
 
 
 class RunClock:
     """Simulated time and its state.
 
     Attributes:
-        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
+        rate: target pace, simulated seconds per wall second; 0: as fast as possible.
         delay_ns: command delay [ns].
         ahead_ns: how far the world may be ahead of the agents [ns].
         now_ns: the newest gate; also 0 before the start.
         next_ns: the next gate, from which the world waits for a newcomer.
         state: as in the message `clock`.
-        steps_allowed: gates that may still come while the run is paused.
+        steps_allowed: number of gates that may still follow while the run is paused.
         jumps: number of jumps of time to another gate.
-        ended: why the run has ended, None while it continues.
-        is_complete: whether it reached its regular end, so that it cannot be continued.
+        ended: why the run has ended; None while it continues.
+        is_complete: whether the run reached its regular end, so that it cannot be continued.
     """
 
     SAVED: ClassVar[Saved] = {  # state of a run that has not ended
@@ -61,12 +61,12 @@ class RunClock:
 
     @property
     def required_ns(self) -> int:
-        """Return the gate whose dones are required for the next one: its commands answer that gate."""
+        """The gate whose dones are required before the world advances: `ahead_ns` before the newest."""
         return self.now_ns - self.ahead_ns
 
     @property
     def is_halted(self) -> bool:
-        """Return whether time stands still regardless of dones: the run has ended or is paused."""
+        """Whether time stands still regardless of dones: the run has ended or is paused."""
         return self.ended is not None or (self.state == "paused" and self.steps_allowed == 0)
 
     def start(self, t_ns: int, paused: bool = False) -> None:
@@ -85,12 +85,12 @@ class RunClock:
         self.stop(reason)
 
     def stop(self, reason: str) -> None:
-        """End the run after the present gate; the first reason is kept."""
+        """End the run after the current gate; the first reason is kept."""
         if self.ended is None:
             self.ended = reason
 
     def hold(self) -> None:
-        """Pause until a request resumes or steps."""
+        """Pause until a request resumes or steps the run."""
         self.state, self.steps_allowed = "paused", 0
 
     # Requests
@@ -141,7 +141,7 @@ def number(value: Any) -> float | None:
 
 
 class CommandAges:
-    """Wall time from a gate's publication to the arrival of a command that answers it."""
+    """Wall times from a gate's publication to the arrival of a command that answers it."""
 
     SAVED: ClassVar[Saved] = {"_published": dict[int, int], "ages": bytes, "_oldest": int}
 
@@ -165,7 +165,7 @@ class CommandAges:
             del self._published[next(iter(self._published))]
 
     def command(self, t_ns: int, wall_ns: int) -> None:
-        """Note when a command stamped t_ns arrived; it has no age if no gate of that stamp is kept."""
+        """Note when a command stamped t_ns arrived; it has no age if that gate's time is not kept."""
         published_wall_ns = self._published.get(t_ns)
         if published_wall_ns is None:
             return
@@ -177,7 +177,7 @@ class CommandAges:
             self._oldest = (self._oldest + 1) % AGES_KEPT
 
     def summary_ms(self) -> dict[str, float] | None:
-        """Return p50, p99 and max in milliseconds, None without commands."""
+        """Return p50, p99 and max in milliseconds; None without commands."""
         if not self._ages_ns:
             return None
         ages = np.array(self._ages_ns) / 1e6
@@ -186,10 +186,10 @@ class CommandAges:
 
 
 class RealTimeFactor:
-    """Simulated per wall seconds, over the last wall second and over the run.
+    """Simulated seconds per wall second, over the last wall second and over the run.
 
     Attributes:
-        sim_ns: simulated time that has passed gate by gate since the first one.
+        sim_ns: simulated time that has passed since the first gate, without jumps.
     """
 
     SAVED: ClassVar[Saved] = {
@@ -200,7 +200,7 @@ class RealTimeFactor:
     }
 
     def __init__(self) -> None:
-        self._marks: list[tuple[int, int]] = []  # simulated and wall time; at most a second's
+        self._marks: list[tuple[int, int]] = []  # simulated and wall times within the last second
         self._start_wall_ns: int | None = None
         self._last = (0, 0)
         self.sim_ns = 0
@@ -242,7 +242,7 @@ class RunStatistics:
     """The statistics of a run for its event `end`.
 
     Attributes:
-        world_misses: gates that the world published too late.
+        world_misses: number of gates that the world published too late.
         closest_m: smallest distance between two drones so far, landed ones included [m]; inf for a single drone.
     """
 
@@ -274,7 +274,7 @@ class RunStatistics:
                 participant.deadline_misses += participant.blocks(need_ns)
 
     def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
-        """Return the figures of the run so far."""
+        """Return the statistics of the run so far."""
         by_name = {p.name: p.deadline_misses for p in participants if p.gating}
         sim_s, wall_s = self.rate.sim_ns / 1e9, self.rate.wall_s
         return {

@@ -37,7 +37,7 @@ class World(Coordinator):
 
     Args:
         mode: "lockstep" or "realtime".
-        rate: real-time factor, simulated seconds per wall second; 0 = as fast as possible.
+        rate: real-time factor, simulated seconds per wall second; 0: as fast as possible.
         run_id: set by a launcher, and by tests that compare records; None: random.
         changed: overrides of the scenario file as `a.b.c=value`; None if unknown.
 
@@ -133,7 +133,7 @@ class World(Coordinator):
     # State
 
     def checkpoint(self) -> State:
-        """Return the state from which the run continues to the same bits, without the truth hash.
+        """Return the state, without the truth hash, from which the run continues with the same bits.
 
         The outbox must be empty.
         """
@@ -197,7 +197,7 @@ class World(Coordinator):
             self._publish_incidents()
         state = fleet.bodies.state
         self.truth_hash.add(clock.now_ns, state[self._simulated] if self.external else state)
-        if self._radio is not None:  # before the gate, since agents start to work when that arrives
+        if self._radio is not None:  # before the gate, since agents start work when the gate arrives
             position_m, seq = state[:, STATE.p_WB : STATE.p_WB + 3], self.outbox.next_seq(keys.RADIO)
             acting = self.faults.of_links(clock.now_ns)
             self.outbox.put(keys.RADIO, self._radio.links(clock.now_ns, seq, position_m, acting))

@@ -3,8 +3,8 @@
 The kernel takes rows of standard normal numbers from one table; `refill` moves the unused rows to the front and draws
 the rest. A stream does not depend on the size of the table, nor on the other drones.
 
-The numbers are those of numpy's default generator (PCG64, ziggurat), compiled here, to the same bits (a test compares
-them): 2.7 ns per number in a loop, against 4 ns by calling numpy's generator from compiled code (docs/decisions/0017).
+The numbers are those of numpy's default generator (PCG64, ziggurat), compiled here, with the same bits (a test
+compares them): 2.7 ns per number in a loop, against 4 ns when compiled code calls numpy's (docs/decisions/0017).
 The generator: M. O'Neill, HMC-CS-2014-0905 (2014), PCG XSL-RR 128/64. The ziggurat: G. Marsaglia and W. W. Tsang, J.
 Stat. Softw. 5 (2000), with numpy's use of the bits. Its tables depend on numpy's rounding, so they are read from
 numpy's generator by setting its state to produce the word that selects an entry.
@@ -30,7 +30,7 @@ STREAMS = tuple(zip(SENSORS, CHANNELS, strict=True))  # name and channels of eac
 
 
 class NoiseTable:
-    """Standard normal numbers for `gates` gates: `table` (N + 1, all streams), `at`, `width`, `cursor` for the kernel.
+    """Standard normal numbers for `gates` gates: `table`, `at`, `width` and `cursor` as in NoiseRows.
 
     `streams` has the words of the generators, uint64 (N + 1, S, WORDS.size).
     """
@@ -39,7 +39,7 @@ class NoiseTable:
         names = [drone.name for drone in scenario.drones]
         streams = [[stream(scenario.seed, f"{name}/{s}") for s in (*SENSORS, "wind")] for name in names]
         common = stream(scenario.seed, "wind")
-        # rows of each stream, including the sample at t = 0
+        # Number of rows of each stream, including the sample at t = 0.
         span = gates * scenario.time.gate_ms / 1000.0
         rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
         self._rows = np.array([math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)])
@@ -63,14 +63,14 @@ class NoiseTable:
         self.refill()
 
     def refill(self) -> None:
-        """Replace the used rows."""
+        """Replace the used rows with fresh ones."""
         with np.errstate(over="ignore"):  # words wrap around; numpy warns of it if this is not compiled
             refill(self.table, self.at, self._rows, self.width, self.cursor, self.streams)
 
     def _draw_start(
         self, scenario: Scenario, streams: list[list[np.random.Generator]], shared: np.random.Generator
     ) -> None:
-        """Draw the biases and gusts at the start, the first numbers of each stream."""
+        """Draw the initial biases and gusts, from the first numbers of each stream."""
         common = shared.standard_normal(3)
         share = scenario.environment.wind.gust_correlation
         for i, drone in enumerate(scenario.drones):
@@ -87,10 +87,10 @@ class NoiseTable:
 
 @kernel(makes_arrays=False)
 def refill(table: NDArray, at: NDArray, rows: NDArray, widths: NDArray, cursor: NDArray, streams: NDArray) -> None:
-    """Move the unused rows of every stream to its front in the table, and draw the rest.
+    """Move the unused rows of every stream to the front of its part of the table, and draw the rest.
 
     Args:
-        table, at: as in NoiseRows; cursor: used rows of each stream, reset to 0.
+        table, at: as in NoiseRows; cursor: number of used rows of each stream, reset to 0.
         rows: int64 (S,), rows of each stream in the table.
         widths: int64 (N + 1, S), numbers in a row of each stream.
         streams: uint64 (N + 1, S, WORDS.size), words of each stream.
@@ -111,10 +111,10 @@ WORDS = columns(
 
 _LAYERS, _SIZES = 256, 2**52  # layers of the ziggurat; possible sizes in a layer
 _TAIL, _TAIL_INVERSE = 3.6541528853610087963519472518, 1.0 / 3.6541528853610087963519472518  # start of the tail
-_MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645  # O'Neill, multiplier for 128 bit
+_MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645  # O'Neill: multiplier for 128 bits
 _MODULUS = 2**128
 _MULTIPLIER_INVERSE = pow(_MULTIPLIER, -1, _MODULUS)
-_ROUNDING = 8  # sizes, more than the rounding error of the first size that is not inside
+_ROUNDING = 8  # in sizes; more than the rounding error of the first size that is not inside
 _MULTIPLIER_HIGH, _MULTIPLIER_LOW = np.uint64(_MULTIPLIER >> 64), np.uint64(_MULTIPLIER & (2**64 - 1))
 _HALF, _HALF_BITS = np.uint64(0xFFFFFFFF), np.uint64(32)
 _TURN_SHIFT, _TURN_MASK = np.uint64(58), np.uint64(63)  # the six highest bits give the rotation of the word
@@ -133,7 +133,7 @@ _Words = tuple[np.uint64, np.uint64]  # high, low
 class Ziggurat(NamedTuple):
     """Tables of the ziggurat, (256,) each."""
 
-    width: NDArray[np.float64]  # number per size
+    width: NDArray[np.float64]  # number per unit of size
     inside: NDArray[np.uint64]  # smaller sizes are entirely under the curve
     height: NDArray[np.float64]  # height of the curve at the end of the layer
 
@@ -169,7 +169,7 @@ _WIDTH, _INSIDE, _HEIGHT = _read_tables()
 
 
 def words(rng: np.random.Generator) -> list[int]:
-    """Return the words of a stream, (WORDS.size,), at the present state of numpy's generator.
+    """Return the words of a stream, (WORDS.size,), for the current state of numpy's generator.
 
     Raises:
         ValueError: the generator is not a PCG64.
@@ -217,7 +217,7 @@ def fill(out: NDArray, stream: NDArray) -> None:
 
 @inlined
 def _high_product(a: np.uint64, b: np.uint64) -> np.uint64:
-    """Return the upper 64 bits of a b."""
+    """Return the upper 64 bits of a * b."""
     a0, a1, b0, b1 = a & _HALF, a >> _HALF_BITS, b & _HALF, b >> _HALF_BITS
     middle = a1 * b0 + ((a0 * b0) >> _HALF_BITS)
     carried = a0 * b1 + (middle & _HALF)
@@ -226,7 +226,7 @@ def _high_product(a: np.uint64, b: np.uint64) -> np.uint64:
 
 @inlined
 def _advanced(state: _Words, step: _Words) -> _Words:
-    """Return state * multiplier + step, of 128 bit."""
+    """Return state * multiplier + step, modulo 2^128."""
     product = state[1] * _MULTIPLIER_LOW
     high = _high_product(state[1], _MULTIPLIER_LOW) + state[1] * _MULTIPLIER_HIGH + state[0] * _MULTIPLIER_LOW
     low = product + step[1]

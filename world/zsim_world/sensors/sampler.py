@@ -74,7 +74,7 @@ class Sampler:
         self._later = NONE
 
     def due(self, logged: int, now_ns: int) -> Sampled:
-        """Return the samples due by `now_ns`, from the first `logged` rows of the log and from those held back.
+        """Return the samples due by `now_ns`, from the first `logged` rows of the log and from the samples held back.
 
         Raises:
             UserCodeError: the equation of a user's sensor fails.
@@ -289,7 +289,7 @@ class Exposures:
     def until(self, state: Array, now_ns: int) -> tuple[list[tuple[int, int]], Between | None]:
         """Return the samples due by a gate and the states around them; without samples, an empty list and None.
 
-        Samples are (time [ns], index of the sensor), in this order.
+        A sample is (time [ns], index of the sensor); samples are sorted by these.
 
         Args:
             state: states of all drones at the gate, (N, STATE.size or more).
@@ -307,7 +307,7 @@ class Exposures:
             self._next_ns = min(self._due_ns)
             former, former_ns = (self._former, self._former_ns) if len(self._former) else (now, now_ns)
             between = Between(former, former_ns, now, now_ns)
-        if self._next_ns <= now_ns + self._gate_ns:  # a sample by the next gate needs this state
+        if self._next_ns <= now_ns + self._gate_ns:  # a sample due by the next gate needs this state
             self._former, self._former_ns = state[:, : STATE.size].copy(), now_ns
         return due, between
 
@@ -325,7 +325,7 @@ def poses_between(former: NDArray, former_ns: int, now: NDArray, now_ns: int, t_
     """Return the poses of all drones at t_ns between two gates, as rows like `former`.
 
     Args:
-        former, now: states at the gates, (N, STATE.size or more); columns beside the pose are interpolated linearly.
+        former, now: states at the gates, (N, STATE.size or more); columns besides the pose are interpolated linearly.
         former_ns, now_ns: times of the gates [ns].
     """
     if t_ns >= now_ns or now_ns <= former_ns:

@@ -33,7 +33,7 @@ from zsim_world.sensors.sensor_set import rounded
 
 CONE_RAYS = 8  # rays on the cone of a beam that has one, in addition to the ray along its axis
 SHARE_MIN = 0.2  # lower bound of a ray's depth over its length, which is 0.26 at the edge of a 150 deg picture
-MOUNT_MAX_M = 2.0  # m, generous bound on the distance of a sensor from its drone's centre, used to skip far drones
+MOUNT_MAX_M = 2.0  # m, design choice: generous bound on a sensor's distance from its drone's centre; skips far drones
 # share: fraction of a ray's length that is measured; below 1 for a depth, which is along the optical axis
 RAY = columns("RayColumns", (Field("direction_B", "1", 3), Field("share", "1")))
 SCANNER = columns(
@@ -308,7 +308,7 @@ def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
 
 @inlined
 def _measured(row: NDArray, distance: float, noise: float, chance: float) -> float:
-    """Return the value measured at a true distance; `noise` and `chance` are standard normal numbers."""
+    """Return the value measured at a true distance, 0 without an echo; `noise` and `chance` are standard normal."""
     if distance == math.inf or chance < row[SCANNER.miss]:
         return 0.0
     share, square = row[SCANNER.share] * distance, row[SCANNER.square] * distance * distance

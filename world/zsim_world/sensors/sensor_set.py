@@ -87,8 +87,8 @@ SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
 LAPSE_1_M = 2.25577e-5  # 1/m, 0.0065 K/m over 288.15 K, ISO 2533
 PRESSURE_EXPONENT = 5.25588  # g M / (R L), ISO 2533
 SONAR_COSINE_MIN = 0.5  # a beam returns an echo up to 60 deg off the vertical; beyond that, it is scattered away
-# Tangents of half the picture's field of view, ahead and aside: 320 x 240 pixels, 64 deg along the diagonal (data sheet
-# of the AR.Drone 2.0); assumed for every vehicle
+# Tangents of half the field of view, ahead and sideways: 320 x 240 pixels, 64 deg along the diagonal (data sheet of the
+# AR.Drone 2.0); assumed for every vehicle
 HALF_VIEW = (0.375, 0.5)
 # Centres of the outer cells of a picture divided into 3 x 3 cells; a hull covers more than half of the picture if it
 # covers the central cell and four of these
@@ -443,7 +443,7 @@ def _beam(x: BodyTruth, s: MountedSensor) -> tuple[Vector, Vector]:
 
 @inlined
 def _hull(state: NDArray, vehicle: NDArray, i: int, o: Vector, d: Vector, far: float) -> tuple[float, int]:
-    """Return the distance [m] to the first hull, other than that of drone `i`, on a ray, and its drone; or `far`, -1.
+    """Return the distance [m] along a ray to the nearest hull of a drone other than `i`, and that drone; or `far`, -1.
 
     Args:
         state, vehicle: rows of all drones, as in Bodies.
@@ -491,7 +491,7 @@ def flow_over(
 
     It is the velocity relative to the surface in the picture, times the distance measured by the sonar over that of the
     surface: correct if both sensors see the same surface. The surface is the one at the centre of the picture. A
-    drone's hull counts only if it covers most of the picture; it moves at its velocity where the optical axis hits it.
+    drone's hull counts only if it covers most of the picture; its velocity is that at the point on the optical axis.
 
     Args:
         ranging: the sonar; state, vehicle: rows of all drones, as in Bodies; i: the drone that carries the sensor.

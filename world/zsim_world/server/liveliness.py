@@ -22,17 +22,17 @@ from zsim_world.run.inputs import Run
 BYE_NS = 100_000_000  # wall time within which a bye may still arrive after the loss of its process's token
 RETURN_NS = 5_000_000_000  # wall time within which a process rejoins a restarted world; 1 s measured
 START_NS = 60_000_000_000  # wall time within which a restarted process joins; a small computer needs 20 s
-NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
+NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router learns of a new token; up to 1 s measured
 TOKENS_S = 1.0  # timeout of a token query, which a router answers within milliseconds
 SILENT_NS = 1_800_000_000  # wall time without health, which is published once a second: silence is reported within 2 s
 DEAD_NS = 10_000_000_000  # wall time without health after which a process that does not gate counts as dead
-STALL_NS = 300_000_000  # wall time between checks that shows that the world or its machine was stopped
+STALL_NS = 300_000_000  # wall time between checks that indicates that the world or its machine was stopped
 SHOWN = 5  # maximum number of key expressions shown for a closed link
 _decode_health = msgspec.msgpack.Decoder(Health).decode
 TOKEN_NS = 3_000_000_000  # wall time limit for a token to appear; behind routers it takes up to 1 s (measured)
 SHOWN_NS = 10_000_000_000  # wall time limit for a first done that proves a process; a first step takes 1 s
 HELD_NS = 1_000_000_000  # wall time for which a living process must block the clock before another may replace it
-DONE_NS = 10_000_000_000  # wall time for which a process may block the clock before its first done; that takes 1 s
+DONE_NS = 10_000_000_000  # wall time for which a process may block the clock before its first done, which takes 1 s
 LOOK_NS = 200_000_000  # wall time between checks of unproven processes
 WITHHELD_MAX = 1000  # maximum number of withheld joins of unknown processes
 NO_TOKEN = "has no liveliness token"
@@ -51,7 +51,7 @@ class LivelinessMonitor:
 
     Args:
         link: the listening session.
-        take_in: enters the messages that have arrived into the run; a bye may be among them.
+        take_in: enters newly arrived messages, possibly a bye, into the run.
     """
 
     def __init__(self, link: Session, run: Run, take_in: Callable[[], None]) -> None:
@@ -71,7 +71,7 @@ class LivelinessMonitor:
         self._health.received(name, time.monotonic_ns())
 
     def check_all(self) -> None:
-        """In a restarted world, schedule a check of each former participant for when it should have rejoined."""
+        """In a restarted world, schedule a check of each former participant for the time by which it rejoins."""
         for name, participant in self._barrier.participants.items():
             wait_ns = RETURN_NS if participant.alive else START_NS
             if participant.away or participant.alive:
@@ -191,7 +191,7 @@ class SlowReaders:
         return [Awaited((p.name, *p.join.serves), p.join.pid) for p in participants if p.is_waited_for]
 
     def report(self) -> None:
-        """Report the links closed since the last call, with the keys that their processes read, as health states."""
+        """Report the links closed since the last call, with the keys that their processes read by their own account."""
         while self.watch.closed:
             closed = self.watch.closed.popleft()
             host = self._own_host if closed.process else closed.address.rpartition(":")[0].strip("[]")
@@ -244,9 +244,7 @@ class Admission:
         self._trusts = trusts
         self._sessions: dict[str, Sessions] = {}  # by process, the sessions whose tokens have proved it
         self._withheld: dict[str, _Withheld] = {}
-        self._standing_ns: dict[
-            str, int
-        ] = {}  # how long each process still without token or done has blocked the clock
+        self._standing_ns: dict[str, int] = {}  # how long processes lacking token or done have blocked the clock
         self._look_wall_ns = 0
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:

@@ -177,7 +177,7 @@ class RunJournal:
         The checkpoint is the second newest, so that the inputs since then (`entries`) refill the message history.
 
         Raises:
-            RunError: the journal belongs to another run, is in use, or cannot be read or kept.
+            RunError: the journal belongs to another run, is in use, or cannot be read or written.
         """
         found = None
         if not self._is_kept:

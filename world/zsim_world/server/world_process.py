@@ -153,7 +153,7 @@ class WorldProcess:
         """Apply the journal without republishing anything, and have the run await its former participants.
 
         Raises:
-            RunError: the journal belongs to another run, or its state does not fit this version of zsim.
+            RunError: the journal belongs to another run, or its checkpoint does not fit this version of zsim.
         """
         checkpoint, world = self._journal.open(), self._world
         is_continued = isinstance(world, World) and checkpoint is not None
@@ -215,7 +215,7 @@ class WorldProcess:
             self._outputs.publish(Output(keys.EVENT, event))
 
     def _take_in(self) -> None:
-        """Enter the messages that have arrived into the run, and submit joins for admission."""
+        """Enter newly arrived messages into the run, and submit joins for admission."""
         for wall_ns, sample in self._inputs.drain():
             key = sample.key
             if key.startswith(OWN):  # the world's own health was entered when it was published

@@ -184,7 +184,7 @@ def loop_gains(design: Firmware, rotor_lag_s: float) -> tuple[float, float, floa
 
 
 def lag_shares(design: Firmware, rotor_lag_s: float) -> tuple[float, float]:
-    """Return the fraction of a rotor's speed error that remains after a step, and the overdrive that halves its lag."""
+    """Return the fraction of a rotor's speed error left after a step, and the overdrive that shortens its lag."""
     decay = el.exp(-STEP_S / rotor_lag_s)
     return decay, (1.0 - el.exp(-STEP_S / (design.lag_lead * rotor_lag_s))) / (1.0 - decay)
 

@@ -1,8 +1,8 @@
 """The firmware's estimate of attitude, velocity, height and disturbance, from its noisy sensors, with fixed gains.
 
-The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected by the measured velocity. The
-accelerometer cannot sense it as the direction of gravity: in flight, a multirotor's specific force is along its thrust
-at any tilt.
+The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected by the measured velocity, since in
+flight the accelerometer does not show the direction of gravity: a multirotor's specific force is along its thrust at
+any tilt.
 
 The gains are steady-state Kalman gains for the noise of the drone's sensors, computed once. Design model of one
 horizontal axis (heading frame), driven by white noise:
@@ -96,10 +96,10 @@ CALIBRATION = columns(  # mounts and site, as known to the board
 
 # Steps, weight of the prior that the floor is level to 0.05 rad, at an accelerometer noise of 0.35 g
 STILL_STEPS_MIN = 50.0
-STILL_STEPS_SWAY = 400.0  # steps, slow the averaging of the gyro's bias: in wind, a standing drone sways on its feet
+STILL_STEPS_SWAY = 400.0  # steps, added to slow the averaging of the gyro's bias: in wind, a standing drone sways
 STILL_STEPS_MAX = 4000.0  # steps, 20 s: the bias walks, so older samples get less weight
 FLOW_QUALITY_MIN = 0.3  # below this quality, the picture shows more horizon than ground
-FLOOR_MIN_M = 0.3  # m, design choice: above this, a drone has landed on an obstacle; sonars measure from 0.25 m or less
+FLOOR_MIN_M = 0.3  # m, design choice: a landing above this is on an obstacle; sonars measure from 0.25 m or less
 SONAR_AGE_MAX = 100.0  # steps, 0.5 s; after this time without an echo, the height comes from the barometer
 
 
@@ -311,7 +311,7 @@ def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, b
 
 @inlined
 def model_rotors(belief: NDArray, decay: float, commands: PerRotor) -> None:
-    """Advance the modelled rotors by one step; `decay` is the fraction of their speed error [rad/s] that remains."""
+    """Advance the modelled rotors by one step under commands [rad/s]; `decay`: fraction of the speed error left."""
     speeds = PerRotor(belief, BELIEF.size, 1, commands.each)
     for r in range(len(commands.each)):
         put_of(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))

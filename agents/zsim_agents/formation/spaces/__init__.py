@@ -1,1 +1,1 @@
-"""Cluster spaces: robots to cluster variables and back, with their Jacobians. Imports zsim only."""
+"""Cluster spaces: conversions between robot poses and cluster variables, with their Jacobians. Imports only zsim."""

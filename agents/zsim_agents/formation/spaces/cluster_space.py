@@ -4,7 +4,8 @@ Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headi
 has as many variables: position and attitude of the formation, the relative heading of each robot, and the shape.
 Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
 
-The functions of the cluster frame C, with Z-Y-X Euler angles, are compiled, because a gate must take only microseconds.
+The functions for the cluster frame C, with Z-Y-X Euler angles, are compiled, because a gate must take only
+microseconds.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Array = NDArray[np.float64]
 TAU = 2 * math.pi
 CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
 NAMES_SHOWN = 20  # maximum number of names in a message; the paper's cluster has 12
-LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
+LENGTH_MIN_M = 1e-9  # a nanometre: below it, a direction is rounding noise
 
 
 class SingularClusterError(ValueError):
@@ -40,23 +41,23 @@ class SingularClusterError(ValueError):
 class ClusterSpace(ABC):
     """One convention of cluster variables for n robots; every method is a pure function.
 
-    A user's space is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, named by the
-    scenario and constructed by `for_places`.
+    A user's space is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, which the
+    scenario names and `for_places` constructs.
 
     Args:
-        names: of the 4 n variables, including pitch. The beginning of a name gives its kind: p, q, rho are lengths;
-            w, departures in metres; roll, yaw, phi, azimuth, angles that wrap; pitch, beta, elevation, angles that do
-            not.
+        names: names of the 4n variables, which include pitch. The beginning of a name gives the variable's kind: p, q
+            and rho are lengths; w is a departure from a template [m]; roll, yaw, phi and azimuth are angles that wrap;
+            pitch, beta and elevation are angles that do not.
         spread_text: the quantity that `spread` measures, in words for messages.
 
     Attributes:
-        size: number of cluster variables, 4 n.
+        size: number of cluster variables, 4n.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, including those that do not wrap (pitch, beta, elevation_k).
         period: (4n,) 2 pi for the angles that wrap, 0 for all other variables.
         bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is no bound.
-        neutral: (4n,) bool, true for the variables that are zero unless a goal is given: tilts, relative headings,
-            departures from a template.
+        neutral: (4n,) bool, true for the variables whose goal is zero unless a request names them: tilts, relative
+            headings, departures from a template.
         tilts: indices of roll and pitch in c.
     """
 
@@ -80,10 +81,10 @@ class ClusterSpace(ABC):
 
     @classmethod
     def for_places(cls, places_m: Array) -> ClusterSpace:
-        """Return the space of n robots with given positions (n, 3) [m]; by default cls(n).
+        """Return the space of n robots with given positions, (n, 3) [m]; by default cls(n), which ignores them.
 
         Args:
-            places_m: the cluster's `template_m`, else the start positions; x ahead, y left of the formation.
+            places_m: the cluster's `template_m`, otherwise the start positions; x ahead, y left of the formation.
         """
         return cls(len(places_m))  # type: ignore[call-arg]
 
@@ -97,7 +98,7 @@ class ClusterSpace(ABC):
 
     @abstractmethod
     def inverse(self, c: Array) -> tuple[Array, Array]:
-        """Return positions p_W (n, 3) [m] and headings yaw (n,) [rad, wrapped] of the robots of c (4n,).
+        """Return positions p_W (n, 3) [m] and headings yaw (n,) [rad, wrapped] of robots in the formation c (4n,).
 
         Raises:
             SingularClusterError: the shape has no extent (h = 0), so that the robots' positions are undefined.
@@ -105,7 +106,7 @@ class ClusterSpace(ABC):
 
     @abstractmethod
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
-        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, in W.
+        """Return J (4n, 4n) with c_dot = J r_dot; r_dot is (vx, vy, vz, yaw rate), robot by robot, in W.
 
         Raises:
             SingularClusterError: as in `forward`.
@@ -124,7 +125,7 @@ class ClusterSpace(ABC):
         """Return the smallest height of the shape [m] (see `spread_text`); 0 if the shape is singular."""
 
     def motion(self, c: Array, c_dot: Array) -> Array:
-        """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 compute it without the matrix."""
+        """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 override this to avoid the matrix."""
         return linear.product(self.inverse_jacobian(c), c_dot)
 
     def specimen(self, apart_m: float) -> Array:
@@ -139,8 +140,8 @@ class ClusterSpace(ABC):
         """Return the distance to singularity [m]: spread(c) cos(pitch).
 
         It is zero exactly where J^-1 is singular (robots 1, 2, 3 collinear or two of them coincident, another robot on
-        the z axis through robot 1, or pitch at 90 degrees); in a level formation, it is how far one robot may move
-        before J^-1 becomes singular.
+        the z axis through robot 1, or pitch at 90 degrees); in a level formation, it is the distance by which one robot
+        may move before J^-1 becomes singular.
         """
         return self.measures(c)[1]
 
@@ -152,8 +153,8 @@ class ClusterSpace(ABC):
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1 (2-norm, in metres and radians without weights).
 
-        It grows with the unit of length, so a formation larger than 4 m is scaled down to 4 m: a large formation is not
-        closer to singularity than a small one of the same shape.
+        The number grows with the size of a formation, although a large formation is not closer to singularity than a
+        small one of the same shape. A formation larger than 4 m is therefore scaled down to 4 m.
         """
         lengths = np.abs(c[self._lengths])
         scaled = c.copy()
@@ -166,7 +167,7 @@ class ClusterSpace(ABC):
         return self.wrapped(c_to - c_from)
 
     def wrapped(self, c: Array) -> Array:
-        """Return c (4n,), or a table (m, 4n) of them, with the angles that wrap brought into [-pi, pi]."""
+        """Return c (4n,), or a table (m, 4n) of such rows, with the angles that wrap brought into [-pi, pi]."""
         if c.ndim > 1:
             return c - self.period * np.rint(c / TAU)
         near = np.empty(self.size)
@@ -181,7 +182,7 @@ class ClusterSpace(ABC):
 
 
 def checked(space: ClusterSpace) -> ClusterSpace:
-    """Make all methods of a user's space raise UserCodeError for results that have a wrong shape or are not finite."""
+    """Return a user's space, made to raise UserCodeError for results that have a wrong shape or are not finite."""
     n, size = space.n, space.size
     shapes: dict[str, tuple[tuple[int, ...], ...]] = {
         "forward": ((size,),),
@@ -219,7 +220,7 @@ def _checked(method: Callable[..., Any], name: str, shapes: tuple[tuple[int, ...
 
 
 def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:
-    """Return velocities (n, 3) [m/s, W] and yaw rates (n,) [rad/s] of the robots of c moving at c_dot."""
+    """Return velocities (n, 3) [m/s, W] and yaw rates (n,) [rad/s] of the robots of a formation c moving at c_dot."""
     r_dot = space.motion(c, c_dot).reshape(space.n, 4)
     return r_dot[:, :3].copy(), r_dot[:, 3].copy()
 
@@ -311,7 +312,7 @@ def pitch_yaw(x_W: Vector) -> tuple[float, float]:
 
 @portable
 def euler_axes_C(roll: float, pitch: float) -> Matrix:
-    """Return w_WC_C for unit rates of roll, pitch and yaw."""
+    """Return w_WC_C for unit rates of roll, pitch and yaw, one row each."""
     sr, cr = el.sin(roll), el.cos(roll)
     sp, cp = el.sin(pitch), el.cos(pitch)
     return (1.0, 0.0, 0.0), (0.0, cr, -sr), (-sp, sr * cp, cr * cp)

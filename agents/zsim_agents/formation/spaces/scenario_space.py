@@ -1,8 +1,8 @@
-"""The cluster space of a scenario's cluster: a stock one, a user's class, or a cluster of clusters by its groups.
+"""The cluster space of a scenario's cluster: a stock one, a user's class, or a cluster of clusters if it has groups.
 
-A group k has the cluster c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the position and heading of robot k of
-the parent; the rest of c_k (tilts, headings and shape) is added to the parent's variables. 4m variables of the parent
-and 4n_k - 4 of each group make 4n. The groups may be clusters of clusters themselves.
+Group k has cluster variables c_k of its own robots. Its (x_c, y_c, z_c, yaw) are the position and heading of robot k of
+the parent; the rest of c_k (tilts, headings and shape) is added to the parent's variables. For m groups, 4m variables
+of the parent and 4n_k - 4 of each group add up to 4n. Groups may themselves be clusters of clusters.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
 
 Places = NDArray[np.intp]
-BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that are those of a robot of the parent
+BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that describe a robot of the parent
 
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
@@ -61,7 +61,7 @@ def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
 
 
 def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:
-    """Return the start positions of drones (n, 3) [m] in axes along the heading of the first: x ahead, y left, z up."""
+    """Return the start positions of drones (n, 3) [m] in the first drone's heading frame: x ahead, y left, z up."""
     by_name = {drone.name: drone for drone in scenario.drones}
     yaw = math.radians(by_name[drones[0]].yaw_deg)
     c, s = el.cos(yaw), el.sin(yaw)
@@ -85,10 +85,10 @@ class _Group(NamedTuple):
     """The indices of a group in the complete cluster.
 
     Attributes:
-        robots, rows: indices of its robots; of their 4n_k entries in r, four each.
-        body, rest: indices of BODY and of all other variables in its own c.
-        own: indices of the rest in the c of the whole.
-        at: indices of its body in the r of the parent.
+        robots, rows: indices of the group's robots, and of their entries in r, four each.
+        body, rest: indices of BODY and of all other variables in the group's own c.
+        own: indices of these other variables in the c of the complete cluster.
+        at: indices of the group's body in the r of the parent.
     """
 
     space: ClusterSpace
@@ -105,7 +105,7 @@ class NestedCluster(ClusterSpace):
 
     phi_k of the parent is the yaw of group k relative to that of the parent, NAME.phi_i the heading of a robot relative
     to the yaw of its group. The origin is the mean of the groups' centroids. The chain rule gives both Jacobians.
-    `groups` are names and spaces in the order of the robots, one for each robot of the parent.
+    `groups` contains the name and space of each group, one group for each robot of the parent, in the same order.
     """
 
     def __init__(self, parent: ClusterSpace, groups: Sequence[tuple[str, ClusterSpace]]) -> None:
@@ -180,7 +180,7 @@ class NestedCluster(ClusterSpace):
         return c
 
     def parts(self, c: Array) -> list[Array]:
-        """Return the cluster of the parent (4m,), then the complete cluster of each group (4n_k,)."""
+        """Return the cluster variables of the parent (4m,), then all cluster variables of each group (4n_k,)."""
         parent = c[: self.parent.size]
         bodies = np.empty((self.parent.n, 4))
         bodies[:, :3], bodies[:, 3] = self.parent.inverse(parent)
@@ -195,14 +195,14 @@ class NestedCluster(ClusterSpace):
         return min(space.spread(part) for space, part in self._pairs(c))
 
     def measures(self, c: Array) -> tuple[float, float]:
-        """Return the minimum spread and margin of parent and groups: the whole is singular if one of them is."""
+        """Return the minimum spread and margin of parent and groups: the cluster is singular if one of them is."""
         spreads, margins = zip(*(space.measures(part) for space, part in self._pairs(c)), strict=True)
         return min(spreads), min(margins)
 
     def condition(self, c: Array) -> float:
         """Return the maximum condition number of the parent and the groups, each in its own scaling.
 
-        J^-1 of the whole is a product of theirs: if none is ill-conditioned, neither is that of the whole.
+        J^-1 of the cluster is a product of theirs: if none of these is ill-conditioned, neither is the product.
         """
         return max(space.condition(part) for space, part in self._pairs(c))
 

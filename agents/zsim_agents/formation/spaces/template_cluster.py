@@ -3,12 +3,12 @@
     P_i = C + R (t_i + (N w)_i)
 
 C is the centroid, t_i the positions in the template, N a basis of the displacements that neither move nor rotate it,
-and R the best-fit rotation of the template to the robots. No robot is privileged, and the motion of one robot changes
-the frame by only a fraction of about 1/n.
+w the coordinates in this basis, and R the best-fit rotation of the template to the robots. No robot is privileged, and
+the motion of one robot changes the frame by only a fraction of about 1/n.
 
-Attitudes by best fit: Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc. Am. A 4
-(1987), section 4; the same rotation as Kabsch's (1976), and never a reflection. As a formation's frame: Belta, Kumar,
-Abstraction and control for groups of robots, IEEE Trans. Robotics 20 (2004).
+The best-fit attitude is that of Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc.
+Am. A 4 (1987), section 4: the same rotation as Kabsch's (1976), but never a reflection. It serves as a formation's
+frame in Belta, Kumar, Abstraction and control for groups of robots, IEEE Trans. Robotics 20 (2004).
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # indices in the 7 x 7 matrix
 class TemplateCluster(ClusterSpace):
     """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, w_1..w_{3n-6}); w in metres rms over the robots.
 
-    w_1 is growth: robots move outwards, by w_1 in the root mean square. Stretches and shears that the template's extent
-    permits follow (`shape_modes`). The template is given as positions (n, 3), n >= 3, from any origin.
+    w_1 is growth: robots move outwards, by w_1 in the root mean square. Then come the stretches and shears that the
+    template's extent permits (`shape_modes`). The template is given as positions (n, 3), n >= 3, from any origin.
 
     Raises:
         ValueError: there are fewer than three positions, or all are collinear.
 
     Attributes:
-        t_C: (n, 3) positions in the template from their centroid, in C [m].
-        modes_C: (n, 3, 3n - 6), N.
+        t_C: positions in the template relative to their centroid, (n, 3) [m; C].
+        modes_C: the basis N, (n, 3, 3n - 6).
     """
 
     def __init__(self, places_m: ArrayLike) -> None:
@@ -90,13 +90,13 @@ class TemplateCluster(ClusterSpace):
         return c[:3] + product(self._places_C(c), rotation_of(c).T), yaw - TAU * np.rint(yaw / TAU)
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
-        """Return J; with b_C = R^T (P - C): w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
+        """Return J, from w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
 
-        It follows from sum of t_i x b_i = 0, the condition for R to be the best fit.
+        With b_i = R^T (P_i - C), this follows from sum of t_i x b_i = 0, the condition for R to be the best fit.
         """
         _, b_C, R_WC = self._fitted(p_W)
         n = self.n
-        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # (3, n, 3), of t_i x R^T v_i
+        arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # (3, n, 3), for t_i x R^T v_i
         turn = solve(inertia(product(b_C.T, self.t_C)), arms.reshape(3, 3 * n)).reshape(3, n, 3)
         roll, pitch, _ = euler_angles(R_WC)
         cross_C = np.array([skew(b) for b in b_C]).reshape(3 * n, 3)
@@ -142,8 +142,8 @@ class TemplateCluster(ClusterSpace):
     def spread(self, c: Array) -> float:
         """Return the root mean square distance of the robots from the line through them, measured along the template.
 
-        It is the minimum eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a template
-        of any size, and zero where another rotation fits equally well.
+        It is the minimum eigenvalue of M (see `jacobian`) over the square root of n times that of the template: exact
+        for the template at any scale, and zero where another rotation fits equally well.
         """
         S = product(self._places_C(c).T, self.t_C)
         return float(eigen(inertia((S + S.T) / 2))[0][0]) / self._reach_m
@@ -151,9 +151,9 @@ class TemplateCluster(ClusterSpace):
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1, with the robots' velocities, headings and phi weighted by their rms.
 
-        With these weights it does not grow with the number of robots; a formation with robots farther than 4 m from the
-        centroid is scaled down to that. w_k and the centroid are orthonormal in these weights, which leaves a 7 x 7
-        matrix: turns, the three directions of w coupled to them, and the mean of phi.
+        With these weights, the number does not grow with the number of robots; a formation with robots farther than 4 m
+        from the centroid is scaled down to 4 m. w_k and the centroid are orthonormal in these weights, which leaves a
+        7 x 7 matrix of turns, the three directions of w coupled to them, and the mean of phi.
         """
         place_C = self._places_C(c)
         scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
@@ -171,11 +171,11 @@ class TemplateCluster(ClusterSpace):
         values = eigen(G)[0]
         return math.sqrt(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
-    def _places_C(self, c: Array) -> Array:  # positions from the centroid (n, 3) [m]
+    def _places_C(self, c: Array) -> Array:  # positions relative to the centroid, (n, 3) [m]
         return self.t_C + product(self._modes, c[self._shape :]).reshape(self.n, 3)
 
     def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
-        """Return the centroid (3,), the positions from it in C (n, 3), and R_WC (3, 3)."""
+        """Return the centroid (3,), the positions relative to it in C (n, 3), and R_WC (3, 3)."""
         centre_W = np.add.reduce(p_W, axis=0) / self.n
         b_W = p_W - centre_W
         gap, R_WC = fitted_rotation(product(self.t_C.T, b_W))
@@ -185,7 +185,7 @@ class TemplateCluster(ClusterSpace):
 
 
 def _root(E: Array, n: int) -> Array:
-    """Return the symmetric root of E / n (3, 3); eigenvalues of E are negative only by rounding."""
+    """Return the symmetric square root of E / n (3, 3); eigenvalues of E are negative only by rounding."""
     values, vectors = eigen((E + E.T) / 2)
     return product(vectors * np.sqrt(np.maximum(values, 0.0) / n), vectors.T)
 
@@ -194,8 +194,8 @@ def fitted_rotation(H: Array) -> tuple[float, Array]:
     """Return how well the rotation is defined, and the rotation R (3, 3) that maximises the sum of b_i . R t_i.
 
     H (3, 3) is the sum of t_i b_i^T. The first result is half the difference between the two largest eigenvalues of
-    Horn's matrix [unit of H]: the smallest eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where
-    several rotations fit equally well, or H is not finite.
+    Horn's matrix [unit of H], which is the smallest eigenvalue of tr(S) I - S with S = sum of R^T b_i t_i^T. It is zero
+    where several rotations fit equally well, or H is not finite.
     """
     K = np.empty((4, 4))
     if not put_horn_matrix(H, K):
@@ -206,7 +206,7 @@ def fitted_rotation(H: Array) -> tuple[float, Array]:
 
 @portable
 def put_horn_matrix(H: Array, K: Array) -> bool:
-    """Write Horn's matrix (4, 4), whose dominant eigenvector is the quaternion, w first; return whether finite."""
+    """Write Horn's matrix (4, 4), whose dominant eigenvector is the quaternion, w first; return whether H is finite."""
     xx, xy, xz = row(H, 0)
     yx, yy, yz = row(H, 1)
     zx, zy, zz = row(H, 2)
@@ -237,8 +237,8 @@ def shape_modes(t: Array) -> Array:
     """Return a basis (n, 3, 3n - 6) of the displacements that neither move nor turn centred points t (n, 3).
 
     Each mode moves the points by 1 m in the root mean square, and all are orthogonal to each other: N^T N = n I. The
-    first are homogeneous: growth, stretches along the axes and shears in their planes, where the extent of the points
-    permits them; the others follow from moving single points, in order.
+    first modes are homogeneous, as far as the extent of the points permits: growth, stretches along the axes and shears
+    in their planes. The others come from moving single points, in order.
 
     Raises:
         ValueError: the points are collinear or coincide.
@@ -257,7 +257,7 @@ def shape_modes(t: Array) -> Array:
 
 
 def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
-    """Return unit vectors (3n,) along the new part of each direction (n, 3), in order, orthogonal to the given ones."""
+    """Return directions (n, 3) as unit vectors (3n,), orthogonal to `done` and each other; omit dependent ones."""
     basis: list[Array] = []
     for direction in directions:
         v = direction.ravel()

@@ -2,7 +2,7 @@
 
 Robots 1, 2 and 3 define the frame C and the triangle (p, q, beta); each further robot k adds its distance rho, azimuth
 and elevation from robot 1 in C. The origin is the centroid of all robots. Two robots form a rod with direction and
-length, without roll.
+length, but no roll.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ NO_FRAME = "robots 1, 2 and 3 are in line or in one place: the formation has no 
 class TriadCluster(ClusterSpace):
     """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, p, q, beta, rho_4, azimuth_4, elevation_4, ...).
 
-    det J^-1 = -p^2 q^2 sin(beta) cos(pitch) at n = 3.
+    det J^-1 = -p^2 q^2 sin(beta) cos(pitch) for n = 3.
     """
 
     def __init__(self, n: int) -> None:
@@ -110,7 +110,7 @@ class TriadCluster(ClusterSpace):
 
 @portable
 def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
-    """Write c (4n,) and return whether the robots have a frame; without one nothing is written."""
+    """Write c (4n,) and return whether the robots define a frame; without one, nothing is written."""
     n = yaw.size
     at = 6 + n  # index of p in c
     p_1 = row(p_W, 0)
@@ -132,7 +132,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
 
 @portable
 def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
-    """Write positions (n, 3) and headings (n,), and return whether they are valid: the shape has an extent."""
+    """Write positions (n, 3) and headings (n,), and return whether they are valid, i.e. the shape has an extent."""
     n = c.size // 4
     put_places_C(c, p_W)
     R_WC = matrix_from_rpy(c[3], c[4], c[5])
@@ -146,10 +146,10 @@ def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
 
 @portable
 def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
-    """Write J^-1 (4n, 4n) into zeros and return whether the shape has an extent; without one nothing is written.
+    """Write J^-1 (4n, 4n), zero on entry, and return whether the shape has an extent; without one, write nothing.
 
-    Robot i moves at v_c + R_WC (w_WC_C x d_i + d_i'), d_i its position in C and d_i' its rate with the shape, and turns
-    at yaw' + phi_i'.
+    Robot i moves at v_c + R_WC (w_WC_C x d_i + d_i') and turns at yaw' + phi_i'; d_i is its position in C, and d_i' the
+    rate of this position due to changes of the shape.
     """
     n = c.size // 4
     if not has_direction(c):
@@ -221,12 +221,12 @@ def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, f
 
 @portable
 def put_places_C(c: Array, place: Array) -> None:
-    """Write the positions of the robots from the centroid, in C (n, 3) [m]."""
+    """Write the positions of the robots relative to the centroid, (n, 3) [m; C]."""
     n = c.size // 4
     at = 6 + n
     p, q = c[at], c[at + 1]
     ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[at + 2])
-    place[:3] = 0.0  # positions from robot 1
+    place[:3] = 0.0  # positions relative to robot 1 until the centroid is subtracted
     place[1, 0], place[1, 1] = -p * ca2, p * sa2
     place[2, 0], place[2, 1] = -q * ca3, -q * sa3
     for k in range(3, n):
@@ -326,7 +326,7 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
 
 
 class PairCluster(ClusterSpace):
-    """c = (x_c, y_c, z_c, pitch, yaw, phi_1, phi_2, p): origin midway, x_C towards robot 1."""
+    """c = (x_c, y_c, z_c, pitch, yaw, phi_1, phi_2, p); the origin is midway, and x_C points towards robot 1."""
 
     def __init__(self) -> None:
         super().__init__(2, ("x_c", "y_c", "z_c", "pitch", "yaw", "phi_1", "phi_2", "p"), "p")
@@ -367,7 +367,7 @@ class PairCluster(ClusterSpace):
 
 @portable
 def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
-    """Write c (8,); only p is valid if the length p is zero."""
+    """Write c (8,); if the length p is zero, only p is valid."""
     d_W = subtract(row(p_W, 0), row(p_W, 1))
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)
@@ -385,7 +385,7 @@ def pair_inverse(c: Array, p_W: Array, yaw: Array) -> None:
 
 @portable
 def pair_inverse_jacobian(c: Array, J_inv: Array) -> None:
-    """Write J^-1 (8, 8) into zeros."""
+    """Write J^-1 (8, 8), zero on entry."""
     R_WC = matrix_from_rpy(0.0, c[3], c[4])
     x, y, z = column(R_WC, 0), column(R_WC, 1), column(R_WC, 2)
     for robot in range(2):
