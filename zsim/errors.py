@@ -150,7 +150,7 @@ CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u20
 
 
 def printable(text: str) -> str:
-    """Return a text for a terminal, with its control codes, which network data may contain, escaped."""
+    """Return a text for a terminal, with control codes escaped, which network data may contain."""
     return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

@@ -33,7 +33,7 @@ from zsim_world.sensors.sensor_set import rounded
 
 CONE_RAYS = 8  # rays on the cone of a beam that has one, in addition to the ray along its axis
 SHARE_MIN = 0.2  # lower bound of a ray's depth over its length, which is 0.26 at the edge of a 150 deg picture
-MOUNT_MAX_M = 2.0  # m, design choice: generous bound on a sensor's distance from its drone's centre; skips far drones
+MOUNT_MAX_M = 2.0  # m, design choice: generous bound on a sensor's distance from its drone's centre, to skip far drones
 # share: fraction of a ray's length that is measured; below 1 for a depth, which is along the optical axis
 RAY = columns("RayColumns", (Field("direction_B", "1", 3), Field("share", "1")))
 SCANNER = columns(
@@ -147,7 +147,7 @@ class ScanSampler:
         self._rows[:] = self._sound
 
     def rows_of(self, drone: int, sensor: str) -> Iterator[Array]:
-        """Yield the rows of a drone's sensor, (SCANNER.size,), one per depth camera, for faults to modify in place."""
+        """Yield the rows of a drone's sensor, (SCANNER.size,), one for each depth camera, for faults to modify."""
         for row, each in zip(self._rows, self._mounted, strict=True):
             if (each.drone, each.sensor) == (drone, sensor):
                 yield row
