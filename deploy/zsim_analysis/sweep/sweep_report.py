@@ -190,7 +190,7 @@ def notes(summary: SweepSummary) -> list[str]:
     lines += marks_of(summary)
     if summary.not_engaged:
         lines.append(
-            f"In {summary.not_engaged} runs that ended well a cluster was never engaged within the judged window; "
+            f"In {summary.not_engaged} runs that ended well, a cluster was never engaged within the judged window; "
             "its errors are left out."
         )
     lines += [f"{count} of {summary.finished} runs have no {OWN}: {why}" for why, count in summary.unmeasured.items()]
@@ -209,7 +209,7 @@ def without_data(summary: SweepSummary) -> str:
         names = [name for name, column in columns.items() if column not in known]
         if names:
             parts.append(what if len(names) == len(columns) else f"{what} of {', '.join(names)}")
-    return f"No run has {', nor '.join(parts)}; they are in no table and no figure." if parts else ""
+    return f"No run has {' or '.join(parts)}; these appear in no table or figure." if parts else ""
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
@@ -334,7 +334,7 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
     title_own = "Figures of your own, means over the runs as planned"
     title_pairs = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
-    caption_pairs = f"means ± half of the {level} interval, of n pairs; few pairs are listed\n"
+    caption_pairs = f"means ± half of the {level} interval, of n pairs; if pairs are few, each difference is listed\n"
     title_ends = f"{summary.scenario}: {summary.finished} of {summary.runs} runs"
     caption_ends = f"means over the runs as planned; minima over all runs; {level} intervals are in the report\n"
     ends = [overview(point, brief=True) for point in points]
