@@ -1,7 +1,7 @@
-"""How tests are shared among workers: the last of three or more is a quiet one; what shares a run shares a worker.
+"""Distribution of tests among workers: the last of three or more is quiet; tests that share a run share a worker.
 
-The quiet one runs what is pure, and only in the time that the others, whose tests start processes and wait for them,
-leave over. When the others have nothing else left to do, they run what is pure, too.
+The quiet worker runs pure tests, and only in the time that is left over by the others, whose tests start processes and
+wait for them. When the others have no such tests left, they run pure tests, too.
 """
 
 import gc
@@ -17,20 +17,20 @@ from zsim.math.compiled import Part
 from zsim_deploy.roles.stop_channel import lower_priority
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
-LEAST = 3  # workers of which one is quiet
+LEAST = 3  # number of workers from which on one is quiet
 
-# A shell ignores SIGINT for what it runs in the background, and every program that a test starts would inherit that.
+# A shell makes background jobs ignore SIGINT, which every program that a test starts would inherit.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def quiet_one(workers: int) -> str | None:
-    """Return the name of the quiet one among so many workers, if there is one."""
+    """Return the name of the quiet worker, or None if there are too few workers."""
     return f"gw{workers - 1}" if workers >= LEAST else None
 
 
 class QuietScheduling(LoadGroupScheduling):
-    """Hands out tests as `--dist loadgroup` does, but to each worker its own kind."""
+    """Distributes tests as `--dist loadgroup` does, but gives each worker its own kind first."""
 
     def _assign_work_unit(self, node: Any) -> None:
         is_quiet = node.gateway.id == quiet_one(self.numnodes)
@@ -50,7 +50,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> QuietSchedul
 
 @pytest.hookimpl(tryfirst=True)  # before xdist puts the groups into the names of tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one worker have all tests of a file that share a fixture of that file, such as a run."""
+    """Give one worker all tests of a file that share a fixture of that file, such as a run."""
     for item in items:
         file = item.nodeid.partition("::")[0]
         fixtures = item._fixtureinfo.name2fixturedefs.values() if isinstance(item, pytest.Function) else ()
@@ -59,10 +59,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Take what is there now for good: the modules that tests have imported, and the variables that these have set."""
+    """Keep the present state for good: the modules that tests have imported, and the variables that these have set."""
     gc.collect()
-    gc.freeze()  # else each search for cycles looks at all tests, for a third of a second
-    gc.unfreeze = lambda: None  # which a run in this process does when it is over
+    gc.freeze()  # otherwise each collection scans all tests, for a third of a second
+    gc.unfreeze = lambda: None  # a run in this process would call it at its end
     commands: Any = sys.modules.get("forked_commands")
     if commands is not None:
         commands.FIRST = commands.inherited()
@@ -70,12 +70,12 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture
 def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run parts of kernels that a test calls as Python, to the same bits; compiling one for that takes seconds."""
+    """Run kernel parts that a test calls as Python, to the same bits, because compiling one takes seconds."""
     monkeypatch.setattr(Part, "__call__", lambda part, *arguments: part.py_func(*arguments))
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    os.environ.pop("COLUMNS", None)  # of the terminal in which tests are started: no test depends on its width
+    os.environ.pop("COLUMNS", None)  # of the terminal that starts the tests, which must not depend on its width
     worker = getattr(config, "workerinput", None)
     if worker and sys.platform == "linux" and worker["workerid"] == quiet_one(worker["workercount"]):
         os.setsid()

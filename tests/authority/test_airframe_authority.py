@@ -1,4 +1,4 @@
-"""Airframes as the literature has them: off-centre rotors are trimmed, drag and thrust follow the flow past them.
+"""Airframes against the literature: off-centre rotors are trimmed; drag and thrust depend on the air flow past them.
 
 Sources: RotorS (Furrer et al. 2016) for the Iris; RotorPy (Folk et al. 2023) and Svacha, Mohta and Kumar (ICUAS 2017)
 for k_d, k_z, k_h and quadratic drag; Faessler, Franchi and Scaramuzza (RA-L 2018) for drag by axis.
@@ -22,7 +22,7 @@ from zsim_world.sensors.sensor_set import fleet_sensors
 
 pytestmark = pytest.mark.usefixtures("interpreted")
 
-ROTORS = slice(STATE.size, STATE.size + 4)  # of drone a: with the Iris there is a column more
+ROTORS = slice(STATE.size, STATE.size + 4)  # speeds of drone a's rotors; with the Iris, a state has one more column
 FAR_IRIS = {"name": "b", "position_m": [100, 0, 0], "model": "iris", "aerodynamics": {"rotor_drag_n_s2_m": 1e-4}}
 GRAVITY_M_S2, MASS_KG = 9.80665, 0.429
 
@@ -33,9 +33,9 @@ def scenario_of(*more: dict[str, Any], **drone: Any) -> Scenario:
 
 
 def bodies_of(**drone: Any) -> Bodies:
-    """Return the bodies of a drone and of an Iris with aerodynamics that stands far away.
+    """Return the bodies of a drone and of a distant Iris with aerodynamics.
 
-    Rotors that are no cross, and aerodynamics, have compiled code of their own: with the Iris, one does for all.
+    Aerodynamics and rotors that do not form a cross need code of their own; with the Iris, one kernel serves all.
     """
     scenario = scenario_of(FAR_IRIS, **drone)
     vehicles = [vehicle_of(each.model) for each in scenario.drones]
@@ -45,10 +45,10 @@ def bodies_of(**drone: Any) -> Bodies:
 def thrown(
     v: Any, q: Any = (1.0, 0.0, 0.0, 0.0), rate: float = 0.0, rotors: Any = 0.0, **drone: Any
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the accelerations of a drone in still air high up [m/s^2], and of its turning [rad/s^2].
+    """Return the linear [m/s^2] and angular [rad/s^2] accelerations of a drone high up in still air.
 
     Args:
-        v, q: its velocity [m/s] and attitude; rate: at which it rolls [rad/s]; rotors: steady speeds [rad/s].
+        v, q: velocity [m/s] and attitude; rate: roll rate [rad/s]; rotors: steady rotor speeds [rad/s].
     """
     bodies = bodies_of(**drone)
     state = bodies.state[0]
@@ -67,8 +67,8 @@ def advance(fleet: Fleet, seconds: float, steer: Any = None) -> None:
         fleet.advance()
 
 
-def test_the_iris_of_rotors_hovers_level_with_its_rear_rotors_faster() -> None:
-    """Moments about the centre: the thrust of each rotor times its arm sums to zero, in closed form x_f / x_r."""
+def test_the_iris_hovers_level_with_faster_rear_rotors() -> None:
+    """The moments of thrust about the centre of mass sum to zero, so the ratio of thrusts is that of the lever arms."""
     vehicle = vehicle_of("iris")
     shares = lift_shares(vehicle)
     np.testing.assert_allclose(allocation(vehicle) @ shares, 0.0, atol=1e-9)
@@ -81,7 +81,7 @@ def test_the_iris_of_rotors_hovers_level_with_its_rear_rotors_faster() -> None:
 
 
 @pytest.mark.soak
-def test_the_iris_of_rotors_flies_with_its_rear_rotors_faster() -> None:
+def test_the_iris_flies_with_faster_rear_rotors() -> None:
     vehicle = vehicle_of("iris")
     shares = lift_shares(vehicle)
     fleet = Fleet(scenario_of(FAR_IRIS, model="iris"))
@@ -107,7 +107,7 @@ def test_the_iris_of_rotors_flies_with_its_rear_rotors_faster() -> None:
 
 
 def test_terminal_velocity_with_quadratic_drag() -> None:
-    """m g = c v^2: a fall with still rotors, and the same on its side with another coefficient."""
+    """m g = c v^2 in a fall with stopped rotors, upright and on its side, where another coefficient applies."""
     drag = {"quadratic_drag_n_s2_m2": [0.02, 0.02, 0.08]}
     for rpy, c in (((0.0, 0.0, 0.0), 0.08), ((math.pi / 2, 0.0, 0.0), 0.02)):
         v = (0.0, 0.0, -math.sqrt(MASS_KG * GRAVITY_M_S2 / c))
@@ -115,7 +115,7 @@ def test_terminal_velocity_with_quadratic_drag() -> None:
         np.testing.assert_allclose(accel, 0.0, atol=1e-9)
 
 
-def test_linear_drag_by_axis_turns_with_the_body() -> None:
+def test_linear_drag_by_axis_rotates_with_the_body() -> None:
     """dv/dt = -R D R^T v / m - g (Faessler et al.), for a body yawed by 30 deg in level flight."""
     drag = {"linear_drag_n_s_m": [0.3, 0.6, 0.1]}
     v, yaw = np.array([3.0, 1.0, 0.0]), math.radians(30.0)
@@ -129,26 +129,26 @@ def test_linear_drag_by_axis_turns_with_the_body() -> None:
 @pytest.mark.parametrize(
     ("coefficients", "v", "force"),
     [
-        # four rotors at 400 rad/s: -k_d w u across, (k_h u^2 - k_z w u_z) along (RotorPy, compute_body_wrench)
+        # four rotors at 400 rad/s: -k_d w u across the axis, (k_h u^2 - k_z w u_z) along (RotorPy, compute_body_wrench)
         ({"rotor_drag_n_s2_m": 1e-4}, (3.0, -2.0, 0.0), (-4 * 1e-4 * 400 * 3.0, 4 * 1e-4 * 400 * 2.0, 0.0)),
         ({"rotor_inflow_n_s2_m": 1e-4}, (0.0, 0.0, 2.0), (0.0, 0.0, -4 * 1e-4 * 400 * 2.0)),
         ({"rotor_lift_n_s2_m2": 5e-3}, (3.0, 4.0, 0.0), (0.0, 0.0, 4 * 5e-3 * 25.0)),
     ],
     ids=["k_d", "k_z", "k_h"],
 )
-def test_thrust_depends_on_the_flow_past_the_rotors(coefficients: Any, v: Any, force: Any) -> None:
+def test_rotor_forces_depend_on_the_flow_past_the_rotors(coefficients: Any, v: Any, force: Any) -> None:
     plain, _ = thrown(v, rotors=400.0, drag_n_s_m=0.0)
     flown, _ = thrown(v, rotors=400.0, drag_n_s_m=0.0, aerodynamics=coefficients)
     np.testing.assert_allclose(MASS_KG * (flown - plain), force, rtol=1e-9, atol=1e-12)
 
 
-def test_a_rotor_that_stands_still_gives_no_lift_in_a_wind() -> None:
+def test_a_stopped_rotor_gives_no_lift_in_an_air_flow() -> None:
     accel, _ = thrown((8.0, 0.0, 0.0), drag_n_s_m=0.0, aerodynamics={"rotor_lift_n_s2_m2": 0.05})
     np.testing.assert_allclose(accel, (0.0, 0.0, -GRAVITY_M_S2), rtol=1e-9, atol=1e-12)
 
 
-def test_turning_rotors_damp_a_roll_by_their_inflow() -> None:
-    """M = -k_z w y^2 p for each rotor at y: a lever arm, not a force at the centre."""
+def test_rotor_inflow_damps_a_roll() -> None:
+    """M = -k_z w y^2 p for each rotor at y: the force acts on a lever arm, not at the centre."""
     k_z, rate = 1e-4, 2.0
     _, turning = thrown((0.0, 0.0, 0.0), rate=rate, rotors=400.0, aerodynamics={"rotor_inflow_n_s2_m": k_z})
     vehicle = bodies_of().vehicle[0]
@@ -156,7 +156,7 @@ def test_turning_rotors_damp_a_roll_by_their_inflow() -> None:
     assert turning[0] == pytest.approx(expected, rel=1e-9)
 
 
-def test_without_aerodynamics_they_are_no_part_of_the_kernel() -> None:
+def test_the_kernel_omits_aerodynamics_with_zero_coefficients() -> None:
     plain, none = (Fleet(scenario_of(**drone)) for drone in ({}, {"aerodynamics": {"rotor_drag_n_s2_m": 0.0}}))
     assert plain.bodies.aero_parts == none.bodies.aero_parts == (0,)
     for fleet in (plain, none):
@@ -167,8 +167,8 @@ def test_without_aerodynamics_they_are_no_part_of_the_kernel() -> None:
 
 
 @pytest.mark.soak
-def test_it_flies_with_all_of_them() -> None:
-    """RotorPy's figures of the Crazyflie and of the Hummingbird's body, on the AR.Drone: it holds its hover and speed."""
+def test_a_drone_flies_with_all_aerodynamic_effects() -> None:
+    """With RotorPy's coefficients of the Crazyflie and the Hummingbird's body, the AR.Drone holds hover and speed."""
     given = {
         "quadratic_drag_n_s2_m2": [0.005, 0.005, 0.01],
         "rotor_drag_n_s2_m": 1.19e-4,

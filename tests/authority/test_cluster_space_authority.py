@@ -1,7 +1,7 @@
-"""The paper's cluster and its controller against figures that stand outside of this code.
+"""The paper's cluster and its controller against figures from outside this code.
 
-Authorities: the paper (equations (3) and (4)); positions, determinant, condition numbers and tracking that
-were worked out for this project with another implementation (to its printed digits); scipy's rotations.
+Authorities: the paper's equations (3) and (4); positions, determinant, condition numbers and tracking errors that
+another implementation computed for this project, to its printed digits; scipy's rotations.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ def changed(**values: float) -> Array:
 # Kinematics
 
 
-def test_the_paper_s_formation_stands_where_it_was_worked_out():
+def test_the_paper_s_formation_matches_the_reference_positions():
     p_W, yaw = SPACE.inverse(C_DES)
     assert np.round(p_W, 3).tolist() == [[5.0, -2.536, 15.0], [3.469, -6.232, 15.0], [6.531, -6.232, 15.0]]
     assert yaw == pytest.approx(np.full(3, math.pi / 2))
@@ -51,8 +51,8 @@ def test_the_paper_s_formation_stands_where_it_was_worked_out():
     assert (round(distance, 2), i + 1, j + 1) == (3.06, 2, 3)
 
 
-def test_the_frame_is_z_y_x_euler_by_scipy():
-    """The triangle is built by the law of cosines and turned by scipy, then measured."""
+def test_the_cluster_frame_matches_scipy_s_z_y_x_euler_angles():
+    """Each triangle is built from p, q and beta, rotated by scipy and then measured."""
     rng = np.random.default_rng(3)
     for _ in range(2000):
         p, q, beta = rng.uniform(0.5, 8.0), rng.uniform(0.5, 8.0), rng.uniform(0.1, 3.0)
@@ -68,7 +68,7 @@ def test_the_frame_is_z_y_x_euler_by_scipy():
         assert np.abs(SPACE.difference(SPACE.forward(p_W, np.zeros(3)), np.array(expected))).max() < 1e-9
 
 
-def test_ten_thousand_round_trips():
+def test_inverse_undoes_forward_for_ten_thousand_formations():
     rng = np.random.default_rng(4)
     worst = 0.0
     for _ in range(10_000):
@@ -79,7 +79,7 @@ def test_ten_thousand_round_trips():
     assert 0.0 < worst < 5e-12
 
 
-def test_the_determinant_is_that_of_the_closed_formula():
+def test_the_determinant_matches_its_closed_form():
     rng = np.random.default_rng(5)
     for _ in range(500):
         c = np.concatenate(
@@ -101,11 +101,11 @@ def test_the_determinant_is_that_of_the_closed_formula():
     ],
     ids=["c_des", "beta 5", "beta 1", "beta 175", "pitch 89"],
 )
-def test_condition_numbers(c, condition):
+def test_condition_numbers_match_the_reference(c, condition):
     assert SPACE.condition(c) == pytest.approx(condition, rel=0.04)
 
 
-def test_the_jacobian_keeps_to_central_differences_at_random_formations():
+def test_the_jacobian_matches_central_differences():
     rng, step = np.random.default_rng(6), 1e-5
     for _ in range(300):
         p_W, yaw = rng.normal(scale=4.0, size=(3, 3)), rng.uniform(-math.pi, math.pi, 3)
@@ -121,12 +121,12 @@ def test_the_jacobian_keeps_to_central_differences_at_random_formations():
         assert np.abs(numeric - SPACE.jacobian(p_W, yaw)).max() < 1e-7
 
 
-# Flights of ideal robots: a velocity lag, a delay of one gate, noise and wind as asked
+# Flights of ideal robots with a velocity lag, a delay of one gate, and optional noise and wind
 
 
 @dataclasses.dataclass
 class Flight:
-    """What a flight has left: instants, true and desired clusters, the least distance between robots."""
+    """Result of a flight: instants, true and desired clusters, and the least distance between robots."""
 
     t_s: Array
     c: Array
@@ -151,9 +151,9 @@ def fly(
     wind_W: tuple[float, float, float] = (0.0, 0.0, 0.0),
     feed_forward: bool = True,
 ) -> Flight:
-    """Fly three robots whose velocities follow commands of the gate before with a first-order lag.
+    """Fly three robots whose velocities follow the commands of the previous gate with a first-order lag.
 
-    noise_m is the standard deviation of estimated positions, correlated over 1 s as a filter's errors are.
+    noise_m is the standard deviation of the position estimates, correlated over 1 s like a filter's errors.
     """
     law, rng = ProportionalLaw(SPACE, gains), np.random.default_rng(11)
     p_W, yaw = start[0].copy(), start[1].copy()
@@ -178,7 +178,7 @@ def fly(
 
 
 def from_the_ground_triangle(**kwargs) -> Flight:
-    """Fly to equation (3) from where drones are assembled, on the ramp that the controller plans."""
+    """Fly from TRIANGLE to equation (3) on the ramp that the controller plans."""
     start = (TRIANGLE, np.zeros(3))
     c = SPACE.forward(*start)
     ramp = RampPlanner(SPACE, FormationGains(), ShapeLimits()).ramp((c, np.zeros(12)), Hold(C_DES), 0.0)
@@ -186,12 +186,12 @@ def from_the_ground_triangle(**kwargs) -> Flight:
 
 
 def on_equation_4(**kwargs) -> Flight:
-    """Fly equation (4) for 150 s, from its start at rest."""
+    """Fly equation (4) for 150 s, starting at rest at its first point."""
     trajectory = ExpressionTrajectory(SPACE, EQUATION_4, np.zeros(12), {"f": 0.01})
     return fly(trajectory, 150.0, start=SPACE.inverse(trajectory.value(0.0)[0]), **kwargs)
 
 
-def test_equation_3_is_reached_from_the_ground_triangle_far_apart_all_the_way():
+def test_equation_3_is_reached_with_the_robots_far_apart():
     flight = from_the_ground_triangle()
     assert flight.closest_m > 2.9
     rms = flight.rms(60.0, 100.0)
@@ -203,12 +203,12 @@ def test_equation_3_is_reached_with_noisy_estimates():
     flight = from_the_ground_triangle(noise_m=0.15)  # a Kalman filter on GPS and flow leaves 0.152 m
     assert flight.closest_m > 2.0
     rms = flight.rms(60.0, 100.0)
-    # k / (k + 1/tau) of the estimate's variance is followed: rms about 0.15 sqrt(0.6/1.6)/sqrt(3) = 0.053 m
+    # the robots follow k / (k + 1/tau) of the estimate's variance: rms about 0.15 sqrt(0.6/1.6)/sqrt(3) = 0.053 m
     assert max(rms["x_c"], rms["y_c"], rms["z_c"]) < 0.09
     assert max(rms["p"], rms["q"]) < 0.25
 
 
-def test_the_integral_takes_out_wind_and_without_it_the_offset_is_wind_over_gain():
+def test_integral_action_removes_the_offset_of_wind_over_gain():
     wind_W = (0.4, -0.3, 0.1)
     without = from_the_ground_triangle(wind_W=wind_W, gains=FormationGains(integral_1_s2=0.0)).rms(80.0, 100.0)
     assert [without[name] for name in ("x_c", "y_c", "z_c")] == pytest.approx([0.4 / 0.6, 0.5, 0.1 / 0.6], rel=0.01)
@@ -237,7 +237,7 @@ def test_equation_4_without_feed_forward_lags_by_its_rate_over_the_gain():
         assert rms[name] == pytest.approx(lag, rel=0.05), name
 
 
-def test_equation_4_is_flown_with_noisy_estimates():
+def test_equation_4_is_tracked_with_noisy_estimates():
     flight = on_equation_4(noise_m=0.15)
     assert flight.closest_m > 2.0
     rms = flight.rms(50.0, 150.0)
@@ -248,8 +248,8 @@ def test_saturated_robots_keep_their_shape_on_a_step_across_the_field():
     start = SPACE.inverse(changed(x_c=-15.0, y_c=12.0, z_c=4.0, yaw=-0.5))
     flight = fly(Hold(C_DES), 60.0, start=start)
     speed = np.hypot(*np.diff(flight.c[:, :2], axis=0).T) / GATE_S
-    assert speed.max() > 0.85 * FormationGains().speed_max_m_s  # the step does saturate
-    # elsewhere: 0.07 m of shape error in transit with one factor, 1.25 m with clipping per axis
+    assert speed.max() > 0.85 * FormationGains().speed_max_m_s  # the step does saturate the speed
+    # another implementation: 0.07 m of shape error in transit with a common factor, 1.25 m with clipping per axis
     assert np.abs(flight.c[:, 9:11] - 4.0).max() < 0.15
     assert flight.closest_m > 2.5
     assert np.abs(SPACE.difference(flight.c[-1], C_DES)).max() < 0.05

@@ -1,6 +1,6 @@
-"""How well a place is held in gusts: measured in flight, and predicted by linear theory of the loops.
+"""How well a position is held in gusts: measured in flight, and predicted by linear theory of the control loops.
 
-An outer loop on truth commands v = 0.6 e + 0.05 integral(e). One horizontal axis is then a linear system driven by
+An outer loop on the truth commands v = 0.6 e + 0.05 integral(e). One horizontal axis is then a linear system driven by
 three white noises (gust, accelerometer, flow), and its spread follows from a Lyapunov equation.
 """
 
@@ -18,9 +18,9 @@ from zsim_world.vehicles.firmware import loop_gains
 from zsim_world.vehicles.observer import GAIN
 
 PROPORTIONAL, INTEGRAL = 0.6, 0.05  # 1/s, 1/s^2
-GUST, TAU_S = 0.5, 5.0  # m/s; 10 m over 2 m/s
+GUST, TAU_S = 0.5, 5.0  # m/s; s, 10 m at 2 m/s
 DRAG = 0.249 / 0.429  # 1/s
-TILT_S = 0.12  # s, the tilt loop as one lag
+TILT_S = 0.12  # s, the tilt loop as a first-order lag
 PRESETS = {
     "paper": {"preset": "paper"},
     "as_printed": {"preset": "paper", "as_printed": True},
@@ -37,7 +37,7 @@ def field(sensors, count, seed=1):
 
 
 def predicted(sensors):
-    """Return the standard deviation of one horizontal axis [m] from the loops' linear model."""
+    """Return the standard deviation of the position on a horizontal axis [m] from the loops' linear model."""
     scenario = field(sensors, 1)
     row = observer.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
     imu, flow = scenario.drones[0].sensors.imu, scenario.drones[0].sensors.flow
@@ -66,7 +66,7 @@ def predicted(sensors):
 
 
 def measured(sensors, seed):
-    """Return the root mean square of each axis [m] of six drones over 200 s at 15 m."""
+    """Return the root mean square position error on each axis [m] of six drones over 200 s at a height of 15 m."""
     fleet = Fleet(field(sensors, 6, seed))
     for i in range(fleet.count):
         fleet.takeoff(i)
@@ -89,7 +89,7 @@ def measured(sensors, seed):
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_gusts_are_rejected_as_theory_says_and_well_enough_for_the_formation(name):
+def test_gusts_are_rejected_as_predicted_and_within_limits(name):
     spread = np.mean([measured(PRESETS[name], seed) for seed in (1, 2)], axis=0)
     assert spread[:2].max() < CAPS_M[name]
     assert spread[2] < 0.05

@@ -1,4 +1,4 @@
-"""Elementary functions, distributions and linear algebra against mpmath with 40 digits and against LAPACK."""
+"""Elementary functions against mpmath with 40 digits, distributions against scipy, linear algebra against LAPACK."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from zsim.math import linear, randomness
 
 COUNT = 1500
 RNG = np.random.default_rng(7)
-ULP_MAX = 2.0  # the promise of zsim.math.elementary
+ULP_MAX = 2.0  # the bound that zsim.math.elementary promises
 
 
 def even(low: float, high: float) -> list[float]:
@@ -23,7 +23,7 @@ def even(low: float, high: float) -> list[float]:
 
 
 def wide(low: float, high: float) -> list[float]:
-    """Return numbers of both signs with even exponents of ten."""
+    """Return numbers of both signs whose exponents of ten are uniformly distributed."""
     return (RNG.choice([-1.0, 1.0], COUNT) * 10.0 ** RNG.uniform(low, high, COUNT)).tolist()
 
 
@@ -59,7 +59,7 @@ def test_functions_are_within_two_units_in_the_last_place(name: str, arguments: 
     assert worst[0] < ULP_MAX, worst
 
 
-def test_the_angle_of_a_point_is_within_two_units_in_every_quadrant() -> None:
+def test_atan2_is_within_two_units_in_the_last_place_in_every_quadrant() -> None:
     pairs = [*zip(even(-3, 3), even(-3, 3), strict=True), *zip(wide(-9, 9), wide(-9, 9), strict=True)]
     with mpmath.workdps(40):
         worst = max((ulps(el.atan2(y, x), mpmath.atan2(mpmath.mpf(y), mpmath.mpf(x))), y, x) for y, x in pairs)
@@ -76,12 +76,12 @@ def test_powers_are_within_their_bound() -> None:
 
 @pytest.mark.parametrize("name", ["sin", "cos", "tan", "asin", "acos", "atan", "exp", "log", "log1p"])
 @pytest.mark.parametrize("x", [0.0, -0.0, 1.0, -1.0, 2.0, math.inf, -math.inf, math.nan, 5e-324, 1e300, -1e300])
-def test_at_the_ends_they_are_those_of_numpy(name: str, x: float) -> None:
-    """To the sign of zero; by the names that numpy has for them."""
+def test_functions_match_numpy_at_special_values(name: str, x: float) -> None:
+    """Also in the sign of zero."""
     with np.errstate(all="ignore"):
         wanted = float(getattr(np, {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}.get(name, name))(x))
     found = getattr(el, name)(x)
-    if abs(x) == 1e300 and name in ("sin", "cos", "tan"):  # whose argument has no digit after the point
+    if abs(x) == 1e300 and name in ("sin", "cos", "tan"):  # an argument without digits after the point
         assert math.isfinite(found)
     else:
         assert (math.isnan(found) and math.isnan(wanted)) or found == pytest.approx(wanted, rel=4e-16, abs=0.0)
@@ -90,15 +90,15 @@ def test_at_the_ends_they_are_those_of_numpy(name: str, x: float) -> None:
 
 @pytest.mark.parametrize("y", [0.0, -0.0, 1.0, -1.0, math.inf, -math.inf, math.nan])
 @pytest.mark.parametrize("x", [0.0, -0.0, 1.0, -1.0, math.inf, -math.inf, math.nan])
-def test_the_angle_of_a_point_at_the_ends_is_that_of_the_c_library(y: float, x: float) -> None:
+def test_atan2_matches_the_c_library_at_special_values(y: float, x: float) -> None:
     found, wanted = el.atan2(y, x), math.atan2(y, x)
     assert found == pytest.approx(wanted, rel=4e-16, nan_ok=True)
     assert math.copysign(1.0, found) == math.copysign(1.0, wanted) or math.isnan(wanted)
 
 
 @pytest.mark.parametrize("name", ["sin_cos", "atan2", "exp", "log", "log1p", "power"])
-def test_the_source_as_plain_python_gives_the_same_bits(name: str) -> None:
-    """Without numba it runs so."""
+def test_plain_python_gives_the_same_bits_as_compiled_code(name: str) -> None:
+    """Without numba, the functions run as plain Python."""
     own = getattr(el, name)
     arguments = list(zip(positive(even(-4, 4)), even(-4, 4), strict=True))[:300]
     source: Callable[..., Any] = getattr(own, "py_func", own)
@@ -108,14 +108,14 @@ def test_the_source_as_plain_python_gives_the_same_bits(name: str) -> None:
 
 
 @pytest.mark.parametrize("x", [709.0, 709.7, 709.78, 709.782712893384, 709.79, 1000.0, 1099.9])
-def test_where_exp_overflows_it_is_inf_also_as_plain_python(x: float) -> None:
+def test_exp_overflows_to_inf_also_as_plain_python(x: float) -> None:
     with np.errstate(over="ignore"):
         wanted = float(np.exp(x))
     source: Callable[..., Any] = getattr(el.exp, "py_func", el.exp)
     assert el.exp(x) == source(x) == pytest.approx(wanted, rel=4e-16)
 
 
-def test_distributions_are_those_of_scipy() -> None:
+def test_distributions_match_scipy() -> None:
     x = np.linspace(-9, 9, 1001)
     found = [randomness.normal_probability(each) for each in x.tolist()]
     np.testing.assert_allclose(found, scipy.special.ndtr(x), atol=1e-15)
@@ -129,7 +129,7 @@ def test_distributions_are_those_of_scipy() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 4, 7, 12, 20])
-def test_linear_algebra_is_that_of_lapack(n: int) -> None:
+def test_linear_algebra_matches_lapack(n: int) -> None:
     rng = np.random.default_rng(n)
     A, B = rng.normal(size=(n, n)), rng.normal(size=(n, 3))
 
@@ -148,7 +148,7 @@ def test_linear_algebra_is_that_of_lapack(n: int) -> None:
     np.testing.assert_allclose(linear.exponential(A), scipy.linalg.expm(A), rtol=1e-9, atol=1e-9)
 
 
-def test_banded_systems_are_solved_as_full_ones() -> None:
+def test_banded_systems_have_the_solutions_of_full_ones() -> None:
     rng = np.random.default_rng(3)
     n, below, above = 40, 5, 2
     A = np.triu(np.tril(rng.normal(size=(n, n)), above), -below)
@@ -159,7 +159,7 @@ def test_banded_systems_are_solved_as_full_ones() -> None:
     np.testing.assert_allclose(linear.solve_banded(diagonals, below, B), np.linalg.solve(A, B), rtol=1e-8, atol=1e-9)
 
 
-def test_singular_matrices_have_their_zero_and_no_solution() -> None:
+def test_singular_matrices_have_a_zero_singular_value_and_no_solution() -> None:
     A = np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [0.0, 1.0, 1.0]])
     assert linear.singular_values(A)[-1] == pytest.approx(0.0, abs=1e-15)
     assert not np.isfinite(linear.solve(A, np.ones(3))).all()

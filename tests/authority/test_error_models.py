@@ -1,4 +1,4 @@
-"""Errors of sensors against closed forms: Gauss-Markov process, Allan deviation, noise at the sensor's own rate.
+"""Sensor errors against closed forms: Gauss-Markov process, Allan deviation, noise at the sensor's own rate.
 
 IEEE Std 952-1997, annex C: white noise of density N has the Allan deviation N / sqrt(tau), a random walk K has
 K sqrt(tau / 3), a Gauss-Markov process of sigma and T peaks at tau = 1.89 T with 0.617 sigma.
@@ -28,7 +28,7 @@ def scenario(**sensors: Any):
 
 
 def errors(model: dict[str, float], samples: int) -> Array:
-    """Return the errors of a barometer of this model at RATE_HZ, one after the other."""
+    """Return successive errors of a barometer with this error model at RATE_HZ."""
     of = scenario(baro={"rate_hz": RATE_HZ, "altitude_m": {"noise": 0.0, **model}})
     sensors = sensor_set.fleet_sensors(of)
     config, found = sensor_set.config(sensors)[0, BARO], np.zeros((samples, 6))
@@ -48,7 +48,7 @@ def allan(x: Array, tau_s: float) -> float:
 
 
 @pytest.mark.parametrize("tau_s", [0.1, 1.0, 10.0])
-def test_a_density_has_its_allan_deviation(tau_s: float):
+def test_white_noise_has_the_allan_deviation_of_its_density(tau_s: float):
     assert allan(errors({"density": 0.02}, 100_000), tau_s) == pytest.approx(0.02 / math.sqrt(tau_s), rel=0.1)
 
 
@@ -57,7 +57,7 @@ def test_a_random_walk_has_its_allan_deviation(tau_s: float):
     assert allan(errors({"bias_walk": 0.02}, 200_000), tau_s) == pytest.approx(0.02 * math.sqrt(tau_s / 3.0), rel=0.1)
 
 
-def test_a_bias_instability_peaks_in_its_allan_deviation():
+def test_the_allan_deviation_of_a_bias_instability_has_its_peak():
     x = errors({"bias_instability": 0.1, "correlation_s": 0.5}, 200_000)
     found = [allan(x, tau_s) for tau_s in (0.2, 0.94, 5.0)]
     assert found[1] == pytest.approx(0.617 * 0.1, rel=0.05)
@@ -76,7 +76,7 @@ def test_the_autocorrelation_decays_with_the_correlation_time(lag_s: float):
     )
 
 
-def test_in_the_world_it_is_stationary_from_the_first_sample():
+def test_correlated_errors_are_stationary_from_the_first_sample():
     of = scenario(gps={"position_m": {"noise": 2.0, "correlation_s": 3.0}, "rate_hz": 5.0})
     fleet, fixes = Fleet(of), []
     for _ in range(200):
@@ -84,14 +84,14 @@ def test_in_the_world_it_is_stationary_from_the_first_sample():
         fixes += [(s.drone, s.values[3:6]) for s in samples_of(fleet) if s.sensor == "gps"]
     truth = fleet.truth().position_m
     by_drone = np.array([[p - truth[i] for drone, p in fixes if drone == i] for i in range(40)])  # (40, samples, 3)
-    bound = 4.0 * math.sqrt(2.0 / 120)  # of 40 drones' three axes
+    bound = 4.0 * math.sqrt(2.0 / 120)  # for the three axes of 40 drones
     for sample in (0, 10, -1):
         assert np.mean(by_drone[:, sample] ** 2) == pytest.approx(4.0, rel=bound)
     both = np.mean(by_drone[:, 0] * by_drone[:, 15])  # 3 s apart
     assert both == pytest.approx(4.0 * math.exp(-1.0), abs=4.0 * bound)
 
 
-def test_who_else_flies_with_correlated_errors_changes_no_other_drones_noise():
+def test_correlated_errors_leave_other_drones_noise_unchanged():
     drones: list[dict[str, Any]] = [{"name": name, "position_m": [3.0 * k, 0, 0]} for k, name in enumerate("ab")]
     document = {"name": "t", "duration_s": 1, "drones": drones, "sensors": {"preset": "paper"}}
     plain = Fleet(resolve(document))
@@ -105,7 +105,7 @@ def test_who_else_flies_with_correlated_errors_changes_no_other_drones_noise():
 
 
 @pytest.mark.parametrize("rate_hz", [200.0, 50.0])
-def test_a_density_of_the_imu_counts_at_its_own_rate(rate_hz: float):
+def test_the_noise_density_of_the_imu_applies_at_its_own_rate(rate_hz: float):
     models = {"accel_m_s2": {"noise": 0.0, "density": 0.004}, "gyro_deg_s": {"noise": 0.0, "density": 0.01}}
     of = scenario(imu={"rate_hz": rate_hz, **models})
     fleet, found = Fleet(of), []

@@ -29,14 +29,14 @@ SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"  # three drones
 SEEDS = range(1, 13)
 TAKEOFF_S, FLYING_S, END_S = 2.0, 8.0, 32.0  # s
 CONVERGED_S = 14.0  # s
-HEIGHT_M, CIRCLE_M, CIRCLE_RAD_S = 4.0, 2.0, 0.4  # a circle beside the start, so that the drones manoeuvre
+HEIGHT_M, CIRCLE_M, CIRCLE_RAD_S = 4.0, 2.0, 0.4  # a circle beside the start makes the drones manoeuvre
 GAIN_1_S, SPEED_M_S = 0.6, 1.0
 
 Array = NDArray[np.float64]
 
 
 class Runs(NamedTuple):
-    """Of R drones (three of each seed) at T gates after convergence."""
+    """Errors and covariances of R drones (three per seed) at T gates after convergence."""
 
     error: Array  # (R, T, 6), position [m] and velocity [m/s]
     covariance: Array  # (R, T, 6, 6)
@@ -44,7 +44,7 @@ class Runs(NamedTuple):
     heading_sigma: Array  # (R, T) [rad]
 
     def nees(self, part: slice = slice(0, 6)) -> Array:
-        """(R, T), of a part of the state."""
+        """Return the normalised squared error (R, T) of a part of the state."""
         e, P = self.error[..., part], self.covariance[..., part, part]
         return np.einsum("rti,rti->rt", e, np.linalg.solve(P, e[..., None])[..., 0])
 
@@ -68,7 +68,7 @@ def flown(case: str) -> Runs:
 
 
 def fly(scenario: Scenario) -> Runs:
-    """Take off and fly circles by the estimates, as a controller would."""
+    """Take off and fly circles on the estimates, as a controller would."""
     fleet = Fleet(scenario)
     gate_s = scenario.time.gate_ms / 1000.0
     bank = EstimatorBank(scenario.drones, scenario.environment, scenario.estimation, gate_s)
@@ -112,43 +112,43 @@ def compare(fleet: Fleet, estimates: list[StateEstimate]) -> tuple[Array, Array,
 
 @pytest.mark.slow
 class TestConsistency:
-    """Every check is made on the same flights: one fixture per set of sensors."""
+    """All checks use the same flights, one fixture per set of sensors."""
 
-    def test_mean_nees_over_the_flight(self, runs: Runs):
-        """One drone per seed, as the runs must be independent; then all three, whose sensors are."""
+    def test_the_mean_nees_over_the_flight_is_in_the_band(self, runs: Runs):
+        """One drone per seed, as the runs must be independent; then all three, whose sensors are independent."""
         low, high = band(6, len(SEEDS))
         assert low < runs.nees()[::3].mean() < high
         low, high = band(6, 3 * len(SEEDS))
         assert low < runs.nees().mean() < high
 
-    def test_mean_nees_at_each_second(self, runs: Runs):
-        """19 of 20 instants are inside of the band; neighbours are correlated, so allow 17."""
+    def test_the_mean_nees_at_most_instants_is_in_the_band(self, runs: Runs):
+        """19 of 20 instants are expected in the band; as neighbours are correlated, 17 suffice."""
         low, high = band(6, len(SEEDS))
         means = runs.nees()[::3, ::45].mean(0)
         assert len(means) == 20
         assert np.count_nonzero((low < means) & (means < high)) >= 17
 
     @pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)], ids=["position", "velocity"])
-    def test_position_and_velocity_each(self, runs: Runs, part: slice):
+    def test_position_and_velocity_are_each_in_the_band(self, runs: Runs, part: slice):
         low, high = band(3, len(SEEDS))
         assert low < runs.nees(part)[::3].mean() < high
 
-    def test_errors_are_small_and_as_large_as_claimed(self, runs: Runs):
+    def test_errors_are_small_and_match_the_estimated_sigma(self, runs: Runs):
         rms = np.sqrt((runs.error**2).mean((0, 1)))
         sigma = np.sqrt(np.einsum("rtii->rti", runs.covariance).mean((0, 1)))
         assert rms == pytest.approx(sigma, rel=0.25)
-        assert rms[:2].max() < 0.30  # m; 0.2 m after 14 s of averaging, on the way to 0.16 m
+        assert rms[:2].max() < 0.30  # m; 0.2 m after 14 s of averaging, which converges to 0.16 m
         assert rms[2] < 0.03  # m
 
-    def test_the_heading(self, runs: Runs):
+    def test_heading_errors_are_small_and_match_the_estimated_sigma(self, runs: Runs):
         rms = math.sqrt((runs.heading_error**2).mean())
         assert rms < 0.01  # rad
         assert rms == pytest.approx(math.sqrt((runs.heading_sigma**2).mean()), rel=0.3)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_fall_to_the_ground_is_owned_up_to(case: str):
-    """Stopped rotors at 1 m: the blow falls between two IMU samples, and the covariance must say so."""
+def test_the_covariance_covers_a_fall_to_the_ground(case: str):
+    """The rotors stop at 1 m; the impact falls between two IMU samples, and the covariance must allow for it."""
     scenario = scenario_file.load(SCENARIO, CASES[case], seed=1)
     fleet = Fleet(scenario)
     gate_s = scenario.time.gate_ms / 1000.0

@@ -1,7 +1,7 @@
-"""The estimator's covariance against its errors where readings are late, correlated, or tell no heading.
+"""The estimator's covariance against its errors where readings are late, correlated, or carry no heading.
 
-On flights of known truth, over seeds: the mean of e^T P^-1 e lies in the 95 % band of chi-square (Bar-Shalom, Li and
-Kirubarajan, "Estimation with Applications to Tracking and Navigation", section 5.4.2).
+On flights with known truth, over several seeds, the mean of e^T P^-1 e lies in the 95 % band of chi-square (Bar-Shalom,
+Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", section 5.4.2).
 """
 
 import math
@@ -14,9 +14,9 @@ from synthetic_flight import Circle, Flight, estimator, fly, readings, scenario
 
 from zsim.math.frames import wrap_angle
 
-SEEDS = range(4)  # a fault of these leaves the band threefold to a thousandfold
+SEEDS = range(4)  # few suffice: a fault exceeds the band by a factor of 3 to 1000
 HEADED = range(6)
-FLYING_S, STANDING_S = 10.0, 1000.0  # instant of the start: within the flight, or after it
+FLYING_S, STANDING_S = 10.0, 1000.0  # instant of the start [s]: within the flight, or after it
 PRECISE = {"position_m": {"noise": 0.02}, "velocity_m_s": {"noise": 0.43}}
 LATE = {
     "fixes at once": {"gps": {**PRECISE}},
@@ -57,13 +57,13 @@ def mean_nees(sensors: dict[str, Any], end_s: float, after_s: float) -> float:
 
 
 def cases(of: dict[str, Any], *others: str) -> list[Any]:
-    """Return the names of cases; those of others, which need no code of their own, are for the soak."""
+    """Return cases by name; `others`, which exercise no code of their own, run only in the soak."""
     return [pytest.param(name, marks=[pytest.mark.soak] if name in others else []) for name in of]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", cases(LATE, "fixes at once", "fixes at 0.5 s", "fixes at 2 s"))
-def test_late_readings_are_worth_what_they_are(case: str):
+def test_late_readings_are_weighted_consistently(case: str):
     low, high = band(6, len(SEEDS))
     assert low < mean_nees(LATE[case], 30.0, 15.0) < high
 
@@ -92,7 +92,7 @@ def test_correlated_errors_are_not_averaged_away(case: str):
         ),
     ],
 )
-def test_where_the_field_tells_no_heading_it_is_that_of_the_set_down(field: tuple[float, ...], start_s: float):
+def test_a_field_without_heading_leaves_that_of_the_set_down(field: tuple[float, ...], start_s: float):
     end_s, errors, sigmas = 30.0, [], []
     of = scenario(environment={"magnetic_field_ut": list(field)}, yaw_deg=30.0)
     for seed in HEADED:
@@ -106,8 +106,8 @@ def test_where_the_field_tells_no_heading_it_is_that_of_the_set_down(field: tupl
     assert max(sigmas) < 0.06
 
 
-def test_without_a_compass_the_heading_grows_as_uncertain_as_the_gyroscope_lets_it():
-    """A bias b that nothing measures turns a standing drone by b t: sigma^2 = set-down^2 + (b t)^2."""
+def test_without_a_compass_heading_sigma_grows_by_the_gyroscope_bias():
+    """A bias b that nothing measures turns the heading of a standing drone by b t: sigma^2 = set-down^2 + (b t)^2."""
     of = scenario(
         sensors={"imu": {"gyro_deg_s": {"noise": 0.01, "bias": 0.1}}},
         environment={"magnetic_field_ut": [0.0, 0.0, 0.0]},

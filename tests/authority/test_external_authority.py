@@ -1,4 +1,4 @@
-"""An external drone acts on the others as a simulated one at the same pose: downwash, hulls and distances to the bit."""
+"""An external drone affects others, to the bit, like a simulated one at the same pose: downwash, hulls, distances."""
 
 import msgspec
 import numpy as np
@@ -23,8 +23,8 @@ def row(p: np.ndarray, v: np.ndarray, rpy: np.ndarray, rotor_rad_s: np.ndarray) 
     return np.concatenate([p, v, quaternion_from_rpy(rpy), np.zeros(3), rotor_rad_s])
 
 
-def test_at_the_same_pose_it_pushes_and_blows_to_the_same_bits():
-    """Places about the other drone, most of them within reach of its jet or its hull."""
+def test_contact_and_downwash_are_bit_identical_at_the_same_pose():
+    """The other drone is placed near the lower one, which is mostly within reach of its jet or its hull."""
     rng = np.random.default_rng(7)
     simulated, external = (fleet_of(body, obstacles=OBSTACLES) for body in ("simulated", "external"))
     blown = touched = bumped = 0
@@ -59,7 +59,7 @@ def scene(body: str) -> Fleet:
 
 
 def flown_over() -> tuple[np.ndarray, list[Truth]]:
-    """Return the path (gates, 3) of a drone over which another one flies, and the truth of that one at each gate."""
+    """Return the path (gates, 3) of a drone with another one flying above, and the truth of the latter at each gate."""
     fleet, path, truths = scene("simulated"), [], []
     assert fleet.takeoff(0) is fleet.takeoff(1) is None
     for gate in range(GATES):
@@ -75,7 +75,7 @@ def flown_over() -> tuple[np.ndarray, list[Truth]]:
 
 
 def flown_beside(truths: list[Truth]) -> np.ndarray:
-    """Return the path of the same drone where a driver publishes these truths of the other one."""
+    """Return the path of the same drone when a driver publishes these truths of the other one."""
     fleet, path = scene("external"), []
     drones = ExternalDrones(fleet)
     assert fleet.takeoff(0) is None
@@ -87,8 +87,8 @@ def flown_beside(truths: list[Truth]) -> np.ndarray:
     return np.array(path)
 
 
-def test_it_blows_on_who_flies_below_as_the_simulated_one_did_whose_truth_its_driver_publishes():
-    """Between two gates a pose is moved on with its velocity, for the air and for the sonar that sees it from above."""
+def test_the_downwash_of_an_external_drone_matches_a_simulated_one():
+    """Between gates, its pose is extrapolated by its velocity, for the air and for a sonar that sees it from above."""
     path, truths = flown_over()
     far = [msgspec.structs.replace(truth, position_m=(50.0, 0.0, 2.0)) for truth in truths]
     same, alone = flown_beside(truths), flown_beside(far)

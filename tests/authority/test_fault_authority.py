@@ -1,4 +1,4 @@
-"""Faults against what follows in closed form from their definition and from the laws of the aircraft."""
+"""Faults against closed forms that follow from their definitions and the physics of the aircraft."""
 
 import math
 from typing import Any
@@ -46,8 +46,8 @@ def strike(fleet: Fleet, kind: str, target: str = "d1", **parameters: Any) -> No
 
 
 @pytest.mark.parametrize("share", [0.9, 0.7])
-def test_the_firmware_makes_up_for_lost_thrust(share: float):
-    """All rotors lose thrust alike. The weight is the same, so each must turn as before, on a command 1/sqrt(share)."""
+def test_the_firmware_compensates_for_lost_thrust(share: float):
+    """All rotors lose thrust alike; for the same weight, each must turn as before, on a command 1/sqrt(share)."""
     fleet = hovering()
     before = fleet.truth().position_m[0, 2]
     strike(fleet, "rotor_efficiency", rotor="all", value=share)
@@ -58,8 +58,8 @@ def test_the_firmware_makes_up_for_lost_thrust(share: float):
     assert rows[-1, 2] == pytest.approx(before, abs=0.05)
 
 
-def test_too_little_thrust_is_a_fall():
-    """The rotors turn at 503 rad/s at most, and their thrust is as the square: below (hover / 503)^2 nothing helps."""
+def test_a_drone_with_too_little_thrust_falls():
+    """Rotors turn at 503 rad/s at most, and thrust grows with the square: below (hover / 503)^2 a drone falls."""
     least = (HOVER_RAD_S / 503.0) ** 2
     held, falls = hovering(), hovering()
     strike(held, "rotor_efficiency", rotor="all", value=1.15 * least)
@@ -69,11 +69,11 @@ def test_too_little_thrust_is_a_fall():
     assert last[2] < 1.0
 
 
-def test_a_gust_pushes_as_drag_says():
-    """The push of a gust w on a hovering drone, against the same drone without: dv/dt = c (w - v), c = drag / mass.
+def test_a_gust_pushes_a_drone_as_its_drag_predicts():
+    """A gust w pushes a hovering drone, relative to one without the gust, by dv/dt = c (w - v), c = drag / mass.
 
-    So it is until the firmware leans, which takes it some gates: three are looked at. w is that of the middle of each
-    gate, and the air of one physics step is that of the step before. A twentieth of the force gone fails.
+    This holds until the firmware leans into the gust, some gates later; three gates are compared. w is the gust at the
+    middle of each gate, and a physics step uses the air of the step before. A loss of a twentieth of the force fails.
     """
     calm, fleet = hovering(), hovering()
     strike(fleet, "gust", "world", velocity_m_s=[20, 0, 0], for_s=1.0)

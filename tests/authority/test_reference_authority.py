@@ -1,4 +1,4 @@
-"""Paths and goals of drones against closed forms, published numbers and an optimisation of another kind."""
+"""Drones' paths and goals against closed forms, published numbers and an independent optimisation."""
 
 import csv
 import math
@@ -32,8 +32,8 @@ def path_of(file: Path) -> PiecewisePolynomial:
     return PiecewisePolynomial(np.array([piece["duration_s"] for piece in pieces]), coefficients)
 
 
-def test_rest_to_rest_is_the_closed_form() -> None:
-    """35 t^4 - 84 t^5 + 70 t^6 - 20 t^7, whose peaks are 2.1875 and 84 sqrt(5) / 25 = 7.5132."""
+def test_a_rest_to_rest_path_has_the_closed_form() -> None:
+    """35 t^4 - 84 t^5 + 70 t^6 - 20 t^7, whose speed peaks at 2.1875 and acceleration at 84 sqrt(5) / 25 = 7.5132."""
     path = minimum_snap((0.0, 1.0), np.array([[0.0] * 4, [1.0] * 4]))
     for column in path.coefficients[0].T.tolist():
         assert column == pytest.approx([0, 0, 0, 0, 35, -84, 70, -20], abs=1e-6)
@@ -42,8 +42,8 @@ def test_rest_to_rest_is_the_closed_form() -> None:
     assert one.at_s[0] == pytest.approx(0.5, abs=1e-6)
 
 
-def test_minimum_snap_is_the_least_of_a_quadratic_programme() -> None:
-    """The equality-constrained programme of Mellinger and Kumar, by its Lagrangian in monomials."""
+def test_minimum_snap_solves_the_quadratic_programme() -> None:
+    """Mellinger and Kumar's equality-constrained programme is solved in monomials through its Lagrangian."""
     times, places = np.array([0.0, 1.0, 1.8, 3.5, 4.0]), np.array([0.0, 2.0, 1.0, -1.0, 0.5])
     spans, m = np.diff(times), len(times) - 1
     cost, rows, right = np.zeros((8 * m, 8 * m)), [], []
@@ -74,8 +74,8 @@ def test_minimum_snap_is_the_least_of_a_quadratic_programme() -> None:
     assert path.coefficients[:, :, 0] == pytest.approx(best, abs=1e-6)
 
 
-def test_figure_eight_of_crazyflie_has_its_published_numbers() -> None:
-    """7.283185 s, 6.134 m, 0.8423 m/s on average, at most 1.2172 m/s and 3.0655 m/s^2, to 0.1 %."""
+def test_the_crazyflie_figure_eight_has_its_published_numbers() -> None:
+    """7.283185 s, 6.134 m, 0.8423 m/s on average, peaks of 1.2172 m/s and 3.0655 m/s^2, all within 0.1 %."""
     path = path_of(EXAMPLES / "figure8.csv")
     peaks, end_s = path.peaks(), path.duration_s or 0.0
     speeds = [float(np.linalg.norm(path.value(t)[1][:3])) for t in np.linspace(0.0, end_s, 20_001)]
@@ -83,10 +83,10 @@ def test_figure_eight_of_crazyflie_has_its_published_numbers() -> None:
     assert end_s == pytest.approx(7.283185, rel=1e-3)
     assert (length_m, length_m / end_s) == pytest.approx((6.134, 0.8423), rel=1e-3)
     assert (peaks.speed_m_s, peaks.accel_m_s2) == pytest.approx((1.2172, 3.0655), rel=1e-3)
-    assert peaks.speed_m_s >= max(speeds) - 1e-9  # no sample is beyond the extremum
+    assert peaks.speed_m_s >= max(speeds) - 1e-9  # no sample exceeds the extremum
 
 
-def test_sampled_peaks_agree_with_those_by_roots() -> None:
+def test_sampled_peaks_agree_with_those_from_roots() -> None:
     path = path_of(EXAMPLES / "swap6v" / "pp1.csv")
 
     class Other:
@@ -98,7 +98,7 @@ def test_sampled_peaks_agree_with_those_by_roots() -> None:
     assert refined.accel_m_s2 == pytest.approx(exact.accel_m_s2, rel=1e-3)
 
 
-def test_every_piece_is_read_as_it_is_written() -> None:
+def test_every_piece_is_read_as_the_file_gives_it() -> None:
     file = EXAMPLES / "swap6v" / "pp3.csv"
     rows = [[float(cell) for cell in row[:33]] for row in list(csv.reader(file.read_text().splitlines()))[1:]]
     path = path_of(file)
@@ -108,7 +108,7 @@ def test_every_piece_is_read_as_it_is_written() -> None:
             assert path.value(float(begin_s) + t)[0] == pytest.approx(wanted, abs=1e-9)
 
 
-def test_a_move_uses_its_limits() -> None:
+def test_a_move_reaches_but_keeps_its_limits() -> None:
     limits = PathLimits(1.0, 0.5, 1.0, 2.0)
     for goal, quantity in (([8, 0, 0, 0], 0), ([0, 0, 3, 0], 1), ([0, 0, 0, 3.0], 2), ([0.3, 0, 0, 0], 3)):
         peaks = move(np.zeros(4), np.array(goal, float), limits).peaks()
@@ -137,16 +137,16 @@ LIMITS = PathLimits(5.0, 1.0, 1.0, 2.0)
         # it cannot stop in 1 m: it brakes over 4 m and comes back over 3 m, as the time-optimal double integrator does
         ([1, 0, 0, 0], [4, 0, 0, 0], 4 / 2 + 2 * math.sqrt(3 / 2)),
         ([4, 0, 0, 0], [4, 0, 0, 0], 4 / 2),
-        ([20, 0, 20, 0], [0, 0, 0, 0], 20 / 1 + 1 / 2),  # straight: the climb's 1 m/s is that aside, which takes longer
+        ([20, 0, 20, 0], [0, 0, 0, 0], 20 / 1 + 1 / 2),  # straight: the slower climb holds both speeds to 1 m/s
     ],
 )
-def test_a_cruise_takes_the_time_of_the_closed_form(goal: list[float], rate: list[float], took_s: float) -> None:
+def test_a_cruise_takes_the_closed_form_time(goal: list[float], rate: list[float], took_s: float) -> None:
     way = cruise(np.zeros(4), np.array(goal, float), LIMITS, np.array(rate, float))
     assert way.duration_s == pytest.approx(took_s, abs=1e-6)
     assert way.value(took_s)[0] == pytest.approx(goal, abs=1e-9)
 
 
-def test_a_cruise_from_any_motion_keeps_its_limits_and_what_is_left_of_it_is_the_cruise_from_there() -> None:
+def test_a_cruise_keeps_its_limits_and_replanning_gives_its_remainder() -> None:
     random = np.random.default_rng(8)
     for _ in range(300):
         far = 10.0 ** random.uniform(-2, 2)
@@ -161,14 +161,14 @@ def test_a_cruise_from_any_motion_keeps_its_limits_and_what_is_left_of_it_is_the
         assert way.peaks().factor(LIMITS) <= 1.0 + 1e-9
         for before, after in zip(way.begins_s[1:-1] - 1e-9, way.begins_s[1:-1], strict=True):
             for one, other in zip(way.value(before), way.value(after), strict=True):
-                assert one == pytest.approx(other, abs=1e-7)  # neither place nor velocity jumps
+                assert one == pytest.approx(other, abs=1e-7)  # neither position nor velocity jumps
         at_s = random.uniform(0.0, 0.9) * end_s
         rest = cruise(way.value(at_s)[0], goal, LIMITS, way.value(at_s)[1])
         for t in np.linspace(at_s, end_s, 7).tolist():
             assert rest.value(t - at_s)[0][:3] == pytest.approx(way.value(t)[0][:3], abs=1e-6)
 
 
-def test_a_cruise_through_places_passes_each_by_its_radius_and_keeps_its_speed() -> None:
+def test_a_cruise_passes_places_within_their_radius_at_speed() -> None:
     places = [np.array(place, float) for place in ([30, 0, 0, 0], [30, 30, 0, 0], [0, 30, 0, 0])]
     rests = cruise_through(np.zeros(4), places, LIMITS, speeds=Cruise(2.0))
     assert rests.duration_s == pytest.approx(3 * (30 / 2 + 2 / 2), abs=1e-6)
@@ -184,7 +184,7 @@ def test_a_cruise_through_places_passes_each_by_its_radius_and_keeps_its_speed()
     assert np.mean(np.array(cruising) > 1.999) > 0.8
 
 
-def test_laps_are_the_curve_and_rest_at_both_ends() -> None:
+def test_laps_follow_the_curve_and_rest_at_both_ends() -> None:
     curve = figure_eight(4.0, 2.0)
     path = Laps(curve, 10.0, 2.0)
     end_s = path.duration_s or 0.0
@@ -198,8 +198,8 @@ def test_laps_are_the_curve_and_rest_at_both_ends() -> None:
     assert path.value(end_s)[1] == pytest.approx(np.zeros(4), abs=1e-12)
 
 
-def test_assigned_drones_keep_their_distance_and_linear_cost_does_not() -> None:
-    """CAPT: starts and goals a metre apart or more, least distance 1/sqrt(2) m, in 1000 random cases."""
+def test_assignment_keeps_drones_apart_where_linear_cost_does_not() -> None:
+    """CAPT: starts and goals at least 1 m apart leave 1/sqrt(2) m between drones, in 1000 random cases."""
     from scipy.optimize import linear_sum_assignment
 
     random = np.random.default_rng(5)
@@ -222,8 +222,8 @@ def test_assigned_drones_keep_their_distance_and_linear_cost_does_not() -> None:
     assert least_linear < 0.5
 
 
-def test_approaches_are_found_and_only_these() -> None:
-    """Two drones cross at right angles, a quarter of a second apart: the closest form of the distance is known."""
+def test_only_approaches_below_the_clearance_are_found() -> None:
+    """Two drones cross at right angles, a quarter of a second apart; dense sampling gives their least distance."""
     ways = [np.array([[-2.0, 0, 1, 0], [2.0, 0, 1, 0]]), np.array([[0, -2.0, 1, 0], [0, 2.0, 1, 0]])]
     one = minimum_snap((0.0, 4.0), ways[0])
     other = minimum_snap((0.0, 0.25, 4.25), np.vstack([ways[1][:1], ways[1][:1], ways[1][1:]]))

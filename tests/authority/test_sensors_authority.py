@@ -1,6 +1,6 @@
-"""Sensors against independent derivations and against the statistics that a scenario asks for.
+"""Sensors against independent derivations and against the statistics that a scenario specifies.
 
-Lever arms are never zero and mounts never straight here: an error in either is invisible otherwise.
+Lever arms are never zero and mounts never aligned, as an error in either would otherwise be invisible.
 """
 
 import math
@@ -23,7 +23,7 @@ SITE = Site(G, tuple(FIELD_W.tolist()))
 
 
 def pose(t):
-    """Return a smooth trajectory: position of the body and its attitude."""
+    """Return the body's position and attitude on a smooth trajectory."""
     position = np.array([2 * math.sin(0.9 * t), 1.5 * math.cos(1.3 * t), 5 + 0.8 * math.sin(1.7 * t)])
     angles = (0.9 * t + 0.3 * math.sin(2.1 * t), 0.35 * math.sin(2.7 * t), 0.4 * math.cos(3.1 * t))
     return position, Rotation.from_euler("ZYX", angles)
@@ -39,7 +39,7 @@ def mount():
 
 
 def derivatives(t, h=1e-3):
-    """Return what a rigid body's state is at t, by differences of the body's pose alone."""
+    """Return the body's state at t from differences of its pose alone."""
     (p0, _), (p1, r1), (p2, _) = pose(t - h), pose(t), pose(t + h)
     velocity, accel = (p2 - p0) / (2 * h), (p2 - 2 * p1 + p0) / h**2
     return p1, velocity, accel, r1, body_rate(t), (body_rate(t + h) - body_rate(t - h)) / (2 * h)
@@ -55,7 +55,7 @@ def wxyz(rotation):
 
 
 def body(p=(0, 0, 0), v=(0, 0, 0), attitude=None, w=(0, 0, 0), a=(0, 0, 0), alpha=(0, 0, 0)):
-    """Return the truth of a drone as compiled code has it."""
+    """Return the truth of a drone in the form that compiled code uses."""
     q = wxyz(attitude or Rotation.identity())
     p, v, w, a, alpha = ((float(each[0]), float(each[1]), float(each[2])) for each in (p, v, w, a, alpha))
     return BodyTruth(p, v, q, w, a, alpha)
@@ -66,8 +66,8 @@ def mounted(turned, range_max=0.0):
 
 
 @pytest.mark.parametrize("t", [0.0, 0.7, 2.2, 5.9])
-def test_imu_is_what_the_sensor_itself_moves_like(t):
-    """Specific force and rate from differences of the sensor's own pose; the kernel's formula knows only the body."""
+def test_the_imu_measures_the_sensor_s_own_motion(t):
+    """The reference is differences of the sensor's own pose; the kernel's formula knows only the body's motion."""
     p, _, accel, attitude, rate, angular = derivatives(t)
     h = 1e-3
     own_p = [sensor_pose(t + k * h)[0] for k in (-1, 0, 1)]
@@ -84,7 +84,7 @@ def test_imu_is_what_the_sensor_itself_moves_like(t):
 
 
 @pytest.mark.parametrize("t", [0.0, 0.7, 2.2, 5.9])
-def test_gps_flow_and_sonar_are_those_of_the_sensors_point(t):
+def test_gps_flow_and_sonar_measure_at_the_sensor_s_position(t):
     p, velocity, _, attitude, rate, _ = derivatives(t)
     h = 1e-5
     own_velocity = (sensor_pose(t + h)[0] - sensor_pose(t - h)[0]) / (2 * h)
@@ -104,13 +104,13 @@ def test_gps_flow_and_sonar_are_those_of_the_sensors_point(t):
 
 
 @pytest.mark.parametrize("t", [0.0, 2.2])
-def test_magnetometer_shows_the_field_in_its_own_axes(t):
+def test_the_magnetometer_measures_the_field_in_its_own_axes(t):
     attitude = pose(t)[1]
     field, _ = mag(body(attitude=attitude), mounted(mount()), SITE)
     np.testing.assert_allclose(field, sensor_pose(t)[1].inv().apply(FIELD_W), atol=1e-12)
 
 
-# Statistics: drones that stand still, so that every value is its error around a known truth.
+# Statistics: the drones stand still, so that every reading is a known truth plus an error
 
 STILL = {"imu": (0, 0, G, 0, 0, 0), "mag": (17.8, 2.8, 14.0), "flow": (0, 0, 0)}
 
@@ -122,7 +122,7 @@ def standing(count, overrides, yaw_deg=90.0, seed=3, **sensors_top):
 
 
 def readings(fleet, seconds, sensor):
-    """Return the values of a sensor, (N, samples, values)."""
+    """Return the readings of a sensor, (N, samples, values)."""
     rows = [[] for _ in range(fleet.count)]
     for _ in range(round(seconds / 0.02)):
         fleet.advance()
@@ -133,19 +133,19 @@ def readings(fleet, seconds, sensor):
 
 
 def assert_sigma(errors, sigma, axis=None):
-    """A chi-square test of a zero-mean spread at 1e-4 on either side."""
+    """Check a zero-mean spread by a chi-square test, at 1e-4 in either tail."""
     n = errors.size if axis is None else errors.shape[axis]
     ratio = (errors**2).sum(axis=axis) / sigma**2
     low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], n)
     assert np.all((low < ratio) & (ratio < high)), np.sqrt(ratio / n) * sigma
 
 
-def test_noise_of_the_paper_preset():
+def test_the_paper_preset_has_its_specified_noise():
     fleet = standing(2, {})
     imu = readings(fleet, 30.0, "imu")[:, 400:] - STILL["imu"]
     assert_sigma(imu[:, :, :3], 0.35)
     assert_sigma(imu[:, :, 3:], math.radians(0.01))
-    # white: neighbours are unrelated, to four standard deviations of a sample correlation
+    # white: neighbours are uncorrelated, to four standard deviations of a sample correlation
     x = imu[0, :, 0]
     assert abs(np.corrcoef(x[1:], x[:-1])[0, 1]) < 4 / math.sqrt(len(x))
     for sensor, at, sigma in (("mag", STILL["mag"], 0.94), ("flow", STILL["flow"], 0.1)):
@@ -157,21 +157,21 @@ def test_noise_of_the_paper_preset():
     assert_sigma(readings(fleet, 30.0, "baro")[:, :, 1] - 0.058, 0.1)
 
 
-def test_density_adds_with_the_root_of_the_rate():
+def test_noise_density_adds_with_the_root_of_the_rate():
     model = {"accel_m_s2": {"noise": 0.03, "density": 0.004}, "gyro_deg_s": {"noise": 0.0, "density": 0.01}}
     imu = readings(standing(1, {"imu": model}), 30.0, "imu")[:, 400:] - STILL["imu"]
     assert_sigma(imu[:, :, :3], math.hypot(0.03, 0.004 * math.sqrt(200)))
     assert_sigma(imu[:, :, 3:], math.radians(0.01 * math.sqrt(200)))
 
 
-def test_bias_is_constant_in_a_run_and_spread_over_drones():
+def test_bias_is_constant_in_a_run_and_varies_between_drones():
     model = {"velocity_m_s": {"noise": 0.0, "bias": 0.2}}
     flow = readings(standing(60, {"flow": model}), 4.0, "flow")[:, 15:, :3]
     assert np.ptp(flow, axis=1).max() < 1e-3
     assert_sigma(flow[:, 0], 0.2)
 
 
-def test_bias_walks_with_the_root_of_time():
+def test_a_bias_walk_grows_with_the_root_of_time():
     model = {"field_ut": {"noise": 0.0, "bias_walk": 0.3}}
     mag = readings(standing(40, {"mag": model}), 20.0, "mag") - STILL["mag"]
     assert_sigma(mag[:, -1] - mag[:, 24], 0.3 * math.sqrt(19.0))
@@ -179,18 +179,18 @@ def test_bias_walks_with_the_root_of_time():
     assert_sigma(steps[:, 50:], 0.3 / math.sqrt(25.0))
 
 
-def test_quantum_is_the_step_of_what_is_shown():
+def test_readings_are_multiples_of_the_quantum():
     model = {"velocity_m_s": {"noise": 0.1, "quantum": 0.25}}
     flow = readings(standing(1, {"flow": model}), 60.0, "flow")[0, :, :3]
     steps = flow / 0.25
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    # of a normal number of 0.1, |x| < 0.125 is shown as 0
+    # a normal number x of sigma 0.1 is read as 0 if |x| < 0.125
     inside = (flow == 0).mean()
     expected = 2 * stats.norm.cdf(1.25) - 1
     assert abs(inside - expected) < 4 * math.sqrt(expected * (1 - expected) / flow.size)
 
 
-def test_dropout_loses_the_share_asked_and_independently():
+def test_dropout_loses_the_specified_share_independently():
     fleet = standing(1, {"imu": {"dropout": 0.2}})
     times = []
     for _ in range(2500):
@@ -204,13 +204,13 @@ def test_dropout_loses_the_share_asked_and_independently():
     assert abs(pairs - 0.04) < 4 * math.sqrt(0.04 * 0.96 / n)
 
 
-def test_everything_or_nothing_dropped():
+def test_dropout_can_lose_everything_or_nothing():
     fleet = standing(1, {"gps": {"dropout": 1.0}, "mag": {"dropout": 0.0}})
     assert len(readings(fleet, 4.0, "mag")[0]) == 100
     assert readings(fleet, 4.0, "gps").size == 0
 
 
-def test_streams_of_drones_axes_and_sensors_are_unrelated():
+def test_imu_noise_is_uncorrelated_between_drones_samples_and_axes():
     fleet = standing(2, {})
     rows = []
     for _ in range(1500):
@@ -221,8 +221,8 @@ def test_streams_of_drones_axes_and_sensors_are_unrelated():
     assert np.abs(correlation).max() < 5 / math.sqrt(1400)
 
 
-def test_in_flight_the_imu_of_a_turned_mount_agrees_with_truth():
-    """In gusts, with lever arm and mount, the noiseless IMU is the truth's acceleration and rate seen from there."""
+def test_a_rotated_imu_agrees_with_the_truth_in_flight():
+    """In gusts, a noiseless IMU on a rotated mount with a lever arm measures the true acceleration and rate there."""
     quiet = {"noise": 0.0}
     sensor = {"mount": {"position_m": list(P_BS), "rpy_deg": list(RPY_BS_DEG)}}
     model = {"imu": {"accel_m_s2": quiet, "gyro_deg_s": quiet, **sensor}}

@@ -1,7 +1,7 @@
-"""The formation in truth with sightings: Test 1 and Test 2 of the paper, and with what can go wrong in formation.
+"""True errors of the formation with sightings: Tests 1 and 2 of the paper, and faults in formation.
 
-The errors are those of what is flown against what is desired, in gusts of 0.5 m/s, with the preset `paper`; what GPS alone
-reaches is in docs/cameras.md. The limits are chosen between what a joint filter reached and what the paper's Table I has.
+Errors are those of the true formation against the desired one, in gusts of 0.5 m/s, with the preset `paper`; those with
+GPS alone are in docs/cameras.md. The limits lie between what a joint filter reached and the paper's Table I.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ AMISS = {
     "covered_hat": "environment.hats.covered=[drone2]",
     "false_hat": "environment.hats.false_m=[[5, -5, 0.07]]",
 }
-RARELY = tuple(each for each in AMISS if each != "false_hat")  # one of them is enough to see that something broke
+RARELY = tuple(each for each in AMISS if each != "false_hat")  # in the soak: one case suffices to see a fault
 SIGHTED = [
     "sensors.front_camera={}",
     "sensors.sightings={}",
@@ -40,7 +40,7 @@ SIGHTED = [
 
 
 def places(record: Path, window_s: tuple[float, float]) -> Array:
-    """Return where the drones truly were at the gates of a window, (T, 3, 3) [m]."""
+    """Return the drones' true positions at the gates of a window, (T, 3, 3) [m]."""
     tracks = []
     with RecordReader(record) as reader:
         for drone in DRONES:
@@ -59,7 +59,7 @@ def flown(folder: Path, scenario: str, fields: list[str], seed: int, window_s: t
 @pytest.mark.parametrize(
     "amiss", [pytest.param(each, marks=pytest.mark.soak) if each in RARELY else each for each in AMISS]
 )
-def test_the_formation_keeps_its_shape(amiss: str, tmp_path: Path) -> None:
+def test_the_formation_keeps_its_shape_despite_faults(amiss: str, tmp_path: Path) -> None:
     track = flown(tmp_path, "eyes.yaml", ["duration_s=200", AMISS[amiss]], 1, WINDOW_S)
     sides = np.linalg.norm(track[:, 1:] - track[:, :1], axis=2)  # p and q
     assert len(sides) > 3000
@@ -67,7 +67,7 @@ def test_the_formation_keeps_its_shape(amiss: str, tmp_path: Path) -> None:
 
 
 LIMITS = {"x_c": 0.11, "y_c": 0.11, "z_c": 0.02, "roll": 0.012, "pitch": 0.008, "yaw": 0.010, "beta": 0.012}  # m, rad
-TESTS = {  # of the paper: fields, limits of p and q, and what differs
+TESTS = {  # of the paper: the fields to set, and the limits of the errors
     "step.yaml": (SIGHTED, {**LIMITS, "p": 0.055, "q": 0.055}),
     "trajectory.yaml": (SIGHTED, {**LIMITS, "yaw": 0.015, "beta": 0.015, "p": 0.07, "q": 0.07}),
     "eyes.yaml": ([], {**LIMITS, "p": 0.055, "q": 0.055}),
@@ -76,8 +76,8 @@ TESTS = {  # of the paper: fields, limits of p and q, and what differs
 
 @pytest.mark.soak
 @pytest.mark.parametrize("scenario", TESTS)
-def test_the_formation_is_exact_in_truth(scenario: str, tmp_path: Path) -> None:
-    """Root mean square of truth less what is desired, in the scenario's window, mean of five seeds."""
+def test_the_true_formation_errors_are_within_their_limits(scenario: str, tmp_path: Path) -> None:
+    """The errors are the root mean square of true - desired in the scenario's window, averaged over five seeds."""
     fields, limits = TESTS[scenario]
     of_seeds = []
     for seed in range(1, 6):

@@ -1,8 +1,8 @@
-"""The joint filter against truth over 12 seeds, and against the bound of a Kalman filter that is written apart.
+"""The joint filter against the truth over 12 seeds, and against the bound of an independently written Kalman filter.
 
-Relative position has three degrees of freedom; its normalised squared error must lie, as a mean over runs, in the 95 %
-band of chi-square (Bar-Shalom, Li and Kirubarajan, section 5.4.2). The bound is the steady state of a filter of position,
-velocity and attitude of level drones, all biases known: no estimator with the same sensors can be better.
+Relative position has three degrees of freedom; its normalised squared error, averaged over runs, must lie in the 95 %
+band of chi-square (Bar-Shalom, Li and Kirubarajan, section 5.4.2). The bound is the steady state of a filter for
+position, velocity and attitude of level drones with all biases known: no estimator with the same sensors can be better.
 """
 
 import math
@@ -27,30 +27,30 @@ SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SIGHTED = ["sensors.front_camera={}", "sensors.sightings={}", "estimation.use_sightings=true"]
 SEEDS = range(1, 13)
 TAKEOFF_S, END_S, CONVERGED_S = 1.0, 32.0, 18.0
-EVERY = 25  # gates between two that are compared
+EVERY = 25  # gates from one comparison to the next
 GATE_S = 0.02
 ACCEL_M_S2, GYRO_RAD_S, IMU_S = 0.35, math.radians(0.01), 0.005  # per sample; preset paper
 GRAVITY_M_S2 = 9.81
 GPS_M, GPS_M_S, GPS_S = 2.0, 0.43, 0.2
 FLOW_M_S, FLOW_S = 0.1, 1 / 15
 BARO_M, BARO_S = 0.1, 0.04
-MAG_UT, FIELD_UT, MAG_S = 0.94, 18.0, 0.04  # noise, and the horizontal field by which it tells the heading
+MAG_UT, FIELD_UT, MAG_S = 0.94, 18.0, 0.04  # noise, and the horizontal field that gives the heading
 SIGHTING_S = 1 / 15
 FOCAL_PX, HAT_M = 354.55, 0.14
-HAT_W_M, LENS_W_M = np.array([0.0, -0.03, 0.11]), np.array([0.0, 0.162, 0.012])  # of a drone that heads north
+HAT_W_M, LENS_W_M = np.array([0.0, -0.03, 0.11]), np.array([0.0, 0.162, 0.012])  # on a drone that heads north
 MODEL = SightingModel()
-WITHIN = 0.6  # of the instants; of a few millimetres the filter is cautious, which leaves the band below
-NOT_ABOVE = 0.95
+WITHIN = 0.6  # least share of instants in the band; the filter is cautious about errors of a few millimetres
+NOT_ABOVE = 0.95  # least share of instants not above the band
 Array = NDArray[np.float64]
 pytestmark = pytest.mark.xdist_group("sightings")
 
 
 class Relative(NamedTuple):
-    """Of drones 2 and 3 to drone 1, T times after convergence, of R flights."""
+    """Errors of drones 2 and 3 relative to drone 1, at T instants after convergence in R flights."""
 
     error: Array  # (R, T, 2, 3) [m]
     covariance: Array  # (R, T, 2, 3, 3)
-    places: Array  # (3, 3), of the drones as they stand in the air at the end, mean of the flights [m]
+    places: Array  # (3, 3), true positions of the drones at the end, averaged over the flights [m]
 
 
 @cache
@@ -83,26 +83,26 @@ def fly(scenario: Scenario) -> Relative:
 
 
 def relative(J: Array, n: int, i: int) -> Array:
-    """Return the covariance of drone i's position to that of the first, (3, 3)."""
+    """Return the covariance of drone i's position relative to the first drone, (3, 3)."""
     a, b = slice(0, 3), slice(i * n, i * n + 3)
     return J[a, a] + J[b, b] - J[a, b] - J[b, a]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("i", [pytest.param(0, marks=pytest.mark.soak), 1])
-def test_the_errors_of_relative_positions_are_as_large_as_the_filter_says(i: int) -> None:
+def test_relative_position_errors_match_the_filter_s_covariance(i: int) -> None:
     runs = flown()
     e, P = runs.error[:, :, i], runs.covariance[:, :, i]
     nees = np.einsum("rti,rti->rt", e, np.linalg.solve(P, e[..., None])[..., 0])
     low, high = band(3, len(SEEDS))
-    means = nees.mean(axis=0)  # over runs, at each instant; instants are half a second apart, about a correlation time
+    means = nees.mean(axis=0)  # over runs, at instants half a second apart, about a correlation time
     assert np.mean((means > low) & (means < high)) >= WITHIN
     assert np.mean(means < high) >= NOT_ABOVE
     assert low < nees.mean() < high
 
 
 @pytest.mark.slow
-def test_the_relative_positions_are_as_good_as_they_can_be() -> None:
+def test_relative_positions_come_close_to_the_bound() -> None:
     runs = flown()
     rms = math.sqrt(np.mean(np.sum(runs.error[..., :2] ** 2, axis=-1)))
     best = math.sqrt(np.mean(np.sum(bound(runs.places)[:, :2] ** 2, axis=-1)))
@@ -147,7 +147,7 @@ def _own_sensors(C: Array, first: int, due: list[float]) -> Array:
 
 
 def _sighting(C: Array, places: Array, i: int) -> Array:
-    """Use what drone i, heading north, sees of the hat of the first one."""
+    """Return C after drone i, heading north, has seen the hat of the first drone."""
     to_hat = places[0] + HAT_W_M - places[i]
     d = to_hat - LENS_W_M
     away = float(np.linalg.norm(d))

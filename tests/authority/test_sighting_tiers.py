@@ -1,7 +1,7 @@
-"""The geometric tier of sightings held against rendered pictures and the detector, over the same truth.
+"""The geometric tier of sightings against rendered pictures with the detector, over the same truth.
 
-Errors of bearing and range are compared as distributions, by their median and nine-tenths, bias, misses and false
-alarms: by range, light and body rate. docs/cameras.md has the figures of the large version.
+For each range, light and body rate, the distributions of bearing and range errors are compared by their median, 90th
+percentile and bias, and the tiers by misses and false alarms. docs/cameras.md has the figures of the large version.
 """
 
 from itertools import product
@@ -12,7 +12,7 @@ import pytest
 from sighting_tiers import FROM_BELOW, Condition, Tiers, measured
 
 RANGES_M = (2.0, 4.0), (4.0, 7.0), (7.0, 12.0)
-DAY, DULL, DUSK = 1.0, 0.4, 0.15  # of a clear day
+DAY, DULL, DUSK = 1.0, 0.4, 0.15  # share of a clear day's light
 QUANTILES = 0.5, 0.9
 
 
@@ -20,11 +20,11 @@ class Band(NamedTuple):
     """How far the tiers may differ.
 
     Attributes:
-        ratio: of the rendered tier's errors over the geometric one's, least and most.
-        bias: of either, in its own standard deviations.
-        missed: difference of the shares.
-        false: per picture, of either.
-        normalised: errors over what either says of them, root mean square, least and most.
+        ratio: least and greatest ratio of the rendered tier's errors to the geometric tier's.
+        bias: greatest bias of either tier, in its own standard deviations.
+        missed: greatest difference between the shares of missed hats.
+        false: most false alarms of either tier per picture.
+        normalised: least and greatest root mean square of either tier's errors over their stated sigmas.
     """
 
     ratio: tuple[float, float]
@@ -34,9 +34,9 @@ class Band(NamedTuple):
     normalised: tuple[float, float]
 
 
-SMALL = Band((0.45, 2.0), 1.0, 0.07, 0.04, (0.45, 1.9))  # of 100 hats
-LARGE = Band((0.5, 1.7), 0.9, 0.04, 0.005, (0.5, 1.65))  # of 800
-FROM_BELOW_LARGE = LARGE._replace(bias=1.2)  # the detector takes the rotors' blurred rim for the edge of small hats
+SMALL = Band((0.45, 2.0), 1.0, 0.07, 0.04, (0.45, 1.9))  # for 100 hats
+LARGE = Band((0.5, 1.7), 0.9, 0.04, 0.005, (0.5, 1.65))  # for 800 hats
+FROM_BELOW_LARGE = LARGE._replace(bias=1.2)  # the detector mistakes the rotors' blurred rim for the edge of small hats
 
 
 def hold(tiers: Tiers, band: Band) -> None:
@@ -67,7 +67,7 @@ def test_both_tiers_err_alike_in_many_pictures(condition: Condition) -> None:
     hold(measured(condition, pictures=400), LARGE)
 
 
-def test_both_tiers_err_alike_where_a_drone_s_own_rotors_hide_a_part_of_its_hat() -> None:
+def test_both_tiers_err_alike_where_rotors_hide_part_of_the_hat() -> None:
     hold(measured(Condition(RANGES_M[0], rise=FROM_BELOW), pictures=60), SMALL)
 
 

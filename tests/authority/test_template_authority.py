@@ -32,7 +32,7 @@ def test_the_attitude_is_scipy_s_best_fit():
             assert (R_WC * fitted.inv()).magnitude() < 1e-12
 
 
-def test_angles_are_z_y_x_euler_by_scipy():
+def test_angles_match_scipy_s_z_y_x_euler_angles():
     rng = np.random.default_rng(2)
     for _ in range(500):
         yaw, pitch, roll = rng.uniform(-3.1, 3.1), rng.uniform(-1.5, 1.5), rng.uniform(-3.1, 3.1)
@@ -40,7 +40,7 @@ def test_angles_are_z_y_x_euler_by_scipy():
         assert euler_angles(R) == pytest.approx((roll, pitch, yaw), abs=1e-12)
 
 
-def test_ten_thousand_round_trips():
+def test_inverse_undoes_forward_for_ten_thousand_formations():
     rng = np.random.default_rng(3)
     space, worst = TemplateCluster(RING), 0.0
     for _ in range(10_000):
@@ -58,16 +58,16 @@ def test_the_spread_of_a_ring_is_its_radius_over_the_root_of_two():
     assert space.spread(grown) == pytest.approx((RADIUS_M + 1.0) / math.sqrt(2), rel=1e-12)
 
 
-def test_the_condition_of_a_level_ring_is_that_of_the_closed_form():
-    """Turns about z and the mean heading mix: [[r^2 + 1, 1], [1, 1]] has the extreme eigenvalues."""
+def test_the_condition_of_a_level_ring_matches_its_closed_form():
+    """Rotation about z and the mean heading are coupled: [[r^2 + 1, 1], [1, 1]] has the extreme eigenvalues."""
     trace, determinant = RADIUS_M**2 + 2, RADIUS_M**2
     root = math.sqrt(trace**2 - 4 * determinant)
     condition = math.sqrt((trace + root) / (trace - root))
     assert TemplateCluster(RING).condition(LEVEL) == pytest.approx(condition, rel=1e-12)
 
 
-def test_kinetic_energy_is_that_of_the_whole_of_its_turn_and_of_its_shape():
-    """Sum of v_i^2 = n v_C^2 + w . M w + n w_dot^2 where the robots stand on the template."""
+def test_kinetic_energy_splits_into_translation_rotation_and_shape():
+    """The sum of v_i^2 is n v_C^2 + w . M w + n w_dot^2 where the robots stand on the template."""
     rng = np.random.default_rng(4)
     places = rng.normal(scale=3.0, size=(N, 3))
     space = TemplateCluster(places)
@@ -81,9 +81,9 @@ def test_kinetic_energy_is_that_of_the_whole_of_its_turn_and_of_its_shape():
 
 
 def test_errors_of_many_robots_average_out():
-    """Independent errors sigma of the robots leave sigma / sqrt(n) in place and sigma / (r sqrt(n)) in yaw.
+    """Independent position errors sigma leave sigma / sqrt(n) in the centre and sigma / (r sqrt(n)) in yaw.
 
-    The frame of a triad stands on three robots, whatever their number.
+    The frame of a triad, in contrast, rests on three robots, whatever their number.
     """
     J = TemplateCluster(RING).jacobian(RING, np.zeros(N))
     sigma_m = 0.152  # of an estimate with GPS and flow
@@ -95,8 +95,8 @@ def test_errors_of_many_robots_average_out():
     assert sigmas[6 + N :] == pytest.approx([sigma_m / math.sqrt(N)] * (3 * N - 6), rel=1e-12)
 
 
-def test_eight_robots_are_better_conditioned_than_as_a_triad():
-    """A prototype found medians of 13 and 34 over formations at random, without a measure of phi of its own."""
+def test_a_template_of_eight_is_better_conditioned_than_a_triad():
+    """A prototype found medians of 13 and 34 over random formations, without a separate scale for phi."""
     rng, template, triad = np.random.default_rng(5), [], cluster_space(8)
     of_triad = []
     for _ in range(400):

@@ -1,4 +1,4 @@
-"""The AR.Drone flies as the published figures say.
+"""The AR.Drone against published figures.
 
 Sources: Li, MSc thesis, TU Delft 2014 (through AuRoRA): rotor constants; tum_ardrone: drag fitted in flight and the
 attitude lag; Parrot: endurance and rotor speed in hover; Cheeseman and Bennett, ARC R&M 3021.
@@ -44,8 +44,8 @@ def advance(fleet, seconds, steer=None):
         fleet.advance()
 
 
-def test_hover_at_361_6_rad_s():
-    """Out of ground effect (at 3 m), with the published mass of .429 kg."""
+def test_the_rotors_turn_at_361_6_rad_s_in_hover():
+    """Out of ground effect (at 3 m), with the published mass of 0.429 kg."""
     fleet = hovering(calm(takeoff_height_m=3.0), 12.0)
     speeds = []
     for _ in range(200):
@@ -55,7 +55,7 @@ def test_hover_at_361_6_rad_s():
 
 
 @pytest.mark.parametrize(("tilt_deg", "speed"), [(12.0, 3.6), (20.0, 6.2), (30.0, 9.8)])
-def test_steady_speed_under_a_held_tilt(tilt_deg, speed):
+def test_a_held_tilt_gives_the_speed_of_the_fitted_drag(tilt_deg, speed):
     """m g tan(tilt) = D v: the table that follows from tum_ardrone's fitted drag."""
     scenario = calm(limits={"tilt_deg": tilt_deg, "altitude_m": 1000.0})
     row, rotors = rows_of(scenario)
@@ -72,7 +72,7 @@ def test_steady_speed_under_a_held_tilt(tilt_deg, speed):
     assert np.hypot(*fleet.truth().velocity_m_s[0, :2]) == pytest.approx(speed, abs=0.35)
 
 
-def test_tilt_answers_a_command_at_least_as_fast_as_the_aircraft():
+def test_tilt_responds_at_least_as_fast_as_the_real_aircraft():
     """tum_ardrone's model, identified in flight: 0.143 s to 63 % of a commanded roll."""
     fleet = hovering(calm(takeoff_height_m=3.0), 12.0)
     final = math.radians(10.0)
@@ -95,8 +95,8 @@ def test_rotors_follow_with_their_time_constant():
     assert (state[13] - 200.0) / 100.0 == pytest.approx(1 - math.exp(-1.0), rel=1e-9)
 
 
-def test_thrust_to_weight_of_the_rotor_set():
-    """Rotors from 126 to 503 rad/s: 8.1 N at most, 1.93 of the weight."""
+def test_the_rotors_have_the_published_thrust_to_weight_ratio():
+    """Rotors from 126 to 503 rad/s: 8.1 N at most, 1.93 times the weight."""
     scenario = calm()
     row, _ = rows_of(scenario)
     most = 4 * row[VEHICLE.thrust] * row[VEHICLE.rotor_max] ** 2
@@ -104,8 +104,8 @@ def test_thrust_to_weight_of_the_rotor_set():
     assert most / (row[VEHICLE.mass] * row[VEHICLE.gravity]) == pytest.approx(1.93, abs=0.02)
 
 
-def test_endurance_in_hover_is_that_of_the_published_battery():
-    """10 to 12 minutes on 1000 mAh, hover power held."""
+def test_hover_endurance_matches_the_published_battery():
+    """10 to 12 minutes on 1000 mAh at constant hover power."""
     fleet = hovering(calm())
     before = fleet.status(0)[1]
     advance(fleet, 60.0)
@@ -114,7 +114,7 @@ def test_endurance_in_hover_is_that_of_the_published_battery():
 
 
 def test_ground_effect_saves_power():
-    """One rotor radius up, Cheeseman and Bennett give 16/15; hovering low needs slower rotors by its root."""
+    """One rotor radius up, Cheeseman and Bennett give 16/15; rotors near the ground turn slower by its root."""
     assert ground_effect(ARDRONE2.rotor_radius_m, ARDRONE2.rotor_radius_m) == pytest.approx(16 / 15)
     fleet = hovering(calm(takeoff_height_m=0.3))
     speeds = []

@@ -1,4 +1,4 @@
-"""Gusts against the Dryden longitudinal form (MIL-HDBK-1797): spread, correlation in time, spectrum, between drones."""
+"""Gusts against the Dryden longitudinal form (MIL-HDBK-1797): spread, spectrum, correlation in time and space."""
 
 import math
 
@@ -38,7 +38,7 @@ def blown(row, common, own, start):
 
 
 def gusts(seconds, seed=1, steady=(0.0, 0.0, 0.0)):
-    """Return gusts at DRONES standing drones at 10 Hz, (samples, DRONES, 3), settled."""
+    """Return settled gusts at DRONES standing drones, at 10 Hz (samples, DRONES, 3)."""
     row = np.zeros(WIND.size)
     row[WIND.steady : WIND.steady + 3] = steady
     row[WIND.gust], row[WIND.length], row[WIND.speed_min], row[WIND.correlation] = SIGMA, 10.0, 2.0, 0.5
@@ -53,24 +53,24 @@ def record():
 
 
 def independent(record):
-    """Return how many independent numbers a series of 12 drones, half correlated, holds: a conservative count."""
+    """Return a conservative count of the independent numbers in a series of 12 half-correlated drones."""
     return record.shape[0] * 0.1 / (2 * TAU_S) * 3 * 2
 
 
-def test_spread_and_mean(record):
+def test_gusts_have_zero_mean_and_the_specified_spread(record):
     n = independent(record)
     assert abs(record.mean()) < 4 * SIGMA / math.sqrt(n)
     assert record.std() == pytest.approx(SIGMA, abs=4 * SIGMA / math.sqrt(2 * n))
 
 
 @pytest.mark.parametrize("lag_s", [1.0, 2.5, 5.0, 10.0])
-def test_correlation_falls_exponentially(record, lag_s):
+def test_correlation_decays_exponentially_in_time(record, lag_s):
     k = round(lag_s / 0.1)
     measured = (record[k:] * record[:-k]).mean() / (record**2).mean()
     assert measured == pytest.approx(math.exp(-lag_s / TAU_S), abs=4 / math.sqrt(independent(record)))
 
 
-def test_spectrum_is_that_of_the_form(record):
+def test_the_spectrum_matches_the_dryden_form(record):
     """S(f) = 4 sigma^2 tau / (1 + (2 pi f tau)^2), one-sided, from 0.01 to 1 Hz."""
     flat = record.reshape(len(record), -1).T
     f, measured = signal.welch(flat, fs=10.0, nperseg=2048)
@@ -81,32 +81,32 @@ def test_spectrum_is_that_of_the_form(record):
         assert measured[band].sum() / form[band].sum() == pytest.approx(1.0, abs=0.06)
 
 
-def test_correlation_between_drones_is_that_of_the_scenario(record):
+def test_correlation_between_drones_is_as_specified(record):
     cross = [(record[:, i] * record[:, j]).mean() for i in range(12) for j in range(i)]
     assert np.mean(cross) / SIGMA**2 == pytest.approx(0.5, abs=0.05)
 
 
-def test_axes_are_unrelated(record):
+def test_axes_are_uncorrelated(record):
     for a, b in ((0, 1), (0, 2), (1, 2)):
         assert abs((record[:, :, a] * record[:, :, b]).mean()) / SIGMA**2 < 0.08
 
 
 def test_gusts_are_stationary_from_the_start():
-    """The first gust of many seeds has the spread already, and the share between drones."""
+    """The first gusts of many seeds already have the full spread and the correlation between drones."""
     first = np.array([NoiseTable(windy(2, seed), 1).gust for seed in range(400)])
     assert first.std() == pytest.approx(SIGMA, rel=0.1)
     assert (first[:, 0] * first[:, 1]).mean() / SIGMA**2 == pytest.approx(0.5, abs=0.12)
 
 
-def test_faster_air_shortens_the_correlation():
+def test_faster_air_shortens_the_correlation_time():
     """At 10 m/s of steady wind the correlation time is L / V = 1 s."""
     fast = gusts(2000.0, steady=(10.0, 0.0, 0.0))
     measured = (fast[10:] * fast[:-10]).mean() / (fast**2).mean()
     assert measured == pytest.approx(math.exp(-1.0), abs=0.05)
 
 
-def test_a_fleet_blows_the_same_filter_every_5_ms():
-    """The gusts of a fleet, replayed from its own streams."""
+def test_a_fleet_runs_the_same_gust_filter_every_5_ms():
+    """The gusts of a fleet are replayed from its own random streams."""
     scenario = windy(2, seed=5)
     fleet, noise = Fleet(scenario), NoiseTable(scenario, 64)
     gust, row = noise.gust.copy(), fleet._w.wind
@@ -120,7 +120,7 @@ def test_a_fleet_blows_the_same_filter_every_5_ms():
     np.testing.assert_allclose(fleet.wind_m_s, gust, atol=1e-7)  # the standing drones sway by micrometres
 
 
-def test_all_shared_is_one_gust_and_none_shared_is_none():
+def test_drones_share_one_gust_only_at_full_correlation():
     for share, alike in ((1.0, True), (0.0, False)):
         fleet = Fleet(windy(2, gust_correlation=share))
         for _ in range(100):

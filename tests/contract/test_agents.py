@@ -1,6 +1,6 @@
-"""The same rules for every agent: an agent is tested by adding it to AGENTS.
+"""Rules that every agent must satisfy; adding an agent to AGENTS tests it.
 
-The inputs are synthetic: drones that stand, take off when they are asked to, and hover, seen by noisy sensors.
+The inputs are synthetic: drones stand on the ground, take off and hover, as noisy sensors measure them.
 """
 
 import random
@@ -38,8 +38,8 @@ GATE_NS = 20_000_000
 IMU_NS = 5_000_000  # 200 Hz
 GATES = 150
 TAKEOFF_S = 0.5
-LIFTOFF_S = 0.6  # in the synthetic flight, when the drones leave the ground
-AIRBORNE_S = 1.0  # and when they have got to their height
+LIFTOFF_S = 0.6  # when the drones of the synthetic flight leave the ground
+AIRBORNE_S = 1.0  # when they reach HEIGHT_M
 HEIGHT_M = 2.0
 GRAVITY_M_S2 = 9.80665
 
@@ -72,7 +72,7 @@ def scenario() -> Scenario:
 
 @cache
 def info() -> Info:
-    """Return what a world would say of itself, its text included."""
+    """Return the Info that a world would publish, with the text of the scenario."""
     it = scenario()
     text = scenario_file.to_text(it)
     return run_info(
@@ -88,7 +88,7 @@ def info() -> Info:
 
 @cache
 def told() -> Scenario:
-    """Return the scenario as an agent reads it in that text."""
+    """Return the scenario as an agent reads it from the text in `info`."""
     return scenario_file.from_text(info().scenario)
 
 
@@ -102,7 +102,7 @@ def make(name: str) -> Agent:
 
 
 class Flight:
-    """Says, gate by gate, what a world and the estimators say."""
+    """Generates, gate by gate, the messages of a world and of the estimators."""
 
     def __init__(self) -> None:
         self._rng = np.random.default_rng(1)
@@ -183,11 +183,11 @@ def flight() -> tuple[tuple[tuple[str, Any], ...], ...]:
 
 
 def inputs(agent: Agent) -> list[KeyedMessages]:
-    """Return, by gate, what the agent reads of the flight."""
+    """Return, by gate, the messages of the flight that the agent reads."""
     return [[(key, m) for key, m in gate if any(keys.matches(e, key) for e in agent.reads)] for gate in flight()]
 
 
-Stepped = tuple[int, list[Output]]  # a gate, and what the agent said in it
+Stepped = tuple[int, list[Output]]  # the instant of a gate [ns], and the agent's outputs in it
 
 
 def stepped(
@@ -220,11 +220,11 @@ def wire(outputs: list[Stepped]) -> list[tuple[int, str, bytes]]:
     return [(t_ns, key, messages.encode(message)) for t_ns, gate in outputs for key, message in gate]
 
 
-# What it says of itself
+# What an agent declares
 
 
 @every_agent
-def test_its_name_is_role_and_thing_and_its_period_whole_gates(name: str):
+def test_the_name_is_role_and_thing_and_the_period_whole_gates(name: str):
     agent = make(name)
     role, dot, thing = agent.name.partition(".")
     assert (dot, agent.role) == (".", role)
@@ -235,7 +235,7 @@ def test_its_name_is_role_and_thing_and_its_period_whole_gates(name: str):
 
 
 @every_agent
-def test_it_reads_what_closes_its_gates_and_is_counted_for_it(name: str):
+def test_an_agent_reads_every_key_that_its_gates_wait_for(name: str):
     agent = make(name)
     assert agent.gate_keys
     assert {keys.status(drone) for drone in agent.counted} <= set(agent.gate_keys)
@@ -245,22 +245,22 @@ def test_it_reads_what_closes_its_gates_and_is_counted_for_it(name: str):
 
 
 @every_agent
-def test_it_never_reads_the_truth(name: str):
+def test_no_agent_reads_the_truth(name: str):
     agent = make(name)
     truths = [keys.truth(drone.name) for drone in scenario().drones]
     assert not [e for e in agent.reads for key in [*truths, keys.VIEW_DRONES] if keys.matches(e, key)]
 
 
-# What it does
+# What an agent does
 
 
 @every_agent
-def test_it_answers_every_gate_of_its_period(name: str):
+def test_an_agent_steps_once_per_period(name: str):
     assert [t_ns for t_ns, _ in flown(name)] == list(range(0, GATES * GATE_NS, make(name).period_ns))
 
 
 @every_agent
-def test_it_shows_eyes_what_it_said_last(name: str):
+def test_a_view_shows_the_latest_output(name: str):
     agent = make(name)
     outputs = run(agent, inputs(agent))
     t_ns, sent = outputs[-1]
@@ -284,7 +284,7 @@ def test_it_shows_eyes_what_it_said_last(name: str):
 
 
 @every_agent
-def test_it_writes_only_where_it_may(name: str):
+def test_an_agent_writes_only_to_permitted_keys(name: str):
     role, _, thing = name.partition(".")
     drones = SEVERAL.get(name, [thing]) if role == "estimator" else scenario().cluster(thing).drones
     things = drones if role == "estimator" else [thing]
@@ -294,15 +294,15 @@ def test_it_writes_only_where_it_may(name: str):
     assert written
 
 
-def test_the_flight_makes_the_controller_say_all_that_it_can():
-    """Else the rules above would hold of messages that never came."""
+def test_the_flight_makes_the_controller_send_states_and_commands():
+    """Otherwise, the rules above would hold for messages that were never sent."""
     written = {keys.leaf(key) for _, gate in flown("controller.main") for key, _ in gate}
     assert written == {"state", "velocity", "mode"}
 
 
 @every_agent
-def test_its_outputs_have_time_number_type_and_source(name: str):
-    """Stamped with the gate, numbered by key without gaps, the same after the wire."""
+def test_outputs_carry_time_sequence_number_type_and_source(name: str):
+    """Each is stamped with its gate, numbered per key without gaps, and unchanged by a round trip."""
     numbers: defaultdict[str, list[int]] = defaultdict(list)
     for t_ns, gate in flown(name):
         for key, message in gate:
@@ -314,12 +314,12 @@ def test_its_outputs_have_time_number_type_and_source(name: str):
         assert found == list(range(len(found)))
 
 
-# The same bits
+# Bit-identical outputs
 
 
 @every_agent
-def test_the_order_of_arrival_and_the_wire_change_no_bit(name: str):
-    """Shuffled within each gate; the inbox puts it right."""
+def test_arrival_order_and_encoding_change_no_bit(name: str):
+    """Messages are shuffled within each gate; the inbox restores their order."""
     agent, rng = make(name), random.Random(1)
     gates = [[(key, _again(key, message)) for key, message in sent] for sent in inputs(agent)]
     for sent in gates:
@@ -328,7 +328,7 @@ def test_the_order_of_arrival_and_the_wire_change_no_bit(name: str):
 
 
 def with_algorithm(algorithm: str) -> Make:
-    """Return what makes the estimator of a drone with a class of its own."""
+    """Return a factory for the estimator of drone1 with another algorithm."""
 
     def build(info: Info, scenario: Scenario) -> Agent:
         estimation = replace(scenario.estimation, algorithm=algorithm)
@@ -346,7 +346,7 @@ GOES_ON: dict[str, Make] = {
 
 
 @pytest.mark.parametrize("make_one", GOES_ON.values(), ids=GOES_ON)
-def test_another_one_goes_on_from_its_snapshot_to_the_same_bits(make_one: Make, monkeypatch: pytest.MonkeyPatch):
+def test_resuming_from_a_snapshot_gives_the_same_bits(make_one: Make, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     first, *others, last = (make_one(info(), scenario()) for _ in range(5))
     gates = inputs(first)
@@ -356,7 +356,7 @@ def test_another_one_goes_on_from_its_snapshot_to_the_same_bits(make_one: Make, 
         run(first, gates[done : gate + 1], inbox)
         other.resume(info(), taken(first))
         done = gate + 1
-    run(first, gates[done : done + 2], inbox)  # which does not reach into what was taken
+    run(first, gates[done : done + 2], inbox)  # this must not alter the snapshots taken
     for gate, other in zip(taken_at, others, strict=True):
         inbox = Inbox(other.gate_keys, other.counted)
         inbox.start_after(gate * GATE_NS)
@@ -366,7 +366,7 @@ def test_another_one_goes_on_from_its_snapshot_to_the_same_bits(make_one: Make, 
 
 
 @every_agent
-def test_a_snapshot_taken_over_is_the_same_snapshot(name: str):
+def test_a_resumed_agent_has_the_same_snapshot(name: str):
     agent, other = make(name), make(name)
     run(agent, inputs(agent)[:50])
     state = taken(agent)
@@ -375,7 +375,7 @@ def test_a_snapshot_taken_over_is_the_same_snapshot(name: str):
 
 
 def taken(agent: Agent) -> State:
-    """Return the checkpoint of an agent as it comes off the wire."""
+    """Return an agent's checkpoint after a round trip through its encoding."""
     state = agent.checkpoint()
     assert state is not None
     return unpack(pack(state))
@@ -386,7 +386,7 @@ def _again(key: str, message: Struct) -> Any:
 
 
 @every_agent
-def test_two_agents_of_one_process_do_not_touch_each_other(name: str):
+def test_two_agents_in_one_process_do_not_affect_each_other(name: str):
     first, second = make(name), make(name)
     gates = inputs(first)
     by_turns = list(zip(stepped(first, gates), stepped(second, gates), strict=True))
@@ -397,8 +397,8 @@ def test_two_agents_of_one_process_do_not_touch_each_other(name: str):
 
 
 @every_agent
-def test_a_new_incarnation_goes_on_from_what_was_said_last(name: str):
-    """As the runner does it: last values, then what was missed; numbers go on, and so does the estimate or phase."""
+def test_a_new_incarnation_continues_from_the_last_outputs(name: str):
+    """As in the runner, the last values come first, then the missed gates; sequence numbers continue."""
     former, agent = make(name), make(name)
     gates = inputs(former)
     before = run(former, gates[: GATES - 20])
@@ -418,14 +418,14 @@ def test_a_new_incarnation_goes_on_from_what_was_said_last(name: str):
             assert messages.decode(key, messages.encode(message)) == message
 
 
-def test_a_restarted_estimator_stays_where_it_was():
+def test_a_restarted_estimator_continues_from_its_last_estimate():
     former, agent = make("estimator.drone1"), make("estimator.drone1")
     gates = inputs(former)
     ((_, ((key, last),)),) = run(former, gates)[-21:-20]
     agent.warm_start(key, last)
     ((_, ((_, first),)), *_) = run(agent, gates[GATES - 20 :])
     jump = np.subtract(first.position_m, last.position_m)  # type: ignore[attr-defined]
-    assert np.abs(jump).max() < 0.1  # m, what a gate of sensors moves an estimate by
+    assert np.abs(jump).max() < 0.1  # m; one gate of readings moves an estimate by less
 
 
 # Requests
@@ -445,7 +445,7 @@ def test_a_restarted_estimator_stays_where_it_was():
     ],
     ids=lambda request: request.op[:12] or "empty",
 )
-def test_a_request_that_makes_no_sense_is_refused_in_a_line(name: str, request_: ControlRequest):
+def test_an_invalid_request_is_refused_in_one_line(name: str, request_: ControlRequest):
     agent = make(name)
     for key in agent.control_keys() or ("nothing",):
         answer = agent.control(key, request_)
@@ -475,6 +475,6 @@ def test_a_refused_request_changes_no_bit(name: str):
 
 
 @pytest.mark.parametrize("kind", [Estimator, Controller])
-def test_a_thing_that_is_not_in_the_scenario_is_refused(kind: Callable[..., Agent]):
+def test_a_drone_or_cluster_outside_the_scenario_is_refused(kind: Callable[..., Agent]):
     with refused(RunError, "'nobody'", scenario().drones[0].name if kind is Estimator else scenario().clusters[0].name):
         kind(info(), scenario(), "nobody")

@@ -1,7 +1,6 @@
-"""The same rules for every message: names, identity, and the refusal of whatever is not the message.
+"""Rules that every message must satisfy: its field names, an exact round trip, and the refusal of any other payload.
 
-The table CONTRACT is the contract's own, written down here a second time: a field that is renamed or dropped in the
-code fails against it.
+CONTRACT repeats the table of the contract, so that renaming or dropping a field in the code fails a test here.
 """
 
 import copy
@@ -22,7 +21,7 @@ from zsim.contract import messages, run_messages
 from zsim.contract.flight_messages import JPEG_BEGINS
 from zsim.errors import DecodeError
 
-# Fields besides t_ns and seq, in the contract's order.
+# Fields other than t_ns and seq, in the order of the contract
 SENSOR = "t_sample_ns "
 CONTRACT = {
     "world/info": "contract run_id federation mode rate gate_ns physics_dt_ns command_delay_ns seed origin drones "
@@ -91,7 +90,7 @@ NULLABLE = {
     *("commander", "trajectory_t_s", "path_t_s", "until_ns"),
     *("age_ms", "loss_percent", "round_trip_ms", "clock_offset_ms"),
 }
-FREE = {"data", "args", "parameters"}  # fields of free content
+FREE = {"data", "args", "parameters"}  # fields with free-form content
 
 every_message = pytest.mark.parametrize("shape", SHAPES)
 every_type = pytest.mark.parametrize(
@@ -100,7 +99,7 @@ every_type = pytest.mark.parametrize(
 
 
 def pack(plain: Any, **options: bool) -> bytes:
-    """Return what the plain `msgpack` package, which knows nothing of the contract, puts on the wire."""
+    """Pack with the plain `msgpack` package, which knows nothing of the contract."""
     packed = msgpack.packb(plain, **options)
     assert packed is not None
     return packed
@@ -116,7 +115,7 @@ def kind_of(shape: str) -> type[msgspec.Struct]:
     return kind
 
 
-# Valid messages of every type, from the types themselves
+# Valid messages of every type, generated from the types themselves
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 text = st.text(max_size=12)
@@ -128,7 +127,7 @@ free = st.recursive(
 
 
 def values(info: Any) -> st.SearchStrategy[Any]:
-    """Return plain values (as msgpack gives them) that fit a type."""
+    """Return a strategy for plain values, as msgpack unpacks them, that fit a type."""
     if isinstance(info, types.Metadata):
         return values(info.type)
     if isinstance(info, types.StructType):
@@ -162,7 +161,7 @@ def maps(info: types.StructType) -> st.SearchStrategy[dict[str, Any]]:
 
 
 def _matched(plain: dict[str, Any]) -> dict[str, Any]:
-    """Give lists that belong together the same length."""
+    """Make lists that belong together equally long."""
     if "desired_rate" in plain:
         plain["drones"] = plain["drones"][:2]
         for name in ("names", "value", "desired", "desired_rate"):
@@ -185,7 +184,7 @@ def plain_messages(shape: str) -> st.SearchStrategy[dict[str, Any]]:
 
 
 def example(shape: str) -> dict[str, Any]:
-    """Return one full message with no empty lists or maps."""
+    """Return one message with all fields and with no empty lists or maps."""
     return _matched(_filled(types.type_info(kind_of(shape))))
 
 
@@ -212,7 +211,7 @@ Path = tuple[Any, ...]
 
 
 def leaves(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
-    """Yield the path and the value of every scalar of a plain message, free content left out."""
+    """Yield the path and value of every scalar in a plain message, except in free-form content."""
     if FREE.intersection(path):
         return
     if isinstance(value, dict | list):
@@ -223,7 +222,7 @@ def leaves(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
 
 
 def branches(value: Any, path: Path = ()) -> Iterator[tuple[Path, list[Any]]]:
-    """Yield the path and the value of every list of a plain message."""
+    """Yield the path and value of every list in a plain message."""
     if isinstance(value, list):
         yield path, value
     if isinstance(value, dict | list):
@@ -247,23 +246,23 @@ def refusal(shape: str, payload: bytes) -> str:
 
 
 def assert_names(error_text: str, shape: str, field: str) -> None:
-    """Check that a refusal is one line that names key, field, found and allowed."""
+    """Check that a refusal is one line that names the key and the field, and says what the value must be."""
     assert error_text.startswith(f"{key_of(shape)}: "), error_text
     assert field in error_text, error_text
     assert "must" in error_text, error_text
     assert error_text.isprintable(), error_text
 
 
-# The names
+# Names
 
 
-def test_every_message_of_the_contract_is_there_and_no_other():
+def test_the_code_has_exactly_the_messages_of_the_contract():
     assert sorted(messages.types_by_shape()) == SHAPES
 
 
 @every_message
-def test_names_and_lengths_are_the_contract_s(shape: str):
-    """Fields in its order, what goes beyond them optional, all of them on the wire."""
+def test_names_and_lengths_match_the_contract(shape: str):
+    """The contract's fields come first, in its order, and are all encoded; further fields are optional."""
     own, kind = CONTRACT[shape].split(), kind_of(shape)
     info = types.type_info(kind)
     assert isinstance(info, types.StructType)
@@ -304,14 +303,14 @@ def test_other_keys_have_no_message(key: str):
     assert len(str(caught.value)) < 200
 
 
-# Identity
+# Round trips
 
 
 @every_type
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_decode_undoes_encode_and_any_msgpack_reads_and_writes_it(shape: str, data: st.DataObject):
-    """What the plain `msgpack` package reads and packs again, keys in any order, is the same message."""
+def test_messages_survive_a_round_trip_also_through_plain_msgpack(shape: str, data: st.DataObject):
+    """The plain `msgpack` package may unpack a message and pack it again, with its keys in any order."""
     kind = kind_of(shape)
     message = msgspec.convert(data.draw(plain_messages(shape)), kind)
     payload = messages.encode(message)
@@ -325,8 +324,8 @@ def test_decode_undoes_encode_and_any_msgpack_reads_and_writes_it(shape: str, da
 
 
 @every_message
-def test_other_ways_to_write_a_message_are_taken(shape: str):
-    """Whole numbers and those of 32 bits for floats, and more fields."""
+def test_equivalent_encodings_and_extra_fields_are_accepted(shape: str):
+    """Integers and 32-bit floats may stand for 64-bit floats, and unknown fields are ignored."""
     plain = whole = example(shape)
     for path, value in leaves(plain):
         whole = replaced(whole, path, 2) if isinstance(value, float) else whole
@@ -337,7 +336,7 @@ def test_other_ways_to_write_a_message_are_taken(shape: str):
     assert all(messages.decode(key_of(shape), other) == message for other in others)
 
 
-def test_the_frame_of_a_velocity_is_heading_by_default():
+def test_the_default_frame_of_a_velocity_is_heading():
     plain = example("drone/*/cmd/velocity")
     del plain["frame"]
     assert messages.decode("drone/d/cmd/velocity", pack(plain)).frame == "heading"
@@ -347,7 +346,7 @@ def test_the_frame_of_a_velocity_is_heading_by_default():
 
 
 @every_message
-def test_a_missing_field_is_refused(shape: str):
+def test_a_missing_required_field_is_refused(shape: str):
     info = types.type_info(kind_of(shape))
     assert isinstance(info, types.StructType)
     for field in info.fields:
@@ -364,7 +363,7 @@ NOT_FINITE = [math.nan, math.inf, -math.inf]
 
 
 def fits(value: Any, wrong: Any) -> bool:
-    """Tell whether `wrong` could stand where `value` does, by type alone."""
+    """Return whether the type of `wrong` is valid in place of `value`."""
     if isinstance(value, float):
         return isinstance(wrong, int | float) and not isinstance(wrong, bool)
     return type(wrong) is type(value)
@@ -382,7 +381,7 @@ def test_a_wrong_type_is_refused(shape: str):
 
 
 @every_message
-def test_a_word_outside_the_list_is_refused(shape: str):
+def test_a_value_outside_an_enumeration_is_refused(shape: str):
     plain = example(shape)
     info = types.type_info(kind_of(shape))
     assert isinstance(info, types.StructType)
@@ -393,7 +392,7 @@ def test_a_word_outside_the_list_is_refused(shape: str):
 
 
 @every_message
-def test_a_number_that_is_not_finite_is_refused(shape: str):
+def test_a_non_finite_number_is_refused(shape: str):
     plain = example(shape)
     floats = [path for path, value in leaves(plain) if isinstance(value, float)]
     for path, number, single in product(floats, NOT_FINITE, (False, True)):
@@ -404,7 +403,7 @@ def test_a_number_that_is_not_finite_is_refused(shape: str):
 
 @pytest.mark.parametrize("number", NOT_FINITE, ids=repr)
 @pytest.mark.parametrize("wrap", [lambda x: x, lambda x: [1, [x]], lambda x: {"a": {"b": x}}, lambda x: {x: 1}])
-def test_a_number_that_is_not_finite_is_refused_in_free_content(number: float, wrap: Any):
+def test_a_non_finite_number_in_free_form_content_is_refused(number: float, wrap: Any):
     plain = {**example("world/event"), "data": {"some": wrap(number)}}
     assert_names(refusal("world/event", pack(plain)), "world/event", "data")
     request = pack({"op": "acquire", "args": {"some": wrap(number)}})
@@ -413,7 +412,7 @@ def test_a_number_that_is_not_finite_is_refused_in_free_content(number: float, w
 
 
 @every_message
-def test_a_wrong_shape_is_refused(shape: str):
+def test_a_list_of_the_wrong_length_is_refused(shape: str):
     plain = example(shape)
     for path, value in branches(plain):
         info = types.type_info(kind_of(shape))
@@ -436,7 +435,7 @@ def test_a_cluster_state_has_four_values_per_drone(name: str):
 
 
 @every_message
-def test_stamps_are_whole_and_not_negative(shape: str):
+def test_t_ns_and_seq_must_be_non_negative_int64(shape: str):
     for name, wrong in product(("t_ns", "seq"), (-1, -(2**63), 2**63, 2**64 - 1, 0.0)):
         line = refusal(shape, pack({**example(shape), name: wrong}))
         assert has_terms(line, key_of(shape), name, str(wrong))
@@ -471,7 +470,7 @@ def test_garbage_is_refused(shape: str):
 
 
 @every_message
-def test_a_promise_of_four_billion_entries_is_refused(shape: str):
+def test_a_header_claiming_more_entries_than_follow_is_refused(shape: str):
     plain = example(shape)
     packed = pack(plain)
     headers = (b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdc\xff\xff", b"\xc6\xff\xff\xff\xff")
@@ -481,12 +480,12 @@ def test_a_promise_of_four_billion_entries_is_refused(shape: str):
         refusal(shape, packed[:place] + header)
 
 
-def test_a_payload_beyond_the_limit_is_refused_unread():
+def test_an_oversized_payload_is_refused_unread():
     payload = b"\x80" * (messages.PAYLOAD_MAX + 1)
     assert has_terms(refusal("clock", payload), "clock", str(len(payload)), str(messages.PAYLOAD_MAX))
 
 
-def test_nesting_without_end_in_free_content_is_refused():
+def test_excessive_nesting_in_free_form_content_is_refused():
     payload = pack({**example("world/event"), "data": {}})
     cut = payload.index(b"\xa4data") + 5
     for item in (b"\x91", b"\x81\xa1x"):
@@ -496,14 +495,14 @@ def test_nesting_without_end_in_free_content_is_refused():
 @every_type
 @settings(max_examples=60, deadline=None)
 @given(payload=st.binary(max_size=80))
-def test_random_bytes_are_a_message_or_refused(shape: str, payload: bytes):
+def test_random_bytes_are_decoded_or_refused(shape: str, payload: bytes):
     judge(shape, payload)
 
 
 @every_type
 @settings(max_examples=30, deadline=None)
 @given(data=st.data())
-def test_a_damaged_message_is_a_message_or_refused(shape: str, data: st.DataObject):
+def test_a_damaged_message_is_decoded_or_refused(shape: str, data: st.DataObject):
     damaged = bytearray(pack(example(shape)))
     for _ in range(data.draw(st.integers(1, 4))):
         place = data.draw(st.integers(0, max(0, len(damaged) - 1)))
@@ -529,7 +528,7 @@ def decoded_or_refused(kind: type[msgspec.Struct], payload: bytes, key: str) -> 
 
 
 def judge(shape: str, payload: bytes) -> None:
-    """Check that a payload is refused in the contract's words or is a message that survives a round trip."""
+    """Check that a payload is refused with its key, or is a finite message that survives a round trip."""
     key = key_of(shape)
     message = decoded_or_refused(kind_of(shape), payload, key)
     if message is None:
@@ -545,19 +544,19 @@ def judge(shape: str, payload: bytes) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(op=text, args=st.dictionaries(text, free, max_size=3), source=text)
-def test_requests_survive_the_wire(op: str, args: dict[str, Any], source: str):
+def test_requests_survive_a_round_trip(op: str, args: dict[str, Any], source: str):
     request = run_messages.ControlRequest(op, args, source)
     assert messages.decode_as(run_messages.ControlRequest, messages.encode(request), "k") == request
 
 
 @settings(max_examples=50, deadline=None)
 @given(ok=st.booleans(), error=text, result=free, more=st.none() | st.integers(0, 2**63 - 1))
-def test_answers_survive_the_wire(ok: bool, error: str, result: Any, more: int | None):
+def test_answers_survive_a_round_trip(ok: bool, error: str, result: Any, more: int | None):
     answer = run_messages.ControlAnswer(ok, error, result, more)
     assert messages.decode_as(run_messages.ControlAnswer, messages.encode(answer), "k") == answer
 
 
-def test_a_request_needs_no_more_than_its_op():
+def test_a_request_needs_only_an_op():
     request = messages.decode_as(run_messages.ControlRequest, pack({"op": "pause"}), "world/control")
     assert (request.op, request.args, request.source) == ("pause", {}, "")
 
@@ -580,13 +579,13 @@ def test_a_malformed_request_is_refused(plain: Any, terms: tuple[str, ...]):
 
 @settings(max_examples=300, deadline=None)
 @given(payload=st.binary(max_size=60))
-def test_a_random_request_is_a_request_or_refused(payload: bytes):
+def test_random_bytes_are_decoded_as_a_request_or_refused(payload: bytes):
     request = decoded_or_refused(run_messages.ControlRequest, payload, "world/control")
     assert request is None or isinstance(request, run_messages.ControlRequest)
 
 
 @pytest.mark.parametrize("drone", ["d1", "d" * 100], ids=["short", "cut short"])
-def test_a_refusal_can_be_said_without_its_key(drone: str):
+def test_a_refusal_can_be_worded_without_its_key(drone: str):
     key = f"drone/{drone}/camera/front/info"
     with pytest.raises(DecodeError) as caught:
         messages.decode(key, b"\xc0")

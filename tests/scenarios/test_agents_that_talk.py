@@ -1,4 +1,4 @@
-"""Agents of a user's class, one for each drone, tell each other where they are: the same bits however they are run."""
+"""Agents of a user's class, one per drone, exchange their positions: the bits are the same however they are run."""
 
 from itertools import pairwise, permutations
 from pathlib import Path
@@ -132,7 +132,7 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def heard(groups: list[list[str]], gates_max: int, kind: str = "Talker", **more: Any) -> dict[str, list[Any]]:
-    """Return what each has heard, in one process with these groups of agents; `more` of the scenario."""
+    """Return what each agent hears in one process, in these groups of agents; `more` are fields of the scenario."""
     scenario = scenario_file.resolve({**_talk(kind), "processes": {"expect": list(NAMES)}, **more})
     world = World(scenario)
     agents = [hosted(world.info(), scenario, group) for group in groups]
@@ -150,7 +150,7 @@ def _talk(kind: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("gates_max", [1, 10])
-def test_each_hears_all_a_gate_later_in_whatever_order_they_are(gates_max: int) -> None:
+def test_agents_hear_all_messages_one_gate_later_in_any_order(gates_max: int) -> None:
     gates = [round(gate * GATE_S * 1e9) for gate in range(26)]
     wanted = [[at, drone, sent] for sent, at in pairwise(gates) for drone in ("d1", "d2", "d3")]
     for order in permutations(NAMES):
@@ -159,13 +159,13 @@ def test_each_hears_all_a_gate_later_in_whatever_order_they_are(gates_max: int) 
         assert heard([[*order[:2]], [order[2]]], gates_max) == dict.fromkeys(NAMES, wanted)
 
 
-def test_the_source_of_a_message_is_its_agent_in_whatever_process(tmp_path: Path) -> None:
+def test_the_source_of_a_message_is_its_agent_in_any_grouping(tmp_path: Path) -> None:
     apart = heard([[name] for name in NAMES], 1, kind="BySource")
     assert {source for _, source, _ in apart["talk.d2"]} == {*NAMES}
     assert heard([[*NAMES]], 1, kind="BySource") == apart
 
 
-def test_a_message_may_stand_for_its_output(tmp_path: Path) -> None:
+def test_a_step_may_return_a_message_in_place_of_an_output(tmp_path: Path) -> None:
     fly(scenario_file.resolve(_talk("Bare")), tmp_path / "run.mcap")
     with RecordReader(tmp_path / "run.mcap") as reader:
         sent = [decode(each.key, each.payload) for each in reader.messages(["talk/d3/word"])]
@@ -173,18 +173,18 @@ def test_a_message_may_stand_for_its_output(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("groups", [[["talk.d1"], ["talk.d2"], ["talk.d3"]], [[*NAMES]]], ids=["apart", "together"])
-def test_a_link_between_two_of_them_may_be_cut(groups: list[list[str]]) -> None:
+def test_the_link_between_two_agents_can_be_cut(groups: list[list[str]]) -> None:
     cut = {"kind": "link_cut", "target": "talk.d1/talk.d2", "one_way": True, "at_s": 0.1, "for_s": 0.2}
     whole, lacking = heard(groups, 1), heard(groups, 1, faults=[cut])
     lost = [entry for entry in whole["talk.d2"] if entry not in lacking["talk.d2"]]
     assert {drone for _, drone, _ in lost} == {"d1"}
-    assert len(lost) == 10  # gates of 0.2 s
+    assert len(lost) == 10  # gates in 0.2 s
     assert (whole["talk.d1"], whole["talk.d3"]) == (lacking["talk.d1"], lacking["talk.d3"])
 
 
 @pytest.mark.parametrize("groups", [[["talk.d1"], ["talk.d2"], ["talk.d3"]], [[*NAMES]]], ids=["apart", "together"])
-def test_a_fault_of_the_radio_loses_their_messages_with_distance(groups: list[list[str]]) -> None:
-    """From 0.1 s to 0.3 s, where d2 and d3 are 8.5 m apart, of which next to nothing arrives, and d1 is 6 m from both."""
+def test_a_radio_fault_loses_messages_by_distance(groups: list[list[str]]) -> None:
+    """From 0.1 s to 0.3 s, d2 and d3, which are 8.5 m apart, hardly hear each other; d1 is 6 m from both."""
     fault = {"kind": "radio", "target": "world", "range_m": 6, "spread_m": 0.2, "at_s": 0.1, "for_s": 0.2}
     whole, lacking = heard(groups, 1), heard(groups, 1, faults=[fault])
     for name in NAMES:
@@ -211,7 +211,7 @@ def test_a_fault_of_the_radio_loses_their_messages_with_distance(groups: list[li
         ("Pirate", ("talk.d1 at 0.00 s", "talkers:Pirate.step", "drone/d2/cmd/mode", "d1")),
     ],
 )
-def test_what_cannot_be_sent_ends_the_run_with_class_key_field_and_gate(
+def test_an_invalid_output_ends_the_run_naming_its_class_and_gate(
     kind: str, terms: tuple[str, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(UserCodeError) as raised:
@@ -220,15 +220,15 @@ def test_what_cannot_be_sent_ends_the_run_with_class_key_field_and_gate(
 
 
 @pytest.mark.parametrize("groups", [[["talk.d1"], ["talk.d2"], ["talk.d3"]], [[*NAMES]]], ids=["apart", "together"])
-def test_over_a_radio_each_hears_whom_it_reaches_and_when_it_does(groups: list[list[str]]) -> None:
-    """d2 and d3 are 8.5 m apart, d1 is 6 m from both."""
+def test_the_radio_respects_range_delay_topology_and_bandwidth(groups: list[list[str]]) -> None:
+    """d2 and d3 are 8.5 m apart, and d1 is 6 m from both."""
     near = heard(groups, 1, radio={"range_m": 7})
     assert [{drone for _, drone, _ in near[name]} for name in NAMES] == [{"d1", "d2", "d3"}, {"d1", "d2"}, {"d1", "d3"}]
     assert {at - sent for each in near.values() for at, _, sent in each} == {20_000_000}
     late = heard(groups, 1, radio={"delay_ms": 50}, topology={"d2": ["d3"]})
     assert {(drone, at - sent) for at, drone, sent in late["talk.d2"]} == {("d2", 20_000_000), ("d3", 60_000_000)}
     assert {drone for _, drone, _ in late["talk.d1"]} == {"d1"}
-    slow = heard(groups, 1, radio={"bandwidth_kbit_s": 5, "queue_max": 1})  # 26 bytes in 41.6 ms
+    slow = heard(groups, 1, radio={"bandwidth_kbit_s": 5, "queue_max": 1})  # 26 bytes take 41.6 ms
     assert [at // 20_000_000 for at, drone, _ in slow["talk.d2"] if drone == "d2"] == [
         1,
         3,
@@ -246,17 +246,16 @@ def test_over_a_radio_each_hears_whom_it_reaches_and_when_it_does(groups: list[l
     ]
 
 
-def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, forked: None) -> None:
-    """Over a radio that loses and delays messages, with a ridge between two drones; killed in the middle, a pilot goes on
-    from its snapshot."""
+def test_processes_and_a_rerun_give_the_same_bits(tmp_path: Path, forked: None) -> None:
+    """The radio loses and delays messages, a ridge parts two drones, and a killed pilot resumes from its snapshot."""
     (tmp_path / "ridge.csv").write_text(RIDGE)
     (tmp_path / "swarm.yaml").write_text(SWARM + OVER_RADIO)
     alone = zsim.run(tmp_path / "swarm.yaml", out=tmp_path / "alone", progress=False)
     messages = alone.messages("swarm/d1/position")
-    assert 150 < len(messages) < 301  # as many as the bandwidth lets out
+    assert 150 < len(messages) < 301  # as many as the bandwidth allows
     with RecordReader(tmp_path / "alone" / "run.mcap") as reader:
         d1_hears = {decode(each.key, each.payload).hears[0] for each in reader.messages([RADIO])}
-    assert d1_hears == {(2,)}  # d3; d2 is as near
+    assert d1_hears == {(2,)}  # d3; d2 is as near, but behind the ridge
     assert {"position_m_x", "position_m_y", "position_m_z"} <= {*messages.columns}
     with zsim.Federation(tmp_path / "swarm.yaml", out=tmp_path / "many") as flight:
         flight.wait_until(3.0)
@@ -271,7 +270,7 @@ def test_as_processes_and_flown_again_they_have_the_same_bits(tmp_path: Path, fo
 
 
 @pytest.mark.soak
-def test_hosted_they_have_the_same_bits(
+def test_hosted_agents_give_the_same_bits(
     federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
@@ -281,8 +280,8 @@ def test_hosted_they_have_the_same_bits(
     assert federation.record().sha256() == alone.truth_sha256
 
 
-def test_the_pentagon_closes(tmp_path: Path) -> None:
-    """Consensus on displacements over a radio of 8 m that loses 30 %, the last positions heard being held."""
+def test_the_swarm_forms_a_regular_pentagon(tmp_path: Path) -> None:
+    """Consensus on displacements over a radio of 8 m range that loses 30 %; the last positions heard are held."""
     run = zsim.run(EXAMPLES / "swarm.yaml", duration_s=25, out=tmp_path / "run", progress=False)
     places = {drone: run.estimate(drone).iloc[-1] for drone in run.drones}
     sides = []
@@ -293,8 +292,8 @@ def test_the_pentagon_closes(tmp_path: Path) -> None:
     assert sides == pytest.approx([3.5267] * 5, abs=0.3)  # 2 · 3 m · sin(36°)
 
 
-def test_their_parameters_are_swept_by_path(near: None, tmp_path: Path) -> None:
-    """The takeoff of one run comes after its end."""
+def test_agent_parameters_are_swept_by_path(near: None, tmp_path: Path) -> None:
+    """In one of the runs, the take-off would come after the end."""
     path = "agents.pilot.parameters.takeoff_s"
     (tmp_path / "swarm.yaml").write_text(SWARM)
     frame = zsim.sweep(

@@ -1,4 +1,4 @@
-"""Drones that start anywhere become a formation, and another one, by assigned places: no two come near each other."""
+"""Drones that start anywhere assemble at assigned places, and assemble anew, without coming near each other."""
 
 import math
 from pathlib import Path
@@ -58,10 +58,11 @@ def places(run: Any, at_s: float) -> np.ndarray:
     return np.array([run.truth(f"d{k}")[columns].to_numpy()[round(at_s * 50)] for k in range(1, 6)])
 
 
-def test_from_a_line_to_a_pentagon_and_turned_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
-    """The line is in no formation at the start. Turned by half a turn, each drone flies to the next place only.
+def test_a_line_becomes_a_pentagon_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
+    """The initial line is no formation. When the pentagon makes half a turn, each drone flies to the nearest place.
 
-    Expected: places of a pentagon within half a metre; from 21 s to 32 s each drone moves by 2 * 4 m * sin(18 deg).
+    Expected: each place of the pentagon is filled within 0.9 m; from 21 s to 32 s each drone moves by
+    2 * 4 m * sin(18 deg).
     """
     path = written(LINE, tmp_path)
     alone = zsim.run(path, out=tmp_path / "alone", progress=False)
@@ -75,7 +76,7 @@ def test_from_a_line_to_a_pentagon_and_turned_with_the_same_bits_after_a_kill(tm
         assert away.min(axis=1).max() < 0.9
     moved = np.linalg.norm((places(alone, 32.0) - places(alone, 21.0))[:, :2], axis=1)
     assert moved == pytest.approx(2 * 4 * math.sin(math.radians(18)), abs=0.9)
-    assert (alone.summary.errors["x_c"].true_rms or 9.0) < 0.3  # of the robots, whoever they are
+    assert (alone.summary.errors["x_c"].true_rms or 9.0) < 0.3  # by robot, whichever drone
     with zsim.Federation(path, duration=26, out=tmp_path / "many") as flight:
         flight.wait_until(23.5)
         flight.kill("controller.main")
@@ -90,7 +91,7 @@ def test_from_a_line_to_a_pentagon_and_turned_with_the_same_bits_after_a_kill(tm
 
 @pytest.mark.soak
 @pytest.mark.parametrize("kill_s", [8.0, 23.5, 30.0])
-def test_without_snapshots_the_step_of_the_plan_is_flown_again(kill_s: float, tmp_path: Path, forked: None) -> None:
+def test_without_snapshots_a_killed_controller_repeats_its_step(kill_s: float, tmp_path: Path, forked: None) -> None:
     path = written({**LINE, "processes": {"snapshot_s": 0}}, tmp_path)
     with zsim.Federation(path, out=tmp_path / "many") as flight:
         flight.wait_until(kill_s)
@@ -100,7 +101,7 @@ def test_without_snapshots_the_step_of_the_plan_is_flown_again(kill_s: float, tm
     assert (run.summary.min_separation_m or 0.0) > 1.9
 
 
-def test_it_is_asked_for_and_refused_where_it_cannot_be_flown(tmp_path: Path) -> None:
+def test_a_requested_assembly_is_flown_or_refused(tmp_path: Path) -> None:
     sim = zsim.Simulation(written(changed(assemblies=LINE["clusters"][0]["plan"]["assemblies"][:1]), tmp_path))
     sim.run(until_s=3)
     with pytest.raises(zsim.ZsimError):
@@ -112,7 +113,7 @@ def test_it_is_asked_for_and_refused_where_it_cannot_be_flown(tmp_path: Path) ->
     sim.ask("cluster/main/control", "assemble", values={"x_c": 3.0})
     sim.run(until_s=21)
     with pytest.raises(zsim.ZsimError):
-        sim.ask("cluster/main/control", "engage")  # on its way
+        sim.ask("cluster/main/control", "engage")  # still assembling
     sim.run(until_s=26)
     sim.ask("cluster/main/control", "engage")
     sim.run(until_s=30)
@@ -150,14 +151,14 @@ def test_samples_come_in_the_order_of_the_robots() -> None:
         ([{"values": {"w_1": -3}}], "clusters[0].plan.assemblies[0]:"),
     ],
 )
-def test_what_cannot_be_assembled_is_told_before_the_flight(assemblies: Any, path: str) -> None:
+def test_an_invalid_assembly_is_refused_before_the_flight(assemblies: Any, path: str) -> None:
     with pytest.raises(ScenarioError) as refused:
         check_plans(scenario_file.resolve(changed(assemblies=assemblies)), "line.yaml")
     assert [line.split(" ")[1] for line in refused.value.faults] == [path]
 
 
-def test_ways_that_lead_too_near_to_each_other_are_refused_with_the_distance() -> None:
-    """Two drones in a row along x that are to be in a row along y pass each other at 2.5 m / sqrt(2)."""
+def test_paths_that_come_too_close_are_refused_with_the_distance() -> None:
+    """Two drones in a row along x that must form a row along y pass each other at 2.5 m / sqrt(2)."""
     starts, template = [[0, 0, 0], [2.5, 0, 0], [8, 1.25, 0]], [[0, 0, 0], [0, 2.5, 0], [8, 1.25, 0]]
     drones = [{"name": f"e{k}", "position_m": place} for k, place in enumerate(starts)]
     plan = {"takeoff_s": 1, "assemblies": [{"values": {"x_c": 8 / 3, "y_c": 1.25, "z_c": 1.5, "yaw": 0}}]}
@@ -168,7 +169,7 @@ def test_ways_that_lead_too_near_to_each_other_are_refused_with_the_distance() -
     assert has_terms(line, "clusters[0].plan.assemblies[0]:", "1.77", "1.8")
 
 
-def test_of_a_triad_all_that_makes_its_shape_must_be_named(tmp_path: Path) -> None:
+def test_an_assembly_of_a_triad_must_give_all_shape_variables(tmp_path: Path) -> None:
     drones = [{"name": f"e{k}", "position_m": [3 * k, 0, 0]} for k in range(3)]
     plan = {"takeoff_s": 1, "assemblies": [{"values": {"p": 4, "q": 4}}]}
     cluster = {"name": "main", "drones": ["e0", "e1", "e2"], "space": "triad", "plan": plan}

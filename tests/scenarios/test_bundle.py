@@ -1,4 +1,4 @@
-"""A flight in one file is flown again elsewhere, and what differs is named."""
+"""A flight bundled in one file is flown again elsewhere, and differences are reported."""
 
 import importlib
 import shutil
@@ -53,7 +53,7 @@ class Climber(zsim.Agent):
 
 @pytest.fixture
 def flown(federation: Federation) -> Path:
-    """The folder of OWN, flown as processes, whose class is in a package that needs another module."""
+    """Return the run folder of OWN, flown as processes; its class is in a package that imports another module."""
     package = federation.folder / "climbing"
     package.mkdir()
     (package / "__init__.py").touch()
@@ -64,7 +64,7 @@ def flown(federation: Federation) -> Path:
 
 
 def forget(folder: Path | None = None) -> None:
-    """Take the modules of OWN out of this process, and away from a folder."""
+    """Remove the modules of OWN from this process and, if given, from a folder."""
     for name in ("heights", "climbing", "climbing.climber"):
         sys.modules.pop(name, None)
     importlib.invalidate_caches()
@@ -79,20 +79,20 @@ def command(*words: object, code: int = 0) -> Completed:
     return done
 
 
-def test_a_flight_in_a_file(
+def test_a_bundle_is_reproducible_and_rerun_elsewhere(
     federation: Federation, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """OWN as processes and in one process; both bundled, and flown again where nothing of it is.
+    """OWN is flown as processes and in one process; both are bundled, and the first is rerun without OWN's modules.
 
-    Expected: the same bytes each time it is bundled, and without its record however it was flown; nothing of this
-    machine in it; refused without --trust, in a line; flown again to the same bits, with its record and without.
+    Expected: a bundle has the same bytes each time and, without the record, however OWN was flown; it holds no trace of
+    this machine; without --trust it is refused in one line; with or without the record, it is rerun to the same bits.
     """
     once, twice, bare, other = (tmp_path / f"{name}.zsim" for name in ("once", "twice", "bare", "other"))
     command("bundle", flown, "-o", once)
     command("bundle", flown, "-o", twice)
     assert once.read_bytes() == twice.read_bytes()
     command("bundle", flown, "-o", once, code=2)
-    monkeypatch.setattr(ReportFigure, "png", lambda figure: figure.name.encode())  # a second for each bundle
+    monkeypatch.setattr(ReportFigure, "png", lambda figure: figure.name.encode())  # saves a second per bundle
     command("bundle", flown, "-o", bare, "--no-record")
     alone = federation.folder / "alone"
     command("run", federation.folder / "scenario.yaml", "--in-process", "--no-report", "--out", alone)
@@ -119,7 +119,7 @@ OUTPUTS = ("estimate", "cmd/mode", "cmd/velocity")
 
 
 def places_of(record: Path, folder: str, host: str) -> list[str]:
-    """Return the keys of a record whose messages have a folder or, as a text of its own, the name of a host."""
+    """Return the keys of a record's messages with a text that contains `folder` or equals `host`."""
     with RecordReader(record) as reader:
         contents = ((each.key, msgpack.unpackb(each.payload)) for each in reader.messages(by_time=False))
         return [key for key, content in contents if any(folder in text or text == host for text in texts(content))]
@@ -131,11 +131,11 @@ def texts(content: Any) -> list[str]:
     return [content] if isinstance(content, str) else []
 
 
-def test_what_differs_is_named(flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bundles of OWN that say something else than what is flown: an estimate, the truth, the commands, a digest.
+def test_differences_in_a_rerun_are_reported(flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bundles of OWN differ from their rerun in an estimate, in the truth, or in the digest of the commands.
 
-    Expected: the key, the instant, the field with both values where there is a record, and what is known of the
-    machines. And what cannot be bundled: a record that was cut; without its record, one that others have steered.
+    Expected: a line gives the key, the instant and, where there is a record, the field with both values; another gives
+    what is known of the machines. A cut record cannot be bundled, nor, without its record, a run that others steered.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("zsim_analysis.bundle.make_bundle.figures", lambda *_: iter(()))
@@ -179,7 +179,7 @@ def test_what_differs_is_named(flown: Path, tmp_path: Path, monkeypatch: pytest.
 
 
 def doctored(run: Path, into: Path, change: Callable[[str, dict[str, Any]], dict[str, Any]]) -> Path:
-    """Write the record of a run anew, with messages changed."""
+    """Rewrite the record of a run with messages changed."""
     into.mkdir()
     with RecordReader(run / RECORD) as reader, RecordWriter(into / RECORD) as writer:
         for each in reader.messages(by_time=False):
@@ -190,7 +190,7 @@ def doctored(run: Path, into: Path, change: Callable[[str, dict[str, Any]], dict
 
 
 def resealed(bundle: Path, name: str, content: bytes) -> Path:
-    """Write a bundle anew with another member, as somebody would who means to deceive."""
+    """Rewrite a bundle with one member replaced and a valid seal, as a forger would."""
     with opened(bundle) as (manifest, _), zipfile.ZipFile(bundle) as archive:
         members: dict[str, Any] = {each: archive.read(each) for each in manifest.files}
     return write_bundle(bundle.with_name("resealed.zsim"), manifest, {**members, name: content}, force=False).path

@@ -1,4 +1,4 @@
-"""Who flies a drone: commanders, refusals with reasons, instants, silence."""
+"""Commands to a drone: commanders, refusals with reasons, instants of effect, and silence."""
 
 import math
 
@@ -19,18 +19,18 @@ def refusal(step: Lockstep, key: str) -> tuple[str, str]:
 
 
 def velocity(step: Lockstep) -> list[float]:
-    """Return the true velocity in W; the drone looks north, so forward is y."""
+    """Return the true velocity in W; the drone heads north, so forward is y."""
     return step.client.get("drone/drone1/truth")["drone/drone1/truth"]["velocity_m_s"]
 
 
-def test_the_first_who_sends_flies(federation: Federation) -> None:
+def test_the_first_sender_commands_until_a_higher_priority_acquires(federation: Federation) -> None:
     """One drone, two programs; the second does not gate.
 
-        tester.one ── takeoff ── forward ───────────────────────────────── release
-        tester.two                        back ✗    acquire 10, back ✓                back ✓
+        tester.one ── takeoff ── forward ──────────────────────── forward ✗ ─────────── forward ✓
+        tester.two                        back ✗    acquire 10, back ✓        release
 
-    Expected: the commander is named in status; the second is refused with the commander's name until it acquires the
-    drone with a higher priority, then the first is refused; a drone that was released is anybody's.
+    Expected: status names the commander; the second program is refused with the commander's name until it acquires the
+    drone with a higher priority, then the first one is refused; once released, the drone is free for anybody.
     """
     step = Lockstep(federation, "--duration", "60")
     step.fly()
@@ -72,13 +72,13 @@ def test_the_first_who_sends_flies(federation: Federation) -> None:
     step.leave()
 
 
-def test_the_instant_of_a_command(federation: Federation) -> None:
-    """A command of the lockstep takes effect at its stamp plus the delay, one from outside when the event says.
+def test_a_command_takes_effect_at_its_instant(federation: Federation) -> None:
+    """A lockstep command takes effect at its stamp plus the delay, an outside command when its event says.
 
         tester.one  ── takeoff stamped 10 ──▶ effect at 10 + delay
         tester.two  ── takeoff ──▶ event `command` with apply_t_ns ──▶ effect at apply_t_ns
 
-    Expected: `mode` events at these instants; an event `command` of the outside one alone, with its apply_t_ns.
+    Expected: `mode` events at these instants; a `command` event, with its apply_t_ns, for the outside command alone.
     """
     step = Lockstep(federation)
     step.answer(9 * GATE_NS)
@@ -95,13 +95,13 @@ def test_the_instant_of_a_command(federation: Federation) -> None:
     step.leave()
 
 
-def test_the_commander_leaves(federation: Federation) -> None:
-    """The commander dies; nobody flies the drone.
+def test_a_drone_hovers_when_its_commander_dies(federation: Federation) -> None:
+    """The commander dies, and nobody else flies the drone.
 
         tester.one ── gates
         tester.two ── forward ── dies
 
-    Expected: an event `release`; the drone hovers.
+    Expected: a `release` event; the drone hovers.
     """
     step = Lockstep(federation, "--duration", "60")
     step.fly()
@@ -119,13 +119,13 @@ def test_the_commander_leaves(federation: Federation) -> None:
     step.leave()
 
 
-def test_silence(federation: Federation) -> None:
+def test_a_drone_hovers_and_then_lands_when_its_commander_is_silent(federation: Federation) -> None:
     """The commander sends one setpoint and then nothing.
 
         t          0.0 s      0.5 s      2.5 s
         drone   flying ──▶ hovering ──▶ landing ──▶ landed
 
-    Expected: hover after 0.5 s of simulated time, landing 2 s later, whatever the wall clock does.
+    Expected: it hovers after 0.5 s of simulated time and lands 2 s later, whatever the wall clock does.
     """
     step = Lockstep(federation, "--duration", "60")
     states = step.client.subscribe("drone/drone1/sensor/status")
@@ -144,7 +144,7 @@ def test_silence(federation: Federation) -> None:
 
 
 def changes_of(received: list[Received]) -> dict[str, int]:
-    """Return when each state was entered last."""
+    """Return the instant at which each state was last entered [ns]."""
     changes, former = {}, ""
     for _, _, status in received:
         if status["state"] != former:
@@ -174,10 +174,10 @@ REFUSED = {
 }
 
 
-def test_commands_that_are_refused(federation: Federation) -> None:
-    """Every fault of a command, from a program in the lockstep.
+def test_invalid_commands_are_refused(federation: Federation) -> None:
+    """A program in the lockstep sends commands with every kind of fault.
 
-    Expected: each is an event with the reason; time and drone go on as if it had not come.
+    Expected: an event gives the reason for each; time and the drone go on as if no command had arrived.
     """
     step = Lockstep(federation)
     step.answer(3 * GATE_NS)
@@ -197,10 +197,10 @@ def test_commands_that_are_refused(federation: Federation) -> None:
     assert step.event("end", "world").message["data"]["refused"] >= len(REFUSED) - 1
 
 
-def test_setpoints_beyond_all_limits(federation: Federation) -> None:
-    """Finite, and absurd: 1e300 m/s, 1e12 rad/s, 1e308 N.
+def test_absurd_setpoints_are_flown_within_limits(federation: Federation) -> None:
+    """The setpoints are finite but absurd: 1e300 m/s, 1e12 rad/s, 1e308 N.
 
-    Expected: the firmware flies what its limits allow, and refuses an orientation without direction.
+    Expected: the firmware flies what its limits allow, and refuses a zero quaternion.
     """
     step = Lockstep(federation, "--duration", "60", scenario=ONE)
     step.fly()

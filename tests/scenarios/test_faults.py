@@ -1,4 +1,4 @@
-"""Injected faults: every kind gives the same bits twice, and others than a run without it; wherever the agents run."""
+"""Injected faults: each kind changes the truth, which is reproducible to the bit wherever the agents run."""
 
 import json
 import time
@@ -27,12 +27,12 @@ from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
 AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0
-ENGAGED_S, BRIEF_S = 5.0, 6.5  # from when on the formation of PAIR is engaged
+ENGAGED_S, BRIEF_S = 5.0, 6.5  # the formation of PAIR is engaged from ENGAGED_S on; a brief flight ends at BRIEF_S
 Document = dict[str, Any]
 LINK = "estimator.drone1/controller.main"
 KILL = "process_kill"
 
-# What a fault of each kind is to be, so that the flight feels it
+# A fault of each kind that affects the flight
 MATRIX: dict[str, Document] = {
     **{f"{sensor}_dropout": {"target": "drone1"} for sensor in ("gps", "mag", "baro", "sonar", "flow")},
     "imu_dropout": {"target": "drone1", "probability": 0.3},
@@ -59,9 +59,9 @@ MATRIX: dict[str, Document] = {
     "link_cut": {"target": "world/estimator.drone1"},
     "radio": {"target": "main", "range_m": 2, "spread_m": 1},
 }
-# Of sensors that no drone has unless it is given them: tests/unit/world/sensors
+# Faults of sensors that a drone has only on request; tested in tests/unit/world/sensors
 SCANNED = {kind for kind in KINDS if KINDS[kind].sensor in SCANNERS}
-CHANCE = {"noise", "jitter", "loss", "radio"}  # in the names of kinds that draw numbers
+CHANCE = {"noise", "jitter", "loss", "radio"}  # words in the names of kinds that draw random numbers
 SEVERAL: list[Document] = [
     {"kind": "link_loss", "target": "world/estimator.drone2", "probability": 0.3, "at_s": 4},
     {"kind": "link_jitter", "target": LINK, "jitter_ms": 70, "at_s": 5, "for_s": 4},
@@ -81,7 +81,7 @@ SEVERAL: list[Document] = [
 
 
 class Flight(NamedTuple):
-    """What a run left behind."""
+    """What is kept of a run."""
 
     sha256: str
     events: list[Event]
@@ -93,7 +93,7 @@ class Flight(NamedTuple):
         return [event for event in self.events if event.kind in kinds]
 
     def changes(self) -> list[tuple[float, str]]:
-        """Return when drone1 came into each state [s], and which."""
+        """Return the instants [s] at which drone1 changed state, each with the new state."""
         pairs = zip(self.statuses, self.statuses[1:], strict=False)
         return [(after.t_ns / 1e9, after.state) for before, after in pairs if after.state != before.state]
 
@@ -103,7 +103,7 @@ def document(faults: Sequence[Document], **values: Any) -> Document:
 
 
 def apart(world: World) -> list[Agent]:
-    """Return estimators and controller as agents of their own, as in a run of processes."""
+    """Return the estimators and the controller as separate agents, as in a run of processes."""
     info, scenario = world.info(), world.scenario
     estimators = [Estimator(info, scenario, drone.name) for drone in scenario.drones]
     return [*estimators, Controller(info, scenario, "main")]
@@ -115,7 +115,7 @@ def fly(
     between: Callable[[World], None] = lambda world: None,
     **values: Any,
 ) -> Flight:
-    """Fly PAIR in one process; `between` is called between gates, as requests come."""
+    """Fly PAIR in one process; `between` is called between gates, when requests arrive."""
     world = World(scenario_file.resolve(document(faults, **values)))
     flight = Flight("", [], [], [], [])
     kept = {
@@ -147,15 +147,16 @@ def briefly_undisturbed() -> Flight:
     return fly([], duration_s=BRIEF_S)
 
 
-def test_every_kind_is_in_the_matrix() -> None:
+def test_every_kind_of_fault_is_covered() -> None:
     assert {*MATRIX, *SCANNED, KILL} == {*KINDS}
 
 
 @pytest.mark.parametrize("kind", MATRIX)
-def test_other_bits_than_without(kind: str, briefly_undisturbed: Flight) -> None:
-    """The fault from 5 s on for a second, unless it says otherwise.
+def test_each_fault_changes_the_truth(kind: str, briefly_undisturbed: Flight) -> None:
+    """A fault lasts from 5 s to 6 s, unless MATRIX says otherwise.
 
-    Expected: another hash than without it; an event at its start and at its end; the flight goes on to the end.
+    Expected: a hash other than that of the undisturbed flight; an event at the start and end of the fault; the flight
+    continues to its end.
     """
     fault = {"kind": kind, "at_s": ENGAGED_S, "for_s": 1.0, **MATRIX[kind]}
     flight = fly([fault], duration_s=BRIEF_S)
@@ -165,21 +166,21 @@ def test_other_bits_than_without(kind: str, briefly_undisturbed: Flight) -> None
     assert flight.events_of("end")[0].data["last_ns"] == BRIEF_S * 1e9
 
 
-def test_the_same_bits_twice() -> None:
-    """All faults in which chance has a part at once, each with numbers of its own to draw, from 4 s on, twice."""
+def test_random_faults_give_the_same_bits_twice() -> None:
+    """All faults that draw random numbers, each from its own stream, at once from 4 s on, flown twice."""
     chance = [kind for kind in MATRIX if CHANCE & set(kind.split("_")) or "probability" in MATRIX[kind]]
     faults = [{"kind": kind, "at_s": 4.0, **MATRIX[kind]} for kind in chance]
     assert len(faults) == 11
     assert fly(faults, duration_s=BRIEF_S).sha256 == fly(faults, duration_s=BRIEF_S).sha256
 
 
-def test_a_fault_that_comes_after_the_end_changes_nothing(undisturbed: Flight) -> None:
+def test_a_fault_after_the_end_changes_nothing(undisturbed: Flight) -> None:
     assert fly([{"kind": "gps_dropout", "target": "drone1", "at_s": 100}]).sha256 == undisturbed.sha256
 
 
 @pytest.mark.parametrize("delay_gates", [1, 5])
-def test_agents_in_one_process_and_apart_receive_the_same(delay_gates: int) -> None:
-    """Several faults at once, in a Group and in agents of their own; the world may run ahead by delay_gates.
+def test_grouped_and_separate_agents_give_the_same_bits(delay_gates: int) -> None:
+    """Several faults at once, with the agents in one Group and separate; the world may run ahead by delay_gates.
 
     Expected: the same hash.
     """
@@ -187,12 +188,12 @@ def test_agents_in_one_process_and_apart_receive_the_same(delay_gates: int) -> N
     assert fly(SEVERAL, time=delay).sha256 == fly(SEVERAL, apart, time=delay).sha256
 
 
-def test_as_processes(federation: Federation) -> None:
-    """Several faults at once, every role a process.
+def test_processes_give_the_same_bits_as_one_process(federation: Federation) -> None:
+    """Several faults at once, with every role in its own process.
 
         world ──╳──sensors──▶ estimators ──╳──estimates──▶ controller ──╳──velocity──▶ world
 
-    Expected: the hash of the run in one process; the lists of faults are on record.
+    Expected: the hash of the run in one process; the faults are on record.
     """
     federation.run(yaml.safe_dump(document(SEVERAL))).ends(with_code=0)
     record = federation.record()
@@ -202,7 +203,7 @@ def test_as_processes(federation: Federation) -> None:
 
 
 def requesting(at_gate: int, op: str, **args: Any) -> Callable[[World], None]:
-    """Return a function that sends the world a request once, between gates."""
+    """Return a function that, called between gates, sends the world one request."""
     asked: list[Any] = []
 
     def ask(world: World) -> None:
@@ -214,7 +215,7 @@ def requesting(at_gate: int, op: str, **args: Any) -> Callable[[World], None]:
 
 
 def planned_of(events: Sequence[Any]) -> list[Document]:
-    """Return the faults of a scenario that those which begin in some events are."""
+    """Return the faults in some events' data as a scenario would plan them."""
     return [
         {
             "kind": data["kind"],
@@ -228,10 +229,10 @@ def planned_of(events: Sequence[Any]) -> list[Document]:
 
 
 @pytest.mark.parametrize("kind", ["gps_stuck", "rotor_stuck", "link_loss", "link_delay", "radio", "gust"])
-def test_by_request_gives_the_bits_of_its_events(kind: str, undisturbed: Flight) -> None:
-    """The fault is requested in flight; then the same is planned from the data of its event.
+def test_a_requested_fault_equals_the_one_planned_from_its_event(kind: str, undisturbed: Flight) -> None:
+    """A fault is requested in flight; then the same fault is planned from the data of its event.
 
-    Expected: the same hash, another one than without.
+    Expected: the same hash, which differs from that of the undisturbed flight.
     """
     fault = {"kind": kind, "for_s": 0.5, **MATRIX[kind]}
     asked = fly([], between=requesting(300, "fault_add", **fault))
@@ -239,10 +240,10 @@ def test_by_request_gives_the_bits_of_its_events(kind: str, undisturbed: Flight)
     assert asked.sha256 == again.sha256 != undisturbed.sha256
 
 
-def test_cleared_by_request(undisturbed: Flight) -> None:
-    """A weak rotor from 6 s on, cleared in flight.
+def test_a_fault_can_be_cleared_by_request(undisturbed: Flight) -> None:
+    """A rotor is weak from 6 s on, until the fault is cleared in flight.
 
-    Expected: it acts until then, so the bits are those of one that ends there.
+    Expected: the bits of a fault that is planned to end when this one is cleared.
     """
     weak = {"kind": "rotor_efficiency", "at_s": AT_S, **MATRIX["rotor_efficiency"]}
     cleared = fly([weak], between=requesting(350, "fault_clear", target="drone1"))
@@ -253,10 +254,10 @@ def test_cleared_by_request(undisturbed: Flight) -> None:
     assert cleared.sha256 != undisturbed.sha256
 
 
-def test_by_command_on_a_running_federation(federation: Federation) -> None:
-    """`zsim fault add` and `clear` on processes; then the same faults planned, in one process.
+def test_faults_can_be_added_and_cleared_by_command(federation: Federation) -> None:
+    """`zsim fault add` and `clear` act on a federation; then the same faults are planned in one process.
 
-    Expected: the lines that the commands print; the same hash.
+    Expected: the commands print each fault with its number, target and times; the same hash.
     """
     run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "1")
     client = federation.client()
@@ -302,14 +303,14 @@ def fault(federation: Federation, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize("victim", ["estimator.drone2", pytest.param("controller.main", marks=pytest.mark.soak)])
-def test_a_killed_process_is_started_again_and_gives_the_same_bits(federation: Federation, victim: str) -> None:
-    """The victim dies by itself after its outputs of the gate at 6.02 s.
+def test_a_killed_process_is_restarted_to_the_same_bits(federation: Federation, victim: str) -> None:
+    """The victim kills itself after it has sent its outputs of the gate at 6.02 s.
 
         estimator or controller ──────┤ SIGKILL   started again ├──────▶
         clock                   ──────┤ waiting_for             ├──────▶ 9 s
 
-    Expected: the launcher sees a death and starts it again; it goes on from its snapshot; the hash of a run in which
-    nobody dies. On a busy machine it may be back before the world has noticed that it was gone.
+    Expected: the launcher notices the death and restarts the process, which resumes from its snapshot; the hash is that
+    of a run without deaths. On a busy machine the process may be back before the world notices its death.
     """
     run = federation.run(yaml.safe_dump(document([{"kind": KILL, "target": victim, "at_s": AT_S}])))
     run.line(f"{victim} .*(died|ended: killed by signal 9).*restart")
@@ -325,19 +326,18 @@ def test_a_killed_process_is_started_again_and_gives_the_same_bits(federation: F
     assert record.sha256() == fly([]).sha256
 
 
-def test_no_process_dies_where_none_is() -> None:
+def test_process_kill_is_refused_in_a_single_process_run() -> None:
     with pytest.raises(RunError, match=r"process_kill of estimator\.drone1 "):
         fly([{"kind": KILL, "target": "estimator.drone1", "at_s": 1}])
 
 
-# What the agents make of it
+# How the agents react
 
 
-def test_an_estimator_without_sensors_says_how_little_it_knows() -> None:
+def test_an_estimator_without_sensors_reports_growing_uncertainty() -> None:
     """Nothing reaches estimator.drone1 from 6 s on.
 
-    Expected: an estimate at every gate, finite, whose sigma grows and covers the truth; the controller holds the
-    formation and says why.
+    Expected: a finite estimate at every gate, whose sigma grows; the controller holds the formation and says why.
     """
     flight = fly([{"kind": "link_cut", "target": "world/estimator.drone1", "at_s": AT_S}])
     sigmas = [np.sqrt(np.array(e.covariance)[[0, 7, 14]]) for e in flight.estimates]
@@ -351,10 +351,10 @@ def test_an_estimator_without_sensors_says_how_little_it_knows() -> None:
 
 
 @pytest.mark.parametrize("kind", ["link_cut", "link_loss"])
-def test_a_controller_without_an_estimate_holds_and_says_so(kind: str) -> None:
+def test_a_controller_without_an_estimate_holds_and_says_why(kind: str) -> None:
     """No estimate of drone1 reaches the controller from 6 s to 8 s.
 
-    Expected: held after half a second, with the age of the estimate as the reason; engaged again at the end.
+    Expected: the formation is held after half a second, because of the estimate's age, and engaged again at the end.
     """
     given = {"kind": kind, "target": LINK, "at_s": AT_S, "for_s": FOR_S}
     flight = fly([{**given, "probability": 1} if kind == "link_loss" else given])
@@ -366,13 +366,13 @@ def test_a_controller_without_an_estimate_holds_and_says_so(kind: str) -> None:
 
 @pytest.mark.parametrize(("for_s", "lands"), [(1.5, False), (3.5, True)])
 def test_drones_without_a_controller_hover_and_then_land(for_s: float, lands: bool) -> None:
-    """No command reaches the world from 6 s on, for a second and a half, or for longer than the firmware waits.
+    """No command reaches the world from 6 s on, for 1.5 s or for longer than the firmware waits before it lands.
 
         cut    6.0 ├───────────────┤ 7.5     or     ├──────────────────────────────┤ 9.5
         state      flying │ hovering │ flying       flying │ hovering     │ landing
                          6.5                              6.5            8.5
 
-    Expected: after half a second of silence the firmware hovers, and two seconds later it lands; nobody falls.
+    Expected: after half a second of silence the firmware hovers, and two seconds later it lands; no drone falls.
     """
     cut = {"kind": "link_cut", "target": "world/controller.main", "at_s": AT_S, "for_s": for_s}
     flight = fly([cut], duration_s=10.0)
@@ -382,15 +382,15 @@ def test_drones_without_a_controller_hover_and_then_land(for_s: float, lands: bo
     assert [t_s for t_s, _ in changes] == pytest.approx([AT_S + 0.5, AT_S + (2.5 if lands else for_s)], abs=0.07)
 
 
-def test_a_delay_of_commands_is_a_longer_command_delay() -> None:
-    """Commands that take two gates longer, from the start.
+def test_a_link_delay_of_commands_equals_a_longer_command_delay() -> None:
+    """From the start, commands arrive two gates later.
 
-    Expected: to the bit what a scenario gives whose command delay is two gates longer.
+    Expected: the bits of a scenario whose command delay is two gates longer.
     """
     slow = fly([{"kind": "link_delay", "target": "controller.main/world", "delay_ms": 40, "one_way": True}])
     assert slow.sha256 == fly([], time={"command_delay_gates": 3}).sha256
 
 
-def test_events_are_json(undisturbed: Flight) -> None:
+def test_fault_events_are_json(undisturbed: Flight) -> None:
     for event in fly([{"kind": "radio", "at_s": 1, **MATRIX["radio"]}]).events_of("fault"):
         assert json.loads(json.dumps(event.data))["kind"] == "radio"

@@ -1,4 +1,4 @@
-"""Drones that cross a forest by their lidars: none touches a trunk, and the bits are the same however they are flown."""
+"""Drones cross a forest by lidar: none touches a trunk, and the bits are the same however the drones are flown."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ def module(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_five_drones_fly_among_the_trunks_and_touch_none(tmp_path: Path, compiled: None) -> None:
-    """Each hull keeps clear of every trunk and of every other hull; all have come a good way into the forest."""
+    """Each hull keeps clear of every trunk and of every other hull; all drones get well into the forest."""
     run = zsim.run(EXAMPLES / "forest.yaml", duration_s=18, out=tmp_path / "run", progress=False)
     rows = [row_of(each) for each in scenario_file.load(EXAMPLES / "forest.yaml").environment.obstacles]
     hull_m = VEHICLE.airframe.hull_radius_m
@@ -42,7 +42,7 @@ def test_five_drones_fly_among_the_trunks_and_touch_none(tmp_path: Path, compile
     assert run.events[run.events.kind == "collision"].empty
 
 
-def test_as_processes_they_have_the_same_bits_though_a_pilot_is_killed(tmp_path: Path, forked: None) -> None:
+def test_processes_give_the_same_bits_even_after_a_pilot_is_killed(tmp_path: Path, forked: None) -> None:
     document = yaml.safe_load((EXAMPLES / "forest.yaml").read_text())
     (tmp_path / "forest.yaml").write_text(yaml.safe_dump({**document, "drones": document["drones"][:3]}))
     alone = zsim.run(tmp_path / "forest.yaml", duration_s=7, out=tmp_path / "alone", progress=False)
@@ -74,7 +74,7 @@ class Mapper(zsim.Agent):
 
 
 @pytest.mark.parametrize(("given", "seen"), [({}, (3, True)), ({"map": True}, (3, True)), ({"map": False}, (0, False))])
-def test_an_agent_has_the_map_where_the_scenario_grants_it(
+def test_an_agent_has_the_map_unless_the_scenario_withholds_it(
     given: dict[str, bool], seen: tuple[int, bool], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "mappers.py").write_text(MAPPERS)
@@ -91,7 +91,7 @@ def test_an_agent_has_the_map_where_the_scenario_grants_it(
     assert agent.seen == seen
 
 
-def test_a_map_is_granted_or_not() -> None:
+def test_a_map_grant_that_is_not_a_boolean_is_refused() -> None:
     with pytest.raises(ScenarioError) as refused:
         scenario_file.load(EXAMPLES / "forest.yaml", ["agents.pilot.map=maybe"])
     assert [line.split(" ")[1] for line in refused.value.faults] == ["agents.pilot.map"]

@@ -1,4 +1,4 @@
-"""Pilots of the formation laws fly: each forms what it promises; the same bits as processes and after a kill."""
+"""Pilots fly the formation laws: each law keeps its promises, with the same bits as processes and after a kill."""
 
 from pathlib import Path
 from typing import Any
@@ -43,15 +43,15 @@ def scenario(law: str, **parameters: Any) -> Any:
     ("law", "parameters", "shape_m", "centre_m"),
     [
         ("consensus", MOVING, 0.25, 0.5),
-        ("leader_follower", MOVING, 1.2, 1.5),  # behind by v / k for each that stands between
+        ("leader_follower", MOVING, 1.2, 1.5),  # lags by v / k per drone in between
         ("virtual_structure", MOVING, 0.25, 0.3),
         ("distance_based", MOVING, 0.25, 0.5),
-        ("bearing_only", MOVING, 0.25, 1.0),  # its size comes by what the two informed ones pull
+        ("bearing_only", MOVING, 0.25, 1.0),  # only the two informed drones' pull sets its size
         ("olfati_saber", MOVING, 0.6, 1.0),
         ("vasarhelyi", MOVING, None, 1.5),
     ],
 )
-def test_each_law_flies_what_it_promises(
+def test_each_law_keeps_its_shape_centre_and_separation(
     law: str, parameters: dict[str, Any], shape_m: float | None, centre_m: float
 ) -> None:
     flight, failure = fly_scenario(scenario_file.resolve(scenario(law, **parameters)))
@@ -67,12 +67,10 @@ def test_each_law_flies_what_it_promises(
     assert found["effort_m2_s"] is not None
 
 
-def test_a_pilot_keeps_off_a_surface_that_it_knows_as_processes_and_after_a_kill_to_the_same_bits(
-    tmp_path: Path, forked: None
-) -> None:
-    """A wall of triangles is between d3 and its flock, 2 m from it; without the map d3 flies into it.
+def test_a_pilot_avoids_a_mapped_surface_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
+    """A wall of triangles stands between d3 and its flock, 2 m from d3; without the map, d3 flies into the wall.
 
-    The flock's pilot has the state of a double integrator beside what it has heard.
+    A pilot of this law has the state of a double integrator besides what it has heard.
     """
     a, b, c, d = [-3, 0, 0], [-3, 6, 0], [-3, 6, 4], [-3, 0, 4]
     wall = {"name": "wall", "triangles": packed(np.array([a + b + c, a + c + d]))}
@@ -105,7 +103,7 @@ def test_a_pilot_keeps_off_a_surface_that_it_knows_as_processes_and_after_a_kill
         ("flock", {}, "class", ("flock", "vasarhelyi")),
     ],
 )
-def test_what_cannot_be_flown_is_refused(
+def test_an_invalid_law_or_parameter_is_refused(
     law: str, parameters: dict[str, Any], path: str, terms: tuple[str, ...], tmp_path: Path
 ) -> None:
     (tmp_path / "laws.yaml").write_text(yaml.safe_dump(scenario(law, **parameters)))
@@ -116,8 +114,8 @@ def test_what_cannot_be_flown_is_refused(
     assert all(term in line for term in terms), line
 
 
-def test_a_reference_without_a_value_in_flight_ends_the_run_with_field_and_time(tmp_path: Path) -> None:
-    """A pole that no check at the start sees; the record is readable up to it."""
+def test_a_reference_undefined_in_flight_ends_the_run_with_field_and_time(tmp_path: Path) -> None:
+    """No check at the start sees the pole at t = 0.5 s; the record is readable up to it."""
     document = {**scenario("virtual_structure", centre_m=["1/(t-0.5)", 0], start_s=8.0), "duration_s": 12}
     document["report"] = {}
     with pytest.raises(UserCodeError) as raised:

@@ -1,4 +1,4 @@
-"""Hunts that fly: what they leave repeats to the bit, and a defect of three causes is found and shrunk to them."""
+"""Hunts in flight: a violation repeats to the bit; a defect with three causes is found and shrunk to them."""
 
 import json
 import shlex
@@ -17,14 +17,14 @@ DEFECT = {"gust": "world", "gps_dropout": "drone2", "link_delay": "controller.ma
 
 
 def hunted(scenario: Path, out: Path, *options: str, code: int) -> dict[str, Any]:
-    """Hunt by the command line; return the summary."""
+    """Hunt from the command line; return the summary."""
     done = run_here("hunt", str(scenario), "--out", str(out), *options)
     assert done.code == code, done
     return json.loads((out / "summary.json").read_text())
 
 
 @pytest.mark.soak
-def test_what_breaks_is_left_as_a_flight_that_repeats_to_the_bit(tmp_path: Path) -> None:
+def test_a_violation_is_kept_as_a_flight_that_repeats_to_the_bit(tmp_path: Path) -> None:
     scenario, out = tmp_path / "pair.yaml", tmp_path / "hunt"
     scenario.write_text(PAIR)
     faults = ("imu_stuck at_s=2..3 for_s=1..2", "sonar_stuck")
@@ -75,7 +75,7 @@ def test_a_planted_defect_is_found_and_shrunk_to_its_three_causes(
 
 
 @pytest.mark.soak
-def test_no_death_of_a_process_costs_a_bit(tmp_path: Path) -> None:
+def test_killing_a_process_changes_no_bit(tmp_path: Path) -> None:
     scenario = tmp_path / "pair.yaml"
     scenario.write_text(PAIR)
     words = ["--fault", "process_kill", "--most", "1", "--require", "same_bits", "--flights", "6", "--duration", "5"]
@@ -94,7 +94,7 @@ def test_no_death_of_a_process_costs_a_bit(tmp_path: Path) -> None:
         ([], 2),
     ],
 )
-def test_what_cannot_be_hunted_is_a_line(near: None, tmp_path: Path, options: list[str], code: int) -> None:
+def test_an_invalid_hunt_ends_without_a_traceback(near: None, tmp_path: Path, options: list[str], code: int) -> None:
     scenario = tmp_path / "pair.yaml"
     scenario.write_text(PAIR)
     done = run_here(

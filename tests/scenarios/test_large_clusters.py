@@ -1,4 +1,4 @@
-"""Many drones in one cluster, and clusters of clusters: they fly as exactly, drone by drone, as three do."""
+"""Many drones in one cluster, and clusters of clusters: each drone flies as accurately as in a cluster of three."""
 
 import time
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ from zsim_world.run.world import World
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHORT_S, START_S = 30.0, 18.0  # s
-SHORT = (  # a good GPS, so that the drones need not stand still first, and a short way up
+SHORT = (  # a good GPS, so that the drones need not stand still first, and a short climb
     "sensors.gps.position_m.noise=0.1",
     "clusters.main.plan.takeoff_s=3",
     "clusters.main.plan.land_s=null",
@@ -36,7 +36,7 @@ ALARM_M = 1.5
 
 @dataclass
 class Flight:
-    """What a run in this process left: the states of its cluster, and where its drones truly were, by instant."""
+    """Result of a run in this process: the states of its cluster, and its drones' true positions by instant."""
 
     scenario: Scenario
     states: list[flight_messages.ClusterState] = field(default_factory=list)
@@ -53,18 +53,18 @@ class Flight:
             self.truth.setdefault(message.t_ns, {})[keys.thing(key)] = message.position_m
 
     def p_W(self, state: flight_messages.ClusterState) -> Array:
-        """Return where the drones truly were (n, 3)."""
+        """Return the drones' true positions (n, 3)."""
         return np.array([self.truth[state.t_ns][name] for name in self.cluster.drones])
 
     def rms_m(self, from_s: float, to_s: float) -> Array:
-        """Return the root mean square of true - desired of every drone in a window (n,)."""
+        """Return every drone's root mean square of true - desired in a window (n,)."""
         window = [state for state in self.states if from_s <= state.t_ns / 1e9 <= to_s]
         assert len(window) > 100
         errors = [self.p_W(state) - self.space.inverse(np.array(state.desired))[0] for state in window]
         return np.sqrt((np.array(errors) ** 2).sum(axis=2).mean(axis=0))
 
     def closest_m(self) -> float:
-        """Return the least distance between two drones in the air, in truth."""
+        """Return the least true distance between two drones in the air."""
         flown = [state for state in self.states if state.phase not in ("idle", "taking_off", "landing")]
         return min(closest_pair(self.p_W(state))[0] for state in flown[::5])
 
@@ -87,17 +87,17 @@ def fly(name: str, *overrides: str, **values: Any) -> Flight:
     ("name", "n", "kind"),
     [
         ("triads", 9, "lead.p"),
-        pytest.param("ring10", 10, "w_1", marks=pytest.mark.soak),  # a template, as the next one is
+        pytest.param("ring10", 10, "w_1", marks=pytest.mark.soak),  # a template, like the next one
         ("grid30", 30, "w_84"),
     ],
 )
-def test_they_take_off_assemble_and_follow_a_trajectory(name: str, n: int, kind: str) -> None:
-    """The shipped scenario with a good GPS and a short way up.
+def test_large_clusters_take_off_engage_and_follow_a_trajectory(name: str, n: int, kind: str) -> None:
+    """The shipped scenario with a good GPS and a short climb.
 
         3 s take-off │ 7 s engaged, on the way to the trajectory's start │ 18 s trajectory │ 30 s
 
-    Expected: 4n variables; engaged where they are, at rest; then every drone within 0.15 m of where it is to be,
-    root mean square; nothing is held, no two drones are near each other or parted by the guard.
+    Expected: 4n variables; the cluster engages at rest where it is; then every drone is within 0.15 m RMS of its
+    desired position; the formation is never held, and no two drones come near each other or are parted by the guard.
     """
     flight = fly(name, *SHORT, duration_s=SHORT_S)
     last, engaged = flight.states[-1], flight.first("engaged")
@@ -118,8 +118,8 @@ def test_they_take_off_assemble_and_follow_a_trajectory(name: str, n: int, kind:
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_a_cluster_of_clusters_as_processes(federation: Federation) -> None:
-    """Three triads, each of nine estimators a process, then the same in one process.
+def test_a_cluster_of_clusters_gives_the_same_bits_as_processes(federation: Federation) -> None:
+    """Three triads fly with nine estimators, each in its own process, then in one process.
 
         world ──sensors──▶ 9 estimators ──estimate──▶ controller.main ──velocity──▶ world
 
@@ -139,14 +139,14 @@ def test_a_cluster_of_clusters_as_processes(federation: Federation) -> None:
     assert federation.record().sha256() == with_processes
 
 
-# The shipped scenarios as they are, against three drones on the paper's Test 1 and 2
+# The shipped scenarios unchanged, against three drones in the paper's Tests 1 and 2
 
 WINDOWS = {"hold": (80.0, 118.0), "trajectory": (125.0, 245.0)}
 SEEDS = (1, 2, 3)
 
 
 def mean_rms_m(name: str, seed: int) -> tuple[float, float, float]:
-    """Return the mean over drones of their RMS in each window, and the closest two drones came; all have landed."""
+    """Return the drones' mean RMS in each window and the least distance between two; check that all have landed."""
     flight = fly(name, seed=seed)
     assert flight.states[-1].phase == "idle"
     assert flight.p_W(flight.states[-1])[:, 2].max() < 0.1
@@ -156,7 +156,7 @@ def mean_rms_m(name: str, seed: int) -> tuple[float, float, float]:
 
 @pytest.fixture(scope="module")
 def of_three() -> tuple[float, float]:
-    """RMS of three drones: at rest on Test 1, moving on Test 2, mean of the seeds."""
+    """Return the RMS of three drones, at rest in Test 1 and moving in Test 2, averaged over the seeds."""
     hold = [float(fly("step", seed=seed).rms_m(80.0, 245.0).mean()) for seed in SEEDS]
     moving = [float(fly("trajectory", seed=seed).rms_m(80.0, 245.0).mean()) for seed in SEEDS]
     return float(np.mean(hold)), float(np.mean(moving))
@@ -164,11 +164,11 @@ def of_three() -> tuple[float, float]:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("name", ["triads", "ring10", "grid30"])
-def test_every_drone_flies_as_well_as_one_of_three(name: str, of_three: tuple[float, float]) -> None:
-    """With the paper's sensors and gusts, three seeds each.
+def test_every_drone_flies_as_well_as_in_a_cluster_of_three(name: str, of_three: tuple[float, float]) -> None:
+    """Each scenario has the paper's sensors and gusts, and is flown with three seeds.
 
-    Expected: RMS of a drone at most 1.15 times that in a cluster of three (errors of GPS alone differ by as much
-    between drones and windows), never two drones within 1.5 m, and all stand on the ground in the end.
+    Expected: a drone's RMS is at most 1.15 times that in a cluster of three (GPS errors alone differ by as much between
+    drones and windows); no two drones come within 1.5 m; all drones stand on the ground at the end.
     """
     flown = np.array([mean_rms_m(name, seed) for seed in SEEDS])
     hold, trajectory, closest_m = flown[:, 0].mean(), flown[:, 1].mean(), flown[:, 2].min()

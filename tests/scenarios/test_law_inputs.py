@@ -1,4 +1,4 @@
-"""A cluster's law reads what the scenario grants it: the same bits however it is flown, a fault where it is not granted."""
+"""A cluster's law reads what the scenario grants, to the same bits however it is flown; anything else is refused."""
 
 from pathlib import Path
 from typing import Any
@@ -52,8 +52,8 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))
 
 
-def test_the_formation_stops_before_the_wall_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
-    """The law keeps 2 m from what the beams see, whose noise and bias are 1 cm each; without them the target is 9 m on."""
+def test_the_formation_stops_at_a_wall_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
+    """The law keeps 2 m from what the beams see, with noise and bias of 1 cm each; the target is 9 m further on."""
     alone = zsim.run(WALL, duration_s=FLOWN_S, out=tmp_path / "alone", progress=False)
     assert 1.8 < min(alone.summary.obstacle_distance_m.values()) < 2.2
     with zsim.Federation(WALL, duration=FLOWN_S, out=tmp_path / "many") as flight:
@@ -68,7 +68,7 @@ def test_the_formation_stops_before_the_wall_with_the_same_bits_after_a_kill(tmp
 
 
 @pytest.mark.soak
-def test_hosted_they_are_the_same_too(tmp_path: Path, forked: None) -> None:
+def test_a_hosted_run_gives_the_same_bits(tmp_path: Path, forked: None) -> None:
     alone = zsim.run(WALL, duration_s=FLOWN_S, out=tmp_path / "alone", progress=False)
     hosted = zsim.run(WALL, duration_s=FLOWN_S, out=tmp_path / "hosted", processes=True, options=["--hosted"])
     assert hosted.truth_sha256 == alone.truth_sha256
@@ -79,7 +79,7 @@ def cluster(*overrides: str, **fields: Any) -> Any:
     return scenario_file.load(WALL, [*overrides, *(f"clusters.main.{name}={each}" for name, each in given.items())])
 
 
-def test_what_is_granted_is_there_when_the_law_is_made_and_before_the_first_sample() -> None:
+def test_grants_are_in_place_before_the_first_sample() -> None:
     scenario = cluster()
     law: Any = engagement_of(scenario, scenario.clusters[0]).law
     assert law.walls == ["wall"]
@@ -90,8 +90,8 @@ def test_what_is_granted_is_there_when_the_law_is_made_and_before_the_first_samp
     assert not permits(rights.reads, keys.sensor("drone2", "gps"))
 
 
-def test_samples_of_a_sensor_of_the_user_s_are_of_the_user_s_class() -> None:
-    """Processes decode them to a class made of their declaration; the law's module has its own."""
+def test_samples_of_a_user_s_sensor_have_the_user_s_class() -> None:
+    """Processes decode samples to a class built from the sensor's declaration; the law's module has its own class."""
     from uwb_range import UwbRange  # type: ignore[import-not-found]
 
     scenario = cluster("sensors.uwb={module: uwb_range}", law="seeing:Blind", law_sensors=["uwb"])
@@ -114,7 +114,7 @@ def test_samples_of_a_sensor_of_the_user_s_are_of_the_user_s_class() -> None:
         ({"law": "seeing:Misled"}, ("seeing:Misled", "'range'", "Lidar", "Range")),
     ],
 )
-def test_reading_what_is_not_granted_names_the_class_and_the_field(fields: Any, terms: tuple[str, ...]) -> None:
+def test_reading_without_a_grant_is_refused_with_class_and_field(fields: Any, terms: tuple[str, ...]) -> None:
     scenario = cluster(**fields)
     with pytest.raises(RunError) as raised:
         engagement_of(scenario, scenario.clusters[0])
@@ -134,7 +134,7 @@ def test_reading_what_is_not_granted_names_the_class_and_the_field(fields: Any, 
         ({"law_map": "maybe"}, "clusters[0].law_map"),
     ],
 )
-def test_a_grant_that_nobody_can_use_is_a_fault_of_the_scenario(fields: Any, path: str) -> None:
+def test_an_unusable_grant_is_refused(fields: Any, path: str) -> None:
     with pytest.raises(ScenarioError) as raised:
         cluster(**fields)
     assert [line.split(" ")[1] for line in raised.value.faults] == [path]

@@ -1,4 +1,4 @@
-"""Foreign programs in the lockstep, by zenoh and msgpack alone: who is waited for, from when, and until when."""
+"""Foreign programs take part in the lockstep by zenoh and msgpack alone: whom the world waits for, and for how long."""
 
 from federation import ONE, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
@@ -10,13 +10,13 @@ def refusal(step: Lockstep, key: str) -> tuple[str, str]:
     return parts(step.event("refused", key).message["data"]["reason"])
 
 
-def test_no_gate_without_its_done(federation: Federation) -> None:
-    """The only wait there is.
+def test_the_world_waits_for_each_done(federation: Federation) -> None:
+    """The only wait in the lockstep.
 
-        done 0 │ gates up to 0 + command delay + one gate │ stands
+        done 0 │ gates up to 0 + command delay + one gate │ waits
 
-    Scenario: one drone, one program that gates, command delay one gate.
-    Expected: time stands exactly two gates after what the program is through with, each time.
+    Scenario: one drone, one gating program, a command delay of one gate.
+    Expected: each time, the world waits exactly two gates after the last gate that the program has done.
     """
     step = Lockstep(federation)
     step.stands_at(DELAY_NS)
@@ -27,10 +27,10 @@ def test_no_gate_without_its_done(federation: Federation) -> None:
     step.leave()
 
 
-def test_a_longer_command_delay(federation: Federation) -> None:
-    """A link of three gates' delay allows the world to be three gates ahead.
+def test_a_longer_command_delay_lets_the_world_run_further_ahead(federation: Federation) -> None:
+    """A command delay of three gates allows the world to be three gates ahead.
 
-    Expected: after done t, time stands at t + 3 gates + one gate.
+    Expected: after done t, the world waits at t + 3 gates + one gate.
     """
     step = Lockstep(federation, "--set", "time.command_delay_gates=3")
     step.stands_at(3 * GATE_NS)
@@ -39,13 +39,13 @@ def test_a_longer_command_delay(federation: Federation) -> None:
     step.leave()
 
 
-def test_a_period_of_several_gates(federation: Federation) -> None:
-    """A program that answers every third gate.
+def test_a_program_may_answer_every_third_gate(federation: Federation) -> None:
+    """The period of a program is three gates.
 
         gates  0  20  40  60  80 ms          done 0 allows 80 ms, done 60 allows 140 ms
         done   0          60
 
-    Expected: the world runs on to one period and the command delay after its done.
+    Expected: after each done, the world runs on for one period plus the command delay.
     """
     period_ns = 3 * GATE_NS
     step = Lockstep(federation, period_ns=period_ns)
@@ -56,10 +56,10 @@ def test_a_period_of_several_gates(federation: Federation) -> None:
     step.leave()
 
 
-def test_a_program_that_does_not_gate(federation: Federation) -> None:
-    """period_ns 0: it takes part, nobody waits for it.
+def test_the_world_does_not_wait_for_a_program_with_period_0(federation: Federation) -> None:
+    """A program with period_ns 0 takes part without being waited for.
 
-    Expected: its join is an event, and the run ends by itself.
+    Expected: an event reports its join, and the run ends by itself.
     """
     step = Lockstep(federation, "--duration", "1", period_ns=0)
     assert step.event("join", ME).message["data"]["from_ns"] == 0
@@ -67,14 +67,14 @@ def test_a_program_that_does_not_gate(federation: Federation) -> None:
     step.leave()
 
 
-def test_a_late_joiner(federation: Federation) -> None:
-    """A second program joins while time runs, is waited for, then dies without a word.
+def test_a_late_joiner_is_waited_for_until_it_dies(federation: Federation) -> None:
+    """A second program joins in mid-run, is waited for, and dies without a bye.
 
         tester.one   ──50──┬─────────53────────────────60──▶ bye ──▶ end
         tester.late        └ join (from 53) ──53── dies
         newest gate       52         54        55      62
 
-    Expected: it is waited for from the gate after its join on, and no longer once it is dead (on_death: drop).
+    Expected: the world waits for it from the gate after its join until its death (on_death: drop).
     """
     step = Lockstep(federation, "--duration", "4")
     step.answer(50 * GATE_NS)
@@ -94,12 +94,12 @@ def test_a_late_joiner(federation: Federation) -> None:
 
 
 def test_a_newer_incarnation_takes_over(federation: Federation) -> None:
-    """A program of the same name joins; the older one is still there and goes on talking.
+    """A program of the same name joins while the older one is still there and keeps sending.
 
         tester.one #1  ──5──┐ superseded   done 6 (refused)
         tester.one #2       └─ join (done 5) ── done 6 ──▶
 
-    Expected: the newer one goes on where the older was; what the older says is refused with the reason.
+    Expected: the newer one continues where the older one was, whose messages are refused with the reason.
     """
     step = Lockstep(federation)
     step.answer(5 * GATE_NS)
@@ -117,12 +117,12 @@ def test_a_newer_incarnation_takes_over(federation: Federation) -> None:
     step.leave()
 
 
-def test_a_restart_after_death(federation: Federation) -> None:
-    """A program dies, time stands (on_death: wait), and it comes back by a new incarnation.
+def test_a_restarted_program_continues_where_it_died(federation: Federation) -> None:
+    """A program dies, the world waits (on_death: wait), and the program comes back as a new incarnation.
 
         tester.one #1  ──5── dies          #2 join ──6──▶
 
-    Expected: `clock` names it while it is away; an event `restart` says from where it goes on.
+    Expected: `clock` names it while it is away; a `restart` event gives the gate after which it continues.
     """
     step = Lockstep(federation, "--set", "processes.on_death={tester.one: wait}")
     step.answer(5 * GATE_NS)
@@ -138,13 +138,13 @@ def test_a_restart_after_death(federation: Federation) -> None:
     step.leave()
 
 
-def test_another_takes_the_place_of_the_dead(federation: Federation) -> None:
-    """A program dies, time stands (on_death: wait), and one of another name comes that does its work.
+def test_another_program_takes_over_from_a_dead_one(federation: Federation) -> None:
+    """A program dies, the world waits (on_death: wait), and a program of another name joins to do its work.
 
         tester.one  ──5── dies
         tester.two         └─ join (serves tester.one) ──6──▶
 
-    Expected: the newcomer goes on where the dead one was, and nobody waits for that one any more.
+    Expected: the newcomer continues where the dead program was, which the world no longer waits for.
     """
     step = Lockstep(federation, "--set", "processes.on_death={tester.one: wait}")
     step.answer(5 * GATE_NS)
@@ -160,13 +160,13 @@ def test_another_takes_the_place_of_the_dead(federation: Federation) -> None:
     step.leave()
 
 
-def test_two_that_do_the_same_work(federation: Federation) -> None:
-    """A program joins that does another's work as well, and that one dies.
+def test_one_of_two_programs_with_the_same_work_may_die(federation: Federation) -> None:
+    """A program joins that also does the work of another program, which then dies.
 
         tester.one  ──5──┬──────── dies
         tester.two       └ join (serves tester.one) ──8──▶
 
-    Expected: an event says that both do it; who is left does it alone, and nobody waits for the dead.
+    Expected: an event reports the doubled work; the survivor does it alone, and the world does not wait for the dead.
     """
     step = Lockstep(federation, "--set", "processes.on_death={tester.one: wait}")
     step.answer(5 * GATE_NS)
@@ -181,10 +181,10 @@ def test_two_that_do_the_same_work(federation: Federation) -> None:
     step.leave()
 
 
-def test_joins_and_dones_that_are_refused(federation: Federation) -> None:
-    """What does not fit the run is refused with the reason, and moves nothing.
+def test_invalid_joins_and_dones_are_refused(federation: Federation) -> None:
+    """A join or a done that does not fit the run is refused with the reason and changes nothing.
 
-    Expected: an event each; time stands where it stood.
+    Expected: one event for each refusal; time does not advance.
     """
     step = Lockstep(federation)
     step.stands_at(DELAY_NS)
@@ -205,13 +205,13 @@ def test_joins_and_dones_that_are_refused(federation: Federation) -> None:
     step.leave()
 
 
-def test_outputs_that_were_lost(federation: Federation) -> None:
-    """A done counts two commands of which one was lost on the way.
+def test_lost_outputs_are_requested_from_their_sender(federation: Federation) -> None:
+    """A done counts a command that was lost in transit.
 
-        tester.one ── takeoff ─✗   takeoff ──▶ world
-                   ── done 0 (sent 2) ────────▶ world ── get process/tester.one/outputs ──▶ tester.one
+        tester.one ── takeoff ─✗               world
+                   ── done 0 (sent 1) ───────▶ world ── get process/tester.one/outputs ──▶ tester.one
 
-    Expected: the world asks for the outputs once; what it gets takes effect at its instant.
+    Expected: the world requests the outputs once; the command in the answer takes effect at its own instant.
     """
     step = Lockstep(federation)
     mode = {"source": ME, "mode": "takeoff"}
@@ -226,10 +226,10 @@ def test_outputs_that_were_lost(federation: Federation) -> None:
     step.leave()
 
 
-def test_outputs_that_nobody_has(federation: Federation) -> None:
-    """As before, but the program does not answer for what it lost.
+def test_outputs_that_nobody_has_are_reported_missing(federation: Federation) -> None:
+    """As above, but the program does not answer the request for its lost outputs.
 
-    Expected: an event says how many are missing, and time goes on.
+    Expected: an event reports how many are missing, and time goes on.
     """
     step = Lockstep(federation)
     step.me.done(0, sent=2)
@@ -238,10 +238,10 @@ def test_outputs_that_nobody_has(federation: Federation) -> None:
     step.leave()
 
 
-def test_pause_step_resume(federation: Federation) -> None:
-    """An operator stops time, takes three steps, and lets it run; a program gates all the while.
+def test_an_operator_can_pause_step_and_resume(federation: Federation) -> None:
+    """An operator pauses the run, steps two gates and resumes; a program gates throughout.
 
-    Expected: `clock` says paused and shows exactly three more gates; every call is an event.
+    Expected: `clock` reports paused and shows exactly two more gates; an event reports every call.
     """
     step = Lockstep(federation)
     step.answer(5 * GATE_NS)
@@ -267,10 +267,10 @@ def test_pause_step_resume(federation: Federation) -> None:
     step.leave()
 
 
-def test_nobody_expected_and_a_stop(federation: Federation) -> None:
+def test_an_operator_stops_a_world_that_expects_nobody(federation: Federation) -> None:
     """A world that expects nobody starts by itself; an operator stops it.
 
-    Expected: it ends with the operator's reason, its clock says stopped.
+    Expected: it ends with the operator's reason, and its clock reports stopped.
     """
     world = federation.world(ONE, "--rate", "1", "--duration", "1000")
     client = federation.client()
@@ -284,14 +284,14 @@ def test_nobody_expected_and_a_stop(federation: Federation) -> None:
     world.line(f"ended: {reason}")
 
 
-def test_only_its_own_bye_ends_a_participation(federation: Federation) -> None:
-    """Somebody else says bye in a participant's name; then the participant itself, by the contract of before 1.1.
+def test_only_its_own_bye_ends_a_program_s_participation(federation: Federation) -> None:
+    """Somebody else sends a bye in a participant's name; then it sends one itself, as in the contract before 1.1.
 
         somebody   ── bye (no incarnation) ── bye (of another) ──
         tester.one ──0──────────────────────────────────────20──▶ bye (no incarnation), token gone
 
-    Expected: both byes of somebody are refused with the incarnation, and time goes on waiting for the participant; its
-    own counts as soon as its token is gone, and is no death.
+    Expected: both forged byes are refused with the incarnation, and the world keeps waiting for the participant, whose
+    own bye counts as soon as its token is gone, and is not a death.
     """
     step = Lockstep(federation)
     step.answer(10 * GATE_NS)
@@ -311,13 +311,13 @@ def test_only_its_own_bye_ends_a_participation(federation: Federation) -> None:
     step.world.ends(with_code=0)
 
 
-def test_who_was_needed_and_leaves_early_fails_the_run(federation: Federation) -> None:
+def test_a_required_process_that_leaves_early_fails_the_run(federation: Federation) -> None:
     """An estimator leaves in flight; the run goes on without it.
 
         estimator.drone1 ──0──────▶ bye
         tester.one       ──0──────────────60──▶ bye ──▶ end
 
-    Expected: the terminal names it at once; the world ends with exit code 1 and says why in its last line.
+    Expected: the terminal reports it at once; the world ends with exit code 1 and gives the reason in its last line.
     """
     step = Lockstep(federation)
     estimator = step.client.join("estimator.drone1", step.info, GATE_NS)

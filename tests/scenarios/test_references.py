@@ -1,4 +1,4 @@
-"""Drones along references of their own: how well, with the same bits however they are run, and as they are asked."""
+"""Drones track references of their own: how closely, with the same bits however they are run, and on request."""
 
 from pathlib import Path
 from typing import Any
@@ -27,14 +27,14 @@ drones:
 
 
 def off(run: zsim.Run, drone: str, phase: str = "path") -> np.ndarray:
-    """Return how far the truth is from the reference [m] while it is in a phase."""
+    """Return the distances between truth and reference [m] while the reference is in a phase."""
     reference, truth = run.messages(f"drone/{drone}/reference"), run.truth(drone)
     at = reference.index[reference.phase == phase]
     return np.linalg.norm(truth.loc[at, AXES].to_numpy() - reference.loc[at, AXES].to_numpy(), axis=1)
 
 
 def test_six_drones_fly_the_public_swap(tmp_path: Path) -> None:
-    """Each stays with its reference, nobody comes near another, and all land where another one started."""
+    """Each drone keeps to its reference, no two come near each other, and each lands where another started."""
     run = zsim.run(EXAMPLES / "swap.yaml", out=tmp_path / "run", progress=False)
     assert run.as_planned, run.shortfalls
     errors = [off(run, drone) for drone in run.drones]
@@ -43,13 +43,13 @@ def test_six_drones_fly_the_public_swap(tmp_path: Path) -> None:
     assert all(each is not None and each < 0.12 for each in tracking)
     truth = [run.truth(drone)[AXES].to_numpy() for drone in run.drones]
     apart = [np.linalg.norm(a - b, axis=1).min() for i, a in enumerate(truth) for b in truth[:i]]
-    assert min(apart) > 0.2  # two clearances; the references come to 0.305 m
+    assert min(apart) > 0.2  # two clearances; the references come within 0.305 m
     for drone, other in zip(truth, reversed(truth), strict=True):
         assert np.linalg.norm((drone[-1] - other[0])[:2]) < 0.3
 
 
-def test_as_processes_after_deaths_and_flown_again_they_have_the_same_bits(tmp_path: Path, forked: None) -> None:
-    """One follows its path, the other one a mission that it is asked for in flight; both of their pilots are killed."""
+def test_processes_with_killed_pilots_and_a_rerun_give_the_same_bits(tmp_path: Path, forked: None) -> None:
+    """One drone follows its path, the other one a mission requested in flight; both pilots are killed."""
     (tmp_path / "short.yaml").write_text(SHORT)
     places, how = [[3, 1, 1], [4, 1, 1.2]], {"speed_m_s": 0.6, "radius_m": 0.3, "yaw_deg": 90}
     with zsim.Federation(tmp_path / "short.yaml", out=tmp_path / "many") as flight:
@@ -75,7 +75,7 @@ def test_as_processes_after_deaths_and_flown_again_they_have_the_same_bits(tmp_p
     assert rerun_record(tmp_path / "many", False, said.append, said.append) == ""
 
 
-def test_a_drone_flies_where_it_is_asked_to_and_a_rerun_does_too(tmp_path: Path) -> None:
+def test_a_drone_flies_as_requested_and_so_does_its_rerun(tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(SHORT)
     with zsim.Simulation(tmp_path / "short.yaml", duration_s=30, record=tmp_path / "run") as sim:
         with pytest.raises(RequestRefusedError):
@@ -101,7 +101,7 @@ def test_a_drone_flies_where_it_is_asked_to_and_a_rerun_does_too(tmp_path: Path)
     assert rerun_record(tmp_path / "run", False, said.append, said.append) == ""
 
 
-def test_a_slower_path_is_swept_and_kept_to_better(near: None, tmp_path: Path) -> None:
+def test_a_sweep_shows_that_a_slower_path_is_tracked_better(near: None, tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(SHORT)
     path = "drones.d1.reference.time_scale"
     options: dict[str, Any] = {"workers": 1, "progress": False, "set": {"drones.d1.reference.land_s": 17}}
@@ -111,14 +111,14 @@ def test_a_slower_path_is_swept_and_kept_to_better(near: None, tmp_path: Path) -
 
 
 @pytest.mark.soak
-def test_hosted_they_have_the_same_bits(federation: Any, tmp_path: Path, compiled: None) -> None:
+def test_a_hosted_run_gives_the_same_bits(federation: Any, tmp_path: Path, compiled: None) -> None:
     (tmp_path / "short.yaml").write_text(SHORT)
     alone = zsim.run(tmp_path / "short.yaml", out=tmp_path / "alone", progress=False)
     federation.run(SHORT, "--hosted").ends(with_code=0)
     assert federation.record().sha256() == alone.truth_sha256
 
 
-def test_it_goes_on_from_a_snapshot_to_the_same_bits(tmp_path: Path) -> None:
+def test_resuming_from_a_snapshot_gives_the_same_bits(tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text(SHORT)
     sim = zsim.Simulation(tmp_path / "short.yaml")
     sim.run(until_s=5)
@@ -133,7 +133,7 @@ def test_it_goes_on_from_a_snapshot_to_the_same_bits(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("op", ["goto", "follow"])
-def test_who_has_no_pilot_cannot_be_asked(op: str, tmp_path: Path) -> None:
+def test_requests_to_a_drone_without_a_pilot_are_refused(op: str, tmp_path: Path) -> None:
     arguments: dict[str, Any] = {
         "goto": {"position_m": (0, 0, 1)},
         "follow": {"circle": {"radius_m": 1, "period_s": 9}},

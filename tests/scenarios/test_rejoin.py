@@ -1,4 +1,4 @@
-"""A drone that was landed in formation flight and took off again, far below the others, comes back on request."""
+"""A drone that landed during formation flight and took off again, far below the others, rejoins on request."""
 
 from pathlib import Path
 
@@ -11,18 +11,18 @@ from zsim_agents.formation.flight_check import HELD_ON_REQUEST
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SHORT = ("clusters.main.plan.takeoff_s=1", "clusters.main.plan.target.z_c=8")
-SEPARATION_M = 1.5  # of the centres; below it the controller raises its alarm
+SEPARATION_M = 1.5  # between centres; below it, the controller raises its alarm
 
 
 @pytest.mark.slow
-def test_a_drone_that_was_landed_rejoins_its_formation() -> None:
-    """Test 1 of the paper at a height of 8 m; the operator lands drone2 and lets it take off.
+def test_a_landed_drone_rejoins_its_formation_on_request() -> None:
+    """Test 1 of the paper at a height of 8 m; the operator lands drone2 and has it take off again.
 
         formation ── engaged ──┤ held ...                      ┆ rejoining ├── engaged ──▶
         drone2    ── flying  ──┤ lands ├ takes off ├ hovers at 1 m ┆ over the ground, then up ┆
 
-    Expected: the formation stays held, its drones where they were, until `rejoin`; then it is engaged again, all drones
-    are where the paper's formation has them, and no two came near each other.
+    Expected: the formation stays held, its other drones in place, until `rejoin`; then it is engaged again, all drones
+    are at their places in the paper's formation, and no two have come near each other.
     """
     flight = OperatedFlight(scenario_file.load(STEP, SHORT, duration_s=10 * STEP_LIMIT_S))
     flight.until(lambda: flight.formation is not None and flight.formation.phase == "engaged")

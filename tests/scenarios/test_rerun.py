@@ -1,4 +1,4 @@
-"""A run is flown again from its record: the same bits, whoever took part; and where not, a line says where."""
+"""A run is flown again from its record, to the same bits whoever took part; a line reports any difference."""
 
 import re
 import subprocess
@@ -21,14 +21,14 @@ PLAIN = ROOT / "examples" / "plain_client.py"
 
 
 class Printed(str):
-    """What a command has printed."""
+    """The output of a command."""
 
     def line(self, pattern: str) -> None:
         assert re.search(pattern, self, re.MULTILINE), self
 
 
 def rerun(federation: Federation, *options: str, code: int = 0, of: Path | None = None) -> Printed:
-    """Fly the recorded run again; return what that prints."""
+    """Rerun the recorded run; return what the command prints."""
     done = run_here("rerun", str(of or federation.out), *options)
     assert done.code == code, done
     return Printed(done.stdout + done.stderr)
@@ -39,7 +39,7 @@ def same(printed: Printed, sha256: str) -> None:
 
 
 def doctored(record: Path, into: Path, change: Callable[[str, bytes], bytes | None]) -> Path:
-    """Write a record anew, with messages changed or (None) left out."""
+    """Rewrite a record with messages changed, or omitted where `change` returns None."""
     into.mkdir()
     with RecordReader(record / "run.mcap") as reader, RecordWriter(into / "run.mcap") as writer:
         for m in reader.messages(by_time=False):
@@ -50,10 +50,10 @@ def doctored(record: Path, into: Path, change: Callable[[str, bytes], bytes | No
 
 
 @pytest.mark.soak
-def test_a_plain_run(federation: Federation, pair_sha256: str) -> None:
-    """PAIR, every role a process.
+def test_a_run_of_processes_is_rerun_to_the_same_bits(federation: Federation, pair_sha256: str) -> None:
+    """PAIR is flown with every role in its own process.
 
-    Expected: world and agents flown again in one process give the same hash, and so does the world alone.
+    Expected: world and agents, flown again in one process, give the same hash, and so does the world alone.
     """
     federation.run(PAIR).ends(with_code=0)
     role = rerun(federation)
@@ -66,7 +66,7 @@ def test_a_plain_run(federation: Federation, pair_sha256: str) -> None:
 
 @pytest.fixture
 def steered(federation: Federation) -> Federation:
-    """A run in which an operator had a hand.
+    """Return the federation of a run that an operator has steered.
 
     operator.pilot ── target z_c ── no GPS for drone1 ── acquire drone2 ── velocity ── mode ── release ── bye
     """
@@ -99,12 +99,12 @@ def steered(federation: Federation) -> Federation:
     return federation
 
 
-def test_a_run_that_was_steered(steered: Federation, pair_sha256: str) -> None:
-    """The operator's run, and what is left of it when the record is cut or changed.
+def test_a_steered_run_is_rerun_with_the_operator_s_inputs(steered: Federation, pair_sha256: str) -> None:
+    """The steered run is rerun from its record, and from copies of it that are cut or changed.
 
-    Expected: the same hash from the operator's inputs; of a cut record the same truth as far as it goes; without the
-    request on record other agents' answers, of the same world; with another wind another world; with the instant, the
-    drone and by how much.
+    Expected: the operator's inputs give the same hash; a cut record gives the same truth as far as it goes; without the
+    recorded request, the agents answer differently in the same world; another wind gives another world. Lines report
+    where the truth first differs: the instant, the drone and by how much.
     """
     sha256 = steered.record().sha256()
     assert sha256 != pair_sha256
@@ -149,15 +149,15 @@ def another_wind(key: str, payload: bytes) -> bytes:
     return msgpack.packb(info) or b""
 
 
-def test_a_foreign_program_that_gates(federation: Federation) -> None:
-    """One drone, flown in the lockstep by a page of zenoh and msgpack.
+def test_a_run_with_a_foreign_program_is_rerun_to_the_same_bits(federation: Federation) -> None:
+    """One drone is flown in the lockstep by a page of code on zenoh and msgpack.
 
-    Expected: its commands come off the record with their stamps; the same hash, also where it left by the contract of
-    before 1.1, so that the loss of its token decided.
+    Expected: the program's commands are taken from the record with their stamps; the same hash, also if the program
+    left by the contract before 1.1, where its participation ends with the loss of its token.
     """
     record = federation.role("record", "--out", str(federation.out))
     world = federation.world(ONE, "--expect", "recorder", "--expect", "plain.client", "--duration", "12")
-    federation.client().info()  # the world is there
+    federation.client().info()  # waits until the world is there
     subprocess.run(
         [sys.executable, str(PLAIN), federation.endpoint], check=True, timeout=PATIENCE_S, capture_output=True
     )
@@ -182,8 +182,8 @@ def before_1_1(key: str, payload: bytes) -> bytes:
     )
 
 
-def test_an_estimator_that_was_killed(federation: Federation) -> None:
-    """An estimator dies in flight and is started again.
+def test_a_run_with_a_killed_estimator_is_rerun_by_the_world_alone(federation: Federation) -> None:
+    """An estimator dies in flight and is restarted.
 
     Expected: a line says that agents are not run again, and why; the world alone gives the same hash.
     """
@@ -202,10 +202,10 @@ def test_an_estimator_that_was_killed(federation: Federation) -> None:
 
 
 @pytest.mark.soak
-def test_a_run_in_realtime(federation: Federation) -> None:
-    """PAIR in realtime at four times its pace, where commands come when they come.
+def test_a_realtime_run_is_rerun_by_the_world_alone(federation: Federation) -> None:
+    """PAIR is flown in realtime at four times its pace, where commands arrive at any instant.
 
-    Expected: the world alone, with the commands as they came, gives the same hash.
+    Expected: the world alone, with the commands at their recorded instants, gives the same hash.
     """
     federation.run(PAIR, "--realtime", "--rate", "4").ends(with_code=0)
     role = rerun(federation)
@@ -213,10 +213,10 @@ def test_a_run_in_realtime(federation: Federation) -> None:
     same(role, federation.record().sha256())
 
 
-def test_what_is_no_record_of_a_flight(federation: Federation) -> None:
-    """A folder without a record, and a record that begins in flight.
+def test_a_missing_or_late_record_is_refused(federation: Federation) -> None:
+    """A folder holds no record, and a record begins in flight.
 
-    Expected: one line each, and the exit code of a user's fault.
+    Expected: one line each, and the exit code for a user's error.
     """
     rerun(federation, code=2, of=federation.folder).line("holds no run.mcap; give the folder of a run")
     federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
@@ -225,10 +225,10 @@ def test_what_is_no_record_of_a_flight(federation: Federation) -> None:
 
 
 def damaged(record: Path, into: Path, part: float, cut: int = 0) -> Path:
-    """Write a record anew in many chunks, turn a bit in one, and cut bytes off its end.
+    """Rewrite a record in many chunks, flip a bit in one, and cut `cut` bytes off the end.
 
     Args:
-        part: of its chunks before the one that is damaged, 0 to 1.
+        part: share of the chunks that precede the damaged one, 0 to 1.
     """
     into.mkdir()
     path = into / "run.mcap"
@@ -245,10 +245,10 @@ def damaged(record: Path, into: Path, part: float, cut: int = 0) -> Path:
 
 
 @pytest.mark.soak
-def test_a_damaged_record(federation: Federation) -> None:
-    """A bit is turned in the last chunk of a record, in the last of one that is cut too, in one in the middle.
+def test_a_damaged_record_is_reported_as_damaged(federation: Federation) -> None:
+    """A bit is flipped in the last chunk of a record, in that of a record that is also cut, and in a middle chunk.
 
-    Expected: no line calls it a cut; truth is the same as far as it can be compared, which is not what was asked.
+    Expected: no line calls the record cut; the truth is the same as far as it can be compared, but the rerun fails.
     """
     federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
     alike = r"; truth is the same at all (\d+) instants before, to the bit"

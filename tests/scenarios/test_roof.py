@@ -1,4 +1,4 @@
-"""Pairs that land on the roof of a box and on a hill of a height map, and rest there; and one that tips over an edge."""
+"""Pairs land and rest on the roof of a box and on a hill in a height map; a drone that lands on an edge tips over."""
 
 import json
 import math
@@ -22,7 +22,7 @@ STAND_M = VEHICLE.airframe.foot_depth_m - VEHICLE.airframe.foot_sag_m
 
 
 def pair(west_m: float, east_m: float, **sonar: float) -> OperatedFlight:
-    """Return the flight to a box between these two x, with these settings of the sonar."""
+    """Return a flight to a box between two x coordinates, with these sonar settings."""
     size, place = [east_m - west_m, 6, ROOF_M], [0.5 * (west_m + east_m), 0, 0]
     plan = {"takeoff_s": 5, "target": {"x_c": 8, "y_c": 0, "z_c": 4, "p": 4}, "land_s": LAND_S}
     drones = [{"name": "drone1", "position_m": [2, 0, 0]}, {"name": "drone2", "position_m": [-2, 0, 0]}]
@@ -43,7 +43,7 @@ def tilts_deg(flight: OperatedFlight) -> Any:
 
 
 def rest(flight: OperatedFlight) -> None:
-    """Expect both drones to rest on the roof."""
+    """Check that both drones rest on the roof."""
     truth = flight.world.fleet.truth()
     assert np.degrees(np.linalg.norm(truth.angular_velocity_rad_s, axis=1)).max() < 1.0
     assert np.linalg.norm(truth.velocity_m_s, axis=1).max() < 1e-3
@@ -53,7 +53,7 @@ def rest(flight: OperatedFlight) -> None:
 
 @pytest.mark.slow
 def test_a_pair_lands_on_a_roof_rests_and_takes_off_again() -> None:
-    """Expected: no collision is told, as on the ground; the second take-off ends at its height over the roof."""
+    """Expected: as on the ground, no collision is reported; the second take-off ends at its height above the roof."""
     flight = pair(5.0, 11.0)
     flight.until(lambda: flight.t_s > LAND_S and set(flight.states.values()) == {"landed"})
     flight.fly(2.0)
@@ -71,9 +71,9 @@ def test_a_pair_lands_on_a_roof_rests_and_takes_off_again() -> None:
 
 @pytest.mark.slow
 def test_a_drone_that_lands_half_over_the_edge_tips_over() -> None:
-    """The edge is 3 cm inside of where drone1 comes down, found by the flight to the whole roof.
+    """The edge is 3 cm short of where drone1 comes down, as found by a flight to the whole roof.
 
-    Without sonars, which would see the edge on the way down, and move it.
+    The sonars are off, since they would see the edge on the way down and so change where drone1 lands.
     """
     whole = pair(5.0, 11.0, dropout=1.0)
     whole.until(lambda: whole.t_s > LAND_S and set(whole.states.values()) == {"landed"})
@@ -89,7 +89,7 @@ def test_a_drone_that_lands_half_over_the_edge_tips_over() -> None:
 
 
 def test_a_drone_that_starts_on_a_roof_knows_its_height(tmp_path: Path) -> None:
-    """The sonar, which alone gives the first heights, measures over the roof."""
+    """The sonar, which alone gives the first heights, measures above the roof."""
     roof = {"name": "roof", "shape": "box", "position_m": [0, 0, 0], "size_m": [4, 4, 3]}
     drone = {"name": "d1", "position_m": [0, 0, 3], "reference": {"takeoff_s": 0.5}}
     document = {"name": "roof", "duration_s": 6, "environment": {"obstacles": [roof]}, "drones": [drone]}
@@ -100,13 +100,13 @@ def test_a_drone_that_starts_on_a_roof_knows_its_height(tmp_path: Path) -> None:
 
 
 def height_m(x_m: float) -> float:
-    """Return the height of the hill: 1 m up to x = 9 m, then falling by 12 cm a metre."""
+    """Return the height of the hill: 1 m up to x = 9 m, then falling by 12 cm per metre."""
     return float(np.clip(TOP_M - SLOPE * (x_m - 9.0), 0.0, TOP_M))
 
 
 @pytest.fixture
 def hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Return the document of the flight to a height map from x = 4 to 14 m, in cells of 1 m."""
+    """Return the document of a flight to a height map that spans x = 4 to 14 m in cells of 1 m."""
     rows = [",".join(f"{height_m(x):g}" for x in range(4, 15))] * 9
     (tmp_path / "hill.csv").write_text("\n".join(rows))
     monkeypatch.setenv(plugin.FOLDERS, "")
@@ -125,8 +125,8 @@ def hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 @pytest.mark.soak
 def test_a_pair_lands_on_a_hill_and_rests_there(hill: dict[str, Any], tmp_path: Path, forked: None) -> None:
-    """Expected: both stand on it to millimetres at its slope, and nothing is told but the landing; likewise as processes,
-    of which the world is killed while they come down."""
+    """Expected: both rest on the hill to millimetres, at its slope, and no collision is reported; processes give
+    the same bits, although the world is killed during the descent."""
     path = tmp_path / "hill.yaml"  # beside the height map
     path.write_text(json.dumps(hill))
     run = zsim.run(path, out=tmp_path / "alone", progress=False)
@@ -152,7 +152,7 @@ def test_a_pair_lands_on_a_hill_and_rests_there(hill: dict[str, Any], tmp_path: 
     [((5.0, 0.0, 1.0), True), ((11.0, 0.0, 0.76), True), ((5.0, 0.0, 0.9), False), ((14.2, 0.0, 0.4), False)],
     ids=["on the top", "on the slope", "below the top", "beside its rim"],
 )
-def test_a_drone_may_start_upon_a_surface_and_not_in_it(hill: dict[str, Any], place: Any, is_sound: bool) -> None:
+def test_a_drone_may_start_on_a_surface_but_not_inside_it(hill: dict[str, Any], place: Any, is_sound: bool) -> None:
     document = {**hill, "clusters": []}
     document["drones"] = [{"name": "drone1", "position_m": [*place]}]
     if is_sound:
@@ -163,7 +163,7 @@ def test_a_drone_may_start_upon_a_surface_and_not_in_it(hill: dict[str, Any], pl
     assert [fault.split(" ")[1] for fault in refused.value.faults] == ["drones[0].position_m"]
 
 
-def test_a_surface_has_a_name_of_its_own(hill: dict[str, Any]) -> None:
+def test_a_surface_must_have_a_unique_name(hill: dict[str, Any]) -> None:
     for name in ("drone1", "post"):
         document = {**hill}
         post = {"name": "post", "shape": "sphere", "position_m": [0, 30, 9], "radius_m": 1}

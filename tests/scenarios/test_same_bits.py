@@ -1,4 +1,4 @@
-"""The same scenario and seed give the same bits, wherever and in whatever order the processes run."""
+"""The same scenario and seed give the same bits, wherever the processes run and in whatever order they start."""
 
 import pytest
 from federation import PAIR, PAIR_ROLES, Federation
@@ -6,14 +6,14 @@ from federation import PAIR, PAIR_ROLES, Federation
 DRONES = ["drone1", "drone2"]
 
 
-def test_as_processes(federation: Federation, pair_sha256: str) -> None:
-    """Every role is a process.
+def test_separate_processes_give_the_same_hash(federation: Federation, pair_sha256: str) -> None:
+    """Every role runs as a process of its own.
 
         world ──sensors──▶ estimator.drone1, .drone2 ──estimate──▶ controller.main ──velocity──▶ world
                 └──▶ recorder
 
     Scenario: PAIR, 12 s.
-    Expected: the hash of the run in one process, in the end event and over the truth on record.
+    Expected: the hash of the run in a single process, both in the event `end` and recomputed from the recorded truth.
     """
     federation.run(PAIR).ends(with_code=0)
     federation.nobody_left()
@@ -24,13 +24,13 @@ def test_as_processes(federation: Federation, pair_sha256: str) -> None:
 
 
 @pytest.mark.soak
-def test_with_all_agents_in_one_process(federation: Federation, pair_sha256: str) -> None:
-    """Estimators and controller share a process; the estimators one kernel.
+def test_agents_in_one_process_give_the_same_hash(federation: Federation, pair_sha256: str) -> None:
+    """Estimators and controller share a process, and the estimators share a kernel.
 
         world ──sensors──▶ ( estimators ──▶ controller ) ──estimates, velocity──▶ world
                 └──▶ recorder
 
-    Expected: one participant beside the recorder, everything that the contract has on record, and the same hash.
+    Expected: one participant besides the recorder, all messages of the contract on record, and the same hash.
     """
     federation.run(PAIR, "--hosted").ends(with_code=0)
     federation.nobody_left()
@@ -41,12 +41,12 @@ def test_with_all_agents_in_one_process(federation: Federation, pair_sha256: str
         assert len(record.all(f"drone/{drone}/estimate")) == len(record.all(f"drone/{drone}/truth"))
 
 
-def test_started_by_hand_world_last_with_one_estimator_for_all(federation: Federation, pair_sha256: str) -> None:
-    """The roles are started one by one, the world when all others wait for it; one process estimates every drone.
+def test_roles_started_by_hand_give_the_same_hash(federation: Federation, pair_sha256: str) -> None:
+    """The roles are started by hand, the world last; one process estimates the state of every drone.
 
         controller.main │ recorder │ estimator 'drone*' │ … │ world
 
-    Expected: each says that it waits for a world, then they fly, and the hash is the same.
+    Expected: each role reports that it is waiting for a world; then they fly, and the hash is the same.
     """
     others = [
         federation.role("controller", "main"),
@@ -61,20 +61,17 @@ def test_started_by_hand_world_last_with_one_estimator_for_all(federation: Feder
     assert federation.record().sha256() == pair_sha256
 
 
-def test_another_seed(federation: Federation, pair_sha256: str) -> None:
-    """PAIR with seed 4 instead of 3.
-
-    Expected: another hash.
-    """
+def test_another_seed_gives_another_hash(federation: Federation, pair_sha256: str) -> None:
+    """PAIR with seed 4 instead of 3."""
     federation.run(PAIR, "--in-process", "--seed", "4").ends(with_code=0)
     assert federation.record().sha256() != pair_sha256
 
 
 @pytest.mark.soak
-def test_paced(federation: Federation, pair_sha256: str) -> None:
-    """PAIR at ten times real time: pacing is a switch of its own.
+def test_a_paced_run_gives_the_same_hash(federation: Federation, pair_sha256: str) -> None:
+    """PAIR is paced at ten times real time.
 
-    Expected: no faster than asked for, and the same hash.
+    Expected: a real-time factor no greater than requested, and the same hash.
     """
     federation.run(PAIR, "--rate", "10").ends(with_code=0)
     record = federation.record()

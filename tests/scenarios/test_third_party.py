@@ -1,4 +1,4 @@
-"""Programs of others in the place of ours, and what the world answers to anyone who asks."""
+"""Foreign programs in place of zsim's roles, and the world's answers to the requests of any client."""
 
 import math
 from itertools import pairwise
@@ -15,7 +15,7 @@ PAIR_DURATION_S = 12
 
 
 class ForeignEstimator:
-    """Takes the place of estimator.drone2 by zenoh and msgpack alone: its estimate is the truth."""
+    """Takes the place of estimator.drone2 with only zenoh and msgpack; its estimate is the truth."""
 
     def __init__(self, client: Client, name: str = "estimator.drone2") -> None:
         self._client = client
@@ -26,7 +26,7 @@ class ForeignEstimator:
         self.last_ns = round(PAIR_DURATION_S * 1e9)
 
     def fly(self) -> None:
-        """Answer every gate to the end."""
+        """Answer every gate until the end of the run."""
         for t_ns in range(0, self.last_ns + 1, GATE_NS):
             truth = self._truth.until(lambda m, t_ns=t_ns: m["t_ns"] == t_ns).message
             self._status.until(lambda m, t_ns=t_ns: m["t_ns"] == t_ns)  # the gate is complete
@@ -36,7 +36,7 @@ class ForeignEstimator:
 
 
 def estimate_of(truth: dict[str, Any]) -> dict[str, Any]:
-    """Return an estimate that is the truth."""
+    """Return an estimate that equals the truth."""
     w, x, y, z = truth["orientation_wxyz"]
     pose = {name: truth[name] for name in ("t_ns", "position_m", "velocity_m_s", "orientation_wxyz")}
     covariance = [0.01 if i % 7 == 0 else 0.0 for i in range(36)]
@@ -44,14 +44,14 @@ def estimate_of(truth: dict[str, Any]) -> dict[str, Any]:
     return {**pose, "yaw_rad": math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), **others}
 
 
-def test_a_foreign_estimator(federation: Federation) -> None:
-    """One of the two estimators is somebody else's program.
+def test_the_world_waits_for_a_foreign_estimator(federation: Federation) -> None:
+    """One of the two estimators is a foreign program.
 
         world ──sensors──▶ estimator.drone1 ─────────────┐
               ──truth────▶ estimator.drone2 (foreign) ───┴──▶ controller.main
 
-    Scenario: PAIR; ours of drone2 is not started.
-    Expected: the world waits for the foreign one as for ours; the formation engages and holds to the end.
+    Scenario: PAIR; zsim's estimator of drone2 is not started.
+    Expected: the world waits for the foreign estimator as for zsim's; the formation engages and holds to the end.
     """
     roles = [federation.world(PAIR), federation.role("estimator", "drone1"), federation.role("controller", "main")]
     client = federation.client()
@@ -65,21 +65,21 @@ def test_a_foreign_estimator(federation: Federation) -> None:
 
 
 def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> None:
-    """The estimator of drone2 is replaced while it flies.
+    """A foreign program replaces the estimator of drone2 during the flight.
 
-        estimator.drone2 (ours)    ──────┐ superseded: one line, and it ends
+        estimator.drone2 (zsim's)  ──────┐ superseded: reported in one line; it ends
         estimator.drone2 (foreign)       └ join ──▶ 12 s
 
-    Expected: the launcher does not start ours again; the run ends well.
+    Expected: the launcher does not restart zsim's estimator; the run completes.
     """
     run = federation.run(PAIR, "--rate", "3")
     client = federation.client()
     clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 6e9)
-    assert client.request("world/control", "rate", value=0.2)["ok"]  # time enough to take over
+    assert client.request("world/control", "rate", value=0.2)["ok"]  # slow enough for the takeover
     truth = client.subscribe("drone/drone2/truth")
     former_pid = federation.pid("estimator.drone2")
-    own = client.token(f"estimator.drone2/session/{client.session.info.zid()}")  # else its first done lets it in
+    own = client.token(f"estimator.drone2/session/{client.session.info.zid()}")  # so that the join takes effect at once
     foreign = client.join("estimator.drone2", client.info(), GATE_NS)
     taken = events.until(lambda m: m["kind"] == "superseded").message["data"]
     assert taken["former_pid"] == former_pid
@@ -95,7 +95,7 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
 
 
 def answer_from(client: Client, participant: Participant, truth: Subscription, from_ns: int) -> None:
-    """Catch up by replay, then answer every gate to the end."""
+    """Catch up by a replay, then answer every gate until the end of the run."""
     replayed = client.request("world/control", "replay", from_ns=from_ns - 1, keys=["drone/drone2/truth"])["result"]
     known = {m["t_ns"]: m for m in (msgpack.unpackb(payload) for _, payload in replayed)}
     for t_ns in range(from_ns, PAIR_DURATION_S * 10**9 + 1, GATE_NS):
@@ -106,13 +106,13 @@ def answer_from(client: Client, participant: Participant, truth: Subscription, f
     participant.bye(PAIR_DURATION_S * 10**9)
 
 
-def test_what_the_world_answers(federation: Federation) -> None:
-    """Last values and replays, for any client, also of publishers that are dead.
+def test_the_world_answers_gets_and_replays(federation: Federation) -> None:
+    """The world serves last values and replays to any client, including those of dead publishers.
 
         tester.one ── estimate, state ── dies          somebody ── get ──▶ world
 
-    Expected: gets answer `world/info`, `clock`, status, truth, estimate and state; wildcards too; a replay brings
-    what is stamped after a time in the order of publication.
+    Expected: gets of `world/info`, `clock`, status, truth, estimate and state are answered, also with wildcards; a
+    replay returns the messages stamped after a time, in the order of their publication.
     """
     step = Lockstep(federation, "--set", "processes.on_death={tester: wait}")
     step.answer(10 * GATE_NS)
@@ -137,7 +137,7 @@ def test_what_the_world_answers(federation: Federation) -> None:
     step.world.ends(with_code=0)
 
 
-BAD_REQUESTS = [  # op, arguments, what is refused where it is one of them
+BAD_REQUESTS = [  # op, arguments, refused field and value if there is one
     ("replay", {}, None),
     ("replay", {"from_ns": "x", "keys": []}, None),
     ("step", {"gates": 0}, ("gates", "0")),
@@ -151,10 +151,10 @@ BAD_REQUESTS = [  # op, arguments, what is refused where it is one of them
 ]
 
 
-def test_requests_that_are_refused(federation: Federation) -> None:
-    """Every fault of a request to the world.
+def test_invalid_requests_are_refused_with_the_reason(federation: Federation) -> None:
+    """Faulty requests are sent to the world, one of each kind, and payloads that are no request.
 
-    Expected: an answer with the reason; garbage too is answered; time goes on afterwards.
+    Expected: each is answered with the reason; simulated time advances afterwards.
     """
     step = Lockstep(federation)
     step.answer(2 * GATE_NS)
@@ -170,10 +170,10 @@ def test_requests_that_are_refused(federation: Federation) -> None:
     step.leave()
 
 
-def test_the_outputs_of_a_role(federation: Federation) -> None:
-    """Every gating process of ours keeps the outputs of its last two gates to answer a get.
+def test_roles_keep_the_outputs_of_their_last_two_gates(federation: Federation) -> None:
+    """Every gating role of zsim keeps the outputs of its last two gates, to answer a get.
 
-    Expected: the commands, estimates and state of the gates of its last dones.
+    Expected: the commands, estimates and state of the gates that it has last reported done.
     """
     run = federation.run(PAIR, "--rate", "10", "--duration", "600")
     client = federation.client()
@@ -193,7 +193,7 @@ def test_the_outputs_of_a_role(federation: Federation) -> None:
 
 @pytest.fixture
 def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> list[dict[str, Any]]:
-    """Data of the event `end` of two runs that the same foreign program flies."""
+    """Return the data of the event `end` of two runs, both flown by the same foreign program."""
     hashes = []
     for number in range(2):
         with Federation(tmp_path_factory.mktemp(f"run{number}")) as federation:
@@ -210,10 +210,10 @@ def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> list[dict
     return hashes
 
 
-def test_a_foreign_program_gives_the_same_bits(twice: list[dict[str, Any]]) -> None:
-    """A program by zenoh and msgpack flies a drone in the lockstep, twice.
+def test_runs_of_a_foreign_program_give_the_same_bits(twice: list[dict[str, Any]]) -> None:
+    """A program with only zenoh and msgpack flies a drone in lockstep, twice.
 
-    Expected: the same last gate and the same hash, though nothing else was the same.
+    Expected: the same last gate and the same hash, although everything else differs between the runs.
     """
     first, second = twice
     assert first["last_ns"] == second["last_ns"]

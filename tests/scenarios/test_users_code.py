@@ -1,4 +1,4 @@
-"""What a user's class does wrong is told with class, method, gate, and value or line, and its module is found again."""
+"""Faults of users' classes are reported with class, method, gate, and value or line; users' modules are found again."""
 
 import re
 import signal
@@ -134,7 +134,7 @@ def line_of(text: str) -> int:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
-    """Yield a folder with a scenario and the module that it may name."""
+    """Yield a folder with a scenario and modules that it may name."""
     (tmp_path / "pair.yaml").write_text(PAIR)
     (tmp_path / "users_code.py").write_text(MODULE)
     converting = MODULE.replace("equation=distance)", "equation=distance, convert=converted)")
@@ -144,7 +144,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 
 
 def forget(folder: Path) -> None:
-    """Let this process know of no module in a folder any more, as another process would not."""
+    """Make this process forget the modules of a folder, as if it were a new process."""
     for name in ("users_code", "users_conversion"):
         sys.modules.pop(name, None)
     sys.path[:] = [place for place in sys.path if not place.startswith(str(folder))]
@@ -177,7 +177,7 @@ FAILURES = {
 
 
 @pytest.mark.parametrize(("overrides", "terms"), FAILURES.values(), ids=FAILURES)
-def test_a_class_that_fails_ends_the_run_as_a_failure_that_is_on_record(
+def test_a_failing_class_ends_the_run_with_its_failure_on_record(
     folder: Path, overrides: list[str], terms: tuple[str, ...]
 ) -> None:
     record = folder / "run.mcap"
@@ -199,25 +199,25 @@ def test_a_class_that_fails_ends_the_run_as_a_failure_that_is_on_record(
         ("space=users_code:Unmade", ("Unmade.for_places", "TypeError")),
     ],
 )
-def test_one_that_fails_before_the_flight_is_named_too(folder: Path, override: str, terms: tuple[str, ...]) -> None:
+def test_a_class_that_fails_before_the_flight_is_named(folder: Path, override: str, terms: tuple[str, ...]) -> None:
     with pytest.raises(UserCodeError) as raised:
         fly(scenario_file.load(folder / "pair.yaml", [f"clusters.main.{override}"]), None)
     assert all(term in str(raised.value) for term in ("'main'", *terms)), raised.value
 
 
-def test_the_scenario_may_let_a_run_go_on_without_who_fails(folder: Path) -> None:
+def test_a_scenario_may_let_a_run_continue_without_a_failed_process(folder: Path) -> None:
     allowed = scenario_file.load(folder / "pair.yaml", [ESTIMATOR, "processes.on_death={controller.main: drop}"])
     assert fly(allowed, folder / "run.mcap") == "the scenario's duration is over"
     assert [each for each in verdict(folder / "run.mcap").shortfalls if each.kind == "process"] == []
 
 
-def test_a_run_of_a_sweep_that_fails_has_the_line_in_its_row(folder: Path) -> None:
+def test_the_row_of_a_failed_sweep_run_holds_the_failure(folder: Path) -> None:
     row = sweep_run.fly(Task(0, 0, {}, scenario_file.load(folder / "pair.yaml", [ESTIMATOR])))
     assert all(term in row["failure"] for term in FAILURES["estimator"][1])
 
 
 @pytest.mark.parametrize("name", ["nan", "raises", "estimator"])
-def test_flown_again_it_fails_at_the_same_gate_with_the_same_line(folder: Path, name: str) -> None:
+def test_a_rerun_fails_at_the_same_gate_with_the_same_line(folder: Path, name: str) -> None:
     with pytest.raises(UserCodeError) as raised:
         fly(scenario_file.load(folder / "pair.yaml", FAILURES[name][0]), folder / "run.mcap")
     forget(folder)
@@ -235,7 +235,7 @@ def test_flown_again_it_fails_at_the_same_gate_with_the_same_line(folder: Path, 
         ("calls > 100", "calls > 50", ("ZeroDivisionError", f"users_code.py:{line_of('# raised')}")),
     ],
 )
-def test_with_another_class_it_is_told_that_it_fails_otherwise(
+def test_a_rerun_reports_that_a_changed_class_behaves_differently(
     folder: Path, old: str, new: str, terms: tuple[str, ...]
 ) -> None:
     with pytest.raises(UserCodeError):
@@ -251,7 +251,7 @@ def test_with_another_class_it_is_told_that_it_fails_otherwise(
 
 
 def flown(folder: Path) -> Path:
-    """Return the folder of a record of a run with a space and a sensor of the user's own."""
+    """Record a run with a user's space and sensor; return the folder of the record."""
     scenario = scenario_file.load(
         folder / "pair.yaml",
         ["clusters.main.space=users_code:Space", "duration_s=1", "sensors.beam={module: users_code}"],
@@ -263,14 +263,14 @@ def flown(folder: Path) -> Path:
 
 
 def judged(run: Path) -> list[str]:
-    """Return which formations a report judges, and fly the run again."""
+    """Fly a run again; return the names of the formations that a report judges."""
     forget(run.parent)
     faults: list[str] = []
     assert rerun_record(run, False, faults.append, faults.append) == ""
     return [formation.name for formation in formations_of(read_flight(run / "run.mcap"))]
 
 
-def test_modules_are_found_where_the_run_found_them_wherever_one_is(
+def test_modules_are_found_where_the_run_found_them(
     folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = flown(folder)
@@ -279,7 +279,7 @@ def test_modules_are_found_where_the_run_found_them_wherever_one_is(
 
 
 @pytest.mark.parametrize("beside", ["record", "working folder"])
-def test_or_beside_the_record_or_in_the_working_folder(
+def test_modules_are_found_beside_the_record_or_in_the_working_folder(
     folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, beside: str
 ) -> None:
     run, there = flown(folder), tmp_path_factory.mktemp("elsewhere")
@@ -291,7 +291,7 @@ def test_or_beside_the_record_or_in_the_working_folder(
     forget(there)
 
 
-def test_one_that_is_nowhere_is_named(folder: Path) -> None:
+def test_a_missing_module_is_named(folder: Path) -> None:
     run = flown(folder)
     (folder / "users_code.py").unlink()
     forget(folder)
@@ -300,7 +300,7 @@ def test_one_that_is_nowhere_is_named(folder: Path) -> None:
     assert "'users_code:Space'" in str(raised.value)
 
 
-# What only reads does not run it
+# Commands that only read run no user's module unless trusted
 
 MARKED = (
     MODULE
@@ -341,14 +341,14 @@ NAMED = {
 
 @pytest.fixture
 def marked(folder: Path) -> Iterator[Path]:
-    """Yield the marker that the module leaves when it runs."""
+    """Yield the path of the file that the module creates when it runs."""
     (folder / "marked.py").write_text(MARKED)
     yield folder / "executed"
     sys.modules.pop("marked", None)
 
 
 def zsim(marked: Path, *arguments: str, runs: bool = False, code: int = 0) -> str:
-    """Run a command as a new process would; check whether it has run the module."""
+    """Run a command as a new process would; check its exit code and whether it has run the module."""
     forget(marked.parent)
     sys.modules.pop("marked", None)
     sensor_type.cache_clear()
@@ -360,26 +360,26 @@ def zsim(marked: Path, *arguments: str, runs: bool = False, code: int = 0) -> st
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_validate_looks_up_what_a_scenario_names_and_runs_it_only_if_told_to(marked: Path, name: str) -> None:
+def test_validate_runs_a_users_module_only_with_trust(marked: Path, name: str) -> None:
     command = ["validate", str(marked.parent / "pair.yaml"), "--set", NAMED[name]]
     text = zsim(marked, *command)
     assert has_terms(text, "note", "marked…", "--trust")
-    assert ("name: pair" in text) is (name not in ("sensor", "vehicle"))  # their numbers are in what it resolves to
+    assert ("name: pair" in text) is (name not in ("sensor", "vehicle"))  # the resolved scenario needs their numbers
     assert "name: pair" in zsim(marked, *command, "--trust", runs=True)
     assert has_terms(zsim(marked, *command[:3], NAMED[name].replace("marked", "nowhere"), code=1), "'nowhere…")
 
 
-def test_kinds_of_faults_neither(marked: Path) -> None:
+def test_fault_kinds_runs_a_users_module_only_with_trust(marked: Path) -> None:
     path = marked.parent / "pair.yaml"
     path.write_text(path.read_text() + "sensors: {beam: {module: marked}}\n")
     assert "beam" not in zsim(marked, "fault", "kinds", str(path))
     assert "beam" in zsim(marked, "fault", "kinds", str(path), "--trust", runs=True)
 
 
-def test_nor_does_what_reads_a_record_and_a_rerun_only_if_told_to(
+def test_report_export_and_rerun_run_a_users_module_only_with_trust(
     marked: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(make_report, "figures", lambda *_: [])  # whose drawing takes longer than all the rest
+    monkeypatch.setattr(make_report, "figures", lambda *_: [])  # drawing them takes longer than all the rest
     run = marked.parent / "run"
     run.mkdir()
     scenario = scenario_file.load(marked.parent / "pair.yaml", NAMED.values(), duration_s=1.0)
@@ -390,9 +390,9 @@ def test_nor_does_what_reads_a_record_and_a_rerun_only_if_told_to(
     zsim(marked, "export", str(run), "--format", "foxglove", "--force", "--trust", runs=True)
     assert has_terms(zsim(marked, "rerun", str(run), code=1), "marked:Plain", "--trust")
     zsim(marked, "rerun", str(run), "--trust", runs=True)
-    with pytest.raises(DocumentError, match="come with all its numbers"):  # a record made to name a module
+    with pytest.raises(DocumentError, match="come with all its numbers"):  # as from a manipulated record
         scenario_file.from_text("name: a\ndrones: [{name: d1, model: marked, position_m: [0, 0, 0]}]\n")
-    assert "marked" in sys.modules  # of the rerun
+    assert "marked" in sys.modules  # the rerun has imported it
 
 
 ENDLESS = """
@@ -415,7 +415,7 @@ class Endless(zsim.Agent):
 """
 
 
-def test_one_that_never_returns_is_interrupted_and_named_and_the_record_is_left(
+def test_an_endless_step_can_be_interrupted_and_keeps_the_record(
     federation: Federation,
 ) -> None:
     (federation.folder / "endless.py").write_text(ENDLESS)

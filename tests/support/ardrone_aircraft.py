@@ -1,4 +1,4 @@
-"""An AR.Drone without sockets and without a run: what it is sent is played, what it sends is kept."""
+"""An AR.Drone without sockets or a run: a test plays its inputs, and its outputs are kept."""
 
 import math
 from typing import Any
@@ -26,7 +26,7 @@ HOVER = (0.0, 0.0, 0.0, 0.0, True)
 
 
 class PlayedAircraft:
-    """An aircraft, the gates of its run, and the program of its pilot."""
+    """An aircraft, the gates of its run, and its pilot's program."""
 
     def __init__(self, more: str = "") -> None:
         scenario = scenario_file.resolve(msgspec.yaml.decode((SCENARIO % more).encode()))
@@ -52,7 +52,7 @@ class PlayedAircraft:
         return self.gate * GATE_NS
 
     def gates(self, count: int = 1, state: DroneState | None = None) -> None:
-        """Let gates pass, in a state."""
+        """Let gates pass with the drone in a state, by default the last one."""
         self.state = state or self.state
         for _ in range(count):
             self.gate += 1
@@ -63,13 +63,13 @@ class PlayedAircraft:
             self.aircraft.update(flight_messages.Status(self.now_ns, 0, *status))
 
     def flown_gates(self, count: int, state: DroneState | None = None) -> None:
-        """Let gates pass while the pilot's program shows that it is there."""
+        """Let gates pass while the pilot's program resets the watchdog."""
         for _ in range(count):
             self.at(at_commands.ResetWatchdog(0))
             self.gates(1, state)
 
     def at(self, *commands: Command) -> None:
-        """Send AT commands, numbered."""
+        """Send AT commands with consecutive sequence numbers."""
         for command in commands:
             self._sequence += 1
             self.aircraft.on_at(at_commands.format_command(command._replace(sequence=self._sequence)))
@@ -83,29 +83,29 @@ class PlayedAircraft:
         self.at(at_commands.Pcmd(0, flag, roll, pitch, gaz, yaw))
 
     def config(self, key: str, value: str) -> None:
-        """Set an entry."""
+        """Set an entry of the configuration."""
         self.at(at_commands.Config(0, key, value))
 
     def listen(self) -> None:
-        """Ask for navdata."""
+        """Request navdata."""
         self.aircraft.on_navdata_request(navdata.REQUEST_UNICAST, PILOT)
 
     def modes(self) -> list[str]:
-        """Return the modes asked of the drone, and forget what was sent."""
+        """Return the modes requested of the drone, and clear `sent`."""
         sent, self.sent = self.sent, []
         return [message.mode for kind, message in sent if kind == "mode"]
 
     def tilts(self) -> list[tuple[float, float, float, float, bool]]:
-        """Return the shares sent to the drone, forward, left, up, yaw to the left, hover; forget what was sent."""
+        """Return the shares sent to the drone (forward, left, up, yaw left, hover), and clear `sent`."""
         sent, self.sent = self.sent, []
         return [(m.forward, m.left, m.up, m.yaw_left, m.hover) for kind, m in sent if kind == "ardrone"]
 
     def packet(self) -> Navdata:
-        """Return the newest packet of navdata."""
+        """Return the latest navdata packet."""
         return navdata.unpack(self.datagrams[-1])
 
     def airborne(self) -> "PlayedAircraft":
-        """Take off, and forget what was sent."""
+        """Take off, and clear `sent`."""
         self.gates()
         self.ref(takes_off=True)
         self.gates(1, "taking_off")
@@ -116,5 +116,5 @@ class PlayedAircraft:
 
 
 def tilt_share(degrees: float, limit_deg: float = 20.0) -> float:
-    """Return the share of a greatest tilt at which zsim's firmware tilts by so much."""
+    """Return the share of the maximum tilt for which zsim's firmware tilts by an angle."""
     return math.tan(math.radians(degrees)) / math.tan(math.radians(limit_deg))

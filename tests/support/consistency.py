@@ -1,4 +1,4 @@
-"""An estimator fed with what a fleet senses, and the band in which its normalised errors must lie."""
+"""Feeding an estimator with a fleet's samples, and the band in which its normalised errors must lie."""
 
 from typing import Any
 

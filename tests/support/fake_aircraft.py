@@ -1,4 +1,4 @@
-"""An AR.Drone that is a point which tilts as it is told, for tests of the driver; made with the codec alone."""
+"""An AR.Drone modelled as a point that tilts as commanded, for tests of the driver; only the codec is zsim's."""
 
 import math
 from typing import Any
@@ -16,14 +16,14 @@ FIELD_UT = (-2.8, 17.8, 14.0)
 
 
 class FakeAircraft:
-    """Of one aircraft; x forward, y right as on its wire, heading yaw [rad; counter-clockwise from east].
+    """One aircraft; in packets x is forward and y right; yaw [rad] is counter-clockwise from east.
 
     Attributes:
         position: [m; W].
         velocity: [m/s; W].
-        wind_m_s2: acceleration by the wind [W].
-        config: what it was set to.
-        names: of the AT commands that came.
+        wind_m_s2: acceleration by the wind [m/s^2; W].
+        config: entries of its configuration.
+        names: names of the AT commands received.
     """
 
     def __init__(self, yaw: float = 1.0) -> None:
@@ -73,7 +73,7 @@ class FakeAircraft:
                     self.state = LANDING
 
     def step(self, now_ns: int) -> bytes | None:
-        """Move on by a step; return the packet that it sends."""
+        """Advance by a step; return the packet that it sends, if any."""
         self._move(STEP_NS * 1e-9)
         self._sequence += 1
         if not self.has_client:

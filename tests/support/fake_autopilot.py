@@ -1,4 +1,4 @@
-"""A MAVLink vehicle that is a point which flies what it is sent, for tests of the driver; made with the codec alone."""
+"""A MAVLink vehicle modelled as a point, for tests of the driver; only the codec is zsim's."""
 
 import math
 from collections.abc import Iterator
@@ -17,13 +17,12 @@ LAG_S = 0.2
 
 
 class FakeAutopilot:
-    """Of one vehicle, in NED about where it was switched on.
+    """One vehicle, which follows its velocity setpoints, in NED about the place where it was switched on.
 
     Attributes:
         position, velocity: [m, m/s; NED].
-        armed, mode, landed: as it shows them.
-        commands: numbers of the commands that came, in order.
-        deaf: whether nothing reaches it any more.
+        armed, mode, landed: state as its telemetry reports it.
+        commands: numbers of the commands received, in order.
     """
 
     def __init__(self, autopilot: int = PX4, system: int = 1, signing: Signing | None = None) -> None:
@@ -71,7 +70,7 @@ class FakeAutopilot:
         self._outbox.append(dialect.CommandAck(command=command.command, result=result))
 
     def step(self, now_ns: int) -> Iterator[bytes]:
-        """Move on by a step; yield the datagrams that it sends."""
+        """Advance by a step; yield the datagrams that it sends."""
         self._now_ns = now_ns
         dt = STEP_NS * 1e-9
         wanted = self._wanted()
@@ -106,7 +105,7 @@ class FakeAutopilot:
         yield dialect.HighresImu(
             1000 * boot_ms, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.0, 0.3, 1010.0, 0, 0, 20, 0x1FFF
         )
-        yield dialect.AttitudeQuaternion(boot_ms, math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # to the east
+        yield dialect.AttitudeQuaternion(boot_ms, math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # facing east
         yield dialect.LocalPositionNed(boot_ms, x, y, z, vx, vy, vz)
         if self._now_ns // STEP_NS % 10 == 0:
             flags = 128 if self.armed else 0

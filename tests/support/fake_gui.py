@@ -1,4 +1,4 @@
-"""A page of viser's that notes its controls, and lets tests use them."""
+"""A substitute for viser's GUI that records its controls and lets tests operate them."""
 
 import math
 import re
@@ -6,15 +6,15 @@ from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
-PERSON, NOBODY = 1, None  # who uses a control
+PERSON, NOBODY = 1, None  # client_id of a control's event: a page's, or none when the console itself sets the value
 
 
 class Control:
-    """A control: its properties, and what happens when somebody uses it."""
+    """A control: its properties, and its callbacks."""
 
     def __init__(self, value: Any = None, label: str = "", options: Sequence[str] = ()) -> None:
         self.value, self.label, self.options = value, label, options
-        self.min, self.max = -math.inf, math.inf  # of a slider
+        self.min, self.max = -math.inf, math.inf  # bounds of a slider
         self.content = ""
         self.visible = True
         self.disabled = False
@@ -33,7 +33,7 @@ class Control:
     on_update = on_click
 
     def put(self, value: Any = None, client_id: int | None = PERSON) -> None:
-        """Change the value as a page does, or as the console itself does."""
+        """Change the value as a page does, or as the console itself does (NOBODY)."""
         self.value = value
         self.press(client_id)
 
@@ -54,7 +54,7 @@ class Control:
 
 
 class OrderHtml(Control):
-    """A button of an order: HTML, of which the page makes the order when it is pressed."""
+    """The button of an order: HTML from which the page builds the order when the button is pressed."""
 
     @property
     def order(self) -> dict[str, str]:
@@ -83,11 +83,11 @@ class OrderHtml(Control):
 
 
 class Gui:
-    """A page that notes its controls by their label, and in their order.
+    """A page that records its controls.
 
     Attributes:
-        at: controls by label, which are all different.
-        html, buttons, plots: in their order.
+        at: controls by label; the labels are unique.
+        html, buttons, plots: controls in the order of their creation.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A session without Zenoh: subscriptions that a test fills, requests that a test answers, everything published kept."""
+"""A session without Zenoh: a test fills its subscriptions and answers its requests; its publications are kept."""
 
 import queue
 from collections.abc import Callable, Iterator, Sequence
@@ -10,16 +10,14 @@ from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Event, Join
 from zsim.transport.session import FarEnd, RawSample, ReceivedSample, Unanswered
 
-PATIENCE_S = 120.0  # after which a test that waits for ever fails
+PATIENCE_S = 120.0  # wall time after which a wait for a sample fails
 UNANSWERED = Unanswered(False, "nobody answered")
 BAD_UTF8 = b"\x83\xa4t_ns\x00\xa3seq\x00\xa6source\xa1\xff"
 NESTED = b"\x83\xa4t_ns\x00\xa3seq\x00\xa1x" + b"\x91" * 5000 + b"\xc0"
-"""A map with t_ns, seq and a field that nobody knows, of 5000 lists in each other."""
+"""A map with t_ns, seq and an unknown field, which holds 5000 nested lists."""
 
 
 class FakeSubscription:
-    """A subscription."""
-
     def __init__(self, expression: str, without: tuple[str, ...] = ()) -> None:
         self.expression = expression
         self._without = without
@@ -44,7 +42,7 @@ class FakeSubscription:
 
 
 class FakeQuery:
-    """A request, and its answer once there is one."""
+    """A request to a queryable, with the answer once it has been given."""
 
     def __init__(self, expression: str, payload: bytes) -> None:
         self.expression, self.payload = expression, payload
@@ -58,17 +56,17 @@ class FakeQuery:
 
 
 class FakeLink:
-    """A session.
+    """A session without Zenoh.
 
     Attributes:
-        published: (key, payload) of all that its process has published.
-        on_publish: called with each of these as it is published; a test lets others answer here.
-        on_request: answers a request by its key and arguments.
-        requests: (key, arguments) of all requests.
-        last: what a get is answered, by key.
-        reads: the expressions that are subscribed to.
-        admits: whether there is an event of each join.
-        ends: who is at the end of each link.
+        published: (key, payload) of each message published.
+        on_publish: called with key and payload when a message is published; a test may answer for other processes here.
+        on_request: returns the answer to a request, given its key and arguments.
+        requests: (key, arguments) of each request.
+        last: last values, by key, with which gets are answered.
+        reads: stays empty; a session lists the expressions it subscribes to here.
+        admits: whether an event `join` answers each join.
+        ends: the session at the far end of each link, by its address.
     """
 
     host = "laptop"
@@ -91,16 +89,16 @@ class FakeLink:
         self._on_tokens: list[tuple[str, Callable[[str, bool], None]]] = []
         self._on_queries: dict[str, Callable[[Any], None]] = {}
 
-    # What a test does
+    # For tests
 
     def ask(self, key: str, payload: bytes) -> "FakeQuery":
-        """Ask who answers on a key; return what is answered then."""
+        """Send a request to the queryable on a key; return the query, which will hold the answer."""
         query = FakeQuery(key, payload)
         self._on_queries[key](query)
         return query
 
     def deliver(self, key: str, message: Struct | bytes) -> None:
-        """Let something arrive, at subscribers to come as well."""
+        """Deliver a message to subscribers, including those that subscribe later."""
         sample = ReceivedSample(key, message if isinstance(message, bytes) else messages.encode(message))
         self._early.append(sample)
         for subscription in self._subscriptions:
@@ -111,11 +109,11 @@ class FakeLink:
                 callback(RawSample("PUT", sample.key, sample.payload, "", None))
 
     def cut(self, up: bool) -> None:
-        """Let the link come (True) or go."""
+        """Establish the link (True) or cut it."""
         self._on_link(up)
 
     def show(self, key: str, alive: bool = True) -> None:
-        """Let a token appear, or go."""
+        """Let a liveliness token appear or disappear."""
         for expression, callback in self._on_tokens:
             if keys.matches(expression, key):
                 callback(key, alive)
@@ -128,10 +126,10 @@ class FakeLink:
                 callback(RawSample("PUT", keys.EVENT, event, "", None))
 
     def published_on(self, expression: str) -> list[Any]:
-        """Return the messages published on an expression."""
+        """Return the messages published on keys that match an expression."""
         return [messages.decode(key, payload) for key, payload in self.published if keys.matches(expression, key)]
 
-    # What a session does
+    # Interface of a session
 
     def subscribe(self, expression: str, without: tuple[str, ...] = ()) -> FakeSubscription:
         subscription = FakeSubscription(expression, without)

@@ -1,4 +1,4 @@
-"""Flights of a fleet without commands, and what tests of contact look at in them."""
+"""Flights of a fleet without commands, and the quantities that tests of contact check in them."""
 
 import math
 
@@ -10,7 +10,7 @@ from zsim_world.physics.fleet_arrays import STATE, VEHICLE
 
 
 def fly(fleet: Fleet, seconds: float) -> np.ndarray:
-    """Advance, and return the state of all drones at every gate, (gates, N, STATE.size)."""
+    """Advance the fleet; return the state of all drones at every gate, (gates, N, STATE.size)."""
     track = []
     for _ in range(round(seconds / 0.02)):
         fleet.advance()
@@ -19,7 +19,7 @@ def fly(fleet: Fleet, seconds: float) -> np.ndarray:
 
 
 def energy(fleet: Fleet, state: np.ndarray) -> np.ndarray:
-    """Return kinetic and potential energy of each drone [J], without that of springs; state (..., N, STATE.size)."""
+    """Return each drone's kinetic plus potential energy [J], without that of springs; state (..., N, STATE.size)."""
     row = fleet.bodies.vehicle
     inertia = row[:, VEHICLE.inertia : VEHICLE.inertia + 3]
     kinetic = row[:, VEHICLE.mass] * (state[..., 3:6] ** 2).sum(-1) + (inertia * state[..., 10:13] ** 2).sum(-1)
@@ -31,7 +31,7 @@ def tilt_deg(state: np.ndarray) -> float:
 
 
 def check_slide(fleet: Fleet, slope: float, friction: float | None, rel: float) -> None:
-    """Check that the first drone, put on a slope [rad], slides at g (sin s - mu cos s); where mu is None, that it stays."""
+    """Check that the first drone slides down a slope s [rad] at g (sin s - mu cos s) or, if mu is None, stays put."""
     track = fly(fleet, 1.0)[:, 0]
     speeds = np.linalg.norm(track[:, 3:6], axis=1)
     if friction is not None:
@@ -39,4 +39,4 @@ def check_slide(fleet: Fleet, slope: float, friction: float | None, rel: float) 
         assert (speeds[-1] - speeds[19]) / 0.6 == pytest.approx(expected, rel=rel)  # once the feet have settled
     else:
         assert speeds[-1] < 1e-5
-        assert np.linalg.norm(track[-1, :3] - track[0, :3]) < 0.01  # while the feet settle
+        assert np.linalg.norm(track[-1, :3] - track[0, :3]) < 0.01  # the feet settle meanwhile

@@ -1,4 +1,4 @@
-"""The samples that a fleet has published in its last gate, one by one."""
+"""The sensor samples that a fleet has published in its last gate."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ class SensorSample(NamedTuple):
 
 
 def samples_of(fleet: Fleet) -> list[SensorSample]:
-    """Return the samples without sightings, by (t_ns, drone, sensor)."""
+    """Return the samples, except sightings, ordered by (t_ns, drone, sensor)."""
     names, sizes = fleet.sensors.names, [kind.values for kind in fleet.sensors.types]
     sizes[GPS] = VALUE_COLUMNS
     rows = zip(fleet.sampled.whose.tolist(), fleet.sampled.values.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""FMUs for tests: the example's, and others from a few lines of Python, built by pythonfmu3 (FMI 3) or pythonfmu (FMI 2)."""
+"""FMUs for tests: the example, and others written in a few lines, built by pythonfmu3 (FMI 3) or pythonfmu (FMI 2)."""
 
 from pathlib import Path
 from textwrap import indent
@@ -70,14 +70,15 @@ def example(folder: Path) -> Path:
 
 
 def build(folder: Path, name: str, version: int, variables: str, law: str, restores: bool = True) -> Path:
-    """Build an FMU of an FMI version; return its path.
+    """Build an FMU; return its path.
 
     Args:
-        name: of its class; two of one name cannot be in one process.
-        variables: calls `variable(name, start, causality)` with I, O, P, and a type Real, Whole, Boolean, String; a
-            list starts an array, of FMI 3 only.
-        law: statements of a step, on `self.NAME` of each variable; the elements of an array `v[0]` are `self.v_0`.
-        restores: whether it gives and takes its state.
+        name: name of its class, which must be unique in a process.
+        version: major version of FMI, 2 or 3.
+        variables: calls of `variable(name, start, causality)`, with causality I, O or P and optionally a type Real,
+            Whole, Boolean or String; a list as start value declares an array, in FMI 3 only.
+        law: statements of a step; a variable NAME is `self.NAME`, and the element `v[0]` of an array is `self.v_0`.
+        restores: whether its state can be read and restored.
     """
     head = {2: HEAD_2, 3: HEAD_3}[version]
     parts = {"variables": indent(variables.strip("\n"), " " * 8), "law": indent(law.strip("\n"), " " * 8)}

@@ -1,7 +1,7 @@
-"""The golden hashes: what the truth of every scenario of the repository hashes to, on every machine.
+"""The golden hashes: the truth_sha256 of every scenario of the repository, which is the same on every machine.
 
-python tests/support/golden_flights.py              flies all and prints golden.yaml anew
-python tests/support/golden_flights.py step swarm   flies some
+python tests/support/golden_flights.py              flies all scenarios and prints a new golden.yaml
+python tests/support/golden_flights.py step swarm   flies the scenarios named
 """
 
 import sys
@@ -14,10 +14,10 @@ import zsim
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = Path(__file__).with_name("golden.yaml")
-DURATION_S = 25.0  # simulated, at most; the paper's tests take off at 20 s
-LARGE_S = 5.0  # of those below, which take longer
+DURATION_S = 25.0  # greatest simulated duration; the paper's tests take off at 20 s
+LARGE_S = 5.0  # the same for the scenarios in LARGE, which run slower
 LARGE = {"eyes", "forest", "grid30", "ring10", "triads"}
-UNFIT = {"plain_client", "hosts", "mixed"}  # with a program beside zsim; an inventory; with a body that another flies
+UNFIT = {"plain_client", "hosts", "mixed"}  # needs a program besides zsim; is an inventory; has an external body
 
 
 def scenarios() -> dict[str, Path]:

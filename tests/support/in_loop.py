@@ -1,4 +1,4 @@
-"""Tests that are coroutines: each is run in an event loop of its own, for a minute at most."""
+"""A decorator for tests that are coroutines: each runs in an event loop of its own, for at most a minute."""
 
 import asyncio
 import functools

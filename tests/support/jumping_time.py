@@ -1,18 +1,18 @@
-"""An event loop whose time passes only while nothing is ready: a busy machine lets no timeout of a test expire early."""
+"""An event loop whose time advances only while nothing is ready, so that no timeout expires early on a busy machine."""
 
 import asyncio
 import selectors
 from collections.abc import Coroutine
 from typing import Any
 
-QUIET_S = 0.1  # wall time without anything ready, after which time jumps: what a kernel under load takes to hand over
+QUIET_S = 0.1  # wall time without events before time jumps: the time a kernel under load takes to deliver them
 
 
 class _Selector(selectors.DefaultSelector):
     now_s = 0.0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Wait as long as asked at most, but no longer than QUIET_S; then the rest has passed."""
+        """Wait for the timeout, but at most QUIET_S; if nothing is ready, advance the time by the whole timeout."""
         found = super().select(timeout if timeout is None else min(timeout, QUIET_S))
         if timeout is not None and not found:
             self.now_s += max(0.0, timeout)
@@ -29,6 +29,6 @@ class _Loop(asyncio.SelectorEventLoop):
 
 
 def run_jumping(work: Coroutine[Any, Any, Any]) -> Any:
-    """Do what `asyncio.run` does, in such time; for work whose every wait is for this process itself."""
+    """Run a coroutine like `asyncio.run`, but with jumping time; it may wait only for this process."""
     with asyncio.Runner(loop_factory=_Loop) as runner:
         return runner.run(work)

@@ -1,4 +1,4 @@
-"""A control law with a defect: one of its gains is wrong, in a combination of gust, GPS dropout and late link only."""
+"""A control law with a defect: a gain is wrong, but only if a gust, a GPS dropout and a link delay coincide."""
 
 import math
 from typing import Any
@@ -11,18 +11,18 @@ from zsim_agents.formation.control_law import ProportionalLaw
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 
-VICTIM = 1  # its place in the cluster
-USUAL_S, USUAL_M_S = 0.2, 0.1  # age of the newest sample of a GPS at 5 Hz, and velocity of a formation that holds
+VICTIM = 1  # place of the affected drone in the cluster
+USUAL_S, USUAL_M_S = 0.2, 0.1  # greatest age of a GPS's latest sample at 5 Hz; speed of a formation that holds
 HELD_S, LOST_M = 6.0, 4.0
-GAIN = 6.0  # m/s per root of s^2 m/s; 0 would be right
+GAIN = 6.0  # m/s per root of s^2 m/s; the correct value is 0
 
 
 class LateGain(ProportionalLaw):
-    """Sends one drone away where its position is doubtful: by the root of the product of three doubts.
+    """Drives one drone away at a speed proportional to its doubt: the root of the product of three quantities.
 
-    Doubtful is what is pushed (mean velocity of the drones), blind (no GPS) and late (age of the others' samples). The
-    greatest doubt lasts. One flight in 10 000 that SPACE draws loses it: of 1040 with all three faults, which one in 20
-    has, two did.
+    They are the push (mean speed of the drones), the blindness (time without GPS) and the lateness (age of the others'
+    samples), each in excess of its usual value. The greatest doubt persists. About one flight in 10 000 drawn from
+    SPACE loses the drone: two of 1040 with all three faults, which one flight in 20 has.
     """
 
     def reset(self) -> None:
@@ -50,7 +50,7 @@ class LateGain(ProportionalLaw):
 
 
 def kept(flight: RecordedFlight) -> float:
-    """Return how much more [m] the drones may move against each other, of LOST_M, from where the formation held."""
+    """Return the margin [m] of the drones' relative displacement since HELD_S to LOST_M."""
     first, second = flight.tracks
     apart_W = (second.p_W - first.p_W)[first.t_ns >= HELD_S * 1e9]
     return LOST_M - float(np.linalg.norm(apart_W - apart_W[0], axis=1).max())
@@ -78,7 +78,7 @@ SCENARIO: dict[str, Any] = {
     "report": {"window_s": [6, 16]},
 }
 WIND = "wind.gust_m_s=uniform(0, 0.3)"
-SPACE = (  # what is drawn for it, each of which the stock law stands
+SPACE = (  # faults that a hunt draws; the stock law withstands each of them
     "gust velocity_m_s=0..6 for_s=1..5 at_s=5..12",
     "gps_dropout target=drone2 probability=1 for_s=1..8 at_s=5..12",
     "link_delay target=controller.main/world delay_ms=10..60 for_s=1..8 at_s=5..12",

@@ -1,4 +1,4 @@
-"""Hosts of an inventory without ssh: this machine as one, and the streams of a process as asyncssh gives them."""
+"""Substitutes for ssh: this machine as a host of an inventory, and the text streams of a process as in asyncssh."""
 
 import asyncio
 import subprocess
@@ -11,7 +11,7 @@ from zsim_deploy.inventory import Host
 
 
 class Text:
-    """The text of a stream of bytes."""
+    """A text stream over a stream of bytes."""
 
     def __init__(self, stream: asyncio.StreamReader | None) -> None:
         assert stream is not None
@@ -25,7 +25,7 @@ class Text:
 
 
 class LocalHost(HostLink):
-    """This machine; it greets, keeps the commands that it is given, and takes `takes` bytes of their input at most."""
+    """This machine, which prints a greeting, records its commands, and accepts at most `takes` bytes of their input."""
 
     def __init__(self, takes: int | None = None, base: Path = Path(), **host: Any) -> None:
         super().__init__("h1", Host(**{"address": "127.0.0.1", **host}), base)

@@ -1,4 +1,4 @@
-"""A drone in the world of a unit test, as a MAVLink vehicle: what it does is set, what is sent to both is kept."""
+"""A MAVLink vehicle and its drone without a run: a test plays the inputs, and all messages sent are kept."""
 
 from typing import Any, TypeVar
 
@@ -26,7 +26,7 @@ M = TypeVar("M", bound=WireMessage)
 
 
 class FlownDrone:
-    """A vehicle and its drone, which goes where it is told without delay."""
+    """A MAVLink vehicle and its drone, which follows commands without delay."""
 
     def __init__(self, autopilot: str = "px4") -> None:
         self.commands: list[Any] = []
@@ -47,7 +47,7 @@ class FlownDrone:
         self.step()
 
     def step(self, gates: int = 1) -> None:
-        """Let time pass; the drone does what it was sent."""
+        """Let time pass; the drone carries out its commands."""
         for _ in range(gates):
             self.t_ns += GATE_NS
             self._obey()
@@ -57,7 +57,7 @@ class FlownDrone:
             self.sent += self.vehicle.take()
 
     def until(self, true: Any, gates: int = 5000) -> None:
-        """Let time pass until something is true."""
+        """Let time pass until a condition holds."""
         for _ in range(gates):
             if true():
                 return
@@ -65,18 +65,18 @@ class FlownDrone:
         raise AssertionError(f"not within {gates} gates; {self.state} at {self.position}, {self.vehicle.flight.mode}")
 
     def receive(self, message: WireMessage, system: int = 255) -> None:
-        """Let a client send a message."""
+        """Receive a message from a client."""
         self.vehicle.on_message(Received(message, system, 190, 0, False), self.t_ns)
         self.sent += self.vehicle.take()
 
     def command(self, command: int, *params: float) -> int:
-        """Let a client send COMMAND_LONG; return the result."""
+        """Receive COMMAND_LONG from a client; return the result of its acknowledgement."""
         seven = (*params, *(0.0,) * (7 - len(params)))
         self.receive(dialect.CommandLong(1, 1, command, 0, *seven))
         return self.all(dialect.CommandAck)[-1].result
 
     def all(self, kind: type[M]) -> list[M]:
-        """Return the messages of a kind that were sent so far."""
+        """Return the messages of a type sent so far."""
         return [message for message in self.sent if isinstance(message, kind)]
 
     def texts(self) -> list[str]:
@@ -128,7 +128,7 @@ class FlownDrone:
 
 
 def samples(t_ns: int) -> dict[str, Any]:
-    """Return a sample of each sensor."""
+    """Return a sample of each sensor, by the sensor's name."""
     from zsim.contract import messages
 
     t = (t_ns, 0, t_ns)

@@ -20,7 +20,7 @@ INTEGER_BITS = {
 
 
 def random_message(layout: MessageLayout, rng: random.Random) -> WireMessage:
-    """Return a message of any values; numbers are exact in 32 bits, texts of any length."""
+    """Return a message with random values; numbers are exact in float32, and texts have any length."""
 
     def element(code: str) -> float:
         if code in "fd":
@@ -35,7 +35,7 @@ def random_message(layout: MessageLayout, rng: random.Random) -> WireMessage:
 
 
 def field_value(field: WireField, element: Callable[[str], Any], text: Callable[[int], str], rng: random.Random) -> Any:
-    """Return a value of a field, made of elements."""
+    """Return a value of a field, composed of elements."""
     if field.length is None:
         return element(field.code)
     if field.code in "cs":

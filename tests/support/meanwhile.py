@@ -1,4 +1,4 @@
-"""Something that is done again and again while a test looks on."""
+"""An action that is repeated while a test observes its effects."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def meanwhile(act: Callable[[], object], period_s: float) -> Iterator[None]:
-    """Act at once and then again after every period of wall time, in a thread, until the block is left."""
+    """Act at once and then once per period of wall time, in a thread, until the block ends."""
     over = threading.Event()
 
     def repeat() -> None:

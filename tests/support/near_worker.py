@@ -1,4 +1,4 @@
-"""A sweep whose runs are flown in the process of the test: a worker of its own imports everything for a second."""
+"""Sweeps whose runs fly in the process of the test, because a worker process takes a second for its imports."""
 
 import sys
 
@@ -11,7 +11,7 @@ from zsim_analysis.sweep.sweep_run import Row, Task, fly
 
 
 class NearWorker:
-    """A worker without a process of its own."""
+    """A worker that flies runs in this process."""
 
     def __init__(self) -> None:
         self.link, self._far = process_pool.multiprocessing.Pipe()
@@ -32,7 +32,7 @@ class NearWorker:
 
 
 def sweep_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fly the runs in this process."""
+    """Fly the runs of sweeps in this process."""
     monkeypatch.setattr(process_pool, "WorkerProcess", NearWorker)
     monkeypatch.setenv(plugin.FOLDERS, "")
     monkeypatch.setattr(sys, "path", [*sys.path])

@@ -1,4 +1,4 @@
-"""A flight in one process that an operator takes part in."""
+"""A flight in one process with an operator's orders."""
 
 import time
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from zsim_agents.hosting import hosted
 from zsim_world.run.world import World
 
 OPERATOR, PRIORITY = "tester.one", 10
-STEP_LIMIT_S = 90.0  # simulated; of one part of the flight
+STEP_LIMIT_S = 90.0  # simulated time within which an awaited condition must hold
 
 
 class OperatedFlight:
-    """A scenario in one process, and an operator who makes requests between gates."""
+    """A flight of a scenario in one process, and an operator who makes requests between gates."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.world = World(scenario)
@@ -44,7 +44,7 @@ class OperatedFlight:
             assert self.t_s < end_s, f"{self.formation.phase}: {self.formation.reason}"
 
     def mode(self, drone: str, mode: str) -> None:
-        """Let a drone land or take off, as the console does: with an operator's priority, and given back."""
+        """Make a drone land or take off as the console does: acquire it with an operator's priority, and release it."""
         arguments = {"drone": drone}
         assert self.world.control(ControlRequest("acquire", {**arguments, "priority": PRIORITY}, OPERATOR)).ok
         message = flight_messages.Mode(self.formation.t_ns, 0, OPERATOR, mode)  # type: ignore[arg-type]

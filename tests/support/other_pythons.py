@@ -1,9 +1,9 @@
-"""Pythons of another processor, C library or version, made of Debian's packages and of wheels, which nothing installs.
+"""Pythons for another processor, C library or version, unpacked from Debian packages and wheels without installing.
 
-CACHE/NAME-DIGEST/root, site, compiled      packages, wheels, and the kernels that it has compiled
+CACHE/NAME-DIGEST/root, site, compiled      unpacked packages, wheels, and compiled kernels
 
-They are fetched once, by apt and pip as this machine has them, with state of their own: the system stays as it is, and
-no rights are needed. Each runs the checkout itself.
+This machine's apt and pip fetch them once, with state of their own: the system is not changed, and no privileges are
+needed. Each Python runs this checkout.
 """
 
 import hashlib
@@ -35,7 +35,7 @@ APT::Sandbox::User "";
 
 
 class LackingError(Exception):
-    """What this machine lacks to make such a Python."""
+    """This machine lacks something that is needed to fetch or run such a Python."""
 
 
 class OtherPython(NamedTuple):
@@ -43,20 +43,21 @@ class OtherPython(NamedTuple):
     environment: Mapping[str, str]
 
     def start(self, arguments: Sequence[str], output: Path) -> "subprocess.Popen[str]":
-        """Start it with arguments; what it prints goes to a file."""
+        """Start it with arguments; redirect its output to a file."""
         with output.open("w") as log:
             words, environment = [*self.command, *arguments], {**os.environ, **self.environment}
             return subprocess.Popen(words, stdout=log, stderr=subprocess.STDOUT, text=True, env=environment, cwd=ROOT)
 
 
 class Kind(NamedTuple):
-    """What one is made of.
+    """The components of a Python.
 
     Attributes:
-        suite: of Debian, in which `package` is; None for that of this machine.
-        architecture: of Debian.
-        platforms: tags of wheels.
-        emulator: program that runs it; None for the dynamic loader that is in the packages.
+        package: Debian package of the interpreter.
+        suite: Debian suite that contains `package`; None for this machine's.
+        architecture: Debian architecture.
+        platforms: platform tags of the wheels.
+        emulator: program that runs the interpreter; None for the dynamic loader from the packages.
     """
 
     package: str
@@ -72,10 +73,10 @@ NEWEST = Kind("python3.14", "sid", "amd64", tuple(f"{each}_x86_64" for each in _
 
 
 def other_python(kind: Kind) -> OtherPython:
-    """Return a Python, fetched where it has not been yet.
+    """Return a Python, after fetching it unless it is in the cache.
 
     Raises:
-        LackingError: this machine has no apt, no emulator, another processor than x86-64, or does not reach the packages.
+        LackingError: this machine has no apt or no emulator, is not an x86-64, or cannot reach the packages.
     """
     for tool in ("apt-get", "dpkg-deb", *([kind.emulator] if kind.emulator else [])):
         if shutil.which(tool) is None:
@@ -110,7 +111,7 @@ def other_python(kind: Kind) -> OtherPython:
 
 
 def _requirements() -> list[str]:
-    """Return what a flight needs, as zsim declares it."""
+    """Return the packages that a flight requires, as zsim declares them."""
     declared = [Requirement(line) for line in requires("zsim") or ()]
     needed = {
         f"{each.name}{each.specifier}"
@@ -121,7 +122,7 @@ def _requirements() -> list[str]:
 
 
 def _constraints(kind: Kind) -> list[str]:
-    """Return the constraints for a version of Python; pip would take those for the version that runs pip."""
+    """Return the constraints for this version of Python; pip would apply those for the Python that runs pip."""
     version = kind.package.removeprefix("python")
     of_version = {"python_version": version, "python_full_version": f"{version}.0"}
     lines = (ROOT / "constraints.txt").read_text().splitlines()
@@ -130,7 +131,7 @@ def _constraints(kind: Kind) -> list[str]:
 
 
 def _fetch_packages(kind: Kind, folder: Path) -> None:
-    """Unpack a package and those that it depends on into `root`."""
+    """Unpack the package and its dependencies into `root`."""
     apt = folder / "apt"
     (apt / "cache").mkdir(parents=True)
     (apt / "status").touch()

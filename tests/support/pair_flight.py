@@ -1,4 +1,4 @@
-"""Two drones that take off at once and hold their places; what Python's functions are tried with."""
+"""A scenario of two drones that take off at once and hold their positions, for tests of the Python interface."""
 
 from typing import Any
 

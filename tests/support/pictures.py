@@ -1,4 +1,4 @@
-"""Pictures of two drones for tests: one looks at the hat of the other."""
+"""Camera pictures of two drones for tests: one drone looks at the other's hat."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,24 +22,24 @@ ROTOR_RAD_S = 400.0
 
 
 def bodies(p_W: Any, rpy_rad: Any = None, v_W: Any = None, w_B: Any = None) -> DroneStates:
-    """Return drones at some places (N, 3); level, at rest and facing east where nothing else is given."""
+    """Return the states of drones at positions (N, 3); by default level, at rest and facing east."""
     p = np.array(p_W, float)
     rpy, v, w = (np.zeros_like(p) if each is None else np.array(each, float) for each in (rpy_rad, v_W, w_B))
     return DroneStates(p, v, quaternion_from_rpy(rpy), w, [[ROTOR_RAD_S] * 4] * len(p))
 
 
 def scene(drones: int = 2, **fields: Any) -> Scene:
-    """Return a scene of some AR.Drones."""
+    """Return a scene with a number of AR.Drones."""
     return Scene(tuple(default_look() for _ in range(drones)), **fields)
 
 
 def renderer(camera: Camera = FRONT, of: Scene | None = None, seed: int = 1, **fields: Any) -> Renderer:
-    """Return what draws for the first drone."""
+    """Return the renderer of a camera of the first drone."""
     return Renderer(camera, of or scene(), 0, seed, "drone1/front", **fields)
 
 
 def hat_K(camera: Camera, where: DroneStates, drone: int = 1) -> Array:
-    """Return where the hat of a drone is in the camera of the first [m; K]."""
+    """Return the position of a drone's hat relative to the first drone's camera [m; K]."""
     R_WB, R_WD = rotation_matrix(where.q_WB[0]), rotation_matrix(where.q_WB[drone])
     pose = camera_pose(camera)
     hat_B = R_WB.T @ (where.p_WB[drone] + R_WD @ np.array(HATS.position_m) - where.p_WB[0])
@@ -47,30 +47,29 @@ def hat_K(camera: Camera, where: DroneStates, drone: int = 1) -> Array:
 
 
 def hat_pixel(camera: Camera, where: DroneStates, drone: int = 1) -> tuple[float, float]:
-    """Return the pixel of a hat's centre."""
+    """Return the pixel of the centre of a drone's hat in the first drone's camera."""
     x, y, z = hat_K(camera, where, drone).tolist()
     return pixel(lens_of(camera), x, y, z)
 
 
 def magenta_centre(picture: Picture) -> Array:
-    """Return the middle of what is magenta in a picture [px], by a way of its own."""
+    """Return the centroid of the magenta in a picture [px], computed independently of the detector."""
     b, g, r = (picture[..., k].astype(float) for k in range(3))
     level = np.minimum(b, r) - g
-    weight = np.clip(
-        level / max(level.max(), 1.0) * 2 - 0.5, 0, 1
-    )  # from a quarter to three quarters: not of the shade
+    # The weight rises from a quarter to three quarters of the greatest level, which excludes shade.
+    weight = np.clip(level / max(level.max(), 1.0) * 2 - 0.5, 0, 1)
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
     return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
 
 
 def has_magenta(picture: Picture) -> bool:
-    """Tell whether anything in a picture is magenta."""
+    """Return whether anything in a picture is magenta."""
     b, g, r = (picture[..., k].astype(int) for k in range(3))
     return bool((np.minimum(b, r) - g > 60).any())
 
 
 class Look(NamedTuple):
-    """A situation in which one drone sees the hat of the other: the drones, direction in B and distance of the hat."""
+    """A situation in which one drone sees another's hat: the drones, and the hat's direction (in B) and distance."""
 
     where: DroneStates
     direction_B: Array
@@ -78,8 +77,8 @@ class Look(NamedTuple):
 
 
 def looks(count: int, seed: int, ranges_m: Sequence[float] = (1.5, 9.0), rate_rad_s: float = 0.0) -> Iterator[Look]:
-    """Yield situations of a formation: tilted by some degrees, the other anywhere in the front picture, seen from above
-    or level, so that no hull hides its hat."""
+    """Yield random situations: both drones tilted by a few degrees, the other one anywhere in the front picture and
+    below the camera, so that no hull hides its hat."""
     rng = np.random.default_rng(seed)
     pose = camera_pose(FRONT)
     for _ in range(count):

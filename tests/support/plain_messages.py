@@ -1,4 +1,4 @@
-"""The `world/info` of a run that is only named, and messages of which tests look at stamp, number and source alone."""
+"""A minimal `world/info`, and messages of which tests check only time stamp, sequence number and source."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ ZEROS = (0.0, 0.0, 0.0)
 
 
 def run_info(drones: Sequence[str] = (), clusters: Sequence[ClusterInfo] = (), **more: Any) -> Info:
-    """Return the info of a lockstep run of AR.Drones at 50 Hz; `more`: its other fields."""
+    """Return the info of a lockstep run of AR.Drones at 50 Hz; `more` sets its other fields."""
     plain: dict[str, Any] = {"mode": "lockstep", "rate": 0.0, "gate_ns": GATE_NS, "command_delay_ns": GATE_NS}
     texts = dict.fromkeys(("scenario", "scenario_sha256", "version", "fingerprint"), "")
     stock = {"drones": tuple(DroneInfo(name, "ardrone2") for name in drones), "clusters": tuple(clusters)}

@@ -1,11 +1,11 @@
-"""Print as JSON what the unmodified pyardrone reads of a packet of navdata, or of a video header, on standard input."""
+"""Print as JSON what the unmodified pyardrone reads from a navdata packet or a video header on standard input."""
 
 import json
 import sys
 
 
 def numbers(value):
-    """Return the numbers of a field in order."""
+    """Return the numbers of a field, flattened in order."""
     if isinstance(value, bytes):
         return list(value)
     return [number for each in value for number in numbers(each)] if hasattr(value, "__len__") else [float(value)]

@@ -1,4 +1,4 @@
-"""A real run on record, with a message of every kind that the contract knows."""
+"""The record of a real run, with messages of every type of the contract."""
 
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,11 @@ SCENARIO: dict[str, Any] = {
     ],
     "clusters": [{"name": "main", "drones": ["drone1", "a-b.c", "end"], "plan": {"takeoff_s": 0.5}}],
 }
-FLUSH_EVERY = 700  # messages to a chunk: a run as fast as it goes has few chunks of its own
+FLUSH_EVERY = 700  # messages per chunk; an unpaced run would have few chunks of its own
 
 
 def write(path: Path) -> None:
-    """Fly for six seconds, and record that with a message of each kind that such a run does not have, in many chunks."""
+    """Record a flight of six seconds in many chunks, with a message of each type that it does not publish itself."""
     flown = path.with_name("flown.mcap")
     fly(scenario_file.resolve(SCENARIO), flown, run_id="run")
     with RecordReader(flown) as reader, RecordWriter(path) as writer:
@@ -49,12 +49,12 @@ def write(path: Path) -> None:
 
 
 def payload(kind: type[msgspec.Struct], t_ns: int) -> bytes:
-    """Return a message of a kind with some value in each field."""
+    """Return an encoded message of a type with a value in each field."""
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     values = {field.name: _some(field.type) for field in info.fields}
     if kind in (Lidar, Depth):
-        values["ranges_m" if kind is Lidar else "depth_m"] = bytes(4 * 7 * 7)  # float32, of 7 rows and 7 columns
+        values["ranges_m" if kind is Lidar else "depth_m"] = bytes(4 * 7 * 7)  # float32, 7 rows and 7 columns
     return msgspec.msgpack.encode({**values, "t_ns": t_ns, "seq": 0})
 
 
@@ -76,6 +76,6 @@ def _some(info: inspect.Type) -> Any:
 
 
 def messages_on(run: Path, key: str) -> list[Any]:
-    """Return the messages of a key on the record of a run."""
+    """Return the messages on a key in the record of a run."""
     with RecordReader(run / "run.mcap") as reader:
         return [messages.decode(key, message.payload) for message in reader.messages({key})]

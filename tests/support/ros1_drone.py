@@ -1,4 +1,4 @@
-"""A drone's topics in ROS 1 without a graph, and subscribers that keep what is published."""
+"""A drone's ROS 1 topics without a ROS graph, and subscribers that keep the messages published."""
 
 from typing import Any, cast
 
@@ -25,7 +25,7 @@ def scenario() -> Scenario:
 
 
 class Subscriber:
-    """A subscriber that keeps what is published, as messages."""
+    """A subscriber that keeps the messages published on a topic."""
 
     def __init__(self, node: Ros1Node, topic: str) -> None:
         published = node.published[topic]
@@ -38,7 +38,7 @@ class Subscriber:
 
 
 class Drone:
-    """The topics of a drone, without a graph."""
+    """A drone's topics without a ROS graph; its commands are kept in `sent`."""
 
     def __init__(self) -> None:
         self.node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", print)

@@ -1,4 +1,4 @@
-"""A master of ROS 1 as small as it can be: who publishes what, who takes it."""
+"""A minimal ROS 1 master: it registers publishers, subscribers and services, and notifies subscribers."""
 
 import threading
 from collections import defaultdict
@@ -8,7 +8,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 
 class Graph:
-    """What a master knows; its methods are the master's API."""
+    """The registrations of a master; the methods are the master's API."""
 
     def __init__(self) -> None:
         self.publishers: dict[str, list[str]] = defaultdict(list)
@@ -56,7 +56,7 @@ class Graph:
 
 
 class Master:
-    """A graph that is served; `stop` and start it again on its port as a master that forgot everything."""
+    """A served graph; after `stop`, a new one on the same port acts as a master that has lost its registrations."""
 
     def __init__(self, port: int = 0) -> None:
         self.graph = Graph()
@@ -68,7 +68,6 @@ class Master:
         self._thread.start()
 
     def stop(self) -> None:
-        """Serve no more."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()

@@ -1,4 +1,4 @@
-"""Lines that a test says in the terminal, whatever pytest captures."""
+"""Printing of lines in the terminal during a test, bypassing pytest's capture."""
 
 from collections.abc import Iterable
 from typing import Any

@@ -1,11 +1,11 @@
-"""A drone that stands for half a second, and a fleet whose state does not stay finite."""
+"""A scenario of a drone that stands on the ground for half a second, and a fleet whose state diverges."""
 
 import pytest
 
 from zsim_world.fleet.fleet import DivergedError, Fleet
 
 GATE_NS = 20_000_000
-DIVERGED_NS = 5 * GATE_NS  # simulated time at which a diverging fleet ends
+DIVERGED_NS = 5 * GATE_NS  # simulated time at which the fleet diverges
 ONE = """
 name: one
 seed: 3
@@ -16,7 +16,7 @@ processes: {expect: []}
 
 
 def diverge(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every fleet diverge with drone d1, 0.12 s after its start."""
+    """Make every fleet report after 0.1 s that drone d1 diverged at 0.12 s."""
     advance = Fleet.advance
 
     def advance_or_diverge(fleet: Fleet) -> None:

@@ -1,7 +1,8 @@
-"""The two tiers of sightings over one truth: pictures with the detector, and the geometry of the world. No run, no keys.
+"""Comparison of the two tiers of sightings, rendered and geometric, over the same truth, without a run.
 
-Each picture has a truth of its own, drawn at random: one drone looks at two others, whose hats are anywhere in its
-picture. Both tiers get this truth at the same instant; each has its own random stream.
+The rendered tier draws pictures and runs the detector on them; the geometric tier is the world's. The truth of each
+picture is drawn at random: one drone looks at two others, whose hats are anywhere in its picture. Both tiers receive
+this truth at the same instant, and each has its own random stream.
 """
 
 import math
@@ -26,15 +27,15 @@ from zsim_world.physics import rays
 from zsim_world.sensors.sightings import SightingSampler
 
 Array = NDArray[np.float64]
-RATE_HZ = 10.0  # of the geometric tier's camera; a picture at every gate of 0.1 s
+RATE_HZ = 10.0  # rate of the geometric tier's camera: a picture at every gate of 0.1 s
 GATE_NS = 100_000_000
 OTHERS = 2
-HULL_M = 0.26  # m, radius of the AR.Drone's hull
-APART_RAD = 0.3  # rad between two hats, at least: no hull is before the other's hat
-ASSOCIATED_RAD = 0.04  # rad from a hat, within which a sighting is of it
-TILT_RAD = 0.06  # rad, standard deviation of roll and pitch
-FROM_ABOVE = (-0.35, -0.03)  # rise per metre from the camera to the hat: no hull is before its own drone's hat
-FROM_BELOW = (0.05, 0.25)  # 3 to 14 deg: its drone's rotors hide a part of it
+HULL_M = 0.26  # radius of the AR.Drone's hull
+APART_RAD = 0.3  # least angle between two hats, so that no hull hides the other drone's hat
+ASSOCIATED_RAD = 0.04  # greatest angle from a hat at which a sighting is associated with it
+TILT_RAD = 0.06  # standard deviation of roll and pitch
+FROM_ABOVE = (-0.35, -0.03)  # rise per metre from the camera to the hat: no hull hides its own drone's hat
+FROM_BELOW = (0.05, 0.25)  # 3 to 14 deg: the rotors of its drone hide a part of the hat
 SCENARIO = """
 name: tiers
 seed: 5
@@ -51,13 +52,13 @@ LENS, POSE = lens_of(FRONT), camera_pose(FRONT)
 
 
 class Condition(NamedTuple):
-    """Under which pictures are taken.
+    """Conditions under which pictures are taken.
 
     Attributes:
-        ranges_m: of the hats, from and to.
-        light: of a clear day.
-        rate_deg_s: of the body that carries the camera, about any axis.
-        rise: per metre from the camera to a hat, from and to.
+        ranges_m: least and greatest range of the hats.
+        light: light relative to a clear day.
+        rate_deg_s: angular rate of the drone that carries the camera, about a random axis.
+        rise: least and greatest rise per metre from the camera to a hat.
     """
 
     ranges_m: tuple[float, float]
@@ -67,13 +68,13 @@ class Condition(NamedTuple):
 
 
 class Tier(NamedTuple):
-    """What a tier made of M hats out of all that were in its pictures.
+    """Results of a tier, with M sighted hats.
 
     Attributes:
-        errors: to the side and down [rad], of the range over the range, (M, 3).
-        sigmas: what the tier said of them, direction [rad] and range over the range, (M, 2).
-        missed: of the hats, the share without a sighting.
-        false: sightings of nothing, per picture.
+        errors: errors of the direction, sideways and down [rad], and relative error of the range, (M, 3).
+        sigmas: standard deviations that the tier reports, of direction [rad] and relative range, (M, 2).
+        missed: share of the hats in the pictures without a sighting.
+        false: false sightings per picture.
     """
 
     errors: Array
@@ -82,37 +83,37 @@ class Tier(NamedTuple):
     false: float
 
     def spread(self, quantile: float) -> tuple[float, float]:
-        """Return the quantile of the absolute errors of bearing [rad] and range."""
+        """Return a quantile of the absolute errors of bearing [rad] and relative range."""
         size = np.abs(self.errors)
         return float(np.quantile(size[:, :2], quantile)), float(np.quantile(size[:, 2], quantile))
 
     def deviation(self) -> tuple[float, float]:
-        """Return the standard deviations of bearing [rad], per axis, and range."""
+        """Return the standard deviations of bearing [rad], per axis, and relative range."""
         return float(self.errors[:, :2].std()), float(self.errors[:, 2].std())
 
     def mean(self) -> Array:
-        """Return the mean errors, down [rad] and of the range."""
+        """Return the mean errors of the direction, down [rad], and of the relative range."""
         return self.errors[:, 1:].mean(axis=0)
 
     def bias(self) -> Array:
-        """Return the mean errors in their own standard deviations, (3,)."""
+        """Return the mean errors divided by their standard deviations, (3,)."""
         return self.errors.mean(axis=0) / self.errors.std(axis=0)
 
     def normalised(self) -> tuple[float, float]:
-        """Return the root mean square errors of bearing and range in what the tier says of them."""
+        """Return the root mean square errors of bearing and range, normalised by the reported standard deviations."""
         over = self.errors / self.sigmas[:, [0, 0, 1]]
         return float(np.sqrt((over[:, :2] ** 2).mean())), float(np.sqrt((over[:, 2] ** 2).mean()))
 
 
 class Tiers(NamedTuple):
-    """Both over the same truth."""
+    """Results of both tiers over the same truth."""
 
     rendered: Tier
     geometric: Tier
 
 
 class _Tally:
-    """Sorts a tier's sightings into hats and nothing."""
+    """Associates a tier's sightings with hats, and counts false ones."""
 
     def __init__(self) -> None:
         self._rows: list[list[float]] = []
@@ -148,7 +149,7 @@ def _row(seen: Seen, hat: Look) -> list[float]:
 
 
 def measured(condition: Condition, pictures: int, seed: int = 3) -> Tiers:
-    """Return what both tiers make of so many pictures."""
+    """Return the results of both tiers over a number of pictures."""
     rng = np.random.default_rng(seed)
     drawn = renderer(FRONT, scene(1 + OTHERS, light=condition.light))
     detector = HatDetector(LENS, POSE, HATS.diameter_m)
@@ -166,13 +167,13 @@ def measured(condition: Condition, pictures: int, seed: int = 3) -> Tiers:
 
 
 def state_of(where: DroneStates) -> Array:
-    """Return the rows that the world has of drones."""
+    """Return the drones' states as rows of the world."""
     return np.hstack([where.p_WB, where.v_WB, where.q_WB, where.w_WB_B])
 
 
 @cache
 def scenario(light: float) -> Scenario:
-    """Return a scenario with sightings as they are by default."""
+    """Return a scenario with sightings at their default settings."""
     with TemporaryDirectory() as folder:
         place = Path(folder) / "tiers.yaml"
         place.write_text(SCENARIO.format(rate_hz=RATE_HZ, light=light))
@@ -180,7 +181,7 @@ def scenario(light: float) -> Scenario:
 
 
 def looks(condition: Condition, rng: np.random.Generator) -> list[Look]:
-    """Return the hats that one drone has in its picture, wholly or in part; all have the same drones."""
+    """Return the hats that are wholly or partly in one drone's picture; all share the same drones."""
     attitudes = [[*rng.normal(0, TILT_RAD, 2), rng.uniform(-math.pi, math.pi)] for _ in range(1 + OTHERS)]
     R_WB, *R_WD = (rotation_matrix(quaternion_from_rpy(np.array(each))) for each in attitudes)
     p = np.array([*rng.uniform(-20, 20, 2), rng.uniform(6, 9)])
@@ -197,7 +198,7 @@ def looks(condition: Condition, rng: np.random.Generator) -> list[Look]:
 
 
 def _directions(R_WB: Array, rise: tuple[float, float], rng: np.random.Generator) -> list[Array]:
-    """Return directions in B to hats anywhere in the picture that rise so much, apart from each other."""
+    """Return directions in B to hats anywhere in the picture, with the given rise and at least APART_RAD apart."""
     found: list[Array] = []
     while len(found) < OTHERS:
         u, v = rng.uniform(0, LENS.width), rng.uniform(0, LENS.height)

@@ -1,4 +1,4 @@
-"""A world of a few drones that expects no process, and what tests read of it."""
+"""A world of a few drones that expects no process, and the events that it publishes."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ GATE_NS = 20_000_000
 
 
 def small_world(mode: str = "lockstep", drones: int = 1, processes: Any = None, **fields: Any) -> World:
-    """Return the world of run `run1` with drones d1, d2, … 5 m apart; `processes` and `fields` are of the scenario."""
+    """Return the world of run `run1` with drones d1, d2, … 5 m apart; `processes` and `fields` go into the scenario."""
     placed = [{"name": f"d{k + 1}", "position_m": [5 * k, 0, 0]} for k in range(drones)]
     expecting = {"expect": [], **(processes or {})}
     return World(
@@ -22,6 +22,6 @@ def small_world(mode: str = "lockstep", drones: int = 1, processes: Any = None, 
 
 
 def events_of(world: Coordinator, *kinds: str) -> list[Event]:
-    """Take the outbox; return its events, of some kinds or all."""
+    """Empty the outbox; return its events, of all kinds unless some are given."""
     events = [message for _, message in world.take_outbox() if isinstance(message, Event)]
     return [event for event in events if not kinds or event.kind in kinds]

@@ -1,4 +1,4 @@
-"""Rows of sweeps that were never flown, their errors being a function of the run."""
+"""Synthetic rows of sweeps, whose errors are a function of the run's number."""
 
 import io
 from typing import Any
@@ -17,7 +17,7 @@ def plan(*vary: str, runs: int = 1, **values: Any) -> SweepPlan:
 
 
 def made(of: SweepPlan, run: int, failure: str | None = None, **known: Any) -> Row:
-    """Return a row as a flight would make it, its errors being a function of the run."""
+    """Return a row as a flight would, with errors that are a function of the run's number."""
     design = SweepDesign(of)
     values = design.values(run)
     result = RunResult(run=run, point=design.point(run), seed=values.get("seed", 1), failure=failure, host="h", **known)
@@ -32,7 +32,7 @@ def well(of: SweepPlan, run: int) -> Row:
 
 
 def printed(renderable: Any, width: int) -> str:
-    """Return what a terminal of so many columns shows."""
+    """Return what a terminal with `width` columns shows."""
     file = io.StringIO()
     Console(file=file, width=width).print(renderable)
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""Cameras that nobody renders: JPEGs whose content a test knows, and the messages about them, on a client's keys."""
+"""Cameras without a renderer: JPEGs of known content and their messages, published by a client."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -15,12 +15,12 @@ from zsim.sensors.camera_model import CameraPose, Lens, camera_matrix, camera_po
 
 SETTINGS: dict[str, Camera] = {"front": FrontCamera(), "bottom": BottomCamera()}
 SKY, GROUND, HAT = (235, 190, 130), (96, 138, 104), (200, 0, 220)  # blue, green, red
-HAT_B = (6.0, 0.8, 0.5)  # m, from the front camera
-NUMBER_BITS = 8  # of a picture's number, as black and white squares in its lower left corner
+HAT_B = (6.0, 0.8, 0.5)  # m, position of a ball relative to the front camera, in B
+NUMBER_BITS = 8  # bits of a picture's number, shown as black and white squares in its lower left corner
 
 
 def info_of(name: str) -> CameraInfo:
-    """Return what a camera says of itself."""
+    """Return the calibration message of a camera."""
     camera = SETTINGS[name]
     lens, pose = lens_of(camera), camera_pose(camera)
     K: Any = tuple(camera_matrix(lens).ravel().tolist())
@@ -34,7 +34,7 @@ def info_of(name: str) -> CameraInfo:
 
 
 def projected(name: str, direction_B: Sequence[float]) -> tuple[float, float]:
-    """Return the pixel of a direction."""
+    """Return the pixel of a direction in B."""
     lens: Lens = lens_of(SETTINGS[name])
     pose: CameraPose = camera_pose(SETTINGS[name])
     x, y, z = np.array(pose.R_BK).T @ np.array(direction_B)
@@ -62,7 +62,7 @@ def picture(name: str, number: int) -> bytes:
 
 
 def image_message(name: str, number: int, data: bytes, t_ns: int) -> CameraImage:
-    """Return a picture's message."""
+    """Return the message of a picture."""
     camera = SETTINGS[name]
     return CameraImage(
         t_ns=t_ns, seq=number, t_sample_ns=t_ns, source="camera.test", width=camera.width_px, height=camera.height_px,
@@ -71,7 +71,7 @@ def image_message(name: str, number: int, data: bytes, t_ns: int) -> CameraImage
 
 
 def sightings_message(number: int, t_ns: int) -> Sightings:
-    """Return that the ball was found."""
+    """Return the message that the ball was found."""
     distance_m = float(np.linalg.norm(HAT_B))
     direction: Any = tuple((np.array(HAT_B) / distance_m).tolist())
     seen = Seen(direction_B=direction, range_m=distance_m, sigma_direction_rad=0.005, sigma_range_m=0.2)
@@ -80,7 +80,7 @@ def sightings_message(number: int, t_ns: int) -> Sightings:
 
 @contextmanager
 def published(client: Any, drones: Sequence[str], rate_hz: float = 10.0, seen_by: Sequence[str] = ()) -> Iterator[None]:
-    """Publish both cameras of drones meanwhile, again and again, and what was seen by some of them."""
+    """Publish both cameras' pictures of drones, and the sightings of the drones `seen_by`, until the block ends."""
     made = {name: [picture(name, number) for number in range(2**NUMBER_BITS)] for name in SETTINGS}
     numbers = itertools.count(1)
 

@@ -1,4 +1,4 @@
-"""A flight with known truth and its sensors, independent of the simulator's world: to test estimators."""
+"""Flights with known truth and their sensor readings, independent of the simulated world, for tests of estimators."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from zsim_agents.estimation.estimator_bank import EstimatorBank
 Array = NDArray[np.float64]
 
 GATE_S = 0.02  # s
-GRAVITY = np.array([0.0, 0.0, 9.80665])  # m/s^2, what a body at rest feels
-DRAG = 0.58  # 1/s, 0.249 N/(m/s) on 0.429 kg
+GRAVITY = np.array([0.0, 0.0, 9.80665])  # m/s^2, specific force on a body at rest
+DRAG = 0.58  # 1/s: 0.249 N/(m/s) divided by 0.429 kg
 STEP_S = 1e-3  # s, of central differences
-GUST_S = 8.0  # s, over which the drone begins to move
-CLIMB_S = 20.0  # s
-HEIGHT_M = 15.0  # m
+GUST_S = 8.0  # s, time over which drift and wind build up
+CLIMB_S = 20.0  # s, duration of the climb
+HEIGHT_M = 15.0  # m, height after the climb
 
 
 def scenario(preset: str = "paper", **sections: Any) -> Scenario:
-    """Return a scenario of one drone; `sensors` and other sections are merged in."""
+    """Return a scenario of one drone, with `sensors`, `yaw_deg` and other sections set."""
     sensors = {"preset": preset, **sections.pop("sensors", {})}
     drone = {"name": "drone1", "position_m": [0.0, 0.0, 0.0], "yaw_deg": sections.pop("yaw_deg", 30.0)}
     return scenario_file.resolve(
@@ -41,7 +41,7 @@ def scenario(preset: str = "paper", **sections: Any) -> Scenario:
 
 
 class Reading(NamedTuple):
-    """What a sensor measured, in the order of `message`."""
+    """A measurement of a sensor; `values` are in the order that `message` expects."""
 
     t_s: float
     sensor: str
@@ -69,28 +69,28 @@ def message(reading: Reading) -> Any:
 
 
 def seconds(t_s: float) -> float:
-    """Return an instant as an estimator gets it, which counts nanoseconds."""
+    """Return an instant [s] rounded to whole nanoseconds, as an estimator receives it."""
     return round(t_s * 1e9) * 1e-9
 
 
 def feed(bank: EstimatorBank, i: int, reading: Reading) -> None:
-    """Hand one reading to a bank."""
+    """Pass a reading of drone `i` to a bank."""
     bank.receive(i, reading.sensor, message(reading), seconds(reading.t_s))
 
 
 class OneDrone:
-    """The estimator that flies, of a scenario's first drone."""
+    """The estimator of a scenario's first drone."""
 
     def __init__(self, of: Scenario) -> None:
         self.bank = EstimatorBank(of.drones[:1], of.environment, of.estimation, GATE_S)
         self.warm_start = partial(self.bank.warm_start, 0)
 
     def feed(self, reading: Reading) -> None:
-        """Hand one reading to it."""
+        """Pass a reading to the estimator."""
         feed(self.bank, 0, reading)
 
     def close(self, t_s: float) -> StateEstimate:
-        """Return the estimate for the end of a gate."""
+        """Return the estimate at the end of a gate."""
         return self.bank.estimate(seconds(t_s))[0]
 
 
@@ -100,12 +100,12 @@ def estimator(of: Scenario) -> OneDrone:
 
 
 class Flight:
-    """Stand at (1, 2, 0) m until `start_s`, then climb to 15 m and drift in sums of sines.
+    """A flight that stands at (1, 2, 0) m until `start_s`, then climbs to 15 m and drifts in sums of sines.
 
     Args:
-        seed: of the drift and the steady wind.
-        start_s: instant of the start [s].
-        yaw_rate: of the flight [rad/s].
+        seed: seed of the drift and the steady wind.
+        start_s: time of the start [s].
+        yaw_rate: yaw rate in flight [rad/s].
         accel: standard deviation of the horizontal acceleration [m/s^2].
     """
 
@@ -134,7 +134,7 @@ class Flight:
         return (around - 2.0 * self.position(t)) / STEP_S**2
 
     def attitude(self, t: Array) -> Array:
-        """R_WB (n, 3, 3): what is not thrust is gravity and drag in the wind."""
+        """R_WB (n, 3, 3), whose z axis is along the thrust that balances acceleration, gravity and drag in the wind."""
         begun = self._ramp(t, GUST_S)[:, None]
         thrust = self.acceleration(t) + GRAVITY + begun * DRAG * (self.velocity(t) - self._wind)
         z = thrust / np.linalg.norm(thrust, axis=1)[:, None]
@@ -160,20 +160,20 @@ class Flight:
         return self.position(t) + R @ p_BS, self.velocity(t) + swing
 
     def specific_force(self, t: Array, p_BS: Array) -> Array:
-        """What an accelerometer at p_BS feels, in B (n, 3)."""
+        """Specific force on an accelerometer at p_BS, in B (n, 3)."""
         w = self.rate(t)
         alpha = (self.rate(t + STEP_S) - self.rate(t - STEP_S)) / (2.0 * STEP_S)
         f = np.einsum("nji,nj->ni", self.attitude(t), self.acceleration(t) + GRAVITY)
         return f + np.cross(alpha, p_BS) + np.cross(w, np.cross(w, p_BS))
 
     def _ramp(self, t: Array, span_s: float) -> Array:
-        """Rise from 0 to 1 from the start on, three times differentiable."""
+        """Rise from 0 to 1 over `span_s` from the start, three times differentiable."""
         u = np.clip((t - self.start_s) / span_s, 0.0, 1.0)
         return u**4 * (35.0 - 84.0 * u + 70.0 * u**2 - 20.0 * u**3)
 
 
 class Circle(Flight):
-    """Stand until `start_s`, then fly at 2 m/s on a circle of 5 m, and climb; arguments as of `Flight`."""
+    """A flight that stands until `start_s`, then climbs on a circle of 5 m at 2 m/s; arguments as for `Flight`."""
 
     RADIUS_M, SPEED_M_S, BEGIN_S = 5.0, 2.0, 4.0
 
@@ -195,7 +195,7 @@ def readings(flight: Flight, of: Scenario, seed: int, end_s: float) -> list[Read
 def fly(
     core: OneDrone, coming: Iterable[Reading], end_s: float, from_s: float = 0.0
 ) -> list[tuple[float, StateEstimate]]:
-    """Feed an estimator gate by gate from `from_s` on and return its estimate of each gate."""
+    """Feed an estimator gate by gate from `from_s` on; return time and estimate of each gate."""
     rest = [r for r in coming if r.t_s > from_s + 1e-9]
     estimates, k = [], 0
     for gate in range(round(from_s / GATE_S) + 1, round(end_s / GATE_S) + 1):
@@ -219,14 +219,14 @@ def _readings_of(name: str, flight: Flight, of: Scenario, seed: int, end_s: floa
 
 
 def _noisy(truth: Array, error: ErrorModel, rate_hz: float, rng: np.random.Generator) -> list[Any]:
-    """Return readings of a channel, (n, axes): bias, its walk, white and Gauss-Markov noise, rounding."""
+    """Return readings of a channel, (n, axes), with bias, bias walk, white and Gauss-Markov noise, and rounding."""
     bias = error.bias * rng.standard_normal(truth.shape[1])
     walk = error.bias_walk / math.sqrt(rate_hz) * np.cumsum(rng.standard_normal(truth.shape), 0)
     white = error.white_sigma(rate_hz) * rng.standard_normal(truth.shape)
     z = truth + bias + walk + white
     if error.correlated_sigma:
         decay, kicks = math.exp(-1.0 / rate_hz / error.correlation_time_s), rng.standard_normal(truth.shape)
-        kicks[1:] *= math.sqrt(1.0 - decay**2)  # the first is the stationary one
+        kicks[1:] *= math.sqrt(1.0 - decay**2)  # the first is drawn from the stationary distribution
         z += error.correlated_sigma * np.asarray(lfilter([1.0], [1.0, -decay], kicks, axis=0))
     return (z if error.quantum == 0.0 else np.round(z / error.quantum) * error.quantum).tolist()
 

@@ -1,4 +1,4 @@
-"""Pictures and calibrations as a camera of drone d1 publishes them, made without a renderer."""
+"""Pictures, calibrations and sightings of a camera of drone d1, generated without a renderer."""
 
 from functools import cache
 
@@ -15,14 +15,14 @@ NO_JPEG = b"GIF89a, which is no JPEG"
 
 @cache
 def jpeg(shade: int = 128, width: int = WIDTH_PX, height: int = HEIGHT_PX) -> bytes:
-    """Return a picture of one shade of grey, 0 to 255."""
+    """Return a JPEG of one shade of grey, 0 to 255."""
     done, data = cv2.imencode(".jpg", np.full((height, width, 3), shade, np.uint8))
     assert done
     return data.tobytes()
 
 
 def image(t_ns: int, seq: int = 0, data: bytes | None = None, source: str = "camera.d1") -> CameraImage:
-    """Return a picture that was exposed 4 ms before its publication."""
+    """Return the message of a picture exposed 4 ms before its publication."""
     exposed_ns = max(0, t_ns - 4_000_000)
     picture = jpeg() if data is None else data
     return CameraImage(t_ns, seq, t_sample_ns=exposed_ns, source=source, width=WIDTH_PX, height=HEIGHT_PX, data=picture)
@@ -45,6 +45,6 @@ def info(t_ns: int = 0, seq: int = 0, source: str = "camera.d1") -> CameraInfo:
 
 
 def sightings(t_ns: int, seq: int = 0, hats: int = 2, source: str = "detector.d1") -> Sightings:
-    """Return what a detector saw: hats ahead, each farther than the one before."""
+    """Return a detector's sightings: hats ahead, each 1 m farther than the one before."""
     seen = tuple(Seen((1.0, 0.0, 0.0), 4.0 + hat, 0.01, 0.2) for hat in range(hats))
     return Sightings(t_ns, seq, t_sample_ns=max(0, t_ns - 4_000_000), source=source, camera="front", seen=seen)

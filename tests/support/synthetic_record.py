@@ -1,4 +1,4 @@
-"""Writes records of flights that never were, with errors known in closed form."""
+"""Records of synthetic flights, with errors known in closed form."""
 
 import math
 import pickle
@@ -21,19 +21,19 @@ from zsim_analysis.reading.recorded_flight import FlightReader, RecordedFlight
 GATE_NS = 20_000_000
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 Entries = Iterable[tuple[str, Any, int]]
-"""Key, message and wall time of all that a run puts on the wire."""
+"""Key, message and wall time [ns] of all messages of a run."""
 
 
 @dataclass
 class Flown:
-    """A synthetic flight of a cluster along its desired values.
+    """A synthetic flight in which a cluster follows its desired values.
 
     Attributes:
         duration_s: last instant.
-        amplitude: (4n,) amplitude of the true error, a sine of `period_s`.
+        amplitude: (4n,) amplitude of the true error, a sine with period `period_s`.
         offset: (4n,) mean of the true error.
         est_amplitude: (4n,) amplitude of estimate − desired, the same sine.
-        other_traffic: also write sensors, estimates and commands, as a real run does.
+        other_traffic: whether to include sensors, estimates and commands, as in a real run.
     """
 
     duration_s: float = 30.0
@@ -56,14 +56,14 @@ def write(path: Path, flown: Flown) -> None:
 
 
 def record(path: Path, entries: Entries) -> None:
-    """Write the record of messages."""
+    """Write a record of messages."""
     with RecordWriter(path) as writer:
         for key, message, wall_ns in entries:
             writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
 
 
 def flight(entries: Entries, answers: bool = False) -> RecordedFlight:
-    """Return the flight of messages, with estimates and commands if these are wanted."""
+    """Return the flight read from messages; with `answers`, including estimates and commands."""
     reader = FlightReader(answers)
     for key, message, wall_ns in entries:
         reader.add_message(key, message, wall_ns)
@@ -71,7 +71,7 @@ def flight(entries: Entries, answers: bool = False) -> RecordedFlight:
 
 
 def traffic(flown: Flown) -> Iterator[tuple[str, Message, int]]:
-    """Yield key, message and wall time of everything that a run puts on the wire."""
+    """Yield key, message and wall time [ns] of all messages of a flight."""
     yield from _flight(pickle.dumps(replace(flown, end=None, events=())))
     last = round(flown.duration_s * 1e9) // GATE_NS
     for event in flown.events:
@@ -83,7 +83,7 @@ def traffic(flown: Flown) -> Iterator[tuple[str, Message, int]]:
 
 @lru_cache(maxsize=4)
 def _flight(pickled: bytes) -> list[tuple[str, Message, int]]:
-    """Return what is on the wire without events; many tests fly alike."""
+    """Return a flight's messages except events; cached because many tests use the same flight."""
     flown = pickle.loads(pickled)
     scenario = scenario_file.load(SCENARIOS / f"{flown.scenario}.yaml", flown.overrides)
     entries: list[tuple[str, Message, int]] = [(keys.INFO, info(scenario), 0)]
@@ -124,7 +124,7 @@ def info(scenario) -> messages.Info:
 
 
 def desired_at(flown: Flown, t_s: float) -> np.ndarray:
-    """Return c_des (12,) of the paper's tests; a climb at the start if there is one."""
+    """Return c_des (12,) of the paper's tests, which begins with a climb if `climb_s` is not 0."""
     rise = min(1.0, t_s / flown.climb_s) if flown.climb_s else 1.0
     if flown.scenario == "step":
         return np.array([5, -5, 15 * rise, 0, 0, math.pi / 2, 0, 0, 0, 4, 4, math.pi / 4])
@@ -182,7 +182,7 @@ def _truth(t_ns: int, seq: int, p_W: np.ndarray, yaw: float) -> flight_messages.
 
 
 def _sensors(name: str, t_ns: int, k: int, rng: np.random.Generator) -> Iterator[tuple[str, Message]]:
-    """Yield 200 Hz of IMU and 25 Hz of the slow sensors, about as many messages as a real run has."""
+    """Yield IMU samples at 200 Hz and samples of slow sensors at 25 Hz, about as many as in a real run."""
     for part in range(4):
         a, b, c, d, e, f = rng.standard_normal(6).tolist()
         yield keys.sensor(name, "imu"), messages.Imu(t_ns, 4 * k + part, t_ns, (a, b, c), (d, e, f))

@@ -1,4 +1,4 @@
-"""A drone's parameters as the world's kernel has them."""
+"""A drone's parameters in the form of the world's compiled kernel."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from zsim_world.physics.fleet_arrays import PerRotor, rotor_row, vehicle_row
 
 
 def rows_of(scenario: Any, i: int = 0) -> tuple[NDArray[np.float64], PerRotor]:
-    """Return the parameters of a scenario's drone, and those of its rotors."""
+    """Return the parameters of a scenario's drone `i`, and those of its rotors."""
     drone = scenario.drones[i]
     vehicle = vehicle_of(drone.model)
     count = len(vehicle.rotors)
@@ -20,12 +20,12 @@ def rows_of(scenario: Any, i: int = 0) -> tuple[NDArray[np.float64], PerRotor]:
 
 
 def one_drone(**drone: Any) -> tuple[NDArray[np.float64], PerRotor]:
-    """Return the parameters of a drone that is like this, and those of its rotors."""
+    """Return the parameters of a drone with the given fields, and those of its rotors."""
     drones = [{"name": "a", "position_m": [0, 0, 0], **drone}]
     return rows_of(resolve({"name": "t", "duration_s": 1, "drones": drones}))
 
 
 def per_rotor(numbers: Any) -> PerRotor:
-    """Return one group of numbers per rotor."""
+    """Return groups of numbers, one for each rotor."""
     held = np.array(numbers, dtype=float)
     return PerRotor(held, 0, 1, tuple(range(len(held))))

@@ -1,4 +1,4 @@
-"""Fixtures of the tests that start processes."""
+"""Fixtures for tests that start processes."""
 
 import pytest
 from chromium import browser
@@ -9,7 +9,7 @@ from lab import lab
 from near_worker import near
 
 from zsim_api.pytest_plugin import Federations
-from zsim_api.pytest_plugin import federation as users_federation  # as users have it; ours starts single commands, too
+from zsim_api.pytest_plugin import federation as users_federation  # the users'; the tests' own starts single commands
 
 __all__ = [
     "browser",
@@ -28,5 +28,5 @@ __all__ += ["users_federation"]
 
 @pytest.fixture
 def flights(users_federation: Federations, forked: None) -> Federations:
-    """The fixture `federation` of the plugin; its `zsim` commands are forked."""
+    """Return the plugin's fixture `federation`, with its `zsim` commands forked."""
     return users_federation

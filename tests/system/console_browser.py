@@ -1,4 +1,4 @@
-"""Pages of the console in a real browser, and all that they request."""
+"""Pages of the console in a real browser, and their requests."""
 
 import io
 import math
@@ -14,16 +14,16 @@ import pytest
 from federation import Federation, Role, free_port
 from wire import PATIENCE_S
 
-VIEWPORT = {"width": 860, "height": 420}  # pictures without a graphics card take long
+VIEWPORT = {"width": 860, "height": 420}  # small, because drawing without a graphics card is slow
 SCREENS = ({"width": 1600, "height": 1000}, {"width": 1280, "height": 720}, {"width": 390, "height": 844})
 FOLDERS = ("Trajectory", "Any fault", "Other variables")
-TABLES = ("Drones", "Events")  # panels that are folded on a phone
+TABLES = ("Drones", "Events")  # tabs of the panel that is folded on a phone
 IN_SIGHT = """() => ['land', 'emergency'].every(name => {
   const button = document.querySelector('#zsim-head button.' + name), box = button.getBoundingClientRect();
   const inside = box.left >= 0 && box.top >= 0 && box.right <= innerWidth && box.bottom <= innerHeight;
   return inside && document.elementFromPoint(box.x + box.width / 2, box.y + box.height / 2) === button;
 })"""
-FRAME_MS = 1000  # from one frame of a scene that nobody looks at to the next
+FRAME_MS = 1000  # interval between frames of a scene that is not drawn
 UNDRAWN_JS = f"""(() => {{
   for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"])
     WebGL2RenderingContext.prototype[name] = () => {{}};
@@ -38,15 +38,15 @@ UNDRAWN_JS = f"""(() => {{
   }};
   window.cancelAnimationFrame = id => {{ cancel(id); clearTimeout(waiting.get(id)); waiting.delete(id); }};
 }})();"""
-"""Draws no scene, and slows down what asks for frame after frame: all that costs most without a graphics card."""
-POLL_MS = 100  # between two looks at what a page shows
+"""Disables drawing of the scene and slows down animation loops, the greatest costs without a graphics card."""
+POLL_MS = 100  # interval at which a page's state is polled
 PATIENCE_MS = 1000 * PATIENCE_S
-PICTURES = os.environ.get("ZSIM_TEST_PICTURES")  # a folder for pictures of pages, for people to look at
-HOLD_MS = 600  # of orders.html: as long a button of an emergency or a take-over is held down
+PICTURES = os.environ.get("ZSIM_TEST_PICTURES")  # folder for screenshots of pages, for visual inspection
+HOLD_MS = 600  # time for which a button of an emergency or a takeover must be held down, from orders.html
 
 
 class BrowserPage:
-    """A page of the console, and all that it requested for."""
+    """A page of the console, its requests and its script errors."""
 
     def __init__(self, page: Any, address: str) -> None:
         self.page = page
@@ -63,7 +63,7 @@ class BrowserPage:
 
     @contextmanager
     def held(self, selector: str) -> Iterator[None]:
-        """Hold a button down by the mouse while a block waits for what comes of it."""
+        """Hold a button down with the mouse during the block."""
         self.page.locator(selector).hover()
         self.page.mouse.down()
         try:
@@ -80,25 +80,25 @@ class BrowserPage:
         wanted.click()
 
     def _unfold(self, tab: Any) -> None:
-        """Open the panel of tables, where it is folded."""
+        """Unfold the panel of tables if it is folded."""
         row = self.page.get_by_label("Expand panel Drones")
         row.or_(tab).first.wait_for(state="attached")
         if row.is_visible():
             row.click()
 
     def open_folders(self) -> None:
-        """Open the folders of the tab that is shown."""
+        """Open the folders of the visible tab."""
         for name in FOLDERS:
             folder = self.page.get_by_text(name, exact=True).first
             if folder.is_visible() and folder.locator(".tabler-icon-chevron-down").count():
                 folder.click()
 
     def close_notice(self) -> None:
-        """Close viser's notice of software WebGL, of a browser without a graphics card."""
+        """Close viser's notice of software WebGL, which it shows without a graphics card."""
         self.page.locator(".mantine-Notification-closeButton").click()
 
     def wait_for_notice(self) -> None:
-        """Wait until viser's notice of software WebGL is there."""
+        """Wait until viser's notice of software WebGL appears."""
         self.page.locator(".mantine-Notification-closeButton").wait_for()
 
     def wait_for_text(self, text: str) -> None:
@@ -106,11 +106,11 @@ class BrowserPage:
         self.page.get_by_text(text).first.wait_for()
 
     def state(self) -> dict[str, Any]:
-        """Return what the page shows, as the page itself reads it."""
+        """Return the state that the page shows, from the address that the page reads it from."""
         return self.page.evaluate("fetch(location.pathname.replace(/\\/$/, '') + '/state').then(r => r.json())")
 
     def until(self, condition: str) -> dict[str, Any]:
-        """Wait until a condition (JavaScript) holds of the state `s`; return the state."""
+        """Wait until a condition (JavaScript) on the state `s` holds; return the state."""
         there = f"(() => {{ try {{ return {condition}; }} catch {{ return false; }} }})()"  # it may show no run yet
         look = f"async () => {{ const s = await (await fetch('/state')).json(); return [{there}, s]; }}"
         until_s = time.monotonic() + PATIENCE_S
@@ -122,14 +122,14 @@ class BrowserPage:
             self.page.wait_for_timeout(POLL_MS)
 
     def until_ground(self, is_so: Callable[[float, float], bool]) -> None:
-        """Wait until a condition holds of what `ground` returns."""
+        """Wait until a condition on the result of `ground` holds."""
         until_s, found = time.monotonic() + PATIENCE_S, (math.nan, math.nan)
         while not is_so(*found):
             assert time.monotonic() < until_s, f"the ground is of lightness and deviation {found}"
             found = self.ground()
 
     def ground(self) -> tuple[float, float]:
-        """Return the mean lightness, from 0 to 1, and its deviation at the scene's foot, where the ground is."""
+        """Return the mean lightness, from 0 to 1, and its deviation in the lowest part of the scene, the ground."""
         image = pytest.importorskip("PIL.Image")
         box = self.page.locator("canvas[data-engine]").bounding_box()
         clip = {**box, "y": box["y"] + 0.85 * box["height"], "height": 0.12 * box["height"]}
@@ -137,14 +137,14 @@ class BrowserPage:
         return float(light.mean()), float(light.std())
 
     def outside(self) -> set[str]:
-        """Return the hosts that it requested for something, beside this machine."""
+        """Return the hosts other than this machine to which it has sent requests."""
         urls = (urlsplit(url) for url in self.requested)
         return {str(url.hostname) for url in urls if url.scheme not in ("data", "blob")} - {"127.0.0.1"}
 
 
 @contextmanager
 def opening(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
-    """Open an address in a browser of its own, with cookies of its own; the scene is there, but drawn only if `drawn`."""
+    """Yield a function that opens an address with cookies of its own; the scene is drawn only if `drawn`."""
     with ExitStack() as stack:
 
         def open_it(address: str, viewport: dict[str, int] = VIEWPORT, drawn: bool = False) -> BrowserPage:
@@ -164,7 +164,7 @@ def opened(browser: Any) -> Iterator[Callable[..., BrowserPage]]:
 
 
 def console(federation: Federation, *options: str) -> tuple[Role, dict[str, str]]:
-    """Start a console; return it with its links."""
+    """Start a console; return it and its links to steer and to look."""
     role = federation.role("console", "--port", str(free_port()), *options)
     steer = role.line("steer at").text.rpartition(" ")[2]
     return role, {"steer": steer, "look": role.line("watch only").text.rpartition(" ")[2]}

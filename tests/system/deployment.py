@@ -1,4 +1,4 @@
-"""Three hosts, certificates for them, and the `zsim` commands of somebody who flies Test 1 on them."""
+"""Three hosts, their certificates, and the `zsim` commands of a user who flies Test 1 on them."""
 
 import json
 import os
@@ -24,14 +24,14 @@ from zsim_analysis.in_process import fly
 STEP = ROOT / "scenarios" / "step.yaml"
 ROLES = {"world": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2", "h3"]}
 FAKETIME = next(map(str, Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1")), None)
-START_S = 120.0  # wall time until something of a run is seen on a machine that does other things too
-NAMED_AFTER_S = 2.0  # a host that is cut off for longer is named
-DISK_BYTES = 1_500_000  # room for what a host needs and a few seconds of a record
-GONE_S = 120.0  # wall time within which nobody may be left on any host after its launcher is gone
+START_S = 120.0  # greatest wall time until a run has started, on a busy machine
+NAMED_AFTER_S = 2.0  # wall time after which a cut-off host is reported
+DISK_BYTES = 1_500_000  # enough for a host's files and a few seconds of a record
+GONE_S = 120.0  # wall time within which all processes must have ended on every host once their launcher is gone
 
 
 class Deployment:
-    """One lab with certificates, and the `zsim` commands that run in its launcher's namespace."""
+    """A lab, with certificates if it is secure, and the `zsim` commands that run in its launcher's namespace."""
 
     def __init__(
         self, lab: Lab, roles: dict[str, Any], secure: bool = True, scenario: Path = STEP, **more: Any
@@ -47,13 +47,13 @@ class Deployment:
             self.here("certs", "init", self.hosts, "--scenario", str(scenario))
 
     def zsim(self, *arguments: str, prefix: tuple[str, ...] = ()) -> Role:
-        """Start a command where the launcher is."""
+        """Start a command in the launcher's namespace."""
         role = Role(list(arguments), (*self.lab.prefix(LAUNCHER), *prefix), self._env)
         self._roles.append(role)
         return role
 
     def here(self, *arguments: str) -> str:
-        """Run to its end, in this process, a command that asks the launcher alone; return what it prints."""
+        """Run a command that contacts only the launcher to its end in this process; return its output."""
         with pytest.MonkeyPatch.context() as patch:
             for name, value in self._env.items():
                 patch.setenv(name, value)
@@ -67,7 +67,7 @@ class Deployment:
         return self.zsim("up", str(self.scenario), *where, "--no-report", *options, prefix=prefix)
 
     def cut(self, name: str) -> float:
-        """Cut a host off; return the wall time."""
+        """Cut off a host; return the wall time (monotonic) [s]."""
         self.lab.cut(name)
         self.cut_off.add(name)
         return time.monotonic()
@@ -81,37 +81,37 @@ class Deployment:
         return {row["role"]: row for row in json.loads(self.here("ps", "--json"))["rows"]}
 
     def until_states(self, wanted: Callable[[dict[str, str]], bool]) -> None:
-        """Ask for the roles' states until they are as wanted."""
+        """Poll the states of the roles until a condition on them holds."""
         until_s = time.monotonic() + START_S
         while not wanted(states := {role: row["state"] for role, row in self.ps().items()}):
             assert time.monotonic() < until_s, states
-            threading.Event().wait(0.05)  # the launcher tells who asks, and nobody else
+            threading.Event().wait(0.05)  # the launcher answers requests, but announces no changes
 
     def kill(self, role: str, number: int = signal.SIGKILL) -> None:
-        """Send a role a signal, once it runs: the newest of its processes where it is being moved."""
+        """Send a signal to a role once it runs; to the latest of its processes while it is being moved."""
         until_s = time.monotonic() + START_S
         while not (pids := self._pids(role)):
             assert time.monotonic() < until_s, f"{role} runs on no host"
-            threading.Event().wait(0.05)  # nothing tells of the start of another's process
+            threading.Event().wait(0.05)  # the start of a process that is not a child cannot be awaited
         os.kill(max(pids), number)
 
     def _pids(self, role: str) -> list[int]:
         lines = [line for host in self.lab.names for line in self.lab.processes(host).items()]
-        own = re.compile(rf"\S*python\S* .*/{re.escape(role)}( |$)")  # its certificate's folder
+        own = re.compile(rf"\S*python\S* .*/{re.escape(role)}( |$)")  # the path of its certificates
         return [pid for pid, line in lines if own.match(line)]
 
     def record(self) -> Record:
-        """Return what was recorded; a record that was cut is mended first."""
+        """Return the record of the run, after repairing it if it is truncated."""
         path = self.out / "run.mcap"
         repair(path)
         return Record(self._stack.enter_context(RecordReader(path)))
 
     def nobody_left(self) -> None:
-        """Wait until no process of zsim's is on any host; fail if one stays."""
+        """Wait until no process of zsim runs on any host; fail if one remains."""
         until_s = time.monotonic() + GONE_S
         while left := {name: found for name in self.lab.names if (found := self.lab.processes(name))}:
             assert time.monotonic() < until_s, left
-            threading.Event().wait(0.05)  # nothing tells of the end of another's process
+            threading.Event().wait(0.05)  # the processes are not known in advance
 
     def close(self) -> None:
         for role in self._roles:
@@ -121,7 +121,7 @@ class Deployment:
 
 @contextmanager
 def closing(deployment: Deployment) -> Iterator[Deployment]:
-    """End what a test has started, and fail if anything of it stays."""
+    """Close a deployment, heal its hosts, and fail if any of its processes remains."""
     try:
         yield deployment
     finally:
@@ -139,7 +139,7 @@ def deployment(lab: Lab) -> Iterator[Deployment]:
 
 @pytest.fixture
 def small_disk() -> Iterator[Callable[[Path, int], None]]:
-    """Give a folder a disk of its own with room for so many bytes."""
+    """Yield a function that mounts a file system of a given size [bytes] on a folder."""
     with ExitStack() as stack:
 
         def mount(folder: Path, size_bytes: int) -> None:
@@ -152,17 +152,17 @@ def small_disk() -> Iterator[Callable[[Path, int], None]]:
 
 @pytest.fixture
 def faketime() -> str:
-    """Return the library that shows a process another time."""
+    """Return the path of the library that gives a process another time."""
     return FAKETIME or pytest.skip("needs libfaketime (apt-get install libfaketime)")
 
 
 def in_flight(run: Role) -> None:
-    """Wait until simulated time goes on."""
+    """Wait until simulated time advances."""
     run.line(r"real time  (idle|taking_off|assembling|engaged)", START_S)
 
 
 def in_process(folder: Path, duration_s: float, overrides: Sequence[str] = ()) -> str:
-    """Return the hash of the same flight in one process."""
+    """Fly the scenario in this process; return its truth_sha256."""
     path = folder / "alone.mcap"
     fly(scenario_file.load(STEP, overrides, duration_s=duration_s), path)
     with RecordReader(path) as reader:

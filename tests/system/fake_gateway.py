@@ -1,4 +1,4 @@
-"""A gateway that sends what the test sends, line by line.
+"""A gateway whose messages a test sends, line by line.
 
 with FakeGateway() as fake:
     ...  # a program connects to fake.port
@@ -20,7 +20,7 @@ HELLO = {
 
 
 class FakeGateway:
-    """Sends what the test sends; it serves one connection."""
+    """A gateway for one connection, controlled by the test."""
 
     def __init__(self) -> None:
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -37,7 +37,7 @@ class FakeGateway:
         self._listener.close()
 
     def receive(self, op: str) -> dict[str, Any]:
-        """Return the next request, which must be of a kind."""
+        """Return the next request, which must have the operation `op`."""
         while b"\n" not in self._received:
             received = self._connection().recv(65536)
             assert received, f"hung up before {op}"
@@ -52,12 +52,12 @@ class FakeGateway:
         self.send({"op": request["op"], **fields, "id": request["id"]})
 
     def send(self, *messages: dict[str, Any] | bytes) -> None:
-        """Send messages, each a line; bytes go as they are."""
+        """Send each message as a line; bytes are sent unchanged."""
         lines = [each if isinstance(each, bytes) else json.dumps(each).encode() + b"\n" for each in messages]
         self._connection().sendall(b"".join(lines))
 
     def welcome(self) -> None:
-        """Answer hello with a run."""
+        """Answer `hello` with the information of a run."""
         self.send({**HELLO, "id": self.receive("hello")["id"]})
 
     def disconnect(self) -> None:

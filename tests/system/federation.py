@@ -1,13 +1,13 @@
-"""A federation under test: its roles as real processes, watched from outside as a user would.
+"""A federation under test: its roles are real processes, observed from outside as by a user.
 
     def test_...(federation):
         run = federation.run(PAIR, "--rate", "5")             `zsim run`, or
         world = federation.start("world", federation.write(ONE), "--listen", federation.endpoint)
-        run.line("engaged")                                   waits for a line of its terminal
+        run.line("engaged")                                   waits for a line of its output
         run.ends(with_code=0)
 
-Nothing sleeps: every wait is for a line, a message or an end. When the test is over every process is killed, and
-the fixture fails the test if one that should have been gone was still there (`nobody_left`).
+Nothing sleeps: every wait is for a line, a message or the end of a process. When the test is over, all its processes
+are killed. A test that expects them to have ended by themselves calls `nobody_left`.
 """
 
 import fcntl
@@ -37,7 +37,7 @@ from wire import PATIENCE_S, Client
 from zsim.record import RecordReader, repair
 from zsim_agents.cameras import detector
 
-COMPILES_S = 600.0  # wall time that compiling takes at most
+COMPILES_S = 600.0  # greatest wall time of compiling
 
 ONE = """
 name: one
@@ -49,7 +49,7 @@ drones:
   - {name: drone1, position_m: [0, 0, 0], yaw_deg: 90}
 processes: {expect: []}
 """
-"""One drone that stands on the ground until somebody flies it."""
+"""One drone that stands on the ground until a program flies it."""
 
 PAIR = """
 name: pair
@@ -69,19 +69,19 @@ PAIR_ROLES = ("estimator.drone1", "estimator.drone2", "controller.main")
 
 
 class Line(NamedTuple):
-    """A line of a terminal and the wall time (monotonic) at which it came."""
+    """A line of output and the wall time (monotonic) of its arrival."""
 
     wall_s: float
     text: str
 
 
 class Role:
-    """A started command; its output is read all the time.
+    """A started command whose output is read continuously.
 
     Args:
-        arguments: of `zsim`.
-        prefix: a command that starts it, such as `ip netns exec NAME`.
-        env: variables that differ from those of the tests.
+        arguments: arguments of `zsim`.
+        prefix: command that starts it, such as `ip netns exec NAME`.
+        env: environment variables that differ from those of the tests.
     """
 
     def __init__(self, arguments: list[str], prefix: tuple[str, ...] = (), env: dict[str, str] | None = None) -> None:
@@ -110,7 +110,7 @@ class Role:
             self._news.notify_all()
 
     def line(self, pattern: str, within_s: float = PATIENCE_S, number: int = 1) -> Line:
-        """Return the first line, or that of a number, in which a pattern is found, waiting for it."""
+        """Wait for and return the first line, or that with a number, in which a pattern is found."""
         until_s = time.monotonic() + within_s
         with self._news:
             while True:
@@ -124,7 +124,7 @@ class Role:
         return pytest.fail(f"{self}: no line with {pattern!r} within {within_s:g} s:\n{self.text()}")
 
     def ends(self, with_code: int | Collection[int], within_s: float = PATIENCE_S) -> float:
-        """Wait for its end, with a code or one of several; return the wall time of it."""
+        """Wait until it ends with a code or one of several; return the wall time (monotonic) of its end."""
         try:
             code = self.process.wait(within_s)
         except subprocess.TimeoutExpired:
@@ -136,18 +136,18 @@ class Role:
         return end_s
 
     def text(self) -> str:
-        """Return all that it has said so far."""
+        """Return its output so far."""
         with self._news:
             return "\n".join(line.text for line in self.lines)
 
     def signal(self, number: int) -> float:
-        """Send it a signal; return the wall time."""
+        """Send it a signal if it is alive; return the wall time (monotonic)."""
         if self.process.poll() is None:
             os.kill(self.process.pid, number)
         return time.monotonic()
 
     def close(self) -> None:
-        """Kill it, if it lives, and give its pipe back."""
+        """Kill it if it is alive, and close its pipe."""
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
@@ -159,7 +159,7 @@ class Role:
 
 
 class Federation:
-    """Everything that one test starts, on an endpoint and in a folder of its own."""
+    """All processes that one test starts, on an endpoint and in a folder of its own."""
 
     def __init__(self, folder: Path, host: str = "127.0.0.1") -> None:
         self.folder = folder
@@ -175,7 +175,7 @@ class Federation:
         return str(path)
 
     def run(self, scenario: str, *options: str) -> Role:
-        """Start `zsim run` on this endpoint, without report."""
+        """Start `zsim run` on this endpoint, without a report."""
         where = ["--out", str(self.out)]
         where += [] if "--in-process" in options else ["--listen", self.endpoint]
         return self.start("run", self.write(scenario), *where, "--no-report", *options)
@@ -195,17 +195,17 @@ class Federation:
         return role
 
     def client(self, federation: str = "zsim") -> Client:
-        """Return a client of this endpoint; it is closed with the federation."""
+        """Return a client of this endpoint, which is closed with the federation."""
         return self._stack.enter_context(Client(self.endpoint, federation))
 
     def record(self) -> "Record":
-        """Return what has been recorded of the run; a record that was cut is mended first."""
+        """Return the record of the run, after repairing it if it is truncated."""
         path = self.out / "run.mcap"
         repair(path)
         return Record(self._stack.enter_context(RecordReader(path)))
 
     def pid(self, name: str) -> int:
-        """Return the process id of a role of `zsim run`, by the arguments that it was started with."""
+        """Return the process id of a role of `zsim run`, found by the arguments of its command."""
         role, _, thing = name.partition(".")
         role = "record" if role == "recorder" else role
         for pid, command in self._processes():
@@ -216,25 +216,25 @@ class Federation:
         return pytest.fail(f"{name} does not run")
 
     def kill(self, name: str, number: int = signal.SIGKILL) -> float:
-        """Send a role of `zsim run` a signal; return the wall time."""
+        """Send a signal to a role of `zsim run`; return the wall time (monotonic)."""
         os.kill(self.pid(name), number)
         return time.monotonic()
 
     def left(self) -> list[str]:
-        """Return the commands of this federation's processes that are there now."""
+        """Return the commands of this federation's processes that are alive."""
         return [" ".join(command) for _, command in self._processes()]
 
     def nobody_left(self, within_s: float = PATIENCE_S) -> None:
-        """Fail if any process of this federation is still there after a while."""
+        """Fail if any process of this federation is still alive after `within_s`."""
         until_s = time.monotonic() + within_s
-        looks = 0  # in a row that found nobody: one look may miss a process that its parent, now gone, has just forked
+        looks = 0  # in a row that found no process: one alone may miss a child just forked by a parent that has ended
         while looks < 2:
             pids = [pid for pid, _ in self._processes()]
             looks = 0 if pids else looks + 1
             assert all(wait_gone(pid, until_s - time.monotonic()) for pid in pids), self.left()
 
     def _processes(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield id and command of the processes that were started with this endpoint or folder."""
+        """Yield id and command of the processes whose command contains this endpoint or folder."""
         marks = (self.endpoint.encode(), str(self.folder).encode())
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit() or int(entry.name) == os.getpid():
@@ -242,15 +242,15 @@ class Federation:
             try:
                 line = (entry / "cmdline").read_bytes()
             except OSError:
-                continue  # it has just ended
-            if b"zsim_deploy." in line and any(mark in line for mark in marks):  # a role, or the fork server of some
+                continue  # the process has just ended
+            if b"zsim_deploy." in line and any(mark in line for mark in marks):  # a role or a fork server of roles
                 yield int(entry.name), line.decode(errors="replace").rstrip("\0").split("\0")
 
     def __enter__(self) -> "Federation":
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Kill what is left, the launcher's children too."""
+        """Kill all remaining processes, including the launcher's children."""
         self._stack.close()
         for role in self._roles:
             role.close()
@@ -259,7 +259,7 @@ class Federation:
 
 
 def wait_gone(pid: int, within_s: float) -> bool:
-    """Wait for the end of a process that is not a child; return whether it has ended."""
+    """Wait for the end of a process that need not be a child; return whether it has ended."""
     try:
         descriptor = os.pidfd_open(pid)
     except ProcessLookupError:
@@ -273,18 +273,18 @@ def wait_gone(pid: int, within_s: float) -> bool:
 
 
 class Record:
-    """What stands in a record, read with the reader of zsim and msgpack."""
+    """The contents of a record, read with zsim's reader and msgpack."""
 
     def __init__(self, reader: RecordReader) -> None:
         self._reader = reader
         self.complete = reader.complete
 
     def all(self, *keys: str) -> list[dict[str, Any]]:
-        """Return the messages of some keys in order of time."""
+        """Return the messages on some keys in order of time."""
         return [msgpack.unpackb(message.payload) for message in self._reader.messages(keys)]
 
     def keys(self) -> dict[str, int]:
-        """Return the keys and how many messages each has."""
+        """Return the number of messages by key."""
         return self._reader.topics()
 
     def events(self, *kinds: str) -> list[dict[str, Any]]:
@@ -292,14 +292,14 @@ class Record:
         return [event for event in self.all("world/event") if event["kind"] in kinds]
 
     def end(self) -> dict[str, Any]:
-        """Return what the world said of its run at the end."""
+        """Return the data of the world's event `end`."""
         return self.events("end")[-1]["data"]
 
     def sha256(self) -> str:
         return self.end()["truth_sha256"]
 
     def recomputed_sha256(self, drones: list[str]) -> str:
-        """Return the hash of the truth as docs/protocol.md defines it, from the messages on record."""
+        """Return the hash of the truth, computed as docs/protocol.md defines it from the messages on record."""
         digest = hashlib.sha256()
         for instant in zip(*(self.all(f"drone/{drone}/truth") for drone in drones), strict=True):
             for truth in instant:
@@ -310,19 +310,19 @@ class Record:
         return digest.hexdigest()
 
     def positions(self, drone: str) -> np.ndarray:
-        """Return the true positions [m; W; (gates, 3)] of a drone."""
+        """Return a drone's true positions [m; W], (gates, 3)."""
         return np.array([truth["position_m"] for truth in self.all(f"drone/{drone}/truth")])
 
 
 @pytest.fixture(scope="session")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Let the kernels be compiled before anything is timed, by the first of the workers that comes here."""
+    """Compile the kernels before anything is timed, in the first test worker that gets here."""
     folder = tmp_path_factory.mktemp("compiled")
     scenario = folder / "pair.yaml"
     scenario.write_text(PAIR)
     flight = ["run", str(scenario), "--in-process", "--duration", "8", "--no-report", "--out", str(folder / "run")]
     checkout = hashlib.sha256(str(ROOT).encode()).hexdigest()[:12]
-    these_tests = os.environ.get("PYTEST_XDIST_TESTRUNUID", "")  # of all workers
+    these_tests = os.environ.get("PYTEST_XDIST_TESTRUNUID", "")  # the same for all workers
     with (Path(tempfile.gettempdir()) / f"zsim-tests-compile-{checkout}.lock").open("a+") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         lock.seek(0)
@@ -336,13 +336,13 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture
 def forked(compiled: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fork the `zsim run` that `zsim.Federation` and `zsim.run` start; test_own_tests.py starts it as a user does."""
+    """Fork the commands that `zsim.Federation` and `zsim.run` start; test_own_tests.py starts them as a user does."""
     for module in ("federation", "flight"):
         monkeypatch.setattr(f"zsim_api.{module}.Program", forked_commands.program)
 
 
 @pytest.fixture
 def federation(tmp_path: Path, compiled: None) -> Iterator[Federation]:
-    """A federation of the test's own; nobody of it outlives the test."""
+    """Yield a federation of the test's own, none of whose processes outlives the test."""
     with Federation(tmp_path) as made:
         yield made

@@ -1,10 +1,10 @@
-"""`zsim` commands that tests start, forked from one process that has everything imported, as `zsim run` forks its roles.
+"""Start of `zsim` commands in tests: forked from a process that has imported everything, as `zsim run` forks its roles.
 
-It saves a third of a second of processor time for each, a second for one that flies, two for `zsim run`. What a test has changed of its
-own process, a command would have inherited: then it is started as a user would start it.
+Forking saves a third of a second of processor time per command, a second for one that flies, and two for `zsim run`.
+If a test has changed what a new process inherits from its own, the command is started as a user would start it instead.
 
-A command that starts no process and changes nothing of its own is run in the process of the test (`run_here`), which
-costs no more than what it does. What `zsim.Federation` and `zsim.run` start is forked, too, with the fixture `forked`.
+A command that starts no process and does not change its own is run in the process of the test (`run_here`), without any
+overhead. With the fixture `forked`, the commands that `zsim.Federation` and `zsim.run` start are forked, too.
 """
 
 import atexit
@@ -32,12 +32,12 @@ from zsim_deploy.launch.role_launcher import RoleLauncher, RoleProcess
 
 ROOT = Path(__file__).parents[2]
 ZSIM = (sys.executable, "-m", "zsim_deploy.cli")
-USER_FAULT = 2  # exit code of what a person has to put right
-PROGRESS = ("waiting for a world of", "loading", "compiling")  # begin the lines of a command that takes long
+USER_FAULT = 2  # exit code of faults that the user has to correct
+PROGRESS = ("waiting for a world of", "loading", "compiling")  # beginnings of lines that only slow commands print
 FORKSERVER = Path(__file__).with_name("warm_forkserver.py")
-COLUMNS = {"COLUMNS": "200"}  # of the terminal
+COLUMNS = {"COLUMNS": "200"}  # width of the terminal
 COLD = ("sweep", "up", "push", "doctor", "restart", "move", "down", "ps", "logs", "fetch", "certs")
-STARTING = ("world", "record", "camera", "detect", "console", "gateway", "ros1", "ros2")  # they change this process
+STARTING = ("world", "record", "camera", "detect", "console", "gateway", "ros1", "ros2")  # change their own process
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LIMITS = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE, resource.RLIMIT_AS)
 
@@ -51,11 +51,11 @@ class Completed(NamedTuple):
 
 
 def start(arguments: list[str], environment: dict[str, str]) -> tuple[RoleProcess, IO[str]]:
-    """Start a command; return it and what it prints.
+    """Start a command; return it and its output.
 
     Args:
-        arguments: of `zsim`.
-        environment: variables that differ from those of the tests.
+        arguments: arguments of `zsim`.
+        environment: environment variables that differ from those of the tests.
     """
     environment = {**COLUMNS, **environment}
     if not _can_fork(arguments):
@@ -67,7 +67,7 @@ def start(arguments: list[str], environment: dict[str, str]) -> tuple[RoleProces
 
 
 def start_in(folder: Path, arguments: list[str], log: IO[str]) -> RoleProcess | None:
-    """Start a command in a folder, with its output to a file; None where it cannot be forked."""
+    """Start a command in a folder, with its output going to a file; return None if it cannot be forked."""
     return _forked([f"PWD={folder}", *arguments], log) if _can_fork(arguments) else None
 
 
@@ -79,7 +79,7 @@ def _forked(arguments: Sequence[str], log: IO[str], environment: Mapping[str, st
 
 
 def start_program(command: list[str], environment: dict[str, str]) -> tuple[RoleProcess, IO[str]]:
-    """Start any program as `start` does a command."""
+    """Start any program as `start` starts a command."""
     process = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -95,7 +95,7 @@ def start_program(command: list[str], environment: dict[str, str]) -> tuple[Role
 
 
 def program(words: Sequence[str], environment: Mapping[str, str], output: Path | int | None) -> Program:
-    """Start a program for `zsim.Federation` and `zsim.run`; arguments as of `Program`."""
+    """Start a program for `zsim.Federation` and `zsim.run`; arguments as for `Program`."""
     is_run = tuple(words[: len(COMMAND)]) == COMMAND
     arguments = words[len(COMMAND) :] if is_run else words[1:] if words[0] == "zsim" else ()
     if not arguments or not isinstance(output, Path) or not _can_fork([*arguments]):
@@ -104,7 +104,7 @@ def program(words: Sequence[str], environment: Mapping[str, str], output: Path |
 
 
 class ForkedProgram(Program):
-    """A `zsim` command as a program beside the test; without a keeper, since it ends with the test anyhow."""
+    """A forked `zsim` command as a `Program`; it has no keeper, because it ends with the test anyway."""
 
     def __init__(self, words: Sequence[str], forked: Sequence[str], output: Path) -> None:
         self.words, self.asked = tuple(words), False
@@ -132,12 +132,12 @@ class ForkedProgram(Program):
 
 
 def run(*arguments: str, hangs_s: float = PATIENCE_S) -> Completed:
-    """Run a command to its end; it is killed when it hangs for so long."""
+    """Run a command to its end; kill it if it takes longer than `hangs_s`."""
     return run_forked(*arguments, hangs_s=hangs_s) if _can_fork(arguments) else run_cold(*arguments)
 
 
 def run_forked(*arguments: str, hangs_s: float = PATIENCE_S) -> Completed:
-    """Run a command to its end that is refused before it would start another process in a way of its own."""
+    """Run a command to its end, forked; it must be refused before it would start other processes."""
     read, write = os.pipe()
     with os.fdopen(write, "w") as log:
         process = _launcher(tuple(COLUMNS.items())).start(arguments, log, listened=True)
@@ -165,7 +165,7 @@ def run_cold(*arguments: str) -> Completed:
 
 
 def run_here(*arguments: str) -> Completed:
-    """Run a command to its end in this process, its signal handlers, variables and places of modules restored."""
+    """Run a command to its end in this process; restore signal handlers, environment variables and sys.path."""
     words, places, variables = sys.argv, [*sys.path], dict(os.environ)
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
     stdout, stderr, code = io.StringIO(), io.StringIO(), None
@@ -186,7 +186,7 @@ def run_here(*arguments: str) -> Completed:
 
 
 def refusal(*arguments: str) -> str:
-    """Run a command that must be refused; return its one line."""
+    """Run a command that must be refused; return its single line of output."""
     done = run(*arguments) if arguments[0] in STARTING else run_here(*arguments)
     assert done.code == USER_FAULT, done
     assert _without_progress(done.stdout) == []
@@ -195,7 +195,7 @@ def refusal(*arguments: str) -> str:
 
 
 def _without_progress(output: str) -> list[str]:
-    """Return the lines of a command but for those that it prints on a slow machine alone."""
+    """Return a command's output lines, except those that it prints only on a slow machine."""
     return [line for line in output.splitlines() if not line.startswith(PROGRESS)]
 
 
@@ -204,12 +204,12 @@ def _can_fork(arguments: list[str] | tuple[str, ...]) -> bool:
 
 
 def inherited() -> Any:
-    """Return what a process hands on to those that it starts."""
+    """Return what this process passes on to its child processes."""
     variables = {name: value for name, value in os.environ.items() if name not in ("PYTEST_CURRENT_TEST", FOLDERS)}
     return variables, [resource.getrlimit(limit) for limit in LIMITS], os.sched_getaffinity(0)
 
 
-FIRST = inherited()  # conftest.py takes it anew when all tests are collected: their modules set variables, too
+FIRST = inherited()  # conftest.py updates it once all tests are collected, because their modules also set variables
 
 
 @cache

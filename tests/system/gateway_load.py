@@ -1,9 +1,9 @@
-"""Many clients of a gateway at once, in a process of their own; prints what they received as a line of JSON.
+"""Many simultaneous clients of a gateway, in a process of their own, which prints a summary as a line of JSON.
 
 python gateway_load.py HTTP_PORT LINES_PORT CLIENTS VALUES
 
-A third reads the estimates of a drone on a line connection, a third the clock on a WebSocket, a third a last value over
-HTTP, ten times a second on one connection. Each ends when it has VALUES values.
+A third of the clients read a drone's estimates on a line connection, a third read the clock on a WebSocket, and a third
+request a last value over HTTP, ten times a second on one connection. Each ends when it has received VALUES values.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""A gateway in a process of its own, and its clients: sockets and HTTP of the standard library, nothing of zsim."""
+"""A gateway in a process of its own, and its clients, which use sockets and HTTP of the standard library, not zsim."""
 
 import http.client
 import json
@@ -23,7 +23,7 @@ class Response(NamedTuple):
 
 
 class LineConnection:
-    """A connection to the port for lines of JSON."""
+    """A connection to the gateway's port for lines of JSON."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port), PATIENCE_S)
@@ -38,7 +38,7 @@ class LineConnection:
         self.send_line(json.dumps({"op": op, **fields}).encode())
 
     def next(self, *ops: str) -> dict[str, Any]:
-        """Return the next message, of some kinds; fail when the connection ends."""
+        """Return the next message, of any or of the given kinds; fail if the connection ends."""
         while True:
             line = self._file.readline()
             assert line, f"the gateway closed the connection; {ops} was waited for"
@@ -47,14 +47,14 @@ class LineConnection:
                 return message
 
     def request(self, op: str, **fields: Any) -> dict[str, Any]:
-        """Send a request and return the response: the message that has its id."""
+        """Send a request; return the response, which is the message with the same id."""
         self.send(op, id="requested", **fields)
         while (message := self.next()).get("id") != "requested":
             pass
         return message
 
     def is_at_end(self) -> bool:
-        """Read to the end of the connection, which may be one that was closed before all that we sent was read."""
+        """Read until the connection ends, possibly by a reset because the gateway closed it with requests unread."""
         with suppress(ConnectionError):
             while self._file.readline():
                 pass
@@ -72,11 +72,11 @@ class LineConnection:
 
 
 class GatewayProcess:
-    """A gateway as a process.
+    """A gateway that runs as a process.
 
     Args:
-        federation: of the world that it serves.
-        options: of `zsim gateway`.
+        federation: federation of the world that it serves.
+        options: options of `zsim gateway`.
     """
 
     def __init__(self, federation: Federation, *options: str) -> None:
@@ -87,7 +87,7 @@ class GatewayProcess:
         self.role.line("HTTP and WebSocket on")
 
     def in_run(self) -> "GatewayProcess":
-        """Wait until it is in a run."""
+        """Wait until it takes part in a run; return it."""
         self.role.line("may use run")
         return self
 
@@ -112,7 +112,7 @@ class GatewayProcess:
 
     @contextmanager
     def events(self, path: str, headers: dict[str, str] | None = None) -> Iterator[Iterator[tuple[str, Any]]]:
-        """Yield (event, data) as the server sends them."""
+        """Yield an iterator over (event, data) as the server sends them."""
         connection = http.client.HTTPConnection("127.0.0.1", self.http_port, timeout=PATIENCE_S)
         try:
             connection.request("GET", path, headers={"Accept": "text/event-stream", **(headers or {})})

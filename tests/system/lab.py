@@ -1,15 +1,16 @@
-"""Real hosts on one machine: network namespaces joined by a bridge, each with its address and its sshd.
+"""Hosts on one machine: network namespaces joined by a bridge, each with an address and an sshd of its own.
 
     def test_...(lab):
         hosts = lab.inventory({"world": "h1", "estimator.*": ["h1", "h2"], "controller.main": "h3"})
         up = lab.popen("launcher", *ZSIM, "up", SCENARIO, "--hosts", str(hosts))
-        lab.cut("h2")                        nothing passes between h2 and the others, until
+        lab.cut("h2")                        h2 is cut off from the others until
         lab.heal("h2")
         lab.slow("h3", 50, 10, 0.02)         50 ± 10 ms and 2 % loss each way
         assert not lab.processes("h1")       no zsim process runs there
 
-What the hosts share: the disk, the hostname, the clock, the user. What is their own: network, sshd, and over ssh an
-empty home, so that no ~/.bashrc of the tester's acts there. When the lab is closed nothing of it is left: every process in its namespaces is killed, also those that a host's sshd started.
+The hosts share the disk, the hostname, the clock and the user. Each has its own network and sshd, and over ssh an empty
+home, so that the tester's ~/.bashrc has no effect. Closing the lab leaves nothing behind: it kills every process in its
+namespaces, including those started over ssh.
 """
 
 import itertools
@@ -45,7 +46,7 @@ table bridge lab {
   }
 }
 """
-RUN_S = 120.0  # wall time for a command on a host
+RUN_S = 120.0  # wall time that a command on a host may take
 _counter = itertools.count()
 
 
@@ -53,8 +54,8 @@ class Lab:
     """Hosts, and a launcher without sshd, on a network of their own.
 
     Args:
-        folder: for keys, logs and each host's folder.
-        names: of the hosts, each of at most 11 characters.
+        folder: folder for keys, logs and each host's files.
+        names: names of the hosts, at most 11 characters each.
     """
 
     def __init__(self, folder: Path, names: Sequence[str] = ("h1", "h2", "h3")) -> None:
@@ -79,7 +80,7 @@ class Lab:
         return self._addresses[name]
 
     def host_folder(self, name: str) -> Path:
-        """Return where zsim keeps what it needs on a host."""
+        """Return the folder in which zsim keeps its files on a host."""
         return self.folder / name / "zsim"
 
     def inventory(
@@ -93,11 +94,11 @@ class Lab:
         """Write an inventory of all hosts and return its path.
 
         Args:
-            roles: process name or pattern to a host or several.
-            routers: name to host, port, upstream.
-            through: host to the router through which it reaches the world.
-            insecure: whether without TLS.
-            python: interpreter that has zsim; None for what `zsim push` installs.
+            roles: host or hosts by process name or pattern.
+            routers: host, port and upstream by name.
+            through: router through which a host reaches the world, by host.
+            insecure: whether to go without TLS.
+            python: interpreter that has zsim; None for the one that `zsim push` installs.
         """
         hosts = {name: self._host(name, (through or {}).get(name), python) for name in self.names}
         document: dict[str, Any] = {"hosts": hosts, "roles": dict(roles)}
@@ -115,17 +116,17 @@ class Lab:
         return given | ({"router": router} if router else {}) | ({"python": python} if python else {})
 
     def run(self, name: str, *command: str, **options: Any) -> subprocess.CompletedProcess[str]:
-        """Run a command on a host (or the launcher) to its end; options as of `subprocess.run`."""
+        """Run a command on a host (or the launcher) to its end; options as for `subprocess.run`."""
         given = {"text": True, "capture_output": True, "timeout": RUN_S, "cwd": ROOT} | options
         return subprocess.run(self._inside(name, command), **{**given, "env": self._env(name, options.get("env"))})
 
     def popen(self, name: str, *command: str, **options: Any) -> subprocess.Popen[str]:
-        """Start a command on a host (or the launcher); options as of `subprocess.Popen`."""
+        """Start a command on a host (or the launcher); options as for `subprocess.Popen`."""
         given = {"text": True, "cwd": ROOT, "start_new_session": True} | options
         return subprocess.Popen(self._inside(name, command), **{**given, "env": self._env(name, options.get("env"))})
 
     def prefix(self, name: str) -> tuple[str, ...]:
-        """Return what starts a command on a host: `prefix(name) + command`."""
+        """Return the words that run a command on a host when put in front of it."""
         return (shutil.which("ip", path=environment()["PATH"]) or "ip", "netns", "exec", self.namespace(name))
 
     def _inside(self, name: str, command: Sequence[str]) -> list[str]:
@@ -139,13 +140,13 @@ class Lab:
         return namespaces.entered(self.namespace(name))
 
     def environment(self, name: str, **variables: str) -> None:
-        """Give every process that is started on a host from now on some variables, over ssh too."""
+        """Set variables for every process that is started on a host from now on, over ssh too."""
         self._variables[name] = variables
         self._retire(self._sshd.pop(name))
         self._start_sshd(name)
 
     def cut(self, name: str) -> None:
-        """Part a host from all others: what is sent is lost, and nobody is told."""
+        """Cut a host off from all others: packets are lost without notice."""
         self._nft(f"add element bridge lab cut {{ {', '.join(self._ports(name))} }}")
 
     def heal(self, name: str) -> None:
@@ -153,7 +154,7 @@ class Lab:
         self._nft(f"delete element bridge lab cut {{ {', '.join(self._ports(name))} }}")
 
     def slow(self, name: str, delay_ms: float, jitter_ms: float = 0.0, loss: float = 0.0, seed: int = 1) -> None:
-        """Give a host's link a delay, a jitter and a loss (0 to 1), each of them each way; zeros undo it."""
+        """Give a host's link a delay, a jitter and a loss (0 to 1) in each direction; zeros undo it."""
         self._fast(name)
         if not (delay_ms or jitter_ms or loss):
             return
@@ -169,18 +170,18 @@ class Lab:
         self._emulators[name] = self._service("net", emulator, "carrying", self.folder / name / "link.log")
 
     def _fast(self, name: str) -> None:
-        """Take the slow link away, if there is one."""
+        """Remove the slow link, if there is one."""
         if emulator := self._emulators.pop(name, None):
             self._retire(emulator)
             near = self._ports(name)[1]
             self._ip("net", f"link del dev {near}", f"link set dev {name} master bridge")
 
     def processes(self, name: str) -> dict[int, str]:
-        """Return id and command of the zsim processes on a host (or the launcher)."""
+        """Return the id and command of the zsim processes on a host (or the launcher)."""
         return {pid: line for pid, line in members(self.namespace(name)) if "zsim_deploy" in line or "/zsim " in line}
 
     def close(self) -> None:
-        """End every process of the lab and take its namespaces away."""
+        """End every process of the lab and remove its namespaces."""
         for namespace in self.namespaces():
             namespaces.remove(namespace)
         for service in (*self._past, *self._sshd.values(), *self._emulators.values()):
@@ -202,11 +203,11 @@ class Lab:
 
     @staticmethod
     def _ports(name: str) -> tuple[str, str]:
-        """Return the ports of the bridge that can be a host's: direct, and of its slow link."""
+        """Return a host's ports on the bridge: for its direct link and for its slow link."""
         return name, f"{name}.near"
 
     def _connect(self) -> None:
-        """Make the namespaces, the bridge, and a cable from it to each host."""
+        """Create the namespaces, the bridge, and a cable from the bridge to each host."""
         ends = (LAUNCHER, *self.names)
         namespaces.ip(*(f"netns add {self.namespace(name)}" for name in ("net", *ends)))
         self._ip("net", "link add name bridge type bridge forward_delay 0", "link set dev bridge up")
@@ -249,18 +250,18 @@ class Lab:
         return Service(self._inside(name, command), ready, log, environment())
 
     def _retire(self, service: Service) -> None:
-        """End a service; what it started, such as the sessions of an sshd, lives on."""
+        """End a service; processes that it started, such as an sshd's sessions, live on."""
         service.kill()
         self._past.append(service)
 
 
 def _arithmetic() -> dict[str, str]:
-    """Return the variables by which BLAS computes in this process; hosts of the same machine are to compute as it does."""
+    """Return the variables that configure BLAS in this process, so that the hosts compute the same bits."""
     return {name: value for name, value in os.environ.items() if name.startswith("OPENBLAS_")}
 
 
 def lacking() -> str | None:
-    """Return why there can be no lab on this machine; None if there can."""
+    """Return why a lab is impossible on this machine; None if it is possible."""
     if not sys.platform.startswith("linux"):
         return "a lab of hosts needs Linux"
     if os.geteuid() != 0:
@@ -276,14 +277,14 @@ def lacking() -> str | None:
 
 
 def demand() -> None:
-    """Skip the test where there can be no lab; fail it in CI."""
+    """Skip the test if a lab is impossible; fail it in CI."""
     if reason := lacking():
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
 
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Iterator[Lab]:
-    """Three hosts of the test's own; skipped where there can be none, but not in CI."""
+    """Three hosts for one test; if a lab is impossible, the test is skipped, or fails in CI."""
     demand()
     with Lab(tmp_path / "lab") as made:
         yield made

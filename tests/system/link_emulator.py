@@ -2,10 +2,10 @@
 
     python link_emulator.py INTERFACE INTERFACE DELAY_MS JITTER_MS LOSS SEED
 
-Each direction delays by DELAY_MS ± JITTER_MS and loses the share LOSS of its frames. The delay wanders between draws
-that are PERIOD_NS apart, so that frames keep their order, as on a radio link, which retransmits before it hands on.
-The kernels of test machines often lack netem, which would do the same. Offloads of the interfaces must be off:
-a frame here is what is on the wire.
+Each direction delays by DELAY_MS ± JITTER_MS and loses the share LOSS of its frames. The delay moves between random
+draws PERIOD_NS apart, so that frames keep their order, as on a radio link that retransmits before it hands frames on.
+The kernels of test machines often lack netem, which would do the same. The interfaces' offloads must be off, so that
+the frames here are those on the wire.
 """
 
 import random
@@ -15,9 +15,9 @@ import sys
 import time
 from collections import deque
 
-PERIOD_NS = 100_000_000  # between two draws of the delay; keeps the order for jitters up to 50 ms
-BUFFER_BYTES = 8 << 20  # of the socket: what a burst brings while the other direction is served
-FRAME_BYTES = 65_536  # more than any frame has
+PERIOD_NS = 100_000_000  # between two draws of the delay; keeps the order of frames for jitters up to 50 ms
+BUFFER_BYTES = 8 << 20  # socket buffer, for a burst that arrives while the other direction is served
+FRAME_BYTES = 65_536  # larger than any frame
 ETH_P_ALL = 0x0003  # linux/if_ether.h
 PACKET_IGNORE_OUTGOING = 23  # linux/if_packet.h
 SOL_PACKET = 263  # linux/socket.h
@@ -25,7 +25,7 @@ SO_RCVBUFFORCE = 33  # asm-generic/socket.h
 
 
 class Direction:
-    """Frames under way from one interface to the other."""
+    """Frames in transit from one interface to the other."""
 
     def __init__(
         self, source: socket.socket, sink: socket.socket, delay_ms: float, jitter_ms: float, loss: float, seed: str
@@ -37,7 +37,7 @@ class Direction:
         self._from_ns, self._from, self._to = 0, self._draw(), self._draw()
 
     def receive(self) -> None:
-        """Take the frames that have come."""
+        """Read the frames that have arrived."""
         while True:
             try:
                 frame = self.source.recv(FRAME_BYTES)
@@ -48,15 +48,15 @@ class Direction:
                 self._under_way.append((now_ns + self._delay(now_ns), frame))
 
     def send(self) -> None:
-        """Hand on the frames whose time has come."""
+        """Forward the frames that are due."""
         while self._under_way and self._under_way[0][0] <= time.monotonic_ns():
             try:
                 self._sink.send(self._under_way.popleft()[1])
             except OSError:
-                continue  # the interface is full or down: a frame lost, as on a radio
+                continue  # the interface is full or down: the frame is lost, as on a radio link
 
     def due_ns(self) -> int | None:
-        """Return when the next frame is to be handed on."""
+        """Return the time at which the next frame is due, None if there is none."""
         return self._under_way[0][0] if self._under_way else None
 
     def _delay(self, now_ns: int) -> int:
@@ -72,7 +72,7 @@ class Direction:
 
 
 def opened(interface: str) -> socket.socket:
-    """Return a socket that sees every frame that comes in on an interface."""
+    """Return a socket that receives every frame entering an interface."""
     made = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_ALL))
     made.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
     made.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)

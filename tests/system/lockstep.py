@@ -1,4 +1,4 @@
-"""A world that waits for one foreign program, gate by gate: nothing moves unless the test says done."""
+"""A world that waits for one external program at every gate: time advances only when the test sends done."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ from federation import ONE, Federation, Role
 from wire import Client, Participant, Received, Subscription
 
 GATE_NS = 20_000_000
-DELAY_NS = GATE_NS  # command delay of the scenarios here, one gate
-TAKEOFF_GATES = 300  # more than a take-off takes
+DELAY_NS = GATE_NS  # the scenarios' command delay, one gate
+TAKEOFF_GATES = 300  # longer than a take-off
 ME = "tester.one"
 
 
 class Lockstep:
-    """A world with one drone that waits for this program and tells it everything rare."""
+    """A world with one drone that waits for this program, which follows its clock and events."""
 
     def __init__(self, federation: Federation, *options: str, scenario: str = ONE, period_ns: int = GATE_NS) -> None:
         self.world: Role = federation.world(scenario, "--expect", ME, *options)
@@ -24,7 +24,7 @@ class Lockstep:
         self.now_ns = -1
 
     def answer(self, until_ns: int) -> None:
-        """Say done for every gate up to until_ns, each when it is there."""
+        """Send done for every gate up to until_ns, once each is reached."""
         for gate_ns in range(self.me.done_ns + self.me.period_ns, until_ns + 1, self.me.period_ns):
             self.see(gate_ns)
             self.me.done(gate_ns)
@@ -36,7 +36,7 @@ class Lockstep:
             self.now_ns = received.message["t_ns"]
 
     def stands_at(self, t_ns: int, *names: str) -> Received:
-        """Wait until time stands for these processes; check that it does at t_ns. What was so before is passed over."""
+        """Wait until time stands still for exactly these processes; check that it does at t_ns. Skip older messages."""
         expected = set(names) or {ME}
         self.clock.now()
         received = self.clock.until(
@@ -52,23 +52,23 @@ class Lockstep:
         return self.events.until(lambda m: (m["kind"], m["subject"]) == (kind, subject))
 
     def leave(self) -> None:
-        """Let the run go on to its end."""
+        """Leave the run, and wait for its end."""
         self.me.bye(self.now_ns)
         self.world.ends(with_code=0)
 
     def put(self, key: str, **fields: Any) -> None:
-        """Publish an output of the gate to be answered next, when it is there, and count it for the next done."""
+        """Publish an output for the next gate to be answered, once that is reached, and count it for the next done."""
         gate_ns = self.me.done_ns + self.me.period_ns
         self.see(gate_ns)
         self.client.put(key, **{"t_ns": gate_ns, "source": ME, **fields})
         self.me.sent += 1
 
     def status(self) -> dict[str, Any]:
-        """Return the last status of the drone."""
+        """Return the latest status of the drone."""
         return self.client.get("drone/drone1/sensor/status")["drone/drone1/sensor/status"]
 
     def fly(self) -> None:
-        """Take off, and stand when the drone hovers."""
+        """Take off, and let time stand still once the drone hovers."""
         self.put("drone/drone1/cmd/mode", mode="takeoff")
         self.answer(self.me.done_ns + TAKEOFF_GATES * GATE_NS)
         self.stands_at(self.me.done_ns + DELAY_NS + GATE_NS)

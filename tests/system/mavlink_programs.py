@@ -1,7 +1,7 @@
-"""Programs that fly MAVLink vehicles, unmodified, as processes of their own; and ports for them.
+"""Unmodified programs that fly MAVLink vehicles, as separate processes, and ports for them.
 
-MAVProxy and node-mavlink are installed into a folder of this machine's cache by the first test that needs them:
-MAVProxy's own requirements would bring a second OpenCV beside ours.
+The first test that needs MAVProxy or node-mavlink installs it into a cache folder of this machine, since MAVProxy's own
+requirements would install a second OpenCV beside that of zsim.
 """
 
 import json
@@ -28,7 +28,7 @@ TRIES = 200
 
 
 def free_udp_ports(count: int) -> int:
-    """Return the first of some ports in a row that nobody has, and that are not returned again for others."""
+    """Return the first of `count` consecutive free UDP ports, which are not handed out again."""
     row: list[int] = []
     for _ in range(TRIES):
         port = free_port()
@@ -48,7 +48,7 @@ def _is_free(port: int) -> bool:
 
 
 class Program:
-    """A program that runs; its output is read all the time."""
+    """A running program, whose output is read continuously."""
 
     def __init__(self, command: list[str], **env: str) -> None:
         self._command = command
@@ -79,19 +79,19 @@ class Program:
             self._news.notify_all()
 
     def type(self, line: str) -> None:
-        """Type a line into it."""
+        """Write a line to its input."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{line}\n")
 
     def line(self, pattern: str) -> str:
-        """Return the first line in which a pattern is found, waiting for it."""
+        """Wait for a line that contains a pattern, and return the first one."""
         with self._news:
             self._news.wait_for(lambda: self._is_over or self._matching(pattern), PATIENCE_S)
             found = self._matching(pattern)
         return found or pytest.fail(f"{self._command}: no line with {pattern!r}:\n{self.text()}")
 
     def result(self) -> Any:
-        """Return what it prints as JSON at its end."""
+        """Wait until the program ends, and return the JSON that it prints."""
         line = self.line(r"^[\[{]")
         assert self.process.wait(PATIENCE_S) == 0, self.text()
         return json.loads(line)
@@ -100,7 +100,7 @@ class Program:
         return "\n".join(self._lines)
 
     def close(self) -> None:
-        """End it."""
+        """End the program."""
         self.process.kill()
         self.process.wait()
         self._reader.join(PATIENCE_S)
@@ -113,12 +113,12 @@ class Program:
 
 
 def python(script: str, *arguments: str) -> Program:
-    """Start a client in Python, which knows nothing of zsim."""
+    """Start a Python client that knows nothing of zsim."""
     return Program([sys.executable, "-u", str(CLIENTS / script), *arguments], PYTHONPATH="")
 
 
 def node(script: str, *arguments: str) -> Program:
-    """Start a client in JavaScript."""
+    """Start a JavaScript client."""
     command = ["node", str(CLIENTS / script), *arguments]
     return Program(command, NODE_PATH=str(node_modules()))
 
@@ -133,7 +133,7 @@ def mavproxy(folder: Path, *arguments: str) -> Program:
 
 
 def node_modules() -> Path:
-    """Return the folder with node-mavlink; the test is left out where it cannot be had."""
+    """Return the folder with node-mavlink; skip the test if it cannot be installed."""
     folder = CACHE / NODE_MAVLINK
     if shutil.which("node") is None or shutil.which("npm") is None:
         _leave_out("node or npm is not installed")
@@ -142,14 +142,14 @@ def node_modules() -> Path:
 
 
 def mavproxy_home() -> Path:
-    """Return the folder with MAVProxy; the test is left out where it cannot be had."""
+    """Return the folder with MAVProxy; skip the test if it cannot be installed."""
     folder = CACHE / MAVPROXY[0]
     _install(folder, [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", "{}", *MAVPROXY])
     return folder
 
 
 def _install(folder: Path, command: list[str]) -> None:
-    """Install into a folder, which is there whole or not at all."""
+    """Install into a folder, which exists only once complete."""
     if folder.is_dir():
         return
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -167,7 +167,7 @@ def _install(folder: Path, command: list[str]) -> None:
 
 
 def _leave_out(reason: str) -> None:
-    """Skip on somebody's machine, fail where everything has to be tried."""
+    """Skip the test on a developer's machine; fail it in CI."""
     if os.environ.get("CI"):
         pytest.fail(reason)
     pytest.skip(reason)

@@ -1,4 +1,4 @@
-"""Formations of which some drones are hardware: another world plays them, and their own wire joins the two."""
+"""Formations with hardware drones, which a second world plays and which are connected by their own protocols."""
 
 import subprocess
 import sys
@@ -26,9 +26,9 @@ drones:
 clusters:
   - {name: main, drones: [drone1, drone2, drone3], plan: {takeoff_s: 8}}
 """
-"""Three drones that take off when the estimators know where they are."""
+"""Three drones that take off once the estimators have determined their positions."""
 PATIENT = "silence: {hover_s: 5, land_s: 60}\n"
-"""Of a run that must not land its drones because a loaded machine pauses."""
+"""Part of a scenario whose drones must not land because a loaded machine pauses."""
 EXTERNAL, SIMULATED = FORMATION.replace("BODY", ", body: external"), FORMATION.replace("BODY", "")
 UNFLOWN = """
 name: unflown
@@ -38,7 +38,7 @@ drones:
   - {name: drone2, position_m: [4, 0, 0], body: external}
 processes: {expect: []}
 """
-"""A simulated drone and one of hardware, which nobody commands."""
+"""A simulated and a hardware drone, which no process commands."""
 PACE = ("--realtime", "--rate", "2")
 SECOND_NS = 1_000_000_000
 DRONES = 3
@@ -55,7 +55,7 @@ class Radio:
         assert self._process.stdout.readline() == "ready\n"
 
     def cut(self, wall_s: float) -> None:
-        """Let nothing pass for a while; return when it is over."""
+        """Cut the link for a while; return once it is restored."""
         self._process.stdin.write(f"cut {wall_s}\n")
         self._process.stdin.flush()
         assert self._process.stdout.readline() == "done\n"
@@ -68,12 +68,12 @@ class Radio:
 
 
 class Hardware:
-    """A world whose drones are offered on the wires of real aircraft, and its record.
+    """A world whose drones are served by the protocols of real aircraft, and its record.
 
     Args:
-        folder: of its own.
-        scenario: whose drones they are; its clusters are left out.
-        pace: options of the run.
+        folder: folder for this world alone.
+        scenario: scenario of the drones; its clusters are omitted.
+        pace: options that set the pace of the run.
     """
 
     def __init__(self, folder: Path, scenario: str = SIMULATED, pace: tuple[str, ...] = PACE) -> None:
@@ -84,7 +84,7 @@ class Hardware:
         self.recorder = self.federation.role("record", "--out", str(self.federation.out))
 
     def serve(self, wire: str) -> list[list[str]]:
-        """Offer the drones on a wire: px4, ardupilot, ardrone; return the ports of each, HOST:PORT."""
+        """Serve the drones by a protocol (px4, ardupilot, ardrone); return each drone's ports as HOST:PORT."""
         return self._ardrone() if wire == "ardrone" else self._mavlink(wire)
 
     def _mavlink(self, autopilot: str) -> list[list[str]]:
@@ -105,18 +105,18 @@ class Hardware:
         return [[f"{host}:{port}" for port in AT_AND_NAVDATA] for host in hosts]
 
     def ends(self) -> None:
-        """End the run, with a whole record."""
+        """End the run with a complete record."""
         assert self.federation.client().request("world/control", "stop")["ok"]
         self.recorder.ends(with_code=0)
 
 
 class Mixed:
-    """The run with the hardware in it.
+    """The run that includes the hardware drones.
 
     Args:
-        federation: of its own.
-        scenario: of the run.
-        pace: options of the run.
+        federation: federation of this run alone.
+        scenario: scenario of the run.
+        pace: options that set the pace of the run.
     """
 
     def __init__(self, federation: Federation, scenario: str = EXTERNAL, pace: tuple[str, ...] = PACE) -> None:
@@ -128,7 +128,7 @@ class Mixed:
         self.links: Subscription = self.client.subscribe("drone/drone3/link")
 
     def drive(self, drone: str, wire: str, ports: Sequence[str], *options: str) -> Role:
-        """Start the driver of a drone, armed, by the ports of its aircraft."""
+        """Start the driver of a drone, armed, on the ports of its aircraft."""
         host = ports[0].rpartition(":")[0]
         how = (
             ("ardrone", "drive", drone, host) if wire == "ardrone" else ("mavlink", "drive", drone, f"udp://{ports[0]}")
@@ -136,11 +136,11 @@ class Mixed:
         return self.federation.start(*how, "--connect", self.federation.endpoint, "--armed", "--speed", "3", *options)
 
     def engaged_ns(self, after_ns: int = 0) -> int:
-        """Wait until the formation is engaged; return when [ns]."""
+        """Wait until the formation is engaged; return the time [ns]."""
         return self.formation.until(lambda m: m["phase"] == "engaged" and m["t_ns"] > after_ns).message["t_ns"]
 
     def until(self, state: str, after_ns: int = 0) -> int:
-        """Wait for a state of drone3; return when [ns]."""
+        """Wait for a state of drone3; return the time [ns]."""
         return self.status.until(lambda m: m["state"] == state and m["t_ns"] > after_ns).message["t_ns"]
 
     def ends(self) -> None:
@@ -149,13 +149,13 @@ class Mixed:
         self.until("landing")
         self.until("landed")
         assert self.client.request("world/control", "stop")["ok"]
-        self.run.ends(with_code=(0, 1))  # 1 where the formation was held for long, as while a driver was away
+        self.run.ends(with_code=(0, 1))  # 1 if the formation was held for long, for instance while a driver was absent
 
 
 def true_rms(
     mixed: Mixed, hardware: Hardware, drones: Sequence[str], window_s: tuple[float, float], rate: float = 2.0
 ) -> dict[str, float]:
-    """Return the RMS errors of the formation in truth, that of some drones being the hardware's."""
+    """Return the RMS errors of the true formation, with the truth of `drones` from the hardware's record."""
     records = (mixed.federation.out / "run.mcap", hardware.federation.out / "run.mcap")
     formation = true_formation(*records, drones, rate)
     rows = formation.true_error[formation.within(window_s)]

@@ -1,4 +1,4 @@
-"""Network namespaces by iproute2: make, enter, list who runs in them, take away with everybody in them."""
+"""Network namespaces by iproute2: enter them, list their processes, and remove them with these."""
 
 import ctypes
 import os
@@ -11,19 +11,19 @@ from pathlib import Path
 
 from federation import wait_gone
 
-FOLDER = Path("/run/netns")  # where iproute2 keeps them
+FOLDER = Path("/run/netns")  # where iproute2 keeps the namespaces
 CLONE_NEWNET = 0x40000000  # linux/sched.h
-GONE_S = 120.0  # wall time for a killed process to vanish, on a machine that does other things too
+GONE_S = 120.0  # wall time for a killed process to vanish on a busy machine
 SBIN = "/usr/sbin:/sbin"  # often missing in a PATH
 
 
 def environment() -> dict[str, str]:
-    """Return the environment with the folders in which a system keeps the tools of its administrator."""
+    """Return the environment with the folders of the administrator's tools in PATH."""
     return {**os.environ, "PATH": f"{os.environ.get('PATH', '/usr/bin:/bin')}:{SBIN}"}
 
 
 def checked(command: Sequence[str], stdin: str = "") -> str:
-    """Run a command that must succeed and return what it prints."""
+    """Run a command, which must succeed, and return its output."""
     done = subprocess.run(command, input=stdin, text=True, capture_output=True, timeout=GONE_S, env=environment())
     if done.returncode:
         raise OSError(f"{' '.join(command)} failed: {done.stderr.strip()}")
@@ -31,7 +31,7 @@ def checked(command: Sequence[str], stdin: str = "") -> str:
 
 
 def ip(*lines: str, within: str | None = None) -> None:
-    """Run lines of `ip` in one go, in a namespace or outside of all."""
+    """Run lines of `ip` as one batch, within a namespace or outside all of them."""
     checked(["ip", *(("-n", within) if within else ()), "-batch", "-"], "\n".join(lines) + "\n")
 
 
@@ -58,7 +58,7 @@ def _enter(descriptor: int) -> None:
 
 
 def members(namespace: str) -> Iterator[tuple[int, str]]:
-    """Yield id and command line of the processes in a namespace."""
+    """Yield the id and command line of each process in a namespace."""
     try:
         inode = (FOLDER / namespace).stat().st_ino
     except FileNotFoundError:
@@ -69,11 +69,11 @@ def members(namespace: str) -> Iterator[tuple[int, str]]:
                 line = (entry / "cmdline").read_bytes().rstrip(b"\0").replace(b"\0", b" ")
                 yield int(entry.name), line.decode(errors="replace")
         except OSError:
-            continue  # it has just ended
+            continue  # the process has just ended
 
 
 def remove(namespace: str) -> None:
-    """Kill every process in a namespace, those too that are started meanwhile, and take it away."""
+    """Kill every process in a namespace, including those started meanwhile, and remove the namespace."""
     while found := [pid for pid, _ in members(namespace) if pid != os.getpid()]:
         for pid in found:
             _kill(pid)
@@ -92,7 +92,7 @@ def _kill(pid: int) -> None:
 
 
 def sweep(prefix: str) -> None:
-    """Take away the namespaces PREFIX-PID-… of processes that were killed before they could do it."""
+    """Remove the namespaces PREFIX-PID-… of processes that were killed before they could do so."""
     for entry in FOLDER.iterdir() if FOLDER.is_dir() else ():
         owner = re.match(rf"{prefix}-(\d+)-", entry.name)
         if owner and not Path("/proc", owner[1]).exists():

@@ -1,4 +1,4 @@
-"""GNU Octave, as far as it is installed: runs the MATLAB client's code in tests."""
+"""GNU Octave, which runs the MATLAB client's code in tests if it is installed."""
 
 import shutil
 import subprocess
@@ -24,7 +24,7 @@ def command(code: str) -> list[str]:
 
 
 def run(code: str, within_s: float = PATIENCE_S) -> str:
-    """Run code to its end; return what it prints. Fails with its error, or with its warnings if there are any."""
+    """Run code and return its output; fail if it raises an error or prints a warning."""
     done = subprocess.run(command(code), cwd=ROOT, capture_output=True, text=True, timeout=within_s)
     assert done.returncode == 0, done.stderr
     assert "warning" not in done.stderr, done.stderr

@@ -1,4 +1,4 @@
-"""What of a page is cut off, out of reach, or written over something else; judged in the browser."""
+"""Detection, in the browser, of parts of a page that are cut off, out of reach or overwritten."""
 
 from typing import Any
 
@@ -75,5 +75,5 @@ FAULTS_JS = """() => {
 
 
 def overflow(page: Any) -> list[str]:
-    """Return what is cut off, out of reach or overwritten on a page, in words; empty where nothing is."""
+    """Return descriptions of what is cut off, out of reach or overwritten on a page."""
     return page.evaluate(FAULTS_JS)

@@ -1,6 +1,6 @@
-"""Who may do what under access control, written down by hand: what the rights of the code are held against.
+"""The rights of every role under access control, written by hand, against which those in the code are checked.
 
-r subscribe, p publish, g get (on a control key: request), a answer gets, t declare the liveliness token, w see it.
+r subscribe, p publish, g get (on a control key: request), a answer gets, t declare the liveliness token, w watch it.
 """
 
 SCENARIO = """
@@ -16,10 +16,10 @@ clusters:
   - {name: main, drones: [drone1, drone2]}
 processes: {expect: [estimator.drone1, estimator.drone2, estimator.drone3, controller.main]}
 """
-"""Two drones in a formation, one that is not, and one that a driver publishes."""
+"""Two drones in a formation, one outside it, and one that a driver publishes."""
 
 SIMULATED = SCENARIO.replace(", body: external", "")
-"""The same, for runs in lockstep."""
+"""SCENARIO with all drones simulated, for runs in lockstep."""
 
 ROLES: tuple[str, ...] = (
     "estimator.drone1",
@@ -163,5 +163,5 @@ KEYS = tuple(_ROWS)
 
 
 def keys_of(role: str, act: str) -> set[str]:
-    """Return the keys on which a role may do one of the acts."""
+    """Return the keys on which a role may perform an act."""
     return {key for key, row in _ROWS.items() if act in row[role]}

@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false
-"""A node as users of ardrone_autonomy write them: takes off, climbs to 1.6 m by navdata, hovers, lands.
+"""A node as users of ardrone_autonomy write it: takes off, climbs to 1.6 m by the altitude in navdata, hovers, lands.
 
 Knows nothing of zsim. Run in the drone's namespace: ROS_NAMESPACE=drone1 python3 ros1_climb.py
 """

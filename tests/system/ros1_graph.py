@@ -1,4 +1,4 @@
-"""A ROS 1 graph of the test's own: Debian's unmodified roscore and command line tools, and nodes with rospy."""
+"""A private ROS 1 graph: Debian's unmodified roscore and command-line tools, and rospy nodes."""
 
 import os
 import shutil
@@ -17,15 +17,15 @@ from wire import PATIENCE_S
 
 TOOLS = ("roscore", "rosmaster", "rosparam", "rostopic", "rosnode", "rosservice")
 MODULES = ("rospy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rosgraph_msgs", "genpy")
-POLL_S = 0.05  # between two attempts to reach a master on its way up
-PYTHON = "/usr/bin/python3"  # the one that Debian's packages are for
+POLL_S = 0.05  # between two attempts to reach a starting master
+PYTHON = "/usr/bin/python3"  # the interpreter that Debian's packages are built for
 RELAY = "/usr/lib/topic_tools/relay"
 GENERATOR = Path("/usr/lib/genpy/genmsg_py.py")
 HEADER = "uint32 seq\ntime stamp\nstring frame_id\n"  # std_msgs/Header
 
 
 def missing() -> str:
-    """Return what of ROS 1 is not installed here, as text; empty where nothing is."""
+    """Return a text that names the missing parts of ROS 1; empty if there are none."""
     tools = [tool for tool in (*TOOLS, RELAY, str(GENERATOR)) if shutil.which(tool) is None]
     if tools:
         return f"ROS 1 is not installed: no {', '.join(tools)}"
@@ -34,7 +34,7 @@ def missing() -> str:
 
 
 class Tool:
-    """A started program; its output is read all the time."""
+    """A started program, whose output is read continuously."""
 
     def __init__(self, command: list[str], env: dict[str, str]) -> None:
         self.command = " ".join(command)
@@ -60,7 +60,7 @@ class Tool:
                 self._news.notify_all()
 
     def until(self, wanted: Callable[[str], object], within_s: float = PATIENCE_S) -> str:
-        """Return the first line from now on that is wanted; fail when none comes."""
+        """Return the next wanted line; fail if none arrives in time."""
         until_s = time.monotonic() + within_s
         with self._news:
             seen = len(self.lines)
@@ -74,7 +74,7 @@ class Tool:
         return pytest.fail(f"{self.command}: no such line within {within_s:g} s; the last ones were\n{last}")
 
     def end(self, number: int = signal.SIGINT) -> None:
-        """End it and its children."""
+        """End the program and its children."""
         if self.process.poll() is None:
             os.killpg(self.process.pid, number)
             try:
@@ -88,7 +88,7 @@ class Tool:
 
 
 class RosGraph:
-    """A master on a free port, and who is at it."""
+    """A master on a free port, and the programs that use it."""
 
     def __init__(self, folder: Path) -> None:
         self.port = free_port()
@@ -108,7 +108,7 @@ class RosGraph:
         }
 
     def start_master(self, *master: str) -> None:
-        """Start roscore, or another master, and wait until it answers; simulated time is what nodes are to use."""
+        """Start roscore or another master, wait until it answers, and have nodes use simulated time."""
         self._master = self.start(*(master or ("roscore",)), "-p", str(self.port))
         until_s = time.monotonic() + PATIENCE_S
         while not self._set_simulated_time():
@@ -116,7 +116,7 @@ class RosGraph:
             threading.Event().wait(POLL_S)
 
     def _set_simulated_time(self) -> bool:
-        """Do what `rosparam set /use_sim_time true` does; return whether the master answers."""
+        """Act as `rosparam set /use_sim_time true`; return whether the master answers."""
         try:
             with ServerProxy(self.uri) as master:
                 master.setParam("/tests", "/use_sim_time", True)
@@ -125,7 +125,7 @@ class RosGraph:
         return True
 
     def stop_master(self) -> None:
-        """Let the master die; not for roscore, which must be let end those that it has started."""
+        """Kill the master; not for roscore, which must end its own child processes."""
         assert self._master is not None
         self._master.end(signal.SIGKILL)
 
@@ -136,19 +136,19 @@ class RosGraph:
         return tool
 
     def run(self, *command: str) -> str:
-        """Return what a program prints, which must end well."""
+        """Run a program, which must succeed, and return its output."""
         done = self._call(*command)
         assert done.returncode == 0, f"{' '.join(command)}:\n{done.stdout}{done.stderr}"
         return done.stdout
 
     def refused(self, *command: str) -> str:
-        """Return what a program prints that must not end well."""
+        """Run a program, which must fail, and return its output."""
         done = self._call(*command)
         assert done.returncode != 0, f"{' '.join(command)}:\n{done.stdout}"
         return done.stdout + done.stderr
 
     def watch(self, topic: str) -> Tool:
-        """Start `rostopic echo` of numbers, a line of them each time; times come first."""
+        """Start `rostopic echo -p`, which prints each message as a line of numbers, its time first."""
         return self.start("rostopic", "echo", "-p", topic)
 
     @contextmanager
@@ -159,7 +159,7 @@ class RosGraph:
         tool.end()
 
     def generate(self, package: str, name: str, definition: str) -> None:
-        """Let ROS's own generator make a message type for its tools, as building its package would."""
+        """Generate a message type for the tools with ROS's own generator, as a build of its package would."""
         source, headers, out = (self._packages / part for part in ("source", "std", f"{package}/msg"))
         for folder in (source, headers, out):
             folder.mkdir(parents=True)
@@ -171,7 +171,7 @@ class RosGraph:
         self.run(PYTHON, str(GENERATOR), "--initpy", "-p", package, "-o", str(out))
 
     def close(self) -> None:
-        """End whoever is left, the master last."""
+        """End the remaining programs, the master last."""
         for tool in reversed(self._tools):
             tool.end()
 
@@ -180,6 +180,6 @@ class RosGraph:
 
 
 def numbers(line: str) -> list[float]:
-    """Return the numbers of a line of `rostopic echo -p`, its time in seconds first; none of its head or a warning."""
+    """Return the numbers of a line of `rostopic echo -p`, its time [s] first; none for the header or a warning."""
     first, *others = line.split(",")
     return [int(first) * 1e-9, *map(float, others)] if first.isdigit() else []

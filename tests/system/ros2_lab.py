@@ -1,4 +1,4 @@
-"""ROS's side of a federation under test: participants of somebody else's making, and a router as rmw_zenohd is one."""
+"""The ROS 2 side of a federation under test: third-party participants, and a router like rmw_zenohd."""
 
 import json
 import os
@@ -19,7 +19,7 @@ from zsim_bridges.ros2.rmw_zenoh import MESSAGES
 HERE = Path(__file__).parent
 TRIGGER = {
     "kind": "std_srvs/srv/Trigger",
-    "request": "uint8 structure_needs_at_least_one_member",  # what an empty request is on the wire
+    "request": "uint8 structure_needs_at_least_one_member",  # how an empty request is encoded
     "response": "bool success\nstring message",
     "fields": {"structure_needs_at_least_one_member": 0},
 }
@@ -36,7 +36,7 @@ with zenoh.open(config):
 
 
 def write_definitions(folder: Path) -> Path:
-    """Write the definitions of all types for participants that would else look for them on the network."""
+    """Write the definitions of all message types for participants, which otherwise fetch them from the network."""
     store = get_typestore(Stores.ROS2_JAZZY)
     texts = {name: store.gendefhash(name, {}, 2)[0] for name in store.fielddefs if "/msg/" in name}
     for name, text in {**texts, **MESSAGES}.items():
@@ -82,7 +82,7 @@ class Child:
         self.process.stdin.flush()
 
     def wait(self, met: Callable[[], Any], what: str, within_s: float = PATIENCE_S) -> Any:
-        """Return what `met` returns, asked after each line, once it is something."""
+        """Call `met` after each line and return its first result that is not None."""
         until_s = time.monotonic() + within_s
         with self.news:
             while (found := met()) is None:
@@ -111,7 +111,7 @@ class Child:
 
 
 class Router(Child):
-    """A Zenoh router on a port, with gossip, as rmw_zenohd is one."""
+    """A Zenoh router on a port, with gossip, like rmw_zenohd."""
 
     def __init__(self, port: int) -> None:
         super().__init__("-c", ROUTER, str(port))
@@ -119,10 +119,10 @@ class Router(Child):
 
 
 class Peer(Child):
-    """A participant, see ros2_peer.py; a peer of Zenoh's as ROS nodes are by default, or a client.
+    """A participant (see ros2_peer.py): a Zenoh peer, as ROS nodes are by default, or a client.
 
     Attributes:
-        received: messages by topic, as they came.
+        received: messages by topic, in order of arrival.
     """
 
     def __init__(self, port: int, definitions: Path, mode: str) -> None:
@@ -134,7 +134,7 @@ class Peer(Child):
         self._result("ready")
 
     def request(self, op: str, **args: Any) -> Any:
-        """Have it do something, and return the result."""
+        """Request an operation of the participant, and return its result."""
         self.write_line(json.dumps({"op": op, **args}))
         return self._result(op)
 
@@ -155,7 +155,7 @@ class Peer(Child):
         self._seen = len(self.lines)
 
     def receive(self, topic: str, met: Callable[[Any], bool] = lambda message: True, fresh: bool = True) -> Any:
-        """Return the first message on a topic that meets a condition, of those to come if it is to be fresh."""
+        """Return the first message on a topic that meets a condition; if `fresh`, ignore those already received."""
         with self.news:
             self._sort()
             first = len(self.received.get(topic, [])) if fresh else 0
@@ -167,7 +167,7 @@ class Peer(Child):
         return self.wait(found, topic)
 
     def until(self, op: str, met: Callable[[Any], bool], **args: Any) -> Any:
-        """Ask until the answer meets a condition."""
+        """Repeat a request until its answer meets a condition."""
         until_s = time.monotonic() + PATIENCE_S
         while not met(answer := self.request(op, **args)):
             if time.monotonic() > until_s:

@@ -1,8 +1,8 @@
-"""A ROS 2 participant of somebody else's making (PyPI zenoh-ros2-sdk) as a process of its own, which takes requests as lines.
+"""A third-party ROS 2 participant (zenoh-ros2-sdk from PyPI) as a process that takes requests as lines.
 
-    python ros2_peer.py PORT FOLDER        FOLDER has PACKAGE/msg/NAME.msg of every type
+    python ros2_peer.py PORT FOLDER        FOLDER contains PACKAGE/msg/NAME.msg for every type
 
-A line in is {"op": ...}, a line out {"op": ..., "result": ...} or {"topic": ..., "message": {...}}.
+An input line is {"op": ...}, an output line {"op": ..., "result": ...} or {"topic": ..., "message": {...}}.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ def say(**line: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a message as JSON has it."""
+    """Return a message as JSON types."""
     if dataclasses.is_dataclass(value):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
@@ -42,7 +42,7 @@ def plain(value: Any) -> Any:
 
 
 class Peer:
-    """One participant."""
+    """The participant, whose methods are the operations."""
 
     def __init__(self, port: int, folder: str) -> None:
         self._session = ZenohSession.get_instance(HOST, port)
@@ -68,7 +68,7 @@ class Peer:
         self._publishers[topic].publish(**{name: self._built(value) for name, value in fields.items()})
 
     def _built(self, value: Any) -> Any:
-        """Return a nested message of {"type": ..., fields}."""
+        """Return the nested message described by {"type": ..., fields}."""
         if not isinstance(value, dict):
             return value
         fields = {name: self._built(each) for name, each in value.items() if name != "type"}
@@ -78,7 +78,7 @@ class Peer:
         client = ROS2ServiceClient(
             service, kind, request_definition=request, response_definition=response, timeout=120.0, **self._where
         )
-        matched = threading.Event()  # a request before the service is known is lost, and the SDK waits for its answer
+        matched = threading.Event()  # a request sent before the service is known is lost, yet the SDK awaits its answer
         querier: Any = client.querier
         querier.declare_matching_listener(lambda status: matched.set() if status.matching else None)
         if querier.matching_status.matching:
@@ -108,7 +108,7 @@ def main() -> None:
         op = asked.pop("op")
         say(op=op, result=getattr(peer, op)(**asked))
     peer._session.close()
-    os._exit(0)  # the SDK leaves threads behind that would keep the process
+    os._exit(0)  # the SDK leaves threads that would keep the process alive
 
 
 main()

@@ -1,7 +1,7 @@
-"""A secured federation on loopback: certificates, a hub that judges, and programs that try everything.
+"""A secured federation on loopback: certificates, a hub with access control, and clients that try everything.
 
-Who is refused gets no error, so what was allowed is read off at the other end: every attempt ends with
-something that is allowed (a fence), and what came before it came.
+A refused client receives no error, so the receiving end shows what was allowed: every series of attempts ends with an
+allowed message (a fence), and whatever has not arrived by then was refused.
 """
 
 import itertools
@@ -30,14 +30,14 @@ from zsim_deploy.certificates import CertificateRequest, access_control
 HOST = "lab"
 SITE = "router.site"
 PREFIX = "zsim/"
-READY = b"ready"  # what is published to learn whether anybody receives it
-SHORT_S = 1.0  # for a link that is to be refused
+READY = b"ready"  # payload published to find out whether a subscriber receives it
+SHORT_S = 1.0  # wait for a link that should be refused
 
 _numbers = itertools.count()
 
 
 class Certificates:
-    """An authority and what it has issued, in a folder."""
+    """A certificate authority and the certificates that it has issued, in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -45,11 +45,11 @@ class Certificates:
         self._authority = certificates.authority(folder, self._now)
 
     def of(self, process: str, days: float = certificates.DAYS, host: str = HOST) -> Path:
-        """Return the folder with the certificate of a process, made anew."""
+        """Issue a new certificate for a process and return its folder."""
         return certificates.issue(self.folder, self._authority, CertificateRequest(host, process), self._now, days)
 
     def identity(self, process: str, rules: dict[str, Any] | None = None) -> Identity:
-        """Return the identity of a process that listens under some access control."""
+        """Return the identity of a process, with access control if rules are given."""
         access = None
         if rules is not None:
             access = self.folder / f"{process}.{next(_numbers)}.access.json"
@@ -63,7 +63,7 @@ def tls_endpoint(host: str = "127.0.0.1") -> str:
 
 @contextmanager
 def hub(made: Certificates, clients: Iterable[str] = ROLES, behind: Iterable[str] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the endpoint and the session of a listening world that lets in some clients, and a router's."""
+    """Yield the endpoint and the session of a world that admits clients, and a router with those behind it."""
     rules = access_control(scenario_file.from_text(SCENARIO), clients, {SITE: behind} if behind else {})
     endpoint = tls_endpoint()
     with connection.listen([endpoint], "zsim", "lockstep", made.identity("world", rules)) as link:
@@ -72,7 +72,7 @@ def hub(made: Certificates, clients: Iterable[str] = ROLES, behind: Iterable[str
 
 @contextmanager
 def site(made: Certificates, upstream: str, clients: Iterable[str] = ROLES) -> Iterator[str]:
-    """Yield the endpoint of a router that leads to a world, once it does."""
+    """Yield the endpoint of a router once it is connected to a world."""
     rules = access_control(scenario_file.from_text(SCENARIO), clients, {}, ["world"])
     endpoint = tls_endpoint()
     with connection.route(endpoint, upstream, "zsim", "lockstep", made.identity(SITE, rules)) as link:
@@ -83,7 +83,7 @@ def site(made: Certificates, upstream: str, clients: Iterable[str] = ROLES) -> I
 
 
 class RawClient:
-    """A program with some certificate, or none, that uses Zenoh as it likes."""
+    """A program, with or without a certificate, that uses Zenoh directly."""
 
     def __init__(self, endpoint: str, tls: Path | None, within_s: float = PATIENCE_S) -> None:
         config = zenoh.Config()
@@ -128,7 +128,7 @@ class RawClient:
         self._kept.append(self.session.declare_subscriber(PREFIX + expression, callback))
 
     def ask(self, key: str, received: "KeyLog") -> None:
-        """Get without waiting for an answer."""
+        """Send a get without waiting for an answer."""
         callback = zenoh.handlers.Callback(received.reply, indirect=False)
         self.session.get(PREFIX + key, callback, timeout=PATIENCE_S)
 
@@ -147,24 +147,24 @@ class RawClient:
         self._kept.append(self.session.liveliness().declare_subscriber(PREFIX + expression, callback, history=True))
 
     def request(self, key: str, op: str, **args: Any) -> dict[str, Any]:
-        """Return the answer to a request; fail when nobody answers."""
+        """Return the answer to a request; fail if there is none."""
         payload = bytes(msgpack.packb({"op": op, "args": args, "source": "client"}) or b"")
         replies = self.session.get(PREFIX + key, payload=payload, timeout=PATIENCE_S)
         return msgpack.unpackb(next(reply.ok for reply in replies if reply.ok is not None).payload.to_bytes())
 
     def settle(self, key: str = "clock") -> None:
-        """Return when the hub has answered a get: what was declared before on this link has arrived."""
+        """Wait until the hub answers a get: by then all earlier declarations on this link have arrived."""
         replies = [reply for reply in self.session.get(PREFIX + key, timeout=PATIENCE_S) if reply.ok is not None]
         assert replies, f"no answer on {key}"
 
     def until_answered(self, key: str) -> None:
-        """Ask until somebody answers: through a router a new queryable is not always known at once."""
+        """Repeat a get until it is answered: a router may not know a new queryable at once."""
         until_s = time.monotonic() + PATIENCE_S
         while not any(reply.ok is not None for reply in self.session.get(PREFIX + key, timeout=1.0)):
             assert time.monotonic() < until_s, f"nobody answers on {key}"
 
     def publish_until_received(self, key: str, received: "KeyLog") -> None:
-        """Publish until it is received: through a router a new subscriber is not always known at once."""
+        """Publish until a sample is received: a router may not know a new subscriber at once."""
         until_s = time.monotonic() + PATIENCE_S
         while not received.take_one(within_s=0.1):
             assert time.monotonic() < until_s, f"nobody receives {key}"
@@ -172,10 +172,10 @@ class RawClient:
 
 
 class KeyLog:
-    """Keys in the order in which they came.
+    """Received keys, in order of arrival.
 
     Args:
-        only: payload of the samples that count; None takes all.
+        only: payload of the samples to log; None for all samples.
     """
 
     def __init__(self, only: bytes | None = None) -> None:
@@ -194,7 +194,7 @@ class KeyLog:
             self.sample(reply.ok)
 
     def take_one(self, within_s: float) -> bool:
-        """Take one key; tell whether one came in time."""
+        """Take one key; return whether one arrived in time."""
         try:
             self._queue.get(timeout=within_s)
         except queue.Empty:
@@ -202,7 +202,7 @@ class KeyLog:
         return True
 
     def until(self, done: Callable[[set[str]], bool]) -> set[str]:
-        """Return what has come once it is `done`; fail when that never happens."""
+        """Return the received keys once they are `done`; fail if they never are."""
         came: set[str] = set()
         while not done(came):
             try:

@@ -1,18 +1,18 @@
-"""A process in the background that prints when it is ready; all that it prints is kept in a file."""
+"""A background process that reports when it is ready, and whose output is kept in a file."""
 
 import subprocess
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-READY_S = 120.0  # wall time to come up on a loaded machine
+READY_S = 120.0  # wall time to become ready on a loaded machine
 
 
 class Service:
     """A started process, ready to serve.
 
     Args:
-        ready: what it prints when it is.
+        ready: text that it prints once it is ready.
         log: file for its output.
 
     Raises:
@@ -32,12 +32,12 @@ class Service:
             raise OSError(f"{command[-1]}: no {ready!r} within {READY_S:g} s; it says {log.read_text()[-400:]!r}")
 
     def kill(self) -> None:
-        """End the process; its children may live on, and write."""
+        """End the process; its children may live on and write output."""
         self._process.kill()
         self._process.wait()
 
     def finish(self) -> None:
-        """Take in the rest of the output, once all who write it have ended."""
+        """Read the rest of the output, until all processes that write it have ended."""
         self._process.wait()
         self._reader.join()
 

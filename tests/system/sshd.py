@@ -1,4 +1,4 @@
-"""An sshd with everything of its own: host key, authorised key, process id file; nothing of /etc/ssh is read."""
+"""An sshd with its own host key, authorised key and process id file; it reads nothing from /etc/ssh."""
 
 import os
 import shlex
@@ -8,8 +8,8 @@ from pathlib import Path
 
 from namespaces import checked, environment
 
-READY = "Server listening"  # what it says when it is
-PRIVILEGES = "/run/sshd"  # it wants this folder; a container has no service that makes it
+READY = "Server listening"  # printed by sshd once it is ready
+PRIVILEGES = "/run/sshd"  # folder that sshd requires; a container has no service that creates it
 CONFIG = """
 ListenAddress {address}
 HostKey {folder}/host_key
@@ -28,21 +28,21 @@ SetEnv {variables}
 
 
 def command(address: str, folder: Path, client: Path, variables: Mapping[str, str]) -> list[str]:
-    """Write a configuration into a folder and return what starts the sshd.
+    """Write a configuration into a folder and return the command that starts the sshd.
 
     Args:
         client: public key that may log in.
-        variables: that every session gets.
+        variables: environment variables of every session.
     """
     given = " ".join(shlex.quote(f"{key}={value}") for key, value in variables.items())
     config = folder / "sshd_config"
     config.write_text(CONFIG.format(address=address, folder=folder, client=client, variables=given))
     os.makedirs(PRIVILEGES, mode=0o755, exist_ok=True)
-    program = shutil.which("sshd", path=environment()["PATH"]) or "sshd"  # it insists on an absolute path
+    program = shutil.which("sshd", path=environment()["PATH"]) or "sshd"  # sshd must be called by an absolute path
     return [program, "-D", "-e", "-f", str(config)]
 
 
 def make_key(path: Path) -> str:
-    """Make a pair of keys without passphrase and return the public one's line."""
+    """Create a key pair without a passphrase and return the line of the public key."""
     checked(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", str(path)])
     return path.with_suffix(".pub").read_text()

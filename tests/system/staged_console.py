@@ -1,4 +1,4 @@
-"""A console as it is, on a run that only the test performs: pages of it cost a browser, and no federation."""
+"""A real console on a run that the test plays: its pages require a browser but no federation."""
 
 import math
 import threading
@@ -24,17 +24,23 @@ from zsim_bridges.console.console_server import Console
 from zsim_bridges.console.page_server import ListenAddress
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
-PICTURES_HZ = 100.0  # while the past is performed; each has one point of the plots
-PAST_STEP_S = 0.5  # simulated, from one picture of the past to the next
-PRESENT_S = 0.5  # wall, and simulated, between two pictures: a browser without a graphics card draws slowly
+PICTURES_HZ = 100.0  # picture rate while the past is performed; each picture adds one point to the plots
+PAST_STEP_S = 0.5  # simulated time between two pictures of the past
+PRESENT_S = 0.5  # wall and simulated time between two later pictures: a browser without a graphics card renders slowly
 GATE_NS = 20_000_000
-LOOK_S = 0.5  # wall, between two looks whether the console lives
+LOOK_S = 0.5  # wall time between two checks that the console is alive
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
 COVARIANCE_M2 = (0.04, 0.0, 0.0, 0.04, 0.0, 0.09)
-GPS = {"gps": (700, 3), "baro": (3000, 0), "mag": (3000, 0), "imu": (30000, 0), "sonar": (0, 120)}  # used, refused
-APART_M = 4.0  # of drones, where the scenario asks for nothing else
-SWAY_M, SWAY_S = 0.4, 25.0  # of the drones about their places, so that curves are none
+GPS = {
+    "gps": (700, 3),
+    "baro": (3000, 0),
+    "mag": (3000, 0),
+    "imu": (30000, 0),
+    "sonar": (0, 120),
+}  # numbers of samples used and refused
+APART_M = 4.0  # distance between drones unless the scenario's target sets another
+SWAY_M, SWAY_S = 0.4, 25.0  # amplitude and period of the drones' sway, which gives the plots curves
 
 
 class StagedLink:
@@ -60,7 +66,7 @@ class StagedLink:
                 callback(sample)
 
     def put(self, key: str, message: Any) -> None:
-        """Take a command; nobody flies by it."""
+        """Ignore a command."""
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
         if expression != keys.CLOCK or self.clock is None:
@@ -77,23 +83,23 @@ class StagedLink:
 
 
 class StagedRun:
-    """The drones of a formation, engaged; three, in that of scenarios/step.yaml, unless another one is given.
+    """An engaged formation: the three drones of scenarios/step.yaml, unless another scenario is given.
 
     Args:
-        past_s: simulated time that has gone by when a page is opened.
-        timeline: of a replay; empty for a flight.
-        scenario: of the run.
-        state: of each drone.
-        drain_percent_s: of each battery.
+        past_s: simulated time that has passed when a page is opened.
+        timeline: timeline of a replay; empty for a live run.
+        scenario: scenario of the run.
+        state: state of each drone.
+        drain_percent_s: rate at which each battery discharges.
 
     Attributes:
-        link: of the console.
+        link: the console's session.
         t_s: simulated time of the newest picture.
-        clock_state: what the run's clock says.
-        stands: whether time stands.
-        commander: who flies each drone.
-        changes: fields of single drones' views, by drone.
-        phase: of the formation.
+        clock_state: state reported by the run's clock.
+        stands: whether time stands still.
+        commander: name of the process that flies the drones.
+        changes: fields to replace in single drones' views, by drone.
+        phase: phase of the formation.
     """
 
     def __init__(
@@ -115,11 +121,11 @@ class StagedRun:
         self.t_s, self.clock_state, self.stands = 0.0, "running", False
         self.changes: dict[str, dict[str, Any]] = {}
         self.phase = "engaged"
-        self._performed_s = 0.0  # wall
+        self._performed_s = 0.0  # wall time of the newest picture
         self.commander: str | None = None
-        self._present = threading.Event()  # once the past has been performed
-        self.percent = 73.0  # of each battery
-        self.percent_of: dict[str, float] = {}  # of those that are otherwise
+        self._present = threading.Event()  # set once the past has been performed
+        self.percent = 73.0  # charge of each battery
+        self.percent_of: dict[str, float] = {}  # exceptions, by drone
         drones = tuple(DroneInfo(drone.name, "ardrone2") for drone in self._scenario.drones)
         self.info: Any = SimpleNamespace(
             run_id="staged", rate=1.0, gate_ns=GATE_NS, mode="lockstep", drones=drones, scenario=scenario.read_text(),
@@ -142,7 +148,7 @@ class StagedRun:
         self.link.clock = Clock(t_ns, 0, "staged", t_ns // GATE_NS, self.clock_state, 1.0)  # type: ignore[arg-type]
 
     def publish_views(self) -> None:
-        """Publish where all drones are at `t_s`, where they are believed to be, and where they are to be."""
+        """Publish the true, estimated and desired positions of all drones at `t_s`."""
         for key, view in self.views_at(self.t_s):
             self.link.publish(key, view)
 
@@ -198,7 +204,7 @@ class StagedRun:
 
 @contextmanager
 def staged_console(run: StagedRun, folder: Path | None = None, hz: float = PICTURES_HZ) -> Iterator[str]:
-    """Serve pages of a run, recorded in a folder if there is one, so many pictures a second; yield the operator's address."""
+    """Serve a run at `hz` pictures per second, with the files of its folder if given; yield the operator's address."""
     port = free_port()
     console = Console(ListenAddress("127.0.0.1", port), "console.1", None, hz, lambda _: None, folder=folder)
     over = threading.Event()

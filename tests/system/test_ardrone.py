@@ -1,4 +1,4 @@
-"""Programs for the AR.Drone, unmodified, fly the drones of a run through `zsim ardrone serve`."""
+"""Unmodified AR.Drone programs fly the drones of a run through `zsim ardrone serve`."""
 
 import ftplib
 import io
@@ -35,11 +35,11 @@ processes: {expect: []}
 BOOTSTRAP_BYTES, DEMO_BYTES, FULL_BYTES, GPS_BYTES = 24, 500, 1904, 2120
 DEMO_AND_TIME = 1 << 0 | 1 << 1
 WITH_GPS = 65_537 | 1 << 27
-FLOWN_AGAIN_S = 0.1  # wall time between two setpoints; a drone hovers half a second after the last one
+FLOWN_AGAIN_S = 0.1  # wall time between setpoints; a drone hovers half a second after the last one
 
 
 class Fleet:
-    """A world in real pace, its drones as AR.Drones, and a program beside."""
+    """A world in real time, a server that presents its drones as AR.Drones, and a client."""
 
     def __init__(self, federation: Federation) -> None:
         self.addresses = addresses(6)
@@ -55,7 +55,7 @@ class Fleet:
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Fleet]:
-    """A fleet that the tests of this file share; each leaves its drones on the ground."""
+    """A fleet that the tests of this file share; each test leaves the drones on the ground."""
     with Federation(tmp_path_factory.mktemp("ardrone")) as federation:
         yield Fleet(federation)
 
@@ -95,7 +95,7 @@ def test_programs_fly_five_drones_at_once(fleet: Fleet, node_modules) -> None:
     assert "is landing" not in fleet.server.text()
 
 
-def test_navdata_begins_with_bootstrap_and_is_acknowledged(fleet: Fleet) -> None:
+def test_navdata_starts_with_bootstrap_and_follows_the_configuration(fleet: Fleet) -> None:
     with PlainPilot(fleet.addresses[5]) as pilot:
         pilot.request()
         datagram, sender = pilot.receive()
@@ -112,7 +112,7 @@ def test_navdata_begins_with_bootstrap_and_is_acknowledged(fleet: Fleet) -> None
         pilot.config("general:navdata_demo", "TRUE")
 
 
-def test_a_demo_comes_fifteen_times_a_simulated_second(fleet: Fleet) -> None:
+def test_demo_navdata_is_sent_at_15_hz_of_simulated_time(fleet: Fleet) -> None:
     with PlainPilot(fleet.addresses[5]) as pilot:
         pilot.request()
         pilot.config("general:navdata_options", str(DEMO_AND_TIME))
@@ -128,18 +128,20 @@ def _seconds(time: int) -> float:
     return (time >> 21) + (time & 0x1FFFFF) / 1e6
 
 
-def test_the_control_port_has_the_configuration(fleet: Fleet) -> None:
+def test_the_control_port_returns_the_configuration(fleet: Fleet) -> None:
     with PlainPilot(fleet.addresses[5]) as pilot:
         pilot.request()
         pilot.send(at_commands.ResetWatchdog(0))
         pilot.config("CONTROL:euler_angle_max", "0.3")
         entries = configuration_entries(pilot.configuration())
         assert entries["general:num_version_soft"] == "2.4.8"
-        assert float(entries["control:euler_angle_max"]) == pytest.approx(math.radians(5.0), abs=1e-4)  # the drone's
+        assert float(entries["control:euler_angle_max"]) == pytest.approx(
+            math.radians(5.0), abs=1e-4
+        )  # the drone's own limit
         assert b"[sessions]\r00000000,default\r" in pilot.configuration(at_commands.SEND_CUSTOM_LIST)
 
 
-def test_the_version_comes_by_ftp_and_the_question_is_answered(fleet: Fleet) -> None:
+def test_the_version_is_served_by_ftp_and_authentication_is_answered(fleet: Fleet) -> None:
     address = fleet.addresses[5]
     with ftplib.FTP() as ftp:
         ftp.connect(address, 5551, PATIENCE_S)
@@ -156,7 +158,7 @@ def test_the_version_comes_by_ftp_and_the_question_is_answered(fleet: Fleet) -> 
         assert asker.recv(100) == b"PARROT AUTH OK"
 
 
-def test_a_drone_that_another_process_flies_is_shown_and_not_obeyed(fleet: Fleet) -> None:
+def test_a_pilot_sees_but_cannot_command_a_drone_that_another_flies(fleet: Fleet) -> None:
     with PlainPilot(fleet.addresses[5]) as pilot:
         pilot.request()
         pilot.config("general:navdata_demo", "TRUE")
@@ -167,7 +169,7 @@ def test_a_drone_that_another_process_flies_is_shown_and_not_obeyed(fleet: Fleet
         other = lambda: fleet.client.put("drone/drone6/cmd/velocity", t_ns=0, source="tester.one", **still)  # noqa: E731
         with meanwhile(other, FLOWN_AGAIN_S):
             statuses.until(lambda status: status["commander"] == "tester.one")
-            pilot.request()  # it was silent, and is sent no more
+            pilot.request()  # navdata has stopped, because the pilot was silent
             flown = lambda packet: StateBit.FLYING in packet.state and packet.options[0].ctrl_state >> 16 == 3  # noqa: E731
             assert pilot.until(flown).options[0].altitude_mm > 500
             pilot.send(at_commands.ref(0, takes_off=False, emergency=True), at_commands.Pcmd(0, 1, 1.0, 0.0, 0.0, 0.0))
@@ -181,7 +183,7 @@ def test_a_drone_that_another_process_flies_is_shown_and_not_obeyed(fleet: Fleet
         assert fleet.client.request("world/control", "release", source="tester.one", drone="drone6")["ok"]
 
 
-def test_the_emergency_stops_the_motors_and_is_left_again(fleet: Fleet) -> None:
+def test_an_emergency_stops_the_motors_and_can_be_cleared(fleet: Fleet) -> None:
     emergency = StateBit.EMERGENCY | StateBit.USER_EMERGENCY
     with PlainPilot(fleet.addresses[5]) as pilot:
 
@@ -204,7 +206,7 @@ def test_the_emergency_stops_the_motors_and_is_left_again(fleet: Fleet) -> None:
 
 
 @pytest.mark.soak
-def test_a_pilot_who_goes_silent_leaves_a_drone_that_lands(fleet: Fleet) -> None:
+def test_a_drone_hovers_and_lands_when_its_pilot_goes_silent(fleet: Fleet) -> None:
     statuses = fleet.client.subscribe("drone/drone6/sensor/status")
     with PlainPilot(fleet.addresses[5]) as pilot:
         pilot.request()
@@ -222,7 +224,7 @@ def test_a_pilot_who_goes_silent_leaves_a_drone_that_lands(fleet: Fleet) -> None
     assert 1.9 < (landing["t_ns"] - hovering["t_ns"]) / 1e9 < 2.4
 
 
-def test_one_run_is_served_after_the_other(federation: Federation) -> None:
+def test_consecutive_runs_are_served(federation: Federation) -> None:
     first = addresses(30)[-1]
     server = serve(federation, first)
     for number in (1, 2):
@@ -237,7 +239,7 @@ def test_one_run_is_served_after_the_other(federation: Federation) -> None:
     server.line("left, the run ended")
 
 
-def test_a_run_as_fast_as_possible_is_refused_or_paced(federation: Federation) -> None:
+def test_an_unpaced_run_is_refused_unless_a_rate_is_given(federation: Federation) -> None:
     federation.world(ONE, "--expect", "nobody.yet")
     first = addresses(20)[-1]
     refused = serve(federation, first)
@@ -257,8 +259,8 @@ def test_a_run_as_fast_as_possible_is_refused_or_paced(federation: Federation) -
         (("--addresses", "here"), "must be an IPv4 address"),
     ],
 )
-def test_addresses_that_cannot_be_had_are_refused(fleet: Fleet, options: tuple[str, ...], reason: str) -> None:
-    # a server beside the fleet's, under another name
+def test_unusable_addresses_are_refused(fleet: Fleet, options: tuple[str, ...], reason: str) -> None:
+    # a server next to the fleet's, under another name
     endpoint = fleet.server.arguments[fleet.server.arguments.index("--connect") + 1]
     role = Role(["ardrone", "serve", "--connect", endpoint, "--name", "ardrone.other", *options])
     try:

@@ -1,4 +1,4 @@
-"""A drone's ports under what nobody means: no end, no traceback, nothing flown, everything counted."""
+"""Fuzzed ports of a drone: the server neither ends nor prints a traceback, flies nothing and counts every refusal."""
 
 import random
 import socket
@@ -11,7 +11,7 @@ from wire import PATIENCE_S
 
 from zsim_bridges.ardrone import at_commands, navdata
 
-BURST = 64  # datagrams that a socket's buffer surely holds
+BURST = 64  # datagrams that certainly fit a socket's buffer
 AUTHENTICATION_PORT, FTP_PORT, VIDEO_PORT = 5552, 5551, 5555
 FORMED = (
     b'AT*REF=1,290718208\r',
@@ -25,7 +25,7 @@ STRANGE_VALUES = ("", "TRUE", "-all", "nan", "inf", "1e999", "-1", "999999999999
 
 
 def malformed(chance: random.Random) -> Iterator[bytes]:
-    """Yield datagrams that hold no AT command at all."""
+    """Yield datagrams without a single valid AT command."""
     while True:
         kind = chance.randrange(4)
         if kind == 0:
@@ -41,7 +41,7 @@ def malformed(chance: random.Random) -> Iterator[bytes]:
 
 
 def strange(chance: random.Random, sequence: int) -> bytes:
-    """Return a command that is well formed, and that nobody should mean; it starts no motor."""
+    """Return a well-formed but senseless command, which starts no motor."""
     number = chance.randrange(-(2**31), 2**31)
     key, value = chance.choice(STRANGE_KEYS), chance.choice(STRANGE_VALUES)
     return chance.choice(
@@ -57,7 +57,7 @@ def strange(chance: random.Random, sequence: int) -> bytes:
 
 
 @pytest.mark.parametrize("count", [20_000, pytest.param(1_000_000, marks=pytest.mark.soak)])
-def test_nothing_flies_and_all_is_counted(federation: Federation, count: int) -> None:
+def test_fuzzed_ports_fly_nothing_and_count_all_refusals(federation: Federation, count: int) -> None:
     address = addresses(40)[-1]
     federation.world(ONE, "--rate", "1", "--duration", "36000")
     server = serve(federation, address)
@@ -82,7 +82,7 @@ def test_nothing_flies_and_all_is_counted(federation: Federation, count: int) ->
 
 
 def _fuzz_commands(pilot: PlainPilot, chance: random.Random, count: int) -> int:
-    """Send malformed datagrams to the AT port, and strange ones between; return how many the former are."""
+    """Send malformed datagrams to the AT port, with strange ones in between; return the number of malformed ones."""
     datagrams = malformed(chance)
     with socket.create_connection((pilot.address, at_commands.CONTROL_PORT), PATIENCE_S) as control:
         pilot.send(at_commands.ResetWatchdog(0))
@@ -95,7 +95,7 @@ def _fuzz_commands(pilot: PlainPilot, chance: random.Random, count: int) -> int:
 
 
 def _await_configuration(pilot: PlainPilot, control: socket.socket) -> None:
-    """Wait until all that was sent to the AT port is dealt with: the answer to a request behind it comes."""
+    """Wait for the answer to a request: by then all earlier datagrams to the AT port have been handled."""
     pilot.send(at_commands.Control(0, at_commands.SEND_CONFIGURATION))
     data = b""
     while not data.endswith(at_commands.END):
@@ -105,7 +105,7 @@ def _await_configuration(pilot: PlainPilot, control: socket.socket) -> None:
 
 
 def _fuzz_requests(pilot: PlainPilot, chance: random.Random, count: int) -> int:
-    """Send datagrams to the other UDP ports that ask for nothing; return how many."""
+    """Send invalid requests to the other UDP ports; return their number."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
         asker.settimeout(PATIENCE_S)
         for _ in range(count // BURST):
@@ -118,7 +118,7 @@ def _fuzz_requests(pilot: PlainPilot, chance: random.Random, count: int) -> int:
 
 
 def _fuzz_streams(address: str, chance: random.Random, count: int) -> None:
-    """Send bytes to the TCP ports, and leave or stay."""
+    """Send random lines and FTP commands to the TCP ports."""
     for port in (at_commands.CONTROL_PORT, FTP_PORT, VIDEO_PORT):
         for _ in range(count):
             with socket.create_connection((address, port), PATIENCE_S) as stream:
@@ -126,4 +126,4 @@ def _fuzz_streams(address: str, chance: random.Random, count: int) -> None:
                 try:
                     stream.sendall(b"\r\n".join([*lines, b"PASV", b"RETR version.txt"[: chance.randrange(17)], b""]))
                 except ConnectionError:
-                    continue  # it has been closed for what was sent before
+                    continue  # the server closed the connection after earlier input

@@ -1,4 +1,4 @@
-"""On an address that other hosts reach, the host that was named is obeyed, and nobody else."""
+"""On an address that other hosts can reach, only the host named by --peer is obeyed."""
 
 import socket
 
@@ -12,7 +12,7 @@ from zsim_bridges.ardrone import at_commands, navdata
 PORTS = (5559, 5551, 5555)  # TCP
 
 
-def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federation) -> None:
+def test_only_the_named_peer_can_fly_the_drone(lab: Lab, federation: Federation) -> None:
     here = lab.prefix("h1")
     scenario = federation.write(ONE)
     federation.start(
@@ -39,7 +39,7 @@ def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federa
 
 
 def _is_closed(address: str, port: int) -> bool:
-    """Tell whether a connection is ended before anything comes."""
+    """Return whether a connection is closed before any data arrive."""
     with socket.create_connection((address, port), PATIENCE_S) as stream:
         try:
             return stream.recv(1) == b""

@@ -1,4 +1,4 @@
-"""Bad input: for each a clear line and an exit code, or a counted refusal; nothing lost, nothing hanging."""
+"""Bad input is answered by a clear line and an exit code or counted as refused; nothing is lost, nothing hangs."""
 
 import errno
 import os
@@ -21,7 +21,7 @@ FOR_LONG = ("--rate", "1", "--duration", "600")
 ON_THE_DRONE = "yaw_deg: 90"
 NO_DRONES = ONE.split("drones:")[0]
 
-# name: (the scenario, what the line must show)
+# name: (scenario, terms that the line must contain)
 SCENARIOS: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown key": (ONE + "wings: 2\n", ("wings", "drones")),
     "unknown key of a drone": (ONE.replace("yaw_deg", "yaw"), ("drones[0].yaw", "arm_m")),
@@ -55,7 +55,7 @@ SCENARIOS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
-def test_a_bad_scenario_is_a_line(tmp_path: Path) -> None:
+def test_a_bad_scenario_is_reported_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     for name, (text, tokens) in SCENARIOS.items():
         path.write_text(text)
@@ -73,7 +73,7 @@ def test_all_faults_of_a_scenario_are_reported_at_once(tmp_path: Path) -> None:
     assert sorted(parts(line)[0] for line in done.stderr.splitlines()) == ["drones[0].mass_kg", "seed", "wings"]
 
 
-# name: (arguments, what the line must show); {free} is an endpoint where nobody listens
+# name: (arguments, terms that the line must contain); {free} is an endpoint on which no process listens
 COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "no file": (("run", "nowhere.yaml"), ("nowhere.yaml: ", "No such file")),
     "a folder": (("validate", "/"), ("/: ", "Is a directory")),
@@ -133,7 +133,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def test_a_bad_command_is_a_line(tmp_path: Path, compiled: None) -> None:
+def test_a_bad_command_is_reported_in_one_line(tmp_path: Path, compiled: None) -> None:
     (tmp_path / "one.yaml").write_text(ONE)
     (tmp_path / "bad.yaml").write_text(with_expression("sin("))
     (tmp_path / "cut").mkdir()
@@ -150,7 +150,7 @@ def with_expression(text: str) -> str:
     return PAIR.replace("{takeoff_s: 0.5}", plan)
 
 
-def test_a_plan_that_can_never_be_flown_ends_the_run(federation: Federation) -> None:
+def test_an_invalid_expression_in_a_plan_ends_the_run(federation: Federation) -> None:
     run = federation.run(with_expression("sin("))
     assert run.process.wait(PATIENCE_S) != 0
     run.close()
@@ -164,7 +164,7 @@ def test_a_plan_that_can_never_be_flown_ends_the_run(federation: Federation) -> 
     federation.nobody_left()
 
 
-# name: (arguments of a role, what the line must show)
+# name: (arguments of a role, text that its output must contain)
 ROLES = {
     "wrong federation": (
         ("estimator", "drone1", "--federation", "other", "--wait", "1"),
@@ -178,7 +178,7 @@ ROLES = {
 
 @pytest.fixture(scope="module")
 def standing(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Federation]:
-    """A world at real time that waits for nobody, and must live through the tests of this file."""
+    """A world in real time that waits for no process and must survive the tests of this file."""
     with Federation(tmp_path_factory.mktemp("standing")) as federation:
         role = federation.world(ONE, *FOR_LONG)
         client = federation.client()
@@ -189,7 +189,7 @@ def standing(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterat
         role.ends(with_code=0)
 
 
-def test_roles_that_do_not_fit(standing: Federation) -> None:
+def test_roles_with_invalid_arguments_are_refused(standing: Federation) -> None:
     roles = {name: standing.role(*arguments) for name, (arguments, _) in ROLES.items()}
     for name, role in roles.items():
         role.ends(with_code=USER_FAULT)
@@ -197,8 +197,8 @@ def test_roles_that_do_not_fit(standing: Federation) -> None:
         assert "Traceback" not in role.text()
 
 
-def test_a_port_in_use(standing: Federation) -> None:
-    """Neither a world nor a whole run takes it, and no role of that run strays into the world that has it."""
+def test_a_port_in_use_is_refused(standing: Federation) -> None:
+    """Neither a world nor a run can listen on it, and no role of that run joins the world that does."""
     second = standing.world(ONE)
     second.ends(with_code=USER_FAULT)
     assert standing.endpoint in second.text()
@@ -211,7 +211,7 @@ def test_a_port_in_use(standing: Federation) -> None:
 
 
 @pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("recorder", marks=pytest.mark.soak)])
-def test_of_two_processes_of_one_name_the_older_ends(standing: Federation, name: str) -> None:
+def test_a_process_is_superseded_by_a_newer_one_of_its_name(standing: Federation, name: str) -> None:
     events = standing.client().subscribe("world/event")
     arguments = [("estimator", "drone1")] * 2
     if name == "recorder":
@@ -221,10 +221,10 @@ def test_of_two_processes_of_one_name_the_older_ends(standing: Federation, name:
     newer = standing.role(*arguments[1])
     older.ends(with_code=SUPERSEDED)
     assert re.search(rf"^{name}: ", older.text(), re.MULTILINE)
-    assert newer.process.poll() is None  # and stays: who leaves early fails the run
+    assert newer.process.poll() is None  # it stays, since a process that leaves early fails the run
 
 
-def test_a_run_is_never_written_over(federation: Federation) -> None:
+def test_a_record_is_never_overwritten(federation: Federation) -> None:
     federation.out.mkdir()
     (federation.out / "run.mcap").write_bytes(b"precious")
     role = federation.run(ONE)
@@ -251,12 +251,14 @@ def test_a_full_disk_ends_the_run_and_keeps_the_record(federation: Federation, s
     role.ends(with_code=1)
     assert os.strerror(errno.ENOSPC) in role.text()
     federation.nobody_left()
-    federation.out = Path(shutil.copytree(federation.out, federation.folder / "kept"))  # mending it takes room
+    federation.out = Path(
+        shutil.copytree(federation.out, federation.folder / "kept")
+    )  # repairing the record takes space
     assert federation.record().keys()["clock"] > 0
 
 
-def test_a_record_that_may_not_grow(federation: Federation) -> None:
-    """As on a full disk, where nobody may mount one: a limit on the size of the recorder's files."""
+def test_a_limit_on_file_size_ends_the_recorder_and_keeps_the_record(federation: Federation) -> None:
+    """The limit on the recorder's files stands in for a full disk where the tests may not mount one."""
     world = federation.world(ONE, "--rate", "20", "--duration", "10000", "--expect", "recorder")
     command = [*ZSIM, "record", "--out", str(federation.out), "--connect", federation.endpoint]
     limited = ["bash", "-c", 'trap "" XFSZ; ulimit -f 300; exec "$@"', "bash", *command]  # KiB
@@ -296,7 +298,7 @@ GARBAGE_KEYS = (
 
 
 def test_garbage_is_counted_and_changes_nothing(federation: Federation) -> None:
-    """The same run with and without a client that floods every kind of key; time waits for it at each gate."""
+    """The same run with and without a client that floods every kind of key, and for which time waits at each gate."""
     folder = federation.folder / "calm"
     folder.mkdir()
     with Federation(folder) as calm:
@@ -314,8 +316,8 @@ def test_garbage_is_counted_and_changes_nothing(federation: Federation) -> None:
         client.pack({"t_ns": 1}),
         os.urandom(64),
         b"\x81" * 5000,
-        client.pack({"t_ns": 1, "seq": 0, "source": ""})[:-1] + b"\xa1\xff",  # no UTF-8
-        client.pack({"t_ns": 1, "seq": 0, "x": 0})[:-1] + b"\x91" * 5000 + b"\xc0",  # lists without end
+        client.pack({"t_ns": 1, "seq": 0, "source": ""})[:-1] + b"\xa1\xff",  # not UTF-8
+        client.pack({"t_ns": 1, "seq": 0, "x": 0})[:-1] + b"\x91" * 5000 + b"\xc0",  # nested lists
     )
     numbers, gates = iter(range(GARBAGE)), range(0, FLOODED_NS + 1, GATE_NS)
     for gate_ns in gates:
@@ -332,5 +334,5 @@ def test_garbage_is_counted_and_changes_nothing(federation: Federation) -> None:
     role.ends(with_code=0)
     record = federation.record()
     assert record.sha256() == undisturbed
-    assert record.end()["refused"] >= GARBAGE // len(GARBAGE_KEYS) * 9  # keys that the world reads
+    assert record.end()["refused"] >= GARBAGE // len(GARBAGE_KEYS) * 9  # the world reads 9 of the keys
     assert len(record.events("refused")) < 5_000

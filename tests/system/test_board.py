@@ -1,4 +1,4 @@
-"""`zsim board` as a user runs it: a table and figures, gone on with where it was left, a law of one's own beside others."""
+"""`zsim board` as a user runs it: a table and figures, a continued board, and the user's own law beside others."""
 
 import csv
 from pathlib import Path
@@ -20,7 +20,7 @@ class Hover(Pilot):
 """
 
 
-def test_a_board_of_three_laws_is_flown_and_gone_on_with(
+def test_a_board_of_three_laws_is_flown_and_continued(
     near: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "hovering.py").write_text(OWN)
@@ -33,7 +33,9 @@ def test_a_board_of_three_laws_is_flown_and_gone_on_with(
     assert [*rows] == laws
     figures = {law: {each.name: float(row[each.name] or "nan") for each in MEASURES} for law, row in rows.items()}
     held, led = figures["cluster_space"], figures["consensus"]
-    assert held["centre_error_m"] > 4.0 > 1.0 > led["centre_error_m"]  # who lacks a drone is held; the others go on
+    assert (
+        held["centre_error_m"] > 4.0 > 1.0 > led["centre_error_m"]
+    )  # cluster space holds when a drone is lost, consensus flies on
     assert held["shape_error_m"] < 0.6
     assert led["shape_error_m"] < 0.6
     assert led["messages_per_drone_s"] < 11 < held["messages_per_drone_s"]
@@ -41,7 +43,7 @@ def test_a_board_of_three_laws_is_flown_and_gone_on_with(
     assert (out / "report.html").stat().st_size > 50_000
     assert "consensus" in (out / "board.md").read_text()
 
-    request = Request(laws, ["drone_loss"], 1, out, workers=0)  # nothing is left for a worker
+    request = Request(laws, ["drone_loss"], 1, out, workers=0)  # no flight is left for a worker
     again = board_of(request, fly_board(request))
     assert again.entry("drone_loss", "consensus").means["shape_error_m"] == pytest.approx(led["shape_error_m"])
 
@@ -54,10 +56,12 @@ def test_a_board_of_three_laws_is_flown_and_gone_on_with(
         (("--laws", "nowhere:Law"), ("agents.pilot.class", "'nowhere:Law'")),
     ],
 )
-def test_what_there_is_not_is_refused(options: tuple[str, ...], terms: tuple[str, ...], tmp_path: Path) -> None:
+def test_unknown_laws_and_scenarios_are_refused(
+    options: tuple[str, ...], terms: tuple[str, ...], tmp_path: Path
+) -> None:
     assert has_terms(refusal("board", *options, "-o", str(tmp_path / "board")), *terms)
 
 
-def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
+def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     assert has_terms(refusal("board", "--scenarios", "step", "-o", str(tmp_path)), "notes.txt", "--force")

@@ -1,4 +1,4 @@
-"""clients/c: the JSON reader, the client against a played gateway, and flights through a real one."""
+"""The C client: its JSON reader, its calls to a fake gateway, and flights through a real one."""
 
 import json
 import os
@@ -38,7 +38,7 @@ Build = Callable[..., Path]
 
 @pytest.fixture(scope="module")
 def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
-    """Compile a program with the client, strictly; each, and the client, with the same flags once."""
+    """Return a function that compiles a program and the client with strict warnings, once for each set of flags."""
     folder = tmp_path_factory.mktemp("c")
     built: dict[tuple[str, ...], Path] = {}
 
@@ -60,7 +60,7 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
 
 
 def output(*command: object, **options: object) -> str:
-    """Run a program to its end, which must be a good one; return what it prints."""
+    """Run a program, which must succeed, and return its output."""
     done = subprocess.run(
         [str(each) for each in command],
         capture_output=True,
@@ -74,7 +74,7 @@ def output(*command: object, **options: object) -> str:
 
 @pytest.fixture(scope="module")
 def locales(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return the environment in which the LOCALES are known."""
+    """Return an environment in which the LOCALES are installed."""
     folder = tmp_path_factory.mktemp("locales")
     if shutil.which("localedef") is None or not all(Path("/usr/share/i18n/locales", each).exists() for each in LOCALES):
         pytest.skip("no sources of locales; on Debian: apt-get install locales")
@@ -83,36 +83,36 @@ def locales(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {**os.environ, "LOCPATH": str(folder)}
 
 
-# The reader
+# The JSON reader
 
 
-def test_the_reader(build: Build) -> None:
+def test_the_json_reader_passes_its_tests(build: Build) -> None:
     assert output(build("clients/c/tests/json_test.c", *SANITIZED)) == "decimal point ., 0 failures\n"
 
 
 @pytest.mark.parametrize("name", LOCALES, ids=LOCALES.get)
-def test_the_reader_where_people_write_numbers_otherwise(build: Build, locales: dict[str, str], name: str) -> None:
+def test_the_json_reader_is_independent_of_the_locale(build: Build, locales: dict[str, str], name: str) -> None:
     printed = output(build("clients/c/tests/json_test.c", *SANITIZED), f"{name}.UTF-8", env=locales)
     assert re.fullmatch(r"decimal point [^.]+, 0 failures\n", printed)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_reader_takes_any_bytes(build: Build, seed: int) -> None:
+def test_the_json_reader_survives_any_bytes(build: Build, seed: int) -> None:
     printed = output(build("clients/c/tests/json_fuzz.c", *SANITIZED), seed, 5_000, input=json.dumps(ESTIMATE))
     lines, valid, values = map(int, re.findall(r"\d+", printed))
     assert lines == 5_000
-    assert 50 < valid < 4_500  # it was neither all spoilt nor left as it was
+    assert 50 < valid < 4_500  # the fuzzer corrupts some of the lines, not all
     assert values > 5_000
 
 
-def test_a_windows_compiler_takes_it(tmp_path: Path) -> None:
+def test_a_windows_compiler_accepts_the_client(tmp_path: Path) -> None:
     compiler = shutil.which("x86_64-w64-mingw32-gcc")
     if compiler is None:
         pytest.skip("no compiler for Windows; on Debian: apt-get install gcc-mingw-w64-x86-64-win32")
     output(compiler, *STRICT[:-1], "-c", HERE / "zsim.c", "-o", tmp_path / "zsim.obj")
 
 
-def test_the_header_is_one_of_cpp_too(tmp_path: Path) -> None:
+def test_the_header_compiles_as_cpp(tmp_path: Path) -> None:
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("g++ is not installed; on Debian: apt-get install g++")
@@ -129,7 +129,7 @@ def test_the_header_is_one_of_cpp_too(tmp_path: Path) -> None:
 
 
 class Talk:
-    """clients/c/tests/talk.c: makes the calls that it is told to make."""
+    """clients/c/tests/talk.c: makes the calls that it reads from its input."""
 
     def __init__(self, program: Path, *arguments: str, env: dict[str, str] | None = None) -> None:
         pipe = subprocess.PIPE
@@ -145,22 +145,22 @@ class Talk:
         )
 
     def calls(self, line: str) -> None:
-        """Let it make a call."""
+        """Request a call."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{line}\n")
 
     def returned(self) -> str:
-        """Return what the call returned."""
+        """Return the result of the call."""
         assert self._process.stdout is not None
         return self._process.stdout.readline().rstrip("\n")
 
     def does(self, line: str) -> str:
-        """Let it make a call and return what that returned."""
+        """Request a call and return its result."""
         self.calls(line)
         return self.returned()
 
     def ends(self) -> None:
-        """Let it end, well."""
+        """Close its input; it must exit with code 0."""
         try:
             _, printed = self._process.communicate(timeout=PATIENCE_S)
         finally:
@@ -187,7 +187,7 @@ def connected(talk: Talk, fake: FakeGateway, timeout_s: float = PATIENCE_S) -> N
     assert talk.returned() == "1 client.me r1 lockstep 0.02 1200000000"
 
 
-def test_it_waits_for_a_run(talk: Talk, fake: FakeGateway) -> None:
+def test_the_client_waits_for_a_run(talk: Talk, fake: FakeGateway) -> None:
     talk.calls(f"connect {fake.port} {PATIENCE_S} me secret")
     hello = fake.receive("hello")
     assert (hello["name"], hello["token"]) == ("me", "secret")
@@ -197,7 +197,7 @@ def test_it_waits_for_a_run(talk: Talk, fake: FakeGateway) -> None:
     assert talk.returned().startswith("1 client.me r1")
 
 
-def test_what_is_wrong_with_a_connection_is_a_line(talk: Talk, fake: FakeGateway) -> None:
+def test_connection_errors_are_reported_in_one_line(talk: Talk, fake: FakeGateway) -> None:
     assert has_terms(talk.does("connect 1 0.1 me"), "-1 zsim: ", "127.0.0.1:1", "`zsim gateway`")
     assert has_terms(talk.does("latest clock t_ns"), "-1 zsim: ", "connection")
     talk.calls(f"connect {fake.port} {PATIENCE_S} me")
@@ -205,7 +205,7 @@ def test_what_is_wrong_with_a_connection_is_a_line(talk: Talk, fake: FakeGateway
     assert talk.returned() == "-1 hello: wrong token"
 
 
-def test_values_wait_while_an_answer_is_awaited(talk: Talk, fake: FakeGateway) -> None:
+def test_values_are_queued_while_an_answer_is_awaited(talk: Talk, fake: FakeGateway) -> None:
     connected(talk, fake)
     talk.calls("subscribe drone/*/truth")
     fake.answer(fake.receive("subscribe"), key="drone/*/truth")
@@ -220,7 +220,7 @@ def test_values_wait_while_an_answer_is_awaited(talk: Talk, fake: FakeGateway) -
     assert talk.does("next 0") == "0"
 
 
-def test_an_answer_that_came_too_late_is_nobodys(talk: Talk, fake: FakeGateway) -> None:
+def test_a_late_answer_is_discarded(talk: Talk, fake: FakeGateway) -> None:
     connected(talk, fake, timeout_s=5)
     talk.calls("latest clock t_ns")
     late = fake.receive("latest")
@@ -234,7 +234,7 @@ def test_an_answer_that_came_too_late_is_nobodys(talk: Talk, fake: FakeGateway) 
     assert talk.returned() == "0"
 
 
-def test_a_setpoint_does_not_wait_and_its_refusal_is_told_with_the_next_call(talk: Talk, fake: FakeGateway) -> None:
+def test_a_setpoint_does_not_wait_and_the_next_call_reports_its_refusal(talk: Talk, fake: FakeGateway) -> None:
     connected(talk, fake)
     assert talk.does("velocity drone1 0.1 -2 1e-300 0.5") == "1"
     put = fake.receive("put")
@@ -250,7 +250,7 @@ def test_a_setpoint_does_not_wait_and_its_refusal_is_told_with_the_next_call(tal
     assert talk.returned() == "1"
 
 
-def test_what_is_written_is_json_in_one_line(talk: Talk, fake: FakeGateway) -> None:
+def test_every_put_is_one_line_of_json(talk: Talk, fake: FakeGateway) -> None:
     connected(talk, fake)
     talk.calls('fields my/"key" -0 \\"\x01ä')
     put = fake.receive("put")
@@ -262,7 +262,7 @@ def test_what_is_written_is_json_in_one_line(talk: Talk, fake: FakeGateway) -> N
     assert parts(talk.does("fields my/key inf text")) == ("number", "not finite")
 
 
-def test_it_asks(talk: Talk, fake: FakeGateway) -> None:
+def test_requests_are_answered(talk: Talk, fake: FakeGateway) -> None:
     connected(talk, fake)
     talk.calls('ask world/control acquire {"drone":"drone1"}')
     asked = fake.receive("ask")
@@ -288,7 +288,7 @@ def in_session(talk: Talk, fake: FakeGateway) -> None:
     assert talk.returned() == "1"
 
 
-def test_a_gate(talk: Talk, fake: FakeGateway) -> None:
+def test_a_gate_delivers_inputs_and_sends_outputs(talk: Talk, fake: FakeGateway) -> None:
     joined(talk, fake)
     assert talk.does("gate 0") == "0"
     assert talk.does("done").startswith("-1 zsim_done: ")
@@ -300,9 +300,9 @@ def test_a_gate(talk: Talk, fake: FakeGateway) -> None:
     talk.calls("latest clock t_ns")
     fake.answer(fake.receive("latest"), values=[{"key": "clock", "value": {"t_ns": 7}}])
     assert talk.returned() == "1 7"
-    assert talk.does("input drone/drone1/estimate sensors.gps.0") == "1 1"  # still there
+    assert talk.does("input drone/drone1/estimate sensors.gps.0") == "1 1"  # the inputs are kept until the gate is done
     assert talk.does("velocity drone1 1 0 0 0 world") == "1"
-    assert talk.does("velocity drone1 1 0 inf 0 world").startswith("-1 ")  # leaves no trace
+    assert talk.does("velocity drone1 1 0 inf 0 world").startswith("-1 ")  # not among the outputs
     assert talk.does("put my/key [1]") == "1"
     assert talk.does("done") == "1"
     done = fake.receive("done")
@@ -321,7 +321,7 @@ def test_a_refused_done_leaves_the_gate_open(talk: Talk, fake: FakeGateway) -> N
     assert fake.receive("done")["outputs"] == [{"key": "drone/drone1/cmd/mode", "value": {"mode": "land"}}]
 
 
-def test_a_put_that_is_begun_and_not_ended_leaves_no_trace(talk: Talk, fake: FakeGateway) -> None:
+def test_an_unfinished_put_is_never_sent(talk: Talk, fake: FakeGateway) -> None:
     joined(talk, fake)
     assert talk.does("end").startswith("-1 zsim_put_end: ")
     assert [talk.does("begin my/lost"), talk.does("add a b")] == ["1", "1"]
@@ -339,7 +339,7 @@ def test_a_put_that_is_begun_and_not_ended_leaves_no_trace(talk: Talk, fake: Fak
     assert fake.receive("done")["outputs"] == [{"key": "my/key", "value": {"a": "b"}}]
 
 
-def test_a_session_knows_nothing_of_the_one_before(talk: Talk, fake: FakeGateway) -> None:
+def test_a_session_keeps_nothing_of_the_previous_one(talk: Talk, fake: FakeGateway) -> None:
     joined(talk, fake)
     assert has_terms(talk.does("join other 0.02 clock"), "-1 zsim_join: ", "client.square", "zsim_leave")
     fake.send(ESTIMATE)
@@ -348,7 +348,7 @@ def test_a_session_knows_nothing_of_the_one_before(talk: Talk, fake: FakeGateway
     fake.send({"op": "error", "error": "done: has not joined", "id": fake.receive("done")["id"]})
     assert talk.does("gate 60").endswith(": the run ended")
     in_session(talk, fake)
-    fake.send(ESTIMATE)  # on its way while it leaves
+    fake.send(ESTIMATE)  # still in transit when the client leaves
     talk.calls("leave")
     fake.answer(fake.receive("leave"))
     assert talk.returned() == "1"
@@ -358,7 +358,7 @@ def test_a_session_knows_nothing_of_the_one_before(talk: Talk, fake: FakeGateway
     assert fake.receive("done")["t_ns"] == 40_000_000
 
 
-def test_a_lost_session_and_a_run_that_ends_are_told(talk: Talk, fake: FakeGateway) -> None:
+def test_a_lost_session_and_the_end_of_a_run_are_reported(talk: Talk, fake: FakeGateway) -> None:
     joined(talk, fake)
     fake.send({"op": "left", "reason": "the run ended"}, {"op": "run", "state": "ended", "run_id": "r1"})
     assert talk.does("gate 60").endswith(": the run ended")
@@ -372,14 +372,14 @@ def test_a_lost_session_and_a_run_that_ends_are_told(talk: Talk, fake: FakeGatew
 
 
 @pytest.mark.parametrize("rubbish", [b"no json\n", b"\xff\x00\n", b"[" * 900 + b"\n", b'{"op": "value"\n', b"\n"])
-def test_what_is_no_json_ends_the_connection(talk: Talk, fake: FakeGateway, rubbish: bytes) -> None:
+def test_invalid_json_closes_the_connection(talk: Talk, fake: FakeGateway, rubbish: bytes) -> None:
     connected(talk, fake)
     fake.send(rubbish)
     assert has_terms(talk.does("next 60"), "-1 zsim: ", "JSON")
     assert has_terms(talk.does("next 60"), "-1 zsim: ", "connection")
 
 
-def test_half_a_line_is_waited_for(talk: Talk, fake: FakeGateway) -> None:
+def test_the_rest_of_an_incomplete_line_is_awaited(talk: Talk, fake: FakeGateway) -> None:
     connected(talk, fake)
     fake.send(b'{"op": "value", "key": "a", "va')
     assert talk.does("next 0.05") == "0"
@@ -389,7 +389,7 @@ def test_half_a_line_is_waited_for(talk: Talk, fake: FakeGateway) -> None:
     assert has_terms(talk.does("next 60"), "-1 zsim: ", "connect again")
 
 
-def test_of_too_many_values_the_oldest_go(build: Build, fake: FakeGateway) -> None:
+def test_the_oldest_of_too_many_values_are_dropped(build: Build, fake: FakeGateway) -> None:
     talk = Talk(build("clients/c/tests/talk.c", *SANITIZED, *SMALL))
     connected(talk, fake)
     talk.calls("latest clock t_ns")
@@ -412,8 +412,8 @@ def test_of_too_many_values_the_oldest_go(build: Build, fake: FakeGateway) -> No
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_gateway_that_raves_does_no_harm(talk: Talk, fake: FakeGateway, seed: int) -> None:
-    """Lines that were spoilt at random, to any call: it returns, and nothing is read or written that should not be."""
+def test_corrupted_lines_do_no_harm(talk: Talk, fake: FakeGateway, seed: int) -> None:
+    """Every call returns after randomly corrupted lines, and the sanitizers find no invalid access."""
     rng = random.Random(seed)
     joined(talk, fake)
     printed = [
@@ -433,7 +433,7 @@ def test_a_gateway_that_raves_does_no_harm(talk: Talk, fake: FakeGateway, seed: 
 
 
 @pytest.mark.parametrize("name", LOCALES, ids=LOCALES.get)
-def test_commands_where_people_write_numbers_otherwise(
+def test_commands_are_independent_of_the_locale(
     build: Build, fake: FakeGateway, locales: dict[str, str], name: str
 ) -> None:
     talk = Talk(build("clients/c/tests/talk.c", *SANITIZED), f"{name}.UTF-8", env=locales)
@@ -473,14 +473,14 @@ def is_a_square(corners: list[list[float]]) -> None:
     start = [corners[0][1], corners[0][2]]
     offsets = [[x - start[0], y - start[1]] for _, x, y, _ in corners]
     for offset, wanted in zip(offsets, [(0, 0), (2, 0), (2, 2), (0, 2), (0, 0)], strict=True):
-        assert offset == pytest.approx(wanted, abs=0.6)  # two corners, each reached to 0.25 m
+        assert offset == pytest.approx(wanted, abs=0.6)  # from one corner to another, each reached within 0.25 m
     assert all(z == pytest.approx(1.5, abs=0.3) for *_, z in corners)
 
 
-def test_it_flies_a_square_in_lockstep_with_the_same_bits_each_time(
+def test_fast_and_slow_builds_fly_bit_identical_squares_in_lockstep(
     build: Build, tmp_path: Path, compiled: None
 ) -> None:
-    """Built fast and built slow: time waits for it, so the flight is the same."""
+    """Time waits for the client, so that its speed does not affect the flight."""
     flights = []
     for name, flags in (("fast", ("-O2",)), ("slow", SANITIZED)):
         (tmp_path / name).mkdir()
@@ -491,13 +491,13 @@ def test_it_flies_a_square_in_lockstep_with_the_same_bits_each_time(
 
 
 @pytest.mark.soak
-def test_it_flies_a_square_in_realtime(build: Build, federation: Federation) -> None:
+def test_the_client_flies_a_square_in_realtime(build: Build, federation: Federation) -> None:
     program = build("examples/c/square.c", *SANITIZED)
     corners, _ = flown(federation, program, "--realtime", "--rate", "3", "--duration", "60", stop=True)
     is_a_square(corners)
 
 
-def test_the_real_gateway_and_every_call(talk: Talk, federation: Federation) -> None:
+def test_the_calls_work_with_a_real_gateway(talk: Talk, federation: Federation) -> None:
     federation.world(ONE, "--rate", "4", "--duration", "600")
     gateway = GatewayProcess(federation, "--token", "secret")
     assert has_terms(talk.does(f"connect {gateway.lines_port} 60 me wrong"), "-1 hello: ", "token")
@@ -508,7 +508,9 @@ def test_the_real_gateway_and_every_call(talk: Talk, federation: Federation) -> 
     assert talk.does("mode drone1 takeof").startswith("-1 drone/drone1/cmd/mode: ")
     assert talk.does("mode drone1 takeoff") == "1"
     assert talk.does("velocity drone1 1 0 0 0 inertial") == "1"
-    assert "inertial" in talk.does("latest clock state")  # the refusal of what did not wait
+    assert "inertial" in talk.does(
+        "latest clock state"
+    )  # the refusal of the velocity, which did not wait for an answer
     assert talk.does("latest clock state") == '1 "running"'
     assert talk.does('ask world/control acquire {"drone":"drone1","priority":3}').startswith("1")
     assert re.match(r"-1 world/control dance: .*dance", talk.does("ask world/control dance"))
@@ -519,7 +521,7 @@ def test_the_real_gateway_and_every_call(talk: Talk, federation: Federation) -> 
     assert talk.does("close") == "1"
 
 
-def test_the_first_program_of_the_docs(build: Build, federation: Federation, tmp_path: Path) -> None:
+def test_the_first_program_of_the_docs_runs(build: Build, federation: Federation, tmp_path: Path) -> None:
     page = (ROOT / "docs" / "clients-c.md").read_text()
     program = tmp_path / "first.c"
     lines = re.findall(r"^    (#include \"zsim.h\"\n(?:(?:    .*)?\n)*?    })\n\n", page, flags=re.MULTILINE)

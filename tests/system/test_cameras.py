@@ -1,4 +1,4 @@
-"""Cameras and detectors of a run: what they see agrees with the truth, and neither they nor what fails changes it."""
+"""Cameras and detectors of a run: sightings agree with the truth, which neither they nor their failures change."""
 
 import signal
 from pathlib import Path
@@ -37,17 +37,17 @@ HEALTH = "process/detector.main/health"
 AIRBORNE_NS = 4_000_000_000
 GATE_S = 0.02
 SIGMAS = 5.0
-SEEN_DEAD = ("death", "superseded")  # the second where it is back before its death is noticed
+SEEN_DEAD = ("death", "superseded")  # the second if it is restarted before its death is noticed
 FOREVER = ("--duration", "600", "--rate", "1")
-LEAST = 12  # sightings that are compared with the truth
+LEAST = 12  # number of sightings to compare with the truth
 GATING = ("--set", "processes.gating=[camera]")
 GATED_S, RATE_HZ = 6, 10
-NAMED = ("silent", "death")  # the second where its link, which takes nothing, is closed before
+NAMED = ("silent", "death")  # the second if its blocked link is closed first
 GARBAGE = (b"", b"\xff\xd8\xff\xd9", bytes(range(256)))
 
 
 class Flown:
-    """The run: its record, and the hash of the truth of the same flight without cameras."""
+    """The record of a run, and the hash of the truth of the same flight without cameras."""
 
     def __init__(self, record: Record, without: str) -> None:
         self.record, self.without = record, without
@@ -55,7 +55,7 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
-    """A flight whose camera is killed in the air, and on whose camera key a stranger publishes garbage."""
+    """A flight whose camera process is killed in the air, and a stranger that publishes garbage on the camera's key."""
     with Federation(tmp_path_factory.mktemp("cameras")) as federation:
         run = federation.run(PAIR, "--cameras", "--detect", *FOREVER)
         client = federation.client()
@@ -88,12 +88,12 @@ def publish_garbage(client: Client) -> None:
         client.put(PICTURES, t_ns=0, seq=0, t_sample_ns=0, source="stranger", data=data, **shape)
 
 
-def test_no_bit_of_the_truth_changes_with_cameras_nor_with_their_death(flown: Flown) -> None:
+def test_neither_cameras_nor_their_death_change_a_bit_of_the_truth(flown: Flown) -> None:
     assert flown.record.sha256() == flown.without
     assert flown.record.recomputed_sha256(["drone1", "drone2"]) == flown.without
 
 
-def test_pictures_are_of_the_exposures_that_are_due(flown: Flown) -> None:
+def test_pictures_are_exposed_on_schedule_and_published_in_time(flown: Flown) -> None:
     pictures = [m for m in flown.record.all(PICTURES) if m["source"] == "camera.main"]
     assert len(pictures) > LEAST
     for each in pictures:
@@ -102,16 +102,16 @@ def test_pictures_are_of_the_exposures_that_are_due(flown: Flown) -> None:
         assert decoded(each["data"], 640, 360).std() > 10
 
 
-def test_the_info_says_what_the_pixels_mean(flown: Flown) -> None:
+def test_the_camera_info_describes_the_camera(flown: Flown) -> None:
     infos = flown.record.all(INFO)
-    assert len(infos) >= 2  # again by the one that was started in the place of the killed one
+    assert len(infos) >= 2  # published again by the restarted camera
     assert set(infos[0]) == set(CameraInfo.__struct_fields__)
     assert infos[0]["rate_hz"] == 10
     assert infos[0]["K"][0] == pytest.approx(354.6, abs=0.1)
     assert infos[0]["gate_ns"] == 20_000_000
 
 
-def test_what_is_seen_is_where_the_truth_has_it(flown: Flown) -> None:
+def test_sightings_agree_with_the_truth(flown: Flown) -> None:
     truths = {drone: flown.record.all(f"drone/{drone}/truth") for drone in ("drone1", "drone2")}
     checked = 0
     for message in flown.record.all(SEEN):
@@ -126,7 +126,7 @@ def test_what_is_seen_is_where_the_truth_has_it(flown: Flown) -> None:
 
 
 def expected(truths: dict[str, list[dict[str, Any]]], t_s: float) -> tuple[np.ndarray, float]:
-    """Return direction in B and distance of drone2's hat from drone1's camera at an instant."""
+    """Return the direction (in B) and distance of drone2's hat from drone1's camera at an instant."""
     (p, q), (p2, q2) = (pose(truths[drone], t_s) for drone in ("drone1", "drone2"))
     hat_B = rotation_matrix(q).T @ (p2 + rotation_matrix(q2) @ np.array(Hats().position_m) - p)
     ray = hat_B - camera_pose(FrontCamera()).p_BK
@@ -150,23 +150,23 @@ def test_pictures_of_a_stranger_are_refused_and_counted(flown: Flown) -> None:
 
 
 @pytest.mark.slow
-def test_no_picture_is_left_out(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> None:
+def test_a_gating_camera_omits_no_picture(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> None:
     with Federation(tmp_path_factory.mktemp("gating")) as federation:
         federation.run(PAIR, "--cameras", "--duration", str(GATED_S), *GATING).ends(with_code=0)
         record = federation.record()
         sha256 = record.sha256()
         stamps = [message["t_sample_ns"] for message in record.all(PICTURES)]
     of_all = [round(n * 1e9 / RATE_HZ) for n in range(GATED_S * RATE_HZ + 1)]
-    assert stamps in (of_all, of_all[:-1])  # the last one comes when the run is over
+    assert stamps in (of_all, of_all[:-1])  # the last one may arrive after the run is over
     assert sha256 == sha256_alone(tmp_path_factory.mktemp("without"), GATED_S)
 
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_a_camera_that_is_killed_holds_time_until_it_is_back(
+def test_pictures_resume_after_a_gating_camera_is_killed(
     tmp_path_factory: pytest.TempPathFactory, compiled: None
 ) -> None:
-    """It is started by the launcher, which knows that the scenario needs it."""
+    """The launcher starts the camera without --cameras, because the scenario gates on it."""
     with Federation(tmp_path_factory.mktemp("killed")) as federation:
         run = federation.run(PAIR, "--duration", "30", "--rate", "4", *GATING)
         client = federation.client()
@@ -179,19 +179,19 @@ def test_a_camera_that_is_killed_holds_time_until_it_is_back(
         run.ends(with_code=0)
 
 
-def test_one_process_has_no_cameras_to_wait_for(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_an_in_process_run_refuses_to_gate_on_cameras(tmp_path_factory: pytest.TempPathFactory) -> None:
     place = tmp_path_factory.mktemp("one") / "pair.yaml"
     place.write_text(PAIR)
     with pytest.raises(ScenarioError, match=r"processes\.gating"):
         InProcessFlight(scenario_file.load(place, ["processes.gating=[camera]"]))
 
 
-amiss = pytest.mark.soak  # cameras are nice: on a loaded machine they stand still of themselves
+amiss = pytest.mark.soak  # cameras run at low priority: on a loaded machine they stall by themselves
 
 
 @pytest.fixture(scope="module")
 def disturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
-    """A flight with a second detector of drone1, whose camera is stopped for a while and goes on."""
+    """A flight with a second detector for drone1, whose camera process is stopped for a while."""
     with Federation(tmp_path_factory.mktemp("amiss")) as federation:
         run = federation.run(PAIR, "--cameras", "--detect", *FOREVER)
         client = federation.client()
@@ -211,12 +211,12 @@ def disturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Any:
 
 
 @amiss
-def test_no_bit_of_the_truth_changes(disturbed: Flown) -> None:
+def test_disturbed_cameras_change_no_bit_of_the_truth(disturbed: Flown) -> None:
     assert disturbed.record.sha256() == disturbed.without
 
 
 @amiss
-def test_two_detectors_of_a_drone_are_named(disturbed: Flown) -> None:
+def test_two_detectors_of_one_drone_are_reported(disturbed: Flown) -> None:
     doubled = disturbed.record.events("doubled")
     assert doubled
     for each in doubled:
@@ -225,7 +225,7 @@ def test_two_detectors_of_a_drone_are_named(disturbed: Flown) -> None:
 
 
 @amiss
-def test_each_of_two_detectors_says_whose_sightings_it_publishes(disturbed: Flown) -> None:
+def test_two_detectors_publish_the_same_sightings_under_their_names(disturbed: Flown) -> None:
     of_both = {name: {} for name in ("detector.main", "detector.second")}
     for message in disturbed.record.all(SEEN):
         of_both[message["source"]][message["t_sample_ns"]] = message["seen"]
@@ -235,7 +235,7 @@ def test_each_of_two_detectors_says_whose_sightings_it_publishes(disturbed: Flow
 
 
 @amiss
-def test_a_camera_that_stands_still_is_named_and_leaves_out_what_is_too_old(disturbed: Flown) -> None:
+def test_a_stalled_camera_is_reported_and_omits_overdue_pictures(disturbed: Flown) -> None:
     assert "camera.main" in {event["subject"] for event in disturbed.record.events(*NAMED)}
     assert disturbed.record.events("drop", "overdue") == []
     late = [m["t_ns"] - m["t_sample_ns"] for m in disturbed.record.all(PICTURES)]
@@ -246,7 +246,7 @@ ONE_SEES = PAIR.replace(", front_camera: {rate_hz: 10}", "").replace(
     "{name: drone1,", "{name: drone1, sensors: {front_camera: {}},"
 )
 
-# name: (command, what its last line must show)
+# name: (command, terms that its output must contain)
 UNKNOWN = {
     "a camera of nobody": (("camera", "ghost"), ("'ghost'", "drone1")),
     "a camera of one without": (("camera", "drone2"), ("'drone2'", "drone1")),
@@ -254,7 +254,7 @@ UNKNOWN = {
 }
 
 
-def test_a_camera_that_is_none_is_a_line(federation: Federation) -> None:
+def test_an_impossible_camera_or_detector_is_refused(federation: Federation) -> None:
     federation.world(ONE_SEES, *FOREVER, "--expect", "nobody.yet")
     for name, (command, terms) in UNKNOWN.items():
         role = federation.role(*command)

@@ -1,4 +1,4 @@
-"""The command line: looking and poking as `ros2 topic` users expect, and help that reads well."""
+"""The command line: inspection and publishing as users of `ros2 topic` expect, requests, and help."""
 
 import json
 import re
@@ -21,7 +21,7 @@ LISTED = {"clock": "Clock", "drone/drone1/sensor/imu": "Imu", "cluster/main/stat
 
 
 def zsim(*arguments: str, code: int = 0) -> Completed:
-    """Run a command to its end."""
+    """Run a command, which must exit with the given code."""
     done = run_here(*arguments)
     assert done.code == code, done
     return done
@@ -38,7 +38,7 @@ class Terminal:
         return done.stdout if code == 0 else done.stderr
 
 
-def test_looking_at_a_run_and_asking_its_controller(federation: Federation) -> None:
+def test_a_run_can_be_inspected_and_its_controller_commanded(federation: Federation) -> None:
     run = federation.run(PAIR, "--rate", "2", "--duration", "1000")
     client = federation.client()
     client.subscribe("clock").until(lambda m: m["t_ns"] > 5.5e9)
@@ -46,13 +46,15 @@ def test_looking_at_a_run_and_asking_its_controller(federation: Federation) -> N
     until_s, listed = time.monotonic() + PATIENCE_S, ""
     while not all(re.search(rf"^{key} +{message} +\d+$", listed, re.MULTILINE) for key, message in LISTED.items()):
         assert time.monotonic() < until_s, listed
-        listed = terminal("keys")  # of one second, in which a machine with much to do may have no message
+        listed = terminal("keys")  # covers one second, in which a loaded machine may publish no message
     echoed = [json.loads(line) for line in terminal("echo", "drone/*/truth", "-n", "4").splitlines()]
     assert {line["key"] for line in echoed} == {"drone/drone1/truth", "drone/drone2/truth"}
     assert all(len(line["message"]["position_m"]) == 3 for line in echoed)
     (raw,) = terminal("echo", "clock", "-n", "1", "--raw").splitlines()
     assert bytes.fromhex(json.loads(raw)["message"]).startswith(b"\x87")  # a msgpack map of seven fields
-    assert "50.0 Hz" in terminal("hz", "drone/drone1/truth", "--seconds", "2.5")  # a clock that waits is sent again
+    assert "50.0 Hz" in terminal(
+        "hz", "drone/drone1/truth", "--seconds", "2.5"
+    )  # not the clock, which repeats while it waits
     assert "nothing/here" in terminal("hz", "nothing/here", "--seconds", "0.1", code=1)
 
     state = client.subscribe("cluster/main/state")
@@ -104,7 +106,7 @@ REFUSED: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def test_asking_the_world(federation: Federation) -> None:
+def test_the_world_answers_requests_and_bad_commands_are_refused(federation: Federation) -> None:
     world = federation.world(ONE, "--rate", "4", "--duration", "1000")
     client = federation.client()
     clock = client.subscribe("clock")
@@ -134,7 +136,7 @@ def test_asking_the_world(federation: Federation) -> None:
     world.ends(with_code=0)
 
 
-def test_help() -> None:
+def test_every_command_has_help() -> None:
     text = zsim("--help").stdout
     for command in COMMANDS:
         assert re.search(rf"\b{command}\b", text)
@@ -144,7 +146,7 @@ def test_help() -> None:
     assert zsim("--version").stdout.startswith("zsim 0.")
 
 
-def test_validate_prints_what_a_scenario_resolves_to(tmp_path: Path) -> None:
+def test_validate_prints_the_resolved_scenario(tmp_path: Path) -> None:
     path = tmp_path / "one.yaml"
     path.write_text(ONE)
     resolved = zsim("validate", str(path), "--set", "seed=77").stdout
@@ -155,8 +157,8 @@ def test_validate_prints_what_a_scenario_resolves_to(tmp_path: Path) -> None:
     assert again.stderr.splitlines() == ["one.yaml: no errors found"]
 
 
-def test_report_of_a_run(federation: Federation, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ReportFigure, "png", lambda _: b"\x89PNG")  # drawn by the tests of reports
+def test_a_report_is_written_from_a_record(federation: Federation, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ReportFigure, "png", lambda _: b"\x89PNG")  # the tests of reports draw figures
     zsim("run", federation.write(PAIR), "--in-process", "--duration", "2", "--no-report", "--out", str(federation.out))
     output = zsim("report", str(federation.out)).stdout
     assert f"report: {federation.out / 'report.html'}" in output

@@ -1,4 +1,4 @@
-"""The page that compares runs, in a browser: nothing of its tables is cut off at the width of a small screen."""
+"""The page that compares runs, in a browser: its tables are not cut off at the width of a small screen."""
 
 from pathlib import Path
 from typing import Any

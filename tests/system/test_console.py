@@ -1,4 +1,4 @@
-"""The operator's console: in a real browser, on a running federation."""
+"""The operator's console, in a real browser and on a running federation."""
 
 import io
 import json
@@ -30,9 +30,9 @@ from wire import PATIENCE_S
 
 from zsim_bridges.console.page_server import ViewerCamera
 
-STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
+STRIP = {"width": 860, "height": 120}  # viewport of a page whose rendering is not checked
 STEER = "a-good-token"
-LOOK_S = 0.5  # between two looks of a page at its console
+LOOK_S = 0.5  # interval at which a page polls its console
 TRIAD = """
 name: triad
 seed: 3
@@ -45,14 +45,14 @@ drones:
 clusters:
   - {name: main, drones: [drone1, drone2, drone3]}
 """
-PLACE_OF_P = 9  # among the sliders: x_c, y_c, z_c, roll, pitch, yaw, three headings, p
-CAMERA = ViewerCamera(  # what a page says first; before it, viser heeds no control of it
+PLACE_OF_P = 9  # index among the sliders: x_c, y_c, z_c, roll, pitch, yaw, three headings, p
+CAMERA = ViewerCamera(  # a page's first message; viser ignores the page's controls until then
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
 
 
 def status(address: str, **headers: str) -> int:
-    """Return what HTTP answers to a get."""
+    """Return the HTTP status of a GET."""
     try:
         with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=PATIENCE_S) as answer:
             return answer.status
@@ -62,7 +62,7 @@ def status(address: str, **headers: str) -> int:
 
 
 def command(address: str, op: str) -> int:
-    """Return what HTTP answers to a button of the page's head."""
+    """Return the HTTP status of a command, as sent by a button in the page's head."""
     request = urllib.request.Request(address, json.dumps({"op": op}).encode())
     try:
         with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
@@ -73,16 +73,16 @@ def command(address: str, op: str) -> int:
 
 
 def colours(picture: bytes) -> int:
-    """Return how many colours a picture has."""
+    """Return the number of colours in a picture scaled to 160 × 90 pixels."""
     image = pytest.importorskip("PIL.Image")
     return len(image.open(io.BytesIO(picture)).convert("RGB").resize((160, 90)).getcolors(160 * 90))
 
 
 class PageConnection:
-    """A page without a picture: what viser's own page says and is packet, over the same websocket.
+    """A page without rendering: it exchanges the messages of viser's own page over the same websocket.
 
     Attributes:
-        ids: of the page's controls, by their label.
+        ids: ids of the page's controls, by label.
     """
 
     def __init__(self, address: str) -> None:
@@ -92,7 +92,7 @@ class PageConnection:
         self._socket = connect(where, subprotocols=subprotocols, compression=None, max_size=None)
         self._socket.send(msgspec.msgpack.encode(CAMERA))
         self._batches: SimpleQueue[list[dict[str, Any]]] = SimpleQueue()
-        self._messages: deque[dict[str, Any]] = deque()  # received, and not looked at yet
+        self._messages: deque[dict[str, Any]] = deque()  # received but not yet examined
         self.ids: dict[str, str] = {}
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -102,7 +102,7 @@ class PageConnection:
         self._thread.join()
 
     def _read(self) -> None:
-        """Read all the time, as a page does: what is not read would keep back what is said after it."""
+        """Read continuously, as a page does: unread messages would hold back later ones."""
         with suppress(ConnectionClosed):
             for packet in self._socket:
                 assert isinstance(packet, bytes)
@@ -111,12 +111,12 @@ class PageConnection:
                 self._batches.put(msgspec.msgpack.decode(plain, strict=False)["messages"])
 
     def put(self, label: str, value: Any) -> None:
-        """Say that somebody has moved a control, or pressed it."""
+        """Report a control as moved or pressed."""
         output = {"type": "GuiUpdateMessage", "uuid": self.ids[label], "updates": {"value": value}}
         self._socket.send(msgspec.msgpack.encode(output))
 
     def until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Return the next thing of a kind that the page is packet, and learn of controls meanwhile."""
+        """Return the next message that meets a condition, and register new controls meanwhile."""
         until_s = time.monotonic() + PATIENCE_S
         while True:
             while self._messages:
@@ -132,7 +132,7 @@ class PageConnection:
             self._take_in(until_s)
 
     def _take_in(self, until_s: float) -> None:
-        """Take what was said at once, with all controls in it."""
+        """Receive a batch of messages and register the controls in it."""
         batch = self._batches.get(timeout=max(0.0, until_s - time.monotonic()))
         for message in batch:
             label = (message.get("props") or {}).get("label")
@@ -143,7 +143,7 @@ class PageConnection:
 
 @pytest.fixture
 def connected() -> Iterator[Callable[[str], PageConnection]]:
-    """Open an address as a page without a picture."""
+    """Return a function that opens an address as a page without rendering."""
     with ExitStack() as stack:
 
         def open_it(address: str) -> PageConnection:
@@ -155,7 +155,7 @@ def connected() -> Iterator[Callable[[str], PageConnection]]:
 
 
 def shown(address: str, until: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-    """Return what a console shows once a condition holds of it."""
+    """Return the state that a console shows, once it meets a condition."""
     until_s = time.monotonic() + PATIENCE_S
     while True:
         with urllib.request.urlopen(f"{address}state", timeout=PATIENCE_S) as answer:
@@ -167,7 +167,7 @@ def shown(address: str, until: Callable[[dict[str, Any]], bool]) -> dict[str, An
 
 
 def press_until(address: str, page: PageConnection, label: str, wanted: str) -> None:
-    """Press a button again and again, which is greyed out at first, until all three drones are in a state."""
+    """Press a button, greyed out at first, repeatedly until all three drones are in a state."""
 
     def press(state: dict[str, Any]) -> bool:
         page.put(label, True)
@@ -186,10 +186,10 @@ def states(shown: dict[str, Any]) -> list[str]:
 def test_an_operator_sees_three_drones_and_flies_them(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
-    run = federation.run(TRIAD, "--rate", "4")  # a browser without a graphics card draws all the while
+    run = federation.run(TRIAD, "--rate", "4")  # a browser without a graphics card renders meanwhile
     _, links = console(federation, "--token", STEER)
 
-    # who may come in
+    # a token is required
     bare = links["steer"].partition("?")[0]
     assert status(bare) == 401
     assert status(f"{bare}state") == 401
@@ -205,27 +205,27 @@ def test_an_operator_sees_three_drones_and_flies_them(
     start = operator.until("s.drones.length == 3 && s.clusters.length == 1 && s.clock == 'running'")
     assert [drone["state"] for drone in start["drones"]] == ["landed"] * 3
 
-    # a viewer sees the controls, and moves nothing with them
+    # a viewer sees the controls but cannot use them
     button = viewer.page.get_by_role("button", name="Take off", exact=True)
     button.wait_for(state="attached")
     button.evaluate("button => button.click()")
     later = operator.until(f"s.t_s > {start['t_s'] + 2}")
     assert later["clusters"][0]["phase"] == "idle"
 
-    # its camera is its own
+    # a viewer has a camera of its own
     assert viewer.page.locator("#zsim-tools [aria-pressed=true]").text_content() == "Follow"
     viewer.page.locator("#zsim-tools").get_by_text("Follow").evaluate("button => button.click()")
     viewer.page.locator("#zsim-tools [aria-pressed=false]").wait_for(state="attached")
     operator.page.locator("#zsim-tools").get_by_text("Top").evaluate("button => button.click()")
 
-    # a flight has no timeline
+    # a live run has no timeline
     assert not operator.page.locator("#zsim-record").is_visible()
 
-    # what would be refused is greyed out
+    # a command that would be refused is greyed out
     engage = operator.page.get_by_role("button", name="Engage", exact=True)
     engage.and_(operator.page.locator(":disabled")).wait_for()
 
-    # they take off by the button, and move
+    # a button makes the drones take off
     operator.press("Take off")
     aloft = operator.until("s.drones.every(d => d.state == 'flying' && d.position_m[2] > 0.8)")
     for before, after in zip(start["drones"], aloft["drones"], strict=True):
@@ -237,7 +237,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.press("Engage")
     engaged = operator.until("s.clusters[0].phase == 'engaged'")
 
-    # p by its slider, and the true p follows
+    # a slider sets the desired p, and the true p follows
     slider = operator.page.get_by_role("slider").nth(PLACE_OF_P)
     engaged_p = engaged["clusters"][0]["desired"]["p"]
     operator.page.get_by_role("button", name="Hold", exact=True).and_(operator.page.locator(":enabled")).wait_for()
@@ -250,7 +250,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.until(f"Math.abs(s.clusters[0].desired.p - {wanted}) < 0.06")
     there = operator.until(f"Math.abs(s.clusters[0].true.p - {wanted}) < 0.3")
 
-    # plots are as wide later as they are now
+    # plots keep their width
     operator.select_tab("Plots")
     operator.page.locator(".uplot canvas").first.wait_for()
     width = "document.querySelector('.uplot-container').offsetWidth"
@@ -258,7 +258,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.until(f"s.t_s > {now_s + 20}")
     assert operator.page.evaluate(width) == width_px
 
-    # GPS lost by a button
+    # a button injects a loss of GPS
     before = there["drones"][0]["sigma_m"]
     operator.select_tab("Faults")
     operator.press("GPS lost")
@@ -270,18 +270,18 @@ def test_an_operator_sees_three_drones_and_flies_them(
     operator.press("Clear all faults")
     operator.until("s.faults.length == 0")
 
-    # on every screen both buttons are in sight
+    # both buttons of the head are in sight on every screen
     for size in SCREENS:
         operator.page.set_viewport_size(size)
         operator.page.wait_for_function(IN_SIGHT)
     operator.page.set_viewport_size(VIEWPORT)
 
-    # and down again
+    # a button makes the drones land
     operator.select_tab("Fly")
     operator.press("Land")
     operator.until("s.drones.every(d => d.state == 'landed')")
 
-    # what is over is shown as over
+    # the page shows that the run is over
     assert operator.page.locator("body.zsim-old").count() == 0
     run.signal(signal.SIGINT)
     operator.page.locator("body.zsim-old").wait_for(state="attached")
@@ -292,7 +292,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
         assert page.faults == []
 
 
-def test_what_one_operator_moves_the_other_sees_move(
+def test_operators_see_controls_that_others_move(
     federation: Federation, connected: Callable[[str], PageConnection]
 ) -> None:
     federation.world(TRIAD, "--rate", "1")
@@ -325,7 +325,7 @@ def test_an_emergency_stops_a_drone_that_another_operator_flies(
     shown(address, lambda state: states(state) == ["landed"] * 3)
     press_until(address, page, "Take off", "flying")
     assert federation.client().request("world/control", "acquire", drone="drone1", priority=10)["ok"]
-    assert command(f"{links['look']}/command", "emergency") in (404, 405)  # who may only look has no such path
+    assert command(f"{links['look']}/command", "emergency") in (404, 405)  # the view-only link has no such path
     assert command(f"{address}command", "dance") == 400
     assert command(f"{address}command", "emergency") == 200
     shown(address, lambda state: states(state) == ["emergency"] * 3)
@@ -333,7 +333,7 @@ def test_an_emergency_stops_a_drone_that_another_operator_flies(
     press_until(address, page, "Reset all", "landed")
 
 
-def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Federation) -> None:
+def test_a_run_prints_its_console_link_and_ends_all_its_processes(federation: Federation) -> None:
     run = federation.run(TRIAD, "--rate", "2", "--console")
     address = run.line("steer at").text.rpartition(" ")[2]
     assert status(address) == 200
@@ -349,7 +349,7 @@ def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Fe
 
 
 @needs_browser
-def test_the_pages_of_a_run_s_console_keep_its_report_and_record(federation: Federation, opened) -> None:
+def test_a_page_keeps_report_and_record_after_the_console_ends(federation: Federation, opened) -> None:
     where = "--out", str(federation.out), "--listen", federation.endpoint
     run = federation.start("run", federation.write(TRIAD), "--console", "--rate", "2", *where)
     page = opened(run.line("steer at").text.rpartition(" ")[2], STRIP).page
@@ -369,7 +369,7 @@ def test_the_pages_of_a_run_s_console_keep_its_report_and_record(federation: Fed
 
 @pytest.fixture
 def waiting(federation: Federation) -> Iterator[Role]:
-    """A run that is over, whose console waits for a page that copies nothing."""
+    """A finished run whose console waits for a page that copies nothing."""
     run = federation.run(TRIAD, "--console", "--rate", "2")
     address = run.line("steer at").text.rpartition(" ")[2]
     client, over, leaves = federation.client(), threading.Event(), threading.Event()
@@ -400,7 +400,7 @@ def waiting(federation: Federation) -> Iterator[Role]:
     ("number", "code"),
     [(signal.SIGINT, 0), pytest.param(signal.SIGTERM, 0, marks=pytest.mark.soak), (signal.SIGKILL, -signal.SIGKILL)],
 )
-def test_who_waits_for_pages_is_ended_by_a_signal(
+def test_a_signal_ends_a_run_that_waits_for_pages(
     federation: Federation, waiting: Role, number: int, code: int
 ) -> None:
     waiting.signal(number)
@@ -408,13 +408,13 @@ def test_who_waits_for_pages_is_ended_by_a_signal(
     federation.nobody_left()
 
 
-def test_consoles_take_another_port_where_theirs_is_taken(federation: Federation) -> None:
+def test_a_console_takes_another_port_if_the_default_is_in_use(federation: Federation) -> None:
     links = [federation.role("console").line("steer at").text.rpartition(" ")[2] for _ in range(2)]
     assert links[0] != links[1]
     assert [status(link) for link in links] == [200, 200]
 
 
-def test_what_a_run_left_behind_is_served_once_it_is_there(tmp_path: Path) -> None:
+def test_report_and_record_are_served_once_they_exist(tmp_path: Path) -> None:
     with staged_console(StagedRun(past_s=0.5), tmp_path) as address:
         assert status(f"{address}report") == status(f"{address}view/record") == 404
         for name in ("report.html", "run.mcap"):
@@ -430,7 +430,7 @@ def test_what_a_run_left_behind_is_served_once_it_is_there(tmp_path: Path) -> No
 
 
 @pytest.mark.soak
-def test_a_console_serves_one_run_after_the_other(federation: Federation) -> None:
+def test_a_console_serves_consecutive_runs(federation: Federation) -> None:
     role, links = console(federation)
     world = federation.world(TRIAD, "--duration", "600")
     role.line("console.1: in run")
@@ -461,7 +461,7 @@ def test_a_second_console_has_a_name_of_its_own(federation: Federation) -> None:
 
 
 @pytest.mark.soak
-def test_two_that_wait_for_a_world_do_not_take_each_others_name(federation: Federation) -> None:
+def test_two_waiting_consoles_take_different_names(federation: Federation) -> None:
     consoles = [console(federation)[0] for _ in range(2)]
     for each in consoles:
         each.line("waiting for a world")
@@ -474,17 +474,17 @@ def test_two_that_wait_for_a_world_do_not_take_each_others_name(federation: Fede
 
 
 def named(role: Role) -> str:
-    """Return under which name a console is in a run; empty before."""
+    """Return the name under which a console is in a run; empty before it joins."""
     return (re.findall(r"^(console\.\d+): in run", role.text(), re.MULTILINE) or [""])[-1]
 
 
-def test_others_are_let_in_with_a_token_only(federation: Federation) -> None:
+def test_listening_to_other_hosts_requires_a_token(federation: Federation) -> None:
     role = federation.role("console", "--listen", "0.0.0.0", "--port", str(free_port()))
     role.ends(with_code=2)
     assert has_terms(role.text(), "0.0.0.0", "--token", "--listen 127.0.0.1")
 
 
-def test_a_port_that_is_taken_is_named(federation: Federation) -> None:
+def test_a_port_in_use_is_reported(federation: Federation) -> None:
     _, links = console(federation)
     port = urlsplit(links["steer"]).port
     other = federation.role("console", "--port", str(port))

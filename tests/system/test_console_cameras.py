@@ -1,4 +1,4 @@
-"""What drones see, in the console: in a real browser, with pictures that a test publishes."""
+"""Camera pictures in the console, in a real browser, with pictures that the tests publish."""
 
 import io
 import math
@@ -51,13 +51,13 @@ TWELVE = "\n".join(
     ]
 )
 EMERGENCY = "EMERGENCY – all rotors stop"
-SKY = np.array(synthetic_camera.SKY[::-1])  # red, green, blue; nothing else in the scene has it
-SKY_PIXELS = 60  # of a frustum's picture, at least
-HEAD_PX = 46  # height of the head of the page
-HAT_PIXELS = 10  # of a drone's hat, at least
-STANDS = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # m; of TRIAD's drones, W
-FIELD_DEG = 75.0  # of viser's camera, from top to bottom
-NEAR = 12  # levels of 255: JPEG, and the scene's light
+SKY = np.array(synthetic_camera.SKY[::-1])  # red, green, blue; a colour that nothing else in the scene has
+SKY_PIXELS = 60  # least number of sky-coloured pixels that a frustum's picture shows
+HEAD_PX = 46  # height of the page's head
+HAT_PIXELS = 10  # least number of hat-coloured pixels that a drone shows
+STANDS = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # m, in W: positions of TRIAD's drones
+FIELD_DEG = 75.0  # vertical field of view of viser's camera
+NEAR = 12  # tolerance of a colour in levels of 255, for JPEG and the scene's lighting
 
 READ_NUMBERS = """() => Object.fromEntries([...document.querySelectorAll('#zsim-cameras .picture')].map(button => {
   const image = button.querySelector('img');
@@ -68,7 +68,7 @@ READ_NUMBERS = """() => Object.fromEntries([...document.querySelectorAll('#zsim-
   const bits = [...Array(BITS).keys()].map(bit => context.getImageData((bit + .5) * side, y, 1, 1).data[0] > 128);
   return [button.dataset.camera, bits.reduce((sum, set, bit) => sum + (set ? 1 << bit : 0), 0)];
 }))""".replace("BITS", str(NUMBER_BITS))
-"""Returns the number that is drawn into each picture, as it stands on the page."""
+"""Returns the number drawn into each picture that the page shows."""
 
 COVERED = """() => [...document.querySelectorAll('#zsim-cameras .picture, #zsim-cameras text, button')].filter(each => {
   const box = each.getBoundingClientRect();
@@ -80,7 +80,7 @@ COVERED = """() => [...document.querySelectorAll('#zsim-cameras .picture, #zsim-
   const on = each.closest('button');
   return !inside || box.width < 10 || at.some(found => !found || !on.contains(found));
 }).map(each => `${each.className} ${each.dataset?.camera ?? each.textContent}`)"""
-"""Returns what of the pictures, their texts and the emergency button is cut off, or has something else over it."""
+"""Returns those of the pictures, their texts and the emergency button that are cut off or covered."""
 
 CUT_TEXTS = """() => [...document.querySelectorAll('#zsim-cameras text')].filter(text => {
   const box = text.getBoundingClientRect(), picture = text.closest('.picture').getBoundingClientRect();
@@ -100,7 +100,7 @@ MARK = """() => {
 
 
 def until(page: BrowserPage, look: Callable[[], Any], holds: Callable[[Any], bool]) -> Any:
-    """Look again and again until something holds of what is seen; return that."""
+    """Poll until the value seen meets a condition, and return it."""
     until_s = time.monotonic() + PATIENCE_S
     while True:
         seen = look()
@@ -115,7 +115,7 @@ def numbers(page: BrowserPage) -> dict[str, int | None]:
 
 
 def wait_until_all_change(page: BrowserPage, cameras: list[str]) -> None:
-    """Wait until every picture has become another."""
+    """Wait until every picture has been replaced by another."""
     first = until(page, lambda: numbers(page), lambda seen: list(seen) == cameras and None not in seen.values())
     changed: set[str] = set()
 
@@ -127,7 +127,7 @@ def wait_until_all_change(page: BrowserPage, cameras: list[str]) -> None:
 
 
 def is_stacked(places: list[dict[str, float]], screen: dict[str, int]) -> bool:
-    """Return whether the scene has most of the screen's height, and the pictures stand below it, as wide as it."""
+    """Return whether the scene takes most of the screen's height, and the pictures the rest, equally wide."""
     scene, pictures = places
     return (
         abs(scene["y"] + scene["height"] - pictures["y"]) < 1.5
@@ -139,7 +139,7 @@ def is_stacked(places: list[dict[str, float]], screen: dict[str, int]) -> bool:
 
 
 def scene_pixels(page: BrowserPage) -> np.ndarray:
-    """Return the scene as it stands on the page: rows of pixels (red, green, blue)."""
+    """Return the scene as rendered on the page: rows of pixels (red, green, blue)."""
     image = pytest.importorskip("PIL.Image")
     box: Any = page.page.locator("canvas[data-engine]").bounding_box()
     return np.array(image.open(io.BytesIO(page.page.screenshot(clip=box, timeout=PATIENCE_MS))).convert("RGB"), int)
@@ -151,8 +151,8 @@ def sky_pixels(page: BrowserPage) -> int:
 
 
 def wait_for_pictures_and_drones(page: BrowserPage, cameras: list[str]) -> None:
-    """Wait until a page shows the pictures, and in its scene the hats of drones, as long as it has no error."""
-    page.page.locator(".mantine-Notification-closeButton").click()  # "software WebGL", of this browser alone
+    """Wait until a page shows the pictures, and the drones' hats in its scene; fail on an error of the page."""
+    page.page.locator(".mantine-Notification-closeButton").click()  # the "software WebGL" notice of this browser
 
     def look() -> tuple[bool, int]:
         assert page.faults == []
@@ -167,9 +167,9 @@ def wait_for_pictures_and_drones(page: BrowserPage, cameras: list[str]) -> None:
 
 
 def place_of(page: BrowserPage, p_W: tuple[float, float, float]) -> tuple[float, float]:
-    """Return where a point of the scene of TRIAD is on the page, whose camera is reset for it."""
+    """Reset the page's camera, and return where a point of TRIAD's scene lies on the page."""
     page.page.locator("#zsim-tools").get_by_text("Reset").click()
-    page.until(f"s.t_s > {page.state()['t_s'] + 1}")  # the next picture moves the camera
+    page.until(f"s.t_s > {page.state()['t_s'] + 1}")  # the camera moves with the next frame
     box: Any = page.page.locator("canvas[data-engine]").bounding_box()
     fov, aspect, up = math.radians(FIELD_DEG), box["width"] / box["height"], np.array([0.0, 0.0, 1.0])
     centre = (STANDS.min(axis=0) + STANDS.max(axis=0)) / 2
@@ -193,14 +193,14 @@ def watched(page: BrowserPage) -> list[str]:
 
 
 def repeated(client: Client, key: str, payload: bytes) -> AbstractContextManager[None]:
-    """Publish the same bytes again and again meanwhile."""
+    """Publish the same bytes repeatedly while the context is open."""
     return meanwhile(lambda: client.put_raw(key, payload), 0.01)
 
 
 @needs_browser
 @pytest.mark.slow
 @pytest.mark.soak
-def test_pictures_and_drones_are_shown_on_a_page_that_is_loaded_again(
+def test_pictures_and_drones_are_shown_on_a_reloaded_page(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
     pytest.importorskip("cv2", reason="pip install opencv-python-headless")
@@ -218,9 +218,7 @@ def test_pictures_and_drones_are_shown_on_a_page_that_is_loaded_again(
 @needs_browser
 @pytest.mark.slow
 @pytest.mark.soak
-def test_what_each_drone_sees_stands_below_the_scene(
-    federation: Federation, opened: Callable[..., BrowserPage]
-) -> None:
+def test_camera_pictures_are_shown_below_the_scene(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
     pytest.importorskip("cv2", reason="pip install opencv-python-headless")
     federation.run(TRIAD, "--rate", "1")
     _, links = console(federation)
@@ -229,24 +227,24 @@ def test_what_each_drone_sees_stands_below_the_scene(
     page.until("s.drones.length == 3 && s.clock == 'running'")
     strip = page.page.locator("#zsim-cameras")
 
-    # a run without cameras shows nothing of them
+    # a run without cameras shows no pictures
     assert page.state()["cameras"] == []
     assert not strip.is_visible()
 
     with synthetic_camera.published(client, THREE, seen_by=["drone1"]):
-        # all six come, and change
+        # all six pictures appear and are updated
         strip.wait_for(state="visible")
         wait_until_all_change(page, SIX)
 
-        # what was seen is drawn where it is, with its range
+        # a sighting is marked at its place in the picture, with its range
         u, v, text = until(page, lambda: page.page.evaluate(MARK), lambda seen: seen is not None)
         expected = synthetic_camera.projected("front", synthetic_camera.HAT_B)
         assert (u * 640 - 0.5, v * 360 - 0.5) == pytest.approx(expected, abs=1.5)
         assert text == "6.1 ± 0.2 m"
         assert page.page.locator("#zsim-cameras circle").count() == 1
 
-        # nothing is cut off, nothing covered; the scene ends where the pictures begin
-        page.page.locator(".mantine-Notification-closeButton").click()  # "software WebGL", of this browser alone
+        # nothing is cut off or covered; the scene ends where the pictures begin
+        page.page.locator(".mantine-Notification-closeButton").click()  # the "software WebGL" notice of this browser
         for screen in SCREENS:
             page.page.set_viewport_size(screen)
             until(page, lambda: page.page.evaluate(COVERED), lambda seen: seen == [])
@@ -254,7 +252,7 @@ def test_what_each_drone_sees_stands_below_the_scene(
             until(page, lambda: page.page.evaluate(PLACES), lambda seen, screen=screen: is_stacked(seen, screen))
         page.page.set_viewport_size(LAPTOP)
 
-        # a click shows the frustum with the picture on it, another hides it
+        # one click shows the frustum with its picture, another hides it
         until(page, lambda: sky_pixels(page), lambda seen: seen < SKY_PIXELS)  # laid out for the laptop again
         click(page, "drone2/front")
         until(page, lambda: sky_pixels(page), lambda seen: seen > SKY_PIXELS)
@@ -262,13 +260,13 @@ def test_what_each_drone_sees_stands_below_the_scene(
         click(page, "drone2/front")
         until(page, lambda: sky_pixels(page), lambda seen: seen < SKY_PIXELS)
 
-        # and so does a click on the drone in the scene
+        # a click on the drone in the scene does the same
         page.page.mouse.click(*place_of(page, (-1.5, -1.5, 0.0)))
         until(page, lambda: sky_pixels(page), lambda seen: seen > SKY_PIXELS)
         assert page.page.locator("#zsim-cameras [aria-pressed=true]").get_attribute("data-camera") == "drone2/front"
         click(page, "drone2/front")
 
-        # what is no picture is counted, and nothing else is touched
+        # an invalid picture is counted and affects no other
         with repeated(client, "drone/drone3/camera/front", b"no message at all"):
             page.until("s.cameras.find(c => c.camera == 'drone3/front').refused > 0")
         info = synthetic_camera.image_message("bottom", 1, b"no JPEG", 0)
@@ -276,7 +274,7 @@ def test_what_each_drone_sees_stands_below_the_scene(
             page.until("s.cameras.find(c => c.camera == 'drone3/bottom').reason.includes('JPEG')")
         wait_until_all_change(page, SIX)
 
-        # who looks at none is sent none
+        # a page that shows no pictures is sent none
         page.press("Cameras ▾")
         until(page, lambda: watched(page), lambda seen: seen == [])
         until(
@@ -293,7 +291,7 @@ def test_what_each_drone_sees_stands_below_the_scene(
 
 @needs_browser
 @pytest.mark.soak
-def test_who_may_only_look_sees_what_the_drones_see(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
+def test_a_viewer_sees_the_camera_pictures(federation: Federation, opened: Callable[..., BrowserPage]) -> None:
     pytest.importorskip("cv2", reason="pip install opencv-python-headless")
     federation.run(TRIAD, "--rate", "1")
     _, links = console(federation, "--token", "a-good-token")
@@ -310,7 +308,7 @@ def test_who_may_only_look_sees_what_the_drones_see(federation: Federation, open
 
 @needs_browser
 @pytest.mark.soak
-def test_of_many_drones_one_chooses_whose_pictures_are_shown(
+def test_the_drones_whose_pictures_are_shown_can_be_chosen(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
     pytest.importorskip("cv2", reason="pip install opencv-python-headless")
@@ -320,7 +318,7 @@ def test_of_many_drones_one_chooses_whose_pictures_are_shown(
     client = federation.client()
     page = opened(links["steer"], LAPTOP)
     with synthetic_camera.published(client, [f"drone{k + 1}" for k in range(12)], rate_hz=5.0):
-        wait_until_all_change(page, SIX)  # there is room for three
+        wait_until_all_change(page, SIX)  # there is room for three drones
         assert sorted(watched(page)) == sorted(SIX)
         page.page.get_by_label("drone of window 2").select_option("drone11")
         now = [f"{drone}/{name}" for drone in ("drone1", "drone11", "drone3") for name in SETTINGS]
@@ -333,7 +331,7 @@ def test_of_many_drones_one_chooses_whose_pictures_are_shown(
     assert page.faults == []
 
 
-def test_pictures_are_for_those_who_may_see_the_page(federation: Federation) -> None:
+def test_pictures_require_the_token_of_their_page(federation: Federation) -> None:
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
@@ -350,7 +348,7 @@ def test_pictures_are_for_those_who_may_see_the_page(federation: Federation) -> 
     connect(f"ws://127.0.0.1:{port}/cameras?token=a-good-token").close()
 
 
-def test_a_page_that_says_what_is_no_request_is_hung_up_on(federation: Federation) -> None:
+def test_an_invalid_request_closes_the_connection(federation: Federation) -> None:
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
 
@@ -362,7 +360,7 @@ def test_a_page_that_says_what_is_no_request_is_hung_up_on(federation: Federatio
                 socket.recv(timeout=PATIENCE_S)
 
 
-def test_a_page_is_sent_pictures_as_they_came(federation: Federation) -> None:
+def test_pictures_are_forwarded_unchanged(federation: Federation) -> None:
     pytest.importorskip("cv2", reason="pip install opencv-python-headless")
     from websockets.sync.client import connect
 

@@ -1,4 +1,4 @@
-"""Thirty drones on a page: sorted, filtered, selected for one command, on a desk's screen and under a thumb."""
+"""Thirty drones on a page: sorted, filtered and selected for one command, on a laptop and on a phone."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -17,8 +17,8 @@ pytestmark = [
 ]
 
 GRID = Path(__file__).parents[2] / "scenarios" / "grid30.yaml"
-DRAWN_HZ = 10.0  # as of thirty drones
-TOUCH_PX = 44  # WCAG 2.2, 2.5.5
+DRAWN_HZ = 10.0  # a console's picture rate for thirty drones
+TOUCH_PX = 44  # least size of a touch target, WCAG 2.2, 2.5.5
 CELL_JS = """([drone, cell]) => {
   const row = document.querySelector(`[data-zsim-drone=${drone}]`), box = row.children[cell].getBoundingClientRect();
   row.scrollIntoView({ block: "center" });
@@ -46,7 +46,7 @@ BARS_JS = """() => {
   }
   return found;
 }"""
-"""Pairs of bars of which one lies over the other."""
+"""Returns pairs of overlapping bars."""
 DRONES_JS = """() => {
   const view = JSON.parse(document.getElementById("zsim-map").dataset.view ?? "null");
   if (!view) return ["not drawn yet"];
@@ -56,11 +56,11 @@ DRONES_JS = """() => {
     return document.elementFromPoint(px, py)?.tagName !== "CANVAS";
   });
 }"""
-"""Corners of the grid, about (5, 0) m, that something lies over on the map."""
+"""Returns the corners of the grid, which is centred on (5, 0) m, that something covers on the map."""
 
 
 def until_nothing(page: BrowserPage, faults: str) -> None:
-    """Wait until a function (JavaScript) finds no fault of a page."""
+    """Wait until a JavaScript function finds no fault in a page."""
     until_s = time.monotonic() + PATIENCE_S
     while found := page.page.evaluate(faults):
         assert time.monotonic() < until_s, found
@@ -84,7 +84,7 @@ def tap(page: BrowserPage, drone: str, cell: int) -> None:
 
 
 def field(page: BrowserPage, label: str) -> Any:
-    """Return where one types what a label names."""
+    """Return the input field that a label names."""
     named = page.page.get_by_text(label, exact=True).and_(page.page.locator(":visible")).first
     return named.locator("xpath=ancestor::div[.//input][1]").locator("input").last
 
@@ -100,13 +100,13 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
     run, address = fleet
     page = opened(address, SCREENS[1])
     page.page.wait_for_function(f"() => ({ROWS_JS})().length === 30")
-    page.page.wait_for_function(f"() => ({ROWS_JS})().slice(0, 2).join() === 'drone17,drone4'")  # the worst first
+    page.page.wait_for_function(f"() => ({ROWS_JS})().slice(0, 2).join() === 'drone17,drone4'")  # worst first
     choose(page, "sort by", "as in the scenario")
     page.page.wait_for_function(f"() => ({ROWS_JS})()[0] === 'drone1'")
     field(page, "filter").fill("drone2")
-    page.page.wait_for_function(f"() => ({ROWS_JS})().length === 11")  # 2, and 20 to 29
+    page.page.wait_for_function(f"() => ({ROWS_JS})().length === 11")  # drone2, and drone20 to drone29
 
-    # a row chooses, its box selects; a command goes to all that are selected
+    # a click on a row chooses the drone, one on its box selects it; a command goes to all selected drones
     tap(page, "drone20", 1)
     page.page.locator("[data-zsim-chosen][data-zsim-drone=drone20]").first.wait_for()
     page.page.locator(".zsim-instruments").wait_for()
@@ -122,7 +122,7 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
         page.page.wait_for_timeout(50)
     assert sorted(acquired()) == ["drone21", "drone29"]
 
-    # a target is shown before it is flown
+    # a target is previewed before it is flown
     page.page.get_by_label("Preview first").check()
     number = field(page, "x_c [m]")
     page.page.locator("#zsim-flight .map").click()
@@ -141,7 +141,7 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
     page.page.wait_for_function("() => Number(document.getElementById('zsim-map').dataset.previews) === 0")
     page.page.get_by_label("Preview first").uncheck()
 
-    # the formation returns: over the middle of its starts first
+    # the formation returns, first to above the centre of its starting positions
     run.link.asked.clear()
     page.press("Return")
     while not targets():
@@ -150,7 +150,7 @@ def test_thirty_drones_are_sorted_filtered_and_commanded_together(
     assert page.faults == []
 
 
-def test_under_a_thumb_everything_is_large_enough_and_nothing_is_under_a_bar(
+def test_on_a_phone_controls_are_large_enough_and_nothing_is_covered(
     fleet: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
 ) -> None:
     _, address = fleet
@@ -163,7 +163,7 @@ def test_under_a_thumb_everything_is_large_enough_and_nothing_is_under_a_bar(
     for tab in ("Fly", "Plots", "Faults", "Run", "Drones", "Events"):
         page.select_tab(tab)
         page.open_folders()
-        page.page.wait_for_timeout(500)  # of what folds open
+        page.page.wait_for_timeout(500)  # until the folders are open
         if small := page.page.evaluate(SMALL_JS):
             found[tab] = small
     assert found == {}

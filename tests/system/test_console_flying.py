@@ -1,4 +1,4 @@
-"""One drone flown from a page: by hand with a dead-man key, and to a place on the map; a viewer moves nothing."""
+"""One drone flown from a page, by hand with a dead-man key and to a place on the map; a viewer cannot fly it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,11 +9,11 @@ from console_browser import SCREENS, BrowserPage, console
 from federation import Federation
 from test_console import TRIAD
 
-FLOWN = 1  # drone2
-STICK_S = 3.0  # simulated; for which the key is held
-BESIDE_M = 1.5  # of a drone: no click on it, and on the map
-MOVED_M = 1.0  # farther than a drone that hovers is blown
-SETTLE_S = 3.0  # simulated; in which a drone comes to rest
+FLOWN = 1  # index of drone2
+STICK_S = 3.0  # simulated time for which a key is held
+BESIDE_M = 1.5  # distance from a drone at which a click misses it but is still on the map
+MOVED_M = 1.0  # farther than the wind moves a hovering drone
+SETTLE_S = 3.0  # simulated time in which a drone comes to rest
 BAR = "document.querySelector('#zsim-flight .bar').dataset.state"
 SEES = "() => { const view = document.getElementById('zsim-map').dataset.view; return view && JSON.parse(view); }"
 
@@ -23,12 +23,12 @@ def place(state: dict[str, Any]) -> list[float]:
 
 
 def after(page: BrowserPage, seconds: float) -> list[float]:
-    """Return where the drone is after some simulated time."""
+    """Return the drone's position after some simulated time."""
     return place(page.until(f"s.t_s > {page.state()['t_s'] + seconds}"))
 
 
 def is_near(x_m: float, y_m: float) -> str:
-    """Return a condition of the page: the drone is near a place."""
+    """Return a condition for the page: the drone is near a place."""
     return f"Math.hypot(s.drones[{FLOWN}].position_m[0] - {x_m}, s.drones[{FLOWN}].position_m[1] - {y_m}) < 0.7"
 
 
@@ -54,7 +54,7 @@ def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened:
     operator.page.get_by_role("button", name="Take off", exact=True).and_(operator.page.locator(":enabled")).click()
     operator.until("s.clusters[0].reason == 'ready to engage'")
 
-    # a viewer has the map, and nothing to fly with
+    # a viewer has the map, but no flight controls
     viewer.page.locator("#zsim-flight .map").click()
     viewer.page.wait_for_function(SEES)
     assert viewer.page.locator("#zsim-flight .fly").is_hidden()
@@ -71,23 +71,23 @@ def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened:
     bar.locator(".fly").click()
     bar.locator(".take").get_by_text("drone2").wait_for()
 
-    # its controller flies it: refused, unless it is taken over
+    # manual flight is refused while the controller flies the drone, until the operator takes over
     bar.locator(".take").click()
     bar.locator(".over").wait_for()
     with operator.held("#zsim-flight .over"):
         bar.locator(".leave").wait_for()
 
-    # without the dead-man key nothing moves; with it forward is where the nose points, here north
+    # nothing moves without the dead-man key; with it, forward is where the nose points, here north
     operator.page.keyboard.down("KeyW")
     start = after(operator, STICK_S)
     assert operator.page.evaluate(BAR) == "flying"
     operator.page.keyboard.down("Shift")
     operator.page.wait_for_function(f"() => {BAR} === 'held'")
-    operator.page.keyboard.down("KeyW")  # a key that is held repeats: the page may have lost the focus for a moment
+    operator.page.keyboard.down("KeyW")  # repeated, as by a held key: the page may have lost the focus for a moment
     there = place(operator.until(f"s.drones[{FLOWN}].position_m[1] > {start[1] + MOVED_M}"))
     assert abs(there[0] - start[0]) < 0.5 * (there[1] - start[1])
 
-    # a page that loses the focus lets it hover, and so does a key that is let go
+    # the drone hovers once the page loses the focus
     operator.page.evaluate("dispatchEvent(new Event('blur'))")
     operator.page.wait_for_function(f"() => {BAR} === 'flying'")
     rest = after(operator, SETTLE_S)
@@ -95,7 +95,7 @@ def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened:
     operator.page.keyboard.up("Shift")
     operator.page.keyboard.up("KeyW")
 
-    # to a place, at its height; outside of the fence there is nothing to go on with
+    # the drone flies to places at its own height; a place outside the fence is not offered
     goal = (round(rest[0] - 1.0, 1), round(rest[1] + 1.0, 1))
     click_map(operator, *goal)
     operator.page.locator("#zsim-map .go").click()
@@ -112,7 +112,7 @@ def test_a_drone_is_flown_by_hand_and_to_a_place(federation: Federation, opened:
     operator.page.locator("#zsim-map .there").wait_for()
     assert operator.page.locator("#zsim-map .go").is_hidden()
 
-    # given back
+    # the operator gives the drone back
     bar.locator(".leave").click()
     bar.locator(".take").wait_for()
     assert operator.outside() == set()

@@ -1,4 +1,4 @@
-"""The head of the console's page, in a real browser, on answers that the test gives."""
+"""The head of the console's page, in a real browser, with the console's answers supplied by the test."""
 
 import functools
 import importlib.resources
@@ -20,7 +20,7 @@ from zsim_bridges.console.page_server import RunFiles
 pytestmark = needs_browser
 
 SIZE = {"width": 1280, "height": 200}
-ADDRESS = "http://console.test/"  # of no machine: all requests are answered here
+ADDRESS = "http://console.test/"  # of no machine: the test answers all requests
 LOOKED_AT = f"{ADDRESS}head"
 AUDIO_JS = """
 window.tones = 0;
@@ -29,19 +29,19 @@ window.AudioContext = class {
   resume() {}
   createOscillator() { return { frequency: {}, connect() {}, start() { window.tones += 1; }, stop() {} }; }
 };"""
-"""In place of the browser's: counts the tones that a page has begun."""
-LOOKS = 2  # of the page at the console: the second comes after the answer to the first is shown
+"""Replaces the browser's AudioContext and counts the tones that a page starts."""
+LOOKS = 2  # polls of the console by the page: the second follows once the answer to the first is shown
 RED = {"severity": "red", "subject": "drone1", "name": "battery", "text": "8 %", "for_s": 0.0, "acknowledged": False}
 
 
 class Head:
-    """A page with the head alone.
+    """A page with only the head.
 
     Attributes:
-        page: playwright's.
-        state: what the console answers.
-        looks: how often it was asked.
-        copied: whether the page had, when it last asked, all that it keeps of a console that leaves.
+        page: the Playwright page.
+        state: the console's answer to a poll.
+        looks: number of polls by the page.
+        copied: whether, at its last poll, the page had copied all that it keeps of an ending console.
     """
 
     def __init__(self, page: Any) -> None:
@@ -71,21 +71,21 @@ class Head:
         route.fulfill(body="{}", content_type="application/json")
 
     def show(self, **state: Any) -> None:
-        """Let the page show another state."""
+        """Change the state, and wait until the page shows it."""
         self.state = {**self.state, **state}
         until = self.looks + LOOKS
         while self.looks < until:
             self.page.wait_for_timeout(POLL_MS)
 
     def wait_for_copies(self) -> None:
-        """Wait until the page has all that it keeps of a console that leaves."""
+        """Wait until the page has copied all that it keeps of an ending console."""
         until_s = time.monotonic() + PATIENCE_S
         while not self.copied:
             assert time.monotonic() < until_s
             self.page.wait_for_timeout(POLL_MS)
 
     def wait_until_laid_out(self, size: dict[str, int], holds: Callable[[], bool] = lambda: True) -> None:
-        """Give the page a size, and wait until both buttons are in sight, nothing is cut off, and something holds."""
+        """Resize the page, and wait until both buttons are in sight, nothing is cut off and a condition holds."""
         self.page.set_viewport_size(size)
         self.page.wait_for_function(IN_SIGHT)
         until_s = time.monotonic() + PATIENCE_S
@@ -94,14 +94,14 @@ class Head:
             self.page.wait_for_timeout(POLL_MS)
 
     def wait_for(self, count: int, of: list[Any]) -> None:
-        """Wait until so many of something have come from the page."""
+        """Wait until a list has received `count` items from the page."""
         until_s = time.monotonic() + PATIENCE_S
         while len(of) < count:
             assert time.monotonic() < until_s, of
             self.page.wait_for_timeout(POLL_MS)
 
     def tones(self) -> int:
-        """Return how many tones the page has begun."""
+        """Return the number of tones that the page has started."""
         return self.page.evaluate("window.tones")
 
 
@@ -117,7 +117,7 @@ def page(browser: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def head(page: Any) -> Iterator[Head]:
-    """The page, loaded anew."""
+    """The page, freshly loaded."""
     page.set_viewport_size(SIZE)
     yield Head(page)
     page.unroute_all(behavior="wait")
@@ -138,7 +138,7 @@ def test_a_red_alarm_sounds_once(head: Head) -> None:
     assert head.tones() == 3
 
 
-def test_no_alarm_sounds_that_was_acknowledged_or_while_the_sound_is_off(head: Head) -> None:
+def test_acknowledged_or_muted_alarms_do_not_sound(head: Head) -> None:
     head.show(alarms=[{**RED, "acknowledged": True}])
     assert head.tones() == 0
     sound = head.page.locator(".sound")
@@ -151,7 +151,7 @@ def test_no_alarm_sounds_that_was_acknowledged_or_while_the_sound_is_off(head: H
     assert head.tones() == 1
 
 
-def test_whatever_alarms_there_are_the_buttons_are_in_sight_and_nothing_is_cut(head: Head) -> None:
+def test_alarms_neither_hide_the_buttons_nor_are_cut_off(head: Head) -> None:
     detail = "step · waiting for estimator.drone1 on lab-computer-2 (40 s), estimator.drone2 on lab-computer-2 (40 s)"
     for size in SCREENS:
         for count, acknowledged in itertools.product((1, 2, 7), (False, True)):
@@ -168,7 +168,7 @@ def test_an_alarm_is_acknowledged_by_its_button(head: Head) -> None:
 
 
 def ended(folder: Path, **state: Any) -> dict[str, Any]:
-    """Return the head of a run that is over, with what its folder holds."""
+    """Return the head's state after a run, with the files of the run's folder."""
     over = {"level": "ended", "title": "run over at 330.0 s", "detail": "step · the duration is over"}
     return {**over, **RunFiles(folder).shown(page="", has_copies=False), **state}
 
@@ -180,7 +180,7 @@ def gone(head: Head) -> None:
 
 
 @pytest.mark.parametrize("above", ["name", "name-that-no-line-can-hold" * 8])
-def test_when_a_run_is_over_its_report_and_record_are_named(head: Head, above: str) -> None:
+def test_report_and_record_of_a_finished_run_are_shown(head: Head, above: str) -> None:
     state = ended(Path(f"/home/somebody/lab/flights/with/a/long/{above}/runs/step-20261125-065514"))
     files = state["files"]
     head.show(files=files)
@@ -194,7 +194,7 @@ def test_when_a_run_is_over_its_report_and_record_are_named(head: Head, above: s
     for size in SCREENS:
         head.page.set_viewport_size(size)
         for link in shown.locator("a").all():
-            link.click(trial=True)  # it lies under the middle of its own box
+            link.click(trial=True)  # nothing covers the middle of its box
     gone(head)
     head.page.locator("[data-level=gone]").wait_for()
     for size in SCREENS:
@@ -202,7 +202,7 @@ def test_when_a_run_is_over_its_report_and_record_are_named(head: Head, above: s
     assert shown.locator("a").count() == 0
 
 
-def test_a_page_keeps_report_and_record_of_a_console_that_leaves(head: Head, tmp_path: Path) -> None:
+def test_a_page_keeps_report_and_record_of_an_ending_console(head: Head, tmp_path: Path) -> None:
     content = {"report": "<title>the report</title>", "record": "MCAP"}
     (tmp_path / "report.html").write_text(content["report"])
     (tmp_path / "run.mcap").write_text(content["record"])
@@ -222,7 +222,7 @@ def test_a_page_keeps_report_and_record_of_a_console_that_leaves(head: Head, tmp
     assert (record.value.suggested_filename, record.value.path().read_text()) == ("run.mcap", content["record"])
 
 
-def test_a_page_copies_no_record_as_large_as_a_disk(head: Head, tmp_path: Path) -> None:
+def test_a_page_does_not_copy_a_record_of_a_terabyte(head: Head, tmp_path: Path) -> None:
     state = ended(tmp_path, leaves=True)
     head.show(**{**state, "files": {"record": {"path": "/runs/large/run.mcap", "size_bytes": 10**12}}})
     head.wait_for_copies()
@@ -232,7 +232,7 @@ def test_a_page_copies_no_record_as_large_as_a_disk(head: Head, tmp_path: Path) 
     assert head.page.locator(".files a").count() == 0
 
 
-def test_what_cannot_be_copied_is_named(head: Head, tmp_path: Path) -> None:
+def test_the_path_of_a_file_that_cannot_be_copied_is_shown(head: Head, tmp_path: Path) -> None:
     for name in ("report.html", "run.mcap"):
         (tmp_path / name).write_text(name)
     head.page.route(f"{ADDRESS}report", lambda route: route.abort())
@@ -245,7 +245,7 @@ def test_what_cannot_be_copied_is_named(head: Head, tmp_path: Path) -> None:
     assert str(tmp_path / "report.html") in str(head.page.locator(".files").text_content())
 
 
-def test_what_a_run_has_not_left_is_not_named(head: Head, tmp_path: Path) -> None:
+def test_a_missing_report_is_not_shown_when_the_console_ends(head: Head, tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_text("MCAP")
     head.page.route(f"{ADDRESS}record", functools.partial(serve, "MCAP"))
     head.show(**ended(tmp_path))
@@ -255,7 +255,7 @@ def test_what_a_run_has_not_left_is_not_named(head: Head, tmp_path: Path) -> Non
     assert head.page.locator(".files").text_content() == f"record: {tmp_path / 'run.mcap'}"
 
 
-def test_the_next_run_on_a_console_s_port_has_none_of_these_copies(head: Head, tmp_path: Path) -> None:
+def test_the_next_run_on_the_same_port_shows_no_old_copies(head: Head, tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text("")
     head.page.route(f"{ADDRESS}report", functools.partial(serve, ""))
     head.show(**ended(tmp_path, leaves=True))
@@ -267,16 +267,16 @@ def test_the_next_run_on_a_console_s_port_has_none_of_these_copies(head: Head, t
     assert head.page.locator(".files a").get_attribute("href") == "/report"
 
 
-STALL_MS = 3500  # of the page: more than what is called lost
+STALL_MS = 3500  # stall of the page, longer than the age at which data count as lost
 STALL_JS = "ms => { const until = performance.now() + ms; while (performance.now() < until); }"
 
 
 class OrderDesk:
-    """What the console makes of the orders of a page.
+    """The console's answers to the orders of a page.
 
     Attributes:
-        orders: that it was sent, with repetitions.
-        state: of each; empty where it does not answer.
+        orders: orders received, with repetitions.
+        state: state answered for every order; empty for no answer.
     """
 
     def __init__(self, head: Head) -> None:
@@ -303,14 +303,14 @@ class OrderDesk:
 
 
 def row(head: Head, state: str, *terms: str) -> None:
-    """Wait for the row of an order in a state, with terms."""
+    """Wait for the row of an order that is in a state and contains terms."""
     found = head.page.locator(f"#zsim-orders [data-state={state}]")
     for term in terms:
         found = found.filter(has_text=term)
     found.wait_for()
 
 
-def test_an_emergency_is_repeated_until_the_console_has_it_and_the_world_has_confirmed_it(head: Head) -> None:
+def test_an_emergency_is_repeated_until_the_world_confirms_it(head: Head) -> None:
     desk = OrderDesk(head)
     head.show(run_id="r7")
     gone(head)
@@ -336,7 +336,7 @@ def test_an_emergency_is_repeated_until_the_console_has_it_and_the_world_has_con
     assert len(desk.orders) == sent
 
 
-def test_what_the_world_refuses_is_told_until_it_is_clicked(head: Head) -> None:
+def test_a_refused_order_is_shown_until_it_is_clicked(head: Head) -> None:
     desk = OrderDesk(head)
     desk.state = "refused"
     head.page.locator(".land").click()
@@ -346,7 +346,7 @@ def test_what_the_world_refuses_is_told_until_it_is_clicked(head: Head) -> None:
 
 
 @pytest.mark.parametrize("key", ["Enter", "Space"])
-def test_an_emergency_is_held_by_the_keyboard_too_and_a_short_press_is_none(head: Head, key: str) -> None:
+def test_an_emergency_needs_a_long_press_on_the_keyboard_too(head: Head, key: str) -> None:
     desk = OrderDesk(head)
     desk.state = "confirmed"
     head.page.locator(".emergency").focus()
@@ -360,7 +360,7 @@ def test_an_emergency_is_held_by_the_keyboard_too_and_a_short_press_is_none(head
     assert len(desk.orders) == 1
 
 
-def test_orders_need_no_socket(browser: Any) -> None:
+def test_orders_need_no_websocket(browser: Any) -> None:
     with browser.new_context() as context:
         head = Head(context.new_page())
         desk = OrderDesk(head)
@@ -371,13 +371,15 @@ def test_orders_need_no_socket(browser: Any) -> None:
         row(head, "confirmed", "Land all")
 
 
-def test_the_socket_is_opened_again_whatever_a_part_of_the_page_does_and_what_waits_is_sent(head: Head) -> None:
+def test_the_websocket_reopens_despite_an_error_and_sends_queued_messages(head: Head) -> None:
     sockets: list[Any] = []
     sent: list[Any] = []
 
     def serve(opened: Any) -> None:
         sockets.append(opened)
-        opened.on_message(lambda text: sent.append(text))  # playwright marks its handlers
+        opened.on_message(
+            lambda text: sent.append(text)
+        )  # a lambda, because playwright sets attributes of its handlers
 
     head.page.route_web_socket("ws://console.test/actions", serve)
     head.page.reload()
@@ -394,7 +396,7 @@ def test_the_socket_is_opened_again_whatever_a_part_of_the_page_does_and_what_wa
     assert [json.loads(each)["do"] for each in sent] == ["choose", "look"]
 
 
-def test_a_page_that_stood_still_says_so_and_blames_no_console(head: Head) -> None:
+def test_a_stalled_page_reports_itself_and_not_the_console(head: Head) -> None:
     head.show()
     head.page.evaluate(STALL_JS, STALL_MS)
     head.page.locator("#zsim-notes").get_by_text("this page stood still").wait_for()
@@ -402,10 +404,12 @@ def test_a_page_that_stood_still_says_so_and_blames_no_console(head: Head) -> No
     assert head.page.locator(".emergency").is_enabled()
 
 
-def test_what_is_old_is_pale_and_then_lost(head: Head) -> None:
+def test_stale_data_are_marked_old_and_then_lost(head: Head) -> None:
     head.show()
     head.show(heard_s=1.5)
-    head.page.locator("body[data-zsim-age=old]").wait_for()  # a page that stands for a moment is older for that long
+    head.page.locator(
+        "body[data-zsim-age=old]"
+    ).wait_for()  # awaited, because a brief stall of the page adds to the age
     head.show(heard_s=0.1)
     head.page.locator("body[data-zsim-age='']").wait_for()
     gone(head)

@@ -1,4 +1,4 @@
-"""Every panel of the console at the sizes of a desk's screen, of a laptop's and of a phone's."""
+"""Every panel of the console on the screens of a desktop, a laptop and a phone."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ from wire import PATIENCE_S
 
 pytestmark = needs_browser
 
-LOOK_MS = 250  # between two looks at a page that is laid out anew
+LOOK_MS = 250  # polling interval for a page that is being laid out
 TIMELINE = {"from_s": 0.0, "to_s": 400.0, "marks": [{"t_s": 20.0, "kind": "mode", "text": "take off"}]}
 FORMS, TABLES = ("Fly", "Plots", "Faults", "Run"), ("Drones", "Events")
 LONG = "link_loss of drone1/estimator.drone1 begins with a probability of 0.3, as was asked for by console.1"
@@ -22,7 +22,7 @@ COVERED_JS = """() => {
   const free = [.2, .4, .6, .8].flatMap(x => [.3, .5, .7].map(y => at(x, y)?.closest("canvas") !== null));
   return { width: canvas.width, height: canvas.height, free: free.filter(Boolean).length / free.length };
 }"""
-"""The scene: its size, and how much of its middle nothing lies over."""
+"""Returns the scene's size, and the share of its middle that nothing covers."""
 CURVES_JS = """() => [...document.querySelectorAll(".uplot canvas")].map(canvas => {
   if (!canvas.width) return [0, 0];  // not laid out yet
   const points = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
@@ -34,7 +34,7 @@ CURVES_JS = """() => [...document.querySelectorAll(".uplot canvas")].map(canvas 
     return count;
   });
 })"""
-"""Of each plot, how many of its pixels have the colours of the estimated and the true curve."""
+"""Returns, for each plot, how many pixels have the colours of the estimated and of the true curve."""
 LIT = ["#zsim-head", "label", "table td"]
 LIGHTNESS_JS = """selectors => selectors.flatMap(selector => {
   const lightness = colour => { const [r, g, b] = colour.match(/[\\d.]+/g).map(Number); return (r + g + b) / 765; };
@@ -45,8 +45,8 @@ LIGHTNESS_JS = """selectors => selectors.flatMap(selector => {
   while (clear(behind) && behind.parentElement) behind = behind.parentElement;
   return [[lightness(getComputedStyle(behind).backgroundColor), lightness(getComputedStyle(element).color)]];
 })"""
-"""How light parts of the page are, from 0 to 1: what is behind a text, and the text."""
-CURVE_PX = 100  # at least, of a curve across a plot; its sign in the legend is no pixel of the canvas
+"""Returns the lightness, from 0 to 1, of the background and the text of parts of the page."""
+CURVE_PX = 100  # least number of a curve's pixels across a plot; the legend is not on the canvas
 DRAWN_JS = (
     f"() => {{ const found = ({CURVES_JS})(); return found.length === 3 && found.every(c => c[1] > {CURVE_PX}); }}"
 )
@@ -57,10 +57,10 @@ UNFOLDED_JS = """() => {
   const text = document.querySelector(".zsim-event-text");
   return text.scrollHeight <= text.clientHeight + 1;
 }"""
-GRID_CONTRAST = 0.03  # at least, of a ground with its grid; of parts of it 0.02, of none 0.005
-ZOOMS, ZOOM_PX = 4, 150  # away from the drones, which are 15 m up
-DRAWN_MS = 1000  # in which a page without a graphics card has drawn what it zoomed to
-LOW = {"width": 1280, "height": 560}  # the panel of drones has a scroll bar
+GRID_CONTRAST = 0.03  # least contrast of the ground with its whole grid; parts of the grid give 0.02, none of it 0.005
+ZOOMS, ZOOM_PX = 4, 150  # zoom steps away from the drones, which are 15 m up, and wheel pixels per step
+DRAWN_MS = 1000  # time in which a page without a graphics card has rendered a zoom
+LOW = {"width": 1280, "height": 560}  # so low that the panel of drones has a scroll bar
 DRAIN_PERCENT_S = 0.06  # of a battery that lasts about as long as the AR.Drone's
 WIDTHS_JS = "() => [...document.querySelectorAll('.uplot-container')].map(each => each.offsetWidth)"
 
@@ -81,7 +81,7 @@ def replay() -> Iterator[str]:
 
 
 def settled(page: BrowserPage) -> list[str]:
-    """Return what is cut off once the page has had time to lay itself out."""
+    """Return what is cut off once the page has had time to settle."""
     until_s = time.monotonic() + PATIENCE_S
     while (faults := overflow(page.page)) and time.monotonic() < until_s:
         page.page.wait_for_timeout(LOOK_MS)
@@ -110,14 +110,14 @@ def test_nothing_is_cut_off_on_any_panel_at_any_size(
 
 
 @pytest.mark.slow
-def test_in_an_emergency_plots_are_drawn_at_once_and_drones_have_all_their_figures_in_sight(
+def test_an_emergency_shows_plots_at_once_and_all_figures_of_the_drones(
     opened: Callable[..., BrowserPage],
 ) -> None:
     with staged_console(StagedRun(state="emergency", drain_percent_s=DRAIN_PERCENT_S)) as address:
         page = opened(address, SCREENS[1])
         page.page.locator("td", has_text="min").first.wait_for()
 
-        # plots have curves as soon as they are opened, and hold their width
+        # plots have curves as soon as they are opened, and keep their width
         page.select_tab("Plots")
         page.page.wait_for_function(DRAWN_JS)
         widths, shown_s = page.page.evaluate(WIDTHS_JS), page.state()["t_s"]
@@ -135,7 +135,7 @@ def test_in_an_emergency_plots_are_drawn_at_once_and_drones_have_all_their_figur
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_an_event_is_unfolded_by_a_click_and_stays_so(flight: str, opened: Callable[..., BrowserPage]) -> None:
+def test_a_click_unfolds_an_event_until_the_next_click(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[0])
     page.wait_for_text("running")
     page.select_tab("Events")
@@ -146,7 +146,7 @@ def test_an_event_is_unfolded_by_a_click_and_stays_so(flight: str, opened: Calla
     text.click()
     page.page.wait_for_function(UNFOLDED_JS)
     shown_s = page.state()["t_s"]
-    page.until(f"s.t_s > {shown_s + 2.0}")  # its row has been made anew
+    page.until(f"s.t_s > {shown_s + 2.0}")  # its row has been rebuilt
     assert page.page.evaluate(UNFOLDED_JS)
     text.click()
     page.page.wait_for_function(f"() => !({UNFOLDED_JS})()")
@@ -165,14 +165,14 @@ def test_a_phone_shows_the_scene_above_one_panel(flight: str, opened: Callable[.
     sheet = page.page.locator(".zsim-sheet").bounding_box()
     assert sheet["width"] == SCREENS[-1]["width"]
     page.close_notice()
-    page.page.wait_for_function(f"({COVERED_JS})().free > 0.7")  # beside the tools over the scene
+    page.page.wait_for_function(f"({COVERED_JS})().free > 0.7")  # apart from the tools over the scene
     page.select_tab("Drones")
     page.page.get_by_role("tab", name="Fly", exact=True).wait_for(state="hidden")  # one panel at a time
 
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_a_plot_keeps_its_size_where_the_cursor_enters_it(flight: str, opened: Callable[..., BrowserPage]) -> None:
+def test_a_plot_keeps_its_size_when_the_cursor_enters_it(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[1])
     page.wait_for_text("running")
     page.select_tab("Plots")
@@ -185,7 +185,7 @@ def test_a_plot_keeps_its_size_where_the_cursor_enters_it(flight: str, opened: C
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_plots_of_a_run_that_is_over_have_curves_of_any_variable(opened: Callable[..., BrowserPage]) -> None:
+def test_plots_of_a_finished_run_can_show_any_variable(opened: Callable[..., BrowserPage]) -> None:
     run = StagedRun()
     with staged_console(run) as address:
         run.end()
@@ -201,7 +201,7 @@ def test_plots_of_a_run_that_is_over_have_curves_of_any_variable(opened: Callabl
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(flight: str, opened: Callable[..., BrowserPage]) -> None:
+def test_the_dark_theme_applies_to_all_of_one_page_only(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page, other = opened(flight, SCREENS[1], drawn=True), opened(flight, SCREENS[1], drawn=True)
     for each in (page, other):
         each.wait_for_text("running")
@@ -210,7 +210,7 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(flight: str, opened: 
     shown = f"({LIGHTNESS_JS})(parts)"
     dark = f"parts => {shown}.length === parts.length && {shown}.every(([behind, text]) => behind < 0.3 && text > 0.4)"
     light = f"parts => {shown}.length === parts.length && {shown}.every(([behind, text]) => behind > 0.7 && text < 0.6)"
-    # What a change lays out anew is not there for a moment; the head is dark in both themes while nothing arrives.
+    # Awaited, because the change rebuilds elements; the head is dark in both themes while no data arrive.
     page.page.wait_for_function(dark, arg=LIT)
     other.page.wait_for_function(light, arg=LIT)
     page.until_ground(lambda lightness, _: lightness < 0.35)
@@ -219,7 +219,7 @@ def test_the_dark_theme_is_one_pages_and_all_of_it_is_dark(flight: str, opened: 
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_the_grid_is_on_the_ground_from_any_height(flight: str, opened: Callable[..., BrowserPage]) -> None:
+def test_the_grid_is_visible_from_any_height(flight: str, opened: Callable[..., BrowserPage]) -> None:
     page = opened(flight, SCREENS[1], drawn=True)
     page.wait_for_text("running")
     page.press("Side")
@@ -233,7 +233,7 @@ def test_the_grid_is_on_the_ground_from_any_height(flight: str, opened: Callable
 
 @pytest.mark.slow
 @pytest.mark.soak
-def test_a_record_at_its_end_offers_nothing_that_would_be_refused(opened: Callable[..., BrowserPage]) -> None:
+def test_a_replay_at_its_end_disables_play_and_step(opened: Callable[..., BrowserPage]) -> None:
     run = StagedRun(past_s=TIMELINE["to_s"], timeline=TIMELINE)
     with staged_console(run) as address:
         run.stands, run.clock_state = True, "paused"

@@ -1,4 +1,4 @@
-"""Several operators at one console, its alarms, its check before take-off and its faults, in real browsers."""
+"""Several operators at one console, and its alarms, pre-flight check and faults, in real browsers."""
 
 import math
 import re
@@ -33,13 +33,13 @@ def run() -> StagedRun:
 
 @pytest.fixture
 def address(run: StagedRun, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    monkeypatch.setattr(control_desk, "LOST_S", math.inf)  # pages without a graphics card may stand for long
+    monkeypatch.setattr(control_desk, "LOST_S", math.inf)  # pages without a graphics card may stall for long
     with staged_console(run) as address:
         yield address
 
 
 def see(page: BrowserPage, text: str | re.Pattern[str]) -> Any:
-    """Wait until the page shows a text, and return where."""
+    """Wait until the page shows a text, and return its locator."""
     found = page.page.get_by_text(text).first
     found.wait_for(timeout=PATIENCE_MS)
     return found
@@ -62,13 +62,13 @@ def wait_until(page: BrowserPage, holds: Callable[[], bool]) -> None:
 
 
 def type_into(page: BrowserPage, place: int, value: str) -> None:
-    """Type into the number beside the slider of a variable."""
+    """Type into the number field beside the slider of a variable."""
     field = page.page.locator("input[inputmode=decimal]").nth(place)
     field.fill(value)
     field.press("Enter")
 
 
-def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost(
+def test_control_stays_with_one_operator_until_given_or_released(
     run: StagedRun, address: str, opened: Callable[..., BrowserPage]
 ) -> None:
     first = opened(address)
@@ -78,7 +78,7 @@ def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost
         page.close_notice()
         see(page, f"also here: {other}")
 
-    # who moves something has it; what the other one types is refused, and shows the value of before again
+    # moving a control takes control; the other operator's input is refused and reset to the previous value
     type_into(first, X_C, "7")
     see(second, "operator 1")
     button(second, "Ask for main").wait_for()
@@ -90,11 +90,11 @@ def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost
     engage = second.page.get_by_role("slider").first
     wait_until(second, lambda: float(engage.locator("xpath=ancestor-or-self::*[@id][1]").evaluate(OPACITY_JS)) < 0.5)
 
-    # anybody holds and lands
+    # every operator may hold and land
     button(second, "Hold").click()
     wait_until(second, lambda: requests(run, "hold") == [{}])
 
-    # asked for, kept; asked for, granted
+    # one request for control is declined, the next one granted
     button(second, "Ask for main").click()
     see(first, "operator 2 asks for it")
     first.page.set_viewport_size(SCREENS[-1])
@@ -110,7 +110,7 @@ def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost
     wait_until(second, lambda: len(requests(run, "target")) == 2)
     assert requests(run, "target")[-1]["values"] == {"x_c": 3.0}
 
-    # a page that is gone releases; who has asked has it
+    # a closed page releases control to the operator who requested it
     button(first, "Ask for main").click()
     second.page.close()
     see(first, re.compile("operator 2 has left"))
@@ -118,7 +118,7 @@ def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost
     type_into(first, X_C, "8")
     wait_until(first, lambda: len(requests(run, "target")) == 3)
 
-    # what another console asks is told
+    # requests by another console are shown
     values = {"x_c": -4.0}
     request = ClusterRequest(round(run.t_s * 1e9), 0, "target", {"values": values}, "console.2", True)
     run.link.publish(keys.cluster_request("main"), request)
@@ -126,10 +126,10 @@ def test_of_two_operators_one_is_in_control_until_it_is_granted_released_or_lost
     assert first.faults == []
 
 
-X_C = 1  # place of the number of x_c among those of the page; `over [s]` is before it
+X_C = 1  # index of x_c's number field on the page; that of `over [s]` precedes it
 
 
-def test_alarms_stay_until_they_are_acknowledged_and_failsafes_say_their_cause(
+def test_alarms_stay_until_acknowledged_and_failsafes_name_their_cause(
     run: StagedRun, address: str, opened: Callable[..., BrowserPage]
 ) -> None:
     page = opened(address)
@@ -144,7 +144,7 @@ def test_alarms_stay_until_they_are_acknowledged_and_failsafes_say_their_cause(
     head.get_by_text("main: other commanders").wait_for()
     head.get_by_text("engaged – drone2 is flown by console.run").wait_for()
 
-    # a process that died, and is back
+    # a process dies and is restarted
     run.happen(
         "death", "estimator.drone1", "estimator.drone1 on lab (pid 7) died; on_death: restart", host="lab", pid=7
     )
@@ -154,12 +154,12 @@ def test_alarms_stay_until_they_are_acknowledged_and_failsafes_say_their_cause(
     button(page, "Acknowledge").click()
     head.get_by_text("estimator.drone1: dead").wait_for(state="detached")
 
-    # one that is dropped is dead all the same
+    # a dropped process counts as dead too
     run.happen("death", "detector.main", "detector.main on lab (pid 9) died; on_death: drop", host="lab", pid=9)
     run.happen("drop", "detector.main", "detector.main is waited for no longer")
     head.get_by_text("detector.main: dead", exact=True).wait_for()
 
-    # an empty battery, with its cause wherever the drone's state is told; then no take-off
+    # an empty battery: the cause is shown wherever the drone's state is, and take-off is disabled afterwards
     cause = "drone3 lands by itself: it has 2.0 % of charge"
     run.changes["drone3"] = {"state": "landing", "battery_percent": 2.0}
     run.happen("landing", "drone3", cause, cause="battery", charge_percent=2.0)
@@ -188,12 +188,12 @@ def test_alarms_stay_until_they_are_acknowledged_and_failsafes_say_their_cause(
         wait_until(page, lambda: overflow(page.page) == [])
     page.page.set_viewport_size(VIEWPORT)
 
-    # all fit: take-off is offered, and is sent
+    # all drones are fit: take-off is offered and sent
     run.changes = {f"drone{k}": {"state": "landed"} for k in (1, 2, 3)}
     takeoff.and_(page.page.locator(":enabled")).click()
     wait_until(page, lambda: requests(run, "takeoff") == [{}])
 
-    # faults: a magnitude that is not stated strikes nothing, what is typed is the terminal's
+    # a fault without its magnitude is refused; the typed syntax is that of the terminal
     page.select_tab("Faults")
     page.open_folders()
     see(page, "30 % of the messages between the processes world and estimator.drone1; no radio")

@@ -1,4 +1,4 @@
-"""Orders that must not get lost, confirmations, ages and limits: in a real browser, with page, console or world stopped."""
+"""Orders that must not be lost, confirmations, ages and limits, in a browser while page, console or world stalls."""
 
 import json
 import signal
@@ -19,10 +19,10 @@ from wire import PATIENCE_S
 pytestmark = needs_browser
 
 SIZES = ({"width": 1440, "height": 900}, {"width": 1024, "height": 768}, {"width": 390, "height": 844})
-LATE_MS, LOST_MS = 1000, 3000  # as there
-STALL_MS = 3500  # of the page; above LOST_MS
-PAST_S = 5.0  # of the staged run; nobody looks at it
-REST_MS = 1500  # after which sliders that rest are sent; above REST_S
+LATE_MS, LOST_MS = 1000, 3000  # ages at which the page marks data as old and as lost
+STALL_MS = 3500  # stall of the page; above LOST_MS
+PAST_S = 5.0  # past of the staged run, which no test examines
+REST_MS = 1500  # time after which the values of resting sliders have been sent; above REST_S
 STALL_JS = "ms => { const until = performance.now() + ms; while (performance.now() < until); }"
 ROW = "#zsim-orders [data-state={}]"
 BAR = "document.querySelector('#zsim-flight .bar').dataset.state"
@@ -30,7 +30,7 @@ MARKER_JS = "() => JSON.parse(document.getElementById('zsim-map').dataset.marker
 
 
 def picture(page: BrowserPage, name: str) -> None:
-    """Keep a picture of a page at all sizes, for people to look at, where a folder is given."""
+    """Save screenshots of a page at all sizes for inspection, if a folder is given."""
     if PICTURES:
         for size in SIZES:
             page.page.set_viewport_size(size)
@@ -40,12 +40,12 @@ def picture(page: BrowserPage, name: str) -> None:
 
 
 def note(page: BrowserPage, text: str) -> None:
-    """Wait for a note of the page."""
+    """Wait for a note on the page."""
     page.page.locator("#zsim-notes div").filter(has_text=text).first.wait_for()
 
 
 def row(page: BrowserPage, state: str, *terms: str) -> str:
-    """Wait for a row of an order in a state, with terms; return its text."""
+    """Wait for the row of an order that is in a state and contains terms; return its text."""
     found = page.page.locator(ROW.format(state))
     for term in terms:
         found = found.filter(has_text=term)
@@ -54,7 +54,7 @@ def row(page: BrowserPage, state: str, *terms: str) -> str:
 
 
 @pytest.mark.slow
-def test_no_order_is_lost_where_page_console_or_world_stand_still(
+def test_no_order_is_lost_when_page_console_or_world_stalls(
     federation: Federation, opened: Callable[..., BrowserPage]
 ) -> None:
     federation.run(TRIAD, "--rate", "1")
@@ -64,19 +64,19 @@ def test_no_order_is_lost_where_page_console_or_world_stand_still(
     page.page.get_by_role("button", name="Take off", exact=True).and_(page.page.locator(":enabled")).click()
     page.until("s.clusters[0].reason == 'ready to engage'")
 
-    # a drone of the controller's is taken over by a hold, which names it and who flies it
+    # a long press, on a button that names both, takes a drone over from its controller
     page.page.locator("#zsim-flight .fly").click()
     page.page.locator("#zsim-flight .take").get_by_text("drone1").click()
     over = page.page.locator("#zsim-flight .over")
     over.wait_for()
     assert "drone1" in str(over.text_content())
     assert "controller.main" in str(over.text_content())
-    over.click()  # too short
+    over.click()  # too short a press
     note(page, "hold it")
     with page.held("#zsim-flight .over"):
         page.page.wait_for_function(f"() => {BAR} === 'flying'")
 
-    # a console that stands still: what is flown is not called alive, and the order waits, in red and with its age
+    # the console stalls: the page no longer shows the flight as live, and the order waits in red, with its age
     role.signal(signal.SIGSTOP)
     page.page.wait_for_function(f"() => ['old', 'lost'].includes({BAR})")
     head.locator(".land").click()
@@ -96,13 +96,13 @@ def test_no_order_is_lost_where_page_console_or_world_stand_still(
     assert len(landings) == 1
     page.page.wait_for_function(f"() => !['held', 'flying', 'old', 'lost'].includes({BAR})")
 
-    # a page that stands still says so itself, and does not accuse the console
+    # the page stalls: it reports itself, not the console
     page.page.evaluate(STALL_JS, STALL_MS)
     note(page, "this page stood still")
     assert head.get_attribute("data-level") != "gone"
     assert head.locator(".emergency").is_enabled()
 
-    # a world that stands still: the emergency by the keyboard
+    # the world stalls: the keyboard orders an emergency
     federation.kill("world", signal.SIGSTOP)
     page.page.locator("#zsim-head[data-level=silent]").wait_for()
     emergency = head.locator(".emergency")
@@ -124,7 +124,7 @@ def test_no_order_is_lost_where_page_console_or_world_stand_still(
 
 @pytest.fixture(scope="module")
 def staged(browser: Any) -> Iterator[tuple[StagedRun, BrowserPage]]:
-    """A run, and a page of it that the tests of this file share; each leaves it as it was."""
+    """A run and a page of it, which the tests of this file share; each test leaves both as they were."""
     run = StagedRun(past_s=PAST_S)
     with staged_console(run) as address, opening(browser) as open_it:
         page = open_it(address, SIZES[1])
@@ -137,7 +137,7 @@ def asked(run: StagedRun, op: str) -> list[dict[str, Any]]:
 
 
 def wait_for(page: BrowserPage, count: int, of: Callable[[], list[Any]]) -> None:
-    """Wait until there are so many of something."""
+    """Wait until `of` returns at least `count` items."""
     until_s = time.monotonic() + PATIENCE_S
     while len(of()) < count:
         assert time.monotonic() < until_s, of()
@@ -145,7 +145,7 @@ def wait_for(page: BrowserPage, count: int, of: Callable[[], list[Any]]) -> None
 
 
 @pytest.mark.slow
-def test_what_is_typed_is_asked_for_or_refused_and_never_changed_to_a_limit(
+def test_a_typed_value_is_requested_or_refused_but_never_clamped(
     staged: tuple[StagedRun, BrowserPage],
 ) -> None:
     run, page = staged
@@ -201,7 +201,7 @@ def test_a_confirmation_names_drone_place_and_height_and_its_marker_stays(
     assert page.page.evaluate(MARKER_JS) == marker
     assert page.page.evaluate(SEES) == view
 
-    # who flies it is named, and taken from by a hold alone
+    # the process that flies the drone is named, and only a long press takes the drone over
     there.locator(".go").click()
     there.get_by_text("controller.main").wait_for()
     assert "drone1" in str(there.locator(".go").text_content())
@@ -222,14 +222,14 @@ def test_a_confirmation_names_drone_place_and_height_and_its_marker_stays(
 
 
 @pytest.mark.slow
-def test_an_order_that_a_page_repeats_is_carried_out_once(
+def test_a_repeated_order_is_carried_out_once(
     staged: tuple[StagedRun, BrowserPage],
 ) -> None:
     run, page = staged
     bodies: list[dict[str, Any]] = []
 
     def lose(route: Any) -> None:
-        """Let the console have an order, and the page no answer, three times."""
+        """Forward an order, but withhold the answer three times."""
         bodies.append(json.loads(route.request.post_data))
         if len(bodies) <= 3:
             route.fetch()
@@ -238,7 +238,7 @@ def test_an_order_that_a_page_repeats_is_carried_out_once(
             route.continue_()
 
     page.page.route("**/command", lose)
-    page.page.route("**/head", lambda route: route.abort())  # which tells of orders, too
+    page.page.route("**/head", lambda route: route.abort())  # it reports orders too
     held = len(asked(run, "hold"))
     page.page.locator("[data-zsim-order=hold]").click()
     assert "confirmed at" in row(page, "confirmed", "Hold main")

@@ -1,4 +1,4 @@
-"""A replay in a browser: it looks like none but a replay, and shows the record around the instant on the timeline."""
+"""A replay in a browser: it is recognisable as a replay, and shows the record around the instant on the timeline."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,7 +12,7 @@ from staged_console import StagedRun, staged_console
 pytestmark = needs_browser
 
 TIMELINE = {"from_s": 0.0, "to_s": 400.0, "marks": [{"t_s": 20.0, "kind": "emergency", "text": "rotors stopped"}]}
-AT_S = 300.0  # where the replay is when the page is opened
+AT_S = 300.0  # position of the replay when the page is opened
 BACK_S = 80.0
 HEAD_JS = "() => getComputedStyle(document.getElementById('zsim-head')).backgroundColor.match(/[0-9]+/g).map(Number)"
 TINT_JS = "() => getComputedStyle(document.body, '::after').backgroundColor"
@@ -27,11 +27,11 @@ CURVE_JS = """() => [...document.querySelectorAll(".uplot canvas")].map(canvas =
     return columns;
   });
 })"""
-"""Of each plot, in which columns (0 to 1) it has the true curve, and the line of the shown instant."""
+"""Returns, for each plot, the columns (0 to 1) with the true curve, and those with the line at the shown instant."""
 FILLED_JS = f"""() => {{ const found = ({CURVE_JS})();
   return found.length === 3 && found.every(each => each && each[1].length && each[1].length < 12
     && each[0].some(x => x < each[1][0] - .2) && each[0].some(x => x > each[1][0] + .2)); }}"""
-"""Whether each plot has its curve on both sides of the shown instant."""
+"""Returns whether each plot has its curve on both sides of the shown instant."""
 RED = (201, 42, 42)
 
 
@@ -44,14 +44,14 @@ def replay() -> Iterator[tuple[StagedRun, str]]:
         yield run, address
 
 
-def test_a_replay_looks_like_one_and_shows_the_record_around_its_cursor(
+def test_a_replay_is_recognisable_and_shows_the_record_around_its_cursor(
     replay: tuple[StagedRun, str], opened: Callable[..., BrowserPage]
 ) -> None:
     run, address = replay
     page = opened(address, SCREENS[1])
     head: Any = page.page.locator("#zsim-head")
 
-    # all drones are in an emergency: nobody has to act, so no red, no sound; progress is that of the record
+    # all drones are in an emergency, but nobody has to act: no red, no sound; the progress is that of the record
     title = f"REPLAY · paused {AT_S:.1f} of {TIMELINE['to_s']:.1f} s (75 %)"
     head.locator(".title").get_by_text(title, exact=True).wait_for()
     red, green, blue = page.page.evaluate(HEAD_JS)
@@ -61,12 +61,12 @@ def test_a_replay_looks_like_one_and_shows_the_record_around_its_cursor(
     assert head.locator(".acknowledge").is_hidden()
     page.page.wait_for_function(f"() => ({FAULTS_JS})().length === 0")
 
-    # curves on both sides, before anything was played
+    # curves on both sides of the instant, before anything was played
     page.select_tab("Plots")
     page.page.wait_for_function(FILLED_JS)
     (first, *_) = page.page.evaluate(CURVE_JS)
 
-    # the same after going back, and trails in the scene and on the map
+    # the same after a jump back, and trails on the map
     run.t_s = BACK_S
     run.publish_views()
     page.wait_for_text(f"{BACK_S:.1f} of {TIMELINE['to_s']:.1f} s (20 %)")

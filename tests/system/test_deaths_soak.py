@@ -1,14 +1,14 @@
-"""A hunt for an event that costs a bit: processes die, stop, move and lose their link, by budget. `make soak`.
+"""A search for events that change a bit of the truth: processes die, stop, move and lose their link. `make soak`.
 
-Each flight has rounds in which everybody dies once and is stopped once and, on three hosts, processes move and hosts are
-cut off, in an order and at times that are drawn from its number: one event comes while others are on their way back. The
-order is drawn so that every event follows every other one in the end. What must hold of a flight is that it has the bits
-of the same one in which nothing happens, and that no gate or message is missing from its record.
+Each flight has rounds in which every process dies once and is stopped once; on three hosts, processes also move and
+hosts are cut off. The flight's number seeds order and times: an event strikes while processes still recover from
+others, and the orders are chosen so that in the end every event has followed every other. A flight must have the same
+bits as one without events, and its record must lack no gate and no message.
 
-    ZSIM_SOAK_BUDGET_S=28800 make soak         a night, each of the two tests half of it
+    ZSIM_SOAK_BUDGET_S=28800 make soak         a night, half of it for each of the two tests
     ZSIM_SOAK_DRAWS=7                          further draws
 
-The figure reached is printed at the end.
+The numbers of events and successions are printed at the end.
 """
 
 import os
@@ -42,28 +42,30 @@ pytestmark = pytest.mark.soak
 
 BUDGET_S = float(os.environ.get("ZSIM_SOAK_BUDGET_S", "240")) / 2  # wall time of each test
 DRAWS = int(os.environ.get("ZSIM_SOAK_DRAWS", "1"))
-EVENTS = 10_000  # of both tests; more are not needed
-ROUNDS = 15  # of a flight at most
+EVENTS = 10_000  # number of events in both tests together; more are not needed
+ROUNDS = 15  # maximum number of rounds in a flight
 STOPPED_S, CUT_S = 0.3, 3.0  # wall time; the second is long enough to be noticed
-PAUSE_S = 0.5  # wall time between two at most: most come while others are on their way back
-ROUND_S = 1.5 * RESTART_WINDOW_S / RESTARTS_MAX  # wall time of a round at least; a launcher takes more for a fault
-TRIES = 20  # orders of a round of which the one with the most untried successions is taken
+PAUSE_S = 0.5  # maximum wall time between two events: most strike while processes still recover from others
+ROUND_S = (
+    1.5 * RESTART_WINDOW_S / RESTARTS_MAX
+)  # minimum wall time of a round; a launcher treats more frequent restarts as a fault
+TRIES = 20  # orders drawn for a round, of which the one with the most untried successions is used
 ESTIMATORS = ("estimator.drone1", "estimator.drone2", "estimator.drone3")
 LAB_ROLES = (*ESTIMATORS, "controller.main", "recorder", "world")
-HOSTS, FAR_HOSTS = ("h1", "h2", "h3"), ("h2", "h3")  # the second: without the world
+HOSTS, FAR_HOSTS = ("h1", "h2", "h3"), ("h2", "h3")  # FAR_HOSTS do not run the world
 BACK = {"world": "world: continues at t = "}
 
 
 class Event(NamedTuple):
     """Something that happens to a process or a host."""
 
-    name: str  # kind and whom it strikes
-    act: Callable[[], object]  # returns False where it is refused
-    back: str = ""  # pattern of the line that shows that it is over; empty for what nobody notices
+    name: str  # kind and target
+    act: Callable[[], object]  # returns False if refused
+    back: str = ""  # pattern of the line that reports its end; empty for an event that goes unnoticed
 
 
 class Tally:
-    """What happened in all flights, and what followed what."""
+    """The events of all flights, and which event followed which."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -92,12 +94,12 @@ def tally(request: pytest.FixtureRequest) -> Iterator[Tally]:
 
 
 class Deaths:
-    """Lets events happen in rounds, each before the last one is over.
+    """Triggers events in rounds, each event before the previous one is over.
 
     Args:
         run: the launcher.
-        tally: of all flights.
-        number: of the flight, from which orders and times are drawn.
+        tally: tally of all flights.
+        number: number of the flight, which seeds orders and times.
     """
 
     def __init__(self, run: Role, tally: Tally, number: int) -> None:
@@ -107,7 +109,7 @@ class Deaths:
         self.history: list[str] = []
 
     def round(self, events: Sequence[Event]) -> None:
-        """Let all of these happen in a drawn order, then wait until all are over."""
+        """Trigger these events in a drawn order, then wait until all are over."""
         until_s = time.monotonic() + ROUND_S
         expected = {event.back: len(re.findall(event.back, self._run.text())) + 1 for event in events if event.back}
         for event in self._order(events):
@@ -137,7 +139,7 @@ class Deaths:
 
 
 def back(role: str) -> str:
-    """Return the pattern of the line that shows that a role that died is there again."""
+    """Return the pattern of the line that reports the return of a dead role."""
     return BACK.get(role, f"(restart|superseded): {role} on ")
 
 
@@ -154,16 +156,16 @@ def kills_and_stops(kill: Callable[..., object], roles: Sequence[str]) -> list[E
 
 
 def sha256_in_process(scenario: Scenario, record: Record, folder: Path) -> str:
-    """Return the hash of the same flight when nothing happens to anybody."""
+    """Return the hash of the truth of the same flight without events."""
     path = folder / "undisturbed.mcap"
-    path.unlink(missing_ok=True)  # of an earlier flight
+    path.unlink(missing_ok=True)  # left by an earlier flight
     fly(msgspec.structs.replace(scenario, duration_s=record.end()["last_ns"] / 1e9), path)
     with RecordReader(path) as reader:
         return Record(reader).sha256()
 
 
 def flights(tally: Tally, share: int) -> Iterator[tuple[int, Callable[[], bool]]]:
-    """Yield the numbers of flights until the budget, or a share of the events, is spent; and whether it is."""
+    """Yield flight numbers until the budget or a share of the events is spent, each with a function to check that."""
     until_s, most = time.monotonic() + BUDGET_S, tally.events + share
 
     def is_spent() -> bool:
@@ -175,7 +177,7 @@ def flights(tally: Tally, share: int) -> Iterator[tuple[int, Callable[[], bool]]
         number, tally.flights = number + 1, tally.flights + 1
 
 
-def test_on_one_host(tmp_path: Path, tally: Tally, compiled: None) -> None:
+def test_events_change_no_bit_on_one_host(tmp_path: Path, tally: Tally, compiled: None) -> None:
     names = (*PAIR_ROLES, "recorder", "world")
     tally.possible += (2 * len(names)) ** 2
     for number, is_spent in flights(tally, EVENTS // 2):
@@ -196,7 +198,7 @@ def test_on_one_host(tmp_path: Path, tally: Tally, compiled: None) -> None:
             assert (record.sha256(), record.recomputed_sha256(drones)) == (wanted, wanted), deaths.history
 
 
-def test_on_three_hosts(lab: Lab, tmp_path: Path, tally: Tally) -> None:
+def test_events_change_no_bit_on_three_hosts(lab: Lab, tmp_path: Path, tally: Tally) -> None:
     moves = [f"move {role} to {host}" for role in ESTIMATORS for host in HOSTS]
     tally.possible += (2 * len(LAB_ROLES) + len(moves) + len(FAR_HOSTS)) ** 2
     for number, is_spent in flights(tally, EVENTS // 2):
@@ -221,7 +223,7 @@ def test_on_three_hosts(lab: Lab, tmp_path: Path, tally: Tally) -> None:
 
 
 def kill_there(federation: Federation, role: str, number: int = signal.SIGKILL) -> None:
-    """Send a role a signal, once it runs."""
+    """Send a signal to a role once it runs."""
     until_s = time.monotonic() + START_S
     while True:
         try:
@@ -230,11 +232,11 @@ def kill_there(federation: Federation, role: str, number: int = signal.SIGKILL) 
         except (pytest.fail.Exception, ProcessLookupError):
             if time.monotonic() > until_s:
                 raise
-        threading.Event().wait(0.05)  # nothing tells of the start of another's process
+        threading.Event().wait(0.05)  # the test has no notice of processes that the run starts
 
 
 def move(deployment: Deployment, role: str, host: str) -> bool:
-    """Move a role; tell whether it did: it is refused where it is there, or on its way to somewhere."""
+    """Move a role; return False if refused, because the role is already on the host or still moving."""
     return deployment.zsim("move", role, host).process.wait(START_S) == 0
 
 

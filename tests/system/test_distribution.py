@@ -1,6 +1,6 @@
-"""What is built of a checkout: the sdist and the wheel hold what they should, and fly where there is no checkout.
+"""The sdist and the wheel contain the right files, and an installation flies without a checkout.
 
-Each is installed by pip in an environment of its own, in folders whose names a shell or a splitter of paths would break.
+Environments and runs are in folders whose names would break careless shell or path handling.
 """
 
 import os
@@ -21,11 +21,9 @@ from forked_commands import ROOT
 import zsim
 from zsim.record import RecordReader
 
-INSTALL_S = 900.0  # wall time of pip, for 130 MB of wheels
-FLIGHT_S = 900.0  # wall time of a flight whose kernels have to be compiled
-ODD = (
-    "a ü 飛"  # of an environment: the programs of pip break where there is a $, and Python refuses a colon, as in PATH
-)
+INSTALL_S = 900.0  # wall time that pip may take, for 130 MB of wheels
+FLIGHT_S = 900.0  # wall time that a flight may take, with compilation of the kernels
+ODD = "a ü 飛"  # name of an environment: pip's programs break at a $, and venv refuses a colon, the separator of PATH
 ODDER = "at 12:30 $x"
 CHANGED = "clusters.main.plan.takeoff_s=0.5"
 FLIGHT_DURATION_S = 8.0
@@ -35,15 +33,15 @@ pytestmark = pytest.mark.soak
 
 
 def clean() -> dict[str, str]:
-    """Return the environment without what leads Python, or git, to a checkout; pip has the versions of constraints.txt."""
+    """Return the environment without variables that lead to a checkout, and with pip held to constraints.txt."""
     names = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "ZSIM_CONNECT", "ZSIM_FEDERATION")
-    held = (ROOT / "constraints.txt").as_uri()  # pip splits a path at its spaces
+    held = (ROOT / "constraints.txt").as_uri()  # a URI, because pip splits a path at its spaces
     kept = {name: text for name, text in os.environ.items() if name not in names}
     return {**kept, "PIP_CONSTRAINT": held, "PIP_BUILD_CONSTRAINT": held, "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
 
 
 def done(command: list[str | Path], folder: Path, timeout_s: float = INSTALL_S) -> str:
-    """Run a command that must succeed, in a folder; return what it prints."""
+    """Run a command, which must succeed, in a folder; return its output."""
     ended = subprocess.run(
         [*map(str, command)], cwd=folder, env=clean(), capture_output=True, text=True, timeout=timeout_s, check=False
     )
@@ -52,7 +50,7 @@ def done(command: list[str | Path], folder: Path, timeout_s: float = INSTALL_S) 
 
 
 def environment(python: str, folder: Path, *packages: str | Path) -> Path:
-    """Make an environment with some packages; return the folder of its programs."""
+    """Create a virtual environment with packages; return the folder of its programs."""
     done([python, "-m", "venv", folder], folder.parent)
     done([folder / "bin/pip", "install", "-q", "--no-compile", *packages], folder.parent)
     return folder / "bin"
@@ -69,7 +67,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def tracked() -> set[str]:
-    """Return the files of the checkout, those too that are not committed yet."""
+    """Return the files of the checkout, including uncommitted ones."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     return {name for name in printed.split("\0") if name and (ROOT / name).exists()}
@@ -81,8 +79,8 @@ def members(wheel: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="git lists what a checkout holds")
-def test_an_sdist_is_the_checkout_and_a_wheel_its_packages(built: tuple[Path, Path], tmp_path: Path) -> None:
-    """A wheel that is made of the sdist is that of the checkout, though the sdist has no git to ask for the commit."""
+def test_the_sdist_holds_the_checkout_and_the_wheel_its_packages(built: tuple[Path, Path], tmp_path: Path) -> None:
+    """A wheel built from the sdist equals that of the checkout, although the sdist has no git to state the commit."""
     sdist, wheel = built
     with tarfile.open(sdist) as archive:
         (top,) = {name.partition("/")[0] for name in archive.getnames()}
@@ -113,7 +111,7 @@ def test_an_sdist_is_the_checkout_and_a_wheel_its_packages(built: tuple[Path, Pa
 
 
 def other_python() -> str:
-    """Return the newest Python of another minor version that zsim takes; empty if the machine has none."""
+    """Return the newest supported Python of another minor version; empty if the machine has none."""
     places = [*Path.home().glob(".pyenv/versions/3.*/bin/python3"), *map(shutil.which, ("python3.14", "python3.13"))]
     code = "import sys, ensurepip; print(*sys.version_info[:2])"
     versions = {}
@@ -125,16 +123,16 @@ def other_python() -> str:
     return versions[max(versions)] if versions else ""
 
 
-def test_what_is_installed_flies_without_a_checkout(built: tuple[Path, Path], tmp_path: Path) -> None:
-    """The sdist, on another Python: in one process, as processes, and from a bundle the bits of the checkout."""
+def test_an_installed_sdist_flies_without_a_checkout(built: tuple[Path, Path], tmp_path: Path) -> None:
+    """On another Python, runs in one process, in several, and from a bundle have the bits of the checkout."""
     bin = environment(other_python() or sys.executable, tmp_path / ODD, f"{built[0]}[python]")
     folder = tmp_path / ODD / ODDER
     folder.mkdir()
-    program: list[str | Path] = [bin / "zsim"]  # whose first line cannot name a Python in such a folder
+    program: list[str | Path] = [bin / "zsim"]  # its shebang cannot name a Python in such a folder
     assert done([*program, "--version"], folder) == f"zsim {zsim.__version__}\n"
     where = done([bin / "python", "-c", "import zsim, zsim_deploy; print(zsim.__file__, zsim_deploy.__file__)"], folder)
     assert str(ROOT) not in where
-    shutil.copy(ROOT / "scenarios/step.yaml", folder)  # from the sdist, or by any other way
+    shutil.copy(ROOT / "scenarios/step.yaml", folder)  # as a user might have it from the sdist or elsewhere
     done([*program, "run", "step.yaml", *SHORT, "--in-process", "--out", "in one"], folder, FLIGHT_S)
     done([*program, "run", "step.yaml", *SHORT, "--out", "processes"], folder, FLIGHT_S)
     checkout = in_process(tmp_path, FLIGHT_DURATION_S, [CHANGED])

@@ -1,22 +1,23 @@
-"""The documentation is run: every command, scenario, example, link and table in README.md and docs/*.md.
+"""Checks of the documentation: every command, scenario, example, link and table in README.md and docs/*.md.
 
-How a fenced block is marked, in the line that opens it:
+The line that opens a fenced block states how the block is checked:
 
-    bash run            executed as it stands, line after line; must succeed
-    bash terminals      each line is a process of its own, as in a terminal of its own, until the next heading
-    bash with PROGRAM   as `bash run`, where there is this program; where there is none, the test says so by skipping
-    bash elsewhere      not for this machine (installs, other hosts); every `zsim` line must be one that the
-                        command line takes, and the others must be among ELSEWHERE
-    yaml, yaml part     a whole scenario; top-level sections to be put into scenarios/step.yaml
-    yaml inventory      a whole inventory, into which scenarios/step.yaml must fit
+    bash run            executed as it stands, line by line; must succeed
+    bash terminals      each line runs as a process, as in a separate terminal, until the next heading
+    bash with PROGRAM   as `bash run` if PROGRAM is installed; otherwise the test is skipped after the other blocks
+    bash elsewhere      not for this machine (installation, other hosts); every `zsim` line must parse, and every
+                        other line must begin with an entry of ELSEWHERE
+    yaml, yaml part     a whole scenario; top-level sections to be merged into scenarios/step.yaml
+    yaml inventory      a whole inventory, which must suit scenarios/step.yaml
     python              must compile
-    python run          executed, all those of a page as one script
+    python run          executed; all blocks of a page form one script
     python test         a file of tests, run by pytest
-    yaml github, yaml gitlab    files of a CI, valid by the schemas of their vendors
+    yaml github, yaml gitlab    CI files, valid by their vendors' schemas
     text, json          output and drawings, not checked
 
-A block of any other kind is a fault, so nothing is left out without a word. What `adapted` changes is all that
-differs from what is printed: endpoints, shorter durations, a faster pace in realtime, and no report where nobody asks for its folder.
+A block of any other kind is an error, so that no block goes unchecked by mistake. Commands run as printed, except for
+what `adapted` changes: endpoints, shorter durations, a faster pace in realtime, and no reports of sweeps or of runs
+without --out.
 """
 
 import os
@@ -63,7 +64,7 @@ from zsim_deploy.launch.role_launcher import RoleProcess
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 PNG = b"\x89PNG"
-RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
+RUN_S = 4.0  # simulated duration of a run or sweep in a `bash run` block
 LONG = (
     "cameras.md",
     "clients.md",
@@ -81,8 +82,8 @@ LONG = (
     "references.md",
     "sweep.md",
     "testing.md",
-)  # what they show has tests of its own
-PATIENCE_S = 600  # wall seconds for one block on a machine that does other work as well
+)  # pages that only the soak tests run, because other tests cover what they show
+PATIENCE_S = 600  # wall time that one block may take on a busy machine
 PROGRAMS = ("octave-cli", "gcc", "node", "zenoh-ros2", "rostopic")
 KINDS = (
     "bash run",
@@ -107,7 +108,7 @@ ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv
 
 
 class Block(NamedTuple):
-    """A fenced block; `chapter` counts the headings before it."""
+    """A fenced block; `chapter` is the number of headings before it."""
 
     kind: str
     text: str
@@ -116,7 +117,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> Iterator[Block]:
-    """Yield the fenced blocks of a page in their order."""
+    """Yield the fenced blocks of a page in order."""
     kind, first, chapter, inside = "", 0, 0, []
     for number, line in enumerate(page.read_text().splitlines(), start=1):
         if line.startswith("```"):
@@ -132,7 +133,7 @@ def blocks(page: Path) -> Iterator[Block]:
 
 
 def pages_with(*kinds: str, long: tuple[str, ...] = ()) -> list[Any]:
-    """Return the pages that hold a block of one of the kinds; those of some names are for the soak."""
+    """Return, as parameters, the pages with a block of one of the kinds; those named in `long` are soak tests."""
     pages = [p for p in PAGES if any(b.kind in kinds for b in blocks(p))]
     return [pytest.param(p, id=p.name, marks=[pytest.mark.soak] if p.name in long else []) for p in pages]
 
@@ -174,7 +175,7 @@ def test_python_runs(page: Path, tmp_path: Path, near: None) -> None:
 
 
 @pytest.mark.parametrize("page", pages_with("python test", long=LONG))
-def test_tests_pass(page: Path, tmp_path: Path, compiled: None) -> None:
+def test_pytest_blocks_pass(page: Path, tmp_path: Path, compiled: None) -> None:
     with Checkout(tmp_path) as checkout:
         for block in blocks(page):
             if block.kind == "python test":
@@ -197,7 +198,7 @@ def test_ci_files_are_valid(schema: str, tmp_path: Path) -> None:
 
 
 class Checkout:
-    """A folder like a fresh checkout, free ports, and the terminals that are open."""
+    """A folder laid out like a fresh checkout, with free ports and the open terminals."""
 
     def __init__(self, folder: Path) -> None:
         for name in ("scenarios", "examples", "clients", "docs", "agents", "world", "zsim"):
@@ -222,11 +223,11 @@ class Checkout:
                 process.wait()
 
     def has(self, program: str) -> bool:
-        """Tell whether there is a program."""
+        """Return whether a program is installed."""
         return shutil.which(program, path=self._environment["PATH"]) is not None
 
     def run(self, block: Block, page: Path) -> None:
-        """Run a block as one script; a plain command that needs no process of its own, in this one."""
+        """Run the plain commands of a block in this process, other lines and blocks with a `$` as scripts."""
         where, whole = f"{page.name}:{block.line}", "$" in block.text
         all_lines = [adapted(line, self._ports, RUN_S) for line in lines(block)]
         for is_plain, some in groupby(all_lines, lambda line: not whole and PLAIN.fullmatch(line) is not None):
@@ -237,7 +238,7 @@ class Checkout:
                 if steered := STEERED.search(line):
                     self._wait_for_flight(steered[1])
                 with chdir(self._folder), pytest.MonkeyPatch.context() as patch:
-                    patch.setattr(ReportFigure, "png", lambda _: PNG)  # drawn by the tests of reports
+                    patch.setattr(ReportFigure, "png", lambda _: PNG)  # the tests of reports draw figures
                     sweep_here(patch)
                     done = run_here(*shlex.split(line)[1:])
                 assert done.code == 0, f"{where}: {line}\n{done}\n{self._logs()}"
@@ -261,7 +262,7 @@ class Checkout:
         assert script.returncode == 0, f"{where}: {text}\n{output}\n{self._logs()}"
 
     def open_terminals(self, block: Block, page: Path) -> None:
-        """Start every line of a block as a process; a world listens when this returns."""
+        """Start each line of a block as a process; return once its world listens and its gateway serves."""
         for line in lines(block):
             text = adapted(line, self._ports, None)
             log = self._folder / f"terminal-{len(self._terminals)}-{time.monotonic_ns()}.log"
@@ -286,7 +287,7 @@ class Checkout:
             self._wait_for_run(self._ports[PORTS.index("8000")])
 
     def _wait_for_run(self, port: int) -> None:
-        """Wait until a gateway has been told of a drone's estimate: then everybody is there."""
+        """Wait until a gateway has received a drone's estimate: by then every process has joined."""
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s:
             with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/json/drone/drone1/estimate"):
@@ -295,7 +296,7 @@ class Checkout:
         raise AssertionError(f"the gateway tells of no estimate\n{self._logs()}")
 
     def _wait_for_flight(self, drone: str) -> None:
-        """Wait until a drone takes setpoints: whoever types the commands is slower than these."""
+        """Wait until a drone accepts setpoints: these commands come sooner than those that a reader types."""
         until_s, where = time.monotonic() + PATIENCE_S, f"tcp/127.0.0.1:{self._ports[0]}"
         while time.monotonic() < until_s:
             said = run_here("echo", f"drone/{drone}/sensor/status", "-n", "1", "--connect", where).stdout
@@ -313,13 +314,13 @@ class Checkout:
         raise AssertionError(f"nobody listens\n{self._logs()}")
 
     def close_terminals(self) -> None:
-        """Press Ctrl-C where a run is led or routed; every process must leave well, the others by themselves."""
+        """Send Ctrl-C to the processes in LEADERS; they, and the others by themselves, must exit cleanly."""
         for text, _, process in self._terminals:
             if process.poll() is None and re.search(LEADERS, text):
                 os.kill(process.pid, signal.SIGINT)
         for text, _, process in self._terminals:
             code = process.wait(timeout=PATIENCE_S)
-            # −2: Ctrl-C met Python on its way out
+            # −2 (SIGINT): Ctrl-C arrived while Python was shutting down
             assert code in (0, 130, -signal.SIGINT), f"{text}: exit code {code}\n{self._logs()}"
         self._terminals.clear()
 
@@ -328,14 +329,14 @@ class Checkout:
 
 
 def lines(block: Block) -> list[str]:
-    """Return the commands of a block: comments away, continued lines joined."""
+    """Return the commands of a block, without comments and with continued lines joined."""
     joined = re.sub(r"\\\n\s*", "", block.text)
     stripped = [re.sub(r"(^|\s)#.*$", "", line).rstrip() for line in joined.splitlines()]
     return [line for line in stripped if line]
 
 
-EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
-PORTS = ("7447", "7448", "8000", "7470", "11311")  # as printed: world, router, HTTP, lines, ROS master
+EXAMPLE_S = 25.0  # simulated duration of an example: past the take-off at 20 s
+PORTS = ("7447", "7448", "8000", "7470", "11311")  # printed ports of the world, router, HTTP, JSON lines and ROS master
 LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2|camera|detect)\b"
 ANSWERED = ("agent", "estimator", "fmu", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2", "camera", "detect",
             "fault (?:add|clear|list)")  # fmt: skip
@@ -344,7 +345,7 @@ FOREIGN = (
     "foreign_estimator.py",
     "range_sensor.py",
     "external_drone.py",
-)  # take the endpoint as an argument
+)  # programs that take the endpoint as a positional argument
 OURS = ("fly_square.py",)
 STEERED = re.compile(r"zsim pub .*\bdrone/(\w+)/cmd/velocity")
 PLAIN = re.compile(
@@ -353,7 +354,7 @@ PLAIN = re.compile(
 
 
 def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
-    """Return a command with this test's endpoints, no longer than longest_s where that is given."""
+    """Return a command with this test's endpoints, and with a duration of longest_s if that is given."""
     endpoint = f"tcp/127.0.0.1:{ports[0]}"
     own = "7447" in line
     line = re.sub(r"\bzsim gateway\b", "zsim gateway --http 8000 --lines 7470", line.replace("0.0.0.0", "127.0.0.1"))
@@ -378,14 +379,14 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
 
 
 def lines_of(*kinds: str) -> Iterator[tuple[str, str]]:
-    """Yield place and text of the commands in blocks of some kinds on all pages."""
+    """Yield the place and the text of every command in blocks of the given kinds, on all pages."""
     for page in PAGES:
         for block in blocks(page):
             for line in lines(block) if block.kind in kinds else ():
                 yield f"{page.name}:{block.line}: {line}", line
 
 
-def test_commands_are_ones_that_exist() -> None:
+def test_every_printed_command_is_valid() -> None:
     for where, line in lines_of("bash run", "bash terminals"):
         words = [word for word in shlex.split(line) if not re.match(r"[A-Z_]+=", word)]
         if words[:1] == ["zsim"]:
@@ -399,7 +400,7 @@ def test_commands_are_ones_that_exist() -> None:
 
 
 def parses(arguments: list[str]) -> bool:
-    """Tell whether the command line takes the arguments; nothing is run."""
+    """Return True if the command line accepts the arguments, and raise otherwise; nothing is run."""
     command, name, rest = commands()[arguments[0]], arguments[0], arguments[1:]
     while hasattr(command, "commands"):
         command, name, rest = command.commands[rest[0]], rest[0], rest[1:]
@@ -413,18 +414,18 @@ def commands() -> dict[str, Any]:
     return typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
-NOT_IN_DEV = {"train_policy.py"}  # run by test_learning.py: it needs an extra that `dev` does not bring
+NOT_IN_DEV = {"train_policy.py"}  # run by test_learning.py: it needs an extra that `dev` does not include
 
 
 def test_every_example_is_run_by_a_page() -> None:
     run = "\n".join(b.text for p in PAGES for b in blocks(p) if b.kind in ("bash run", "bash terminals"))
     examples = sorted((ROOT / "examples").glob("*.*"))
-    named = set(re.findall(r"[=: ](\w+)", run))  # as a module
+    named = set(re.findall(r"[=: ](\w+)", run))  # run as modules
     left_out = [e.name for e in examples if f"examples/{e.name}" not in run and e.stem not in named]
     assert set(left_out) == NOT_IN_DEV
 
 
-def test_every_command_of_the_command_line_is_shown() -> None:
+def test_every_command_is_shown_on_a_page() -> None:
     shown = "\n".join(b.text for p in PAGES for b in blocks(p) if b.kind.startswith("bash"))
     assert [name for name in commands() if f"zsim {name}" not in shown] == []
 
@@ -477,7 +478,7 @@ _INFO: dict[str, Any] = {
 }
 
 
-# The reference of fields: a table after `<!-- fields: Name -->` for each section of zsim/scenario/scenario.py
+# The field reference: a table after `<!-- fields: Name -->` for each section of zsim/scenario/scenario.py
 
 SCANNER_SECTIONS = (RangeConfig, LidarConfig, DepthConfig)
 CAMERA_SECTIONS = (FrontCamera, BottomCamera, SightingModel, Hats)
@@ -486,7 +487,7 @@ SECTIONS = {
     for name, section in {**vars(scenario), "Limits": vehicle.Limits, "Aerodynamics": vehicle.Aerodynamics}.items()
     if isinstance(section, type)
     and issubclass(section, (scenario.Spec, vehicle.Limits, vehicle.Aerodynamics))
-    and section not in (scenario.Spec, scenario.Piloted)  # bases
+    and section not in (scenario.Spec, scenario.Piloted)  # base classes
 } | {
     section.__name__: section
     for section in (
@@ -509,12 +510,12 @@ OWN_UNITS = {
     "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",
     "bias_instability": "channel's", "quantum": "channel's", "madgwick_beta": "rad/s", "values": "m, rad", "target": "m, rad",
 }  # fmt: skip
-FILLED_IN = {("Sensors", "own"), ("OwnAgent", "declared"), ("Surface", "triangles")}  # which no file has
+FILLED_IN = {("Sensors", "own"), ("OwnAgent", "declared"), ("Surface", "triangles")}  # set by the code, never by a file
 BY_PRESET = {"rate_hz", "imu", "gps", "mag", "baro", "sonar", "flow"}  # required once the preset is applied
 
 
 def reference() -> dict[str, list[list[str]]]:
-    """Return the rows of every table of fields in docs/scenario.md, by section."""
+    """Return the rows of every field table in docs/scenario.md, by section."""
     text = (ROOT / "docs/scenario.md").read_text()
     tables = re.findall(r"<!-- fields: (\w+) -->\n\n?((?:\|.*\n)+)", text)
     return {
@@ -523,11 +524,11 @@ def reference() -> dict[str, list[list[str]]]:
     }
 
 
-def test_every_section_of_a_scenario_has_its_table() -> None:
+def test_every_scenario_section_has_a_table() -> None:
     assert sorted(reference()) == sorted(set(SECTIONS) - {"Document"})
 
 
-def test_the_table_of_a_section_says_what_the_code_says() -> None:
+def test_the_field_tables_match_the_code() -> None:
     written = reference()
     assert {name: [row[:4] for row in table] for name, table in written.items()} == {
         name: list(rows(name)) for name in written
@@ -536,7 +537,7 @@ def test_the_table_of_a_section_says_what_the_code_says() -> None:
 
 
 def rows(name: str) -> Iterator[list[str]]:
-    """Yield field, unit, default and limits of a section, as the reference is to show them."""
+    """Yield the field, unit, default and limits of every entry of a section, as the reference must show them."""
     section = SECTIONS[name]
     inherited = {f.name for f in msgspec.structs.fields(Sensor)} if name in _SENSORS else set()
     infos = types.type_info(section)
@@ -625,7 +626,7 @@ def _length(info: types.ListType | types.DictType) -> str:
     return least + (f", at most {info.max_length}" if info.max_length else "")
 
 
-def test_the_presets_are_written_as_they_are() -> None:
+def test_the_preset_table_matches_the_code() -> None:
     text = (ROOT / "docs/scenario.md").read_text()
     table = re.search(r"<!-- presets -->\n\n?((?:\|.*\n)+)", text)
     assert table
@@ -634,7 +635,7 @@ def test_the_presets_are_written_as_they_are() -> None:
 
 
 def preset_rows() -> Iterator[list[str]]:
-    """Yield every value that a preset sets: path, then the value in each preset, – where it keeps the default."""
+    """Yield a row for each value that a preset sets: its path, then its value in each preset (– for the default)."""
     flat = {name: dict(_flat(preset)) for name, preset in PRESETS.items()}
     printed = dict(_flat(AS_PRINTED))
     paths = list(dict.fromkeys(path for values in flat.values() for path in values))
@@ -668,7 +669,7 @@ def protocol_row(shape: str) -> str:
 
 
 def test_the_protocol_names_every_message_its_fields_and_a_writer() -> None:
-    """The row of a key holds the message's name, those of all its fields, nested ones too, and who publishes it."""
+    """The row of a key names the message, all its fields, including nested ones, and a publisher."""
     lacking = {}
     for shape, kind in messages.types_by_shape().items():
         row, writers = protocol_row(shape), messages.TOPICS[shape].writers if shape in messages.TOPICS else ()
@@ -693,7 +694,7 @@ def test_the_protocol_names_every_event() -> None:
 # Links, files and names
 
 
-def test_links_lead_somewhere() -> None:
+def test_link_targets_exist() -> None:
     """Links to files and headings exist; a link whose text is a name in code leads to a file that defines it."""
     faults = []
     for page in PAGES:
@@ -714,13 +715,13 @@ def test_links_lead_somewhere() -> None:
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of the headings of a page, as GitHub makes them."""
+    """Return the anchors of the headings of a page, as GitHub generates them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def defines(file: Path, name: str) -> bool:
-    """Tell whether a file defines the last part of a dotted name; a path to the file itself counts."""
+    """Return whether a file defines the last part of a dotted name; the file's own path counts."""
     last = name.removesuffix("()").rsplit(".", 1)[-1]
     definition = re.compile(rf"^\s*(class|def) {last}\b|^{last}\b.*=", re.MULTILINE)
     return str(file).endswith(name) or definition.search(file.read_text()) is not None
@@ -729,7 +730,7 @@ def defines(file: Path, name: str) -> bool:
 FOLDERS = "zsim|world|agents|deploy|examples|scenarios|docs|tests|benchmarks"
 
 
-def test_files_that_are_named_exist() -> None:
+def test_named_files_exist() -> None:
     named = {name for page in PAGES for name in re.findall(rf"`((?:{FOLDERS})/[\w/.-]+\.\w+)`", page.read_text())}
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
 

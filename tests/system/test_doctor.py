@@ -1,4 +1,4 @@
-"""`zsim doctor` on a lab: what it measures, through what greetings and how slow a link, and what it calls a fault."""
+"""`zsim doctor` on a lab of hosts: its measurements, despite login greetings and slow links, and its faults."""
 
 import socket
 from pathlib import Path
@@ -18,25 +18,25 @@ pytestmark = pytest.mark.slow
 
 
 def doctor(lab: Lab, hosts: Path, *options: str) -> Completed:
-    """Run `zsim doctor` for the step scenario at the launcher."""
+    """Run `zsim doctor` for the step scenario on the launcher's host."""
     with lab.inside(LAUNCHER):
         return run_here("doctor", str(STEP), "--hosts", str(hosts), *options)
 
 
 def faults(done: Completed) -> list[str]:
-    """Return what keeps the hosts from flying."""
+    """Return the reported faults, without warnings."""
     return [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
 
 
 def rows(text: str) -> dict[tuple[str, ...], list[str]]:
-    """Return what the table of paths says, by from, to and port."""
+    """Return the rest of each row of the table of paths by its from, to and port."""
     below = text.partition("bandwidth")[2].splitlines()[1:]
     words = [line.split() for line in below]
     return {tuple(row[:3]): row[3:] for row in words if len(row) > 3 and row[2].isdigit()}
 
 
-def test_a_host_with_a_router_only_is_measured_and_a_greeting_is_passed_over(lab: Lab) -> None:
-    """h2's estimators go to the router on h3, that to the world on h1."""
+def test_a_router_host_is_measured_despite_login_greetings(lab: Lab) -> None:
+    """h2's estimators connect to the router on h3, which connects to the world on h1."""
     for name in lab.names:
         (lab.folder / name / ".bashrc").write_text("echo 'Welcome to lab'\necho '17'\n")
     routers: dict[str, dict[str, Any]] = {"field": {"host": "h3"}}
@@ -57,7 +57,7 @@ def test_a_slow_link_is_measured(lab: Lab) -> None:
     assert found[1] == "ms"
 
 
-def test_a_port_that_is_taken_is_a_line(lab: Lab) -> None:
+def test_a_port_in_use_is_reported(lab: Lab) -> None:
     with lab.inside("h1"), socket.create_server((lab.address("h1"), 7447)):
         done = doctor(lab, lab.inventory(ROLES, insecure=True))
     assert done.code == 2
@@ -65,8 +65,8 @@ def test_a_port_that_is_taken_is_a_line(lab: Lab) -> None:
     assert has_terms(line, "h1: ", "7447")
 
 
-def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
-    (lab.folder / "h3" / "zsim").touch()  # where its folder should be
+def test_what_a_host_lacks_is_reported_with_a_remedy(lab: Lab) -> None:
+    (lab.folder / "h3" / "zsim").touch()  # a file in place of its folder
     hosts = lab.inventory(ROLES, insecure=True)
     document = yaml.safe_load(hosts.read_text())
     del document["hosts"]["h1"]["python"]

@@ -1,4 +1,4 @@
-"""A driver's port under what no aircraft sends: the driver lives, counts it, and starts no motor."""
+"""Malformed datagrams on a driver's port: the driver survives, counts them and starts no motor."""
 
 import random
 import socket
@@ -22,19 +22,19 @@ from zsim_bridges.mavlink.dialect import Link
 pytestmark = pytest.mark.soak
 
 COUNT = 1_000_000
-CHUNK = 100  # datagrams that a socket's buffer surely holds
-LEAST_COUNTED = 0.95  # of them: what is cut inside a frame is one fault with the next
+CHUNK = 100  # datagrams that certainly fit into a socket's buffer
+LEAST_COUNTED = 0.95  # minimum share counted: a truncated frame is one fault with the next
 STEP_NS = 20_000_000
-STARTERS = {"Ref", "Pcmd"}  # AT commands by which an aircraft flies
+STARTERS = {"Ref", "Pcmd"}  # AT commands that make an aircraft fly
 
 
 class Autopilot:
-    """A MAVLink vehicle on a port of its own.
+    """A MAVLink vehicle on its own port.
 
     Attributes:
-        command: that starts its driver.
-        addresses: host and port of each of its sockets.
-        good: datagrams that it may send.
+        command: Arguments of zsim that start its driver.
+        addresses: Host and port of each of its sockets.
+        good: Valid datagrams that the vehicle may send.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class Autopilot:
 
 
 class Parrot:
-    """An AR.Drone at an address of its own; the attributes are those of an autopilot."""
+    """An AR.Drone at its own address, with the attributes of `Autopilot`."""
 
     def __init__(self) -> None:
         host = addresses(50)[-1]
@@ -81,10 +81,10 @@ class Parrot:
 
 
 class Wire:
-    """The sockets of an aircraft, at whose other end a driver is.
+    """The sockets of an aircraft, connected to a driver.
 
     Args:
-        aircraft: that takes what comes.
+        aircraft: Receives the driver's datagrams.
     """
 
     def __init__(self, aircraft: Any) -> None:
@@ -96,14 +96,14 @@ class Wire:
         self._driver: tuple[str, int] = ("", 0)
 
     def await_driver(self) -> None:
-        """Take the first datagram; it shows where the driver is."""
+        """Receive the first datagram, whose sender is the driver's address."""
         datagram, self._driver = self._sockets[0].recvfrom(65_536)
         self._aircraft.receive(0, datagram)
         for own in self._sockets:
             own.setblocking(False)
 
     def exchange(self) -> None:
-        """Let the aircraft take what has come, move on by a step, and send what is due."""
+        """Pass received datagrams to the aircraft, step it and send its datagrams."""
         for channel, own in enumerate(self._sockets):
             try:
                 while True:
@@ -118,7 +118,7 @@ class Wire:
         self._sockets[0].sendto(datagram, self._driver)
 
     def until_read(self) -> None:
-        """Wait until the driver has read all that was sent."""
+        """Wait until the driver has read everything sent to it."""
         port = f":{self._driver[1]:04X}"
         while True:
             rows = (line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:])
@@ -131,7 +131,7 @@ class Wire:
 
 
 def mutated(chance: random.Random, good: bytes) -> bytes:
-    """Return random bytes, or a datagram of which one bit is another or the end is missing."""
+    """Return random bytes, or a datagram with one bit flipped or its end cut off."""
     kind, place = chance.randrange(3), chance.randrange(1, len(good))
     if kind == 0:
         return chance.randbytes(chance.randint(1, 300))
@@ -141,7 +141,7 @@ def mutated(chance: random.Random, good: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("kind", [Autopilot, Parrot])
-def test_a_million_malformed_datagrams_fly_nothing(federation: Federation, kind: type) -> None:
+def test_malformed_datagrams_start_no_motor(federation: Federation, kind: type) -> None:
     aircraft, chance = kind(), random.Random(17)
     wire = Wire(aircraft)
     federation.world(UNFLOWN, "--realtime", "--rate", "1")

@@ -1,4 +1,4 @@
-"""Formations of which one drone is hardware: another world plays it, and its own wire joins the two."""
+"""Formations with one hardware drone, which a second world simulates behind the drone's own protocol."""
 
 import signal
 from collections.abc import Iterator
@@ -25,8 +25,10 @@ def mixed(tmp_path: Path, compiled: None) -> Iterator[Mixed]:
 
 
 @pytest.mark.parametrize("wire", ["px4", pytest.param("ardupilot", marks=pytest.mark.soak)])
-def test_two_simulated_drones_and_one_of_hardware_fly_in_formation(hardware: Hardware, mixed: Mixed, wire: str) -> None:
-    """Also after the driver was killed in flight and started again."""
+def test_two_simulated_drones_and_a_hardware_drone_fly_in_formation(
+    hardware: Hardware, mixed: Mixed, wire: str
+) -> None:
+    """The formation engages again after the driver was killed in flight and restarted."""
     ports = hardware.serve(wire)[2]
     driver = mixed.drive("drone3", wire, ports)
     engaged_ns = mixed.engaged_ns()
@@ -43,5 +45,5 @@ def test_two_simulated_drones_and_one_of_hardware_fly_in_formation(hardware: Har
     driver.line("left")
     hardware.ends()
     rms = true_rms(mixed, hardware, ["drone3"], (again_ns / 1e9 + 4, until_ns / 1e9), rate=1.0)
-    assert max(rms["x_c"], rms["y_c"], rms["p"], rms["q"]) < 1.0  # m: the GPS alone has 2
+    assert max(rms["x_c"], rms["y_c"], rms["p"], rms["q"]) < 1.0  # m; the GPS alone errs by 2 m
     assert max(rms["z_c"], rms["yaw"], rms["beta"]) < 0.3

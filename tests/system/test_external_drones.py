@@ -1,4 +1,4 @@
-"""External drones: a driver with zenoh and msgpack alone flies in a formation, dies in flight, and comes back."""
+"""External drones: a driver that needs only zenoh and msgpack flies in a formation, dies and is restarted."""
 
 import os
 import signal
@@ -41,7 +41,7 @@ Start = Callable[[], subprocess.Popen[str]]
 
 @pytest.fixture
 def driver(federation: Federation) -> Iterator[Start]:
-    """What starts the driver of the examples, as often as it is called; all are gone afterwards."""
+    """A function that starts the example driver; every driver is killed after the test."""
     started: list[subprocess.Popen[str]] = []
 
     def start() -> subprocess.Popen[str]:
@@ -64,7 +64,7 @@ def driver(federation: Federation) -> Iterator[Start]:
 
 
 def arm(client: Client, link: Subscription) -> None:
-    """Ask the newest driver to arm, once it is there."""
+    """Request the newest driver to arm once it is connected."""
     link.until(lambda m: m["state"] == "connected")
     assert client.request(ARM, "arm", "operator.test") == {"ok": True, "error": ""}
     link.until(lambda m: m["state"] == "armed")
@@ -76,8 +76,10 @@ def stop(client: Client, role: Role) -> None:
 
 
 @pytest.mark.parametrize("hosted", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["apart", "hosted"])
-def test_a_formation_of_simulated_and_external_drones(federation: Federation, driver: Start, hosted: bool) -> None:
-    """It engages; while the driver is dead it is held and the others go on; then it flies on with the next driver."""
+def test_a_mixed_formation_survives_the_death_of_its_driver(
+    federation: Federation, driver: Start, hosted: bool
+) -> None:
+    """While the driver is dead the formation is held and time goes on; with the next driver it engages again."""
     run = federation.run(MIXED, "--realtime", *(["--hosted"] if hosted else []))
     assert has_terms(run.line("external drones").text, DRIVER, federation.endpoint)
     client = federation.client()
@@ -110,12 +112,12 @@ def test_a_formation_of_simulated_and_external_drones(federation: Federation, dr
     assert [m["seq"] for m in accepted] == list(range(len(accepted)))
     assert {m["source"] for m in accepted} == {"controller.main"}
     gates = {m["t_ns"] for m in record.all("cluster/main/state") if held["t_ns"] - 10**9 < m["t_ns"] < ended["t_ns"]}
-    assert len(gates) * 20_000_000 >= 0.9 * (ended["t_ns"] - held["t_ns"] + 10**9)  # the others went on
+    assert len(gates) * 20_000_000 >= 0.9 * (ended["t_ns"] - held["t_ns"] + 10**9)  # time went on for the others
     assert record.sha256() == record.recomputed_sha256(["drone1", "drone2"])
 
 
-def test_the_world_stays_the_arbiter(federation: Federation, driver: Start) -> None:
-    """Commands of who does not fly it, and those that its state does not allow, never reach the driver."""
+def test_the_world_arbitrates_commands_to_an_external_drone(federation: Federation, driver: Start) -> None:
+    """Commands from other sources than its commander, or not allowed in its state, never reach the driver."""
     world = federation.world(ALONE, "--realtime")
     client = federation.client()
     events, link = client.subscribe("world/event"), client.subscribe(f"drone/{DRONE}/link")
@@ -145,7 +147,7 @@ def test_the_world_stays_the_arbiter(federation: Federation, driver: Start) -> N
     assert "pilot.one" in events.until(lambda m: m["kind"] == "refused" and m["source"] == "pilot.two").message["text"]
     shown = views.until(lambda m: m["drones"][1]["commander"] == "pilot.one").message["drones"][1]
     assert shown["position_m"][2] > 0.8
-    status.until(lambda m: m["state"] == "landing")  # after silence, by its driver
+    status.until(lambda m: m["state"] == "landing")  # by the driver, after commands have ceased
     client.put("drone/drone1/truth", t_ns=0, position_m=[0, 0, 0])
     refused = events.until(lambda m: m["kind"] == "refused" and m["subject"] == "drone/drone1/truth").message
     assert "only the world publishes here" in refused["text"]
@@ -153,7 +155,7 @@ def test_the_world_stays_the_arbiter(federation: Federation, driver: Start) -> N
     stop(client, world)
 
 
-def test_a_run_waits_for_a_driver_that_the_scenario_expects(federation: Federation, driver: Start) -> None:
+def test_a_run_waits_for_an_expected_driver(federation: Federation, driver: Start) -> None:
     run = federation.run(ALONE.replace("expect: []", f"expect: [{DRIVER}]"), "--realtime")
     assert "the run waits for driver.drone3" in run.line("external drones").text
     run.line(f"waiting for .*{DRIVER}")

@@ -1,4 +1,4 @@
-"""Ctrl-C while a command still loads what it needs: a line, as later."""
+"""Ctrl-C while a command still loads its modules gives one line, as it does later."""
 
 import os
 import signal
@@ -8,11 +8,11 @@ import sys
 import pytest
 from federation import free_port
 
-LOADS = (sys.executable, "-X", "importtime", "-m", "zsim_deploy")  # Python itself says what it has loaded
+LOADS = (sys.executable, "-X", "importtime", "-m", "zsim_deploy")  # Python reports each loaded module
 
 
 @pytest.mark.parametrize("loaded", ["zsim.errors", "typer"])
-def test_ctrl_c_while_it_loads_is_a_line(loaded: str) -> None:
+def test_ctrl_c_while_a_command_loads_is_reported_in_one_line(loaded: str) -> None:
     command = [*LOADS, "keys", "--wait", "60", "--connect", f"tcp/127.0.0.1:{free_port()}"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stderr is not None

@@ -1,4 +1,4 @@
-"""FMUs as processes in the lockstep: `zsim fmu`, with FMUs that pythonfmu3 and pythonfmu build."""
+"""`zsim fmu`: FMUs built by pythonfmu3 and pythonfmu as processes in lockstep."""
 
 import math
 from pathlib import Path
@@ -28,7 +28,7 @@ MAP = ("--map", "p=estimate.position_m", "--map", "v=velocity_m_s")
 
 
 class Waypoint(Agent):
-    """The law of examples/waypoint_fmu.py, as an agent in Python."""
+    """The law of examples/waypoint_fmu.py as an agent in Python."""
 
     name = "fmu.drone1"
     reads = (keys.estimate("drone1"),)
@@ -61,7 +61,7 @@ class Waypoint(Agent):
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SHORTER = ("--duration", "45")
-C_DES = (5.0, -5.0, 15.0, 0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0, 4.0, 4.0, math.pi / 4)  # equation (3)
+C_DES = (5.0, -5.0, 15.0, 0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0, 4.0, 4.0, math.pi / 4)  # equation (3) of the paper
 CLUSTER_VARIABLES = f"""
 variable("c", [0.0] * 12, I)
 variable("c_des", {list(C_DES)!r}, P)
@@ -78,7 +78,7 @@ self.c_dot = [max(-limit, min(limit, 0.4 * each)) for each, limit in zip(error, 
 
 
 class ClusterController(Agent):
-    """The law of the FMU, as an agent in Python with the kinematics of its own."""
+    """The law of the FMU as an agent in Python, with its own kinematics."""
 
     name = "controller.main"
 
@@ -108,7 +108,7 @@ class ClusterController(Agent):
         ]
 
 
-def test_flies_test_1_as_the_cluster_space_controller(federation: Federation, tmp_path: Path) -> None:
+def test_an_fmu_flies_test_1_as_the_cluster_space_controller(federation: Federation, tmp_path: Path) -> None:
     path = fmus.build(tmp_path, "Cluster", 3, CLUSTER_VARIABLES, CLUSTER_LAW)
     assert validate_fmu(str(path)) == []
     world = federation.start("world", str(STEP), *SHORTER, "--listen", federation.endpoint, "--expect", "recorder")
@@ -140,11 +140,11 @@ def waypoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fmus.example(tmp_path_factory.mktemp("fmu"))
 
 
-def test_the_example_is_an_fmu_by_fmpy(waypoint: Path) -> None:
+def test_fmpy_validates_the_example(waypoint: Path) -> None:
     assert validate_fmu(str(waypoint)) == []
 
 
-def test_flies_a_drone_as_a_process_with_the_bits_of_the_same_law_in_python(
+def test_an_fmu_flies_the_bits_of_the_same_law_in_python(
     federation: Federation, waypoint: Path, tmp_path: Path
 ) -> None:
     world = federation.world(SCENARIO, "--expect", "recorder")
@@ -182,7 +182,7 @@ COUNTED_LAW = """
 self.steps += 1
 self.vx = 0.001 * self.steps + 0.1 * (8.0 - self.x)
 """
-KILLED_S = 4.5  # of 6: both are in the air, the last snapshots are of 4 s
+KILLED_S = 4.5  # out of 6 s: both drones are airborne, and the last snapshots are from 4 s
 PLACES = {"x": "estimate.position_m.0", "vx": "velocity_m_s.0"}
 
 
@@ -191,10 +191,8 @@ def command(path: Path, drone: str) -> str:
     return f"fmu.{drone}=zsim fmu {path} --drone {drone} {places} --takeoff 0.5 --frame world"
 
 
-def test_those_that_are_killed_and_started_again_fly_the_bits_of_the_undisturbed_flight(
-    flights: Federations, tmp_path: Path
-) -> None:
-    """What they do depends on how many steps they have made; `zsim run` starts one again, the test the other."""
+def test_restarted_fmus_fly_the_bits_of_the_undisturbed_flight(flights: Federations, tmp_path: Path) -> None:
+    """The output of each FMU depends on its number of steps; `zsim run` restarts one FMU, the test the other."""
     made = [
         zsim.Fmu(
             fmus.build(tmp_path, f"Counted{version}", version, COUNTED_VARIABLES, COUNTED_LAW),
@@ -213,10 +211,10 @@ def test_those_that_are_killed_and_started_again_fly_the_bits_of_the_undisturbed
     flight.assert_same_bits(zsim.run(DUO, agents=made, out=tmp_path / "alone", progress=False))
     for drone in ("drone2", "drone3"):
         log = (flight.folder / "logs" / f"fmu.{drone}.log").read_text()
-        assert has_terms(log, f"fmu.{drone}:", "4.00", "s")  # of its snapshot
+        assert has_terms(log, f"fmu.{drone}:", "4.00", "s")  # the time of its snapshot
 
 
-def test_one_that_cannot_give_its_state_says_so_and_begins_afresh(flights: Federations, tmp_path: Path) -> None:
+def test_an_fmu_that_cannot_save_its_state_restarts_afresh_and_reports_it(flights: Federations, tmp_path: Path) -> None:
     path = fmus.build(tmp_path, "Forgetful", 3, COUNTED_VARIABLES, COUNTED_LAW.replace("0.1 *", "0 *"), restores=False)
     flight = flights(DUO, duration=5, programs=[command(path, "drone3")])
     flight.wait_until(KILLED_S)

@@ -1,4 +1,4 @@
-"""The gateway as its clients meet it: streams, lockstep sessions, both HTTP trees, who is let in."""
+"""The gateway as its clients see it: streams, lockstep sessions, both HTTP trees and access control."""
 
 import asyncio
 import base64
@@ -23,7 +23,7 @@ from zsim_bridges.web.web_server import STRANGERS_MAX
 GATE_NS = 20_000_000
 PILOT = "client.pilot"
 FLOWN = ONE.replace("expect: []", f"expect: [{PILOT}]").replace("duration_s: 10", "duration_s: 4")
-"""A drone that a client flies in a lockstep session: time waits for it from the start."""
+"""One drone flown by a client in a lockstep session; time waits for the client from the start."""
 STANDING = FLOWN.replace("duration_s: 4", "duration_s: 3600")
 
 
@@ -52,7 +52,7 @@ def stream(gateway: GatewayProcess) -> Iterator[LineConnection]:
 # Streams
 
 
-def test_a_client_says_who_it_is_and_is_informed_of_the_run(stream):
+def test_hello_names_the_client_and_describes_the_run(stream):
     response = stream.request("hello", name="laptop")
     assert (response["name"], response["mode"], response["gate_s"], response["drones"]) == (
         "client.laptop",
@@ -67,19 +67,19 @@ def last_ns(stream) -> int:
     return last["value"]["t_ns"]
 
 
-def test_last_values_come_from_the_cache_and_streams_as_they_pass(stream):
+def test_last_values_come_from_the_cache_and_streams_deliver_each_sample(stream):
     stream.send("subscribe", key="drone/*/sensor/imu")
     first, second = (stream.next("value")["value"] for _ in range(2))
     assert second["seq"] == first["seq"] + 1
     assert first["accel_m_s2"][2] == pytest.approx(9.81, abs=1.0)
-    while last_ns(stream) < first["t_ns"]:  # the cache has what passed the world in batches, which come later
+    while last_ns(stream) < first["t_ns"]:  # the world sends samples to the cache in batches, which arrive later
         stream.next("value")
     keys = {entry["key"] for entry in stream.request("latest", key="drone/drone1/**")["values"]}
     assert {"drone/drone1/truth", "drone/drone1/sensor/status", "drone/drone1/sensor/imu"} <= keys
     assert stream.request("unsubscribe", key="drone/*/sensor/imu")["op"] == "unsubscribe"
 
 
-def test_a_drone_flies_by_what_a_client_puts(gateway):
+def test_a_client_flies_a_drone_with_puts(gateway):
     with gateway.connect() as stream:
         stream.request("hello", name="flyer")
         stream.send("subscribe", key="drone/drone1/sensor/status")
@@ -87,20 +87,20 @@ def test_a_drone_flies_by_what_a_client_puts(gateway):
         _until(stream, "state", {"hovering", "flying"})
         up = {"velocity_m_s": [0, 0, 0.2], "yaw_rate_rad_s": 0}
 
-        def fly_up() -> None:  # again with each status: in realtime one that comes late is refused
+        def fly_up() -> None:  # repeated with each status, as a late command is refused in realtime
             stream.send("put", key="drone/drone1/cmd/velocity", value=up, quiet=True)
 
         _until(stream, "commander", {"client.flyer"}, fly_up)
     with gateway.connect() as other:
         other.request("hello", name="other")
         other.send("subscribe", key="drone/drone1/sensor/status")
-        _until(other, "commander", {None})  # the first one has hung up, so nobody flies it
+        _until(other, "commander", {None})  # the first client has disconnected, so nobody commands the drone
         assert other.request("put", key="drone/drone1/cmd/mode", value={"mode": "land"})["op"] == "put"
         _until(other, "state", {"landed"})
 
 
 def _until(stream: LineConnection, field: str, wanted: set[Any], act: Callable[[], None] = lambda: None) -> None:
-    """Act, and act again after each value, until one has a field as it is wanted."""
+    """Call `act` now and after each received value until the value of `field` is among `wanted`."""
     until_s = time.monotonic() + PATIENCE_S
     act()
     while stream.next("value")["value"].get(field) not in wanted:
@@ -117,7 +117,7 @@ def test_the_world_and_controllers_answer_requests(stream):
     assert parts(error) == ("cluster", "'main'")
 
 
-# a request, and what the line of its refusal must show
+# each request and the terms that its refusal must contain
 REFUSED: dict[bytes, tuple[str, ...]] = {
     b'{"op": "nope"}': ("'nope'", "$.op"),
     b'{"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "up"}}': ("mode is 'up'", "takeoff"),
@@ -144,7 +144,7 @@ REFUSED: dict[bytes, tuple[str, ...]] = {
 }
 
 
-def test_what_is_no_request_is_refused_in_a_line_and_the_connection_goes_on(stream):
+def test_an_invalid_request_is_refused_and_the_connection_stays_open(stream):
     stream.request("hello")
     for line, terms in REFUSED.items():
         stream.send_line(line)
@@ -154,8 +154,8 @@ def test_what_is_no_request_is_refused_in_a_line_and_the_connection_goes_on(stre
         assert stream.request("hello")["op"] == "hello"
 
 
-def test_what_is_no_json_at_first_is_no_client(gateway):
-    with gateway.connect() as stream:  # a page that lets a browser post here
+def test_a_connection_that_does_not_begin_with_json_is_closed(gateway):
+    with gateway.connect() as stream:  # as a web page could make a browser post to this port
         stream.send_line(
             b"POST / HTTP/1.1\r\n\r\n" + b'{"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "takeoff"}}'
         )
@@ -163,15 +163,15 @@ def test_what_is_no_json_at_first_is_no_client(gateway):
         assert stream.is_at_end()
 
 
-def test_a_line_without_end_ends_the_connection(gateway):
+def test_an_overlong_line_closes_the_connection(gateway):
     with gateway.connect() as stream:
-        with suppress(ConnectionError):  # closed while the rest is on its way
+        with suppress(ConnectionError):  # the gateway closes while the rest is being sent
             stream.send_line(b'{"op": "hello", "name": "' + b"x" * 1_100_000)
         assert "longer than" in stream.next("error")["error"]
         assert stream.is_at_end()
 
 
-def test_a_client_that_does_not_read_loses_the_oldest_and_is_informed(gateway):
+def test_a_slow_client_loses_the_oldest_values_and_is_notified(gateway):
     with gateway.connect() as slow, gateway.connect() as other:
         assert slow.request("subscribe", key="my/flood")["op"] == "subscribe"
         text = "x" * 500_000
@@ -183,7 +183,7 @@ def test_a_client_that_does_not_read_loses_the_oldest_and_is_informed(gateway):
             pass
 
 
-def test_values_of_ones_own_keys_are_any_json(stream):
+def test_the_values_of_user_keys_may_be_any_json(stream):
     stream.request("subscribe", key="my/**")
     for value in (1, "text", [1, None], {"a": {"b": 2.5}}):
         stream.send("put", key="my/key", value=value, quiet=True)
@@ -197,7 +197,7 @@ def test_whole_numbers_may_be_written_as_doubles(stream):
     assert (stream.next("value")["value"]["t_ns"], type(value["t_ns"])) == (20_000_000, float)
 
 
-def test_a_websocket_says_the_same(gateway):
+def test_a_websocket_speaks_the_same_protocol(gateway):
     async def talk() -> tuple[dict[str, Any], dict[str, Any]]:
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{gateway.url}/stream") as socket:
             await socket.send_json({"op": "hello", "name": "page"})
@@ -213,7 +213,7 @@ def test_a_websocket_says_the_same(gateway):
 # HTTP
 
 
-def test_the_json_tree_gets_puts_asks_and_streams(gateway):
+def test_the_json_tree_supports_get_put_post_and_streams(gateway):
     imu = gateway.http("GET", "/json/drone/drone1/sensor/imu")
     assert (imu.status, imu.headers["content-type"]) == (200, "application/json")
     assert len(imu.json()["accel_m_s2"]) == 3
@@ -259,7 +259,7 @@ def test_the_zenoh_tree_streams_puts_and_deletions(gateway):
         assert (event, data["value"]) == ("DELETE", None)
 
 
-def test_what_is_put_is_got_as_it_was_and_not_after_its_deletion(gateway):
+def test_a_put_value_is_returned_unchanged_until_it_is_deleted(gateway):
     for body, kind, value in ((b'{"a": 1}', "application/json", {"a": 1}), (b"hi", "text/plain", "hi")):
         gateway.http("PUT", "/zsim/my/own", body, {"Content-Type": kind})
         (entry,) = gateway.http("GET", "/zsim/my/own").json()
@@ -272,13 +272,13 @@ def test_what_is_put_is_got_as_it_was_and_not_after_its_deletion(gateway):
     assert gateway.http("GET", "/json/my/own").status == 404
 
 
-def test_views_are_last_values_too(gateway, stream):
+def test_views_can_be_read_as_last_values(gateway, stream):
     stream.send("subscribe", key="view/drones")
     stream.next("value")
     assert gateway.http("GET", "/json/view/drones").json()["drones"][0]["name"] == "drone1"
 
 
-def test_nobody_speaks_for_the_world_of_another_federation_either(gateway):
+def test_puts_to_keys_of_another_federations_world_are_forbidden(gateway):
     assert gateway.http("PUT", "/other/clock", b"x").status == 403
     assert gateway.http("PUT", "/other/process/world/bye", b"x").status == 403
 
@@ -304,18 +304,18 @@ BAD_REQUESTS = [
     ("GET", "/json/%ff", None, 400),
     ("GET", "/json/", None, 400),
     ("PUT", "/json/my/big", b"1" * 1_100_000, 413),
-    ("GET", "/@/**", None, 403),  # Zenoh's sessions, and the addresses of all who are connected
+    ("GET", "/@/**", None, 403),  # Zenoh's admin space, with the addresses of all connected sessions
     ("POST", "/%40/router/**", b"1", 403),
 ]
 OTHER_SITES = [
     {"Origin": "http://evil.example"},
     {"Host": "evil.example"},
-    {"Origin": "http://localhost:3000"},  # another server of this machine
-    {"Origin": "null"},  # a frame that any page can make
+    {"Origin": "http://localhost:3000"},  # another server on this machine
+    {"Origin": "null"},  # a sandboxed frame, which any page can create
 ]
 
 
-def test_bad_requests_are_told_what_is_wrong_and_pages_of_other_sites_may_not_ask(gateway):
+def test_bad_requests_and_requests_from_other_sites_are_refused(gateway):
     for method, path, body, status in BAD_REQUESTS:
         answer = gateway.http(method, path, body)
         assert answer.status == status, (path, answer.body)
@@ -324,7 +324,7 @@ def test_bad_requests_are_told_what_is_wrong_and_pages_of_other_sites_may_not_as
         assert gateway.http("GET", "/json/clock", headers=headers).status == 403, headers
 
 
-def test_connections_that_send_no_request_lock_nobody_out(gateway):
+def test_idle_connections_do_not_lock_out_others(gateway):
     with ExitStack() as stack:
         halves = []
         for _ in range(STRANGERS_MAX + 1):
@@ -340,11 +340,11 @@ def test_connections_that_send_no_request_lock_nobody_out(gateway):
 
 
 def fly(gateway: GatewayProcess, between: Callable[[], None] = lambda: None) -> int:
-    """Take off and climb in a lockstep session until the run ends; return how many gates there were.
+    """Take off and climb in a lockstep session until the run ends; return the number of gates.
 
     Args:
-        gateway: of the gateway.
-        between: called while a gate is open.
+        gateway: The gateway to connect to.
+        between: Called while a gate is open.
     """
     gates = 0
     with gateway.connect() as stream:
@@ -365,7 +365,7 @@ def fly(gateway: GatewayProcess, between: Callable[[], None] = lambda: None) -> 
     return gates
 
 
-def test_a_session_keeps_the_lockstep_and_flies_with_the_same_bits(tmp_path):
+def test_two_lockstep_sessions_are_bit_identical(tmp_path):
     hashes = []
     for number in range(2):
         with Federation(tmp_path / str(number)) as federation:
@@ -383,7 +383,7 @@ def test_a_session_keeps_the_lockstep_and_flies_with_the_same_bits(tmp_path):
 
 @pytest.fixture(scope="module")
 def standing(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[GatewayProcess]:
-    """The gateway of a world that waits for a pilot, and goes on in real time when it has left."""
+    """The gateway of a world that waits for a pilot and continues in real time once the pilot has left."""
     with Federation(tmp_path_factory.mktemp("standing")) as federation:
         federation.world(STANDING, "--rate", "1")
         yield GatewayProcess(federation).in_run()
@@ -415,7 +415,7 @@ def test_a_refused_done_leaves_the_gate_open(standing):
         assert stream.request("leave")["op"] == "leave"
 
 
-def test_a_gate_of_a_former_session_is_nobodys(standing):
+def test_a_gate_of_a_former_session_is_refused(standing):
     with standing.connect() as stream:
         for _ in range(3):
             gate = join(stream)
@@ -425,7 +425,7 @@ def test_a_gate_of_a_former_session_is_nobodys(standing):
             assert has_terms(refused["error"], "done: ", "join")
 
 
-def test_of_two_sessions_of_a_name_the_first_is_told(standing):
+def test_a_second_session_with_the_same_name_replaces_the_first(standing):
     with standing.connect() as first, standing.connect() as second:
         for stream in (first, second):
             join(stream)
@@ -433,7 +433,7 @@ def test_of_two_sessions_of_a_name_the_first_is_told(standing):
         assert "is 'gateway.main'" in first.request("join", name="gateway.main", period_s=0.02)["error"]
 
 
-def test_the_world_names_a_client_that_hung_up_and_takes_it_back(federation):
+def test_the_world_reports_a_disconnected_client_and_lets_it_rejoin(federation):
     federation.world(STANDING.replace("processes: {", "processes: {on_death: {client: wait}, "))
     gateway, events = GatewayProcess(federation).in_run(), federation.client().subscribe("world/event")
     with gateway.connect() as stream:
@@ -449,7 +449,7 @@ def test_the_world_names_a_client_that_hung_up_and_takes_it_back(federation):
     assert events.until(lambda e: e["kind"] == "leave").message["subject"] == PILOT
 
 
-# Runs and ends
+# Beginnings and ends of runs and gateways
 
 
 def test_clients_stay_while_runs_come_and_go(federation):
@@ -470,7 +470,7 @@ def test_clients_stay_while_runs_come_and_go(federation):
 
 
 @pytest.mark.soak
-def test_a_session_ends_with_its_run_though_a_gate_was_never_answered(federation):
+def test_a_session_ends_with_its_run_despite_an_unanswered_gate(federation):
     world = federation.world(STANDING)
     gateway = GatewayProcess(federation).in_run()
     with gateway.connect() as stream:
@@ -485,7 +485,7 @@ def test_a_session_ends_with_its_run_though_a_gate_was_never_answered(federation
                 pass
 
 
-def test_a_killed_world_is_told_of(federation):
+def test_clients_are_notified_of_a_killed_world(federation):
     world = federation.world(STANDING)
     gateway = GatewayProcess(federation).in_run()
     with gateway.connect() as stream:
@@ -497,7 +497,7 @@ def test_a_killed_world_is_told_of(federation):
         assert [stream.next("run")["state"] for _ in range(3)] == ["back", "ended", "begun"]
 
 
-def test_ctrl_c_ends_it_with_a_bye(federation):
+def test_ctrl_c_ends_the_gateway_with_a_bye(federation):
     federation.world(STANDING)
     gateway, byes = GatewayProcess(federation).in_run(), federation.client().subscribe("process/gateway.main/bye")
     with gateway.connect() as stream:
@@ -517,23 +517,23 @@ def test_a_second_gateway_of_the_same_name_takes_over(federation):
     assert "gateway.main: another" in first.role.text()
 
 
-def test_a_taken_port_is_a_line(federation):
+def test_a_port_in_use_is_reported(federation):
     gateway = GatewayProcess(federation)
     second = federation.role("gateway", "--http", str(gateway.http_port), "--lines", str(gateway.lines_port))
     second.ends(with_code=2)
     assert has_terms(second.text(), str(gateway.http_port), "--http", "--lines")
 
 
-# Who is let in
+# Access control
 
 
-def test_an_empty_token_is_none(federation):
+def test_an_empty_token_is_refused(federation):
     refused = federation.role("gateway", "--token", "")
     refused.ends(with_code=2)
     assert has_terms(refused.text(), "token", "empty")
 
 
-def test_off_loopback_it_wants_a_token(federation):
+def test_listening_off_loopback_requires_a_token(federation):
     refused = federation.role("gateway", "--listen", "0.0.0.0")
     refused.ends(with_code=2)
     (line,) = refused.text().splitlines()
@@ -542,7 +542,7 @@ def test_off_loopback_it_wants_a_token(federation):
 
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[GatewayProcess]:
-    """A gateway that wants a token."""
+    """A gateway that requires a token."""
     with Federation(tmp_path_factory.mktemp("guarded")) as federation:
         federation.world(STANDING)
         yield GatewayProcess(federation, "--listen", "0.0.0.0", "--token", "open sesame").in_run()
@@ -568,8 +568,8 @@ def test_a_token_is_required_on_every_port(guarded):
         assert stream.is_at_end()
 
 
-def test_who_shows_the_token_is_served_whatever_others_keep_open(guarded):
-    """Half a request, or nothing at all, on more connections than each port keeps of those without a token."""
+def test_clients_with_the_token_are_served_despite_idle_connections(guarded):
+    """Others send half a request or nothing on more connections than each port allows without a token."""
     with ExitStack() as stack:
         for port, most in ((guarded.http_port, STRANGERS_MAX), (guarded.lines_port, UNAUTHENTICATED_MAX)):
             for _ in range(most + 1):
@@ -582,7 +582,7 @@ def test_who_shows_the_token_is_served_whatever_others_keep_open(guarded):
             assert stream.request("latest", key="clock")["op"] == "latest"
 
 
-def test_bytes_that_are_no_header_are_refused(guarded):
+def test_invalid_header_bytes_are_refused(guarded):
     for headers in (
         {"Authorization": "Bearer \xff"},
         {"Authorization": "Bearer open sesame", "Content-Type": "a/\xff"},

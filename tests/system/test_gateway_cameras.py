@@ -1,4 +1,4 @@
-"""The pictures of cameras as clients of the gateway meet them: OpenCV, a browser, one that does not read."""
+"""Camera pictures as clients of the gateway see them: OpenCV, a browser and a client that does not read."""
 
 import base64
 import socket
@@ -18,11 +18,11 @@ from wire import PATIENCE_S, Client
 
 FRONT = "drone/drone1/camera/front"
 PICTURES = 12
-LARGE = 300_000  # bytes, so that what a connection holds is full soon
+LARGE = 300_000  # bytes, to fill the buffers of a connection quickly
 
 
 class Pictures:
-    """A connection that reads the parts of a stream, as far as it is asked to."""
+    """A connection to a picture stream that reads one picture per call of `next`."""
 
     def __init__(self, gateway: GatewayProcess, path: str) -> None:
         self._socket = socket.socket()
@@ -35,7 +35,7 @@ class Pictures:
         self.headers = self._read_headers()
 
     def next(self) -> tuple[int, bytes]:
-        """Return the next picture: its number, and the JPEG."""
+        """Return the number and the JPEG data of the next picture."""
         while not self._file.readline().startswith(b"--"):
             pass
         headers = self._read_headers()
@@ -74,7 +74,7 @@ def camera(lab: tuple[Federation, GatewayProcess]) -> Client:
     return lab[0].client()
 
 
-def test_opencv_shows_them(gateway: GatewayProcess, camera: Client) -> None:
+def test_opencv_reads_the_stream(gateway: GatewayProcess, camera: Client) -> None:
     with pumping(camera, FRONT):
         capture = cv2.VideoCapture(f"{gateway.url}/camera/drone1/front")
         shades = []
@@ -84,10 +84,10 @@ def test_opencv_shows_them(gateway: GatewayProcess, camera: Client) -> None:
             assert picture.shape == (SIZE[1], SIZE[0], 3)
             shades.append(round(float(np.mean(picture)) / 16))
         capture.release()
-    assert len(set(shades)) > 2  # other pictures come, not one again and again
+    assert len(set(shades)) > 2  # the pictures differ
 
 
-def test_every_picture_is_as_published_and_has_its_time(gateway: GatewayProcess, camera: Client) -> None:
+def test_pictures_arrive_as_published_with_their_times(gateway: GatewayProcess, camera: Client) -> None:
     with pumping(camera, FRONT), Pictures(gateway, "/camera/drone1/front") as stream:
         assert (stream.status, stream.headers["cache-control"]) == (200, "no-store")
         pictures = [stream.next() for _ in range(PICTURES)]
@@ -96,7 +96,7 @@ def test_every_picture_is_as_published_and_has_its_time(gateway: GatewayProcess,
     assert numbers == sorted(set(numbers))
 
 
-def test_the_newest_picture_by_itself(gateway: GatewayProcess, camera: Client) -> None:
+def test_the_newest_picture_is_served_on_its_own(gateway: GatewayProcess, camera: Client) -> None:
     with pumping(camera, FRONT):
         answer = gateway.http("GET", "/camera/drone1/front.jpg")
     assert (answer.status, answer.headers["content-type"]) == (200, "image/jpeg")
@@ -105,7 +105,7 @@ def test_the_newest_picture_by_itself(gateway: GatewayProcess, camera: Client) -
     assert answer.body == shaded(round(float(answer.headers["x-timestamp"]) * 1e3))
 
 
-def test_who_does_not_read_loses_pictures_and_the_others_none(gateway: GatewayProcess, camera: Client) -> None:
+def test_only_the_slow_client_loses_pictures(gateway: GatewayProcess, camera: Client) -> None:
     large = (640, 360)
     with (
         pumping(camera, FRONT, large, filler=LARGE),
@@ -132,7 +132,7 @@ def test_who_does_not_read_loses_pictures_and_the_others_none(gateway: GatewayPr
         ("/camera/drone1%2Fx/front", ("drone", "drone1")),
     ],
 )
-def test_what_is_no_camera_is_refused(gateway: GatewayProcess, path: str, terms: tuple[str, ...]) -> None:
+def test_an_unknown_camera_is_refused(gateway: GatewayProcess, path: str, terms: tuple[str, ...]) -> None:
     answer = gateway.http("GET", path)
     assert answer.status == 404
     assert has_terms(answer.json()["error"], *terms)
@@ -150,13 +150,13 @@ JUNK = (
 )
 
 
-def test_junk_on_a_camera_s_key_is_counted_and_touches_nothing(gateway: GatewayProcess, camera: Client) -> None:
+def test_junk_on_a_cameras_key_is_counted_and_ignored(gateway: GatewayProcess, camera: Client) -> None:
     healths = camera.subscribe("process/gateway.main/health")
     before = healths.until(lambda health: True).message["refused"]
     with Pictures(gateway, "/camera/drone1/front") as stream:
         with pumping(camera, FRONT):
             stream.next()
-        for junk in JUNK:  # now that the gateway's subscription has reached whoever publishes
+        for junk in JUNK:  # the gateway's subscription has now reached the publisher
             camera.put_raw(FRONT, junk)
         with pumping(camera, FRONT):
             number, data = stream.next()
@@ -165,13 +165,13 @@ def test_junk_on_a_camera_s_key_is_counted_and_touches_nothing(gateway: GatewayP
     assert counted == before + len(JUNK)
 
 
-def test_an_info_that_is_none_is_not_shown_and_the_one_before_stays(gateway: GatewayProcess, camera: Client) -> None:
+def test_an_invalid_camera_info_is_ignored(gateway: GatewayProcess, camera: Client) -> None:
     path = f"/json/{FRONT}/info"
     healths = camera.subscribe("process/gateway.main/health")
     before = healths.until(lambda health: True).message["refused"]
     with gateway.events(path) as events:
         with meanwhile(lambda: camera.put(f"{FRONT}/info", **calibration()), PERIOD_S):
-            _, first = next(events)  # the gateway's subscription has reached whoever publishes
+            _, first = next(events)  # the gateway's subscription has reached the publisher
         absurd = {**calibration(), "seq": 1, "source": "evil.cam", "width": 10**9, "K": [0.0] * 9}
         camera.put_raw(f"{FRONT}/info", Client.pack(absurd))
         healths.until(lambda health: health["refused"] > before)
@@ -195,7 +195,7 @@ def test_a_client_of_the_gateway_may_be_a_camera(gateway: GatewayProcess) -> Non
         assert has_terms(answer.json()["error"], "drone/drone1/camera/bottom", "data", "JPEG")
 
 
-def test_pictures_are_for_those_who_show_the_token(federation: Federation) -> None:
+def test_pictures_require_the_token(federation: Federation) -> None:
     federation.world(PAIR, "--realtime", "--expect", "nobody.yet")
     guarded = GatewayProcess(federation, "--token", "sesame").in_run()
     for path in ("/camera/drone1/front", "/camera/drone1/front.jpg", "/camera/drone1/front?token=wrong"):
@@ -208,7 +208,7 @@ def test_pictures_are_for_those_who_show_the_token(federation: Federation) -> No
 
 @needs_browser
 @pytest.mark.soak
-def test_a_browser_shows_them(gateway: GatewayProcess, camera: Client, browser: Any) -> None:
+def test_a_browser_shows_the_stream(gateway: GatewayProcess, camera: Client, browser: Any) -> None:
     page = browser.new_context().new_page()
     page.set_default_timeout(1000 * PATIENCE_S)
     with pumping(camera, FRONT):

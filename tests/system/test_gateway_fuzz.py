@@ -1,4 +1,4 @@
-"""The gateway under requests that nobody meant: no 5xx, no end, no effect of what was refused."""
+"""The gateway under fuzzing: no 5xx, no crash, no effect of refused requests."""
 
 import json
 import os
@@ -15,17 +15,17 @@ from hypothesis import strategies as st
 from test_gateway import FLOWN, fly
 
 SCHEMATHESIS = Path(sys.executable).with_name("st")
-HANGS_S = 900.0  # wall time after which nothing comes any more
-EXAMPLES = 2  # of each operation
-SEED = "2"  # makes no `*` for a name: that is an expression, which the patterns do not have, and answered by a list
+HANGS_S = 900.0  # wall time after which the fuzzer counts as hung
+EXAMPLES = 2  # per operation
+SEED = "2"  # generates no `*` as a name: it is an expression, which the patterns exclude and a list answers
 CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
 STRICT = f"{CHECKS},negative_data_rejection,positive_data_acceptance,unsupported_method"
-GATES_FUZZED = 180  # of the 201 of the flight; with the last ones the run is over
-OWN_KEYS = r"\{key\}"  # of one's own, where a key that the pattern does not take may do as well
+GATES_FUZZED = 180  # out of the flight's 201 gates; the run ends during the last ones
+OWN_KEYS = r"\{key\}"  # paths of user keys, where a key outside the pattern may be valid, too
 
 
 def fuzz(gateway: GatewayProcess, checks: str, mode: str, *options: str, examples: int = EXAMPLES) -> str:
-    """Let schemathesis at a gateway by its description; return what it prints, and fail if it found anything."""
+    """Run schemathesis on a gateway's description; return its output, and fail if it finds anything."""
     command = [
         SCHEMATHESIS, "run", f"{gateway.url}/openapi.json", "--checks", checks, "--mode", mode, "--seed", SEED,
         "--max-examples", str(examples), "--phases", "examples,coverage,fuzzing", "--warnings", "off", "--no-color",
@@ -43,7 +43,7 @@ def fuzz(gateway: GatewayProcess, checks: str, mode: str, *options: str, example
     [(STRICT, "--exclude-path-regex"), (CHECKS, "--include-path-regex")],
     ids=["what zsim answers", "own keys"],
 )
-def test_its_description_holds(federation: Federation, checks: str, option: str) -> None:
+def test_the_gateway_conforms_to_its_openapi_description(federation: Federation, checks: str, option: str) -> None:
     federation.world(FLOWN.replace("duration_s: 4", "duration_s: 3600"), "--expect", "nobody.yet")
     gateway = GatewayProcess(federation).in_run()
     fuzz(gateway, checks, "all", option, OWN_KEYS)
@@ -66,7 +66,7 @@ WAYS = ("json", "zenoh", "stream", "control", "headers")
 
 
 class Refused(NamedTuple):
-    """A request that is none: a way in, a kind of command, and a body."""
+    """An invalid request: the entry that it uses, a kind of command and a body."""
 
     way: str
     kind: str
@@ -74,7 +74,7 @@ class Refused(NamedTuple):
 
 
 def junk(count: int) -> list[Refused]:
-    """Return requests that hypothesis generates, always the same."""
+    """Return requests that hypothesis generates deterministically."""
     made: list[Refused] = []
 
     @settings(max_examples=count, deadline=None, derandomize=True, database=None)
@@ -86,13 +86,13 @@ def junk(count: int) -> list[Refused]:
     return made
 
 
-def test_what_is_refused_changes_no_bit(tmp_path):
+def test_refused_requests_do_not_change_the_flight(tmp_path):
     hashes = [_flown(tmp_path / "alone", []), _flown(tmp_path / "fuzzed", junk(GATES_FUZZED))]
     assert hashes[0] == hashes[1]
 
 
 def _flown(folder: Path, requests: list[Refused]) -> str:
-    """Return the truth of a flight between whose gates requests are refused."""
+    """Return the hash of the truth of a flight with a refused request at each gate."""
     folder.mkdir()
     left = iter(requests)
     with Federation(folder) as federation:
@@ -110,7 +110,7 @@ def _flown(folder: Path, requests: list[Refused]) -> str:
 
 
 def _refused(gateway: GatewayProcess, stream: LineConnection, request: Refused | None) -> None:
-    """Send a request and see it refused."""
+    """Send a request, if any, and check that it is refused."""
     if request is None:
         return
     way, kind, body = request

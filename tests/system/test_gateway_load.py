@@ -1,4 +1,4 @@
-"""Two hundred clients of a gateway, while the world flies in realtime: every one gets its values, however slowly."""
+"""Two hundred clients of a gateway of a realtime run: each receives its values, however slowly."""
 
 import json
 import subprocess
@@ -23,11 +23,11 @@ clusters:
 """
 LOAD = Path(__file__).with_name("gateway_load.py")
 CLIENTS = 200
-HANGS_S = 1800.0  # wall time after which nothing comes any more
+HANGS_S = 1800.0  # wall time after which the clients count as hung
 
 
 def fly_with_clients(federation: Federation, clients: int, values: int) -> dict[str, Any]:
-    """Fly in realtime while so many clients take so many values each; return their figures and the world's."""
+    """Fly in realtime while `clients` receive `values` each; return their figures and the deadline misses."""
     run = federation.run(TRIO, "--realtime", "--hosted")
     gateway = GatewayProcess(federation).in_run()
     client = federation.client()

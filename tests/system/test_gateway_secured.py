@@ -1,4 +1,4 @@
-"""A gateway in a federation with TLS and access control: what it may do, and lockstep sessions with certificates of their own."""
+"""A gateway in a federation with TLS and access control: its rights, and sessions with their own certificates."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ GATE_NS = 20_000_000
 
 @pytest.fixture
 def gateway(federation: Federation, tmp_path: Path) -> GatewayProcess:
-    """A gateway that comes in as an operator; in its folder lies the certificate of one session."""
+    """A gateway that joins as an operator, with the certificate of one session in its folder."""
     made = Certificates(tmp_path / "certs")
     rules = access_control(scenario_file.from_text(IN_LOCKSTEP), ["operator.gate", "matlab.main"], {})
     world = made.identity("world", rules)
@@ -30,7 +30,7 @@ def gateway(federation: Federation, tmp_path: Path) -> GatewayProcess:
     return GatewayProcess(federation, "--tls", str(made.of("operator.gate"))).in_run()
 
 
-def test_it_reads_and_commands_as_an_operator(gateway: GatewayProcess):
+def test_the_gateway_reads_and_commands_as_an_operator(gateway: GatewayProcess):
     gateway.role.line("^operator.gate: ")
     assert gateway.http("GET", "/json/clock").json()["state"] == "waiting"
     assert [entry["key"] for entry in gateway.http("GET", "/zsim/clock").json()] == ["zsim/clock"]
@@ -40,7 +40,7 @@ def test_it_reads_and_commands_as_an_operator(gateway: GatewayProcess):
     assert gateway.http("POST", "/json/world/control", {"op": "stop"}).json()["ok"]
 
 
-def test_a_session_comes_in_by_its_own_certificate(gateway: GatewayProcess):
+def test_a_session_joins_with_its_own_certificate(gateway: GatewayProcess):
     with gateway.connect() as stream:
         assert stream.request("join", name="matlab.main", period_s=0.02, reads=STATUSES)["op"] == "join"
         gate = stream.next("gate", "left")
@@ -55,7 +55,7 @@ def test_a_session_comes_in_by_its_own_certificate(gateway: GatewayProcess):
         assert "taking_off" in seen
 
 
-def test_a_session_without_a_certificate_is_told(gateway: GatewayProcess):
+def test_a_session_without_a_certificate_is_refused(gateway: GatewayProcess):
     with gateway.connect() as stream:
         stream.request("join", name="other", period_s=0.02, reads=STATUSES)
         reason = stream.next("left")["reason"]

@@ -1,4 +1,4 @@
-"""Test 1 of the paper with every drone behind its own wire, as good as without; and what a cut link does."""
+"""Test 1 of the paper with hardware in the loop, against a run without, and the effects of a cut link."""
 
 import math
 import re
@@ -21,15 +21,15 @@ pytestmark = [pytest.mark.soak, pytest.mark.slow]
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 WINDOW_S = (120.0, 320.0)
 DRONES = ("drone1", "drone2", "drone3")
-LANDS_S = 4.0  # s: 2 s of com_watchdog, and 2 s of hovering
-MOST = 1.3  # of the errors without a wire
-AS_ONE = {"p": ("p", "q"), "x_c": ("x_c", "y_c"), "roll": ("roll", "pitch")}  # of one kind, judged together
+LANDS_S = 4.0  # 2 s of com_watchdog and 2 s of hovering
+MOST = 1.3  # maximum ratio to the errors without a wire
+AS_ONE = {"p": ("p", "q"), "x_c": ("x_c", "y_c"), "roll": ("roll", "pitch")}  # errors of the same kind, combined
 JUDGED = ("x_c", "z_c", "roll", "yaw", "p", "beta")
-RADIO = {"a wire": (0.0, 0.0, 0.0), "a radio": (20.0, 10.0, 0.02)}  # delay and jitter of simulated ms, share lost
+RADIO = {"a wire": (0.0, 0.0, 0.0), "a radio": (20.0, 10.0, 0.02)}  # delay and jitter in simulated ms, share lost
 
 
 def kinds(rms: dict[str, float]) -> dict[str, float]:
-    """Return the errors that are judged."""
+    """Return the judged errors, those of a kind combined."""
     return {name: math.hypot(*(rms[each] for each in AS_ONE.get(name, (name,)))) for name in JUDGED}
 
 
@@ -46,10 +46,10 @@ def direct(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> dict[str
 @pytest.mark.parametrize("external", [("drone3",), DRONES], ids=["one", "all"])
 @pytest.mark.parametrize("radio", RADIO)
 @pytest.mark.parametrize("wire", ["px4", "ardrone"])
-def test_test_1_is_flown_as_well_as_without(
+def test_test_1_has_similar_errors_with_hardware_in_the_loop(
     tmp_path: Path, direct: dict[str, float], wire: str, radio: str, external: tuple[str, ...]
 ) -> None:
-    # From one AT command to the next are 15 to 30 ms of wall time: at twice real time half as many steer a flight.
+    # AT commands are 15 to 30 ms of wall time apart, so twice real time would halve their number per flight.
     rate = 2.0 if wire == "px4" and len(external) > 1 else 1.0
     pace = ("--realtime", "--rate", f"{rate:g}")
     delay_ms, jitter_ms, loss = RADIO[radio]
@@ -73,7 +73,7 @@ def test_test_1_is_flown_as_well_as_without(
 def through_radio(
     wire: str, served: list[list[str]], radio: tuple[float, float, float]
 ) -> tuple[Radio, list[list[str]]]:
-    """Return a radio link to some aircraft, and their ports behind it."""
+    """Return a radio link to some aircraft and the addresses that reach them through it."""
     if wire == "ardrone":
         ports = [[re.sub(r"^127\.(\d+)", lambda m: f"127.{int(m[1]) + 100}", each) for each in own] for own in served]
     else:
@@ -88,14 +88,14 @@ def through_radio(
 
 
 class Flight:
-    """A mixed formation that is engaged, its drone3 behind a radio."""
+    """An engaged mixed formation with drone3 behind a radio."""
 
     def __init__(self, mixed: Mixed, hardware: Hardware, radio: Radio) -> None:
         self.mixed, self.radio = mixed, radio
         self.aircraft = hardware.federation.client().subscribe("drone/drone3/sensor/status")
 
     def states(self) -> list[str]:
-        """Return the states of the aircraft since the last call, each once in a row."""
+        """Return the states of the aircraft since the last call, without repetitions in a row."""
         seen: list[str] = []
         for received in self.aircraft.now():
             if seen[-1:] != [received.message["state"]]:
@@ -119,7 +119,7 @@ def flown(tmp_path: Path, compiled: None, request: Any) -> Iterator[Flight]:
 
 @pytest.mark.parametrize("flown", ["px4", "ardupilot"], indirect=True)
 @pytest.mark.parametrize("cut_s", [1.0, 3.0, 10.0])
-def test_a_mavlink_vehicle_holds_while_its_link_is_cut_and_flies_on(flown: Flight, cut_s: float) -> None:
+def test_a_mavlink_vehicle_holds_during_a_cut_and_flies_on_after_it(flown: Flight, cut_s: float) -> None:
     flown.states()
     flown.radio.cut(cut_s / 2)
     now_ns = flown.mixed.formation.until(lambda m: True).message["t_ns"]
@@ -131,7 +131,7 @@ def test_a_mavlink_vehicle_holds_while_its_link_is_cut_and_flies_on(flown: Fligh
 
 @pytest.mark.parametrize("flown", ["ardrone"], indirect=True)
 @pytest.mark.parametrize("cut_s", [1.0, 3.0, 10.0])
-def test_an_ardrone_flies_on_after_a_short_cut_and_lands_in_a_long_one(flown: Flight, cut_s: float) -> None:
+def test_an_ardrone_flies_on_after_a_short_cut_and_lands_during_a_long_one(flown: Flight, cut_s: float) -> None:
     flown.states()
     flown.radio.cut(cut_s / 2)
     if cut_s < LANDS_S:

@@ -1,4 +1,4 @@
-"""`zsim up` on three real hosts: the same bits as in one process, over TLS with access control, whatever fails."""
+"""`zsim up` on three hosts over TLS with access control gives the bits of one process despite failures."""
 
 import itertools
 import os
@@ -14,15 +14,15 @@ from deployment import ROLES, START_S, Deployment, closing, in_flight, in_proces
 from lab import Lab
 
 DRONES = ("drone1", "drone2", "drone3")
-FLIGHT_S = 15.0  # simulated, of Test 1
-GATES_PER_S = 50  # of Test 1
-TAKEOFF = "clusters.main.plan.takeoff_s=1"  # a second into the run, so that it flies
-CUT_S = 1.0  # shorter than what a host is named for
-CUT_IN_REALTIME_S = 5.0  # longer than the firmware's patience (0.5 s until it hovers, 2 s more until it lands)
+FLIGHT_S = 15.0  # simulated part of Test 1
+GATES_PER_S = 50  # as in Test 1
+TAKEOFF = "clusters.main.plan.takeoff_s=1"  # early, so that the drones fly during the test
+CUT_S = 1.0  # shorter than the time after which a silent host is reported
+CUT_IN_REALTIME_S = 5.0  # longer than the firmware waits (0.5 s until it hovers, 2 s more until it lands)
 
 
-def test_ps_logs_restart_move_and_down(deployment: Deployment, tmp_path: Path) -> None:
-    """Who is restarted, moved or cut off goes on from where it was: the bits are those of a quiet run."""
+def test_ps_logs_restart_move_and_down_leave_the_bits_unchanged(deployment: Deployment, tmp_path: Path) -> None:
+    """Processes that are stopped, restarted, moved or cut off continue with the bits of an undisturbed run."""
     run = deployment.up("--rate", "0.5", "--duration", "3600", "--set", TAKEOFF)
     in_flight(run)
     rows = deployment.ps()
@@ -68,8 +68,8 @@ def test_ps_logs_restart_move_and_down(deployment: Deployment, tmp_path: Path) -
 
 
 @pytest.mark.soak
-def test_a_broken_ssh_session_is_the_death_of_its_roles(deployment: Deployment) -> None:
-    """They end, since their launcher is gone; time stands still until there are new ones."""
+def test_a_broken_ssh_session_counts_as_the_death_of_its_roles(deployment: Deployment) -> None:
+    """The roles end, since they have lost their launcher; time stops until they are restarted."""
     run = deployment.up("--rate", "4", "--duration", "3600")
     in_flight(run)
     for pid, line in namespaces.members(deployment.lab.namespace("h2")):
@@ -86,7 +86,7 @@ def test_a_broken_ssh_session_is_the_death_of_its_roles(deployment: Deployment) 
 
 @pytest.mark.soak
 def test_in_realtime_drones_land_while_their_controller_is_cut_off(deployment: Deployment) -> None:
-    """The firmware's watchdog lands them; what the controller says too late is refused; the world has it all.
+    """The firmware's watchdog lands them; late commands of the controller are refused; the record has every gate.
 
     world, recorder, estimator.drone1 ─── h1        h2 ─── controller.main, estimator.drone2
                                              cut 5 s
@@ -110,8 +110,8 @@ def test_in_realtime_drones_land_while_their_controller_is_cut_off(deployment: D
 
 
 @pytest.mark.soak
-def test_a_host_that_computes_otherwise_is_warned_of_and_shown(lab: Lab, tmp_path: Path) -> None:
-    """The processes of one host find only a part of the code."""
+def test_a_host_with_a_different_fingerprint_is_reported(lab: Lab, tmp_path: Path) -> None:
+    """The processes of one host compute their fingerprint from only part of the code."""
     less = "from zsim.contract import fingerprint\nfingerprint.CODE = fingerprint.CODE[:1]\n"
     (tmp_path / "sitecustomize.py").write_text(less)
     lab.environment("h3", PYTHONPATH=str(tmp_path))
@@ -125,8 +125,8 @@ def test_a_host_that_computes_otherwise_is_warned_of_and_shown(lab: Lab, tmp_pat
 
 
 @pytest.mark.soak
-def test_a_router_per_site_each_at_the_world(lab: Lab, tmp_path: Path) -> None:
-    """What an estimator of one site says reaches the controller of the other through the world.
+def test_sites_with_a_router_each_communicate_through_the_world(lab: Lab, tmp_path: Path) -> None:
+    """Estimates from one site reach the controller at the other through the world.
 
     estimator.drone2, controller.main ─── router.a ─── world ─── router.b ─── estimator.drone3
     """
@@ -138,8 +138,8 @@ def test_a_router_per_site_each_at_the_world(lab: Lab, tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-def test_over_a_poor_link_it_flies_in_realtime(lab: Lab) -> None:
-    """50 ± 10 ms and 2 % loss each way to the host of an estimator."""
+def test_a_formation_flies_in_realtime_over_a_poor_link(lab: Lab) -> None:
+    """The link to the host of an estimator has 50 ± 10 ms delay and 2 % loss in each direction."""
     lab.slow("h3", 50, 10, 0.02)
     with closing(Deployment(lab, ROLES)) as deployment:
         run = deployment.up("--realtime", "--duration", "18", "--set", "clusters.main.plan.takeoff_s=2")

@@ -1,4 +1,4 @@
-"""What is asked of a `zsim up` that runs, and what it leaves behind: on real hosts, over TLS."""
+"""Commands to a running `zsim up`, and what it leaves behind on its hosts, over TLS."""
 
 import re
 import signal
@@ -20,31 +20,31 @@ IN_FLIGHT = r" [1-9][0-9]*\.[0-9] . 3600 s"  # a line of progress after the firs
 
 ROLES = {"world": "h1", "recorder": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2"]}
 SPARE = "h3"
-DRONES = 10  # their estimators, the world, the recorder and the link's own word are more than sshd's 10 channels
+DRONES = 10  # with the world, the recorder and the link's own channel, more than sshd's 10 channels
 
 
 def keys(deployment: Deployment) -> list[Path]:
-    """Return what of certificates and keys is on any host."""
+    """Return the certificates and keys left on the hosts."""
     return [path for name in deployment.lab.names for path in deployment.lab.host_folder(name).rglob("*.pem")]
 
 
 def nothing_stays(deployment: Deployment) -> None:
-    """Fail if anything of a run is on any host."""
+    """Check that no file of a run is left on the hosts."""
     assert keys(deployment) == []
     assert [path for name in deployment.lab.names for path in deployment.lab.host_folder(name).glob("runs/*")] == []
 
 
 def goes_on(deployment: Deployment) -> None:
-    """Wait until every process runs and nobody is waited for."""
+    """Wait until every process is running and none is waited for."""
     until_s = time.monotonic() + START_S
     while {row["state"] for row in deployment.ps().values()} != {"running"}:
         assert time.monotonic() < until_s, deployment.ps()
-        threading.Event().wait(0.05)  # nothing tells of a process that is waited for no longer
+        threading.Event().wait(0.05)  # no line reports that a process is no longer waited for
 
 
 @pytest.mark.soak
-def test_restarts_at_once_and_moves_refused_and_carried_out(lab: Lab) -> None:
-    """One move has no certificate there, the other is to a host that was not used before."""
+def test_processes_can_be_restarted_and_moved_during_a_run(lab: Lab) -> None:
+    """One move is refused, as its host lacks the certificate; the other is to a host not used before."""
     with closing(Deployment(lab, ROLES)) as deployment:
         rmtree(lab.folder / "certs" / SPARE / "estimator.drone1", ignore_errors=True)
         run = deployment.up("--rate", "4", "--duration", "3600")
@@ -76,8 +76,8 @@ def test_restarts_at_once_and_moves_refused_and_carried_out(lab: Lab) -> None:
 
 
 @pytest.mark.soak
-def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
-    """Meanwhile others who want to fly there are refused before anything is started, and leave nothing."""
+def test_closing_the_terminal_ends_the_run_like_ctrl_c(lab: Lab) -> None:
+    """Meanwhile, other runs on these hosts are refused before anything starts, and leave nothing behind."""
     with closing(Deployment(lab, ROLES, secure=False)) as deployment:
         run = deployment.up("--rate", "4", "--duration", "3600")
         in_flight(run)
@@ -103,9 +103,9 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
         follower.ends(with_code=0, within_s=START_S)
 
 
-@pytest.mark.soak  # test_kill has it on one host
-def test_a_pipe_that_nobody_reads_any_more_ends_the_run_and_fetches_its_record(lab: Lab) -> None:
-    """As in `zsim up … 2>&1 | head`."""
+@pytest.mark.soak  # test_kill covers this on one host
+def test_a_broken_output_pipe_ends_the_run_and_fetches_its_record(lab: Lab) -> None:
+    """As in `zsim up … 2>&1 | head`, the reader exits during the flight."""
     with closing(Deployment(lab, ROLES, secure=False)) as deployment:
         piped = '"$@" 2>&1 | sed -E "/' + IN_FLIGHT + '/q"'
         run = deployment.up("--rate", "4", "--duration", "3600", prefix=("sh", "-c", piped, "sh"))
@@ -117,8 +117,8 @@ def test_a_pipe_that_nobody_reads_any_more_ends_the_run_and_fetches_its_record(l
 
 
 @pytest.mark.soak
-def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
-    """Whoever flies next is told of the record and how to fetch it; a second that cannot be fetched fails its run."""
+def test_a_killed_launcher_leaves_a_record_but_no_keys(lab: Lab) -> None:
+    """The next run reports the record and how to fetch it; a run whose own record cannot be fetched fails."""
     with closing(Deployment(lab, ROLES)) as deployment:
         run = deployment.up("--rate", "1", "--duration", "3600")
         in_flight(run)
@@ -145,8 +145,8 @@ def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
 
 
 @pytest.mark.soak
-def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
-    """The record stays where it is, the keys are taken from the hosts that can be reached."""
+def test_the_end_does_not_wait_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
+    """The record stays on its host; the keys are removed from the hosts that can be reached."""
     with closing(Deployment(lab, {**ROLES, "recorder": SPARE})) as deployment:
         run = deployment.up("--rate", "4", "--duration", "3600")
         in_flight(run)
@@ -164,7 +164,7 @@ def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
 
 
 @pytest.mark.soak
-def test_more_processes_on_a_host_than_sshd_has_channels_for(lab: Lab) -> None:
+def test_a_host_may_run_more_processes_than_sshd_has_channels(lab: Lab) -> None:
     drones = [{"name": f"drone{i}", "position_m": [3.0 * i, 0.0, 0.0]} for i in range(DRONES)]
     scenario = lab.folder / "many.yaml"
     scenario.write_text(yaml.safe_dump({"name": "many", "duration_s": 1, "drones": drones}))

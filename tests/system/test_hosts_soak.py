@@ -1,4 +1,4 @@
-"""Faults at random simulated times on three hosts, many of each kind: `make soak`; a table of them at the end."""
+"""Repeated faults of each kind at random simulated times on three hosts, with a table of outcomes (`make soak`)."""
 
 import errno
 import functools
@@ -22,8 +22,8 @@ from said_lines import say
 pytestmark = pytest.mark.soak
 
 REPETITIONS = 5
-DURATION_S, RATE = 60.0, 8  # simulated
-LATEST_S = 30.0  # simulated, of a fault, after the start
+DURATION_S, RATE = 60.0, 8  # simulated time; ratio of simulated to wall time
+LATEST_S = 30.0  # simulated time from the start to the latest fault
 CUTS_S = {"cut 1 s": 1.0, "cut 5 s": 5.0, "cut 20 s": 20.0}
 LOSING = ("estimator.drone1", "estimator.drone3", "controller.main")
 RECORDER, WORLD = "recorder", "world"
@@ -35,11 +35,11 @@ class Outcome(NamedTuple):
     kind: str
     survived: bool
     named_after_s: float | None
-    """Wall time from the fault to the line that names it; None where there is none to come."""
+    """Wall time from the fault to the line that reports it; None if no line is expected."""
 
 
 class Tally:
-    """What became of every repetition."""
+    """The outcomes of all repetitions."""
 
     def __init__(self) -> None:
         self.outcomes: list[Outcome] = []
@@ -74,7 +74,7 @@ def undisturbed() -> str:
 
 @pytest.mark.parametrize("repetition", range(REPETITIONS))
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_fault_at_a_random_time(
+def test_a_run_ends_as_expected_after_a_fault_at_a_random_time(
     lab: Lab,
     small_disk: Callable[[Path, int], None],
     faketime: str,
@@ -98,7 +98,7 @@ def test_a_fault_at_a_random_time(
 def prepared(
     lab: Lab, kind: str, chance: random.Random, small_disk: Callable[[Path, int], None], faketime: str
 ) -> Deployment:
-    """Return a lab in which a fault of this kind can come, or is there from the start."""
+    """Return a deployment in which a fault of this kind can occur or is present from the start."""
     if kind == ROUTER:
         return Deployment(lab, ROLES, routers={"field": {"host": "h2"}}, through={"h2": "field", "h3": "field"})
     if kind == CLOCK:
@@ -112,7 +112,7 @@ def prepared(
 
 
 def strike(deployment: Deployment, run: Role, kind: str, chance: random.Random) -> float | None:
-    """Let a fault happen; return the wall time [s] until a line names it."""
+    """Cause a fault; return the wall time [s] until a line reports it, if one does."""
     if kind in (CLOCK, DISK):
         return None
     at_s = time.monotonic()
@@ -127,7 +127,7 @@ def strike(deployment: Deployment, run: Role, kind: str, chance: random.Random) 
 
 
 def cut_off(deployment: Deployment, run: Role, host: str, for_s: float) -> float | None:
-    """Cut a host off for so long; return the wall time [s] until its line."""
+    """Cut a host off for `for_s`; return the wall time [s] until it is reported, if it is."""
     at_s = deployment.cut(host)
     is_named, named_after_s = for_s > NAMED_AFTER_S, None
     if is_named:
@@ -141,7 +141,7 @@ def cut_off(deployment: Deployment, run: Role, host: str, for_s: float) -> float
 
 
 def judge(deployment: Deployment, run: Role, kind: str) -> None:
-    """Fail unless the run has ended as it must after a fault of this kind, with all that was recorded."""
+    """Check that the run ended, and recorded, as it must after a fault of this kind."""
     run.ends(with_code=1 if kind == DISK else 0, within_s=START_S + CUTS_S.get(kind, 0.0))
     record = deployment.record()
     assert record.keys()["clock"] > 1

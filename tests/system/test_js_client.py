@@ -1,4 +1,4 @@
-"""clients/js and examples/js: in Node, and in a real browser."""
+"""clients/js and examples/js in Node and in a browser."""
 
 import os
 import re
@@ -25,7 +25,7 @@ needs_node = pytest.mark.skipif(NODE is None, reason="node is not installed; on 
 
 
 def node(*arguments: object) -> str:
-    """Run a script to its end, which must be a good one; return what it prints."""
+    """Run a script, which must succeed; return its output."""
     command = [str(NODE), *map(str, arguments)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, f"{done.stdout[-4000:]}\n{done.stderr[-4000:]}"
@@ -37,7 +37,7 @@ def node(*arguments: object) -> str:
 
 
 @needs_node
-def test_the_module_against_a_played_gateway() -> None:
+def test_the_modules_own_tests_pass() -> None:
     output = node("--test", "--test-reporter=tap", "clients/js/tests/zsim.test.mjs")
     assert int(re.findall(r"^# pass (\d+)$", output, flags=re.MULTILINE)[0]) >= 11
 
@@ -60,7 +60,7 @@ def test_a_script_flies_a_square_in_lockstep(federation: Federation) -> None:
 
 
 @needs_node
-def test_a_script_that_finds_nobody_says_so() -> None:
+def test_a_script_without_a_gateway_reports_it() -> None:
     script = 'import { connect } from "./clients/js/zsim.js"; await connect("tcp://127.0.0.1:1", { timeoutS: 0.3 });'
     command = [str(NODE), "--input-type=module", "--eval", script]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S)
@@ -69,7 +69,7 @@ def test_a_script_that_finds_nobody_says_so() -> None:
 
 
 @needs_node
-def test_the_first_program_of_the_docs(federation: Federation, tmp_path: Path) -> None:
+def test_the_first_program_of_the_documentation_works(federation: Federation, tmp_path: Path) -> None:
     page = (ROOT / "docs" / "clients-js.md").read_text()
     lines = re.findall(r"^    (import \{ connect \} .*\n(?:(?:    .*)?\n)*?    \}\);)\n\n", page, flags=re.MULTILINE)
     federation.world(ONE, "--duration", "600", "--rate", "4")
@@ -82,12 +82,12 @@ def test_the_first_program_of_the_docs(federation: Federation, tmp_path: Path) -
 
 # In a browser
 
-TOKEN = ("--token", "secret")  # the page is served on another port than the gateway
+TOKEN = ("--token", "secret")  # required, as the page is not served from the gateway's port
 
 
 @pytest.fixture
 def served() -> Iterator[str]:
-    """Serve the checkout as docs/clients-js.md says; return the address of the page."""
+    """Serve the checkout as in docs/clients-js.md; yield the address of the page."""
     port = free_port()
     command = [sys.executable, "-m", "http.server", "--bind", "127.0.0.1", str(port)]
     env = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -101,7 +101,7 @@ def served() -> Iterator[str]:
 
 
 class Watched:
-    """A page, all that it asked for, and what went wrong in it."""
+    """A page with all its requests and errors."""
 
     def __init__(self, page: Any, address: str) -> None:
         self.page = page
@@ -115,18 +115,17 @@ class Watched:
         page.goto(address)
 
     def press(self, name: str) -> None:
-        """Press a button."""
         self.page.get_by_role("button", name=name, exact=True).click()
 
     def wait_for_text(self, pattern: str) -> None:
-        """Wait until the page shows a text."""
+        """Wait until the page shows text that matches `pattern`."""
         try:
             self.page.get_by_text(re.compile(pattern)).first.wait_for()
         except Exception:
             pytest.fail(f"no {pattern!r} on the page, but:\n{self.page.inner_text('body')}\n{self.faults}")
 
     def map(self) -> str:
-        """Return the picture on the canvas."""
+        """Return the canvas's picture as a data URL."""
         return self.page.evaluate("document.getElementById('map').toDataURL()")
 
 
@@ -136,7 +135,7 @@ EAST = r"^(0\.[4-9]|[1-9]\.)"
 
 @pytest.fixture
 def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
-    """Open the page on a gateway."""
+    """A function that opens the page on a gateway."""
     with ExitStack() as stack:
 
         def open_it(gateway: GatewayProcess, query: str = "&token=secret") -> Watched:
@@ -147,10 +146,10 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
         yield open_it
 
 
-@pytest.mark.soak  # a browser that is not given its time for seconds loses the drone that it flies
+@pytest.mark.soak  # a browser starved of CPU for seconds loses control of its drone
 @needs_browser
-def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Callable[..., Watched]) -> None:
-    patient = ["--set", "silence.hover_s=2", "--set", "silence.land_s=2"]  # with a page on a busy machine
+def test_the_page_shows_and_flies_a_drone(federation: Federation, opened: Callable[..., Watched]) -> None:
+    patient = ["--set", "silence.hover_s=2", "--set", "silence.land_s=2"]  # allow for a slow page on a busy machine
     federation.world(ONE, "--rate", "1", "--duration", "600", *patient)
     gateway = GatewayProcess(federation, *TOKEN)
     other = federation.client()
@@ -168,7 +167,7 @@ def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Cal
 
     t_ns = other.get("clock")["clock"]["t_ns"]
     velocity = {"source": "other.one", "velocity_m_s": [2.0, 0.0, 0.0], "yaw_rate_rad_s": 0.0, "frame": "world"}
-    other.put("drone/drone1/cmd/velocity", t_ns=t_ns, **velocity)  # 2 s of it, then silence
+    other.put("drone/drone1/cmd/velocity", t_ns=t_ns, **velocity)  # flown for 2 s, until silence.hover_s is over
     seen.wait_for_text(EAST)
     assert seen.map() != on_the_ground
 
@@ -176,11 +175,11 @@ def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Cal
     seen.wait_for_text(r", held$")
     page = states.until(lambda m: (m["commander"] or "").startswith("client.page-")).message["commander"]
     held_from_ns = states.now()[-1].message["t_ns"]
-    states.until(lambda m: m["t_ns"] > held_from_ns + 5e9)  # longer than silence is suffered
+    states.until(lambda m: m["t_ns"] > held_from_ns + 5e9)  # longer than the limits on silence
     assert states.received[-1].message["state"] == "flying"
     other.put("drone/drone1/cmd/velocity", t_ns=t_ns, **velocity)
     assert page in events.until(lambda m: m["kind"] == "refused").message["text"]
-    seen.wait_for_text("is flown by 'client.page-")  # people are told too
+    seen.wait_for_text("is flown by 'client.page-")  # the page shows the refusal, too
 
     seen.press("Let go drone1")
     events.until(lambda m: (m["kind"], m["subject"]) == ("control", "release"))
@@ -195,7 +194,7 @@ def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Cal
 
 
 @needs_browser
-def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
+def test_the_page_survives_the_end_of_its_run_and_of_its_gateway(
     federation: Federation, opened: Callable[..., Watched]
 ) -> None:
     world = federation.world(ONE, "--rate", "2", "--duration", "600")
@@ -214,8 +213,8 @@ def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
 
 @needs_browser
 @pytest.mark.soak
-def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: Callable[..., Watched]) -> None:
-    """A landed drone cannot be held: the page says what the world said, and stays."""
+def test_the_page_shows_why_a_command_is_refused(federation: Federation, opened: Callable[..., Watched]) -> None:
+    """A landed drone cannot be held; the page shows the world's reason and keeps working."""
     federation.world(ONE, "--rate", "2", "--duration", "600")
     seen = opened(GatewayProcess(federation, *TOKEN))
     seen.wait_for_text(r"^landed$")
@@ -226,7 +225,7 @@ def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: 
 
 @needs_browser
 @pytest.mark.soak
-def test_the_page_shows_a_token_where_one_is_asked_for(federation: Federation, opened: Callable[..., Watched]) -> None:
+def test_the_page_presents_its_token_to_the_gateway(federation: Federation, opened: Callable[..., Watched]) -> None:
     federation.world(ONE, "--rate", "2", "--duration", "600")
     gateway = GatewayProcess(federation, *TOKEN)
     opened(gateway, "").wait_for_text("no gateway answers there, or it wants a token")

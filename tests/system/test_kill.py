@@ -1,4 +1,4 @@
-"""kill -9 of every process of a run: the rest says so, does what on_death says, and leaves nothing behind."""
+"""Killing each process of a run: the others report it, follow `on_death` and leave nothing behind."""
 
 import re
 import signal
@@ -22,24 +22,24 @@ from zsim_api.pytest_plugin import Federations
 from zsim_deploy.launch.supervisor import UNREAD
 
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
-SEEN_BACK = ("restart", "superseded")  # the second where it is back before its death is noticed
+SEEN_BACK = ("restart", "superseded")  # the second if it rejoins before its death is noticed
 GATE_NS = 20_000_000
 ENGAGED_NS, END_NS = 6_000_000_000, 12_000_000_000
-LATE_NS = 7_900_000_000  # of 8 s
+LATE_NS = 7_900_000_000  # just before the end of a run of 8 s
 FROZEN_S = 14  # longer than LEASE_READER_MS
 IN_FLIGHT = r" [1-9][0-9]*\.[0-9] . 100000 s"  # a line of progress after the first second
-APART_M = 0.3  # of a run with deaths from one without, in realtime
+APART_M = 0.3  # permitted distance between the paths of a realtime run with deaths and of one without
 MOVING = PAIR.replace(
     "{takeoff_s: 0.5}",
     "{takeoff_s: 0.5, trajectory: {start_s: 9, waypoints: [{at_s: 0, values: {x_c: 0}}, {at_s: 8, values: {x_c: 2}}]}}",
 )
 STEP = (ROOT / "scenarios" / "step.yaml").read_text()
-UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
+UNWRITTEN_NS = 5_000_000_000  # simulated, at rate 4: may be unwritten, as a recorder holds data for 0.5 s or more
 
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
-    """The folder of PAIR flown in one process, where nobody is killed."""
+    """The folder of an undisturbed run of PAIR in one process."""
     with Federation(tmp_path_factory.mktemp("undisturbed")) as federation:
         federation.run(PAIR, "--in-process").ends(with_code=0)
         return federation.out
@@ -47,15 +47,15 @@ def alone(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(alone: Path) -> dict[str, np.ndarray]:
-    """True positions of PAIR when nobody is killed."""
+    """True positions in an undisturbed run of PAIR."""
     with RecordReader(alone / "run.mcap") as reader:
         return {drone: Record(reader).positions(drone) for drone in ("drone1", "drone2")}
 
 
 class Flight:
-    """PAIR under way at four times real time, formation engaged, with a foreign program that listens.
+    """A run of PAIR at four times real time with the formation engaged, observed by an external client.
 
-    It goes on until it is ended, so that nothing has to be done in time.
+    It runs until it is ended, so that no test has to meet a deadline.
     """
 
     def __init__(self, federation: Federation, *options: str) -> None:
@@ -85,7 +85,7 @@ def waiting_for(clock: Received, name: str) -> dict[str, Any]:
 
 
 def check_end(federation: Federation, whole: bool) -> Record:
-    """Check that nobody is left and that the record can be read; return it."""
+    """Check that no process is left and that the record can be read; return the record."""
     federation.nobody_left()
     record = federation.record()
     assert record.all("drone/drone1/truth")[-1]["t_ns"] >= ENGAGED_NS - UNWRITTEN_NS
@@ -102,7 +102,9 @@ def check_end(federation: Federation, whole: bool) -> Record:
         pytest.param("controller.main", ("--hosted",), marks=pytest.mark.soak),
     ],
 )
-def test_restart(flights: Federations, alone: Path, name: str, options: tuple[str, ...]) -> None:
+def test_a_killed_participant_is_restarted_with_the_same_bits(
+    flights: Federations, alone: Path, name: str, options: tuple[str, ...]
+) -> None:
     flight = flights(yaml.safe_load(PAIR), options=options)
     flight.wait_until("engaged")
     flight.kill(name)
@@ -118,7 +120,7 @@ def test_restart(flights: Federations, alone: Path, name: str, options: tuple[st
 
 
 @pytest.mark.parametrize("name", ["controller.main", pytest.param("recorder", marks=pytest.mark.soak)])
-def test_a_run_that_a_death_has_ended_has_failed(flights: Federations, name: str) -> None:
+def test_a_run_ended_by_a_death_has_failed(flights: Federations, name: str) -> None:
     flight = flights(yaml.safe_load(PAIR), set={"processes.on_death": {name.partition(".")[0]: "end"}})
     flight.wait_until(3.0)
     flight.kill(name)
@@ -127,11 +129,11 @@ def test_a_run_that_a_death_has_ended_has_failed(flights: Federations, name: str
 
 
 @pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("controller.main", marks=pytest.mark.soak)])
-def test_wait(federation: Federation, name: str) -> None:
+def test_time_stops_until_a_killed_participant_is_started_again(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: wait}}")
     federation.kill(name)
     flight.event("death", name)
-    standing = flight.stands_for(name, longer_than_s=1)  # since the death: no gate of before took as long
+    standing = flight.stands_for(name, longer_than_s=1)  # longer than any gate before the death took
     later = flight.stands_for(name, longer_than_s=waiting_for(standing, name)["since_wall_s"])
     assert waiting_for(later, name)["host"]
     assert later.message["t_ns"] == standing.message["t_ns"]
@@ -143,7 +145,7 @@ def test_wait(federation: Federation, name: str) -> None:
 
 
 @pytest.mark.soak
-def test_who_does_not_come_back_in_its_time_ends_the_run(federation: Federation) -> None:
+def test_an_overdue_participant_ends_the_run(federation: Federation) -> None:
     flight = Flight(federation, "--set", "processes.on_death={estimator: wait}", "--set", "processes.return_s=1.5")
     federation.kill("estimator.drone1")
     flight.event("overdue", "estimator.drone1")
@@ -153,7 +155,7 @@ def test_who_does_not_come_back_in_its_time_ends_the_run(federation: Federation)
 
 
 @pytest.mark.soak
-def test_or_the_run_goes_on_without_it(federation: Federation) -> None:
+def test_an_overdue_participant_is_dropped_and_the_run_goes_on(federation: Federation) -> None:
     options = (
         "processes.on_death={controller: wait}",
         "processes.return_s=1.5",
@@ -169,11 +171,11 @@ def test_or_the_run_goes_on_without_it(federation: Federation) -> None:
 
 
 @pytest.mark.parametrize("name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main"])
-def test_drop(federation: Federation, name: str) -> None:
+def test_a_killed_participant_is_dropped_and_the_run_goes_on(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: drop}}")
     federation.kill(name)
     flight.event("drop", name)
-    is_held = name.startswith("estimator")  # the formation does not fly without an estimate: not as planned
+    is_held = name.startswith("estimator")  # without an estimate the formation is held: the run is not as planned
     flight.finish(with_code=int(is_held))
     record = check_end(federation, whole=True)
     assert record.events("restart") == []
@@ -181,7 +183,7 @@ def test_drop(federation: Federation, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*(pytest.param(each, marks=pytest.mark.soak) for each in PAIR_ROLES[1:]), "recorder"])
-def test_end(federation: Federation, name: str) -> None:
+def test_a_death_ends_the_run_if_the_scenario_says_so(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: end}}")
     federation.kill(name)
     flight.event("death", name)
@@ -192,8 +194,8 @@ def test_end(federation: Federation, name: str) -> None:
 
 
 @pytest.mark.soak
-def test_who_is_terminated_has_died(federation: Federation) -> None:
-    """SIGTERM from somebody who is not the launcher: first to an estimator, then to the recorder."""
+def test_a_process_terminated_from_outside_counts_as_dead(federation: Federation) -> None:
+    """SIGTERM comes from outside the launcher, first to an estimator, then to the recorder."""
     flight = Flight(federation)
     federation.kill("estimator.drone1", signal.SIGTERM)
     assert flight.event("death", "estimator.drone1").message["data"]["on_death"] == "restart"
@@ -205,14 +207,14 @@ def test_who_is_terminated_has_died(federation: Federation) -> None:
 
 
 def check_whole(record: Record) -> None:
-    """Check that every gate is on record once, and of every key every message.
+    """Check that the record holds every gate once and every message of every key.
 
-    What a participant repeated, since the world died before it knew of it, may be there twice.
+    A message that a participant repeated because the world had died before receiving it may occur twice.
     """
     t_ns = [message["t_ns"] for message in record.all("drone/drone1/truth")]
     assert t_ns == list(range(0, record.end()["last_ns"] + 1, GATE_NS))
     for key in [*record.keys()]:
-        if not key.startswith(("process/", "view/")):  # who is started again counts its own messages anew
+        if not key.startswith(("process/", "view/")):  # a restarted process numbers its messages from 0 again
             by_number: dict[int, dict[str, Any]] = {}
             for message in record.all(key):
                 assert by_number.setdefault(message["seq"], message) == message, key
@@ -220,7 +222,7 @@ def check_whole(record: Record) -> None:
 
 
 @pytest.mark.parametrize("pace", [4, pytest.param(1000, marks=pytest.mark.soak)])
-def test_a_recorder_that_is_killed_again_and_again_leaves_no_gap(
+def test_repeated_kills_of_the_recorder_leave_no_gap(
     federation: Federation, undisturbed: dict[str, np.ndarray], pace: int
 ) -> None:
     flight = Flight(federation, "--rate", str(pace))
@@ -238,8 +240,10 @@ def test_a_recorder_that_is_killed_again_and_again_leaves_no_gap(
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.soak), signal.SIGKILL])
 @pytest.mark.soak
-def test_a_recorder_that_ends_just_before_the_run(federation: Federation, number: signal.Signals) -> None:
-    """The last gates are written by the one in its place, or the run has failed, and says why."""
+def test_a_recorder_that_dies_near_the_end_is_replaced_or_fails_the_run(
+    federation: Federation, number: signal.Signals
+) -> None:
+    """Either its replacement writes the last gates, or the run fails and says why."""
     run = federation.run(PAIR, "--rate", "4", "--duration", "8")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= LATE_NS)
     federation.kill("recorder", number)
@@ -258,8 +262,8 @@ def test_a_recorder_that_ends_just_before_the_run(federation: Federation, number
 
 @pytest.mark.soak
 @pytest.mark.parametrize("pace", [("--realtime",), ("--rate", "4")])
-def test_a_recorder_that_is_stopped_just_before_the_end(federation: Federation, pace: tuple[str, ...]) -> None:
-    """It never goes on: the run has failed by what its record lacks, and nobody ends in another way for it."""
+def test_a_recorder_stopped_just_before_the_end_fails_the_run(federation: Federation, pace: tuple[str, ...]) -> None:
+    """It never continues: the run fails because its record is incomplete, and every other process ends normally."""
     run = federation.run(PAIR, *pace, "--duration", "8")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= LATE_NS)
     federation.kill("recorder", signal.SIGSTOP)
@@ -272,8 +276,8 @@ def test_a_recorder_that_is_stopped_just_before_the_end(federation: Federation, 
 
 
 @pytest.mark.soak
-def test_a_world_that_was_frozen(federation: Federation) -> None:
-    """For longer than any reader's link lives; what of it the recorder missed it asks for."""
+def test_a_frozen_world_leaves_no_gap_in_the_record(federation: Federation) -> None:
+    """The freeze outlasts the lease of every link; the recorder requests the gates that it has missed."""
     flight = Flight(federation)
     federation.kill("world", signal.SIGSTOP)
     federation.role("echo", "clock", "--wait", str(FROZEN_S)).ends(with_code=2, within_s=2 * PATIENCE_S)
@@ -284,8 +288,8 @@ def test_a_world_that_was_frozen(federation: Federation) -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("name", ["world", "recorder"])
-def test_gates_that_nobody_has_any_more_are_missed_aloud(federation: Federation, name: str) -> None:
-    """In realtime nobody waits: a recorder, or a world, that was stopped for long may cost gates, and these are named."""
+def test_lost_gates_are_reported(federation: Federation, name: str) -> None:
+    """Realtime does not wait, so a long stop of the recorder or the world may lose gates, which must be reported."""
     run = federation.run(PAIR, "--realtime", "--duration", "40")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= ENGAGED_NS // 6)
     federation.kill(name, signal.SIGSTOP)
@@ -303,8 +307,8 @@ def test_gates_that_nobody_has_any_more_are_missed_aloud(federation: Federation,
 
 
 @pytest.mark.soak
-def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federation: Federation) -> None:
-    """What was lost with the former one is a miss or two of each agent, not one at every gate after it."""
+def test_a_restarted_realtime_world_does_not_count_lost_time_as_misses(federation: Federation) -> None:
+    """The time lost by the death counts as one or two misses per agent, not as one at every later gate."""
     run = federation.run(PAIR, "--realtime", "--rate", "2", "--duration", "16")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= ENGAGED_NS // 2)
     federation.kill("world")
@@ -312,7 +316,7 @@ def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federat
     run.ends(with_code=0)
     end = federation.record().end()
     assert end["sim_s"] == pytest.approx(end["last_ns"] / 1e9)
-    assert max(end["deadline_misses_by"].values()) < 400  # of 800 gates, some 650 of them after the death
+    assert max(end["deadline_misses_by"].values()) < 400  # out of 800 gates, about 650 of them after the death
 
 
 @pytest.mark.parametrize(
@@ -322,10 +326,10 @@ def test_a_world_that_was_restarted_in_realtime_counts_only_its_own_time(federat
         pytest.param(STEP, (30.0, 40.0, 50.0), 70.0, id="Test 1", marks=pytest.mark.soak),
     ],
 )
-def test_in_realtime_the_formation_flies_on_as_without_the_deaths(
+def test_a_realtime_formation_keeps_its_path_despite_deaths(
     federation: Federation, tmp_path: Path, scenario: str, kills_s: tuple[float, ...], end_s: float
 ) -> None:
-    """A controller, an estimator and the world, one after the other, on the way to a target."""
+    """A controller, an estimator and the world are killed in turn while the formation moves to a target."""
     run = federation.run(scenario, "--realtime", "--duration", str(end_s))
     clock = federation.client().subscribe("clock")
     for name, at_s in zip(("controller.main", "estimator.drone1", "world"), kills_s, strict=True):
@@ -344,7 +348,7 @@ def test_in_realtime_the_formation_flies_on_as_without_the_deaths(
 
 
 @pytest.mark.soak
-def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
+def test_the_death_of_a_world_that_is_not_to_be_restarted_ends_the_run(federation: Federation) -> None:
     flight = Flight(federation, "--set", "processes.on_death={world: end}")
     federation.kill("world")
     flight.run.line("world .*signal 9")
@@ -360,7 +364,9 @@ def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
         pytest.param("kill -9 of everything, of the launcher when the world is back", marks=pytest.mark.soak),
     ],
 )
-def test_an_interrupted_run_goes_on(federation: Federation, undisturbed: dict[str, np.ndarray], how: str) -> None:
+def test_an_interrupted_run_can_be_continued(
+    federation: Federation, undisturbed: dict[str, np.ndarray], how: str
+) -> None:
     flight = Flight(federation)
     if how == "Ctrl-C":
         flight.run.signal(signal.SIGINT)
@@ -386,7 +392,7 @@ def test_an_interrupted_run_goes_on(federation: Federation, undisturbed: dict[st
         assert np.array_equal(record.positions(drone)[: len(wanted)], wanted)
 
 
-def test_launcher(federation: Federation) -> None:
+def test_the_death_of_the_launcher_ends_the_run(federation: Federation) -> None:
     flight = Flight(federation)
     flight.run.signal(signal.SIGKILL)
     end = flight.events.until(lambda m: m["kind"] == "end")
@@ -397,7 +403,7 @@ def test_launcher(federation: Federation) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.soak)])
-def test_interrupt(federation: Federation, number: signal.Signals) -> None:
+def test_an_interrupt_ends_the_run_with_a_complete_record(federation: Federation, number: signal.Signals) -> None:
     flight = Flight(federation)
     flight.run.signal(number)
     flight.run.ends(with_code=130)
@@ -409,7 +415,7 @@ def test_interrupt(federation: Federation, number: signal.Signals) -> None:
 @pytest.mark.parametrize(
     "options", [("--in-process",), pytest.param((), marks=pytest.mark.soak)], ids=["one process", "processes"]
 )
-def test_a_terminal_that_is_closed(federation: Federation, options: tuple[str, ...]) -> None:
+def test_closing_the_terminal_ends_the_run(federation: Federation, options: tuple[str, ...]) -> None:
     where = options or ("--listen", federation.endpoint)
     command = ["run", federation.write(PAIR), "--out", str(federation.out), "--duration", "100000", *where]
     run = federation.start(*command, prefix=("env", "--default-signal=HUP"))  # the tests may run under nohup
@@ -427,8 +433,8 @@ def test_a_terminal_that_is_closed(federation: Federation, options: tuple[str, .
 @pytest.mark.parametrize(
     "options", [pytest.param(("--in-process",), marks=pytest.mark.soak), ()], ids=["one process", "processes"]
 )
-def test_a_pipe_that_nobody_reads_any_more(federation: Federation, tmp_path: Path, options: tuple[str, ...]) -> None:
-    """As in `zsim run … 2>&1 | head`: whoever reads leaves in flight."""
+def test_a_broken_output_pipe_ends_the_run(federation: Federation, tmp_path: Path, options: tuple[str, ...]) -> None:
+    """As in `zsim run … 2>&1 | head`, the reader exits during the flight."""
     where = options or ("--listen", federation.endpoint)
     command = ["run", federation.write(PAIR), "--out", str(federation.out), "--duration", "100000", *where]
     code = tmp_path / "code"
@@ -443,7 +449,7 @@ def test_a_pipe_that_nobody_reads_any_more(federation: Federation, tmp_path: Pat
 
 
 @pytest.mark.soak
-def test_interrupt_while_time_stands(federation: Federation) -> None:
+def test_an_interrupt_ends_a_run_whose_time_has_stopped(federation: Federation) -> None:
     flight = Flight(federation)
     federation.kill("estimator.drone2", signal.SIGSTOP)
     flight.stands_for("estimator.drone2")
@@ -453,7 +459,7 @@ def test_interrupt_while_time_stands(federation: Federation) -> None:
 
 
 @pytest.mark.soak
-def test_two_interrupts(federation: Federation) -> None:
+def test_a_second_interrupt_ends_a_run_with_a_frozen_world(federation: Federation) -> None:
     flight = Flight(federation)
     federation.kill("world", signal.SIGSTOP)
     flight.run.signal(signal.SIGINT)
@@ -463,7 +469,7 @@ def test_two_interrupts(federation: Federation) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.soak)])
-def test_a_run_that_is_told_to_end_before_it_has_loaded(
+def test_a_run_can_be_interrupted_while_it_loads(
     federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "nothing_is_compiled"))
@@ -473,4 +479,4 @@ def test_a_run_that_is_told_to_end_before_it_has_loaded(
     run.ends(with_code=130)
     assert re.search(f"ended: .*{REASONS[number]}", run.text())
     federation.nobody_left()
-    assert [path.name for path in federation.out.iterdir()] == ["scenario.yaml"]  # nothing flew: it may be used again
+    assert [path.name for path in federation.out.iterdir()] == ["scenario.yaml"]  # the folder can be reused

@@ -1,4 +1,4 @@
-"""The lab itself: its hosts are reached over ssh, a cut is a cut, a slow link is as slow as said, nothing is left."""
+"""The lab of hosts itself: SSH to the hosts, cut links, slow links and cleaning up."""
 
 import asyncio
 import itertools
@@ -20,12 +20,12 @@ from zsim_deploy import inventory
 from zsim_deploy.hosts.host_link import HostLink
 
 PORT = 9000
-SOON_S, LATE_S = 120.0, 0.4  # an answer that must come, one that must not
-BATCH = 50  # datagrams under way together; any socket's buffer has room for twice as many
+SOON_S, LATE_S = 120.0, 0.4  # timeouts for an expected and for an unexpected answer
+BATCH = 50  # datagrams in transit at once; the buffer of any socket holds twice as many
 
 
 def over_ssh(lab: Lab, command: str) -> dict[str, str]:
-    """Return what a line of shell prints on each host, connected from the launcher."""
+    """Run a shell command on each host from the launcher; return each output."""
     placed = inventory.load(lab.inventory({"world": lab.names[0]}))
 
     async def one(name: str) -> str:
@@ -43,7 +43,7 @@ def over_ssh(lab: Lab, command: str) -> dict[str, str]:
 
 
 def udp(lab: Lab, name: str) -> socket.socket:
-    """Return a socket in the network of a host."""
+    """Return a UDP socket bound in a host's network namespace."""
     with lab.inside(name):
         made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
@@ -52,14 +52,14 @@ def udp(lab: Lab, name: str) -> socket.socket:
 
 
 class Echo:
-    """Asks a host for answers from another."""
+    """Measures round trips from one host to another."""
 
     def __init__(self, here: socket.socket, address: str) -> None:
         self._here, self._there = here, (address, PORT)
         self._count = itertools.count()
 
     def round_trip_s(self, within_s: float = SOON_S) -> float | None:
-        """Return how long an answer took; None if there was none."""
+        """Return the time that an answer took, or None if none came in time."""
         question = str(next(self._count)).encode()
         self._here.settimeout(within_s)
         start_s = time.monotonic()
@@ -74,7 +74,7 @@ class Echo:
 
 @contextmanager
 def echo(lab: Lab, name: str, from_: str = LAUNCHER) -> Iterator[Echo]:
-    """Let a host answer another's datagrams."""
+    """Let a host echo the datagrams of another."""
 
     def answer() -> None:
         while (came := there.recvfrom(100))[0] != b"end":
@@ -92,7 +92,7 @@ def echo(lab: Lab, name: str, from_: str = LAUNCHER) -> Iterator[Echo]:
 
 
 def udp_end(lab: Lab, name: str) -> socket.socket:
-    """Return a socket on the host itself: its loopback is never cut."""
+    """Return a UDP socket on the host itself, whose loopback is never cut."""
     with lab.inside(name):
         return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
@@ -108,13 +108,13 @@ def test_a_failing_command_is_one_line_with_its_host(lab: Lab) -> None:
         over_ssh(lab, "nosuch")
 
 
-def test_variables_reach_what_is_started_on_a_host_and_only_there(lab: Lab) -> None:
+def test_environment_variables_are_set_on_their_host_only(lab: Lab) -> None:
     lab.environment("h2", ZSIM_WORD="two words")
     assert over_ssh(lab, "echo $ZSIM_WORD") == {"h1": "", "h2": "two words", "h3": ""}
     assert lab.run("h2", "printenv", "ZSIM_WORD").stdout == "two words\n"
 
 
-def test_a_cut_parts_a_host_from_all_others_until_it_is_healed(lab: Lab) -> None:
+def test_a_cut_isolates_a_host_until_it_is_healed(lab: Lab) -> None:
     with echo(lab, "h1") as other, echo(lab, "h2", from_="h3") as cut:
         assert cut.round_trip_s() is not None
         lab.cut("h2")
@@ -124,7 +124,7 @@ def test_a_cut_parts_a_host_from_all_others_until_it_is_healed(lab: Lab) -> None
         assert cut.round_trip_s() is not None
 
 
-def test_a_slow_link_has_its_delay_both_ways(lab: Lab) -> None:
+def test_a_slow_link_delays_both_directions(lab: Lab) -> None:
     least_s = 2 * 0.040
     with echo(lab, "h3") as link:
         lab.slow("h3", 50, 10)
@@ -143,7 +143,7 @@ def test_a_slow_link_can_be_cut(lab: Lab) -> None:
         assert link.round_trip_s() is not None
 
 
-def test_a_slow_link_loses_its_share_and_keeps_the_order(lab: Lab) -> None:
+def test_a_slow_link_loses_its_share_and_preserves_the_order(lab: Lab) -> None:
     sent, share = 2000, 0.1
     lab.slow("h1", 20, 20, share)
     with udp(lab, "h1") as there, udp(lab, LAUNCHER) as here:
@@ -153,7 +153,7 @@ def test_a_slow_link_loses_its_share_and_keeps_the_order(lab: Lab) -> None:
 
 
 def carried(here: socket.socket, there: socket.socket, count: int) -> list[int]:
-    """Send numbers in batches, each when something of the one before is there, and return what comes."""
+    """Send numbers in batches, each once part of the previous batch has arrived; return those received."""
     came: list[int] = []
     there.settimeout(SOON_S)
     for first in range(0, count, BATCH):
@@ -164,7 +164,7 @@ def carried(here: socket.socket, there: socket.socket, count: int) -> list[int]:
     return came
 
 
-def test_processes_of_zsim_are_seen_on_their_host_only(lab: Lab) -> None:
+def test_zsim_processes_are_listed_on_their_host_only(lab: Lab) -> None:
     nowhere = f"tcp/{lab.address('h1')}:7447"
     with closing(Role(["estimator", "drone1", "--connect", nowhere, "--insecure"], lab.prefix("h2"))) as role:
         role.line("waiting for a world")
@@ -179,18 +179,18 @@ def test_nothing_is_left_of_a_lab_when_a_test_fails(tmp_path: Path) -> None:
         made.slow("b", 10)
         over_ssh(made, "nohup sleep 600 >/dev/null 2>&1 & echo started")
         running = inhabitants(made)
-        assert len(running) >= 2 * 2 + 1  # an sshd and a sleep on each host, a link's process
+        assert len(running) >= 2 * 2 + 1  # an sshd and a sleep on each host, and one process for the link
         raise ZeroDivisionError
     assert all(wait_gone(pid, 0.0) for pid in running)
     assert not any((namespaces.FOLDER / namespace).exists() for namespace in made.namespaces())
 
 
 def inhabitants(lab: Lab) -> list[int]:
-    """Return the ids of all processes of a lab."""
+    """Return the process ids of a lab."""
     return [pid for namespace in lab.namespaces() for pid, _ in namespaces.members(namespace)]
 
 
-def test_labs_side_by_side_do_not_meet(lab: Lab, tmp_path: Path) -> None:
+def test_concurrent_labs_are_isolated(lab: Lab, tmp_path: Path) -> None:
     with Lab(tmp_path / "other", ("h1",)) as other:
         other.cut("h1")
         with echo(lab, "h1") as link:
@@ -198,7 +198,7 @@ def test_labs_side_by_side_do_not_meet(lab: Lab, tmp_path: Path) -> None:
     assert over_ssh(lab, "true") == dict.fromkeys(lab.names, "")
 
 
-def test_a_machine_without_the_tools_skips_but_fails_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_tools_skip_a_test_but_fail_it_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lab_module, "TOOLS", {"no-such-tool": "no-such-package"})
     monkeypatch.setattr(lab_module.os, "geteuid", lambda: 0)
     wanted = "a lab of hosts needs no-such-package; apt-get install it"

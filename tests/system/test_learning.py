@@ -1,4 +1,4 @@
-"""stable-baselines3 trains the policy of examples/train_policy.py, which then flies as an agent to the same bits."""
+"""stable-baselines3 trains the policy of examples/train_policy.py, which then flies the same bits as an agent."""
 
 import os
 import subprocess
@@ -11,7 +11,7 @@ import zsim
 
 pytestmark = pytest.mark.soak
 STEPS = 20_000
-JUDGED = range(20)  # seeds of episodes
+JUDGED = range(20)  # seeds of the evaluation episodes
 
 
 def test_a_policy_learns_and_flies_as_an_agent(tmp_path: Path) -> None:
@@ -24,7 +24,7 @@ def test_a_policy_learns_and_flies_as_an_agent(tmp_path: Path) -> None:
     model.learn(STEPS)
     after = train_policy.episode_rewards(model, JUDGED).mean()
     print(f"mean reward of an episode: {before:.1f} before, {after:.1f} after {STEPS} steps")
-    assert after > before / 2  # both are negative: less than half as far from home
+    assert after > before / 2  # both are negative: less than half the distance from home
 
     env = train_policy.home_env()
     train_policy.flown(model, env, seed=100)

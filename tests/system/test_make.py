@@ -1,4 +1,4 @@
-"""What `make` runs is taken by pytest as it stands in the Makefile."""
+"""pytest accepts the commands of the Makefile."""
 
 import shlex
 import subprocess
@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MARKED = "tests/system/test_sweep.py"  # holds a group, soaks and others
+MARKED = "tests/system/test_sweep.py"  # contains a group, soak tests and others
 
 
 @pytest.mark.parametrize("target", ["test", pytest.param("soak", marks=pytest.mark.soak)])
-def test_its_tests_are_found(target: str) -> None:
+def test_make_targets_find_their_tests(target: str) -> None:
     printed = subprocess.run(
         ["make", "-n", "--no-print-directory", target], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout

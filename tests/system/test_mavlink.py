@@ -1,4 +1,4 @@
-"""Unmodified programs fly drones through `zsim mavlink serve`: MAVSDK, DroneKit, MAVProxy, node-mavlink."""
+"""Unmodified programs fly drones through `zsim mavlink serve`: MAVSDK, DroneKit, MAVProxy and node-mavlink."""
 
 import random
 import socket
@@ -27,17 +27,18 @@ processes: {{expect: []}}
 """
 PACE = ("--rate", "2")
 ASKED_MAX = 60
-LEAST_READ = 0.95  # of what is sent on UDP to a busy process
+LEAST_READ = 0.95  # share of the UDP datagrams sent to a busy process
 KEY = bytes(range(32))
 FRAMES, FRAMES_SOAK = 20_000, 1_000_000
-CHUNK = 50  # datagrams that a socket takes before they are read
+CHUNK = 50  # datagrams that fit into a socket's buffer
 
 
 class Vehicles:
-    """The drones of a run, offered once by a personality.
+    """The drones of a run as vehicles of one autopilot.
 
     Attributes:
-        gcs, api: port of the ground station, and of the first program; gcs_local, api_local: first ports of the vehicles.
+        gcs, api: Ports of the ground station and of the first program.
+        gcs_local, api_local: First ports of the vehicles for each.
     """
 
     def __init__(self, federation: Federation, name: str, *options: str) -> None:
@@ -51,7 +52,7 @@ class Vehicles:
 
 
 class Fleet:
-    """A run whose drones are vehicles of both autopilots."""
+    """A run whose drones are served as vehicles of both autopilots."""
 
     def __init__(self, federation: Federation) -> None:
         self.federation = federation
@@ -61,17 +62,16 @@ class Fleet:
         self.client: Client = federation.client()
         self.commands = self.client.subscribe("drone/*/cmd/*")
         self._programs: list[Program] = []
-        ports = [str(self.px4.api + i) for i in range(2)]  # beside the other programs: they take their time
+        ports = [str(self.px4.api + i) for i in range(2)]  # concurrently with the other programs, as they take long
         self.mavsdk = self.keep(programs.python("mavsdk_square.py", *ports))
         self.dronekit = self.keep(programs.python("dronekit_goto.py", f"udp:127.0.0.1:{self.ardupilot.api + 2}"))
 
     def keep(self, program: Program) -> Program:
-        """Return a program, which ends with the fleet."""
+        """Register a program to be ended with the fleet, and return it."""
         self._programs.append(program)
         return program
 
     def close(self) -> None:
-        """End the programs."""
         for program in self._programs:
             program.close()
 
@@ -79,7 +79,7 @@ class Fleet:
         return self.client.get(f"drone/{drone}/truth")[f"drone/{drone}/truth"]
 
     def refused(self) -> int:
-        """Return how much the vehicles of PX4 have refused so far."""
+        """Return the number of frames that the PX4 vehicles have refused so far."""
         health = self.client.subscribe("process/mavlink.px4/health")
         return health.until(lambda _: True).message["refused"]
 
@@ -89,7 +89,7 @@ class Fleet:
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Fleet]:
-    """A run that the tests of this file share, each with drones of its own."""
+    """A run shared by the tests of this file, each with its own drones."""
     with Federation(tmp_path_factory.mktemp("mavlink")) as federation:
         fleet = Fleet(federation)
         try:
@@ -106,7 +106,7 @@ def test_node_mavlink_arms_takes_off_and_lands(fleet: Fleet) -> None:
     assert {"HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT", "SYS_STATUS"} <= set(seen["messages"])
 
 
-def test_mavproxy_flies_by_what_a_pilot_types(fleet: Fleet, tmp_path: Path) -> None:
+def test_mavproxy_flies_by_typed_commands(fleet: Fleet, tmp_path: Path) -> None:
     port = fleet.ardupilot.api + 3
     pilot = fleet.keep(programs.mavproxy(tmp_path, f"--master=udpin:127.0.0.1:{port}"))
     pilot.line("Received [0-9]+ parameters")
@@ -135,7 +135,7 @@ def test_mavsdk_flies_two_vehicles_at_once_offboard(fleet: Fleet) -> None:
         assert abs(x - (0.0 if drone == "drone1" else 12.0)) < 1.5
 
 
-def test_dronekit_goes_somewhere_and_flies_a_mission(fleet: Fleet) -> None:
+def test_dronekit_flies_to_a_point_and_a_mission(fleet: Fleet) -> None:
     flight = fleet.dronekit.result()
     assert flight["parameters"] == {"SYSID_THISMAV": 3.0, "WPNAV_SPEED": 500.0}
     assert abs(flight["north_m"] - 4.4) < 0.8
@@ -145,7 +145,7 @@ def test_dronekit_goes_somewhere_and_flies_a_mission(fleet: Fleet) -> None:
 
 
 def malformed(rng: random.Random, link: Link) -> bytes:
-    """Return a datagram that is no frame, a cut or a changed one, or one of random bytes behind a good checksum."""
+    """Return random bytes, a truncated frame, a frame with a flipped bit, or random bytes after a start byte."""
     good = link.pack(dialect.CommandLong(param1=1.0, command=400, target_system=6, target_component=1))
     kind = rng.randrange(4)
     if kind == 0:
@@ -159,7 +159,7 @@ def malformed(rng: random.Random, link: Link) -> bytes:
 
 
 def flood(fleet: Fleet, count: int) -> None:
-    """Send malformed frames to both ports of a vehicle: all are counted, it lives, its drone has been sent nothing."""
+    """Send malformed frames to both ports of a vehicle; check that it counts them, survives and sends no command."""
     rng, link = random.Random(17), Link(255, 190)
     ports = (fleet.px4.gcs_local + DRONES - 1, fleet.px4.api_local + DRONES - 1)
     before = fleet.refused()
@@ -176,7 +176,7 @@ def flood(fleet: Fleet, count: int) -> None:
 
 
 def until_answered(sender: socket.socket, link: Link, port: int) -> None:
-    """Ask for a version until the answer comes: what was sent before has then been read, or lost by a full buffer."""
+    """Request the version until it arrives: everything sent earlier has then been read, or lost in a full buffer."""
     parser = Parser()
     ask = link.pack(dialect.CommandLong(param1=148.0, command=512, target_system=6, target_component=1))
     for _ in range(ASKED_MAX):
@@ -198,7 +198,7 @@ def test_a_million_malformed_frames_are_counted_and_nothing_flies(fleet: Fleet) 
     flood(fleet, FRAMES_SOAK)
 
 
-def test_with_a_key_only_signed_messages_are_obeyed(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_signing_key_admits_only_signed_messages(fleet: Fleet, tmp_path: Path) -> None:
     (tmp_path / "key").write_bytes(KEY)
     vehicles = Vehicles(fleet.federation, "signed", "--signing-key", str(tmp_path / "key"))
     port = vehicles.api_local + DRONES - 1
@@ -220,7 +220,7 @@ def test_with_a_key_only_signed_messages_are_obeyed(fleet: Fleet, tmp_path: Path
 
 
 def theirs_timestamp(parser: Parser) -> int:
-    """Return the time of the vehicle's clock, as its signatures have it."""
+    """Return the timestamp of the vehicle's latest signature."""
     assert parser._signing is not None
     return parser._signing.timestamp
 

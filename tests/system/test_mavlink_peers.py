@@ -1,4 +1,4 @@
-"""On an address that other hosts reach, the program that was named is obeyed, and nobody else; so with keys."""
+"""MAVLink vehicles obey only the configured peer on an address open to other hosts, and only the right key."""
 
 import math
 import socket
@@ -16,7 +16,7 @@ from wire import PATIENCE_S
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import Link, Parser, Received
 
-PROGRAM, VEHICLE = 14540, 14580  # ports of the first program, and of the first vehicle
+PROGRAM, VEHICLE = 14540, 14580  # ports of the first program and of the first vehicle
 ARM, TAKE_OFF = 400, 22
 ACCEPTED = 0
 PACE = ("--rate", "1", "--duration", "600")
@@ -24,7 +24,7 @@ KEYS = {"theirs": bytes(range(32)), "another": bytes(32)}
 
 
 def commands() -> Iterator[bytes]:
-    """Yield the frames that arm the first vehicle and let it take off to its own height."""
+    """Yield frames that arm the first vehicle and make it take off to its default height."""
     link = Link(255, 190)
     for command in (ARM, TAKE_OFF):
         target = {"command": command, "target_system": 1, "target_component": 1}
@@ -32,12 +32,12 @@ def commands() -> Iterator[bytes]:
 
 
 def results(frames: list[Received]) -> list[int]:
-    """Return what commands were answered with."""
+    """Return the results of the acknowledged commands."""
     messages: list[Any] = [each.message for each in frames]
     return [message.result for message in messages if isinstance(message, dialect.CommandAck)]
 
 
-def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federation) -> None:
+def test_only_the_configured_peer_may_fly(lab: Lab, federation: Federation) -> None:
     here, scenario = lab.prefix("h1"), federation.write(ONE)
     federation.start("world", scenario, "--listen", federation.endpoint, *PACE, prefix=here)
     where = ("--listen", lab.address("h1"), "--api", f"{lab.address('h2')}:{PROGRAM}")
@@ -62,7 +62,7 @@ def test_a_stranger_flies_nothing_and_the_peer_does(lab: Lab, federation: Federa
 
 @pytest.mark.soak
 @pytest.mark.parametrize("key", KEYS)
-def test_a_driver_arms_a_vehicle_of_its_own_key_alone(federation: Federation, tmp_path: Path, key: str) -> None:
+def test_a_driver_arms_only_a_vehicle_with_its_own_key(federation: Federation, tmp_path: Path, key: str) -> None:
     for name, data in KEYS.items():
         (tmp_path / name).write_bytes(data)
     api, gcs, local = free_udp_ports(2), free_udp_ports(1), free_udp_ports(4)

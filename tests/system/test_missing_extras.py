@@ -1,4 +1,4 @@
-"""What a person types who has installed zsim without extras: each command says which one it needs, in a line."""
+"""Without extras, each command reports in one line which of them it needs."""
 
 import json
 import subprocess
@@ -39,7 +39,7 @@ for number, words in enumerate(commands):
     print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
 INVENTORY = "hosts: {a: {address: 127.0.0.1}}\nroles: {world: a, recorder: a, 'estimator.*': a, 'controller.*': a}\n"
-# command, and extras that it names; {run} is the folder of a run, {hosts} an inventory, {new} a folder that is not there
+# command, extras that it must report; {run}: folder of a run, {hosts}: an inventory, {new}: a missing folder
 COMMANDS = [
     (["run", STEP, "--out", "{new}"], "agents,report,world"),
     (["run", STEP, "--out", "{new}", "--in-process", "--no-report"], "agents,record,world"),
@@ -69,8 +69,8 @@ COMMANDS = [
 ]
 
 
-def test_a_command_without_its_extra_says_what_to_type(tmp_path: Path) -> None:
-    """Each command is forked from one Python in which there is no package that an extra brings."""
+def test_a_command_without_its_extra_says_how_to_install_it(tmp_path: Path) -> None:
+    """Each command is forked from one Python that finds none of the packages of the extras."""
     (tmp_path / "hosts.yaml").write_text(INVENTORY)
     (tmp_path / "run").mkdir()
     write(tmp_path / "run" / "run.mcap", Flown())
@@ -88,6 +88,6 @@ def test_a_command_without_its_extra_says_what_to_type(tmp_path: Path) -> None:
     assert not new.exists()
 
 
-def test_each_module_is_of_an_extra() -> None:
+def test_every_optional_module_belongs_to_a_known_extra() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(EXTRA_OF.values()) <= set(extras)

@@ -1,4 +1,4 @@
-"""In a notebook: classes of a cell fly, progress is one line below the cell, and an interrupt keeps the record."""
+"""Runs in a notebook: classes defined in cells, one line of progress, tracebacks and interrupts."""
 
 import queue
 import re
@@ -16,7 +16,7 @@ pytest.importorskip("ipykernel", reason="ipykernel is not installed")
 
 
 class Notebook:
-    """A kernel whose cells are run one after the other."""
+    """A kernel that runs cells one at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.manager = jupyter_client.KernelManager(kernel_name="python3")
@@ -26,8 +26,8 @@ class Notebook:
         self.client.wait_for_ready(timeout=PATIENCE_S)
 
     def messages(self, code: str) -> Iterator[dict[str, Any]]:
-        """Run a cell; yield what the kernel says until it is through."""
-        asked = self.client.execute(dedent(code), stop_on_error=False)  # else it aborts what comes soon after
+        """Run a cell; yield the kernel's messages until the cell has finished."""
+        asked = self.client.execute(dedent(code), stop_on_error=False)  # or an error would abort later cells
         while True:
             try:
                 said = self.client.get_iopub_msg(timeout=PATIENCE_S)
@@ -40,7 +40,7 @@ class Notebook:
             yield said
 
     def run(self, code: str) -> str:
-        """Run a cell; return what it prints; fails where it raises."""
+        """Run a cell and return what it prints; fail if it raises."""
         text = ""
         for said in self.messages(code):
             if said["msg_type"] == "error":
@@ -56,7 +56,7 @@ class Notebook:
 
 @pytest.fixture(scope="module")
 def notebook(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Notebook]:
-    """One kernel for all tests: each starts with the cells that it needs, and has folders of its own."""
+    """A kernel shared by all tests, each of which runs the cells that it needs and uses its own folders."""
     folder = tmp_path_factory.mktemp("notebook")
     (folder / "pair.yaml").write_text(PAIR)
     made = Notebook(folder)
@@ -78,14 +78,14 @@ FAILS = False
 """
 
 
-def test_a_class_of_a_cell_flies_here_and_as_processes(notebook: Notebook) -> None:
+def test_an_agent_class_of_a_cell_flies_in_the_kernel_and_as_processes(notebook: Notebook) -> None:
     notebook.run(CELL)
     said = [*notebook.messages("run = zsim.run('pair.yaml', agents=[Lander], out='here')\nrun")]
     shown = [each["content"]["data"] for each in said if "data" in each["content"]]
     assert "<table>" in shown[-1]["text/html"]
     assert sum(each["msg_type"] == "display_data" for each in said) == 1
     assert not [each for each in said if each["msg_type"] == "error"]
-    assert " 12.0 / 12 s " in shown[-2]["text/plain"]  # where the line has come to
+    assert " 12.0 / 12 s " in shown[-2]["text/plain"]  # the last state of the line
     said = [*notebook.messages("many = zsim.run('pair.yaml', agents=[Lander], out='many', processes=True)")]
     assert not [each for each in said if each["msg_type"] == "error"]
     printed = "".join(each["content"]["text"] for each in said if each["msg_type"] == "stream")
@@ -100,7 +100,7 @@ def test_a_class_of_a_cell_flies_here_and_as_processes(notebook: Notebook) -> No
     assert notebook.run("print(many.truth_sha256 == run.truth_sha256)") == "True\n"
 
 
-def test_what_a_cell_does_wrong_is_shown_with_its_line(notebook: Notebook) -> None:
+def test_an_error_in_an_agent_of_a_cell_is_shown_with_its_line(notebook: Notebook) -> None:
     notebook.run(CELL.replace("FAILS = False", "FAILS = True"))
     said = [*notebook.messages("zsim.run('pair.yaml', agents=[Lander], out='wrong', progress=False)")]
     before, error = said[-2:]
@@ -110,7 +110,7 @@ def test_what_a_cell_does_wrong_is_shown_with_its_line(notebook: Notebook) -> No
     assert notebook.run("print(zsim.load('wrong').duration_s >= 6)") == "True\n"
 
 
-def test_a_mistake_is_shown_with_the_user_s_own_lines_alone(notebook: Notebook) -> None:
+def test_a_traceback_shows_only_the_users_own_lines(notebook: Notebook) -> None:
     mistaken = """
         def flown():
             return zsim.Scenario.load('pair.yaml').with_(seed=-1).resolved
@@ -127,11 +127,11 @@ def test_a_mistake_is_shown_with_the_user_s_own_lines_alone(notebook: Notebook) 
 
 
 @pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.soak)])
-def test_an_interrupt_ends_a_flight_with_its_record_whole(notebook: Notebook, processes: bool) -> None:
+def test_an_interrupt_ends_a_flight_with_a_complete_record(notebook: Notebook, processes: bool) -> None:
     names, out, shown = [], f"interrupted-{processes}", 0
     for said in notebook.messages(f"zsim.run('pair.yaml', duration_s=1e5, out={out!r}, processes={processes})"):
         shown += said["msg_type"] == "update_display_data"
-        if shown == 1:  # a second one would not wait for the record
+        if shown == 1:  # only once: a second interrupt would not wait for the record
             notebook.manager.interrupt_kernel()
             shown += 1
         if said["msg_type"] == "error":

@@ -1,6 +1,6 @@
-"""The notebooks of docs/ run, and hold what a whole run of them shows.
+"""The notebooks in docs/ run, and contain the outputs of a full run.
 
-A cell of parameters has others in its metadata, `short`, with which the notebook takes seconds.
+The metadata of a cell of parameters has a replacement, `short`, with which the notebook takes only seconds.
 """
 
 import copy
@@ -11,13 +11,13 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
-PATIENCE_S = 1800  # wall seconds for a cell on a machine that does other work as well
-SIZE_MAX = 1_000_000  # bytes of a notebook, with its pictures
+PATIENCE_S = 1800  # wall time per cell on a busy machine
+SIZE_MAX = 1_000_000  # bytes per notebook, including pictures
 
 nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
 nbclient = pytest.importorskip("nbclient", reason="nbclient is not installed")
 pytest.importorskip("ipykernel", reason="ipykernel is not installed")
-SOAKED = ("2-own-estimator", "3-own-law", "4-train-a-policy")  # what they show has tests of its own
+SOAKED = ("2-own-estimator", "3-own-law", "4-train-a-policy")  # other tests cover what they show
 AT_ONCE = [pytest.param(each, marks=[pytest.mark.soak] if each.stem in SOAKED else []) for each in NOTEBOOKS]
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -32,12 +32,12 @@ def pictures(notebook: Any) -> list[int]:
 
 
 def executed(path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, short: bool) -> Any:
-    """Run a copy of a notebook in a folder as in this repository; CellExecutionError if a cell raises."""
+    """Run a copy of a notebook in a folder laid out like the repository. Raises CellExecutionError if a cell raises."""
     notebook = copy.deepcopy(nbformat.read(path, as_version=4))
     for cell in notebook.cells:
         if short and "short" in cell.metadata:
             cell.source = cell.metadata["short"]
-    monkeypatch.setenv("TMPDIR", str(folder))  # a kernel is killed in the end, and leaves what is temporary
+    monkeypatch.setenv("TMPDIR", str(folder))  # the kernel is killed and leaves its temporary files
     for name in ("scenarios", "examples"):
         (folder / name).symlink_to(ROOT / name)
     where = folder / "docs/notebooks"
@@ -48,7 +48,7 @@ def executed(path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, short: b
 
 
 @each_notebook
-def test_it_holds_what_a_whole_run_shows(path: Path) -> None:
+def test_a_notebook_contains_the_outputs_of_a_full_run(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     assert path.stat().st_size < SIZE_MAX
@@ -67,11 +67,11 @@ def test_it_holds_what_a_whole_run_shows(path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", AT_ONCE, ids=lambda each: each.stem)
-def test_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_runs_with_short_parameters(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert pictures(executed(path, tmp_path, monkeypatch, short=True)) == pictures(nbformat.read(path, as_version=4))
 
 
 @pytest.mark.soak
 @each_notebook
-def test_the_whole_of_it_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_runs_in_full(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert pictures(executed(path, tmp_path, monkeypatch, short=False)) == pictures(nbformat.read(path, as_version=4))

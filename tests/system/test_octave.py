@@ -23,16 +23,16 @@ SQUARE = ONE.replace("expect: []", "expect: [client.square]").replace("duration_
 ROUNDS = ONE.replace("expect: []", "expect: [round.trip]").replace("duration_s: 10", "duration_s: 3600")
 MATLAB = (ROOT / "examples" / "matlab" / "step_matlab.yaml").read_text()
 PYTHON = (ROOT / "scenarios" / "step.yaml").read_text()
-SHORT_S = 30  # engaged from 24 s on
-NEAR = 1e-9  # m, rad and their rates: only rounding differs; over all of Test 1 at most 1.4e-14 was measured
-TEST_1_S = 900.0  # wall time for all of Test 1 on a busy machine
-ROUND_TRIP_MS = 1.5  # median, goal
+SHORT_S = 30  # the formation engages at 24 s
+NEAR = 1e-9  # m, rad, m/s and rad/s: only rounding differs; the largest difference measured in Test 1 is 1.4e-14
+TEST_1_S = 900.0  # wall time for the whole of Test 1 on a busy machine
+ROUND_TRIP_MS = 1.5  # goal for the median
 ROUND_TRIPS = 2000
 
 
 @contextmanager
 def octave(code: str) -> Iterator["subprocess.Popen[str]"]:
-    """Code that runs beside the test."""
+    """Run code in Octave concurrently with the test."""
     with subprocess.Popen(command(code), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as it:
         yield it
         it.kill()
@@ -44,7 +44,7 @@ def client(gateway: GatewayProcess, code: str) -> list[str]:
     return run(f"{made} {code} c.close();").splitlines()
 
 
-# What a client can see and do
+# The client
 
 
 @pytest.fixture(scope="module")
@@ -55,15 +55,15 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayProcess
         yield GatewayProcess(federation).in_run()
 
 
-def test_it_knows_the_run(gateway: GatewayProcess) -> None:
+def test_a_client_describes_the_run(gateway: GatewayProcess) -> None:
     output = client(
         gateway, "printf('%s %s %s %g %s', c.name, c.run.federation, c.run.mode, c.run.gate_s, c.run.drones{:});"
     )
     assert output == ["client.octave zsim realtime 0.02 drone1"]
 
 
-def test_last_values(gateway: GatewayProcess) -> None:
-    """Sensors, truth and status as structs with rows; of an expression, all keys; of what is not there, nothing."""
+def test_last_values_are_structs_with_rows(gateway: GatewayProcess) -> None:
+    """Sensors, truth and status are structs with rows; an expression gives all its keys, a missing value is empty."""
     code = """
     c.subscribe('drone/drone1/sensor/gps'); c.next();  % the rarest sensor: the others have come before it
     imu = c.imu('drone1'); gps = c.gps('drone1'); truth = c.truth('drone1'); status = c.status('drone1');
@@ -80,8 +80,8 @@ def test_last_values(gateway: GatewayProcess) -> None:
     assert client(gateway, code) == ["running"]
 
 
-def test_a_stream_of_values(gateway: GatewayProcess) -> None:
-    """Every sample once, in order, those too that come while something else is asked for."""
+def test_a_subscription_delivers_every_sample_in_order(gateway: GatewayProcess) -> None:
+    """Every sample arrives once and in order, including those that arrive during another request."""
     code = """
     c.subscribe('drone/drone1/sensor/imu');
     first = c.next();
@@ -96,8 +96,8 @@ def test_a_stream_of_values(gateway: GatewayProcess) -> None:
     assert client(gateway, code) == ["0"]
 
 
-def test_it_flies_a_drone(gateway: GatewayProcess) -> None:
-    """Take-off, a velocity, landing; who flies it is this client; who is refused is told why."""
+def test_a_client_flies_a_drone(gateway: GatewayProcess) -> None:
+    """It takes off, flies at a velocity and lands as the drone's commander; refusals give the reason."""
     code = """
     c.takeoff();
     while ~strcmp(c.status('drone1').state, 'hovering'), pause(0.05); end
@@ -123,7 +123,7 @@ def test_it_flies_a_drone(gateway: GatewayProcess) -> None:
 
 
 def page_blocks(heading: str) -> list[str]:
-    """Return the indented blocks of code under a heading of the page, blank lines within them included."""
+    """Return the indented code blocks under a heading of the page."""
     page = (ROOT / "docs" / "matlab.md").read_text()
     (chapter,) = re.findall(rf"^## {heading}\n(.*?)(?=^## )", page, re.DOTALL | re.MULTILINE)
     return [
@@ -132,15 +132,15 @@ def page_blocks(heading: str) -> list[str]:
     ]
 
 
-def test_the_first_flight_of_the_page(gateway: GatewayProcess) -> None:
+def test_the_first_flight_in_the_documentation_works(gateway: GatewayProcess) -> None:
     (code,) = page_blocks("A first flight")
     output = run(code.replace("'127.0.0.1'", f"'127.0.0.1', 'Port', {gateway.lines_port}"))
     assert "accel_m_s2 =" in output
     assert len(re.findall(r"-?\d+\.\d+", output.splitlines()[-1])) == 3
 
 
-def test_the_lockstep_of_the_page(federation: Federation) -> None:
-    """It takes the drone to 1 m, and leaves; the world goes on."""
+def test_the_lockstep_example_in_the_documentation_works(federation: Federation) -> None:
+    """It takes the drone to 1 m and leaves; the world continues."""
     world = federation.world(
         ONE.replace("expect: []", "expect: [client.myctrl]").replace("duration_s: 10", "duration_s: 14")
     )
@@ -154,7 +154,7 @@ def test_the_lockstep_of_the_page(federation: Federation) -> None:
     world.ends(with_code=0)
 
 
-def test_the_page_names_methods_that_there_are() -> None:
+def test_the_documentation_names_exactly_the_public_methods() -> None:
     page = (ROOT / "docs" / "matlab.md").read_text()
     source = (CLIENT / "+zsim" / "Client.m").read_text()
     methods = set(re.findall(r"^        function (?:\S+ = |\[.*?\] = )?(\w+)\(", source, re.MULTILINE))
@@ -165,8 +165,8 @@ def test_the_page_names_methods_that_there_are() -> None:
 # The lockstep
 
 
-def test_the_first_example(federation: Federation) -> None:
-    """examples/matlab/fly_square.m flies its corners; the world waits for it from the start, and goes on after it."""
+def test_the_fly_square_example_visits_its_corners(federation: Federation) -> None:
+    """The world waits for examples/matlab/fly_square.m from the start and continues after it has left."""
     world = federation.world(SQUARE)
     events = federation.client().subscribe("world/event")
     gateway = GatewayProcess(federation).in_run()
@@ -179,7 +179,7 @@ def test_the_first_example(federation: Federation) -> None:
 
 
 def fly(federation: Federation, duration_s: float, within_s: float = PATIENCE_S) -> str:
-    """Fly examples/matlab/step_matlab.yaml with the controller in MATLAB, and report; return what that prints."""
+    """Fly examples/matlab/step_matlab.yaml with the controller in MATLAB; return the controller's output."""
     where = ("--out", str(federation.out), "--listen", federation.endpoint)
     flight = federation.start("run", federation.write(MATLAB), *where, "--duration", str(duration_s))
     gateway = GatewayProcess(federation).in_run()
@@ -192,7 +192,7 @@ def fly(federation: Federation, duration_s: float, within_s: float = PATIENCE_S)
 
 @contextmanager
 def python_flight(folder: Path, duration_s: float) -> Iterator[Federation]:
-    """Our own controller's flight of Test 1."""
+    """A flight of Test 1 with the Python controller."""
     with Federation(folder) as federation:
         options = ("--in-process", "--out", str(federation.out), "--duration", str(duration_s))
         federation.start("run", federation.write(PYTHON), *options).ends(with_code=0, within_s=TEST_1_S)
@@ -204,13 +204,15 @@ def states(federation: Federation) -> list[dict[str, Any]]:
 
 
 def apart(ours: list[dict[str, Any]], theirs: list[dict[str, Any]], field: str) -> float:
-    """Return the greatest difference of a list of numbers over all gates."""
+    """Return the largest difference of a field, a list of numbers, over all gates."""
     return float(np.abs(np.array([m[field] for m in ours]) - np.array([m[field] for m in theirs])).max())
 
 
 @pytest.mark.soak
-def test_the_controller_flies_as_ours_does(federation: Federation, tmp_path_factory: pytest.TempPathFactory) -> None:
-    """To engagement and 6 s on: the same phases at the same gates, the same estimates and references.
+def test_the_matlab_controller_agrees_with_the_python_controller(
+    federation: Federation, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Until 6 s after engagement, phases, estimates and references agree at every gate.
 
     world ── estimators ── zsim gateway ── octave (matlab.main)        world, estimators, controller.main
     """
@@ -229,12 +231,12 @@ def test_the_controller_flies_as_ours_does(federation: Federation, tmp_path_fact
 
 
 @pytest.mark.soak
-def test_the_controller_is_killed_and_started_again(federation: Federation) -> None:
-    """In flight; time stands meanwhile, as the scenario wants it.
+def test_a_restarted_matlab_controller_engages_again(federation: Federation) -> None:
+    """It is killed in flight; time stops meanwhile, as the scenario specifies.
 
         matlab.main ── engaged ── SIGKILL          matlab.main ── engaged ──▶ 32 s
 
-    Expected: the second one engages the formation that hovers, and the run ends well.
+    Expected: the second controller engages the hovering formation, and the run succeeds.
     """
     flight = federation.run(MATLAB, "--duration", "32")
     watcher = federation.client()
@@ -256,8 +258,8 @@ def test_the_controller_is_killed_and_started_again(federation: Federation) -> N
 
 
 @pytest.mark.soak
-def test_round_trips(federation: Federation) -> None:
-    """How long a control loop in Octave waits for the gateway on this machine."""
+def test_round_trips_take_no_longer_than_the_goal(federation: Federation) -> None:
+    """The time that a control loop in Octave waits for the gateway on this machine."""
     federation.world(ROUNDS)
     gateway = GatewayProcess(federation).in_run()
     figures = json.loads(run(f"round_trip({gateway.lines_port}, {ROUND_TRIPS})", within_s=120.0))

@@ -1,4 +1,4 @@
-"""Machines that let a process open few files: one line says how many there must be, and so many are enough."""
+"""Low limits on open files: one line reports how many a command needs, and that many are enough."""
 
 import re
 import subprocess
@@ -9,8 +9,8 @@ from federation import ONE, PAIR
 from forked_commands import ROOT, USER_FAULT, ZSIM
 from refused import has_terms
 
-PATIENCE_S = 120.0  # wall time in which a run of a simulated second ends, on a machine with much to do
-TOO_FEW = (10, 16, 24)  # of these one was a traceback, one a panic, and one hung
+PATIENCE_S = 120.0  # wall time for a run of 1 s of simulated time on a busy machine
+TOO_FEW = (10, 16, 24)  # unchecked limits that cause a traceback, a panic or a hang
 BRIEF = ONE.replace("expect: []", "expect: [estimator.drone1]").replace("duration_s: 10", "duration_s: 1")
 BRIEF_PAIR = PAIR.replace("duration_s: 12", "duration_s: 1")
 HOSTS = "hosts: {h1: {address: 192.0.2.1}}\nroles: {'*': h1}\nsecurity: {insecure: true}\n"
@@ -28,7 +28,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 
 
 def zsim(folder: Path, files: int, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run a command that may open so many files."""
+    """Run a command under a limit of `files` open files."""
     one, pair, out, hosts = (folder / name for name in ("one.yaml", "pair.yaml", "out", "hosts.yaml"))
     hosts.write_text(HOSTS)
     one.write_text(BRIEF)
@@ -39,11 +39,11 @@ def zsim(folder: Path, files: int, *arguments: str) -> "subprocess.CompletedProc
 
 
 def needed(folder: Path, name: str) -> int:
-    """Run a command with too few files; return the number that its line says, once the line is as it is to be."""
+    """Run a command with too few files, check the line that reports it, and return the number in it."""
     few = TOO_FEW[len(name) % len(TOO_FEW)]
     done = zsim(folder, few, *COMMANDS[name])
     assert done.returncode == USER_FAULT, done.stderr
-    line = done.stderr.splitlines()[-1]  # a sweep shows its progress before
+    line = done.stderr.splitlines()[-1]  # a sweep shows its progress first
     assert "Traceback" not in done.stderr
     said = re.search(r"must be (\d+) for", line)
     assert said is not None, line
@@ -52,17 +52,17 @@ def needed(folder: Path, name: str) -> int:
     return int(said[1])
 
 
-SESSIONS = ("an observer", "gateway", "console", "up")  # open a session as an agent does
+SESSIONS = ("an observer", "gateway", "console", "up")  # these open a session as an agent does
 RUNS = ["run", pytest.param("a hosted run", marks=pytest.mark.soak)]
 OTHERS = ["world", "an agent", "sweep", *(pytest.param(name, marks=pytest.mark.soak) for name in SESSIONS)]
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_too_few_files_are_a_line_with_the_number_needed(tmp_path: Path, name: str) -> None:
+def test_too_low_a_limit_is_reported_with_the_number_needed(tmp_path: Path, name: str) -> None:
     needed(tmp_path, name)
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_the_number_that_is_said_is_enough(tmp_path: Path, name: str) -> None:
+def test_the_reported_number_of_files_is_enough(tmp_path: Path, name: str) -> None:
     flown = zsim(tmp_path, needed(tmp_path, name), *COMMANDS[name])
     assert flown.returncode == 0, flown.stderr

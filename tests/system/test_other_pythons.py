@@ -1,4 +1,4 @@
-"""Test 1 of the paper on another processor, with another version of Python, and on two processors at once."""
+"""Test 1 of the paper on another processor, on another version of Python, and on two processors at once."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,8 +15,8 @@ from zsim.scenario import scenario_file
 from zsim_analysis.in_process import fly
 
 STEP = golden_flights.scenarios()["step"]
-EMULATED_S = 7200.0  # wall time in which an emulator compiles everything and flies
-FORMED_S = 22.0  # simulated; the formation takes off at 1 s and holds its shape from 18 s on
+EMULATED_S = 7200.0  # wall time for an emulator to compile everything and complete a run
+FORMED_S = 22.0  # simulated; the formation takes off at 1 s and keeps its shape from 18 s
 
 pytestmark = pytest.mark.soak
 
@@ -29,7 +29,7 @@ def made(kind: Kind) -> OtherPython:
 
 
 @pytest.mark.parametrize("kind", [NEWEST, AARCH64], ids=["python3.14", "aarch64"])
-def test_another_python_flies_to_the_golden_hash(kind: Kind, tmp_path: Path) -> None:
+def test_another_python_reproduces_the_golden_hash(kind: Kind, tmp_path: Path) -> None:
     with made(kind).start([golden_flights.__file__, "step"], tmp_path / "output") as process:
         try:
             code = process.wait(EMULATED_S)
@@ -42,7 +42,7 @@ def test_another_python_flies_to_the_golden_hash(kind: Kind, tmp_path: Path) -> 
 
 
 def test_an_estimator_on_another_processor_changes_no_bit(federation: Federation, tmp_path: Path) -> None:
-    """World, controller and two estimators on x86-64, the third on aarch64, over Zenoh."""
+    """The world, controller and two estimators run on x86-64, the third estimator on aarch64, over Zenoh."""
     fields = ["processes.start_timeout_s=3600", "clusters.main.plan.takeoff_s=1"]
     options = [word for field in fields for word in ("--set", field)]
     fly(scenario_file.load(STEP, fields, duration_s=FORMED_S), tmp_path / "alone.mcap")

@@ -1,4 +1,4 @@
-"""Parts of a user's own, out of examples/, however a scenario is flown: estimator, sensors, vehicle, cluster space, law."""
+"""User parts from examples/ in runs of every kind: estimator, sensors, vehicle, cluster space and control law."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ MINE = "my_estimator:MyEstimator"
 SPACE = "clusters.main.space=leader_cluster:LeaderCluster"
 LAW = "clusters.main.law=potential_field:PotentialField"
 FLIGHT = ("clusters.main.plan.takeoff_s=1", "drones.drone1.battery_percent=90")
-FORMED_S = 10.0  # engaged from 6 s on
+FORMED_S = 10.0  # the formation engages at 6 s
 SENSORS = (
     "sensors.my_uwb={module: uwb_range, anchor_m: [0, 0, 2], range_m: {noise: 0.05}}",
     "sensors.pitot={module: airspeed, latency_ms: 30, mount: {position_m: [0.15, 0, 0]}}",
@@ -34,7 +34,7 @@ KEYS = ("drone/drone1/sensor/my_uwb", "drone/drone2/sensor/my_uwb", "drone/drone
 
 @pytest.fixture
 def examples(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let modules of examples/ be found, here and in what is started from here."""
+    """Put examples/ on the module path of this process and its children."""
     monkeypatch.setenv("PYTHONPATH", EXAMPLES)
     monkeypatch.syspath_prepend(EXAMPLES)
 
@@ -44,11 +44,13 @@ def examples(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def beside(federation: Federation) -> Path:
-    """The example beside the scenario's file."""
+    """The example estimator, copied next to the scenario."""
     return Path(shutil.copy(ROOT / "examples/my_estimator.py", federation.folder))
 
 
-def test_it_flies_in_processes_of_its_own_as_in_one(flights: Federations, federation: Federation, beside: Path) -> None:
+def test_a_user_estimator_gives_the_same_bits_in_several_processes(
+    flights: Federations, federation: Federation, beside: Path
+) -> None:
     flown = {"scenario": federation.write(PAIR), "set": {"estimation.algorithm": MINE}}
     flight = flights(**flown)
     run = flight.run()
@@ -70,7 +72,7 @@ def test_it_flies_in_processes_of_its_own_as_in_one(flights: Federations, federa
         ("kalman", "package.module:Class"),
     ],
 )
-def test_a_wrong_name_is_a_line(federation: Federation, beside: Path, name: str, wrong: str) -> None:
+def test_a_bad_estimator_name_is_reported(federation: Federation, beside: Path, name: str, wrong: str) -> None:
     path = federation.write(PAIR, "pair.yaml")
     for command in (("validate", "--trust"), ("run",)):
         line = refusal(*command, path, "--set", f"estimation.algorithm={name}")
@@ -86,7 +88,7 @@ def of_sensors(*fields: str) -> list[str]:
 
 
 def check_ranges(record: Record) -> None:
-    """Hold the ranges on record against the truth."""
+    """Check the recorded ranges against the truth."""
     truths = {truth["t_ns"]: truth["position_m"] for truth in record.all("drone/drone1/truth")}
     ranges = [m for m in record.all(KEYS[0]) if m["t_sample_ns"] in truths]
     off = [m["range_m"] - np.linalg.norm(np.subtract(truths[m["t_sample_ns"]], (0, 0, 2))) for m in ranges]
@@ -99,8 +101,8 @@ def same_samples(first: Record, second: Record) -> bool:
 
 
 @pytest.mark.soak
-def test_processes_give_the_samples_of_one_process(federation: Federation) -> None:
-    """With modules beside the scenario; exported and flown again where only Python's path has them, or none."""
+def test_user_sensors_give_the_same_samples_in_several_processes(federation: Federation) -> None:
+    """The modules are next to the scenario, and the record can be exported without them."""
     for name in ("uwb_range.py", "airspeed.py"):
         shutil.copy(ROOT / "examples" / name, federation.folder)
     federation.run(PAIR, *of_sensors()).ends(with_code=0)
@@ -134,7 +136,7 @@ class Ranged(MyEstimator):
 """
 
 
-def test_an_estimator_of_the_user_s_own_receives_it(federation: Federation) -> None:
+def test_a_user_estimator_receives_a_user_sensor(federation: Federation) -> None:
     for name in ("uwb_range.py", "airspeed.py", "my_estimator.py"):
         shutil.copy(ROOT / "examples" / name, federation.folder)
     (federation.folder / "ranged.py").write_text(RANGED)
@@ -142,7 +144,7 @@ def test_an_estimator_of_the_user_s_own_receives_it(federation: Federation) -> N
     federation.run(PAIR, *chosen).ends(with_code=0)
     record, one = federation.record(), federation.folder / "one"
     estimates = record.all("drone/drone1/estimate")
-    assert estimates[-1]["sensors"]["my_uwb"][0] >= 10 * SENSED_S - 2  # Hz; the last ones are on their way
+    assert estimates[-1]["sensors"]["my_uwb"][0] >= 10 * SENSED_S - 2  # 10 Hz, less those in transit
     path = federation.write(PAIR)
     federation.start("run", path, *chosen, "--in-process", "--no-report", "--out", str(one)).ends(with_code=0)
     with RecordReader(one / "run.mcap") as reader:
@@ -152,7 +154,7 @@ def test_an_estimator_of_the_user_s_own_receives_it(federation: Federation) -> N
 
 
 @pytest.mark.usefixtures("examples")
-def test_a_record_is_flown_again(federation: Federation) -> None:
+def test_a_run_with_user_sensors_can_be_rerun(federation: Federation) -> None:
     out = federation.folder / "one"
     path = federation.write(PAIR)
     flown = run_here("run", path, *of_sensors(), "--in-process", "--no-report", "--out", str(out))
@@ -169,7 +171,7 @@ def test_a_record_is_flown_again(federation: Federation) -> None:
     ],
 )
 @pytest.mark.usefixtures("examples")
-def test_a_faulty_one_is_a_line(federation: Federation, field: str, where: str) -> None:
+def test_a_faulty_user_sensor_is_reported(federation: Federation, field: str, where: str) -> None:
     line = refusal("validate", "--trust", federation.write(PAIR, "pair.yaml"), *of_sensors(field)[2:])
     assert f"pair.yaml: {where} is" in line
 
@@ -190,8 +192,8 @@ def test_a_sweep_compares_vehicles(tmp_path: Path, near: None) -> None:
 
 
 @pytest.mark.soak
-def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> None:
-    """In the window of its report the triangle stands where it is to, as well as its positioning of 10 cm allows."""
+def test_crazyflies_fly_test_1_at_room_scale(federation: Federation) -> None:
+    """In the window of the report, the triangle's errors are as small as a positioning accuracy of 10 cm allows."""
     path = str(ROOT / "scenarios/crazyflie.yaml")
     out = federation.folder / "crazyflie"
     federation.start("run", path, "--in-process", "--out", str(out)).ends(with_code=0)
@@ -202,7 +204,7 @@ def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> 
 
 @pytest.mark.usefixtures("examples")
 @pytest.mark.parametrize(("model", "rotor"), [("larger_battery", "rotor7"), ("hexacopter", "front_left")])
-def test_a_fault_of_a_rotor_that_is_not_there_is_one_line(federation: Federation, model: str, rotor: str) -> None:
+def test_a_fault_of_a_missing_rotor_is_reported(federation: Federation, model: str, rotor: str) -> None:
     fault = f"faults=[{{kind: rotor_stuck, target: drone1, at_s: 1, rotor: {rotor}}}]"
     chosen = ("--set", f"drones.drone1.model={model}", "--set", fault)
     line = refusal("validate", "--trust", federation.write(PAIR), *chosen)
@@ -222,10 +224,10 @@ def truth_near(record: Any, drone: str, t_ns: int) -> np.ndarray:
     return np.array(next(t["position_m"] for t in record.all(f"drone/{drone}/truth") if t["t_ns"] >= t_ns))
 
 
-def test_processes_with_modules_beside_the_scenario_give_the_bits_of_one_process_that_imports_them(
+def test_a_user_space_and_law_give_the_same_bits_in_several_processes(
     federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The origin of the space is robot 1, and it is there that the cluster is led."""
+    """The modules are next to the scenario or imported; the leader space puts its origin at drone1."""
     for name in ("leader_cluster.py", "potential_field.py"):
         (federation.folder / name).write_text((ROOT / "examples" / name).read_text())
     federation.run(STEP.read_text(), *of_formation(SPACE, LAW)).ends(with_code=0)
@@ -238,7 +240,7 @@ def test_processes_with_modules_beside_the_scenario_give_the_bits_of_one_process
 
 
 @pytest.mark.parametrize(("field", "how"), [("space", ["--in-process"]), ("law", [])])
-def test_a_class_that_is_not_there_is_one_line(federation: Federation, field: str, how: list[str]) -> None:
+def test_a_missing_space_or_law_class_is_reported(federation: Federation, field: str, how: list[str]) -> None:
     run = federation.run(STEP.read_text(), *how, *of_formation(f"clusters.main.{field}=nowhere.at_all:Missing"))
     run.ends(with_code=2)
     assert "cluster 'main'" in run.line("nowhere.at_all:Missing").text
@@ -268,7 +270,7 @@ DIES = "clusters.main.law=dying:Dies"
 def test_a_law_that_ends_its_process_leaves_a_record_without_an_end(
     federation: Federation, dies_well: bool, code: int
 ) -> None:
-    """In one process nothing can catch it; what was recorded until then can be read."""
+    """In one process nothing can catch this; the record up to that moment is readable."""
     (federation.folder / "dying.py").write_text(DYING.replace("DIES_WELL", str(dies_well)))
     federation.run(PAIR, "--in-process", "--set", DIES).ends(with_code=code)
     record = federation.record()
@@ -276,7 +278,7 @@ def test_a_law_that_ends_its_process_leaves_a_record_without_an_end(
     assert record.all("drone/drone1/truth")[-1]["t_ns"] > 2e9
 
 
-def test_a_law_that_ends_its_process_with_0_is_a_death_that_ends_the_run(federation: Federation) -> None:
+def test_a_law_that_exits_with_0_counts_as_a_death(federation: Federation) -> None:
     (federation.folder / "dying.py").write_text(DYING.replace("DIES_WELL", "True"))
     run = federation.run(PAIR, "--set", DIES, "--set", "processes.on_death={controller: end}")
     run.ends(with_code=1)

@@ -1,4 +1,4 @@
-"""What is a user's own, flown by `zsim up` on several hosts: sensors, vehicle, estimator, space and law; agents."""
+"""User sensors, vehicles, estimators, cluster spaces, laws, agents and programs with `zsim up` on several hosts."""
 
 import shutil
 from pathlib import Path
@@ -34,8 +34,8 @@ KEYS = ("drone/drone1/sensor/my_uwb", "drone/drone2/sensor/pitot", "drone/drone3
 
 
 @pytest.mark.soak
-def test_they_fly_as_in_one_process(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Modules of sensors and vehicles need be only where the scenario is read and where the world is."""
+def test_user_parts_on_hosts_fly_as_in_one_process(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Modules of sensors and vehicles are needed only on the launcher and on the world's host."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLES))
     (tmp_path / "agents").mkdir()
@@ -57,7 +57,7 @@ def test_they_fly_as_in_one_process(lab: Lab, tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.soak
-def test_drones_that_talk_to_each_other_fly_as_in_one_process(
+def test_communicating_drones_on_hosts_fly_as_in_one_process(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
@@ -74,10 +74,10 @@ def test_drones_that_talk_to_each_other_fly_as_in_one_process(
         assert len(record.all("swarm/drone1/position")) == DURATION_S / 0.02 + 1
 
 
-def test_a_program_without_a_place_is_started_here_and_named_where_it_fails(
+def test_an_unplaced_program_runs_on_the_launcher_and_its_failure_is_reported(
     lab: Lab, tmp_path: Path, forked: None
 ) -> None:
-    """To the bits that it flies to under `zsim run`."""
+    """Its flight has the same bits as under `zsim run`."""
     client, dies = EXAMPLES / "plain_client.yaml", tmp_path / "dies.yaml"
     dies.write_text(
         client.read_text().replace("[python, plain_client.py, '{endpoint}']", "[sh, -c, echo lost; exit 3]")
@@ -111,10 +111,10 @@ class Trained(zsim.PolicyAgent):
 
 
 @pytest.mark.soak
-def test_a_trained_policy_flies_on_hosts_with_the_bits_of_its_environment(
+def test_a_trained_policy_on_hosts_flies_the_bits_of_its_environment(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is trained by random search: of some linear policies the one that holds the drones nearest to 2 m."""
+    """Training is a random search for the linear policy that best keeps the drones at 2 m."""
     modules, rng = tmp_path / "modules", np.random.default_rng(1)
     modules.mkdir()
     monkeypatch.syspath_prepend(str(modules))
@@ -141,7 +141,7 @@ def test_a_trained_policy_flies_on_hosts_with_the_bits_of_its_environment(
             total += sum(rewards.values())
         return total
 
-    up = np.array([0.0, 0.0, 1.0, 0.0])  # of an action
+    up = np.array([0.0, 0.0, 1.0, 0.0])  # direction of an action
     tried = [np.outer(up, -rng.uniform(0.0, 1.0, 2)) for _ in range(4)]
     best = max(tried, key=episode)
     np.save(modules / "weights.npy", best)

@@ -1,4 +1,4 @@
-"""Programs of users that a scenario names: started with a run, waited for, named where they fail, ended with it."""
+"""User programs of a scenario: started with the run, awaited, reported if they fail, and ended with the run."""
 
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ def test_a_program_in_the_folder_of_the_scenario_flies_a_drone(tmp_path: Path, f
     ],
     ids=["never joins", "may stay away", "dies", "may die", "is not there"],
 )
-def test_one_that_fails_is_named_and_fails_the_run_unless_the_scenario_allows_it(
+def test_a_failed_program_is_reported_and_fails_the_run_unless_allowed(
     federation: Federation,
     command: list[str],
     more: dict[str, Any],
@@ -67,13 +67,13 @@ def test_one_that_fails_is_named_and_fails_the_run_unless_the_scenario_allows_it
         ({"my.main": {"command": ["true"], "start_timeout_s": -1}}, "programs.my.main.start_timeout_s", "-1"),
     ],
 )
-def test_a_faulty_entry_is_refused_at_its_place(programs: dict[str, Any], field: str, value: str) -> None:
+def test_a_faulty_program_entry_is_refused_with_its_field(programs: dict[str, Any], field: str, value: str) -> None:
     with pytest.raises(ScenarioError) as raised:
         scenario_file.resolve({**yaml.safe_load(ONE), "programs": programs})
     assert any(f": {field} " in line and value in line for line in raised.value.faults), raised.value.faults
 
 
-def test_in_one_process_none_is_started() -> None:
+def test_one_process_refuses_a_scenario_with_programs() -> None:
     resolved = scenario_file.resolve(yaml.safe_load(scenario(["sleep", "600"])))
     with pytest.raises(ScenarioError) as raised:
         InProcessFlight(resolved)

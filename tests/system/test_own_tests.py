@@ -1,4 +1,4 @@
-"""Tests of a user's, by the fixture `federation` of the pytest plugin: run by a pytest of its own, but for refusals."""
+"""User tests with the fixture `federation` of the pytest plugin, mostly run in a separate pytest."""
 
 import os
 import re
@@ -61,11 +61,11 @@ def test_of_a_program_that_hangs(federation):
     flight.kill("estimator.drone2")
     flight.wait_until("engaged", within_s=1)
 """
-KEPT = "test_mine.py-test_of_a_program_that_hangs"  # of the failed test
+KEPT = "test_mine.py-test_of_a_program_that_hangs"  # folder of the failed test
 
 
 def pytest_run(folder: Path, test: str, *options: str) -> subprocess.Popen[str]:
-    """Start pytest on a test, as a user does."""
+    """Start pytest on a test as a user would."""
     (folder / "test_mine.py").write_text(HEAD + test)
     return started(["-m", "pytest", "-p", "no:cacheprovider", "--basetemp", str(folder / "tmp"), *options], folder)
 
@@ -76,7 +76,7 @@ def python_run(folder: Path, script: str) -> subprocess.Popen[str]:
 
 
 def started(words: list[str], folder: Path) -> subprocess.Popen[str]:
-    """Start Python in a folder; standard error goes with its output."""
+    """Start Python in a folder, with standard error merged into its output."""
     environment = {**os.environ, "COLUMNS": "200"}
     return subprocess.Popen(
         [sys.executable, *words],
@@ -94,7 +94,7 @@ def output_of(process: subprocess.Popen[str]) -> str:
 
 
 def left_in(folder: Path) -> list[int]:
-    """Return the processes that have something of a folder in their command line."""
+    """Return the processes whose command line contains the folder."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
@@ -107,7 +107,7 @@ def left_in(folder: Path) -> list[int]:
     return found
 
 
-def test_one_passes_and_one_that_fails_says_who_waits_and_keeps_its_record(compiled: None, tmp_path: Path) -> None:
+def test_a_failed_test_reports_what_it_waited_for_and_keeps_its_record(compiled: None, tmp_path: Path) -> None:
     process = pytest_run(tmp_path, PASSING + FAILING)
     output = output_of(process)
     assert process.returncode == 1, output
@@ -118,9 +118,9 @@ def test_one_passes_and_one_that_fails_says_who_waits_and_keeps_its_record(compi
     names = [name for name, _ in logs]
     launcher = names.index("zsim-run")
     first, others = {*names[:launcher]}, {*names[launcher + 1 :]}
-    assert {"estimator.drone2", "ground.main"} <= first  # it was killed, it is waited for
+    assert {"estimator.drone2", "ground.main"} <= first  # one was killed, the other is waited for
     assert first | others == {"controller.main", "estimator.drone1", "estimator.drone2", "ground.main", "recorder"}
-    assert [bool(rest) for _, rest in logs] == [place > launcher for place in range(len(logs))]  # one line is all
+    assert [bool(rest) for _, rest in logs] == [place > launcher for place in range(len(logs))]  # later logs: one line
     assert re.search("--- ground.main.log\nhere on tcp/127.0.0.1:[0-9]+\n", output)
     kept = tmp_path / "runs/failed" / KEPT / "run1"
     assert f"kept in {kept}" in output
@@ -156,12 +156,12 @@ def test_side_by_side(federation, number):
 
 
 @pytest.mark.parametrize("kind", [pytest.param("test", marks=pytest.mark.soak), "script"])
-def test_kill_9_leaves_nothing_running(compiled: None, tmp_path: Path, kind: str) -> None:
+def test_a_killed_test_or_script_leaves_nothing_running(compiled: None, tmp_path: Path, kind: str) -> None:
     process = pytest_run(tmp_path, KILLED_TEST, "-s") if kind == "test" else python_run(tmp_path, KILLED_SCRIPT)
     assert process.stdout is not None
     assert any("it flies" in line or "fault: gust" in line for line in process.stdout)
     started = psutil.Process(process.pid).children(recursive=True)
-    assert len(started) >= (11 if kind == "test" else 7)  # keepers, launcher, fork server, roles, programs
+    assert len(started) >= (11 if kind == "test" else 7)  # keepers, launcher, fork server, roles and programs
     process.kill()
     process.communicate()
     _, alive = psutil.wait_procs(started, PATIENCE_S)
@@ -171,14 +171,14 @@ def test_kill_9_leaves_nothing_running(compiled: None, tmp_path: Path, kind: str
 
 
 @pytest.mark.soak
-def test_side_by_side(compiled: None, tmp_path: Path) -> None:
+def test_user_tests_can_run_in_parallel(compiled: None, tmp_path: Path) -> None:
     process = pytest_run(tmp_path, SIDE_BY_SIDE, "-n", "2")
     output = output_of(process)
     assert process.returncode == 0, output
     assert "2 passed" in output
 
 
-def test_the_plugin_loads_nothing_before_a_test_flies() -> None:
+def test_the_plugin_loads_nothing_before_a_test_uses_it() -> None:
     loaded = "import pytest, zsim_api.pytest_plugin, sys; print({name.partition('.')[0] for name in sys.modules})"
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
     assert "zsim_api" in done.stdout
@@ -186,14 +186,14 @@ def test_the_plugin_loads_nothing_before_a_test_flies() -> None:
 
 
 @pytest.mark.parametrize("program", ["ground.main=sleep 600", "sleep 600"], ids=["before time begins", "and after"])
-def test_nobody_of_an_unknown_name_is_waited_for(flights: Federations, program: str) -> None:
+def test_unknown_processes_are_refused_without_waiting(flights: Federations, program: str) -> None:
     flight = flights(yaml.safe_load(PAIR), programs=[program])
     with refused(RunError, "'estimator.drone9'", "estimator.drone1", "estimator.drone2") as raised:
         flight.kill("estimator.drone9")
     assert raised.type is RunError
     if program.startswith("ground.main"):
         with refused(RunFailedError, "ground.main"):
-            flight.kill("ground.main", within_s=0)  # it has the name, and does not join
+            flight.kill("ground.main", within_s=0)  # a known program that does not join
         with refused(RunError, "ground.main", "ended"):
             flight.start("ground.main")
         with refused(RunError, "'ground.other'", "ground.main"):

@@ -1,4 +1,4 @@
-"""examples/plain_client.py and foreign_estimator.py: code by docs/protocol.md takes part as ours do."""
+"""examples/plain_client.py and foreign_estimator.py, written from docs/protocol.md, take part in runs."""
 
 import ast
 import os
@@ -30,7 +30,7 @@ def plain_client(federation: Federation) -> Iterator["subprocess.Popen[str]"]:
         process.kill()
 
 
-def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
+def test_the_client_is_one_page_with_only_zenoh_and_msgpack() -> None:
     text = PROGRAM.read_text()
     assert len(text.splitlines()) <= 40
     imported = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
@@ -40,12 +40,12 @@ def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
     puts = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
     puts = [node for node in puts if ast.unparse(node.func) == "session.put"]
     assert puts
-    for put in puts:  # without it zenoh drops what does not fit, and the world waits for ever
+    for put in puts:  # or Zenoh drops what does not fit, and the world waits forever
         assert "congestion_control=zenoh.CongestionControl.BLOCK" in ast.unparse(put)
 
 
 def standing(clock: Subscription) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return how the program is waited for, twice at one instant: what it sent before it was stopped has been used."""
+    """Return two `waiting_for` entries of the program at one instant, once all that it sent has been used."""
     former = None
     while True:
         now = clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == [NAME]).message
@@ -54,12 +54,12 @@ def standing(clock: Subscription) -> tuple[dict[str, Any], dict[str, Any]]:
         former = now
 
 
-def test_it_flies_and_holds_time(federation: Federation, request: pytest.FixtureRequest) -> None:
+def test_the_client_flies_and_holds_time(federation: Federation, request: pytest.FixtureRequest) -> None:
     world = federation.world(ONE, "--rate", "0.25", "--duration", "3600", "--set", "processes.expect=[]")
     client = federation.client()
     clock, events = client.subscribe("clock"), client.subscribe("world/event")
     truth = client.subscribe("drone/drone1/truth")
-    clock.until(lambda m: m["t_ns"] > 0)  # nobody is expected: time runs
+    clock.until(lambda m: m["t_ns"] > 0)  # no process is expected, so time runs
     program: subprocess.Popen[str] = request.getfixturevalue("plain_client")
     joined = events.until(lambda m: (m["kind"], m["subject"]) == ("join", NAME))
     assert joined.message["data"]["from_ns"] > 0
@@ -78,16 +78,16 @@ def test_it_flies_and_holds_time(federation: Federation, request: pytest.Fixture
     shown = re.fullmatch(r"t = (\d+\.\d\d) s, flying, accelerometer \[.*\]\n", output)
     assert shown is not None, output
     assert float(shown[1]) >= 10.0
-    flown = truth.until(lambda m: m["t_ns"] >= 10 * 10**9)  # the run may be over by now
+    flown = truth.until(lambda m: m["t_ns"] >= 10 * 10**9)  # the run may have ended by now
     east, north, _ = flown.message["velocity_m_s"]
-    assert north == pytest.approx(0.5, abs=0.3)  # m/s forward, the drone looks north
+    assert north == pytest.approx(0.5, abs=0.3)  # m/s forward; the drone faces north
     assert east == pytest.approx(0.0, abs=0.3)
     assert events.until(lambda m: m["kind"] == "leave").message["data"]["reason"] == "shown"
     assert client.request("world/control", "stop")["ok"]
     world.ends(with_code=0)
 
 
-def test_it_flies_ten_seconds_beside_a_world_that_has_run_for_longer(
+def test_the_client_joins_a_running_world_and_flies_ten_seconds(
     federation: Federation, request: pytest.FixtureRequest
 ) -> None:
     world = federation.world(ONE, "--rate", "10", "--duration", "36000")
@@ -104,14 +104,14 @@ def test_it_flies_ten_seconds_beside_a_world_that_has_run_for_longer(
 
 
 @pytest.mark.parametrize(("program", "name"), [(PROGRAM, NAME), (ESTIMATOR, "foreign.drone1")])
-def test_it_ends_with_a_line_when_its_world_is_killed(program: Path, name: str, federation: Federation) -> None:
-    """The world dies without a word while the program answers its gates."""
+def test_a_killed_world_ends_the_program_with_one_line(program: Path, name: str, federation: Federation) -> None:
+    """The world is killed while the program answers its gates."""
     world = federation.world(ONE.replace("expect: []", f"expect: [{name}]"), "--rate", "1", "--duration", "3600")
     clock = federation.client().subscribe("clock")
     clock.until(lambda _: True)
     command = [sys.executable, str(program), federation.endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        clock.until(lambda m: m["t_ns"] > 0)  # it has answered
+        clock.until(lambda m: m["t_ns"] > 0)  # the program has answered a gate
         world.signal(signal.SIGKILL)
         output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1, output

@@ -1,4 +1,4 @@
-"""The same bits on every processor: the golden flights as other processors, C libraries and BLAS compute."""
+"""The same bits on every processor: the golden flights under settings of other processors, C libraries and BLAS."""
 
 import os
 import platform
@@ -17,9 +17,9 @@ from zsim_deploy.cli.hosts_commands import older_processor
 
 GOLDEN: dict[str, str] = yaml.safe_load(golden_flights.GOLDEN.read_text())
 OLDER = older_processor()
-GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}  # code of a few minutes' compilation
+GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}  # takes a few minutes to compile
 BLAS = ("Haswell", "Nehalem", "Sandybridge") if platform.machine() == "x86_64" else ("ARMV8", "NEOVERSEN1")
-MIXED = ("step", "swarm", "ring10", "eyes")  # with a triad, a radio, a template, sightings
+MIXED = ("step", "swarm", "ring10", "eyes")  # cover a triad, a radio, a template and sightings
 BY_SETTING = [{name: value} for name, value in OLDER.items() if name != "OPENBLAS_CORETYPE"]
 BY_SETTING += [{"OPENBLAS_CORETYPE": core} for core in BLAS]
 
@@ -36,7 +36,7 @@ class Bent(zsim.ControlLaw):
 
 
 def flown(settings: dict[str, str], *names: str) -> dict[str, str]:
-    """Return the hashes of golden flights of a process with some variables."""
+    """Return the hashes of golden flights in a process with the given environment variables."""
     command = [sys.executable, "-P", golden_flights.__file__, *names]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **settings})
     assert done.returncode == 0, done.stderr
@@ -48,26 +48,26 @@ def golden(*names: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", golden_flights.scenarios())
-def test_every_scenario_of_the_repository_gives_its_golden_hash(name: str) -> None:
+def test_every_scenario_reproduces_its_golden_hash(name: str) -> None:
     assert golden_flights.fly(name) == GOLDEN[name]
 
 
-def test_there_is_a_golden_hash_of_every_scenario() -> None:
+def test_every_scenario_has_a_golden_hash() -> None:
     assert list(GOLDEN) == list(golden_flights.scenarios())
 
 
-@pytest.mark.soak  # in CI all together
+@pytest.mark.soak  # CI tests all settings together
 @pytest.mark.parametrize("settings", BY_SETTING, ids=lambda each: "=".join(*each.items())[:40])
-def test_one_setting_changes_nothing(settings: dict[str, str]) -> None:
+def test_one_processor_setting_does_not_change_the_hash(settings: dict[str, str]) -> None:
     assert flown(settings, "step") == golden("step")
 
 
-def test_all_settings_together_change_nothing() -> None:
+def test_all_processor_settings_together_do_not_change_the_hashes() -> None:
     assert flown(OLDER, *MIXED) == golden(*MIXED)
 
 
 @pytest.mark.soak
-def test_with_all_settings_and_code_for_any_processor_nothing_changes() -> None:
+def test_generic_code_and_all_settings_do_not_change_the_hashes() -> None:
     assert flown({**OLDER, **GENERIC}, *GOLDEN) == GOLDEN
 
 
@@ -79,8 +79,8 @@ SHORT: dict[str, Any] = {
 }
 
 
-def test_without_compiled_code_nothing_changes_and_nothing_is_told(tmp_path: Path) -> None:
-    """As one steps through it: lanes without a drone divide by no 0, and no integer that wraps around is warned of."""
+def test_interpreted_code_gives_the_same_bits_without_warnings(tmp_path: Path) -> None:
+    """As in a debugger: lanes without a drone cause no division by 0, and integers wrap around without a warning."""
     compiled = zsim.run(SHORT, out=tmp_path / "compiled", progress=False)
     script = f"import sys, zsim; print(zsim.run({SHORT}, out=sys.argv[1], progress=False).truth_sha256)"
     command = [sys.executable, "-P", "-c", script, str(tmp_path / "interpreted")]
@@ -89,7 +89,7 @@ def test_without_compiled_code_nothing_changes_and_nothing_is_told(tmp_path: Pat
     assert (done.returncode, done.stderr, done.stdout) == (0, "", f"{compiled.truth_sha256}\n")
 
 
-def test_a_law_that_depends_on_the_processor_is_found(tmp_path: Path) -> None:
+def test_doctor_finds_a_law_that_depends_on_the_processor(tmp_path: Path) -> None:
     (tmp_path / "bent.py").write_text(LAW)
     scenario = yaml.safe_load((golden_flights.ROOT / "scenarios" / "step.yaml").read_text())
     scenario["clusters"][0] |= {"law": "bent:Bent", "plan": {**scenario["clusters"][0]["plan"], "takeoff_s": 1}}

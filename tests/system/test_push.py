@@ -1,4 +1,4 @@
-"""`zsim push`: hosts without internet get zsim over ssh alone, each what its roles need, and only once."""
+"""`zsim push` installs zsim on hosts without internet over SSH: what their roles need, and only once."""
 
 import asyncio
 import json
@@ -25,7 +25,7 @@ from zsim_deploy.hosts.host_link import HostLink, shell_line
 from zsim_deploy.hosts.push import choose_interpreter, interpreter_query, open_installer, parse_interpreters
 from zsim_deploy.hosts.wheelhouse import Wheelhouse, WheelSet, wheel_target
 
-CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, as a user's is
+CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between test runs, like a user's cache
 PUSH_S = 180.0  # wall time for two installations on a loaded machine
 PUSH = (*ZSIM, "push")
 WHERE = "import zsim_deploy; print(zsim_deploy.__file__)"
@@ -37,12 +37,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("push")]
 
 @pytest.fixture
 def hosts(lab: Lab) -> Path:
-    """An inventory: h1 has estimators, h2 nothing that needs an extra."""
+    """An inventory in which h1 has estimators, and h2 nothing that needs an extra."""
     return lab.inventory(ROLES, python=None)
 
 
 def over_ssh(lab: Lab, hosts: Path, name: str, *command: str, given: str = "") -> str:
-    """Return what a command prints that the launcher runs on a host."""
+    """Run a command on a host from the launcher and return its output."""
     placed = inventory.load(hosts)
 
     async def work() -> bytes:
@@ -57,7 +57,7 @@ def over_ssh(lab: Lab, hosts: Path, name: str, *command: str, given: str = "") -
 
 
 def look(lab: Lab, hosts: Path, name: str, python: str) -> dict[str, Any]:
-    """Return what a host says of itself when it is to be installed on."""
+    """Return a host's description of itself for an installation."""
     placed = inventory.load(hosts)
 
     async def work() -> dict[str, Any]:
@@ -73,7 +73,7 @@ def look(lab: Lab, hosts: Path, name: str, python: str) -> dict[str, Any]:
 
 
 def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, WheelSet]:
-    """Gather, outside of the lab where there is an index, what `zsim push` needs inside."""
+    """Gather what `zsim push` needs in the lab from outside it, where there is a package index."""
     wanted = inventory.needed_extras(inventory.load(hosts).inventory)
     found = parse_interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", interpreter_query()))
     python = choose_interpreter(names[0], found, sys.version_info[:2]).path
@@ -87,14 +87,14 @@ def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, WheelSet]:
 
 
 def push(lab: Lab, hosts: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """Run `zsim push` at the launcher of the lab."""
+    """Run `zsim push` on the lab's launcher."""
     cache = {"XDG_CACHE_HOME": str(CACHE)}
     return lab.run(LAUNCHER, *PUSH, "--hosts", str(hosts), *options, env=cache, timeout=PUSH_S)
 
 
-def test_hosts_without_internet_get_what_their_roles_need_once(lab: Lab, hosts: Path) -> None:
+def test_offline_hosts_receive_what_their_roles_need_only_once(lab: Lab, hosts: Path) -> None:
     gather(lab, hosts, "h1", "h2")
-    lab.environment("h1", NUMBA_DISABLE_JIT="1")  # compiling takes longer than all the rest
+    lab.environment("h1", NUMBA_DISABLE_JIT="1")  # compiling takes longer than everything else
     first = push(lab, hosts, "--host", "h1", "--host", "h2")
     assert first.returncode == 0, first.stderr
     assert "2 of 2" in first.stdout
@@ -114,7 +114,7 @@ def test_hosts_without_internet_get_what_their_roles_need_once(lab: Lab, hosts: 
     assert [note.stat().st_mtime_ns for note in notes] == before
 
 
-def test_each_host_that_cannot_have_it_is_a_line(lab: Lab, hosts: Path, tmp_path: Path) -> None:
+def test_each_unsuitable_host_is_reported(lab: Lab, hosts: Path, tmp_path: Path) -> None:
     programs = tmp_path / "programs"
     programs.mkdir()
     (programs / "sh").symlink_to("/bin/sh")
@@ -131,7 +131,7 @@ def test_each_host_that_cannot_have_it_is_a_line(lab: Lab, hosts: Path, tmp_path
     assert has_terms(h2, "h2: ", at, str(known), f"ssh-keyscan -p 22 {at} >> {known}")
 
 
-def test_a_host_without_sftp_is_a_line(lab: Lab, hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_without_sftp_is_reported(lab: Lab, hosts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     gather(lab, hosts, "h2")
     monkeypatch.setattr(sshd, "CONFIG", sshd.CONFIG.replace("sftp internal-sftp", "sftp /usr/lib/none"))
     lab.environment("h2")
@@ -146,7 +146,7 @@ def test_a_host_without_sftp_is_a_line(lab: Lab, hosts: Path, monkeypatch: pytes
 
 
 @pytest.mark.soak
-def test_a_push_that_is_interrupted_does_not_disturb_the_next_one(lab: Lab, hosts: Path) -> None:
+def test_an_interrupted_push_does_not_disturb_the_next(lab: Lab, hosts: Path) -> None:
     gather(lab, hosts, "h2")
     command = (*PUSH, "--hosts", str(hosts), "--host", "h2")
     pipe = subprocess.PIPE
@@ -163,7 +163,7 @@ def test_a_push_that_is_interrupted_does_not_disturb_the_next_one(lab: Lab, host
 
 
 @pytest.mark.soak
-def test_two_pushes_at_a_time_wait_for_each_other(lab: Lab, hosts: Path) -> None:
+def test_simultaneous_pushes_wait_for_each_other(lab: Lab, hosts: Path) -> None:
     gather(lab, hosts, "h2")
     command = (*PUSH, "--hosts", str(hosts), "--host", "h2")
     options: dict[str, Any] = {
@@ -177,7 +177,7 @@ def test_two_pushes_at_a_time_wait_for_each_other(lab: Lab, hosts: Path) -> None
     assert sorted("1 of 1" in output for output, _ in outputs) == [False, True]
 
 
-def test_a_launcher_without_an_index_and_a_cache_is_said_to_be_so(lab: Lab, hosts: Path, tmp_path: Path) -> None:
+def test_a_launcher_without_an_index_and_a_cache_is_reported(lab: Lab, hosts: Path, tmp_path: Path) -> None:
     nowhere = {
         "XDG_CACHE_HOME": str(tmp_path),
         "PIP_CONFIG_FILE": os.devnull,
@@ -192,7 +192,7 @@ def test_a_launcher_without_an_index_and_a_cache_is_said_to_be_so(lab: Lab, host
 
 
 @pytest.mark.soak
-def test_another_build_of_the_same_version_takes_the_place_of_the_first(lab: Lab, hosts: Path, tmp_path: Path) -> None:
+def test_another_build_of_the_same_version_replaces_the_first(lab: Lab, hosts: Path, tmp_path: Path) -> None:
     pip = gather(lab, hosts, "h2")["h2"].pip.path
     for text in ("BUILD = 1", "BUILD = 2"):
         order = {"project": write_wheel(tmp_path / "wheels", text), "pip": pip.name, "wheels": [], "extras": []}
@@ -209,7 +209,7 @@ def test_another_build_of_the_same_version_takes_the_place_of_the_first(lab: Lab
     assert found["wheels"] == {}
 
 
-def test_an_installation_that_broke_off_counts_as_none(tmp_path: Path) -> None:
+def test_an_incomplete_installation_counts_as_none(tmp_path: Path) -> None:
     assert on_host.inspect_folder(tmp_path)["installed"] is None
     (tmp_path / "venv/bin").mkdir(parents=True)
     (tmp_path / "venv/bin/python").symlink_to(sys.executable)
@@ -222,7 +222,7 @@ def test_an_installation_that_broke_off_counts_as_none(tmp_path: Path) -> None:
 
 
 def write_wheel(folder: Path, text: str) -> str:
-    """Write a wheel of a zsim that is one line of text into a folder and return its name."""
+    """Write a wheel whose module `zsim` is the given line into a folder; return its name."""
     folder.mkdir(parents=True, exist_ok=True)
     name = f"zsim-{__version__}-py3-none-any.whl"
     with zipfile.ZipFile(folder / name, "w") as wheel:

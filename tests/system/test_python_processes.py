@@ -1,4 +1,4 @@
-"""Classes of a script fly as processes: the bits of one process, their errors, and nothing left running after Ctrl-C."""
+"""Classes of a script as processes: the bits of one process, their errors, and no process left after Ctrl-C."""
 
 import os
 import signal
@@ -50,7 +50,7 @@ def script(folder: Path, text: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def test_a_script_flies_as_processes_to_the_bits_of_one(tmp_path: Path) -> None:
+def test_a_script_flies_the_same_bits_in_several_processes_and_in_one(tmp_path: Path) -> None:
     text = "for name, how in (('one', {}), ('many', {'processes': True})):\n    print(fly(name, 9.0, **how).truth_sha256)\n"
     said, errors = script(tmp_path, text).communicate()
     one, many = said.split()
@@ -63,7 +63,7 @@ def test_a_script_flies_as_processes_to_the_bits_of_one(tmp_path: Path) -> None:
     assert one in again.stdout
 
 
-def test_what_a_process_raises_is_in_its_log_and_in_the_error(tmp_path: Path) -> None:
+def test_an_exception_in_a_process_is_in_its_log_and_in_the_error(tmp_path: Path) -> None:
     program = script(tmp_path, "fly('many', -1.0, processes=True)\n")
     _, errors = program.communicate()
     assert program.returncode == 1
@@ -92,21 +92,21 @@ class TwoRates(zsim.ControlLaw):
         return c[:2]
 
 
-@pytest.mark.soak  # the next one has the same law and the same error
-def test_a_law_that_fails_before_the_first_gate_is_an_error(tmp_path: Path, compiled: None) -> None:
+@pytest.mark.soak  # the next test has the same law and error
+def test_a_law_that_fails_before_the_first_gate_fails_the_run(tmp_path: Path, compiled: None) -> None:
     (tmp_path / "pair.yaml").write_text(PAIR)
     with pytest.raises(RunFailedError, match=r"TwoRates\.rates .*\(2,\)"):
         zsim.run(tmp_path / "pair.yaml", law=TwoRates, processes=True, out=tmp_path / "many", progress=False)
 
 
-def test_a_test_that_waits_is_told_why_its_law_failed(tmp_path: Path, forked: None) -> None:
+def test_a_waiting_test_receives_the_error_of_its_law(tmp_path: Path, forked: None) -> None:
     (tmp_path / "pair.yaml").write_text(PAIR)
     with zsim.Federation(tmp_path / "pair.yaml", law=TwoRates, out=tmp_path / "run") as flight:  # noqa: SIM117
         with pytest.raises(RunFailedError, match=r"TwoRates\.rates .*\(2,\)"):
             flight.wait_until("engaged")
 
 
-def test_an_injected_fault_comes_at_the_same_gate_however_far_the_world_may_be(tmp_path: Path, forked: None) -> None:
+def test_an_injected_fault_starts_at_a_reproducible_gate(tmp_path: Path, forked: None) -> None:
     (tmp_path / "pair.yaml").write_text(PAIR)
     bias = {"kind": "gyro_bias", "target": "drone2", "for_s": 2, "value_deg_s": [3, 0, 0]}
     runs = []
@@ -128,7 +128,7 @@ class Pushed(zsim.PolicyAgent):
         return {agent: 0.3 * np.tanh(seen[:8]) for agent, seen in observations.items()}
 
 
-def test_a_policy_flies_as_a_process_to_the_bits_of_its_environment(tmp_path: Path, forked: None) -> None:
+def test_a_policy_as_a_process_flies_the_bits_of_its_environment(tmp_path: Path, forked: None) -> None:
     (tmp_path / "pair.yaml").write_text(PAIR)
     how: Any = {"observe": Pushed.observe, "action": Pushed.action, "step_s": Pushed.step_s}
     env = zsim.parallel_env(tmp_path / "pair.yaml", reward=lambda sim, agent: 0.0, duration_s=8, **how)

@@ -1,4 +1,4 @@
-"""Realtime: paced by the wall clock, nobody is waited for, everything late is counted."""
+"""Realtime runs: paced by the wall clock, with no waiting, and with every delay counted."""
 
 import os
 import signal
@@ -10,39 +10,39 @@ from refused import parts
 from wire import Client
 
 FOR_LONG = ("--duration", "3600")
-SLOW = 0.02  # rate at which 500 ms of simulated time are 25 s of wall time
+SLOW = 0.02  # rate at which 500 ms of simulated time take 25 s of wall time
 NOBODY_FLIES = "processes.on_death={controller: drop}"
 GATE_NS = 20_000_000
 
 
 def stop(client: Client, role: Role, code: int = 0) -> None:
-    """End a run by request; its code is 1 where it has left its plan."""
+    """End a run by request; its exit code is 1 if it has left its plan."""
     assert client.request("world/control", "stop")["ok"]
     role.ends(with_code=code)
 
 
 @pytest.mark.parametrize("rate", [1, pytest.param(5, marks=pytest.mark.soak)])
-def test_it_keeps_pace(federation: Federation, rate: int) -> None:
+def test_a_realtime_run_keeps_pace(federation: Federation, rate: int) -> None:
     duration_s = 3 * rate
     run = federation.run(PAIR, "--realtime", "--rate", str(rate), "--duration", str(duration_s))
     run.ends(with_code=0)
     record = federation.record()
     end = record.end()
     assert end["last_ns"] == duration_s * 10**9
-    # How late a loaded machine is, is no matter here; that nothing is early, and that it is measured and reported, is.
+    # A loaded machine may be late by any amount, but nothing may be early, and delays must be measured and reported.
     assert end["wall_s"] > 0.99 * duration_s / rate
     assert end["deadlines"] >= 3 * (duration_s * 50 - 3)
     assert 0 <= end["deadline_misses"] <= end["deadlines"] + duration_s * 50
     assert end["deadline_misses"] == sum(end["deadline_misses_by"].values())
     assert set(end["deadline_misses_by"]) == {*PAIR_ROLES, "world"}
-    if rate == 5:  # it flies from 4 s on
+    if rate == 5:  # the other run ends before the flight begins at 4 s
         age = end["command_age_ms"]
         assert 0 < age["p50"] <= age["p99"] <= age["max"]
     assert all(clock["waiting_for"] == [] for clock in record.all("clock") if clock["state"] == "running")
 
 
-def test_nobody_is_waited_for(federation: Federation) -> None:
-    """A stopped estimator holds neither time nor its controller; it is a deadline missed at every gate."""
+def test_a_stopped_participant_is_not_waited_for(federation: Federation) -> None:
+    """A stopped estimator holds up neither time nor its controller, and misses a deadline at every gate."""
     run = federation.run(PAIR, "--realtime", "--rate", "2", *FOR_LONG)
     client = federation.client()
     clock, states = client.subscribe("clock"), client.subscribe("cluster/main/state")
@@ -54,11 +54,11 @@ def test_nobody_is_waited_for(federation: Federation) -> None:
     federation.kill("estimator.drone1", signal.SIGCONT)
     stop(client, run)
     end = federation.record().end()
-    assert end["deadline_misses_by"]["estimator.drone1"] >= 150  # of the 200 gates that it slept through
+    assert end["deadline_misses_by"]["estimator.drone1"] >= 150  # out of the 200 gates while it was stopped
 
 
-def test_a_run_that_is_frozen_goes_on_where_it_stood(federation: Federation) -> None:
-    """As by a machine that is suspended: no time is made up for in a burst that nobody could follow or record."""
+def test_a_frozen_run_continues_where_it_stopped(federation: Federation) -> None:
+    """As when a machine is suspended; lost time is not made up in a burst that nothing could follow or record."""
     rate, duration_s, frozen_s = 2, 14, 3.0
     run = federation.run(PAIR, "--realtime", "--rate", str(rate), "--duration", str(duration_s))
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] > 2e9)
@@ -77,8 +77,8 @@ def test_a_run_that_is_frozen_goes_on_where_it_stood(federation: Federation) -> 
     assert record.end()["wall_s"] > 0.99 * (duration_s / rate + frozen_s)
 
 
-def test_a_dead_controller_means_hover(federation: Federation) -> None:
-    """The dead fly no drone any more, and a drone that nobody flies hovers."""
+def test_drones_hover_after_their_controller_dies(federation: Federation) -> None:
+    """A dead controller loses its drones, and a drone without a commander hovers."""
     run = federation.run(PAIR, "--realtime", "--rate", "3", *FOR_LONG, "--set", NOBODY_FLIES)
     client = federation.client()
     events, states = client.subscribe("world/event"), client.subscribe("drone/drone1/sensor/status")
@@ -92,8 +92,8 @@ def test_a_dead_controller_means_hover(federation: Federation) -> None:
     assert list(dict.fromkeys(seen)) == ["flying", "hovering"]
 
 
-def test_a_silent_commander_means_hover_then_land(federation: Federation) -> None:
-    """A controller that hangs still holds its drones: the firmware's watchdog lands them."""
+def test_drones_hover_then_land_under_a_silent_commander(federation: Federation) -> None:
+    """A hung controller keeps its drones, so the firmware's watchdog lands them."""
     run = federation.run(PAIR, "--realtime", "--rate", "3", *FOR_LONG)
     client = federation.client()
     states = client.subscribe("drone/drone1/sensor/status")
@@ -109,7 +109,7 @@ def test_a_silent_commander_means_hover_then_land(federation: Federation) -> Non
     assert landing.message["t_ns"] - hovering_ns == pytest.approx(2e9, abs=GATE_NS)
 
 
-def test_old_commands_are_refused_by_age(federation: Federation) -> None:
+def test_commands_older_than_500_ms_are_refused(federation: Federation) -> None:
     world = federation.world(ONE, "--realtime", "--rate", "1", *FOR_LONG)
     client = federation.client()
     clock, events = client.subscribe("clock"), client.subscribe("world/event")
@@ -126,7 +126,7 @@ def test_old_commands_are_refused_by_age(federation: Federation) -> None:
     stop(client, world)
 
 
-def test_pause_and_resume(federation: Federation) -> None:
+def test_a_realtime_run_can_be_paused_stepped_and_resumed(federation: Federation) -> None:
     world = federation.world(ONE, "--realtime", "--rate", "5", "--duration", "1000")
     client = federation.client()
     clock = client.subscribe("clock")

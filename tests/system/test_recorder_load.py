@@ -1,4 +1,4 @@
-"""The recorder beside 50 drones with everything that they say: nothing is missing, counted by the `seq` of each key."""
+"""The recorder with all messages of 50 drones: none is missing by the `seq` of each key."""
 
 import pytest
 
@@ -6,12 +6,12 @@ from benchmarks.recorder import DRONES, Flown, fly
 
 RATES_HZ = (
     200 + 5 + 25 + 25 + 25 + 15 + 4 * 50
-)  # of a drone: its sensors; status, truth, estimate and command every gate
-SHARE = 0.6  # of those at least: commands begin with the flight, and the `paper` preset leaves nothing out
+)  # per drone: sensors, then status, truth, estimate and command at every gate
+SHARE = 0.6  # minimum share of these messages: commands begin only with the flight
 
 
 def complete(flown: Flown, seconds: float) -> None:
-    """Fail if anything is missing."""
+    """Check that no message is missing."""
     assert flown.faults == {}
     assert flown.missing == 0
     assert flown.sim_s == pytest.approx(seconds)
@@ -19,7 +19,7 @@ def complete(flown: Flown, seconds: float) -> None:
 
 
 @pytest.mark.soak
-def test_five_seconds_as_fast_as_they_go_are_recorded_without_a_gap(compiled: None) -> None:
+def test_five_seconds_at_full_speed_are_recorded_without_a_gap(compiled: None) -> None:
     complete(fly(DRONES, 5.0), 5.0)
 
 

@@ -1,7 +1,7 @@
-"""What `zsim render` writes is what systemd, Compose and Kubernetes take, and what their command lines start flies.
+"""systemd, Compose and Kubernetes accept what `zsim render` writes, and its commands complete a run.
 
-Validators: `systemd-analyze verify`, the schema of the Compose specification (in check-jsonschema), and the schemas
-of the Kubernetes API (in kubernetes-validate), strict: an unknown field is a fault.
+Validators: `systemd-analyze verify`, the schema of the Compose specification (from check-jsonschema) and the schemas
+of the Kubernetes API (from kubernetes-validate) in strict mode, which refuses unknown fields.
 """
 
 import os
@@ -30,7 +30,7 @@ from zsim_deploy.render import STATE, STOP_S, compose, kubernetes, systemd
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"
-OLDEST, NEWEST = "1.31", "1.37"  # podFailurePolicy is stable from 1.31 on; the newest that the validator knows
+OLDEST, NEWEST = "1.31", "1.37"  # podFailurePolicy is stable since 1.31; 1.37 is the validator's newest
 
 Started = Callable[[Role], Role]
 
@@ -50,7 +50,7 @@ SECURITY = pytest.mark.parametrize("insecure", [False, True], ids=["tls", "insec
 
 
 def rendered(folder: Path, target: str, insecure: bool = False, text: str = HOSTS, scenario: Path = STEP) -> Path:
-    """Write what a target renders into a folder; return that."""
+    """Render the files of a target into a subfolder and return it."""
     hosts = folder / "hosts.yaml"
     hosts.write_text(text + f"security: {{insecure: {str(insecure).lower()}}}\n")
     render = {"systemd": systemd, "compose": compose, "kubernetes": kubernetes}[target]
@@ -65,7 +65,7 @@ def rendered(folder: Path, target: str, insecure: bool = False, text: str = HOST
 
 
 def verify(folder: Path) -> str:
-    """Return what systemd-analyze has against the units of a host."""
+    """Return the complaints of systemd-analyze about the units of a host."""
     units = [str(path) for path in sorted([*folder.glob("*.service"), *folder.glob("*.target")])]
     done = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, timeout=PATIENCE_S)
     return done.stderr + (f"exit code {done.returncode}" if done.returncode else "")
@@ -74,7 +74,7 @@ def verify(folder: Path) -> str:
 @needs_systemd
 @SECURITY
 @pytest.mark.parametrize("host", ["lab", "one", "two"])
-def test_units_are_verified(tmp_path: Path, host: str, insecure: bool) -> None:
+def test_systemd_verifies_the_units(tmp_path: Path, host: str, insecure: bool) -> None:
     assert verify(rendered(tmp_path, "systemd", insecure) / host) == ""
 
 
@@ -99,14 +99,14 @@ def test_a_fault_in_a_unit_is_found(tmp_path: Path, right: str, wrong: str, mess
 
 
 def judged(*paths: Path) -> str:
-    """Return what the Compose specification has against some files."""
+    """Return how files violate the Compose specification."""
     files = map(str, paths)
     command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", *files]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
     return "" if done.returncode == 0 else done.stdout + done.stderr
 
 
-def test_compose_files_fit_the_specification(tmp_path: Path) -> None:
+def test_compose_files_conform_to_the_specification(tmp_path: Path) -> None:
     files = []
     for insecure in (False, True):
         (tmp_path / str(insecure)).mkdir()
@@ -127,9 +127,9 @@ def documents(out: Path) -> list[dict]:
 
 @SECURITY
 @pytest.mark.parametrize("version", [OLDEST, NEWEST])
-def test_manifests_fit_the_api(tmp_path: Path, version: str, insecure: bool) -> None:
+def test_manifests_conform_to_the_kubernetes_api(tmp_path: Path, version: str, insecure: bool) -> None:
     found = documents(rendered(tmp_path, "kubernetes", insecure))
-    assert len(found) == 4 + 1 + 6 + 2  # what stays, records and scenario; the Service; roles; routers
+    assert len(found) == 4 + 1 + 6 + 2  # Namespace, volume claim, Pod and ConfigMap; Service; roles; routers
     assert {kubernetes_validate.validate(one, version, strict=True) for one in found} == {version}
 
 
@@ -140,8 +140,8 @@ def test_a_fault_in_a_manifest_is_found(tmp_path: Path) -> None:
         kubernetes_validate.validate(job, NEWEST, strict=True)
 
 
-def test_the_secrets_are_made_from_the_files_of_certs_init(tmp_path: Path) -> None:
-    """The script is run with a kubectl that looks whether the files are there and does what it is message of them."""
+def test_the_secrets_are_created_from_the_files_of_certs_init(tmp_path: Path) -> None:
+    """The script runs with a stub of kubectl that reports whether each file exists."""
     out = rendered(tmp_path, "kubernetes")
     certs(tmp_path, STEP)
     (tmp_path / "kubectl").write_text(f"""#!{sys.executable}
@@ -161,17 +161,17 @@ for path in map(pathlib.Path, files):
     )
     assert done.returncode == 0, done.stderr
     looked = done.stderr.splitlines()
-    assert len(looked) == 8 + 3  # a certificate each, and access control of the world and two routers
+    assert len(looked) == 8 + 3  # each process's certificate, and the access control of the world and two routers
     assert all(line.endswith(": True") for line in looked)
 
 
 def certs(folder: Path, scenario: Path) -> None:
-    """Make the certificates of the inventory in a folder."""
+    """Create the certificates of the inventory in a folder."""
     made = run_here("certs", "init", str(folder / "hosts.yaml"), "--scenario", str(scenario))
     assert made.code == 0, made
 
 
-# What a unit starts
+# Commands of units
 
 
 class Unit(NamedTuple):
@@ -181,7 +181,7 @@ class Unit(NamedTuple):
     words: list[str]
 
     def __call__(self, *more: str, prefix: tuple[str, ...] = ()) -> Role:
-        """Start it, with options before the name, which comes after a double dash."""
+        """Start the command with more options, which go before any double dash and the name after it."""
         at = self.words.index("--") if "--" in self.words else len(self.words)
         python, *arguments = [*self.words[:at], *more, *self.words[at:]]
         assert (python, *arguments[:3]) == (sys.executable, "-P", *ZSIM[1:])
@@ -189,7 +189,7 @@ class Unit(NamedTuple):
 
 
 def units(out: Path, state: Path) -> Iterator[Unit]:
-    """Yield the units of all hosts; `state` is in the place of StateDirectory=."""
+    """Yield the units of all hosts, with `state` as their StateDirectory=."""
     for path in sorted(out.glob("*/*.service")):
         (line,) = re.findall(r"^ExecStart=(.*)$", path.read_text(), re.MULTILINE)
         line = line.replace(STATE, str(state))
@@ -198,7 +198,7 @@ def units(out: Path, state: Path) -> Iterator[Unit]:
 
 
 def here(folder: Path, ports: Sequence[int]) -> str:
-    """Return an inventory with three hosts, all of them this one, drone2's behind a router."""
+    """Return an inventory of three hosts, all on this machine, with drone2's behind a router."""
     world, router = ports
     host = f"address: 127.0.0.1, user: me, python: {sys.executable}, folder: {folder}"
     return f"""
@@ -210,7 +210,7 @@ port: {world}
 
 
 def laid_out(folder: Path, scenario: str, insecure: bool) -> dict[str, Unit]:
-    """Render units for this machine, bring every host's files to its folder, return the units by process."""
+    """Render units for this machine and copy each host's files to its folder; return the units by process."""
     own = folder / "own.yaml"
     own.write_text(scenario)
     text = here(folder, [free_port(), free_port()])
@@ -226,7 +226,7 @@ def laid_out(folder: Path, scenario: str, insecure: bool) -> dict[str, Unit]:
 
 @pytest.fixture
 def started() -> Iterator[Started]:
-    """Return what notes a role, which is killed at the end of the test if it lives."""
+    """A function that registers a role, which is killed at the end of the test if it is still running."""
     with ExitStack() as stack:
 
         def note(role: Role) -> Role:
@@ -239,10 +239,8 @@ def started() -> Iterator[Started]:
 @pytest.mark.parametrize(
     ("name", "insecure"), [("estimator.drone1", False), ("controller.main", True), ("recorder", False)]
 )
-def test_a_unit_s_command_is_one_that_the_role_takes(
-    tmp_path: Path, started: Started, name: str, insecure: bool
-) -> None:
-    """Nobody listens there, and the role says so, which it does when it is content with its options."""
+def test_roles_accept_the_commands_of_their_units(tmp_path: Path, started: Started, name: str, insecure: bool) -> None:
+    """The role reports that no world listens, which it does only after accepting its options."""
     unit = laid_out(tmp_path, PAIR, insecure)[name]
     role = started(unit("--wait", "0.1"))
     role.ends(with_code=2)
@@ -251,7 +249,7 @@ def test_a_unit_s_command_is_one_that_the_role_takes(
     assert role.text().splitlines()[-1] == expected
 
 
-def test_a_certificate_that_is_not_there_is_a_line(tmp_path: Path, started: Started) -> None:
+def test_a_missing_key_is_reported(tmp_path: Path, started: Started) -> None:
     unit = laid_out(tmp_path, PAIR, insecure=False)["estimator.drone1"]
     (tmp_path / "one/certs/estimator.drone1/key.pem").unlink()
     role = started(unit("--wait", "0.1"))
@@ -262,8 +260,8 @@ def test_a_certificate_that_is_not_there_is_a_line(tmp_path: Path, started: Star
 
 @pytest.mark.parametrize("insecure", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["tls", "insecure"])
 @pytest.mark.usefixtures("compiled")
-def test_the_units_of_three_hosts_fly(tmp_path: Path, started: Started, insecure: bool) -> None:
-    """All units at once, in whatever order they come up, until the world ends the run; the recorder dies once."""
+def test_the_units_of_three_hosts_complete_a_run(tmp_path: Path, started: Started, insecure: bool) -> None:
+    """All units start together and run until the world ends the run; the recorder is killed and restarted once."""
     found = laid_out(tmp_path, PAIR.replace("duration_s: 12", "duration_s: 6"), insecure)
     assert set(found) == {"world", "recorder", *PAIR_ROLES, "router.yard"}
     roles = {name: started(unit()) for name, unit in sorted(found.items())}
@@ -283,11 +281,11 @@ def test_the_units_of_three_hosts_fly(tmp_path: Path, started: Started, insecure
 
 
 @pytest.mark.usefixtures("compiled")
-def test_a_world_ends_by_the_signal_of_its_unit(tmp_path: Path, started: Started) -> None:
+def test_a_world_ends_on_the_kill_signal_of_its_unit(tmp_path: Path, started: Started) -> None:
     found = laid_out(tmp_path, PAIR, insecure=True)
     text = (tmp_path / "systemd/lab/zsim-world.service").read_text()
     assert "KillSignal=SIGTERM" in text
-    world = started(found["world"](prefix=("env",)))  # a program of its own, as of all units
+    world = started(found["world"](prefix=("env",)))  # a new program, as systemd starts it
     world.line("tcp/127.0.0.1:")
     world.signal(signal.SIGTERM)
     world.ends(with_code=0, within_s=STOP_S)

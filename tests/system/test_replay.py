@@ -1,4 +1,4 @@
-"""A record played back onto the keys: the same bytes, for whoever would listen to a flight; pictures, too."""
+"""Replays of records: the recorded bytes, pictures included, on the keys of the flight."""
 
 import re
 import shutil
@@ -24,7 +24,7 @@ RESAID = ("drone/*/sensor/*", "drone/*/truth", "drone/*/estimate", "drone/*/cmd/
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
-    """The folder of a run of PAIR, 12 s."""
+    """The folder of a run of PAIR, which lasts 12 s."""
     with Federation(tmp_path_factory.mktemp("flown")) as federation:
         federation.run(PAIR, "--in-process").ends(with_code=0)
         return federation.out
@@ -37,7 +37,7 @@ def replay(federation: Federation, folder: Path, *options: str) -> Role:
 
 
 class Ear:
-    """Keeps the payloads of some keys, byte by byte, before its client is told of anything that arrives later."""
+    """Collects the raw payloads of some keys, each before the client receives anything that arrives later."""
 
     def __init__(self, client: Client, *expressions: str) -> None:
         self.received: defaultdict[str, list[bytes]] = defaultdict(list)
@@ -66,7 +66,7 @@ def resume(client: Client) -> None:
 
 
 def without_source(payload: bytes) -> dict[str, Any]:
-    """Return an estimate without the name of its process: in the recorded run one process did all."""
+    """Return an estimate without its source, since the recorded run was a single process."""
     return unsigned(msgpack.unpackb(payload))
 
 
@@ -74,13 +74,13 @@ def unsigned(message: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in message.items() if name != "source"}
 
 
-def test_the_same_payloads(federation: Federation, flown: Path) -> None:
-    """Everything that was said of and by the drones, said again as fast as it goes.
+def test_a_replay_publishes_the_recorded_payloads(federation: Federation, flown: Path) -> None:
+    """Sensors, truth, estimates, commands and states are replayed as fast as possible.
 
         run.mcap ──▶ zsim replay ──▶ sensors, truth, estimates, commands, states ──▶ a client
 
-    Expected: byte by byte what was recorded; another run_id, and whose replay it is; views, though none are on record;
-    a clock of its own that ends.
+    Expected: the recorded payloads, byte for byte; a new run_id and the id of the recorded run; views, although none
+    are recorded; a clock that ends as stopped.
     """
     role = replay(federation, flown, "--rate", "0", "--paused")
     client = federation.client()
@@ -102,8 +102,8 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
     assert {view.key for view in views.now()} >= {"view/drones", "view/cluster/main"}
 
 
-def test_a_console_beside_it_has_a_timeline(federation: Federation, flown: Path) -> None:
-    """Played to its end, where it stands: nothing is over before somebody ends it."""
+def test_the_console_of_a_replay_has_a_timeline(federation: Federation, flown: Path) -> None:
+    """The replay pauses at its end and lasts until it is interrupted."""
     pytest.importorskip("viser", reason="viser is not installed; pip install '.[console]'")
     role = replay(federation, flown, "--console", "--rate", "0")
     client = federation.client()
@@ -122,10 +122,10 @@ def test_a_console_beside_it_has_a_timeline(federation: Federation, flown: Path)
     federation.nobody_left()
 
 
-def test_a_part_of_it(federation: Federation, flown: Path) -> None:
-    """From 5 s to 6 s, the GPS and the truth alone, at four times its pace; looked at with `zsim echo`.
+def test_a_part_of_a_record_can_be_replayed(federation: Federation, flown: Path) -> None:
+    """The GPS and the truth alone are replayed from 5 s to 6 s at rate 4.
 
-    Expected: exactly these messages; last values to be got; no faster than asked for.
+    Expected: exactly these messages; available last values; no faster pace than requested.
     """
     keys = ("drone/*/truth", "drone/*/sensor/gps")
     options = [part for key in keys for part in ("--keys", key)]
@@ -134,13 +134,13 @@ def test_a_part_of_it(federation: Federation, flown: Path) -> None:
     ear, clock = Ear(client, "drone/**", "cluster/**"), client.subscribe("clock")
     stood = clock.until(lambda m: m["state"] == "paused")
     assert stood.message["t_ns"] == 5_000_000_000
-    role.line("/ 6 s")  # progress counts what is played, not what the scenario was to last
+    role.line("/ 6 s")  # progress refers to the part played, not to the scenario's duration
     assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 5_000_000_000
     resume(client)
     over = clock.until(lambda m: m["state"] == "stopped")
     role.ends(with_code=0)
     assert re.search("^ended: .*6 s", role.text(), re.MULTILINE)
-    assert over.wall_s - stood.wall_s > 0.24  # 1 s at 4, but for the gate that time stood at
+    assert over.wall_s - stood.wall_s > 0.24  # 1 s at rate 4, less the gate at which the replay was paused
     assert {key.split("/", 2)[2] for key in ear.received} == {"truth", "sensor/gps"}
     wanted = recorded(flown, *keys)
     for key, payloads in ear.received.items():
@@ -148,11 +148,8 @@ def test_a_part_of_it(federation: Federation, flown: Path) -> None:
         assert [p for p in payloads if msgpack.unpackb(p)["t_ns"] > 5_000_000_000] == in_time
 
 
-def test_echo(federation: Federation, flown: Path) -> None:
-    """`zsim echo` on a replay at its own pace.
-
-    Expected: it prints payloads of the record.
-    """
+def test_echo_prints_replayed_payloads(federation: Federation, flown: Path) -> None:
+    """`zsim echo` on a replay prints recorded payloads."""
     replay(federation, flown, "--rate", "0.2")
     echo = federation.role("echo", "drone/drone2/sensor/imu", "--raw", "-n", "20")
     echo.ends(with_code=0)
@@ -162,13 +159,13 @@ def test_echo(federation: Federation, flown: Path) -> None:
     assert set(output) <= on_record
 
 
-def test_an_estimator_under_test(federation: Federation, flown: Path) -> None:
-    """Our own estimator of drone1 works from the record, in lockstep; a recorder beside it.
+def test_an_estimator_reproduces_its_estimates_from_a_record(federation: Federation, flown: Path) -> None:
+    """The estimator of drone1 runs on the record in lockstep, next to a recorder.
 
         run.mcap ──▶ zsim replay ──sensors──▶ estimator.drone1 ──estimate──▶ recorder
 
-    Expected: its estimates are those that were recorded in flight, to the bit, and are not played; those of drone2
-    are; the record made is that of a replay, and is not flown again.
+    Expected: its estimates equal those recorded in flight to the bit, and only they are published; those of drone2 are
+    replayed; the new record is marked as one of a replay, and rerun refuses it.
     """
     role = replay(federation, flown, "--rate", "0", "--expect", "estimator.drone1", "--expect", "recorder")
     others = [federation.role("estimator", "drone1"), federation.role("record", "--out", str(federation.out))]
@@ -187,10 +184,10 @@ def test_an_estimator_under_test(federation: Federation, flown: Path) -> None:
 
 
 @pytest.mark.soak
-def test_an_estimator_without_gps(federation: Federation, flown: Path) -> None:
-    """The estimator under test hears no GPS, by --keys.
+def test_an_estimator_does_not_wait_for_keys_left_out(federation: Federation, flown: Path) -> None:
+    """`--keys` withholds the GPS from the estimator under test.
 
-    Expected: it is not waited for what is left out; it counts no GPS, and the others as in flight.
+    Expected: nobody waits for what is left out; the estimator counts no GPS and as many other samples as in flight.
     """
     kinds = [part for kind in ("imu", "mag", "baro", "flow", "status") for part in ("--keys", f"drone/*/sensor/{kind}")]
     role = replay(federation, flown, "--rate", "0", "--expect", "estimator.drone1", "--to", "4", *kinds)
@@ -208,10 +205,10 @@ def test_an_estimator_without_gps(federation: Federation, flown: Path) -> None:
     assert sum(last["sensors"]["baro"]) == sum(flew["sensors"]["baro"]) > 0
 
 
-def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
-    """Time is steered, flight is refused.
+def test_a_replay_allows_time_control_and_refuses_flight(federation: Federation, flown: Path) -> None:
+    """Requests that control time succeed; those that control flight are refused.
 
-    Expected: pause, step, seek, rate, resume and stop as of a run; who flies is told why not.
+    Expected: pause, step, seek, rate, resume and stop work; each refusal of a flight request gives the reason.
     """
     role = replay(federation, flown, "--rate", "2")
     client = federation.client()
@@ -245,10 +242,10 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
     role.ends(with_code=0)
 
 
-def test_a_recorder_that_comes_late(federation: Federation, flown: Path) -> None:
-    """A recorder joins a replay from 2 s on, when it has played 6 s of it and nobody keeps its beginning.
+def test_a_recorder_may_join_a_replay_late(federation: Federation, flown: Path) -> None:
+    """A recorder joins a replay from 2 s once 6 s of it have been played and its beginning is no longer kept.
 
-    Expected: its record says of which run it is; its end tells the time that was played.
+    Expected: the record names the original run; its end gives the duration that was played.
     """
     role = replay(federation, flown, "--from", "2", "--to", "9", "--rate", "0", "--paused")
     client = federation.client()
@@ -265,17 +262,17 @@ def test_a_recorder_that_comes_late(federation: Federation, flown: Path) -> None
     (info,) = map(msgpack.unpackb, on_record["world/info"])
     assert info["replay_of"]
     stamps = [msgpack.unpackb(payload)["t_ns"] for payload in on_record["drone/drone1/truth"]]
-    assert 2_900_000_000 < stamps[0] < 3_100_000_000  # the last 5 s
+    assert 2_900_000_000 < stamps[0] < 3_100_000_000  # only the last 5 s are kept
     assert stamps[-1] == 9_000_000_000
     end = next(m for m in map(msgpack.unpackb, on_record["world/event"]) if m["kind"] == "end")
     assert end["data"]["sim_s"] == 7.0
 
 
 @pytest.mark.soak
-def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
+def test_all_roles_reproduce_their_outputs_from_a_record(federation: Federation, flown: Path) -> None:
     """Both estimators and the controller take part as in a flight.
 
-    Expected: they answer as they did in flight, and what they said then is not played besides.
+    Expected: they publish what they did in flight, and their recorded messages are not replayed as well.
     """
     expect = [part for name in PAIR_ROLES for part in ("--expect", name)]
     role = replay(federation, flown, "--rate", "0", "--to", "6", *expect)
@@ -293,10 +290,11 @@ def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
 
 
 @pytest.mark.soak
-def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:
+def test_a_truncated_record_is_played_as_far_as_it_goes(federation: Federation, flown: Path) -> None:
     """The writer of the record died.
 
-    Expected: it is played as far as it goes; a folder without a record, and a time after its end, are told in a line.
+    Expected: the record is played as far as it goes; a folder without a record, a time after its end and a bad key are
+    reported.
     """
     cut = federation.folder / "cut"
     cut.mkdir()
@@ -321,7 +319,7 @@ FRONT, FRONT_INFO = "drone/drone1/camera/front", "drone/drone1/camera/front/info
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
-    """The folder of a run of 4 s beside which a camera of somebody's own publishes."""
+    """The folder of a run of 4 s with an external camera."""
     with Federation(tmp_path_factory.mktemp("filmed")) as federation:
         world = federation.world(ONE.replace("duration_s: 10", "duration_s: 4"), "--rate", "1", "--expect", "recorder")
         recorder = federation.role("record", "--out", str(federation.out))
@@ -335,17 +333,17 @@ def filmed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
         return federation.out
 
 
-def test_they_are_on_record_and_the_run_is_flown_again_without_them(filmed: Path, federation: Federation) -> None:
+def test_pictures_are_recorded_and_the_run_can_be_rerun_without_them(filmed: Path, federation: Federation) -> None:
     pictures = recorded(filmed, FRONT)[FRONT]
     assert len(pictures) > 20
-    assert len(set(pictures)) == len(pictures)  # none is there twice
+    assert len(set(pictures)) == len(pictures)  # no picture is recorded twice
     assert len(recorded(filmed, FRONT_INFO)[FRONT_INFO]) == 1
     again = federation.start("rerun", str(filmed))
     again.ends(with_code=0)
     again.line("truth_sha256 is the same")
 
 
-def test_a_replay_plays_them_byte_by_byte_and_answers_how_the_camera_sees(filmed: Path, federation: Federation) -> None:
+def test_a_replay_publishes_the_recorded_pictures_and_calibration(filmed: Path, federation: Federation) -> None:
     pictures = recorded(filmed, FRONT)[FRONT]
     role = replay(federation, filmed, "--rate", "2", "--paused")
     client = federation.client()
@@ -361,5 +359,5 @@ def test_a_replay_plays_them_byte_by_byte_and_answers_how_the_camera_sees(filmed
     clock.until(lambda m: m["state"] == "stopped")
     role.ends(with_code=0)
     played = ear.received[FRONT]
-    assert len(played) > 1  # a machine with much to do skips some
+    assert len(played) > 1  # a busy machine skips some
     assert [payload for payload in pictures if payload in set(played)] == played

@@ -1,4 +1,4 @@
-"""Debian's unmodified ROS 1 tools and rospy see and fly a drone through `zsim ros1`."""
+"""Debian's unmodified ROS 1 tools and rospy observe and fly a drone through `zsim ros1`."""
 
 import json
 import re
@@ -50,7 +50,7 @@ uint32[] tags_height
 float32[] tags_orientation
 float32[] tags_distance
 float32 tm
-"""  # what the driver's package would build for its users: ardrone_autonomy/msg/Navdata.msg
+"""  # ardrone_autonomy/msg/Navdata.msg, which the driver's package would build
 IMAGE, CAMERA_INFO = "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo"
 OFFERED = {
     **{f"/drone1/ardrone/{camera}image_raw/compressed": IMAGE for camera in ("", "front/", "bottom/")},
@@ -72,13 +72,13 @@ OFFERED = {
 
 @pytest.fixture(scope="module", autouse=True)
 def installed() -> None:
-    """Leave the tests of this file out, and say why, where ROS 1 is not installed."""
+    """Skip this file, with the reason, if ROS 1 is not installed."""
     if reason := ros1_graph.missing():
         pytest.skip(reason)
 
 
 class Flight:
-    """A world with an estimator, the bridge, and the ROS graph that it is in."""
+    """A world with an estimator, and the bridge with its ROS graph."""
 
     def __init__(self, federation: Federation, graph: RosGraph) -> None:
         self.graph = graph
@@ -95,7 +95,7 @@ def bridge(federation: Federation, graph: RosGraph) -> Role:
 
 @pytest.fixture(scope="module")
 def flight(installed: None, tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Flight]:
-    """A flight that the tests of this file share; each leaves the drone on the ground."""
+    """A flight shared by the tests of this file, each of which leaves the drone on the ground."""
     folder = tmp_path_factory.mktemp("ros1")
     graph = RosGraph(folder)
     with Federation(folder) as federation:
@@ -113,8 +113,8 @@ def graph(flight: Flight) -> RosGraph:
 
 
 @pytest.mark.soak
-def test_pictures_are_as_a_camera_publishes_them(flight: Flight, graph: RosGraph):
-    """A camera of somebody's own: rospy's tools have its pictures, and what their pixels mean."""
+def test_pictures_arrive_as_the_camera_published_them(flight: Flight, graph: RosGraph):
+    """The ROS tools receive the pictures of an external camera and its calibration."""
     camera = flight.federation.client()
     camera.put("drone/drone1/camera/front/info", **calibration())
     with pumping(camera, "drone/drone1/camera/front"):
@@ -142,7 +142,7 @@ def test_the_tools_list_what_the_driver_offers(graph: RosGraph):
 
 
 @pytest.mark.soak
-def test_rostopic_measures_the_rates_of_the_aircraft_in_simulated_time(graph: RosGraph):
+def test_rostopic_measures_the_sensor_rates_in_simulated_time(graph: RosGraph):
     rates_hz = {"ardrone/imu": 200.0, "ardrone/navdata": 50.0, "fix": 5.0}
     watched = {topic: graph.start("rostopic", "hz", "-w", "200", f"/drone1/{topic}") for topic in rates_hz}
     for topic, hz in watched.items():
@@ -154,20 +154,20 @@ def _is_near(line: str, rate_hz: float) -> bool:
     return abs(float(line.split()[-1]) - rate_hz) < 0.1 * rate_hz
 
 
-def test_rostopic_echoes_navdata_with_the_type_that_ros_s_generator_makes(graph: RosGraph):
+def test_rostopic_echoes_navdata_with_the_generated_type(graph: RosGraph):
     output = graph.run("rostopic", "echo", "-n", "1", "/drone1/ardrone/navdata")
     values = dict(re.findall(r"^(\w+): (\S+)$", output, re.MULTILINE))
     assert values["state"] == "2"
     assert 50.0 < float(values["batteryPercent"]) <= 100.0
-    assert abs(float(values["rotZ"]) - 90.0) < 20.0  # the scenario's yaw_deg, by the estimator's magnetometer
+    assert abs(float(values["rotZ"]) - 90.0) < 20.0  # the scenario's yaw_deg, as estimated with the magnetometer
     assert abs(float(values["az"]) - 1.0) < 0.2
     assert int(values["altd"]) < 200
 
 
-def test_rostopic_and_roscpp_fly_a_drone_and_see_it_move(graph: RosGraph):
+def test_rostopic_and_roscpp_fly_and_track_a_drone(graph: RosGraph):
     truth = graph.watch(TRUTH)
     truth.until(numbers)
-    asked = graph.run("rosnode", "info", "/zsim")  # of the node itself
+    asked = graph.run("rosnode", "info", "/zsim")  # answered by the node itself
     assert re.search(r"topic: /drone1/ground_truth/state\n    \* to: /rostopic\S+\n    \* direction: outbound", asked)
     graph.run("rosservice", "call", "/drone1/ardrone/flattrim")
     with graph.published("/drone1/ardrone/takeoff", "std_msgs/Empty"):
@@ -177,7 +177,7 @@ def test_rostopic_and_roscpp_fly_a_drone_and_see_it_move(graph: RosGraph):
     north = graph.start("rostopic", "pub", "-r", "10", "/drone1/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.15}}")
     truth.until(lambda line: (at := numbers(line)) and at[2] > y + 1.5)  # forward is north: yaw_deg 90
     north.end()
-    graph.start(ros1_graph.RELAY, "/pilot", "/drone1/cmd_vel")  # in C++ it takes and publishes with roscpp
+    graph.start(ros1_graph.RELAY, "/pilot", "/drone1/cmd_vel")  # relays through roscpp
     graph.start(ros1_graph.RELAY, "/drone1/ground_truth/state", "/copy")
     west = graph.start("rostopic", "pub", "-r", "10", "/pilot", "geometry_msgs/Twist", "{linear: {y: 0.15}}")
     copy = graph.watch("/copy/pose/pose/position")
@@ -189,32 +189,32 @@ def test_rostopic_and_roscpp_fly_a_drone_and_see_it_move(graph: RosGraph):
     truth.end()
 
 
-def test_a_rospy_node_of_the_driver_s_users_flies_unchanged(graph: RosGraph):
+def test_a_rospy_node_for_ardrone_autonomy_flies_unchanged(graph: RosGraph):
     node = graph.start(ros1_graph.PYTHON, str(CLIMB), ROS_NAMESPACE="drone1")
     output = json.loads(node.until(lambda line: line.startswith("{")))
     assert output["states"][:3] == [2, 6, 4]
     assert 3 in output["states"]
     assert output["states"][-2:] == [8, 2]
-    assert output["altd"] > 1500  # by how much more is up to how soon the node reads
+    assert output["altd"] > 1500  # the excess depends on how soon the node reads
     assert abs(output["ground_truth"] - output["altd"] / 1000) < 0.5
     assert abs(output["rotZ"] - 90.0) < 20.0
     assert output["odometry"] == "drone1/ardrone_base_link"
-    assert output["fix"] == pytest.approx(4.0)  # preset paper: 2 m
+    assert output["fix"] == pytest.approx(4.0)  # m²: the preset paper has a standard deviation of 2 m
     assert abs(output["mag"]) < 1.0
 
 
-def test_what_is_no_number_is_refused_and_told(flight: Flight):
+def test_a_velocity_that_is_not_a_number_is_refused_and_reported(flight: Flight):
     with flight.graph.published("/drone1/cmd_vel", "geometry_msgs/Twist", "{linear: {x: .nan}}"):
         flight.bridge.line("/drone1/cmd_vel: .*/rostopic_.*finite")
 
 
-def test_what_the_world_refuses_is_told(flight: Flight):
+def test_a_refusal_of_the_world_is_reported(flight: Flight):
     with flight.graph.published("/drone1/ardrone/land", "std_msgs/Empty"):
         flight.bridge.line("ros1.main: drone/drone1/cmd/mode: drone1 is landed")
 
 
-@pytest.mark.soak  # test_node.py has it without ROS's own master
-def test_a_master_may_come_late_and_be_restarted_and_is_left_in_order(federation: Federation, tmp_path: Path):
+@pytest.mark.soak  # test_node.py covers this without ROS's own master
+def test_the_bridge_survives_a_late_and_restarted_master_and_unregisters(federation: Federation, tmp_path: Path):
     graph, master = RosGraph(tmp_path), ("rosmaster", "--core")
     federation.world(ONE, *PACE)
     try:
@@ -234,7 +234,7 @@ def test_a_master_may_come_late_and_be_restarted_and_is_left_in_order(federation
 
 
 @pytest.mark.soak
-def test_nodes_outlive_a_world_and_end_the_bridge(federation: Federation, tmp_path: Path):
+def test_nodes_survive_the_world_and_can_stop_the_bridge(federation: Federation, tmp_path: Path):
     graph = RosGraph(tmp_path)
     try:
         graph.start_master("rosmaster", "--core")

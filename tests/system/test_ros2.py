@@ -1,4 +1,4 @@
-"""`zsim ros2` as ROS nodes see it: participants of somebody else's making find, hear, fly and ask the drones."""
+"""`zsim ros2` as ROS nodes see it: independent participants discover, read, fly and query the drones."""
 
 import math
 import signal
@@ -35,7 +35,7 @@ drones:
   - {name: quad-1.a, position_m: [0, 0, 0], yaw_deg: 90}
 processes: {expect: []}
 """
-"""A drone whose name ROS does not take, in a run that ends when it is ended."""
+"""A drone whose name is invalid in ROS, in a run that outlasts every test."""
 
 ROS = tuple[Callable[..., Peer], Callable[[int], Router]]
 
@@ -47,7 +47,7 @@ def definitions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def ros(definitions: Path) -> Iterator[ROS]:
-    """What starts participants and routers on a port; they end with the test."""
+    """Functions that start a participant or a router on a port; both end with the test."""
     with ExitStack() as stack:
         yield (
             lambda port, mode="peer": stack.enter_context(Peer(port, definitions, mode)),
@@ -60,14 +60,14 @@ def port_of(endpoint: str) -> int:
 
 
 def bridge(federation: Federation, *arguments: str) -> Role:
-    """Start a bridge; return it once ROS can see it."""
+    """Start a bridge and return it once it is visible to ROS."""
     started = federation.role("ros2", *arguments)
     started.line("ROS domain 0")
     return started
 
 
 def expected() -> dict[str, list[str]]:
-    """Return the topics of PAIR with their types, as docs/ros2.md has them."""
+    """Return the topics of PAIR with their types as in docs/ros2.md."""
     of_run = {
         "/clock": "rosgraph_msgs/msg/Clock",
         "/tf": "tf2_msgs/msg/TFMessage",
@@ -112,12 +112,12 @@ def yaw(odometry: dict[str, Any]) -> float:
 
 
 def test_two_participants_find_and_receive_every_topic_and_request(federation: Federation, ros: ROS) -> None:
-    """One is there before the bridge, one comes after it; all values are checked against physics."""
+    """One starts before the bridge, the other after it; all values are checked against physics."""
     federation.run(PAIR.replace("duration_s: 12", "duration_s: 1000"), "--rate", "2")
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= 0)
     peer, _ = ros
     topics = expected()
-    without = (*TAKEN, "compressed", "camera_info")  # commands, and what there is no camera for here
+    without = (*TAKEN, "compressed", "camera_info")  # commands and, as there is no camera here, camera topics
     kinds = {topic: kind for topic, (kind,) in topics.items() if topic.rsplit("/", 1)[1] not in without}
     before = peer(port_of(federation.endpoint))
     for topic, kind in kinds.items():
@@ -147,8 +147,8 @@ def test_two_participants_find_and_receive_every_topic_and_request(federation: F
     assert "held" in refused["message"]
 
 
-def test_pictures_are_as_a_camera_publishes_them(federation: Federation, ros: ROS) -> None:
-    """A camera of somebody's own that has said how it sees before ROS asks: its pictures, and what they mean."""
+def test_pictures_arrive_as_the_camera_published_them(federation: Federation, ros: ROS) -> None:
+    """An external camera has published its calibration before ROS subscribes; ROS receives pictures and calibration."""
     federation.world(ONE.replace("duration_s: 10", "duration_s: 3600"), "--realtime")
     camera = federation.client()
     camera.subscribe("clock").until(lambda m: m["t_ns"] > 0)
@@ -173,7 +173,7 @@ def test_pictures_are_as_a_camera_publishes_them(federation: Federation, ros: RO
 
 
 def check_sensors(received: dict[str, Any]) -> None:
-    """Check the sensors of a drone that stands or hovers near (2, 0), heading north, in Buenos Aires."""
+    """Check the sensors of a drone in Buenos Aires that is on the ground or hovers near (2, 0), heading north."""
     imu = received["/drone1/imu"]
     assert imu["linear_acceleration"]["z"] == pytest.approx(9.81, abs=3.0)  # the preset's noise is 0.35 m/s^2
     assert imu["linear_acceleration_covariance"][0] == pytest.approx(0.35**2)
@@ -196,7 +196,7 @@ def check_sensors(received: dict[str, Any]) -> None:
 
 
 def check_frames(received: dict[str, Any], peer: Peer) -> None:
-    """Check that everything hangs together from map to the sensors; the sonar's x axis points down."""
+    """Check that the frames are connected from map to the sensors and that the sonar's x axis points down."""
     still = {t["child_frame_id"]: t for t in received["/tf_static"]["transforms"]}
     assert still["drone1/odom"]["header"]["frame_id"] == "map"
     assert {"drone1/imu_link", "drone1/gps_link", "drone1/mag_link", "drone1/baro_link"} <= still.keys()
@@ -212,7 +212,7 @@ def check_frames(received: dict[str, Any], peer: Peer) -> None:
 
 
 def check_odometry(peer: Peer) -> None:
-    """Check an estimate against the truth of about the same time, and against the covariance that it tells."""
+    """Check an estimate against the truth at about the same time, within the covariance that it reports."""
     estimate = peer.receive("/drone1/odometry")
     truth = peer.receive("/drone1/ground_truth", lambda m: seconds(m["header"]) >= seconds(estimate["header"]))
     sigma = [math.sqrt(estimate["pose"]["covariance"][7 * k]) for k in range(3)]
@@ -227,8 +227,8 @@ def check_odometry(peer: Peer) -> None:
 
 
 def test_a_node_flies_a_drone(federation: Federation, ros: ROS) -> None:
-    """Take off, fly ahead and to the left, turn, land, stop: each does what REP-103 says of its sign."""
-    patient = ("--set", "silence.hover_s=5", "--set", "silence.land_s=60")  # with a node on a busy machine
+    """Take off, fly ahead and left, turn, land and stop: every command has the sign that REP-103 gives it."""
+    patient = ("--set", "silence.hover_s=5", "--set", "silence.land_s=60")  # allow for a slow node on a busy machine
     federation.world(ONE.replace("duration_s: 10", "duration_s: 1000"), "--rate", "4", *patient)
     first = bridge(federation)
     node = ros[0](port_of(federation.endpoint))
@@ -240,7 +240,7 @@ def test_a_node_flies_a_drone(federation: Federation, ros: ROS) -> None:
     node.receive("/drone1/state", lambda m: m["data"] == "hovering")
 
     def fly(until: Callable[[Any], bool], ahead: float = 0.0, left: float = 0.0, turn: float = 0.0) -> Any:
-        """Send a velocity at each truth that is received, until one meets a condition."""
+        """Send a velocity at each received truth until one meets a condition; return that truth."""
         fields = {
             "linear": {"type": "geometry_msgs/msg/Vector3", "x": ahead, "y": left, "z": 0.0},
             "angular": {"type": "geometry_msgs/msg/Vector3", "x": 0.0, "y": 0.0, "z": turn},
@@ -282,10 +282,10 @@ def test_a_node_flies_a_drone(federation: Federation, ros: ROS) -> None:
     node.receive("/drone1/state", lambda m: m["data"] == "landed")
 
 
-def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: ROS) -> None:
-    """Stamps, numbers and identities are as rmw_zenoh wants them; what is not is refused, counted, and moves nothing.
+def test_the_bridge_sends_valid_messages_and_refuses_invalid_ones(federation: Federation, ros: ROS) -> None:
+    """Messages have the stamps, numbers and identities of rmw_zenoh; invalid ones are refused and counted.
 
-    When the last reader dies, nothing is read for it any more.
+    Once the last subscriber has gone, the bridge reads nothing more.
     """
     federation.world(ONE.replace("duration_s: 10", "duration_s: 1000"), "--rate", "0.5")
     started = bridge(federation)
@@ -320,12 +320,12 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
         received.append(health["received"])
         return received[-1] == received[-2]
 
-    raw.subscribe("process/ros2.main/health").until(stands)  # nobody subscribes any more: nothing is read
+    raw.subscribe("process/ros2.main/health").until(stands)  # without subscribers nothing is read
     assert received[-1] > 0
 
 
 def check_attachments(session: zenoh.Session, node: Peer) -> None:
-    """Check that messages are counted without gaps, by the identity that the token stands for."""
+    """Check that messages are numbered without gaps and carry the identity that belongs to their token."""
     tokens = [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/0/*/*/*/MP/**") if reply.ok]
     (token,) = (each for each in tokens if "/%drone1%imu/" in each)
     beside: list[bytes] = []
@@ -343,8 +343,8 @@ def check_attachments(session: zenoh.Session, node: Peer) -> None:
 
 
 @pytest.mark.soak
-def test_either_side_may_restart(federation: Federation, ros: ROS) -> None:
-    """ROS's own router comes late, dies and comes back; so do the bridge and the world: ROS nodes receive again."""
+def test_nodes_receive_again_after_any_process_restarts(federation: Federation, ros: ROS) -> None:
+    """ROS's router starts late and is restarted, as are the bridge and the world; ROS nodes receive again each time."""
     peer, router = ros
     world = federation.world(NEVER, "--realtime")
     port = free_port()
@@ -358,7 +358,7 @@ def test_either_side_may_restart(federation: Federation, ros: ROS) -> None:
     at_rest = one.receive("/quad_1_a/imu")
     assert xyz(at_rest["linear_acceleration"]) == pytest.approx([0, 0, 9.81], abs=0.5)
     other.request("publish", topic="/chatter", kind="std_msgs/msg/String", fields={"data": "hello"})
-    one.until("topics", lambda found: "/chatter" in found)  # with a router of ROS, ROS nodes find each other
+    one.until("topics", lambda found: "/chatter" in found)  # through ROS's router, ROS nodes find each other
 
     clock = federation.client().subscribe("clock")
 
@@ -366,7 +366,7 @@ def test_either_side_may_restart(federation: Federation, ros: ROS) -> None:
         return 1e-9 * clock.now()[-1].message["t_ns"]
 
     def receives_again() -> None:
-        """Wait for a sample that is taken from now on."""
+        """Wait for a sample taken after this call."""
         start_s = now_s()
         one.receive("/quad_1_a/imu", lambda m: seconds(m["header"]) > start_s)
 
@@ -390,8 +390,8 @@ def test_either_side_may_restart(federation: Federation, ros: ROS) -> None:
     second.close()
 
 
-def test_a_secured_world_is_reached_as_an_operator(federation: Federation, ros: ROS, tmp_path: Path) -> None:
-    """The bridge shows its certificate to the world, and none to ROS's router, which is on this machine."""
+def test_the_bridge_joins_a_secured_world_as_an_operator(federation: Federation, ros: ROS, tmp_path: Path) -> None:
+    """The bridge presents its certificate to the world but none to ROS's router, which is on this machine."""
     made = Certificates(tmp_path / "certs")
     world = made.identity("world", access_control(scenario_file.from_text(NEVER), ["operator.ros"], {}))
     federation.endpoint = tls_endpoint()
@@ -410,10 +410,8 @@ def test_a_secured_world_is_reached_as_an_operator(federation: Federation, ros: 
     assert ours.lines[-1].text.startswith("operator.ros: ")
 
 
-def test_the_hub_alone_brings_peers_to_the_drones_and_clients_to_each_other_too(
-    federation: Federation, ros: ROS
-) -> None:
-    """docs/ros2.md says so, and to run rmw_zenohd where nodes are peers, which is ROS's default."""
+def test_without_a_ros_router_peers_do_not_find_each_other(federation: Federation, ros: ROS) -> None:
+    """As docs/ros2.md states, peers, ROS's default, reach the drones but need rmw_zenohd to find each other."""
     federation.world(NEVER, "--rate", "2")
     bridge(federation)
     peer, _ = ros

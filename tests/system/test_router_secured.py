@@ -1,4 +1,4 @@
-"""A router with access control knows who behind it must lose nothing, though its own certificate lets it read little."""
+"""A router with access control knows which processes behind it must lose no data, despite its own few rights."""
 
 import time
 from pathlib import Path
@@ -21,7 +21,7 @@ ESTIMATOR, GATE_NS = "estimator.drone1", 20_000_000
 
 
 @pytest.mark.parametrize("joins", [True, False])
-def test_who_takes_part_behind_it_is_known_by_its_token_and_its_join(tmp_path: Path, joins: bool) -> None:
+def test_a_router_knows_participants_behind_it_by_token_and_join(tmp_path: Path, joins: bool) -> None:
     made = Certificates(tmp_path)
     rules = access_control(scenario_file.from_text(SCENARIO), [ESTIMATOR], {}, ["world"])
     there, wanted = tls_endpoint(), [Awaited((ESTIMATOR,), 7 if joins else 0)]
@@ -35,6 +35,6 @@ def test_who_takes_part_behind_it_is_known_by_its_token_and_its_join(tmp_path: P
         until_s = time.monotonic() + PATIENCE_S
         while links.awaited() != wanted:
             assert time.monotonic() < until_s, links.awaited()
-            if joins:  # again until the router's subscription is there
+            if joins:  # repeated until the router's subscription exists
                 link.put(keys.process(ESTIMATOR, "join"), Join(0, 0, "r", 1, "estimator", "lab", 7, GATE_NS))
-            Event().wait(0.05)  # nothing tells that a token has come
+            Event().wait(0.05)  # nothing signals the arrival of a token

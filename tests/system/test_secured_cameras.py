@@ -1,4 +1,4 @@
-"""Cameras and detectors over TLS: with the rights of their role they do their work, without them they are told so."""
+"""Cameras and detectors over TLS: they work with the rights of their role, and are refused without them."""
 
 from collections.abc import Iterator
 
@@ -24,7 +24,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
 
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory, made: Certificates, compiled: None) -> Iterator[str]:
-    """Where a world listens that lets in a camera, a detector and an operator."""
+    """The endpoint of a world that admits a camera, a detector and an operator."""
     world = made.identity("world", access_control(scenario_file.from_text(EYES), LET_IN, {}))
     at = tls_endpoint()
     secured = ("--listen", at, "--tls", str(world.tls), "--access", str(world.access))
@@ -33,7 +33,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory, made: Certificates, compi
         yield at
 
 
-def test_a_camera_and_a_detector_do_their_work_with_no_more_than_their_rights(
+def test_a_camera_and_a_detector_work_with_the_rights_of_their_roles(
     federation: Federation, made: Certificates, endpoint: str
 ) -> None:
     for command, name in (("camera", "camera.drone1"), ("detect", "detector.drone1")):
@@ -47,7 +47,7 @@ def test_a_camera_and_a_detector_do_their_work_with_no_more_than_their_rights(
         came.until(lambda keys: keys >= {PICTURES, SEEN})
 
 
-# (command, the certificate that it is given, what that may not read)
+# (command, certificate that it uses, key that this may not read)
 OF_ANOTHER_ROLE = (
     ("camera", "detector.drone1", "drone/*/truth"),
     ("detect", "camera.drone1", "drone/drone1/camera/front/info"),
@@ -55,7 +55,7 @@ OF_ANOTHER_ROLE = (
 
 
 @pytest.mark.parametrize(("command", "certificate", "key"), OF_ANOTHER_ROLE)
-def test_with_the_certificate_of_another_role_it_ends_with_a_line(
+def test_a_camera_or_detector_with_anothers_certificate_is_refused(
     made: Certificates, endpoint: str, command: str, certificate: str, key: str
 ) -> None:
     done = forked_commands.run(command, "drone1", "--connect", endpoint, "--tls", str(made.of(certificate)))

@@ -1,4 +1,4 @@
-"""Security on the wire: who gets in, who may do what, what a bad certificate says, and that a run is the same."""
+"""Security on the wire: admission, the rights of each role, reports of bad certificates, and reproducible runs."""
 
 import contextlib
 import re
@@ -39,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
 
 @contextmanager
 def reached(made: Certificates, role: str, way: str) -> Iterator[tuple[RawClient, Any]]:
-    """Yield a program with the certificate of a role, and the session of the world that it reaches one way."""
+    """Yield a client with the certificate of a role and the world's session, connected as `way` says."""
     with ExitStack() as stack:
         direct = way == WAYS[0]
         endpoint, link = stack.enter_context(hub(made, [role] if direct else [], [] if direct else [role]))
@@ -57,17 +57,17 @@ def answer_once(query: Any, key: str) -> None:
 
 
 def tell_last(link: Any, key: str) -> None:
-    """Publish behind everything that the session has published before, views included: they have a queue of their own."""
+    """Publish after everything that the session has published so far, including views, which have their own queue."""
     block, last = zenoh.CongestionControl.BLOCK, zenoh.Priority.BACKGROUND
     link._raw.put(f"{PREFIX}{key}", key.encode(), congestion_control=block, priority=last)
 
 
-# The table of rights, tried out
+# The table of rights in practice
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_publish(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_publish_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     fence = f"process/{role}/health"
     with reached(made, role, way) as (client, link):
         received, ready = KeyLog(), KeyLog()
@@ -86,7 +86,7 @@ def test_what_a_role_may_publish(made: Certificates, role: str, way: str) -> Non
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_read(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_read_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     fence = "world/event"
     with reached(made, role, way) as (client, link):
         received = KeyLog()
@@ -103,7 +103,7 @@ def test_what_a_role_may_read(made: Certificates, role: str, way: str) -> None:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_a_wildcard_brings_no_more_than_its_parts(made: Certificates, role: str) -> None:
+def test_a_wildcard_grants_no_more_than_the_keys_it_matches(made: Certificates, role: str) -> None:
     with reached(made, role, WAYS[0]) as (client, link):
         received, fence = KeyLog(), KeyLog()
         for expression in ("**", "@batch", "drone/**", "drone/*/*", "process/**", "*"):
@@ -121,7 +121,7 @@ def test_a_wildcard_brings_no_more_than_its_parts(made: Certificates, role: str)
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_get_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     fence = f"process/{role}/replay"
     with reached(made, role, way) as (client, link):
         asked, answered = KeyLog(), KeyLog()
@@ -144,7 +144,7 @@ def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_what_a_role_may_answer(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_answer_exactly_the_permitted_keys(made: Certificates, role: str, way: str) -> None:
     with reached(made, role, way) as (client, link):
         others = [key for key in KEYS if key != "clock"]
         for key in others:
@@ -159,7 +159,7 @@ def test_what_a_role_may_answer(made: Certificates, role: str, way: str) -> None
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
-def test_whose_life_a_role_may_show(made: Certificates, role: str, way: str) -> None:
+def test_a_role_can_declare_exactly_the_permitted_tokens(made: Certificates, role: str, way: str) -> None:
     with reached(made, role, way) as (client, link):
         received = KeyLog()
         link.on_token("process/*", lambda key, alive: received.take(key))
@@ -169,7 +169,7 @@ def test_whose_life_a_role_may_show(made: Certificates, role: str, way: str) -> 
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_whose_life_a_role_may_see(made: Certificates, role: str) -> None:
+def test_a_role_can_see_exactly_the_permitted_tokens(made: Certificates, role: str) -> None:
     with reached(made, role, WAYS[0]) as (client, link):
         received, fence = KeyLog(), KeyLog()
         client.subscribe_tokens("process/*", received)
@@ -185,7 +185,7 @@ def test_whose_life_a_role_may_see(made: Certificates, role: str) -> None:
         assert received.until_fence("the end") == {"the end"}
 
 
-def test_a_router_s_own_certificate_opens_no_more_than_its_clients_have(made: Certificates) -> None:
+def test_a_routers_certificate_grants_no_more_than_its_clients_rights(made: Certificates) -> None:
     fence = "process/estimator.drone1/health"
     with hub(made, [], ["estimator.drone1"]) as (endpoint, link), RawClient(endpoint, made.of(SITE)) as client:
         received = KeyLog()
@@ -197,13 +197,13 @@ def test_a_router_s_own_certificate_opens_no_more_than_its_clients_have(made: Ce
         assert received.until_fence(fence) == keys_of("estimator.drone1", "p")
 
 
-# Who is let in at all
+# Admission
 
 OUTSIDERS = ("no certificate", "another authority", "plaintext", "plaintext with credentials", "an expired certificate")
 
 
 @pytest.mark.parametrize("who", OUTSIDERS)
-def test_an_outsider_gets_nothing(made: Certificates, tmp_path: Path, who: str) -> None:
+def test_an_outsider_is_refused(made: Certificates, tmp_path: Path, who: str) -> None:
     with hub(made) as (endpoint, link):
         received = KeyLog()
         link.declare_subscriber("**", lambda sample: received.take(sample.key))
@@ -216,7 +216,7 @@ def test_an_outsider_gets_nothing(made: Certificates, tmp_path: Path, who: str) 
 
 
 def outsider(who: str, made: Certificates, tmp_path: Path, endpoint: str) -> tuple[str, Path | None]:
-    """Return where an outsider connects, and with which folder."""
+    """Return an outsider's endpoint and its folder of certificates."""
     plain = endpoint.replace("tls/", "tcp/")
     if who.startswith("plaintext"):
         return plain, None if who == "plaintext" else made.of("operator.main")
@@ -244,17 +244,17 @@ def test_a_certificate_without_rights_gets_nothing(made: Certificates) -> None:
             for key in KEYS:
                 stranger.put(key)
                 link.put_raw(key, b"world")
-        links.until_fence("down")  # the world has taken all that came on the link
+        links.until_fence("down")  # the world has read everything that arrived on the link
         received.take("the end")
         got.take("the end")
         assert received.until_fence("the end") == {"the end"}
         assert got.until_fence("the end") == {"the end"}
 
 
-# What a bad certificate says
+# Reports of bad certificates
 
 
-def test_a_certificate_whose_time_is_over_says_so(made: Certificates) -> None:
+def test_an_expired_certificate_is_reported(made: Certificates) -> None:
     folder = made.of("estimator.drone1", days=-0.5, host="past")
     with hub(made) as (endpoint, _):
         line = refusal("estimator", "drone1", "--connect", endpoint, "--tls", str(folder))
@@ -262,7 +262,7 @@ def test_a_certificate_whose_time_is_over_says_so(made: Certificates) -> None:
     assert re.search(r"\d{4}-\d\d-\d\d", line)
 
 
-def test_a_world_whose_time_is_over_says_so(made: Certificates, tmp_path: Path) -> None:
+def test_an_expired_certificate_of_the_world_is_reported(made: Certificates, tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(SIMULATED)
     folder = made.of("world", days=-0.5, host="past")
     line = refusal("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
@@ -280,10 +280,10 @@ def test_a_world_whose_time_is_over_says_so(made: Certificates, tmp_path: Path) 
         (("ros1", "--name", "operator.ros"), "operator.ros"),
     ],
 )
-def test_a_certificate_for_another_name_is_a_line_at_once(
+def test_a_certificate_for_another_name_is_reported_at_once(
     federation: Federation, made: Certificates, role: tuple[str, ...], name: str
 ) -> None:
-    """Also where the name is known from the world only, as by a pattern."""
+    """This includes names that only the world can resolve, such as those that match a pattern."""
     world = made.identity("world", access_control(scenario_file.from_text(SCENARIO), ROLES, {}))
     endpoint = tls_endpoint()
     if "[" in role[-1]:
@@ -294,9 +294,7 @@ def test_a_certificate_for_another_name_is_a_line_at_once(
     assert has_terms(line, str(folder), "estimator.drone1", name, "--tls")
 
 
-def test_a_world_with_the_certificate_of_another_is_a_line_before_it_compiles(
-    made: Certificates, tmp_path: Path
-) -> None:
+def test_a_world_with_anothers_certificate_is_refused_before_it_compiles(made: Certificates, tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(SIMULATED)
     folder = made.of("recorder")
     line = refusal("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
@@ -305,7 +303,9 @@ def test_a_world_with_the_certificate_of_another_is_a_line_before_it_compiles(
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", [("estimator", "drone1"), ("keys",), ("echo", "clock")])
-def test_who_is_not_let_in_is_told_so_at_once(made: Certificates, role: tuple[str, ...], way: str) -> None:
+def test_a_process_that_is_not_admitted_ends_at_once_with_the_reason(
+    made: Certificates, role: tuple[str, ...], way: str
+) -> None:
     folder = made.of("estimator.drone1")
     with ExitStack() as stack:
         endpoint, _ = stack.enter_context(hub(made, ["recorder"], ["recorder"]))
@@ -315,7 +315,7 @@ def test_who_is_not_let_in_is_told_so_at_once(made: Certificates, role: tuple[st
     assert has_terms(line, "estimator.drone1", "world" if way == WAYS[0] else SITE, "recorder", "zsim certs init")
 
 
-# (command, what its line must show) with the certificate of estimator.drone1
+# (command, terms that its refusal must contain) with the certificate of estimator.drone1
 LACKING: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
     (("keys",), ("read", "**", "world/info")),
     (("echo", "drone/drone1/truth"), ("read", "drone/drone1/truth", "drone/drone1/sensor/*")),
@@ -332,7 +332,7 @@ LACKING: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
 
 
 @pytest.mark.soak
-def test_a_right_that_is_lacking_is_a_line(federation: Federation, made: Certificates) -> None:
+def test_a_missing_right_is_reported(federation: Federation, made: Certificates) -> None:
     rules = access_control(scenario_file.from_text(SCENARIO), ["estimator.drone1", "operator.main"], {})
     endpoint, world = tls_endpoint(), made.identity("world", rules)
     secured = ("--listen", endpoint, "--tls", str(world.tls), "--access", str(world.access))
@@ -355,7 +355,7 @@ def test_a_right_that_is_lacking_is_a_line(federation: Federation, made: Certifi
         (("keys",), "operator.main"),
     ],
 )
-def test_a_foreign_certificate_is_a_line_at_once(
+def test_a_certificate_of_another_authority_is_reported_at_once(
     made: Certificates, tmp_path: Path, role: tuple[str, ...], name: str
 ) -> None:
     folder = Certificates(tmp_path).of(name)
@@ -373,7 +373,7 @@ def test_a_router_that_is_refused_upstream_ends(made: Certificates, tmp_path: Pa
     assert has_terms(done.stderr.splitlines()[-1], endpoint, "authority")
 
 
-# name: (folder's content changed how, what the line must show)
+# name: (change to the folder, terms that the report must contain)
 FILES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "no folder": (lambda folder: [path.unlink() for path in folder.iterdir()], ("recorder/ca.pem", "No such file")),
     "no key": (lambda folder: (folder / "key.pem").unlink(), ("recorder/key.pem", "No such file")),
@@ -397,7 +397,7 @@ FILES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_files_of_no_use_are_a_line(tmp_path: Path, name: str) -> None:
+def test_unusable_certificate_files_are_reported(tmp_path: Path, name: str) -> None:
     made = Certificates(tmp_path)
     made.of("world")
     folder = made.of("recorder")
@@ -411,7 +411,7 @@ def test_files_of_no_use_are_a_line(tmp_path: Path, name: str) -> None:
     assert has_terms(line, endpoint, *tokens), line
 
 
-def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path: Path) -> None:
+def test_incompatible_options_are_reported(made: Certificates, tmp_path: Path) -> None:
     folder, access = made.of("operator.main"), tmp_path / "access.json"
     (tmp_path / "scenario.yaml").write_text(SIMULATED)
     world = ("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--access", str(access))
@@ -425,14 +425,14 @@ def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path
         assert has_terms(refusal(*world, *tls), "access.json: ", token)
 
 
-def test_who_listens_elsewhere_than_its_certificate_says(made: Certificates) -> None:
+def test_a_listener_at_another_address_than_in_its_certificate_is_reported(made: Certificates) -> None:
     endpoint = tls_endpoint("127.0.0.2")
     with connection.listen([endpoint], "zsim", "lockstep", made.identity("world")):
         line = refusal("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
     assert has_terms(line, endpoint, "127.0.0.1", "127.0.0.2")
 
 
-def test_who_listens_without_tls(made: Certificates) -> None:
+def test_a_listener_without_tls_is_reported(made: Certificates) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"tls/127.0.0.1:{server.getsockname()[1]}"
         threading.Thread(target=answer_plainly, args=(server,), daemon=True).start()
@@ -449,7 +449,7 @@ def answer_plainly(server: socket.socket) -> None:
                 connection.sendall(b"HTTP/1.0 400 Bad Request\r\n\r\n")
 
 
-def test_what_the_listener_thinks_of_our_certificate(made: Certificates, tmp_path: Path) -> None:
+def test_peer_fault_finds_the_listeners_objection_to_a_certificate(made: Certificates, tmp_path: Path) -> None:
     past = Identity(HOST, made.of("recorder", days=-0.5, host="past"))
     foreign = Certificates(tmp_path).of("recorder")
     (foreign / "ca.pem").write_bytes((made.folder / "ca.pem").read_bytes())
@@ -457,13 +457,13 @@ def test_what_the_listener_thinks_of_our_certificate(made: Certificates, tmp_pat
         assert peer_fault(Identity(HOST, made.of("recorder")), endpoint) is None
         assert "expired" in str(peer_fault(past, endpoint))
         assert "authority" in str(peer_fault(Identity(HOST, foreign), endpoint))
-    assert peer_fault(Identity(HOST, made.of("recorder")), endpoint) is None  # nobody listens: it may come
+    assert peer_fault(Identity(HOST, made.of("recorder")), endpoint) is None  # no listener yet: one may still start
 
 
-# A run
+# Whole runs
 
 
-def test_a_replay_brings_what_its_asker_may_read(federation: Federation, made: Certificates) -> None:
+def test_a_replay_contains_only_what_its_requester_may_read(federation: Federation, made: Certificates) -> None:
     rules = access_control(scenario_file.from_text(ONE), ["estimator.drone1", "operator.main"], {})
     endpoint, world = tls_endpoint(), made.identity("world", rules)
     secured = ("--listen", endpoint, "--tls", str(world.tls), "--access", str(world.access))
@@ -489,7 +489,7 @@ def test_a_replay_brings_what_its_asker_may_read(federation: Federation, made: C
         assert operator.request("world/control", "stop")["ok"]
 
 
-def test_a_secured_run_is_the_same_run(federation: Federation, made: Certificates) -> None:
+def test_a_secured_run_is_bit_identical_to_an_unsecured_one(federation: Federation, made: Certificates) -> None:
     endpoint = tls_endpoint()
     rules = access_control(scenario_file.from_text(PAIR), ["recorder", *PAIR_ROLES], {SITE: ["controller.main"]})
     world = made.identity("world", rules)

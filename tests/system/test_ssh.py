@@ -1,4 +1,4 @@
-"""What keeps the launcher out of a host is one line that says what to do."""
+"""Every failed SSH connection to a host is reported in one line with a remedy."""
 
 import asyncio
 from pathlib import Path
@@ -16,7 +16,7 @@ from zsim_deploy.inventory import Host
 
 
 def refusal(lab: Lab, base: Path, host: Host) -> str:
-    """Return what is said of a host that cannot be connected to."""
+    """Return the error for a host to which the launcher cannot connect."""
     with lab.inside(LAUNCHER), pytest.raises(HostsError) as caught:
         asyncio.run(host_link.connect("h1", host, base))
     return str(caught.value)
@@ -28,7 +28,7 @@ def given(lab: Lab, **changed: str | int) -> Host:
     return Host(**{**fields, **changed})  # pyright: ignore[reportArgumentType]
 
 
-def test_each_refusal_is_a_line(lab: Lab, tmp_path: Path) -> None:
+def test_each_refusal_is_reported_in_one_line(lab: Lab, tmp_path: Path) -> None:
     at = f"{lab.address('h1')} port 22"
     make_key(tmp_path / "other")
     checked(["ssh-keygen", "-q", "-t", "ed25519", "-N", "secret", "-f", str(tmp_path / "locked")])
@@ -52,7 +52,7 @@ def test_each_refusal_is_a_line(lab: Lab, tmp_path: Path) -> None:
         assert "\n" not in line
 
 
-def test_a_host_that_does_not_answer_is_a_line(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_that_does_not_answer_is_reported(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(host_link, "CONNECT_S", 0.5)
     lab.cut("h1")
     line = refusal(lab, lab.folder, given(lab))
@@ -60,7 +60,7 @@ def test_a_host_that_does_not_answer_is_a_line(lab: Lab, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("kind", ["ed25519", "rsa"])
-def test_a_host_key_that_changed_is_not_called_unknown(lab: Lab, tmp_path: Path, kind: str) -> None:
+def test_a_changed_host_key_is_not_reported_as_unknown(lab: Lab, tmp_path: Path, kind: str) -> None:
     at, known = lab.address("h1"), tmp_path / "known_hosts"
     checked(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", "", "-f", str(tmp_path / "former")])
     known.write_text(f"{at} {(tmp_path / 'former.pub').read_text()}")

@@ -1,4 +1,4 @@
-"""Time is stopped by nobody who does not take part, and who stops it is named."""
+"""Only participants can stop simulated time, and those that do are reported."""
 
 import itertools
 import re
@@ -19,12 +19,12 @@ GATE_NS = 20_000_000
 
 
 class Watched:
-    """PAIR under way, and what a stranger sees of it."""
+    """A run of PAIR, and an external client that observes it."""
 
     def __init__(self, federation: Federation, *pace: str) -> None:
         self.federation = federation
-        self.tokens: list[object] = []  # that live as long as this
-        self.incarnation = 0  # of the last join that was made up
+        self.tokens: list[object] = []  # kept alive as long as this object
+        self.incarnation = 0  # of the last forged join
         self._incarnations = itertools.count(2**40)
         self.run = federation.run(PAIR, *(pace or ("--rate", "1")), "--duration", "100000")
         self.client: Client = federation.client()
@@ -34,25 +34,25 @@ class Watched:
         self.clock.until(lambda m: m["t_ns"] >= 1e9)
 
     def stop(self, name: str) -> None:
-        """Stop a process that has shown a sign of life."""
+        """Stop a process once it has published its health."""
         self.client.subscribe(f"process/{name}/health").until(lambda m: True)
         self.federation.kill(name, signal.SIGSTOP)
 
     def join_as(self, name: str, **about: object) -> None:
-        """Publish a join, and nothing else: no token, no done."""
+        """Publish a forged join without a token or any `done`."""
         role, run_id, self.incarnation = name.split(".")[0], self.info["run_id"], next(self._incarnations)
         fields = {"t_ns": 0, "run_id": run_id, "incarnation": self.incarnation, "role": role}
         fields |= {"host": "nowhere", "pid": 1}
         self.client.put(f"process/{name}/join", **{**fields, "period_ns": GATE_NS, **about})
 
     def goes_on(self) -> None:
-        """Wait until simulated time has gone on."""
+        """Wait until simulated time continues."""
         self.clock.now()
         t_ns = self.clock.until(lambda m: not m["waiting_for"]).message["t_ns"]
         self.clock.until(lambda m: m["t_ns"] > t_ns + 5e8)
 
     def flies_on(self) -> None:
-        """Wait until simulated time has gone on, and end the run."""
+        """Wait until simulated time continues, and end the run."""
         self.goes_on()
         assert self.client.request("world/control", "stop")["ok"]
         self.run.ends(with_code=0)
@@ -60,14 +60,14 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[Watched]:
-    """A run that the tests of this file share: each lets it go on."""
+    """A run shared by the tests of this file, each of which lets time continue."""
     with Federation(tmp_path_factory.mktemp("watched")) as federation:
         made = Watched(federation)
         yield made
         made.flies_on()
 
 
-def test_strangers_without_tokens_stop_no_time(watched: Watched) -> None:
+def test_joins_without_tokens_do_not_stop_time(watched: Watched) -> None:
     watched.join_as(VISITOR)
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("no_show", VISITOR))
     watched.run.line(f"no_show: {VISITOR} on nowhere")
@@ -78,7 +78,7 @@ def test_strangers_without_tokens_stop_no_time(watched: Watched) -> None:
     assert {event["kind"] for event in told} == {"no_show"}
 
 
-def test_a_join_of_another_s_process_is_answered_by_a_newer_one(watched: Watched) -> None:
+def test_a_process_answers_a_forged_join_with_a_newer_one(watched: Watched) -> None:
     health = watched.client.subscribe(f"process/{CONTROLLER}/health").until(lambda m: m).message
     watched.join_as(CONTROLLER, host=health["host"], pid=health["pid"])
     made_up = watched.incarnation
@@ -87,7 +87,7 @@ def test_a_join_of_another_s_process_is_answered_by_a_newer_one(watched: Watched
     watched.goes_on()
 
 
-def test_a_stopped_estimator_is_named_and_not_the_controller_that_waits_for_it(watched: Watched) -> None:
+def test_a_stopped_estimator_is_reported_rather_than_its_controller(watched: Watched) -> None:
     watched.stop(ESTIMATOR)
     watched.events.until(lambda m: (m["kind"], m["subject"]) == ("silent", ESTIMATOR))
     wanted = {ESTIMATOR: [], CONTROLLER: [ESTIMATOR]}
@@ -98,7 +98,7 @@ def test_a_stopped_estimator_is_named_and_not_the_controller_that_waits_for_it(w
     watched.goes_on()
 
 
-def test_a_stopped_world_is_named(watched: Watched) -> None:
+def test_a_stopped_world_is_reported(watched: Watched) -> None:
     watched.stop("world")
     watched.run.line(f"world .pid {watched.federation.pid('world')}. shows no sign of life")
     watched.federation.kill("world", signal.SIGCONT)
@@ -106,14 +106,14 @@ def test_a_stopped_world_is_named(watched: Watched) -> None:
     watched.goes_on()
 
 
-def test_who_takes_a_place_and_does_nothing_gives_it_back(watched: Watched) -> None:
-    """The last one: its tokens stay, so that nobody takes their end for that of the controller in its place."""
+def test_an_idle_impostor_loses_its_place(watched: Watched) -> None:
+    """This test comes last: its tokens remain, as their end would count as the death of the new controller."""
     takes_a_place(watched, ("superseded", "death", "restart"))
     watched.goes_on()
 
 
 def takes_a_place(watched: Watched, kinds: tuple[str, ...]) -> None:
-    """Join as the controller, with all its tokens, and wait until the world has noticed that it does nothing."""
+    """Join as the controller with all its tokens, and wait until the world has replaced the idle impostor."""
     client = watched.client
     watched.tokens = [client.token(CONTROLLER), client.token(f"{CONTROLLER}/session/{client.session.info.zid()}")]
     watched.join_as(CONTROLLER)
@@ -122,7 +122,7 @@ def takes_a_place(watched: Watched, kinds: tuple[str, ...]) -> None:
 
 
 @pytest.mark.soak
-def test_in_realtime_too(federation: Federation) -> None:
+def test_an_idle_impostor_loses_its_place_in_realtime(federation: Federation) -> None:
     watched = Watched(federation, "--realtime")
     takes_a_place(watched, ("superseded", "no_show", "restart"))
     watched.flies_on()
@@ -130,9 +130,9 @@ def test_in_realtime_too(federation: Federation) -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("has_token", [False, True])
-def test_a_join_in_another_s_name_takes_no_place(federation: Federation, has_token: bool) -> None:
+def test_a_forged_join_does_not_take_over_a_place(federation: Federation, has_token: bool) -> None:
     watched = Watched(federation)
-    if has_token:  # of the name alone, as a program has that knows no more than the contract
+    if has_token:  # for the name alone, as from a program that knows only the contract
         watched.client.token(CONTROLLER)
     pid = federation.pid(CONTROLLER)
     watched.join_as(CONTROLLER)
@@ -143,7 +143,7 @@ def test_a_join_in_another_s_name_takes_no_place(federation: Federation, has_tok
 
 
 @pytest.mark.soak
-def test_a_stopped_recorder_is_named_in_realtime(federation: Federation) -> None:
+def test_a_stopped_recorder_is_reported_in_realtime(federation: Federation) -> None:
     watched = Watched(federation, "--realtime")
     watched.stop("recorder")
     watched.clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == ["recorder"])
@@ -153,9 +153,9 @@ def test_a_stopped_recorder_is_named_in_realtime(federation: Federation) -> None
     watched.flies_on()
 
 
-# Who reads nothing
+# Slow readers
 
-KERNEL_BYTES = 400_000  # that a link takes at least before a put to it waits (measured)
+KERNEL_BYTES = 400_000  # a link accepts at least this much before a put to it blocks (measured)
 READER = """
 import json, sys, time, zenoh
 config = zenoh.Config()
@@ -172,7 +172,7 @@ time.sleep(1000)
 
 @contextmanager
 def reader(endpoint: str, stopped: bool) -> Iterator[int]:
-    """Let a program subscribe to everything and take nothing of it; yield its process id."""
+    """Run a program that subscribes to everything and reads nothing; yield its process id."""
     program = subprocess.Popen([sys.executable, "-c", READER, endpoint], stdout=subprocess.PIPE)
     try:
         assert program.stdout is not None
@@ -186,9 +186,7 @@ def reader(endpoint: str, stopped: bool) -> Iterator[int]:
 
 
 @pytest.mark.parametrize("pace", [pytest.param(("--rate", "10"), marks=pytest.mark.soak), ("--realtime",)])
-def test_who_subscribes_to_everything_and_takes_nothing_costs_nobody_anything(
-    federation: Federation, pace: tuple[str, ...]
-) -> None:
+def test_readers_that_take_nothing_do_not_slow_the_run(federation: Federation, pace: tuple[str, ...]) -> None:
     watched = Watched(federation, *pace)
     held_bytes: list[int] = []
     with ExitStack() as readers:
@@ -200,7 +198,7 @@ def test_who_subscribes_to_everything_and_takes_nothing_costs_nobody_anything(
         t_ns = watched.clock.now()[-1].message["t_ns"]
         watched.clock.until(lambda m: m["t_ns"] > t_ns + 5e9)
     watched.flies_on()
-    if "--realtime" in pace:  # so no put has waited for them, and no gate was late by them
+    if "--realtime" in pace:  # so no put blocked and no gate was late because of them
         assert median(held_bytes) < KERNEL_BYTES
     assert re.search(r"\bstuck: ", watched.run.text()) is None
     record = federation.record()
@@ -210,7 +208,9 @@ def test_who_subscribes_to_everything_and_takes_nothing_costs_nobody_anything(
 
 @pytest.mark.parametrize("pace", [pytest.param(("--rate", "10"), marks=pytest.mark.soak), ("--realtime",)])
 @pytest.mark.soak
-def test_nor_behind_a_router(federation: Federation, pace: tuple[str, ...]) -> None:
+def test_readers_behind_a_router_that_take_nothing_do_not_slow_the_run(
+    federation: Federation, pace: tuple[str, ...]
+) -> None:
     watched = Watched(federation, *pace)
     there, options = f"tcp/127.0.0.1:{free_port()}", [word for word in pace if word == "--realtime"]
     router = federation.role("router", "site", "--listen", there, *options)

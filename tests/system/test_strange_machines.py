@@ -1,4 +1,4 @@
-"""Machines that lack what others have: locks, shared memory, a home, streams, room for odd paths."""
+"""Unusual machines: no locks, shared memory, home or output streams; odd and overlong paths; proxies."""
 
 import csv
 import errno
@@ -37,12 +37,12 @@ import errno, fcntl, os
 def flock(*_):
     raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
 fcntl.flock = flock
-"""  # for what is started; run here, it is undone by monkeypatch
+"""  # for child processes; in this process monkeypatch undoes it
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
-    """The folder of a run of a second that several tests look at; its scenario is beside it."""
+    """The folder of a shared run of 1 s, next to its scenario."""
     folder = tmp_path_factory.mktemp("flown")
     (folder / "pair.yaml").write_text(PAIR)
     done = run_here("run", str(folder / "pair.yaml"), "--in-process", *SHORT, "--out", str(folder / "run"))
@@ -51,7 +51,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
 
 
 CLOSED, FULL = ">&- 2>&- <&-", ">/dev/full 2>/dev/full"
-STREAMED = (  # command, its exit code whatever becomes of its output, and what it is tried with
+STREAMED = (  # command, its exit code whatever happens to its output, the streams to try it with
     ("--version", 0, (CLOSED, FULL)),
     ("validate {scenario}", 0, (FULL,)),
     ("validate nowhere.yaml", USER_FAULT, (CLOSED,)),
@@ -64,8 +64,8 @@ STREAMED = (  # command, its exit code whatever becomes of its output, and what 
 
 
 @pytest.mark.parametrize("streams", [CLOSED, FULL])
-def test_what_a_stream_does_not_take_is_lost_and_nothing_else(tmp_path: Path, flown: Path, streams: str) -> None:
-    """A stream that is closed leaves its number to the next file that is opened, such as the record."""
+def test_closed_or_full_streams_lose_only_their_output(tmp_path: Path, flown: Path, streams: str) -> None:
+    """The next file that is opened, such as the record, takes the descriptor of a closed stream."""
     names = {"scenario": flown.parent / "pair.yaml", "run": flown, "out": tmp_path, "port": free_port()}
     for command, code in [(command, code) for command, code, tried in STREAMED if streams in tried]:
         line = f"{shlex.join(ZSIM)} {command.format(**names)} {streams}"
@@ -78,21 +78,23 @@ def test_what_a_stream_does_not_take_is_lost_and_nothing_else(tmp_path: Path, fl
         assert completeness(record).complete
 
 
-def test_a_full_output_is_a_line_on_the_other_stream() -> None:
+def test_a_full_standard_output_is_reported_on_standard_error() -> None:
     done = subprocess.run(
         f"{shlex.join(ZSIM)} --help >/dev/full", shell=True, capture_output=True, text=True, check=True
     )
     assert done.stderr == f"standard output cannot be written ({os.strerror(errno.ENOSPC)}); further output is lost\n"
 
 
-ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \xff")  # the last is no UTF-8
+ODD = os.fsdecode(b"lab:3 'a' \"b\" $HOME `x` [red]%s;&| \xc3\xbc\xe9\xa3\x9b \xff")  # the last byte is not valid UTF-8
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Glyph")  # of the font
+@pytest.mark.filterwarnings("ignore:Glyph")  # the font lacks some glyphs
 @pytest.mark.parametrize("several", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["a run", "several"])
-def test_any_path_will_do(tmp_path: Path, flown: Path, several: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(make_bundle, "figures", lambda *_: iter(()))  # `report` writes them into such a folder
+def test_commands_accept_paths_with_any_characters(
+    tmp_path: Path, flown: Path, several: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(make_bundle, "figures", lambda *_: iter(()))  # skipped, as `report` writes figures
     folder = tmp_path / (ODD + "n" * 150)
     folder.mkdir()
     scenario, out = folder / f"{ODD}.yaml", folder / "run"
@@ -105,7 +107,7 @@ def test_any_path_will_do(tmp_path: Path, flown: Path, several: bool, monkeypatc
         here = [("export", out, "--format", form) for form in ("csv", "parquet", "mat", "foxglove")]
         here += [("report", out, "--format", "svg"), ("rerun", out)]
         here += [("bundle", out, "-o", folder / f"{ODD}.zsim"), ("rerun", folder / f"{ODD}.zsim")]
-    done = run(*map(str, outside))  # with processes that are given these paths
+    done = run(*map(str, outside))  # as its child processes are given these paths
     assert done.code == 0, done
     assert "Traceback" not in done.stderr
     if several:
@@ -119,7 +121,7 @@ def test_any_path_will_do(tmp_path: Path, flown: Path, several: bool, monkeypatc
 
 
 @pytest.mark.parametrize("path", ["n" * 300, "/tmp/" + "nnnnnnnnn/" * 450])
-def test_a_path_that_is_too_long_is_a_line(flown: Path, path: str) -> None:
+def test_an_overlong_path_is_reported(flown: Path, path: str) -> None:
     for arguments in (
         ("validate", path),
         ("run", path),
@@ -136,8 +138,8 @@ def test_a_path_that_is_too_long_is_a_line(flown: Path, path: str) -> None:
         assert os.strerror(errno.ENAMETOOLONG) in refusal(*arguments)
 
 
-def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) -> None:
-    """PlotJuggler reads a table as one series of time."""
+def test_csv_tables_by_name_have_increasing_time(tmp_path: Path, flown: Path) -> None:
+    """PlotJuggler reads a table as a single time series."""
     done = run_here("export", str(flown), "--format", "csv", "--by-name", "--out", str(tmp_path / "csv"))
     assert done.code == 0, done
     assert {"truth.drone1.csv", "truth.drone2.csv", "clock.world.csv"} <= {
@@ -152,7 +154,7 @@ def test_a_table_of_each_drone_has_increasing_time(tmp_path: Path, flown: Path) 
 
 
 READ_ONLY_TMPFS = "mount -t tmpfs -o ro tmpfs"
-LACKING = {  # what is before the command of a run, in a namespace of mounts; the run's exit code
+LACKING = {  # what is missing: shell commands before the run in a mount namespace, the run's exit code
     "variables, folders that can be written and shared memory": (  # as in a container
         f"{READ_ONLY_TMPFS} /dev/shm && mkdir $OUT/here && {READ_ONLY_TMPFS} $OUT/here && cd $OUT/here && "
         "env -i TMPDIR=/nowhere",
@@ -169,7 +171,7 @@ LACKING = {  # what is before the command of a run, in a namespace of mounts; th
 
 @needs_root
 @pytest.mark.parametrize("lacking", LACKING)
-def test_a_run_without(tmp_path: Path, flown: Path, lacking: str) -> None:
+def test_a_run_without_resources_succeeds_or_is_refused_cleanly(tmp_path: Path, flown: Path, lacking: str) -> None:
     before, code = LACKING[lacking]
     words = [*ZSIM, "run", str(flown.parent / "pair.yaml"), *SHORT, "--out", str(tmp_path / "run")]
     line = f"OUT={shlex.quote(str(tmp_path))}; {before} {shlex.join(words)}"
@@ -184,17 +186,15 @@ def test_a_run_without(tmp_path: Path, flown: Path, lacking: str) -> None:
 
 
 @pytest.mark.parametrize("words", ["ps", "logs world", "restart world", "move world h1", "down"])
-def test_where_there_are_no_unix_sockets_launchers_are_not_to_be_reached(
-    words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As on Windows."""
+def test_launchers_are_out_of_reach_without_unix_sockets(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows has no Unix sockets."""
     monkeypatch.delattr(os, "getuid")
     monkeypatch.delattr(socket, "AF_UNIX")
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     assert has_terms(refusal(*words.split()), "Unix sockets", "WSL")
 
 
-def test_a_flight_under_test_needs_signals_of_posix(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_under_test_needs_posix_signals(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "killpg")
     with pytest.raises(RunError):
         tested.Federation(PAIR)
@@ -213,8 +213,8 @@ READ_ONLY = f"mount --bind {shlex.quote(str(ROOT))} {shlex.quote(str(ROOT))} && 
 
 
 @needs_root
-def test_without_a_home_kernels_are_compiled_once_on_a_machine(tmp_path: Path) -> None:
-    """As in a container: neither the package nor a home can be written."""
+def test_kernels_are_compiled_once_per_machine_without_a_home(tmp_path: Path) -> None:
+    """As in some containers, neither the package nor a home is writable."""
     (tmp_path / "kernel.py").write_text(KERNEL)
     (tmp_path / "empty").mkdir()
     python = f"cd {tmp_path}/empty && env -u XDG_CACHE_HOME HOME=/proc/none {sys.executable} ../kernel.py"
@@ -230,10 +230,10 @@ def test_without_a_home_kernels_are_compiled_once_on_a_machine(tmp_path: Path) -
     assert mode == "700"
 
 
-def test_a_folder_of_somebody_else_is_not_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """What is kept is code: a folder that others can write is passed over, as is a link to one.
+def test_a_cache_folder_that_others_can_write_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The cache holds code, so a folder that others can write is ignored, as is a link to one.
 
-    The user has no home that anybody knows, for which Python leaves `~` as it is.
+    The user has no known home, so Python leaves `~` unexpanded.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(kernels.os.path, "expanduser", lambda path: path)
@@ -257,7 +257,7 @@ def test_a_folder_of_somebody_else_is_not_run(monkeypatch: pytest.MonkeyPatch, t
 
 @pytest.fixture
 def lockless(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let this process, and every Python that it starts, find a file system without locks, as some of NFS and Lustre are."""
+    """Simulate a file system without locks, as NFS and Lustre can be, in this process and its Python children."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(LOCKLESS)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
@@ -266,7 +266,7 @@ def lockless(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("compiled", "lockless")
-def test_a_run_and_a_sweep_go_on_without_locks(tmp_path: Path) -> None:
+def test_runs_and_sweeps_work_without_file_locks(tmp_path: Path) -> None:
     scenario = tmp_path / "pair.yaml"
     scenario.write_text(PAIR)
     reason = os.strerror(errno.EOPNOTSUPP)
@@ -304,7 +304,7 @@ PASSED = (
 
 
 def wait_for_port(port: int) -> None:
-    """Wait until somebody listens on a port."""
+    """Wait until something listens on a port."""
     until_s = time.monotonic() + PATIENCE_S
     while True:
         with socket.socket() as probe:
@@ -315,7 +315,7 @@ def wait_for_port(port: int) -> None:
 
 
 @pytest.mark.skipif(not shutil.which("nginx"), reason="nginx is missing; on Debian: apt-get install nginx-light")
-def test_the_console_and_the_gateway_behind_a_path_of_a_proxy(federation: Federation, browser: Any) -> None:
+def test_the_console_and_the_gateway_work_behind_a_proxy_path(federation: Federation, browser: Any) -> None:
     ports = {name: free_port() for name in ("port", "console", "gateway")}
     folder = federation.folder
     (folder / "nginx.conf").write_text(NGINX.format(folder=folder, passed=PASSED, **ports))
@@ -336,7 +336,7 @@ def test_the_console_and_the_gateway_behind_a_path_of_a_proxy(federation: Federa
             page.goto(f"{base}{path}?token=secret")
             assert page.url.partition("?")[0] == f"{base}{path}"
             assert "token" not in page.url
-            page.get_by_text("drone1").first.wait_for(timeout=1000 * PATIENCE_S)  # told by viser's socket
+            page.get_by_text("drone1").first.wait_for(timeout=1000 * PATIENCE_S)  # received over viser's socket
             page.wait_for_function("() => document.querySelector('#zsim-head')?.innerText.match(/\\d/)")
 
         def places() -> set[str]:

@@ -1,4 +1,4 @@
-"""`zsim sweep` as a user runs it: the same bits as single runs, whoever flies them, is killed or interrupted."""
+"""`zsim sweep` gives the same bits as single runs with any workers, and after kills and interruptions."""
 
 import json
 import logging
@@ -25,12 +25,12 @@ from zsim_analysis.report.summary import judge
 from zsim_analysis.sweep.sweep import load, locked
 
 GUST = "environment.wind.gust_m_s"
-DURATION_S, LONG_S = 10.0, 40.0  # s: the longer takes so long on the wall that a signal reaches it before it is over
+DURATION_S, LONG_S = 10.0, 40.0  # LONG_S is long enough for a signal to arrive before a run ends
 FLIGHT = ("--set", "drones.drone1.mass_kg=0.45")
 PLAN = ("--vary", "seed", "--vary", "wind.gust_m_s=0,1", *FLIGHT)
 RUNS = 4
-FIRST = rf" [1-{RUNS - 1}] / {RUNS} runs"  # a line while there is still something to fly
-WALL = ("wall_s", "real_time_factor", "date")  # all that may differ between two sweeps
+FIRST = rf" [1-{RUNS - 1}] / {RUNS} runs"  # a line of progress while runs are left
+WALL = ("wall_s", "real_time_factor", "date")  # the only columns that may differ between two sweeps
 
 
 def rows(out: Path) -> list[dict[str, Any]]:
@@ -48,7 +48,7 @@ def sweep(federation: Federation, out: Path, *options: str, duration_s: float = 
 
 
 def workers(role: Role) -> list[psutil.Process]:
-    """Return the processes that fly; the other child is multiprocessing's resource tracker."""
+    """Return the worker processes, without multiprocessing's resource tracker."""
     children = psutil.Process(role.process.pid).children()
     return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
 
@@ -59,7 +59,7 @@ def gone(processes: list[psutil.Process]) -> bool:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
-    """A sweep that nobody disturbs, by two workers, with its report."""
+    """The folder of an undisturbed sweep by two workers, with its report."""
     folder = tmp_path_factory.mktemp("undisturbed")
     with Federation(folder) as federation:
         options = ("--workers", "2", "--report")
@@ -69,7 +69,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Pat
 
 @pytest.fixture(scope="module")
 def undisturbed_for_long(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
-    """The rows of a sweep of longer runs that nobody disturbs."""
+    """The folder of an undisturbed sweep of longer runs."""
     folder = tmp_path_factory.mktemp("undisturbed_for_long")
     with Federation(folder) as federation:
         sweep(federation, folder / "sweep", "--workers", "2").ends(with_code=0)
@@ -87,7 +87,7 @@ def test_a_run_of_a_sweep_has_the_bits_of_a_single_run(federation: Federation, u
         assert {each: row[f"errors.{parameter}.{each}"] for each in errors} == errors
 
 
-def test_the_table_and_the_report(undisturbed: Path) -> None:
+def test_a_sweep_writes_its_table_and_report(undisturbed: Path) -> None:
     found = rows(undisturbed)
     assert [row["run"] for row in found] == list(range(RUNS))
     assert [row[GUST] for row in found] == [0, 1, 0, 1]
@@ -104,10 +104,8 @@ def test_the_table_and_the_report(undisturbed: Path) -> None:
     assert [(point["values"][GUST], point["runs"]) for point in points] == [(0, 2), (1, 2)]
 
 
-@pytest.mark.soak  # in CI the next one kills
-def test_a_killed_worker_is_replaced_and_its_run_flown_again(
-    federation: Federation, undisturbed_for_long: Path
-) -> None:
+@pytest.mark.soak  # in CI, the next test covers kills
+def test_a_killed_worker_is_replaced_and_its_run_repeated(federation: Federation, undisturbed_for_long: Path) -> None:
     out = federation.folder / "sweep"
     role = sweep(federation, out, "--workers", "1")
     role.line(FIRST)
@@ -119,13 +117,13 @@ def test_a_killed_worker_is_replaced_and_its_run_flown_again(
 
 
 @pytest.mark.soak
-def test_ctrl_c_then_kill_then_the_same_command(federation: Federation, undisturbed_for_long: Path) -> None:
-    """Whatever is finished is kept and not flown again; nobody outlives the sweep."""
+def test_an_interrupted_or_killed_sweep_can_be_continued(federation: Federation, undisturbed_for_long: Path) -> None:
+    """Finished runs are kept and not repeated; no worker outlives the sweep."""
     out = federation.folder / "sweep"
     role = sweep(federation, out, "--workers", "1", "--keep-records")
     role.line(FIRST)
     flying = workers(role)
-    os.killpg(role.process.pid, signal.SIGINT)  # as a terminal does: to all of them
+    os.killpg(role.process.pid, signal.SIGINT)  # to all of its processes, as a terminal sends it
     role.ends(with_code=130)
     assert gone(flying)
     assert f"--out {out}" in role.text()
@@ -154,8 +152,8 @@ def test_ctrl_c_then_kill_then_the_same_command(federation: Federation, undistur
     assert has_terms(role.text(), f"{out}: ", "seed", "--out")
 
 
-def test_runs_that_fail_are_rows(federation: Federation, near: None) -> None:
-    """One combination cannot be flown: the others are, and the sweep has failed."""
+def test_failed_runs_have_rows(federation: Federation, near: None) -> None:
+    """One combination cannot be flown; the others are, and the sweep exits with 1."""
     out, path = federation.folder / "sweep", federation.write(PAIR, "pair.yaml")
     values = "processes.expect=[estimator.drone1,estimator.drone2,controller.main],[console.1]"
     done = forked_commands.run_here(
@@ -176,8 +174,8 @@ def length_s(flight):
 """
 
 
-def test_figures_of_a_user_s_own_that_fail_in_one_run_lose_no_other(federation: Federation) -> None:
-    """The module stands beside the scenario; the worker of another process loads it there."""
+def test_a_failing_user_metric_affects_only_its_run(federation: Federation) -> None:
+    """The worker process loads the module from the scenario's folder."""
     out, path = federation.folder / "sweep", federation.write(PAIR, "pair.yaml")
     (federation.folder / "figures_of_mine.py").write_text(FIGURES)
     options = ("--vary", "duration_s=0.2,0.4", "--set", "report.metrics=figures_of_mine:length_s", "--workers", "1")
@@ -195,8 +193,8 @@ def test_figures_of_a_user_s_own_that_fail_in_one_run_lose_no_other(federation: 
 @pytest.mark.parametrize(
     "name", [pytest.param("stüp.yaml", marks=pytest.mark.soak), b"st\xfcp.yaml".decode(errors="surrogateescape")]
 )
-def test_a_scenario_file_of_any_name(federation: Federation, name: str) -> None:
-    """Also where the locale knows nothing but ASCII."""
+def test_a_scenario_file_may_have_any_name(federation: Federation, name: str) -> None:
+    """This holds in an ASCII-only locale, too."""
     out, path = federation.folder / "sweep", federation.write(PAIR, name)
     ascii_only = ("env", "LC_ALL=C", "PYTHONUTF8=0")
     options = ("--duration", "0.2", "--workers", "1", "--out", str(out))
@@ -222,7 +220,7 @@ BAD = {
 }
 
 
-def test_bad_sweeps(federation: Federation) -> None:
+def test_bad_sweep_options_are_refused(federation: Federation) -> None:
     path = federation.write(PAIR, "pair.yaml")
     for name, (options, text) in BAD.items():
         done = forked_commands.run_forked("sweep", path, "--out", str(federation.folder / "sweep"), *options)
@@ -237,7 +235,7 @@ def test_bad_sweeps(federation: Federation) -> None:
 
 @pytest.fixture
 def cluster() -> Iterator[str]:
-    """Address of a Dask cluster of two processes on this host."""
+    """The address of a Dask cluster of two processes on this host."""
     pytest.importorskip("distributed", reason="the extra `dask` is not installed")
     from distributed import LocalCluster
 
@@ -248,8 +246,10 @@ def cluster() -> Iterator[str]:
 
 
 @pytest.mark.soak
-def test_a_dask_cluster_flies_the_same_rows(federation: Federation, undisturbed_for_long: Path, cluster: str) -> None:
-    """A cluster goes on with what other workers have begun."""
+def test_a_dask_cluster_produces_the_same_rows(
+    federation: Federation, undisturbed_for_long: Path, cluster: str
+) -> None:
+    """The cluster continues a sweep that other workers have begun."""
     out = federation.folder / "sweep"
     with locked(out, load(undisturbed_for_long).plan) as folder, folder.journal() as journal:
         journal.append(rows(undisturbed_for_long)[1])
@@ -262,7 +262,7 @@ def test_a_dask_cluster_flies_the_same_rows(federation: Federation, undisturbed_
 
 @pytest.fixture
 def hosts(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Address and process of a Dask scheduler that can be killed; it has one worker."""
+    """The address and process of a Dask scheduler with one worker, for tests that kill it."""
     pytest.importorskip("distributed", reason="the extra `dask` is not installed")
     from distributed import Client
 
@@ -283,7 +283,7 @@ def hosts(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
 
 @pytest.mark.soak
-def test_a_dask_scheduler_that_dies_ends_the_sweep_in_a_line(
+def test_the_death_of_a_dask_scheduler_is_reported(
     federation: Federation, hosts: tuple[str, subprocess.Popen[bytes]]
 ) -> None:
     (address, scheduler), out = hosts, federation.folder / "sweep"

@@ -1,6 +1,6 @@
-"""Users' agents that talk to each other: each message arrives at the same gate however they are run.
+"""User agents that exchange messages: each message arrives at the same gate however the agents are run.
 
-python test_talking_agents.py ENDPOINT FOLDER a b     runs talkers as one process; writes what each has heard
+python test_talking_agents.py ENDPOINT FOLDER a b     runs talkers as one process; writes what each received
 """
 
 import json
@@ -26,13 +26,13 @@ from zsim.transport.connection import find_world
 from zsim_world.run.world import World
 
 NAMES = ("a", "b", "c")
-WAITS_FOR = {"b": "a"}  # whose state closes the gate of whom; the others only read it
+WAITS_FOR = {"b": "a"}  # reader: the talker whose state its gate waits for; the others only read states
 GATES = 25
 EXPECT = [word for name in NAMES for word in ("--expect", f"talk.{name}")]
 
 
 class Talker(Agent):
-    """Publishes a state at every gate, and notes the states of all with the gate at which each is received."""
+    """Publishes a state at every gate, and notes every state received with the gate of its arrival."""
 
     def __init__(self, info: messages.Info, name: str) -> None:
         super().__init__()
@@ -99,7 +99,7 @@ def on_zenoh(federation: Federation, processes: Sequence[Sequence[str]]) -> dict
 
 
 def expected() -> dict[str, list[list[Any]]]:
-    """Return what is heard: what is waited for in its gate, the rest a command delay of one gate and a gate later."""
+    """Return the expected arrivals: awaited states in their own gate, others two gates later, one for the delay."""
     heard: dict[str, list[list[Any]]] = {}
     for name in NAMES:
         delays = {keys.cluster_state(each): 0 if WAITS_FOR.get(name) == each else 2 for each in NAMES}
@@ -111,7 +111,7 @@ def expected() -> dict[str, list[list[Any]]]:
 
 
 @pytest.mark.parametrize("names", [*map("".join, permutations(NAMES))])
-def test_in_one_process_in_any_order(federation: Federation, names: Sequence[str]) -> None:
+def test_messages_arrive_as_expected_in_one_process_in_any_order(federation: Federation, names: Sequence[str]) -> None:
     path = federation.write(ONE)
     assert in_one_process(path, [[name] for name in names]) == expected()
     assert in_one_process(path, [names]) == expected()
@@ -127,7 +127,7 @@ def test_in_one_process_in_any_order(federation: Federation, names: Sequence[str
     ],
     ids=lambda names: "-".join(names),
 )
-def test_on_zenoh_together_or_each_as_a_process(federation: Federation, processes: Sequence[str]) -> None:
+def test_messages_arrive_as_expected_over_zenoh(federation: Federation, processes: Sequence[str]) -> None:
     assert on_zenoh(federation, processes) == expected()
 
 

@@ -1,4 +1,4 @@
-"""Two runs on one host, started at the same time from one folder: neither meets the other's port, keys or files."""
+"""Two runs started at once on one host from one folder do not share ports, keys or files."""
 
 import json
 import re
@@ -19,14 +19,14 @@ from zsim.scenario import scenario_file
 from zsim_analysis.in_process import fly
 from zsim_deploy.launch.run import DEFAULT_PORT
 
-SLOW, DURATION_S = "0.02", 2.0  # at this rate, until it is changed: longer than any test may take
+SLOW, DURATION_S = "0.02", 2.0  # at this rate a run outlasts any test, until the rate is changed
 FLIGHT = ("run", "pair.yaml", "--no-report", "--duration", f"{DURATION_S:g}", "--rate", SLOW)
 STARTS_S = 120.0  # wall time
 
 
 @pytest.fixture
 def runs(tmp_path: Path, compiled: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Role]]:
-    """Two runs of one scenario as a person starts them in two terminals; `zsim ps` of the test shows those alone."""
+    """Two runs of one scenario, as if started in two terminals, and the only ones that the test's `zsim ps` shows."""
     (tmp_path / "pair.yaml").write_text(PAIR)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     inside = ("env", "-C", str(tmp_path))
@@ -35,19 +35,19 @@ def runs(tmp_path: Path, compiled: None, monkeypatch: pytest.MonkeyPatch) -> Ite
 
 
 def status() -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of `zsim ps` by the folder of a run."""
+    """Return the rows of `zsim ps` by the run's folder."""
     shown = [json.loads(line) for line in run_here("ps", "--json").stdout.splitlines()]
     return {run["out"]: run["rows"] for run in shown}
 
 
-def test_two_runs_side_by_side_fly_as_each_would_alone(tmp_path: Path, runs: list[Role]) -> None:
+def test_concurrent_runs_fly_as_each_would_alone(tmp_path: Path, runs: list[Role]) -> None:
     out = [tmp_path / re.split(" into ", run.line(r"^pair: .* into ", STARTS_S).text)[1] for run in runs]
     for run in runs:
-        run.line(r" 0\.0 / 2 s ", STARTS_S)  # its world listens, and its processes are started
+        run.line(r" 0\.0 / 2 s ", STARTS_S)  # its world listens and its processes have been started
     assert len({*out}) == 2
     pids: list[int | None] = [None]
     until_s = time.monotonic() + PATIENCE_S
-    while None in pids and time.monotonic() < until_s:  # a process has none until it is forked
+    while None in pids and time.monotonic() < until_s:  # a process has no pid until it is forked
         rows = status()
         assert set(rows) == {str(folder) for folder in out}
         pids = [row["pid"] for folder in rows for row in rows[folder] if row["state"] != "ended"]
@@ -67,7 +67,7 @@ def test_two_runs_side_by_side_fly_as_each_would_alone(tmp_path: Path, runs: lis
 
 
 def endpoint_of(run: Role) -> str:
-    """Return where a run's world listens: Zenoh's own port, unless it says another, as the last of several tries."""
+    """Return the endpoint of a run's world: the last one reported, or else the default port."""
     said = re.findall(r"this run is on (tcp/127\.0\.0\.1:\d+)", run.text())
     return said[-1] if said else f"tcp/127.0.0.1:{DEFAULT_PORT}"
 
@@ -79,8 +79,8 @@ def hash_of(path: Path) -> str:
         return record.sha256()
 
 
-def test_a_folder_is_a_runs_from_its_first_moment_on(tmp_path: Path, compiled: None) -> None:
-    """Of two that start at once, one flies; the other is refused, and leaves that one alone."""
+def test_only_one_of_two_simultaneous_runs_gets_a_folder(tmp_path: Path, compiled: None) -> None:
+    """Of two runs that start at once, one completes; the other is refused and does not disturb it."""
     (tmp_path / "pair.yaml").write_text(PAIR)
     flight = ["run", str(tmp_path / "pair.yaml"), "--no-report", "--duration", "1", "--out", str(tmp_path / "run")]
     with ExitStack() as stack:

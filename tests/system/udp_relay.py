@@ -1,10 +1,10 @@
-"""A radio link between UDP ports: delay, jitter, loss, and cuts.
+"""A radio link between UDP ports with delay, jitter, loss and cuts.
 
     python udp_relay.py DELAY_MS JITTER_MS LOSS SEED HOST:PORT=HOST:PORT ...
 
-What comes to the first address of a pair goes to the second, and what that answers goes back to whoever sent last. The
-delay wanders, so that datagrams keep their order, as on a radio that retransmits. A line `cut SECONDS` on standard input
-lets nothing pass for so long; each line is answered by `done` when it is over.
+Datagrams to the first address of a pair are relayed to the second; answers go back to the latest sender. The delay
+varies slowly, so that datagrams keep their order, as on a radio that retransmits. A line `cut SECONDS` on standard
+input blocks all traffic for that time; `done` on standard output reports its end.
 """
 
 import asyncio
@@ -12,11 +12,11 @@ import random
 import sys
 from typing import Any
 
-PERIOD_S = 0.1  # between two draws of the delay
+PERIOD_S = 0.1  # time between two draws of the delay
 
 
 class Radio:
-    """What a datagram meets under way."""
+    """The delay and loss of datagrams."""
 
     def __init__(self, delay_ms: float, jitter_ms: float, loss: float, seed: int) -> None:
         self._delay_s, self._jitter_s, self._loss = delay_ms / 1e3, jitter_ms / 1e3, loss
@@ -28,7 +28,7 @@ class Radio:
         return self._delay_s + self._draw.uniform(-self._jitter_s, self._jitter_s)
 
     def delay_s(self, now_s: float) -> float | None:
-        """Return how long a datagram takes; None if it is lost."""
+        """Return the delay of a datagram, or None if it is lost."""
         while now_s - self._from_s > PERIOD_S:
             self._from_s = max(self._from_s + PERIOD_S, now_s - PERIOD_S)
             self._a, self._b = self._b, self._delay()
@@ -38,7 +38,7 @@ class Radio:
 
 
 class Near(asyncio.DatagramProtocol):
-    """The port to which one side sends; the other side has a port of its own."""
+    """The port to which one side sends; the other side has its own."""
 
     def __init__(self, radio: Radio) -> None:
         self._radio = radio
@@ -65,11 +65,11 @@ class Near(asyncio.DatagramProtocol):
             loop.call_later(delay_s, send)
 
     def error_received(self, exc: Exception) -> None:
-        """Nobody is there yet."""
+        """Ignore that the other side does not listen yet."""
 
 
 class Far(asyncio.DatagramProtocol):
-    """The side that is sent to."""
+    """The side to which datagrams are relayed."""
 
     def __init__(self, near: Near) -> None:
         self._near = near
@@ -78,7 +78,7 @@ class Far(asyncio.DatagramProtocol):
         self._near.back(data)
 
     def error_received(self, exc: Exception) -> None:
-        """Nobody is there yet."""
+        """Ignore that the other side does not listen yet."""
 
 
 def address(text: str) -> tuple[str, int]:

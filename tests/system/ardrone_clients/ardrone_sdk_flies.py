@@ -1,4 +1,4 @@
-"""Fly a drone with the unmodified ardrone-sdk, which begins with the video: take off, move, hover, land."""
+"""Fly a drone with the unmodified ardrone-sdk, which starts the video first: take off, move, hover, land."""
 
 import json
 import sys
@@ -16,11 +16,11 @@ def main(host: str) -> None:
     drone = ardrone.ARDrone(host)
     try:
         _until(lambda: "demo" in drone.navdata)
-        drone.takeoff()  # once, as its users do
+        drone.takeoff()  # sent once, as its users do
         _until(lambda: _state(drone) == HOVERING)
         print(json.dumps({"event": "hovering", "altitude_mm": drone.navdata["demo"]["altitude"]}), flush=True)
         drone.set_speed(0.5)
-        drone.move_forward()  # once: it goes on until another command
+        drone.move_forward()  # sent once; the drone moves on until another command
         _until(lambda: drone.navdata["demo"]["vx"] > 700.0)
         print(json.dumps({"event": "flying", "theta": drone.navdata["demo"]["theta"]}), flush=True)
         drone.hover()

@@ -1,4 +1,4 @@
-"""Fly a drone with the unmodified pyardrone: take off, climb, turn, hover, land; print what its navdata and pictures show."""
+"""Fly a drone with the unmodified pyardrone, and print its navdata and pictures: take off, climb, turn, hover, land."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from pyardrone import ARDrone, at
 
 LANDED, FLYING, HOVERING = 2, 3, 4  # upper half of ctrl_state
 PERIOD_S, LATE_S = 0.03, 100.0
-BLACK = 20  # mean of a picture that is nearly so
+BLACK = 20  # mean pixel value up to which a picture counts as black
 
 
 def main(host: str) -> None:
@@ -32,7 +32,7 @@ def main(host: str) -> None:
     _until(drone, lambda: _state(drone) == LANDED, drone.land)
     _show(drone, "landed")
     sys.stdout.flush()
-    os._exit(0)  # its threads of video have no end
+    os._exit(0)  # its video threads never end
 
 
 def _turned(angle_mdeg: float) -> float:
@@ -44,7 +44,7 @@ def _state(drone: ARDrone) -> int:
 
 
 def _until(drone: ARDrone, reached, act=lambda: None) -> None:
-    """Repeat a command, as pilots' programs do, until something is reached."""
+    """Repeat a command, as pilots' programs do, until a condition holds."""
     until_s = time.monotonic() + LATE_S
     while not reached():
         if time.monotonic() > until_s:

@@ -1,8 +1,8 @@
 # pyright: reportMissingImports=false, reportOptionalMemberAccess=false, reportOptionalOperand=false
 # pyright: reportCallIssue=false, reportArgumentType=false
-"""A flight as users of DroneKit write it: arm in GUIDED, take off, go somewhere, upload a mission, land.
+"""A flight as DroneKit users write it: arm in GUIDED mode, take off, go to a place, fly an uploaded mission, land.
 
-Knows nothing of zsim. Run: python dronekit_goto.py CONNECTION; prints what it saw as JSON.
+Knows nothing of zsim. Run: python dronekit_goto.py CONNECTION; prints its observations as JSON.
 """
 
 import json
@@ -21,7 +21,7 @@ NORTH_DEG = 4e-5  # about 4.4 m
 
 
 class Waiter:
-    """Waits until something is true of a vehicle, looking whenever one of its attributes has changed."""
+    """Waits for a condition, which it checks whenever an attribute of the vehicle has changed."""
 
     def __init__(self, vehicle):
         self._vehicle = vehicle

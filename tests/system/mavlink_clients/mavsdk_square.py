@@ -1,7 +1,7 @@
 # pyright: reportMissingImports=false, reportOptionalMemberAccess=false
-"""Two vehicles at once as users of MAVSDK write it: arm, take off, fly a square offboard, land.
+"""A flight of two vehicles at once, as MAVSDK users write it: arm, take off, fly a square in offboard mode, land.
 
-Knows nothing of zsim. Run: python mavsdk_square.py PORT1 PORT2; prints what it saw as JSON.
+Knows nothing of zsim. Run: python mavsdk_square.py PORT1 PORT2; prints its observations as JSON.
 """
 
 import json
@@ -18,11 +18,13 @@ from mavsdk.plugins.telemetry import Telemetry
 PATIENCE_S = 100.0
 TAKEOFF_M = 3.0
 SIDE_M = 3.0
-SILENCE_S = 5.0  # of setpoints, in simulated time, which may go faster than the wall clock by which they are sent
+SILENCE_S = (
+    5.0  # tolerated gap between setpoints in simulated time, which may run faster than the wall clock that paces them
+)
 
 
 class Watch:
-    """The newest value of a stream of telemetry."""
+    """The newest value of a telemetry stream."""
 
     def __init__(self, subscribe):
         self.value = None
@@ -42,7 +44,7 @@ class Watch:
 
 
 class Pilot:
-    """A vehicle behind a port of its own."""
+    """A vehicle on a port of its own."""
 
     def __init__(self, port):
         self.mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
@@ -87,7 +89,7 @@ class Pilot:
         self.seen["corners"] = len(corners)
 
     def turn(self):
-        """Climb by a velocity along the body, and stop."""
+        """Climb while turning, at a velocity in body axes, and stop."""
         self.offboard.set_velocity_body(VelocityBodyYawspeed(0.0, 0.0, -0.8, 30.0))
         self.place.until(lambda p: p.position.down_m < -TAKEOFF_M - 1.0, "the climb")
         self.offboard.stop()

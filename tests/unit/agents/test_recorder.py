@@ -1,4 +1,4 @@
-"""The recorder: what was sent before it came, once and without a gap, and garbage as it came."""
+"""The recorder writes all messages once, without gaps, even those sent before it joined, and garbage as received."""
 
 import errno
 import os
@@ -39,12 +39,12 @@ Pair = tuple[str, bytes]
 
 
 def record(link: Any, path: Path, info: Info = INFO, say: Any = lambda text: None) -> None:
-    """Record a run that a link brings to its end."""
+    """Record a run until the link reports its end."""
     assert Recorder(link, info, path, say=say).run() == RUN_ENDED
 
 
 def on_record(path: Path, *wanted: str) -> list[Pair]:
-    """Return all messages in the order of their times, or those of some keys as they were written."""
+    """Return all messages in order of time, or those on some keys in the order in which they were written."""
     with RecordReader(path) as reader:
         return [(each.key, each.payload) for each in reader.messages(wanted or None, by_time=not wanted)]
 
@@ -66,7 +66,7 @@ def imu(gate: int) -> Pair:
 
 
 def whole(gate: int) -> list[Pair]:
-    """Return a gate as the world hands it over: its samples in one."""
+    """Return a gate as the world passes it on: all samples in one message."""
     return [(keys.GATE, GateMessages.of(gate * GATE_NS, gate, TABLE, [imu(gate)]).pack()), clock(gate)]
 
 
@@ -79,10 +79,10 @@ def page(passed: list[Pair], more: int | None = None) -> ControlAnswer:
 
 
 def linked(answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, bytes] = LAST) -> FakeLink:
-    """Return a link to a world that answers replays, has last values, and has sent batches."""
+    """Return a link to a world that answers replay requests, retains last values and has sent batches."""
     link, left = FakeLink(), iter(answers)
     link.last = last
-    link.on_request = lambda key, args: next(left, page([]))  # the world has no more of the gates before the last one
+    link.on_request = lambda key, args: next(left, page([]))  # then there is nothing left to replay
     for passed in batches:
         link.deliver(keys.BATCH, encode_batch(passed))
     return link
@@ -91,7 +91,7 @@ def linked(answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, b
 def recorded(
     path: Path, answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, bytes] = LAST
 ) -> list[Pair]:
-    """Record a run of which all answers are asked for; return what is in the record."""
+    """Record a run, assert that all answers were requested, and return the messages in the record."""
     link = linked(answers, *batches, [clock(99, "stopped")], last=last)
     record(link, path)
     assert len(link.requests) >= len(answers)
@@ -99,7 +99,7 @@ def recorded(
 
 
 def cut_at_first_join(link: FakeLink) -> None:
-    """Lose the link, and restore it, once the recorder has joined."""
+    """Lose and restore the link as soon as the recorder has joined."""
 
     def cut(key: str, payload: bytes) -> None:
         if key == JOIN and len(link.published_on(key)) == 1:
@@ -113,8 +113,8 @@ def stamps(found: list[Pair], key: str) -> list[int]:
     return [messages.decode(key, payload).t_ns // GATE_NS for name, payload in found if name == key]
 
 
-def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
-    """The replay reaches gate 6; the batches since its subscription begin with gate 4."""
+def test_a_late_recorder_writes_duplicate_messages_once(tmp_path: Path):
+    """The replay reaches gate 6; the batches received since the subscription begin with gate 4."""
     replayed = [page(gates(0, 1, 2, 3, 4, 5, 6))]
     found = recorded(tmp_path / "run.mcap", replayed, gates(4), gates(5, 6), gates(7), gates(8))
     assert stamps(found, IMU) == list(range(9))
@@ -122,29 +122,29 @@ def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
 
 
 @pytest.mark.parametrize("last", [LAST, {}], ids=["answered", "not answered"])
-def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path, last: dict[str, bytes]):
-    """The replay has lost the world's first words; what the hub still answers comes as it is, once."""
+def test_the_run_info_is_recorded_once_however_late_the_recorder_joins(tmp_path: Path, last: dict[str, bytes]):
+    """The replay lacks the world's first messages; the value retained by the hub is recorded unchanged, once."""
     found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=last)
     assert found[0] == pair(keys.INFO, INFO)
     assert [key for key, _ in found].count(keys.INFO) == 1
 
 
-def test_the_newest_faults_are_on_record_once(tmp_path: Path):
+def test_the_latest_faults_are_recorded_once(tmp_path: Path):
     first, second, third = (pair(keys.FAULTS, Faults(gate * GATE_NS, gate, ())) for gate in (1, 5, 8))
     for number, passed in enumerate(([*gates(7)], [first, *gates(2), second, *gates(7)])):
         found = recorded(tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=LAST | dict([second]))
         assert stamps(found, keys.FAULTS) == ([5, 8], [1, 5, 8])[number]
 
 
-def test_gates_in_one_are_recorded_message_by_message_and_once(tmp_path: Path):
+def test_combined_gates_are_recorded_message_by_message_and_once(tmp_path: Path):
     replayed = [page(gates(0, 1, 2, 3))]
     found = recorded(tmp_path / "run.mcap", replayed, whole(2), whole(3), whole(4), whole(5))
     assert stamps(found, IMU) == list(range(6))
     assert [payload for key, payload in found if key == IMU] == [imu(gate)[1] for gate in range(6)]
 
 
-def test_a_gate_whose_columns_lead_outside_is_refused(tmp_path: Path):
-    """Whoever may publish may send such a thing; the record stays whole."""
+def test_a_gate_with_out_of_range_columns_is_refused(tmp_path: Path):
+    """Any process that may publish can send such a gate; the record stays intact."""
     good = GateMessages.of(GATE_NS, 1, TABLE, [imu(1), imu(2)])
     bad = [b"", b"\xc1"]
     for which, stamps_, ends in (
@@ -163,7 +163,7 @@ def test_a_gate_whose_columns_lead_outside_is_refused(tmp_path: Path):
     assert stamps(found, IMU) == [0, 1, 2, 3]
 
 
-def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_duplicates_of_the_end_of_a_long_replay_are_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recorder, "KNOWN_MAX", 6)
     found = recorded(tmp_path / "run.mcap", [page(gates(*range(10)))], gates(8, 9, 10))
     assert stamps(found, IMU) == list(range(11))
@@ -178,21 +178,19 @@ def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: 
     ],
     ids=["in pages", "not at once", "a page at first"],
 )
-def test_all_pages_of_a_replay_are_written_and_what_is_not_answered_asked_for_again(
-    tmp_path: Path, answers: list[ControlAnswer]
-):
+def test_all_pages_of_a_replay_are_written_and_missing_answers_retried(tmp_path: Path, answers: list[ControlAnswer]):
     assert stamps(recorded(tmp_path / "run.mcap", answers, gates(3)), IMU) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("key", [keys.CLOCK, keys.EVENT, IMU, "process/x.y/join", "of/somebody"])
 @pytest.mark.parametrize("payload", [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000], ids=["utf8", "nested", "no", "deep"])
-def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes):
+def test_garbage_is_recorded_as_received(tmp_path: Path, key: str, payload: bytes):
     passed = [(key, payload), clock(0), (key, payload), clock(1)]
     found = recorded(tmp_path / "run.mcap", [page([(key, payload)])], passed)
     assert [each for each in found if each[1] == payload] == [(key, payload)] * 2
 
 
-def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_messages_on_too_many_keys_are_counted_and_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     link, lines = linked([], [imu(0), clock(0), imu(1), clock(1, "stopped")], last={}), []
     link.deliver("view/drones", b"\x81\xa4t_ns\x01")
@@ -203,7 +201,7 @@ def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monke
     assert has_terms(line, "recorder", "3", "65535", "keys")
 
 
-def test_what_has_no_time_is_recorded_at_the_worlds_whatever_strangers_stamp(tmp_path: Path):
+def test_untimed_messages_get_the_world_s_time_despite_foreign_stamps(tmp_path: Path):
     path = tmp_path / "run.mcap"
     strange = ("my/thing", msgspec.msgpack.encode({"t_ns": 2**61, "seq": 0}))
     recorded(path, [page(gates(0, 1, 2, 3))], [*gates(3), *gates(4), strange, ("my/raw", b"as it is")], gates(5))
@@ -217,11 +215,11 @@ def completed(path: Path) -> Completeness:
         return completeness(reader)
 
 
-# Without a gap
+# Gaps
 
 
 def died(path: Path, passed: list[Pair], cut: int = 0) -> None:
-    """Leave what a recorder that was killed leaves: a record without an end, cut by some bytes."""
+    """Write a record as a killed recorder leaves it: without an end, and truncated by `cut` bytes."""
     with RecordWriter(path) as writer:
         for key, payload in passed:
             writer.add(key, payload, messages.encoding(key), messages.decode(key, payload).t_ns, 1)
@@ -230,8 +228,8 @@ def died(path: Path, passed: list[Pair], cut: int = 0) -> None:
     path.write_bytes(data[: end - cut])
 
 
-def test_one_that_is_started_again_goes_on_with_the_record(tmp_path: Path):
-    """It has the gates up to 4; the world replays the last of these and those that passed meanwhile."""
+def test_a_restarted_recorder_continues_the_record(tmp_path: Path):
+    """The record has the gates up to 4; the world replays the last of these and those that passed in the meantime."""
     path = tmp_path / "run.mcap"
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2, 3, 4)])
     found = recorded(path, [page(gates(2, 3, 4, 5, 6, 7))], gates(7), gates(8), whole(9))
@@ -241,14 +239,14 @@ def test_one_that_is_started_again_goes_on_with_the_record(tmp_path: Path):
 
 
 @pytest.mark.parametrize("cut", [1, 40])
-def test_what_its_last_chunk_lacks_is_asked_for(tmp_path: Path, cut: int):
+def test_messages_missing_from_the_last_chunk_are_requested(tmp_path: Path, cut: int):
     path = tmp_path / "run.mcap"
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)], cut)
     found = recorded(path, [page(gates(0, 1, 2, 3))], gates(4))
     assert stamps(found, IMU) == list(range(5))
 
 
-def test_news_of_a_join_of_its_own_process_that_it_did_not_publish_are_answered_by_a_newer_one(tmp_path: Path):
+def test_an_unknown_join_of_its_own_process_is_answered_by_a_newer_one(tmp_path: Path):
     link = linked([], last={})
 
     def entry(number: int, incarnation: int) -> Pair:
@@ -275,8 +273,8 @@ def test_the_record_of_another_run_is_left_alone(tmp_path: Path):
     assert path.read_bytes() == before
 
 
-def test_a_disk_that_is_full_while_it_joins_is_a_bye(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The world has its join then: without a bye it would wait for a recorder that is started again."""
+def test_a_recorder_whose_disk_fills_while_it_joins_sends_a_bye(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The world already has its join: without a bye, it would wait for the recorder to be restarted."""
     link, write_all = linked([page(gates(0))]), mcap_layout.write_all
 
     def write(file: FileIO, data: bytes) -> None:
@@ -292,8 +290,8 @@ def test_a_disk_that_is_full_while_it_joins_is_a_bye(tmp_path: Path, monkeypatch
     assert (bye.reason, bye.incarnation) == (str(full.value), join.incarnation)
 
 
-def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
-    """The link goes after gate 1 and comes back before gate 4."""
+def test_messages_missed_while_the_link_was_lost_are_requested(tmp_path: Path):
+    """The link is lost after gate 1 and restored before gate 4."""
     path, link = tmp_path / "run.mcap", FakeLink()
     replays = iter([page(gates(0)), page(gates(0, 1, 2, 3))])
 
@@ -320,8 +318,8 @@ def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
     assert first.incarnation != second.incarnation
 
 
-def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_them(tmp_path: Path):
-    """No link was lost as far as anybody noticed: the batch of gate 3 went nowhere."""
+def test_missing_gates_are_requested_and_recorded_before_later_ones(tmp_path: Path):
+    """No loss of the link is noticed: only the batch of gate 3 is missing."""
     path, strange = tmp_path / "run.mcap", ("drone/d1/cmd/velocity", b"of gate 5")
     answers = [page(gates(0, 1)), page([*gates(1, 2, 3), strange, *gates(4)])]
     found = recorded(path, answers, gates(2), [strange, *whole(4)], whole(5), [clock(6)])
@@ -330,8 +328,8 @@ def test_gates_that_did_not_come_are_asked_for_and_stand_before_what_came_after_
     assert written == [*[keys.CLOCK] * 4, strange[0], *[keys.CLOCK] * 4]
 
 
-def test_a_clock_of_time_that_stood_still_is_missed_by_its_number(tmp_path: Path):
-    """The world died just after it had published that clock: the next one knows of it."""
+def test_a_missing_clock_of_halted_time_is_detected_by_its_number(tmp_path: Path):
+    """The world died just after it had published that clock, which its successor knows of."""
     path, stood = tmp_path / "run.mcap", clock(1, seq=2)
     after = [clock(1, seq=3), clock(2, seq=4)]
     recorded(path, [page(gates(0)), page([*gates(0, 1), stood, *after])], gates(1), after)
@@ -339,8 +337,8 @@ def test_a_clock_of_time_that_stood_still_is_missed_by_its_number(tmp_path: Path
     assert [(each.step, each.seq) for each in clocks[:-1]] == [(0, 0), (1, 1), (1, 2), (1, 3), (2, 4)]
 
 
-def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path):
-    """Printed in a line while the run goes on, and read off the record afterwards."""
+def test_gates_that_the_world_no_longer_has_are_reported_missing(tmp_path: Path):
+    """They are reported in one line during the run, and found from the record afterwards."""
     path, lines = tmp_path / "run.mcap", []
     answers = [page(gates(0)), page(gates(8, 9))]
     record(linked(answers, gates(1), gates(2), whole(9), whole(10), [clock(11, "stopped")]), path, say=lines.append)
@@ -351,8 +349,8 @@ def test_gates_that_the_world_has_no_longer_are_missing_by_number(tmp_path: Path
     assert (found.complete, found.gates, found.gates_missing, found.messages_missing) == (False, 7, 5, 5)
 
 
-def test_a_world_that_is_far_ahead_changes_no_order_and_doubles_nothing(tmp_path: Path):
-    """It replays gates that are on their way still, behind the ones that are missing."""
+def test_a_replay_far_ahead_causes_no_reordering_and_no_duplicates(tmp_path: Path):
+    """It holds gates that are still in transit, beyond the missing ones."""
     path = tmp_path / "run.mcap"
     on_their_way = [each for gate in range(5, 30) for each in whole(gate)]
     found = recorded(path, [page(gates(0)), page(gates(20, 21, 22, 23))], on_their_way, [clock(30)])
@@ -361,7 +359,7 @@ def test_a_world_that_is_far_ahead_changes_no_order_and_doubles_nothing(tmp_path
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_the_end_of_a_run_that_passed_while_the_link_was_lost_is_asked_for(
+def test_the_end_of_a_run_missed_while_the_link_was_lost_is_requested(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ):
     monkeypatch.setattr(recorder, "QUIET_S", 0.0)
@@ -373,8 +371,8 @@ def test_the_end_of_a_run_that_passed_while_the_link_was_lost_is_asked_for(
     assert completed(path).complete
 
 
-def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_clock_is_missing(tmp_path: Path):
-    """A world that was started again has published events, and the recorder comes back when only clocks follow."""
+def test_missed_realtime_messages_are_requested_even_if_no_clock_is(tmp_path: Path):
+    """A restarted world has published events, and the recorder reconnects when only clocks follow."""
     path, info = tmp_path / "run.mcap", replace(INFO, mode="realtime")
     missed = [pair(keys.EVENT, Event(0, number, "superseded", "x.y", "x.y", "")) for number in (0, 1)]
     answers = [page(gates(0)), page([*gates(0), *missed, *gates(1)])]
@@ -398,7 +396,7 @@ def test_what_passed_before_a_link_was_back_is_asked_for_in_realtime_though_no_c
     assert [messages.decode(*each).seq for each in written if each[0] == keys.CLOCK] == [0, 1, 2, 3]
 
 
-def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
+def test_missing_gates_are_not_requested_from_another_run(tmp_path: Path):
     path, other = tmp_path / "run.mcap", dict([pair(keys.INFO, replace(INFO, run_id="other"))])
     link = linked([page(gates(0))], [*gates(1), *gates(4), clock(5, "stopped")], last=other)
     record(link, path)
@@ -406,7 +404,7 @@ def test_another_run_is_not_asked_for_gates_that_are_missing(tmp_path: Path):
     assert len(link.requests) == 1
 
 
-def test_who_goes_on_with_a_record_counts_from_its_end(tmp_path: Path):
+def test_gates_missing_from_a_continued_record_count_from_its_end(tmp_path: Path):
     path, lines = tmp_path / "run.mcap", []
     died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)])
     record(linked([page(gates(5))] * 2, [*gates(5, 6), clock(7, "stopped")], last={}), path, say=lines.append)
@@ -414,14 +412,14 @@ def test_who_goes_on_with_a_record_counts_from_its_end(tmp_path: Path):
     assert completed(path).gaps == (GateGap(2, 3 * GATE_NS, 4 * GATE_NS),)
 
 
-def test_who_goes_on_with_the_record_of_a_run_that_is_over_leaves(tmp_path: Path):
+def test_a_recorder_that_continues_a_finished_run_ends(tmp_path: Path):
     path, before = tmp_path / "run.mcap", [pair(keys.INFO, INFO), *gates(0, 1, 2), clock(3, "stopped")]
     died(path, before)
     record(linked([page(before)], last={}), path)
     assert completed(path).complete
 
 
-def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
+def test_the_recorder_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
     path, on_disk = tmp_path / "run.mcap", list[tuple[int, int]]()
     link = linked([page(gates(*range(60)))], [*gates(*range(59, 130)), clock(130, "stopped")], last={})
 
@@ -440,7 +438,7 @@ def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
 
 
 @pytest.mark.parametrize("garbage", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1"])
-def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
+def test_a_garbage_batch_is_refused_without_ending_the_recording(tmp_path: Path, garbage: bytes):
     link = linked([], last={})
     for payload in (garbage, encode_batch([clock(0, "stopped")])):
         link.deliver(keys.BATCH, payload)
@@ -455,7 +453,7 @@ FRONT, FRONT_INFO = keys.camera("d1", "front"), keys.camera_info("d1", "front")
 
 
 def filmed(path: Path, pictures: list[Struct | bytes], last: dict[str, bytes]) -> list[Pair]:
-    """Record a run in which pictures are published beside what passes the world; return what is on record."""
+    """Record a run in which pictures bypass the world, and return the messages in the record."""
     link = linked([], gates(0), [clock(99, "stopped")], last=LAST | last)
     for picture in pictures:
         link.deliver(FRONT, picture)
@@ -463,7 +461,7 @@ def filmed(path: Path, pictures: list[Struct | bytes], last: dict[str, bytes]) -
     return on_record(path)
 
 
-def test_pictures_are_on_record_as_published_and_how_the_camera_sees_too(tmp_path: Path):
+def test_pictures_and_camera_information_are_recorded_as_published(tmp_path: Path):
     pictures: list[Struct | bytes] = [image(number * GATE_NS, number) for number in range(3)]
     found = filmed(tmp_path / "run.mcap", pictures, dict([pair(FRONT_INFO, info())]))
     assert [payload for key, payload in found if key == FRONT] == [
@@ -472,14 +470,14 @@ def test_pictures_are_on_record_as_published_and_how_the_camera_sees_too(tmp_pat
     assert [payload for key, payload in found if key == FRONT_INFO] == [messages.encode(info())]
 
 
-def test_junk_on_a_camera_s_key_is_on_record_and_disturbs_nothing(tmp_path: Path):
+def test_garbage_on_a_camera_s_key_is_recorded_and_does_no_harm(tmp_path: Path):
     found = filmed(tmp_path / "run.mcap", [b"\xc1", image(0, 0, NO_JPEG), image(GATE_NS, 1)], {})
     assert [key for key, _ in found].count(FRONT) == 3
     assert stamps(found, IMU) == [0]
 
 
-def test_a_record_of_pictures_is_hardly_larger_than_they_are(tmp_path: Path):
-    """JPEG is compressed; what the container and the messages' other fields add is below 2 %."""
+def test_a_record_of_pictures_is_hardly_larger_than_the_pictures(tmp_path: Path):
+    """JPEG is already compressed; the container and the other fields of the messages add less than 2 %."""
     rng = np.random.default_rng(1)
     jpegs = [b"\xff\xd8\xff" + rng.bytes(18_000) for _ in range(200)]
     filmed(tmp_path / "run.mcap", [image(n * GATE_NS, n, data) for n, data in enumerate(jpegs)], {})

@@ -1,4 +1,4 @@
-"""A run on record, read from Python: against the messages that were written, the export and the report."""
+"""Reading a recorded run from Python: results agree with the written messages, the export and the report."""
 
 import html
 import json
@@ -35,7 +35,7 @@ NAMES = [*cluster_space(3).names]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight of six seconds, engaged from about the fourth on, with a message of every kind."""
+    """Return the folder of a flight of 6 s with a message of every kind, engaged from about 4 s."""
     made = tmp_path_factory.mktemp("run")
     recorded_run.write(made / "run.mcap")
     return made
@@ -54,7 +54,7 @@ def without_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
 # Tables
 
 
-def test_truth_is_what_was_recorded(folder: Path, run: zsim.Run) -> None:
+def test_truth_is_read_as_recorded(folder: Path, run: zsim.Run) -> None:
     truth, written = run.truth(DRONE), recorded_run.messages_on(folder, keys.truth(DRONE))
     assert len(truth) == len(written) > 290
     assert [*truth.index] == [message.t_ns / 1e9 for message in written]
@@ -91,12 +91,12 @@ def plain(table: pd.DataFrame) -> pd.DataFrame:
     return table.astype(object).where(table.notna(), None)
 
 
-def test_a_hat_that_was_seen_is_a_row(run: zsim.Run) -> None:
+def test_a_sighted_hat_is_a_row(run: zsim.Run) -> None:
     seen = run.messages("drone/drone1/sensor/sightings")
     assert {"camera", "hat", "direction_B_x", "range_m"} <= {*seen}
 
 
-def test_own_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
+def test_foreign_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
     thing = run.messages("own/thing")
     assert thing[["x_0", "x_1"]].to_numpy().tolist() == [[1.0, 2.0]]
     assert run.messages("own/noise")["hexadecimal"].tolist() == ["c100"]
@@ -119,19 +119,19 @@ def test_own_messages_have_a_column_for_each_field(run: zsim.Run) -> None:
         ([b"\xff\xd8", None], {"f": [b"\xff\xd8", None]}),
     ],
 )
-def test_own_fields_become_numbers_where_all_are(values: list[Any], columns: dict[str, list[Any]]) -> None:
+def test_foreign_fields_become_numbers_if_all_values_are(values: list[Any], columns: dict[str, list[Any]]) -> None:
     made = recorded._own_columns("f", values)
     assert {*made} == {*columns}
     for name, expected in columns.items():
         np.testing.assert_array_equal(made[name], np.array(expected, made[name].dtype))
 
 
-def test_a_picture_is_bytes(folder: Path, run: zsim.Run) -> None:
+def test_a_picture_is_read_as_bytes(folder: Path, run: zsim.Run) -> None:
     (picture,) = recorded_run.messages_on(folder, "drone/drone1/camera/front")
     assert run.messages("drone/drone1/camera/front")["data"].tolist() == [picture.data]
 
 
-def test_messages_have_their_stamps_too(folder: Path, run: zsim.Run) -> None:
+def test_messages_include_their_stamps(folder: Path, run: zsim.Run) -> None:
     with RecordReader(folder / "run.mcap") as reader:
         written = [*reader.messages({"clock"})]
     clock = run.messages("clock")
@@ -153,7 +153,7 @@ def test_without_pandas_a_frame_is_a_dict_of_arrays(folder: Path, without_pandas
 
 @pytest.fixture
 def passes(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """The keys of each pass over a record."""
+    """Return a list that collects the keys of each pass over a record."""
     made: list[list[str]] = []
     read = recorded.read_tables
 
@@ -168,13 +168,13 @@ def passes(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
 def test_a_key_is_read_once(folder: Path, passes: list[list[str]]) -> None:
     run = zsim.load(folder)
     first = run.truth("drone1")
-    first.loc[:, "position_m_x"] = 7.0  # the user's own from here on
+    first.loc[:, "position_m_x"] = 7.0  # the frame belongs to the user
     assert run.truth("drone1")["position_m_x"].iloc[0] == pytest.approx(2.0)
     run.messages("drone/drone1/truth")
     assert passes == [["drone/drone1/truth"]]
 
 
-def test_all_drones_are_read_at_once_from_the_second_on(folder: Path, passes: list[list[str]]) -> None:
+def test_the_remaining_drones_are_read_together_with_the_second(folder: Path, passes: list[list[str]]) -> None:
     run = zsim.load(folder)
     heights = {drone: run.truth(drone)["position_m_y"].iloc[0] for drone in run.drones}
     assert heights == {"drone1": 0.0, DRONE: 0.0, "end": 3.0}
@@ -199,7 +199,7 @@ def test_a_fleet_too_large_for_memory_is_read_drone_by_drone(
 
 @pytest.fixture(scope="module")
 def step(tmp_path_factory: pytest.TempPathFactory) -> zsim.Run:
-    """A synthetic flight whose true errors are sines of 1 mm to 12 mm about 1 cm, and half of that as estimated."""
+    """Return a synthetic flight: true errors are sines of 1 to 12 mm about 1 cm, estimated ones half of them."""
     made = tmp_path_factory.mktemp("step")
     true = np.arange(1, 13) * 1e-3
     synthetic_record.write(
@@ -208,7 +208,7 @@ def step(tmp_path_factory: pytest.TempPathFactory) -> zsim.Run:
     return zsim.load(made)
 
 
-def test_errors_of_a_formation_are_those_of_the_closed_form(step: zsim.Run) -> None:
+def test_errors_of_a_formation_match_the_closed_form(step: zsim.Run) -> None:
     table = step.errors(window=(2.0, 9.98))
     assert [*table.index] == [("main", name) for name in NAMES]
     sine = np.arange(1, 13) * 1e-3 / np.sqrt(2)
@@ -225,7 +225,7 @@ def test_errors_of_a_formation_are_those_of_the_closed_form(step: zsim.Run) -> N
     assert set(formation["phase"]) == {"engaged"}
 
 
-def test_without_a_window_errors_are_those_of_the_report(step: zsim.Run) -> None:
+def test_errors_without_a_window_are_those_of_the_report(step: zsim.Run) -> None:
     page = step.report()
     reported = json.loads((page.parent / "summary.json").read_text())
     for name, errors in reported["clusters"]["main"]["errors"].items():
@@ -235,10 +235,10 @@ def test_without_a_window_errors_are_those_of_the_report(step: zsim.Run) -> None
     assert indented_json(step.summary) == (page.parent / "summary.json").read_bytes()
 
 
-def test_errors_of_an_estimate_are_against_the_truth(run: zsim.Run) -> None:
+def test_errors_of_an_estimate_are_relative_to_the_truth(run: zsim.Run) -> None:
     errors, truth, estimate = run.estimate_errors("drone1"), run.truth("drone1"), run.estimate("drone1")
     own = (estimate["position_m_x"] - truth["position_m_x"]).dropna()
-    assert errors["position_m_x"].to_numpy() == pytest.approx(own.to_numpy(), abs=1e-6)  # estimates are held as float32
+    assert errors["position_m_x"].to_numpy() == pytest.approx(own.to_numpy(), abs=1e-6)  # estimates are kept as float32
     stated = np.sqrt(estimate["covariance_11"].loc[errors.index])
     assert errors["sigma_position_m_y"].to_numpy() == pytest.approx(stated.to_numpy(), rel=1e-6)
     part = errors.loc[2.0:4.0]
@@ -250,12 +250,12 @@ def test_errors_of_an_estimate_are_against_the_truth(run: zsim.Run) -> None:
     assert table.loc["position_m_z", "inside"] == pytest.approx(inside)
 
 
-def test_where_a_window_has_nothing_statistics_are_unknown(run: zsim.Run) -> None:
+def test_statistics_of_an_empty_window_are_unknown(run: zsim.Run) -> None:
     for of in ("formations", "estimates"):
         assert run.errors((100.0, 200.0), of).drop(columns="unit").isna().all(axis=None)
 
 
-def test_how_it_was_flown_is_known(run: zsim.Run) -> None:
+def test_a_run_has_its_drones_scenario_end_and_hash(run: zsim.Run) -> None:
     assert run.drones == ("drone1", "a-b.c", "end")
     assert run.clusters == ("main",)
     assert run.duration_s == 6.0
@@ -266,13 +266,13 @@ def test_how_it_was_flown_is_known(run: zsim.Run) -> None:
     assert run.keys["drone/end/truth"] == len(run.truth("end"))
 
 
-def test_its_scenario_flies_again_to_the_same_bits(run: zsim.Run, tmp_path: Path) -> None:
+def test_a_rerun_of_the_scenario_is_identical_to_the_bit(run: zsim.Run, tmp_path: Path) -> None:
     again = zsim.run(run.scenario, out=tmp_path / "again", progress=False)
     assert again.truth_sha256 == run.truth_sha256
     pd.testing.assert_frame_equal(again.truth(DRONE), run.truth(DRONE))
 
 
-def test_all_drones_are_one_dataset(run: zsim.Run) -> None:
+def test_all_drones_form_one_xarray_dataset(run: zsim.Run) -> None:
     data = run.xarray()
     assert dict(data.sizes) == {"drone": 3, "t_s": 301}
     assert [*data.drone.values] == [*run.drones]
@@ -281,21 +281,21 @@ def test_all_drones_are_one_dataset(run: zsim.Run) -> None:
     assert data.estimate_position_m_x.sel(drone=DRONE).dropna("t_s")[-1] == last
 
 
-# Shown
+# Presentation
 
 
-def test_a_figure_is_that_of_the_report(step: zsim.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_figure_of_the_report_is_drawn_alone(step: zsim.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
     monkeypatch.setattr(flight_figures, "draw_plan", lambda *_: drawn.append("plan"))
     monkeypatch.setattr(make_report, "draw_errors", lambda *_: drawn.append("errors"))
     shape: Any = step.figure("shape")
     assert "$p$" in shape.axes[0].get_ylabel()
     assert step.figure("figure_8_shape").axes[0].get_ylabel() == shape.axes[0].get_ylabel()
-    assert drawn == []  # no other one
+    assert drawn == []  # no other figure
     assert shape._repr_png_().startswith(b"\x89PNG")
 
 
-def test_a_figure_that_there_is_not_is_refused_with_those_that_there_are(run: zsim.Run) -> None:
+def test_an_unknown_figure_is_refused_with_the_known_ones(run: zsim.Run) -> None:
     with refused(
         RunError,
         "'shap'",
@@ -306,7 +306,7 @@ def test_a_figure_that_there_is_not_is_refused_with_those_that_there_are(run: zs
         run.figure("shap")
 
 
-def test_a_notebook_shows_its_errors_and_how_it_fell_short(step: zsim.Run) -> None:
+def test_a_notebook_shows_errors_and_shortfalls(step: zsim.Run) -> None:
     shown = step._repr_html_()
     assert "step, seed 1, 3 drones" in shown
     assert "12 s, " in shown
@@ -314,7 +314,7 @@ def test_a_notebook_shows_its_errors_and_how_it_fell_short(step: zsim.Run) -> No
     assert html.escape(step.shortfalls[0].text) in shown
 
 
-# What is not there
+# Missing data
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,7 @@ def test_a_notebook_shows_its_errors_and_how_it_fell_short(step: zsim.Run) -> No
         (lambda run: run.messages("own/thin"), ("'own/thin'", "did you mean own/thing?")),
     ],
 )
-def test_what_is_not_on_record_is_refused_with_what_is(run: zsim.Run, ask: Any, words: tuple[str, ...]) -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones(run: zsim.Run, ask: Any, words: tuple[str, ...]) -> None:
     with refused(RunError, *words):
         ask(run)
 
@@ -351,7 +351,7 @@ def test_a_folder_without_a_record_is_refused(tmp_path: Path) -> None:
         ("xarray", "zsim.load(sys.argv[1]).xarray()", "notebook"),
     ],
 )
-def test_a_missing_extra_is_named_with_its_command(folder: Path, module: str, code: str, extra: str) -> None:
+def test_a_missing_extra_is_reported_with_its_install_command(folder: Path, module: str, code: str, extra: str) -> None:
     script = f"import sys, zsim; sys.modules[{module!r}] = None; {code}"
     done = subprocess.run([sys.executable, "-c", script, str(folder)], capture_output=True, text=True, check=False)
     assert has_terms(
@@ -359,10 +359,10 @@ def test_a_missing_extra_is_named_with_its_command(folder: Path, module: str, co
     )
 
 
-# Records of every kind
+# Incomplete and foreign records
 
 
-def test_a_record_that_was_cut_is_read_to_its_last_chunk(folder: Path, tmp_path: Path) -> None:
+def test_a_truncated_record_is_read_to_its_last_chunk(folder: Path, tmp_path: Path) -> None:
     content = (folder / "run.mcap").read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])
     run = zsim.load(tmp_path)
@@ -382,7 +382,7 @@ def written_of(folder: Path, out: Path, is_kept: Callable[[str], bool]) -> zsim.
     return zsim.load(out / "run.mcap")
 
 
-def test_a_record_without_world_info_has_the_drones_that_are_on_it(folder: Path, tmp_path: Path) -> None:
+def test_a_record_without_world_info_has_the_drones_of_its_messages(folder: Path, tmp_path: Path) -> None:
     run = written_of(folder, tmp_path, lambda key: key != keys.INFO)
     assert {*run.drones} == {"drone1", DRONE, "end"}
     assert run.clusters == ("main",)
@@ -391,7 +391,7 @@ def test_a_record_without_world_info_has_the_drones_that_are_on_it(folder: Path,
         _ = run.scenario
 
 
-def test_a_record_without_truth_says_so_where_truth_is_needed(folder: Path, tmp_path: Path) -> None:
+def test_a_record_without_truth_is_refused_where_truth_is_needed(folder: Path, tmp_path: Path) -> None:
     run = written_of(folder, tmp_path, lambda key: key in (keys.INFO, keys.EVENT))
     assert (run.duration_s, run.ended) == (6.0, DURATION_OVER)
     assert "end" in [*run.events["kind"]]
@@ -411,10 +411,8 @@ class Space(TriadCluster):
 """
 
 
-def test_a_space_of_the_scenario_s_own_is_imported_for_who_trusts_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "space_of_a_stranger", None)  # put back what was there, which is nothing
+def test_a_scenario_s_own_space_is_imported_only_if_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "space_of_a_stranger", None)  # so that monkeypatch removes the module afterwards
     del sys.modules["space_of_a_stranger"]
     module = tmp_path / "space_of_a_stranger.py"
     module.write_text(OWN_SPACE)
@@ -430,7 +428,7 @@ def test_a_space_of_the_scenario_s_own_is_imported_for_who_trusts_it(
     assert "space_of_a_stranger" not in sys.modules
     assert len(zsim.load(tmp_path / "run", trust=True).formation()) == len(flown.formation())
 
-    module.unlink()  # as on another machine
+    module.unlink()  # as if on another machine
     del sys.modules["space_of_a_stranger"]
     elsewhere = zsim.load(tmp_path / "run")
     assert elsewhere.summary.truth_sha256 == flown.truth_sha256

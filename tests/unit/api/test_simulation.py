@@ -1,4 +1,4 @@
-"""A flight stepped from Python: the bits of a whole flight, what acts when, and what a caller may ask for."""
+"""A flight stepped from Python: identity with a whole flight, timing of commands, and requests of callers."""
 
 from collections.abc import Iterator
 from itertools import count
@@ -24,7 +24,7 @@ ONE: dict[str, Any] = {**PAIR, "name": "one", "drones": [{"name": "d1", "positio
 
 
 def climb(sim: zsim.Simulation) -> Iterator[bytes]:
-    """Take a drone off and fly it east; yield what is known at every gate."""
+    """Make a drone take off and fly east; yield the truth and estimates at every gate."""
     for gate in count():
         commands = {0: zsim.takeoff()}.get(gate) or zsim.velocity(0.5, 0, 0.2, frame="world")
         sim.step({"d1": commands})
@@ -35,7 +35,7 @@ def gates(sim: zsim.Simulation, number: int) -> list[bytes]:
     return [known for known, _ in zip(climb(sim), range(number), strict=False)]
 
 
-def test_a_stepped_flight_has_the_bits_of_a_whole_one() -> None:
+def test_a_stepped_flight_is_identical_to_a_whole_one() -> None:
     sim = zsim.Simulation(PAIR)
     assert sim.run() == DURATION_OVER
     flight = InProcessFlight(Scenario(**PAIR).resolved)
@@ -44,7 +44,7 @@ def test_a_stepped_flight_has_the_bits_of_a_whole_one() -> None:
     assert sim.truth_sha256 == flight.world.truth_hash.hexdigest()
 
 
-def test_steps_without_commands_leave_the_stock_agents_to_it() -> None:
+def test_built_in_agents_fly_if_steps_have_no_commands() -> None:
     sim = zsim.Simulation(PAIR)
     while sim.ended is None:
         sim.step()
@@ -53,7 +53,7 @@ def test_steps_without_commands_leave_the_stock_agents_to_it() -> None:
     assert np.abs(sim.estimates.position_m - sim.truth.position_m).max() < 5
 
 
-def test_a_command_acts_after_the_delay() -> None:
+def test_a_command_acts_after_the_command_delay() -> None:
     sim = zsim.Simulation(ONE, agents=None, set={"time.command_delay_gates": 3})
     before = sim.state("d1")
     assert sim.command_delay_s == pytest.approx(0.06)
@@ -61,12 +61,12 @@ def test_a_command_acts_after_the_delay() -> None:
     for _ in range(6):
         sim.step({"d1": zsim.takeoff()} if not states else {})
         states.append(sim.state("d1"))
-    # stamped at 0, it acts from the gate at 0.06 s on, which the fourth step shows
+    # stamped at 0, it acts from the gate at 0.06 s, which the fourth step shows
     assert states == [before] * 3 + ["taking_off"] * 3
 
 
 @pytest.mark.parametrize("agents", ["stock", None])
-def test_a_seed_has_its_bits_after_every_reset(agents: Any) -> None:
+def test_a_seed_gives_the_same_flight_after_every_reset(agents: Any) -> None:
     sim = zsim.Simulation(ONE, agents=agents)
     first = gates(sim, 100)
     sim.reset()
@@ -79,13 +79,13 @@ def test_a_seed_has_its_bits_after_every_reset(agents: Any) -> None:
     assert gates(sim, 100) == first
 
 
-def test_a_flight_goes_on_from_a_snapshot_to_the_same_bits() -> None:
+def test_a_restored_flight_continues_bit_for_bit() -> None:
     sim = zsim.Simulation(ONE)
     gates(sim, 100)
     kept, t_s = sim.snapshot(), sim.t_s
     first = gates(sim, 60)
     sim.step({"d1": zsim.emergency()})
-    sim.run()  # to its end
+    sim.run()  # to the end
     with refused(RunError, "snapshot:"):
         sim.snapshot()
     for each in (sim, zsim.Simulation(ONE, seed=8)):
@@ -94,7 +94,7 @@ def test_a_flight_goes_on_from_a_snapshot_to_the_same_bits() -> None:
         assert gates(each, 60) == first
 
 
-def test_arrays_are_views_that_cannot_be_written() -> None:
+def test_arrays_are_read_only_views() -> None:
     sim = zsim.Simulation(PAIR, agents=None)
     position_m = sim.truth.position_m
     assert position_m.shape == (2, 3)
@@ -109,7 +109,7 @@ def test_arrays_are_views_that_cannot_be_written() -> None:
     assert position_m[1, 2] == pytest.approx(stands_m, abs=1e-3)
 
 
-def test_sensors_have_their_newest_samples_by_field() -> None:
+def test_sensors_give_their_newest_samples_by_field() -> None:
     sim = zsim.Simulation(PAIR, agents=None)
     sim.run(until_s=1.0)
     assert set(sim.sensors) == {"imu", "gps", "mag", "baro", "sonar", "flow"}
@@ -123,7 +123,7 @@ def test_sensors_have_their_newest_samples_by_field() -> None:
 
 
 class Counter(Agent):
-    """Counts its gates, and keeps d1 in the air."""
+    """An agent that counts its gates and makes d1 take off."""
 
     reads = ("drone/*/sensor/status",)
 
@@ -140,14 +140,14 @@ class Counter(Agent):
 
 
 class Short:
-    """Has no constructor of an agent's."""
+    """A class whose constructor returns an agent of another class."""
 
     def __new__(cls) -> Any:
         return Counter()
 
 
 @pytest.mark.parametrize("made", [Counter, Counter(), Short, lambda: Counter()])
-def test_own_agents_begin_anew_at_every_reset(made: Any) -> None:
+def test_a_user_s_agents_start_afresh_at_every_reset(made: Any) -> None:
     sim = zsim.Simulation(ONE, agents=[made], stock=False)
     for _ in range(2):
         sim.run(until_s=3.0)
@@ -183,7 +183,7 @@ def test_an_agent_that_raises_ends_the_flight(capsys: pytest.CaptureFixture[str]
         ({"d1": [zsim.takeoff(), None]}, ("NoneType",)),
     ],
 )
-def test_what_is_no_command_is_refused_before_anything_is_sent(commands: Any, terms: tuple[str, ...]) -> None:
+def test_an_invalid_command_is_refused_before_anything_is_sent(commands: Any, terms: tuple[str, ...]) -> None:
     sim = zsim.Simulation(ONE, agents=None)
     with refused(RunError, *terms):
         sim.step(commands)
@@ -200,12 +200,12 @@ def test_what_is_no_command_is_refused_before_anything_is_sent(commands: Any, te
         lambda: zsim.rotors([float("inf")] * 4),
     ],
 )
-def test_numbers_of_commands_are_checked_where_they_are_made(make: Any) -> None:
+def test_values_of_commands_are_checked_at_creation(make: Any) -> None:
     with pytest.raises(RunError):
         make()
 
 
-def test_requests_and_faults_act_between_gates() -> None:
+def test_requests_and_faults_are_handled_between_steps() -> None:
     sim = zsim.Simulation(PAIR)
     sim.run(until_s=1.0)
     sim.inject({"kind": "gps_dropout", "target": "d1", "at_s": 1.5, "for_s": 2.0})
@@ -228,7 +228,7 @@ def test_a_stepped_flight_is_recorded(tmp_path: Path) -> None:
     assert flight.completeness.complete
 
 
-def test_faults_of_a_scenario_are_those_of_its_yaml() -> None:
+def test_faults_of_a_scenario_are_reported_as_for_yaml() -> None:
     with refused(ScenarioError, "scenario: drones[0].mass_kg is -1.4", "> 0"):
         zsim.Simulation(ONE, set={"drones.d1.mass_kg": -1.4})
     with refused(ScenarioError, "environment.wnd", "wind"):

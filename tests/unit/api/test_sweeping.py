@@ -1,4 +1,4 @@
-"""`zsim.sweep`: a frame of the runs, with classes and functions of scripts, in workers that know nothing of the script."""
+"""`zsim.sweep`: the frame of runs, and classes and functions of a script in workers that do not execute it."""
 
 import os
 import re
@@ -27,7 +27,7 @@ from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep.sweep import load, read_table
 from zsim_analysis.sweep.sweep_run import fly_scenario
 
-PATIENCE_S = 120.0  # wall time within which processes end
+PATIENCE_S = 120.0  # wall time allowed for processes to end
 DOCUMENT = yaml_file.value(ONE)
 
 
@@ -49,18 +49,18 @@ def climb_m(run: "zsim.Run") -> dict[str, float]:
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_a_metric_is_given_the_run_or_where_it_says_flight_the_arrays(near: None, tmp_path: Path, keep: bool) -> None:
+def test_a_metric_gets_the_run_or_if_its_parameter_is_flight_the_arrays(near: None, tmp_path: Path, keep: bool) -> None:
     frame: Any = zsim.sweep(
         DOCUMENT, {"seed": [4, 6]}, metrics=[climb_m, counts], out=tmp_path, keep_records=keep, progress=False
     )
     assert frame["metrics_failure"].isna().all()
-    assert frame["metrics.gates"].tolist() == [26, 26]  # 0.5 s, with the first instant
+    assert frame["metrics.gates"].tolist() == [26, 26]  # 0.5 s, including the first instant
     assert frame["metrics.drones"].tolist() == [1, 1]
     records = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("run.mcap"))
     assert records == ([f"runs/00000{run}/run.mcap" for run in range(2)] if keep else [])
 
 
-def test_a_frame_has_a_row_for_each_run_with_its_values_and_figures(near: None, tmp_path: Path) -> None:
+def test_a_frame_has_a_row_per_run_with_values_and_metrics(near: None, tmp_path: Path) -> None:
     gusts = np.array([0.0, 0.5])
     frame: Any = zsim.sweep(
         DOCUMENT,
@@ -136,8 +136,8 @@ def write(folder: Path, **files: str) -> None:
         (folder / name.replace("_", ".")).write_text(text)
 
 
-def test_workers_know_a_script_s_classes_and_do_not_run_it_again(tmp_path: Path) -> None:
-    """The script has no `if __name__ == "__main__"`, and its law is one of a module beside it."""
+def test_workers_have_a_script_s_classes_without_executing_it_again(tmp_path: Path) -> None:
+    """The script has no `if __name__ == "__main__"`, and its law derives from a class in a module beside it."""
     write(tmp_path, script_py=SCRIPT, beside_py=BESIDE, pair_yaml=PAIR)
     done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.stdout.splitlines() == [
@@ -148,7 +148,7 @@ def test_workers_know_a_script_s_classes_and_do_not_run_it_again(tmp_path: Path)
     law = read_table(tmp_path / "swept/sweep.parquet")[0]["clusters.main.law"].partition(":")[0]
     assert law.startswith(plugin.MADE)
     assert (tmp_path / f"swept/runs/000000/{law}.py").exists()
-    assert not (tmp_path / f"swept/runs/000001/{law}.py").exists()  # flies the stock law
+    assert not (tmp_path / f"swept/runs/000001/{law}.py").exists()  # this run uses the built-in law
     again = run_here("rerun", "--trust", str(tmp_path / "swept/runs/000000"))
     assert again.code == 0, again
 
@@ -170,7 +170,7 @@ print("not reached")
 
 
 def interrupted(folder: Path, out: str) -> subprocess.CompletedProcess[str]:
-    """Run a sweep of three runs that is interrupted when the first one is finished."""
+    """Run a sweep of three runs and interrupt it once the first one has finished."""
     write(folder, script_py=f"OUT = {out!r}\n{WAITING}", one_yaml=ONE)
     with subprocess.Popen(
         [sys.executable, "script.py"],
@@ -190,7 +190,7 @@ def interrupted(folder: Path, out: str) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess([], process.returncode, output, errors)
 
 
-def test_ctrl_c_ends_the_workers_and_the_same_call_goes_on(near: None, tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_workers_and_keeps_finished_runs(near: None, tmp_path: Path) -> None:
     done = interrupted(tmp_path, "swept")
     assert done.stdout == ""
     assert done.returncode == -signal.SIGINT
@@ -201,8 +201,8 @@ def test_ctrl_c_ends_the_workers_and_the_same_call_goes_on(near: None, tmp_path:
     assert (plan.runs, plan.vary) == (3, ("seed=1,2,3",))
 
 
-def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
-    """Its own folder, the modules of what the script defines, and in a worker the record of a run."""
+def test_the_remains_of_a_killed_sweep_are_removed_by_the_next_one(tmp_path: Path) -> None:
+    """The remains are the sweep's folder, the modules of the script's definitions, and the record of a worker's run."""
     temporary = tmp_path / "tmp"
     temporary.mkdir()
     environment = {**os.environ, "TMPDIR": str(temporary)}
@@ -225,7 +225,7 @@ def test_what_a_killed_sweep_has_left_is_removed_by_the_next_one(tmp_path: Path)
     assert [*temporary.iterdir()] == []
 
 
-def test_the_same_call_flies_what_is_missing(
+def test_a_repeated_call_flies_only_the_missing_runs(
     near: None, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def call(count: int) -> pd.DataFrame:
@@ -251,7 +251,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason(
     assert shown[-1] == f"2 of 2 runs failed: {frame['failure'][0]}"
 
 
-def test_what_is_missing_is_alike_in_sweeps_that_failed_and_that_did_not(
+def test_missing_values_have_the_same_types_in_good_and_failed_sweeps(
     near: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     good: Any = zsim.sweep(DOCUMENT, {"seed": [1, 2]}, progress=False)
@@ -277,7 +277,7 @@ def made_law(gain: float) -> type:
     return Law
 
 
-def test_classes_that_a_function_makes_can_be_told_apart(near: None, tmp_path: Path) -> None:
+def test_classes_created_by_one_function_have_distinct_names(near: None, tmp_path: Path) -> None:
     laws = [made_law(0.1), made_law(0.2), made_law(0.3), "proportional"]
     laws[2].__name__ = "Law 0.3"
     frame: Any = zsim.sweep(
@@ -301,7 +301,7 @@ BAD: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_cannot_vary_is_refused_before_anything_flies(case: str) -> None:
+def test_an_invalid_variation_is_refused_before_any_run(case: str) -> None:
     vary, terms = BAD[case]
     with refused(ScenarioError, *terms) as raised:
         zsim.sweep(DOCUMENT, vary)
@@ -325,11 +325,11 @@ print(frame["clusters.main.law"].tolist(), frame["failure"].isna().all(), frame[
 
 
 @pytest.mark.slow
-def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_cell_shows_progress_in_one_updated_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
     write(tmp_path, pair_yaml=PAIR)
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # a kernel is killed in the end, and leaves what is temporary
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # the kernel is killed in the end and leaves temporary files
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
     options = {"resources": {"metadata": {"path": str(tmp_path)}}, "kernel_name": "python3"}
     nbclient.NotebookClient(notebook, timeout=300, **options).execute()
@@ -337,26 +337,26 @@ def test_a_cell_of_a_notebook_shows_one_line_that_changes(tmp_path: Path, monkey
     printed = "".join(each.text for each in outputs if each.get("name") == "stdout")
     assert printed == "['Law', 'proportional'] True [2.0, 2.0]\n"
     lines = [each.data["text/plain"] for each in outputs if "█" in each.get("data", {}).get("text/plain", "")]
-    assert len(lines) == 1  # it has changed in its place
+    assert len(lines) == 1  # it is updated in place
     assert " 2 / 2 runs" in lines[0]
     assert not [each for each in outputs if each.get("name") == "stderr"]  # no warning about a missing widget
 
 
 @pytest.mark.slow
-def test_an_interrupted_cell_ends_its_workers_keeps_its_own_folder_and_the_kernel_goes_on(tmp_path: Path) -> None:
+def test_an_interrupted_cell_ends_its_workers_and_keeps_its_folder(tmp_path: Path) -> None:
     jupyter = pytest.importorskip("jupyter_client")
     pytest.importorskip("ipykernel")
     write(tmp_path, one_yaml=ONE)
     manager, client = jupyter.manager.start_new_kernel(kernel_name="python3", cwd=str(tmp_path))
     try:
-        sent = client.execute(f"OUT = None\n{WAITING}", stop_on_error=False)  # else it aborts what comes soon after
+        sent = client.execute(f"OUT = None\n{WAITING}", stop_on_error=False)  # otherwise it aborts the next request
         while not (tmp_path / "flying").exists():
             time.sleep(0.05)
         kernel = psutil.Process(manager.provisioner.process.pid)
         workers = [each for each in kernel.children(recursive=True) if "spawn_main" in " ".join(each.cmdline())]
         assert len(workers) == 1
         manager.interrupt_kernel()
-        replies = iter(lambda: client.get_shell_msg(timeout=PATIENCE_S), None)  # those of its start come first
+        replies = iter(lambda: client.get_shell_msg(timeout=PATIENCE_S), None)  # replies to its start come first
         reply = next(each for each in replies if each["parent_header"]["msg_id"] == sent)
         assert reply["content"]["ename"] == "KeyboardInterrupt"
         shown = iter(lambda: client.get_iopub_msg(timeout=PATIENCE_S)["content"], None)
@@ -372,8 +372,8 @@ def test_an_interrupted_cell_ends_its_workers_keeps_its_own_folder_and_the_kerne
 
 
 @pytest.mark.soak
-def test_a_client_s_workers_are_given_a_script_s_modules(tmp_path: Path) -> None:
-    """They run in a folder from which they would not find them."""
+def test_workers_of_a_dask_client_get_the_script_s_modules(tmp_path: Path) -> None:
+    """The workers run in a folder in which the modules cannot be found."""
     pytest.importorskip("distributed")
     script = f"""
 import logging
@@ -402,7 +402,7 @@ if __name__ == "__main__":  # for the cluster, whose workers Dask starts
         zsim.sweep(DOCUMENT, {"seed": [1]}, client=object(), out=tmp_path / "other")
 
 
-def test_without_pandas_nothing_is_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sweep_without_pandas_is_refused_before_any_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with refused(RunError, "pandas"):
         zsim.sweep(DOCUMENT, {"seed": [1]}, duration_s=1, out=tmp_path / "sweep")

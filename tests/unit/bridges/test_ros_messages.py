@@ -1,4 +1,4 @@
-"""Rotations as ROS writes them, against scipy."""
+"""Rotations in the conventions of ROS, against SciPy."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def test_quaternions_end_with_w():
         assert (q.x, q.y, q.z, q.w) == pytest.approx(rotation.as_quat(), abs=1e-15)
 
 
-def test_a_mean_rate_is_that_of_the_turn_in_the_body():
+def test_the_mean_rate_is_that_of_the_rotation_in_the_body_frame():
     rng = np.random.default_rng(4)
     for before, turn in zip(Rotation.random(50, rng), rng.normal(size=(50, 3)), strict=True):
         after = before * Rotation.from_rotvec(turn)

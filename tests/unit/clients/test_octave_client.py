@@ -1,4 +1,4 @@
-"""The MATLAB client, run by GNU Octave, against a gateway that says exactly what a test wants."""
+"""The MATLAB client, run by GNU Octave, against a gateway with scripted answers."""
 
 import json
 import socket
@@ -23,7 +23,7 @@ Answer = Callable[[JsonMap], list[JsonMap | bytes]]
 
 
 class FakeGateway:
-    """Takes one connection and answers each line as it is told, everything after `hello` by `answer`."""
+    """Accepts one connection and answers `hello` by `hello` and every other line by `answer`."""
 
     def __init__(self, answer: Answer, hello: Answer | None = None, listener: socket.socket | None = None) -> None:
         self._answer = answer
@@ -55,7 +55,7 @@ class FakeGateway:
 
 
 def _line(reply: JsonMap, asked: JsonMap) -> bytes:
-    """Return a line; what is no message of itself answers what was asked."""
+    """Return a line, which has the ID of the request unless its message is unsolicited."""
     answered = {} if reply["op"] in ("value", "gate", "left", "lost", "run") else {"id": asked.get("id")}
     return json.dumps({**reply, **answered}, separators=(",", ":"), ensure_ascii=False).encode() + b"\n"
 
@@ -70,7 +70,7 @@ def gateway(answer: Answer, hello: Answer | None = None) -> Iterator[FakeGateway
 
 
 def reply(port: int, code: str) -> list[str]:
-    """Return the lines that code prints with `c`, a client of this port."""
+    """Return the lines that code prints, with `c` a client connected to the port."""
     return run(f"c = zsim.Client('127.0.0.1', 'Port', {port}, 'Timeout', 5); {code} c.delete();").splitlines()
 
 
@@ -78,8 +78,8 @@ def echo(asked: JsonMap) -> list[JsonMap | bytes]:
     return [{"op": asked["op"], "key": asked.get("key")}]
 
 
-def test_requests_as_the_gateway_wants_them() -> None:
-    """What each method puts on the wire; times and lists of one as what they are."""
+def test_each_method_sends_the_request_that_the_gateway_expects() -> None:
+    """Times stay integers, and lists of one element stay lists."""
     code = """
     c.put('any/key', struct('t_ns', 330000000000, 'list', {{'one'}}));
     c.velocity('drone1', [1; 2; 0.25], 0.5);
@@ -111,7 +111,7 @@ def test_requests_as_the_gateway_wants_them() -> None:
     assert isinstance(rest[0]["value"]["t_ns"], int)
 
 
-def test_requests_of_the_world_and_of_a_cluster() -> None:
+def test_requests_to_the_world_and_to_a_cluster() -> None:
     code = """
     c.pause(); c.advance(3); c.resume(); c.rate(2); c.stop('done');
     c.clusterTarget('main', struct('z_c', 10), 20); c.clusterHold('main'); c.clusterRejoin('main');
@@ -138,8 +138,8 @@ def test_requests_of_the_world_and_of_a_cluster() -> None:
     ]
 
 
-def test_lines_however_they_are_cut() -> None:
-    """An answer of 1 MB in pieces, an answer byte by byte within a letter, and many lines in one piece."""
+def test_lines_are_read_however_they_are_split() -> None:
+    """An answer of 1 MB in pieces, one byte by byte that splits a character, and many lines in one piece."""
 
     def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         value = {"text": "ü" * 500_000 if asked["key"] == "long" else "grün", "v": [1, 2, 3]}
@@ -161,8 +161,8 @@ def test_lines_however_they_are_cut() -> None:
         assert reply(fake.port, code) == ["1000000 grün 3"]
 
 
-def test_nothing_is_there_yet() -> None:
-    """No value, no values and no news are empty, not errors."""
+def test_missing_values_and_news_are_empty() -> None:
+    """They are no errors."""
 
     def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         return [{"op": "latest", "values": []}]
@@ -178,8 +178,8 @@ def test_nothing_is_there_yet() -> None:
 FAILS = "try, {code} catch e, printf('%s %s\\n', e.identifier, e.message); end;"
 
 
-def test_refusals_and_ends() -> None:
-    """A refusal is an error and the client goes on; an end of the connection is another."""
+def test_a_refusal_and_a_closed_connection_are_different_errors() -> None:
+    """The client can continue after a refusal."""
 
     def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         if asked["op"] == "put":
@@ -215,8 +215,8 @@ def test_refusals_and_ends() -> None:
         assert has_terms(line, *terms)
 
 
-def test_no_answer_and_a_late_one() -> None:
-    """A request without an answer ends after the timeout; its late refusal does not concern the next."""
+def test_a_missing_answer_times_out_and_a_late_one_is_ignored() -> None:
+    """The late refusal does not affect the next request."""
     first: list[int] = []
 
     def answer(asked: JsonMap) -> list[JsonMap | bytes]:
@@ -234,8 +234,8 @@ def test_no_answer_and_a_late_one() -> None:
     assert after == "goes on"
 
 
-def test_a_run_that_begins_later() -> None:
-    """Until a run begins the client waits, so long as its option says; then it knows the drones."""
+def test_the_client_waits_for_a_run_to_begin() -> None:
+    """It waits as long as its option allows, and then knows the drones."""
     asked_before: list[JsonMap] = []
 
     def hello(asked: JsonMap) -> list[JsonMap | bytes]:
@@ -259,8 +259,8 @@ def test_a_run_that_begins_later() -> None:
     assert has_terms(text, "zsim:timeout", f"127.0.0.1:{fake.port}", "0.2 s", "zsim run")
 
 
-def test_the_lockstep() -> None:
-    """What is sent in a gate is its answer; a refused answer leaves it open; `left` ends it."""
+def test_the_client_steps_in_lockstep() -> None:
+    """Messages sent during a gate are its answer; a refused answer leaves the gate open; `left` ends the lockstep."""
     gates = iter(range(1, 10))
 
     def answer(asked: JsonMap) -> list[JsonMap | bytes]:
@@ -302,10 +302,10 @@ def test_the_lockstep() -> None:
     assert all(isinstance(done["t_ns"], int) for done in dones)
 
 
-def test_a_gateway_that_comes_up_later() -> None:
-    """Until somebody listens the client tries again, as that in C does; then it goes on."""
+def test_the_client_waits_for_a_gateway_to_start() -> None:
+    """Like the C client, it retries until the gateway listens."""
     listener = socket.socket()
-    listener.bind(("127.0.0.1", 0))  # nobody listens on it yet: a connection is refused
+    listener.bind(("127.0.0.1", 0))  # not yet listening: connections are refused
     port = listener.getsockname()[1]
     code = FAILS.format(code=f"zsim.Client('127.0.0.1', 'Port', {port}, 'Wait', 0);")
     code += f"fflush(stdout); c = zsim.Client('127.0.0.1', 'Port', {port}, 'Wait', {PATIENCE_S}); disp(c.name);"
@@ -320,8 +320,8 @@ def test_a_gateway_that_comes_up_later() -> None:
     assert after == "client.test\n"
 
 
-def test_faults_before_there_is_a_connection() -> None:
-    """Nobody is there within `Wait`; what no waiting mends is an error at once."""
+def test_faults_before_a_connection_are_errors() -> None:
+    """An absent gateway is an error after `Wait`, and a fault that waiting cannot mend is one at once."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     tried = (
@@ -335,8 +335,8 @@ def test_faults_before_there_is_a_connection() -> None:
     assert has_terms(wrong, "zsim:argument", "'Prt'", "unknown", "Port", "Token", "Name", "Timeout", "Wait")
 
 
-def test_the_tests_in_matlab() -> None:
-    """clients/matlab/tests, as a user runs them."""
+def test_the_matlab_tests_pass() -> None:
+    """These are clients/matlab/tests, run as a user would."""
     lines = run("run_tests()").splitlines()
     assert lines
     assert all(line.startswith("ok ") for line in lines)

@@ -1,4 +1,4 @@
-"""The MATLAB controller's mathematics and phases against those of the Python one, run by GNU Octave."""
+"""The mathematics and phases of the MATLAB controller, run by GNU Octave, against those of the Python controller."""
 
 import json
 import math
@@ -20,7 +20,7 @@ pytestmark = needs_octave
 
 SPACE, GAINS = cluster_space(3), gains_of(Gains())
 DRONES = ("drone1", "drone2", "drone3")
-NEAR = 1e-9  # both compute in doubles; their libraries differ in the last bits
+NEAR = 1e-9  # tolerance: both compute in doubles, but their libraries differ in the last bits
 DT_S = 0.1
 EQUATION_3 = {
     "x_c": 5, "y_c": -5, "z_c": 15, "roll": 0, "pitch": 0, "yaw": math.pi / 2,
@@ -31,7 +31,7 @@ MODES = ("", "landed", "taking_off", "hovering", "flying", "landing", "emergency
 
 
 def random_maps(count: int) -> list[dict[str, Any]]:
-    """Return robots that have a frame, where they move, and where they are to go."""
+    """Return robots with a well-defined cluster frame, their velocities, and their desired cluster states."""
     rng = np.random.default_rng(7)
     maps = []
     while len(maps) < count:
@@ -54,9 +54,9 @@ def random_maps(count: int) -> list[dict[str, Any]]:
 
 
 class Air:
-    """Three drones that follow velocity commands with a lag, and estimates of them with noise.
+    """Three drones that follow velocity commands with a lag, and their noisy estimates.
 
-    From 40 s on drone2's position is lost for 2 s, so that the formation is held and goes on afterwards.
+    From 40 s to 42 s, the position of drone2 is lost, so that the formation holds and then continues.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class Air:
         }
 
     def fly(self, output: GateOutput) -> None:
-        """Move on by DT_S as the output asks."""
+        """Advance by DT_S, following the output."""
         self.t_s = round(self.t_s + DT_S, 9)
         for command in output.modes:
             self._switch(DRONES.index(command.drone), command.mode)
@@ -102,7 +102,7 @@ class Air:
 
 
 def flight() -> tuple[list[dict[str, Any]], list[GateOutput]]:
-    """Fly the Python controller; return its inputs and outputs, gate by gate."""
+    """Fly the Python controller and return its inputs and outputs, gate by gate."""
     plan = [
         Scheduled(5.0, Order.TAKE_OFF),
         Scheduled(5.0, Order.ENGAGE),
@@ -125,14 +125,14 @@ def flight() -> tuple[list[dict[str, Any]], list[GateOutput]]:
 
 
 def target(from_s: float, values: dict[str, float]) -> dict[str, Any]:
-    """Return a target as cluster_step takes it; null stands for what it does not name."""
+    """Return a target in the form of cluster_step, with None for every variable that it does not set."""
     named = [float(values[name]) if name in values else None for name in SPACE.names]
     return {"from_s": from_s, "values": named, "takeoff_s": 5.0, "land_s": 85.0, "over_s": math.nan}
 
 
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The cases, what Python makes of them and what Octave does."""
+    """Return the cases, with the results of Python and of Octave."""
     maps = random_maps(200)
     gates, outputs = flight()
     targets = [target(0.0, EQUATION_3), target(60.0, TURNED)]
@@ -145,8 +145,8 @@ def near(found: Any, wanted: Any) -> bool:
     return bool(np.allclose(np.array(found, float), np.array(wanted, float), rtol=NEAR, atol=NEAR))
 
 
-def test_the_mathematics(figures: dict[str, Any]) -> None:
-    """Forward and inverse kinematics, both Jacobians, the condition number and the law, on random robots."""
+def test_the_mathematics_agree_with_python(figures: dict[str, Any]) -> None:
+    """The test covers both kinematics, both Jacobians, the condition number and the law, on random robots."""
     guarded = []
     for case, found in zip(figures["maps"], figures["octave"]["maps"], strict=True):
         p_W, yaw, v_W = (np.array(case[name]) for name in ("p_W", "yaw", "v_W"))
@@ -171,8 +171,8 @@ def test_the_mathematics(figures: dict[str, Any]) -> None:
     assert set(guarded) == {(False, False), (False, True), (True, False), (True, True)}
 
 
-def test_the_phases(figures: dict[str, Any]) -> None:
-    """A flight with take-off, engagement, two targets, a lost position and landing: the same at every gate."""
+def test_the_phases_agree_with_python(figures: dict[str, Any]) -> None:
+    """The flight has a take-off, an engagement, two targets, a lost position and a landing."""
     (found,) = figures["octave"]["flights"]
     for wanted, step in zip(figures["outputs"], found, strict=True):
         assert step["phase"] == wanted.phase
@@ -190,7 +190,7 @@ def test_the_phases(figures: dict[str, Any]) -> None:
         assert step["factor"] == pytest.approx(wanted.factor, rel=NEAR)
 
 
-def test_the_flight_goes_through_every_phase(figures: dict[str, Any]) -> None:
+def test_the_flight_passes_through_every_phase(figures: dict[str, Any]) -> None:
     phases = list(dict.fromkeys(output.phase for output in figures["outputs"]))
     assert phases == ["idle", "taking_off", "assembling", "engaged", "held", "landing"]
     assert figures["outputs"][-1].phase == "idle"

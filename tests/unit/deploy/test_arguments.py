@@ -1,4 +1,4 @@
-"""The options by which commands reach a world: what typer sees, and what the command is given."""
+"""The options by which commands reach a world: what typer parses, and what the commands receive."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from zsim_deploy.arguments import (
 
 
 def given(decorate: Any, *arguments: str, **environment: str) -> tuple[WorldAccess, str, int]:
-    """Return what a command gets of a command line, and the exit code."""
+    """Return what a command receives from a command line."""
     app, got = typer.Typer(), []
 
     @app.command()
@@ -31,7 +31,7 @@ def given(decorate: Any, *arguments: str, **environment: str) -> tuple[WorldAcce
     return got[0]
 
 
-def test_a_command_that_looks_waits_a_little_and_one_that_takes_part_for_ever():
+def test_observers_wait_briefly_for_a_world_and_participants_indefinitely():
     assert given(observer_options, "clock") == (
         WorldAccess(DEFAULT_ENDPOINT, "zsim", LOOK_S, None, False, None),
         "clock",
@@ -40,7 +40,7 @@ def test_a_command_that_looks_waits_a_little_and_one_that_takes_part_for_ever():
     assert given(participant_options, "clock", "--count", "3")[0].wait_s is None
 
 
-def test_options_reach_the_command_beside_its_own():
+def test_shared_options_reach_a_command_besides_its_own():
     options = ("--connect", "tcp/h:1", "--federation", "f", "--wait", "2", "--insecure", "--host", "lab")
     reach, key, count = given(participant_options, "clock", *options, "--launched", "r1", "--count", "2")
     assert reach == WorldAccess("tcp/h:1", "f", 2.0, None, True, "lab", "r1")
@@ -48,14 +48,14 @@ def test_options_reach_the_command_beside_its_own():
     assert (reach.who.host, reach.who.insecure) == ("lab", True)
 
 
-def test_the_environment_gives_the_endpoint_where_the_option_does_not():
+def test_the_environment_gives_the_endpoint_unless_the_option_does():
     for decorate in (observer_options, participant_options):
         assert given(decorate, "clock", ZSIM_CONNECT="tcp/h:1")[0].endpoint == "tcp/h:1"
         assert given(decorate, "clock", ZSIM_CONNECT="")[0].endpoint == DEFAULT_ENDPOINT
         assert given(decorate, "clock", "--connect", "tcp/o:2", ZSIM_CONNECT="tcp/h:1")[0].endpoint == "tcp/o:2"
 
 
-def test_a_refused_endpoint_is_told_with_the_variable_that_it_comes_from():
+def test_a_refused_endpoint_from_the_environment_names_the_variable():
     refusal, environment = "no world on tcp/h:1", {"ZSIM_CONNECT": "tcp/h:1"}
     assert has_terms(endpoint_origin(refusal, ["zsim", "keys"], environment), refusal, "ZSIM_CONNECT")
     for option in (["--connect", "tcp/h:1"], ["--connect=tcp/h:1"]):

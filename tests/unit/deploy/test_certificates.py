@@ -1,4 +1,4 @@
-"""The authority and what it issues: purposes, names, times, files, and when a certificate is made anew."""
+"""The certificate authority and what it issues: purposes, names, validity, files, and renewal."""
 
 import base64
 import errno
@@ -57,9 +57,7 @@ def signer(tmp_path: Path) -> certificates.Authority:
     return certificates.authority(tmp_path, NOW)
 
 
-def test_a_certificate_names_process_and_addresses_is_good_for_a_month_and_signs_nothing(
-    tmp_path: Path, signer
-) -> None:
+def test_a_certificate_names_its_process_and_lasts_30_days(tmp_path: Path, signer) -> None:
     place = issue(tmp_path, signer, CertificateRequest("h1", "world", ("10.0.0.1", "lab.local")), NOW)
     made = x509.load_pem_x509_certificate((place / "certificate.pem").read_bytes())
     names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -74,7 +72,7 @@ def test_a_certificate_names_process_and_addresses_is_good_for_a_month_and_signs
     made.verify_directly_issued_by(signer.certificate)
 
 
-def test_keys_are_p256_their_owner_s_alone_and_never_shared(tmp_path: Path, signer) -> None:
+def test_keys_are_on_p256_readable_by_their_owner_alone_and_never_shared(tmp_path: Path, signer) -> None:
     places = [issue(tmp_path, signer, CertificateRequest(host, "recorder"), NOW) for host in ("h1", "h2")]
     keys = [serialization.load_pem_private_key((place / "key.pem").read_bytes(), None) for place in places]
     for path in (tmp_path / "ca.key", *(place / "key.pem" for place in places)):
@@ -84,7 +82,7 @@ def test_keys_are_p256_their_owner_s_alone_and_never_shared(tmp_path: Path, sign
     assert not list(tmp_path.rglob("*.new"))
 
 
-def test_an_authority_is_kept_until_another_is_forced(tmp_path: Path, signer) -> None:
+def test_an_authority_is_kept_until_a_new_one_is_forced(tmp_path: Path, signer) -> None:
     issue(tmp_path, signer, ESTIMATOR, NOW)
     again = certificates.authority(tmp_path, NOW)
     assert again.certificate == signer.certificate
@@ -95,7 +93,7 @@ def test_an_authority_is_kept_until_another_is_forced(tmp_path: Path, signer) ->
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "ca.key"])
-def test_half_an_authority_is_not_written_over(tmp_path: Path, signer, missing: str) -> None:
+def test_an_incomplete_authority_is_not_overwritten(tmp_path: Path, signer, missing: str) -> None:
     (tmp_path / missing).unlink()
     left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with refused(RunError, str(missing), "missing", "--force"):
@@ -103,7 +101,7 @@ def test_half_an_authority_is_not_written_over(tmp_path: Path, signer, missing: 
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == left
 
 
-def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
+def test_an_unusable_authority_is_refused(tmp_path: Path, signer) -> None:
     with refused(RunError, "ca.pem", "authority", "expired", "2031-10-31", "--force"):
         certificates.authority(tmp_path, NOW + timedelta(days=1826))
     (tmp_path / "ca.key").write_text("nothing")
@@ -117,7 +115,7 @@ def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
         certificates.authority(Path("/proc/certs"), NOW)
 
 
-def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer) -> None:
+def test_a_certificate_is_renewed_when_it_is_unusable(tmp_path: Path, signer) -> None:
     def reason(wanted: CertificateRequest = ESTIMATOR, days: float = 0.0) -> str | None:
         return renewal_reason(tmp_path, signer.certificate, wanted, NOW + timedelta(days=days))
 
@@ -134,8 +132,8 @@ def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer)
 
 
 @pytest.mark.parametrize("left", ["ca.pem", "certificate.pem", "key.pem"])
-def test_files_of_which_some_are_older_are_made_anew_and_shown(tmp_path: Path, signer, left: str) -> None:
-    """As whoever renewed them leaves them when it is stopped in between."""
+def test_files_left_from_an_older_issue_are_reported_and_renewed(tmp_path: Path, signer, left: str) -> None:
+    """An interrupted renewal leaves such a mixture."""
     older = (issue(tmp_path, signer, ESTIMATOR, NOW) / left).read_bytes()
     other = certificates.authority(tmp_path, NOW, force=True)
     place = issue(tmp_path, other, ESTIMATOR, NOW)
@@ -149,7 +147,7 @@ def test_files_of_which_some_are_older_are_made_anew_and_shown(tmp_path: Path, s
 
 
 def of_no_curve() -> str:
-    """Return a private key on a curve that there is not."""
+    """Return a private key on a curve that does not exist."""
     encodings = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     key = ec.generate_private_key(ec.SECP256R1()).private_bytes(serialization.Encoding.DER, *encodings)
     p256 = bytes.fromhex("2a8648ce3d030107")  # 1.2.840.10045.3.1.7
@@ -158,7 +156,7 @@ def of_no_curve() -> str:
 
 
 @pytest.mark.parametrize("content", ["", "nothing", "-----BEGIN PRIVATE KEY-----\n", of_no_curve()], ids=range(4))
-def test_a_key_that_is_none_is_made_anew(tmp_path: Path, signer, content: str) -> None:
+def test_an_unreadable_key_is_replaced(tmp_path: Path, signer, content: str) -> None:
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
     (place / "key.pem").write_text(content)
     assert has_terms(renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW), "read")
@@ -169,7 +167,7 @@ def test_a_key_that_is_none_is_made_anew(tmp_path: Path, signer, content: str) -
 @pytest.mark.parametrize(
     ("begin_days", "days", "terms"), [(0.0, 30.0, ()), (0.0, -0.5, ("expired",)), (2.0, 30.0, ("valid",))]
 )
-def test_a_process_judges_the_time_of_its_own_certificate(
+def test_a_process_checks_the_validity_of_its_own_certificate(
     tmp_path: Path, begin_days: float, days: float, terms: tuple[str, ...]
 ) -> None:
     now = datetime.now(UTC)
@@ -180,7 +178,7 @@ def test_a_process_judges_the_time_of_its_own_certificate(
 
 
 def prepared(folder: Path, hosts: str) -> Path:
-    """Write inventory and scenario into a new folder."""
+    """Write the inventory and the scenario into a new folder."""
     folder.mkdir()
     (folder / "hosts.yaml").write_text(hosts)
     (folder / "scenario.yaml").write_text(SCENARIO)
@@ -192,7 +190,7 @@ def run(*arguments: str | Path) -> Any:
 
 
 def init(folder: Path, *options: str) -> Any:
-    """Run `zsim certs init`; errors come as they are."""
+    """Run `zsim certs init`, raising its errors."""
     done = run("init", folder / "hosts.yaml", "--scenario", folder / "scenario.yaml", *options)
     if isinstance(done.exception, ZsimError):
         raise done.exception
@@ -212,12 +210,12 @@ NAMES = ["world on h1", "recorder on h1", "estimator.drone1 on h2", "estimator.d
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
-    """Return a lab whose name a shell would take for two, with inventory, scenario and no certificates."""
+    """Return a folder, with a space in its name, that has an inventory and a scenario but no certificates."""
     return prepared(tmp_path / "our lab", LAB_HOSTS)
 
 
 def lacking(lab: Path, now: datetime | None = None) -> list[str]:
-    """Return what the scenario of a lab lacks, without the lab of the certificates that each line begins with."""
+    """Return the faults of the lab's certificates, without the folder with which each line begins."""
     placed = inventory.load(lab / "hosts.yaml")
     places = inventory.placement(placed, scenario_file.load(lab / "scenario.yaml"))
     found = certificate_faults(placed, places, now or datetime.now(UTC))
@@ -226,14 +224,14 @@ def lacking(lab: Path, now: datetime | None = None) -> list[str]:
 
 
 def advised(lab: Path, line: str) -> list[str]:
-    """Return the words after `zsim certs` of the command that a line advises, for the scenario of a lab."""
+    """Return the arguments after `zsim certs` of the command that a line advises, with the lab's scenario."""
     (command,) = re.findall("`(.*)`", line)
     words = shlex.split(command)
     assert words[:2] == ["zsim", "certs"]
     return [str(lab / "scenario.yaml") if word == "FILE" else word for word in words[2:]]
 
 
-def test_without_certificates_the_advice_works_as_it_is_given(lab: Path) -> None:
+def test_the_advice_for_missing_certificates_works_as_given(lab: Path) -> None:
     (line,) = lacking(lab)
     init_command = f"zsim certs init '{lab}/hosts.yaml' --scenario FILE"
     assert has_terms(line, "no certificates", init_command, "security.insecure")
@@ -241,7 +239,7 @@ def test_without_certificates_the_advice_works_as_it_is_given(lab: Path) -> None
     assert lacking(lab) == []
 
 
-def test_certificates_whose_time_is_over_are_named_and_the_advice_renews_them(lab: Path) -> None:
+def test_expired_certificates_are_named_and_the_advice_renews_them(lab: Path) -> None:
     init(lab, "--days", "20")
     later = datetime.now(UTC) + timedelta(days=20, minutes=1)
     (line,) = lacking(lab, later)
@@ -261,7 +259,9 @@ def test_certificates_whose_time_is_over_are_named_and_the_advice_renews_them(la
         ("h1/world/key.pem", "half a key", ("certificate", "read", "world", "h1")),
     ],
 )
-def test_what_is_missing_is_named(lab: Path, lost: str, content: str | None, terms: tuple[str, ...]) -> None:
+def test_missing_or_unreadable_files_are_named(
+    lab: Path, lost: str, content: str | None, terms: tuple[str, ...]
+) -> None:
     init(lab)
     path = lab / "certs" / lost
     shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -274,8 +274,8 @@ def test_what_is_missing_is_named(lab: Path, lost: str, content: str | None, ter
     assert lacking(lab) == []
 
 
-def test_what_a_run_does_not_need_may_be_missing(lab: Path) -> None:
-    """An estimator has one for every host, so that it can be moved; the address of a client is not checked."""
+def test_certificates_that_a_run_does_not_need_may_be_missing(lab: Path) -> None:
+    """An estimator has a certificate for every host, so that it can be moved; a client's address is not checked."""
     init(lab)
     shutil.rmtree(lab / "certs/h1/estimator.drone1")
     shutil.rmtree(lab / "certs/operators")
@@ -290,8 +290,8 @@ def test_what_a_run_does_not_need_may_be_missing(lab: Path) -> None:
     assert lacking(lab) == []
 
 
-def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(lab: Path) -> None:
-    """Its hosts are none: nobody listens on port 1."""
+def test_the_doctor_checks_certificates_with_and_without_a_scenario(lab: Path) -> None:
+    """The hosts cannot be reached, since nothing listens on port 1."""
     placed = inventory.load(lab / "hosts.yaml")
     places = inventory.placement(placed, scenario_file.load(lab / "scenario.yaml"))
     for given in (None, places):
@@ -311,21 +311,21 @@ def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(lab: Path)
 
 
 @pytest.mark.parametrize("days", ["0", "-1", "nan", "inf", "1e-9", "826"])
-def test_a_lifetime_that_is_none_is_refused_in_a_line(lab: Path, days: str) -> None:
+def test_an_invalid_lifetime_is_refused(lab: Path, days: str) -> None:
     done = init(lab, "--days", days)
     assert done.exit_code == 2
     assert has_terms(done.output, "0.05", "825")
     assert not (lab / "certs").exists()
 
 
-def test_show_without_certificates_is_a_line(lab: Path) -> None:
+def test_show_without_certificates_is_refused_with_advice(lab: Path) -> None:
     done = run("show", lab / "hosts.yaml")
     assert isinstance(done.exception, RunError)
     assert has_terms(str(done.exception), f"{lab}/certs", "certificates", f"'{lab}/hosts.yaml'", "--scenario", "FILE")
     assert done.stdout == ""
 
 
-def test_show_advises_a_command_that_mends(lab: Path) -> None:
+def test_show_advises_a_command_that_renews(lab: Path) -> None:
     init(lab)
     now = datetime.now(UTC)
     signer = certificates.authority(lab / "certs", now)
@@ -341,7 +341,7 @@ def test_show_advises_a_command_that_mends(lab: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o644, 0o640])
-def test_private_keys_that_others_can_read_are_warned_of_in_a_line(lab: Path, mode: int) -> None:
+def test_private_keys_that_others_can_read_cause_one_warning(lab: Path, mode: int) -> None:
     assert init(lab).stderr == ""
     placed = inventory.load(lab / "hosts.yaml")
     assert exposed_keys(placed) is None
@@ -376,13 +376,13 @@ def folder(tmp_path: Path) -> Path:
 
 
 def enrolment(folder: Path, *operators: str) -> tuple[list[CertificateRequest], dict[tuple[str, str], dict[str, Any]]]:
-    """Return the certificates, and the access control by host and process."""
+    """Return the required certificates, and the access control by host and process."""
     placed = inventory.load(folder / "hosts.yaml")
     wanted, access = certificates.enrolment(placed, scenario_file.load(folder / "scenario.yaml"), operators)
     return wanted, {(host, process): rules for host, process, rules in access}
 
 
-def test_world_and_routers_have_one_certificate_and_who_may_move_has_one_for_every_host(folder: Path) -> None:
+def test_movable_processes_have_a_certificate_for_every_host(folder: Path) -> None:
     addresses = {"lab": "10.0.0.1", "onboard1": "10.1.0.1", "onboard2": "10.1.0.2", "hut": "hut.local"}
     placed = {"world": ["lab"], "router.field": ["lab"], "router.hill": ["hut"], "operator.anna": ["hut"]}
     movable = ("recorder", "estimator.drone1", "estimator.drone2", "controller.main")
@@ -391,8 +391,8 @@ def test_world_and_routers_have_one_certificate_and_who_may_move_has_one_for_eve
     assert {*enrolment(folder, "main", "anna@hut")[0]} == {*wanted, CertificateRequest("operators", "operator.main")}
 
 
-def test_the_driver_of_an_external_drone_has_a_certificate_and_is_let_in(folder: Path) -> None:
-    """It runs wherever its aircraft can be reached, and the scenario need not expect it."""
+def test_the_driver_of_an_external_drone_is_certified_and_admitted(folder: Path) -> None:
+    """The driver may run on any host that reaches its aircraft, and the scenario need not expect it."""
     assert not any("driver.drone2" in lets_in(rules) for rules in enrolment(folder)[1].values())
     external = SCENARIO.replace("position_m: [2, 0, 0]", "position_m: [2, 0, 0], body: external")
     (folder / "scenario.yaml").write_text(external)
@@ -407,13 +407,13 @@ def lets_in(rules: dict[str, Any]) -> set[str]:
 
 
 def publishes(rules: dict[str, Any], name: str) -> set[str]:
-    """Return the drones and clusters about which a common name may publish."""
+    """Return the drones and clusters about which a process of the given common name may publish."""
     found = [rule for rule in rules["rules"] if rule["id"] == f"{name} ingress put"]
     keys = [key.split("/") for rule in found for key in rule["key_exprs"]]
     return {parts[2] for parts in keys if parts[1] in ("drone", "cluster")}
 
 
-def test_each_listening_process_lets_in_who_comes_to_it(folder: Path) -> None:
+def test_each_listening_process_admits_the_processes_that_connect_to_it(folder: Path) -> None:
     _, access = enrolment(folder, "main", "anna@hut")
     world, field, hill = access["lab", "world"], access["lab", "router.field"], access["hut", "router.hill"]
     roles = {"recorder", "estimator.drone1", "estimator.drone2", "controller.main"}
@@ -427,12 +427,12 @@ def test_each_listening_process_lets_in_who_comes_to_it(folder: Path) -> None:
     assert publishes(hill, "router.field") == set()
 
 
-def test_a_router_of_no_host_lets_in_who_comes_from_below_alone(folder: Path) -> None:
+def test_a_router_that_no_host_uses_admits_only_routers_and_the_world(folder: Path) -> None:
     (folder / "hosts.yaml").write_text(HOSTS.replace(", router: field", ""))
     assert lets_in(enrolment(folder)[1]["lab", "router.field"]) == {"router.hill", "world"}
 
 
-def test_an_operator_may_be_at_several_places(folder: Path) -> None:
+def test_an_operator_may_have_certificates_for_several_hosts(folder: Path) -> None:
     wanted, access = enrolment(folder, "anna", "anna@hut", "anna")
     assert [each.host for each in wanted if each.process == "operator.anna"] == ["operators", "hut"]
     let_in = {process for (_, process), rules in access.items() if "operator.anna" in lets_in(rules)}
@@ -440,25 +440,25 @@ def test_an_operator_may_be_at_several_places(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("host", ["moon", ""])
-def test_an_operator_at_no_host_is_a_line(folder: Path, host: str) -> None:
+def test_an_operator_at_an_unknown_host_is_refused(folder: Path, host: str) -> None:
     with refused(InventoryError, "hosts.yaml", "'anna'", f"'{host}'", "hosts", "onboard1", "onboard2"):
         enrolment(folder, f"anna@{host}")
 
 
 @pytest.mark.parametrize("name", ["../../../oops", "a" * 33, "Anna", "", "operator.", "operator.a/b"])
-def test_an_operator_whose_name_is_none_is_a_line(folder: Path, name: str) -> None:
+def test_an_operator_with_an_invalid_name_is_refused(folder: Path, name: str) -> None:
     with refused(BadNameError, "operator", "1", "32", "0-9"):
         enrolment(folder, name)
 
 
 def operators_of(folder: Path, host: str, process: str) -> set[str]:
-    """Return the operators whom the access control of a process that listens lets in."""
+    """Return the operators that the access control of a listening process admits."""
     rules = json.loads((folder / "certs" / host / f"{process}.access.json").read_text())
     return {name for name in lets_in(rules) if name.startswith("operator.")}
 
 
-def test_operators_who_are_there_stay(folder: Path) -> None:
-    """One whose folder is gone is let in no more."""
+def test_enrolled_operators_stay_admitted(folder: Path) -> None:
+    """An operator whose folder was deleted is no longer admitted."""
     init(folder)
     assert operators_of(folder, "lab", "world") == {"operator.main"}
     init(folder, "--operator", "anna@hut")
@@ -471,7 +471,7 @@ def test_operators_who_are_there_stay(folder: Path) -> None:
     assert operators_of(folder, "lab", "world") == {"operator.ben", f"operator.{'a' * 32}"}
 
 
-def test_access_control_that_cannot_be_written_is_a_line_and_the_former_stays(
+def test_unwritable_access_control_is_reported_and_the_old_file_is_kept(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     init(folder)
@@ -489,7 +489,7 @@ def test_access_control_that_cannot_be_written_is_a_line_and_the_former_stays(
     assert (folder / "certs/lab/world.access.json").read_bytes() == former
 
 
-def test_init_makes_everything_once_and_show_lists_it(folder: Path) -> None:
+def test_init_creates_everything_once_and_show_lists_it(folder: Path) -> None:
     assert has_terms(init(folder).stdout, "20", "certificates", "0")
     made = {path: path.read_bytes() for path in (folder / "certs").rglob("*.pem")}
     assert has_terms(init(folder).stdout, "0", "certificates", "20")
@@ -502,7 +502,7 @@ def test_init_makes_everything_once_and_show_lists_it(folder: Path) -> None:
 
 
 ACTS = {"r": "reads", "p": "writes", "g": "asks", "a": "answers", "t": "tokens", "w": "watches"}
-# What each act is on the wire at the process that listens: (flow, message); all of them are needed.
+# The (flow, message) pairs, as the listening process sees them, that each act needs.
 WIRE = {
     "r": (("ingress", "declare_subscriber"), ("egress", "put")),
     "p": (("ingress", "put"), ("egress", "declare_subscriber")),
@@ -525,7 +525,7 @@ def scenario() -> Any:
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("act", ACTS)
-def test_the_rights_of_a_role_are_those_of_the_table_and_zenoh_is_told_so(scenario: Any, role: str, act: str) -> None:
+def test_the_access_control_gives_a_role_the_rights_of_the_table(scenario: Any, role: str, act: str) -> None:
     expressions = getattr(roles.rights_for(role, scenario), ACTS[act])
     rules = access_control(scenario, ROLES, {})
     asked = TOKENS if act in "tw" else KEYS
@@ -534,7 +534,7 @@ def test_the_rights_of_a_role_are_those_of_the_table_and_zenoh_is_told_so(scenar
 
 
 def allows(rules: dict[str, Any], name: str, needed: tuple[tuple[str, str], ...], key: str) -> bool:
-    """Tell whether all that is needed is allowed to a common name on a key, as Zenoh decides it."""
+    """Tell whether Zenoh would allow a common name all the needed (flow, message) pairs on a key."""
     subjects = {subject["id"] for subject in rules["subjects"] if name in subject.get("cert_common_names", (name,))}
     ids = {rule for policy in rules["policies"] if subjects & set(policy["subjects"]) for rule in policy["rules"]}
     mine = [rule for rule in rules["rules"] if rule["id"] in ids]
@@ -551,7 +551,7 @@ def includes(expressions: list[str], key: str) -> bool:
     return any(zenoh.KeyExpr(expression).includes(zenoh.KeyExpr(key)) for expression in expressions)
 
 
-def test_what_is_not_granted_is_denied_and_zenoh_takes_the_whole(scenario: Any) -> None:
+def test_zenoh_accepts_the_rules_which_deny_everything_not_granted(scenario: Any) -> None:
     rules = access_control(scenario, ROLES, {"router.site": ["estimator.drone2"]}, ["world"])
     assert rules["default_permission"] == "deny"
     assert {rule["permission"] for rule in rules["rules"]} == {"allow"}
@@ -562,7 +562,7 @@ def test_what_is_not_granted_is_denied_and_zenoh_takes_the_whole(scenario: Any) 
     assert all(key.startswith("lab2/") for rule in rules["rules"] for key in rule["key_exprs"])
 
 
-def test_a_router_may_do_what_those_behind_it_may_and_no_more(scenario: Any) -> None:
+def test_a_router_has_exactly_the_rights_of_the_processes_behind_it(scenario: Any) -> None:
     rules = access_control(scenario, (), {"router.site": ["estimator.drone1", "controller.main"]})
     for act in ACTS:
         asked = TOKENS if act in "tw" else KEYS
@@ -574,7 +574,7 @@ def test_a_router_may_do_what_those_behind_it_may_and_no_more(scenario: Any) -> 
     ("process", "like"),
     [("my.drone1", "estimator.drone1"), ("fence.main", "controller.main")],
 )
-def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, process: str, like: str) -> None:
+def test_a_replacement_process_has_the_rights_of_the_one_it_replaces(scenario: Any, process: str, like: str) -> None:
     own = {f"{of}/{name}" for of in ("process", "view/estimates") for name in (like, process)}
 
     def of_others(name: str, act: str) -> set[str]:
@@ -587,7 +587,7 @@ def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, pr
 @pytest.mark.parametrize(
     "process", ["world.spare", "recorder.spare", "fence.round", "console", "estimator.drone9", "controller.drone1"]
 )
-def test_a_process_about_nothing_known_hears_what_all_are_told(scenario: Any, process: str) -> None:
+def test_a_process_of_unknown_purpose_may_read_only_common_messages(scenario: Any, process: str) -> None:
     found = roles.rights_for(process, scenario)
     assert set(found.reads) == {"world/info", "clock", "world/event", "world/faults", "world/radio"}
     assert all(key.startswith(f"process/{process}/") for key in found.writes)

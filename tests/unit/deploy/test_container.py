@@ -1,6 +1,6 @@
-"""The image and the Compose file that flies Test 1 in it: what a container may do, and that it flies what is there.
+"""The image, and the Compose file that flies Test 1 in it: the rights of the container, and the files that it names.
 
-The schema of the Compose file is judged in tests/system/test_render_valid.py.
+The schema of the Compose file is validated in tests/system/test_render_valid.py.
 """
 
 import re
@@ -13,7 +13,7 @@ CONTAINER = ROOT / "deploy/container"
 STAGES = re.split(r"^FROM ", (CONTAINER / "Dockerfile").read_text(), flags=re.MULTILINE)[1:]
 
 
-def test_the_image_has_what_was_built_and_runs_as_nobody() -> None:
+def test_the_image_has_only_what_was_built_and_runs_without_privileges() -> None:
     built, flown = STAGES
     name = built.splitlines()[0].split()[-1]
     copied = re.findall(r"^COPY (?:--from=(\w+) )?(\S+) \S+$", flown, re.MULTILINE)
@@ -21,12 +21,12 @@ def test_the_image_has_what_was_built_and_runs_as_nobody() -> None:
     assert all((ROOT / path).is_dir() for stage, path in copied if not stage)
     assert not re.search(r"\bpip\b", flown)
     last = re.findall(r"^(USER|ENTRYPOINT) (.*)$", flown, re.MULTILINE)
-    user, group = map(int, dict(last)["USER"].split(":"))  # numbers: a cluster judges those alone
+    user, group = map(int, dict(last)["USER"].split(":"))  # numeric, because Kubernetes can check only numeric IDs
     assert user > 0
     assert group > 0
 
 
-def test_test_1_is_flown_with_as_little_as_can_be() -> None:
+def test_test_1_is_flown_with_the_fewest_rights() -> None:
     document = yaml.safe_load((CONTAINER / "compose.yaml").read_text())
     (service,) = document["services"].values()
     assert service["read_only"] is True

@@ -1,4 +1,4 @@
-"""Inventories: which process runs where, who connects to whom, and every fault told at once, a line each."""
+"""Inventories: which process runs where, which connects to which, and every fault reported at once, a line each."""
 
 import errno
 import os
@@ -62,17 +62,25 @@ def test_the_example_is_secure_and_places_every_process_of_the_step_scenario(ste
 @pytest.mark.parametrize(
     ("roles", "estimators", "recorder"),
     [
-        (ROLES, "one two one", "lab"),  # the hosts of a list take turns
+        (ROLES, "one two one", "lab"),  # processes take the hosts of a list in turn
         (dict(reversed(ROLES.items())), "one two one", "lab"),
-        ({**ROLES, "estimator.drone1": "lab"}, "lab one two", "lab"),  # a name takes precedence, and no turn
-        ({"*": "lab", "estimator.*": "one", "estimator.*3": "two"}, "one one two", "lab"),  # so does a longer pattern
+        (
+            {**ROLES, "estimator.drone1": "lab"},
+            "lab one two",
+            "lab",
+        ),  # a full name takes precedence, and does not advance the list
+        (
+            {"*": "lab", "estimator.*": "one", "estimator.*3": "two"},
+            "one one two",
+            "lab",
+        ),  # a longer pattern takes precedence, too
         ({**ROLES, "recorder": "two"}, "one two one", "two"),
-        ({**ROLES, "world": ["one", "two"]}, "one two one", "one"),  # the recorder is at the world's host, …
-        ({**ROLES, "*": ["one", "two"]}, "one two one", "one"),  # … and takes a turn only where it is placed
+        ({**ROLES, "world": ["one", "two"]}, "one two one", "one"),  # the recorder is on the world's host, …
+        ({**ROLES, "*": ["one", "two"]}, "one two one", "one"),  # … which does not advance the list of another pattern
         ({**ROLES, "world": "*", "*": ["one", "two"]}, "one two one", "two"),
     ],
 )
-def test_where_processes_are_placed(
+def test_processes_are_placed_by_the_most_specific_pattern(
     tmp_path: Path, step: Scenario, roles: dict[str, Any], estimators: str, recorder: str
 ) -> None:
     roles = {name: hosts for name, hosts in roles.items() if hosts != "*"}
@@ -81,8 +89,8 @@ def test_where_processes_are_placed(
     assert (found["recorder"], found["controller.main"]) == (recorder, "lab")
 
 
-def test_what_has_no_place_and_what_places_nobody_are_told_at_once(tmp_path: Path, step: Scenario) -> None:
-    """Programs of the user's own are placed too."""
+def test_unplaced_processes_and_unused_patterns_are_reported_at_once(tmp_path: Path, step: Scenario) -> None:
+    """The user's own programs are placed, too."""
     with pytest.raises(InventoryError) as caught:
         places(tmp_path, step, {"world": "lab", "estimator.drone1": "one", "estimater.*": "two"})
     *lines, last = caught.value.faults
@@ -99,12 +107,12 @@ SITES = {"site": {"host": "one", "port": 7448}, "yard": {"host": "two", "port": 
 
 @pytest.fixture
 def sites(tmp_path: Path) -> InventoryFile:
-    """Host two is behind its own router, which is behind host one's."""
+    """Return an inventory in which host two is behind its own router, which is behind that of host one."""
     return placed(tmp_path, routers=SITES, hosts={**HOSTS, "two": {"address": "192.168.1.22", "router": "yard"}})
 
 
-def test_who_connects_to_whom_across_hosts(sites: InventoryFile, step: Scenario) -> None:
-    """Estimators on one and two; two's go to the router on two, that to one's, that to the world."""
+def test_processes_connect_through_the_routers_of_their_hosts(sites: InventoryFile, step: Scenario) -> None:
+    """Host one connects to the world; host two to its own router, that to the router on one, and that to the world."""
     found = inventory.placement(sites, step)
     assert inventory.endpoint(sites, found, "one") == "tls/192.168.1.10:7447"
     assert inventory.endpoint(sites, found, "two") == "tls/192.168.1.22:7449"
@@ -114,14 +122,14 @@ def test_who_connects_to_whom_across_hosts(sites: InventoryFile, step: Scenario)
     assert inventory.connections(sites, found) == {("lab", 7447): {"one"}, ("one", 7448): {"two"}}
 
 
-def test_routers_come_after_those_that_they_connect_to(tmp_path: Path, step: Scenario) -> None:
+def test_routers_are_listed_after_their_upstream_routers(tmp_path: Path, step: Scenario) -> None:
     chain = {f"r{i}": {"host": "lab", "port": 8000 + i, "upstream": f"r{i + 1}"} for i in range(4)}
     found = placed(tmp_path, routers={**chain, "r4": {"host": "one"}, "a": {"host": "two"}})
     routers = [process.thing for process in inventory.processes(found, step) if process.role == "router"]
     assert routers == ["a", "r4", "r3", "r2", "r1", "r0"]
 
 
-def test_a_host_that_has_a_router_only_connects_too_and_the_world_to_nobody(tmp_path: Path, step: Scenario) -> None:
+def test_a_host_with_only_a_router_connects_but_the_world_does_not(tmp_path: Path, step: Scenario) -> None:
     hosts = {**HOSTS, "one": {"address": "192.168.1.21", "router": "gate"}, "gate": {"address": "192.168.1.30"}}
     found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "gate"}}, roles={**ROLES, "estimator.*": "one"})
     ways = inventory.connections(found, inventory.placement(found, step))
@@ -141,14 +149,16 @@ def test_a_host_that_has_a_router_only_connects_too_and_the_world_to_nobody(tmp_
         ("fe80::1%eth0", False, "tls/[fe80::1%eth0]:7000"),
     ],
 )
-def test_endpoints(tmp_path: Path, step: Scenario, address: str, insecure: bool, endpoint: str) -> None:
+def test_endpoints_have_protocol_address_and_port(
+    tmp_path: Path, step: Scenario, address: str, insecure: bool, endpoint: str
+) -> None:
     hosts = {**HOSTS, "lab": {"address": address}}
     found = placed(tmp_path, hosts=hosts, port=7000, security={"insecure": insecure})
     assert inventory.listening(found, "lab", 7000) == endpoint
     assert inventory.endpoint(found, inventory.placement(found, step), "one") == endpoint
 
 
-def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
+def test_all_faults_are_reported_at_once(tmp_path: Path) -> None:
     document = {
         "hosts": {"lab": {"address": "192.168.1.10", "router": "yrad", "prot": 22}, "one": {"port": 0, "address": "x"}},
         "roles": {"world": "lba", "estimator.*": ["one", "three"], "recorder": []},
@@ -173,7 +183,7 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])
-def test_routers_in_a_circle_are_each_told_and_one_that_leads_there_is_not(tmp_path: Path, circle: list[str]) -> None:
+def test_each_router_in_a_cycle_is_reported(tmp_path: Path, circle: list[str]) -> None:
     after = dict(zip(circle, circle[1:] + circle[:1], strict=True))
     routers = {name: {"host": "lab", "upstream": above} for name, above in {**after, "tail": "a"}.items()}
     lines = faults(tmp_path, {"hosts": HOSTS, "roles": ROLES, "routers": routers})
@@ -194,18 +204,18 @@ def test_routers_in_a_circle_are_each_told_and_one_that_leads_there_is_not(tmp_p
         ("hosts: {a: {address: x}}\nroles: {world: a}\nrouters: {r: null}", [("routers.r", "null", "map")]),
         ("hosts: {a: {address: 'x y'}}\nroles: {world: a}", [("hosts.a.address", "'x y'", "[A-Za-z0-9_.:%-]{1,253}")]),
         ("hosts: {A: {address: x}}\nroles: {}", [("hosts.A", "key", "'A'", "[a-z0-9_.-]{1,32}")]),
-        ("hosts: {.: {address: x}}\nroles: {world: .}", [("hosts..", "folder")]),  # after which one is named
+        ("hosts: {.: {address: x}}\nroles: {world: .}", [("hosts..", "folder")]),  # a host's folder bears its name
         ("hosts: {..: {address: x}}\nroles: {world: ..}", [("hosts...", "folder")]),
         ("hosts: {a: {address: x}, b: {address: y}}\nroles: {world: c}", [("roles.world", "'c'", "hosts", "a", "b")]),
         ("hosts: {a: {address: x, router: r}}\nroles: {world: a}", [("hosts.a.router", "'r'", "routers", "none")]),
     ],
 )  # fmt: skip
-def test_faults(tmp_path: Path, text: str, terms_of_each: list[tuple[str, ...]]) -> None:
+def test_each_fault_is_named_with_its_path(tmp_path: Path, text: str, terms_of_each: list[tuple[str, ...]]) -> None:
     for line, terms in zip(faults(tmp_path, text), terms_of_each, strict=True):
         assert has_terms(line, "hosts.yaml", *terms)
 
 
-def test_two_cannot_listen_on_one_port(tmp_path: Path, step: Scenario) -> None:
+def test_two_processes_cannot_listen_on_one_port(tmp_path: Path, step: Scenario) -> None:
     routers = {"a": {"host": "lab", "port": 7447}, "b": {"host": "one"}, "c": {"host": "one"}, "d": {"host": "two"}}
     with pytest.raises(InventoryError) as caught:
         inventory.placement(placed(tmp_path, routers=routers), step)
@@ -223,7 +233,9 @@ def test_two_cannot_listen_on_one_port(tmp_path: Path, step: Scenario) -> None:
         ("hosts: {a: {address: x}, a: {address: y}}\nroles: {}", ("given", "twice")),
     ],
 )
-def test_a_file_that_is_no_inventory_is_one_line(tmp_path: Path, content: str | None, terms: tuple[str, ...]) -> None:
+def test_a_file_that_is_no_inventory_is_reported_in_one_line(
+    tmp_path: Path, content: str | None, terms: tuple[str, ...]
+) -> None:
     path = tmp_path / "own.yaml"
     if content is not None:
         path.write_text(content)
@@ -249,11 +261,11 @@ LONG = {
 
 
 @pytest.mark.parametrize("name", LONG)
-def test_a_megabyte_that_is_no_inventory_is_refused_at_once(tmp_path: Path, name: str) -> None:
+def test_a_megabyte_that_is_no_inventory_is_refused_quickly(tmp_path: Path, name: str) -> None:
     text, where = LONG[name]
     start_s = time.process_time()
     lines = faults(tmp_path, text)
-    assert time.process_time() - start_s < 2.0  # promised; comparing each router with each took minutes
+    assert time.process_time() - start_s < 2.0  # the promised limit; comparing all pairs of routers would take minutes
     assert has_terms(lines[0], where)
 
 
@@ -281,7 +293,7 @@ def test_a_host_needs_the_extras_of_its_roles(roles: dict[str, str | list[str]],
     assert needed_extras(inventory) == {"a": a, "b": b}
 
 
-def test_a_router_needs_none_and_extras_can_be_added() -> None:
+def test_a_router_needs_no_extras_and_extras_can_be_added() -> None:
     hosts = {"a": Host(address="192.0.2.1"), "gate": Host(address="192.0.2.2")}
     inventory = Inventory(hosts=hosts, roles={"world": "a"}, routers={"north": Router(host="gate")})
     assert needed_extras(inventory)["gate"] == set()
@@ -289,8 +301,8 @@ def test_a_router_needs_none_and_extras_can_be_added() -> None:
 
 
 @pytest.mark.parametrize("extra", [AGENTS, WORLD])
-def test_who_calculates_has_all_that_its_bits_depend_on(extra: str) -> None:
-    """Else a host that `zsim push` has installed on could not compute, or would be slower."""
+def test_computing_roles_require_every_package_of_the_fingerprint(extra: str) -> None:
+    """Otherwise a host installed by `zsim push` could not compute, or would be slower."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
     def distributions(lines: list[str]) -> set[str]:

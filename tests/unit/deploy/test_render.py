@@ -1,4 +1,4 @@
-"""Rendered units, compose files and manifests: every process once, in its place, with what it needs and no more."""
+"""Rendered systemd units, compose files and manifests: each process once, on its host, with exactly what it needs."""
 
 import errno
 import hashlib
@@ -73,7 +73,7 @@ def usual(step: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Texts:
     return {name: target(hosts, step) for name, target in TARGETS.items()}
 
 
-# What all targets have in common: {process: (host, words of its command after `python -m zsim_deploy.cli`)}
+# What all targets share: {process: (host, arguments of its command after `python -m zsim_deploy.cli`)}
 
 
 def of_systemd(texts: dict[str, str]) -> Words:
@@ -131,10 +131,10 @@ def option(words: list[str], name: str) -> str | None:
 
 @ALL
 @pytest.mark.parametrize("insecure", [False, True])
-def test_every_process_is_there_once_on_its_host_with_its_endpoints_and_certificates(
+def test_every_process_runs_once_on_its_host_with_endpoints_and_certificates(
     target: str, insecure: bool, tmp_path: Path
 ) -> None:
-    """Certificates are for who has TLS, access control for who listens; the pace is the world's."""
+    """Every process gets its certificate with TLS, listening processes their access control, and the world the rate."""
     hosts = placed(tmp_path, HOSTS + "security: {insecure: true}" if insecure else HOSTS)
     texts = TARGETS[target](hosts, scenario_file.load(STEP, ["federation=lab.2"]), ("--realtime", "--rate", "2.0"))
     found = READ[target](texts)
@@ -150,15 +150,15 @@ def test_every_process_is_there_once_on_its_host_with_its_endpoints_and_certific
     scheme = "tcp" if insecure else "tls"
     assert given("--connect") == {"world": None, **{name: f"{scheme}/{at}" for name, at in CONNECTS.items()}}
     assert given("--listen") == {**dict.fromkeys(PLACES), **{name: f"{scheme}/{at}" for name, at in LISTENS.items()}}
-    assert told("--realtime") == set(LISTENS)  # it shortens the lease of routers
+    assert told("--realtime") == set(LISTENS)  # routers take it too, for a shorter lease
     assert given("--rate") == {**dict.fromkeys(PLACES), "world": "2.0"}
     assert (told("--tls"), told("--access")) == ((set(), set()) if insecure else (set(PLACES), set(LISTENS)))
     assert not insecure or not any("certs" in text or "secret" in text.lower() for text in texts.values())
 
 
 @ALL
-def test_names_that_begin_with_a_dash_are_names(target: str, tmp_path: Path) -> None:
-    """The commands are read as `zsim` itself reads them."""
+def test_names_that_begin_with_a_dash_are_not_read_as_options(target: str, tmp_path: Path) -> None:
+    """The test parses the commands as `zsim` itself does."""
     text = STEP.read_text().replace("name: drone1", "name: -d1").replace("[drone1,", "[-d1,").replace("main", "-c")
     (tmp_path / "dashes.yaml").write_text(text)
     dashes = placed(tmp_path, HOSTS.replace("yard", "-r"))
@@ -190,8 +190,8 @@ def test_the_world_has_the_scenario_and_waits_for_the_recorder(target: str, host
 
 
 @ALL
-def test_no_key_and_no_launcher_s_access_is_in_a_text(target: str, tmp_path: Path, step: Scenario) -> None:
-    """The texts may be shown around: neither key material, nor by which key the launcher gets in."""
+def test_no_text_contains_keys_or_the_access_of_the_launcher(target: str, tmp_path: Path, step: Scenario) -> None:
+    """The texts may be shared, so they hold neither private keys nor how the launcher logs in."""
     (tmp_path / "certs/lab/world").mkdir(parents=True)
     (tmp_path / "certs/lab/world/key.pem").write_text("-----BEGIN PRIVATE KEY-----\nMC4CAQ\n")
     text = HOSTS.replace("user: lab,", "user: lab, key: ~/.ssh/launcher, known_hosts: known, ssh: 10.0.0.1,")
@@ -202,7 +202,7 @@ def test_no_key_and_no_launcher_s_access_is_in_a_text(target: str, tmp_path: Pat
 
 
 @ALL
-def test_a_program_of_the_user_s_own_is_told_of_and_not_started(target: str, tmp_path: Path) -> None:
+def test_a_program_of_the_user_is_mentioned_but_not_started(target: str, tmp_path: Path) -> None:
     own = scenario_file.load(STEP, ["processes.expect=[my.drone1, controller.main]"])
     text = HOSTS.replace('"estimator.*": [one, two]', '"my.*": two')
     texts = TARGETS[target](placed(tmp_path, text), own)
@@ -213,7 +213,7 @@ def test_a_program_of_the_user_s_own_is_told_of_and_not_started(target: str, tmp
     assert remarked == [where[target]]
 
 
-def test_a_program_of_the_scenario_is_told_of_with_its_command(tmp_path: Path) -> None:
+def test_a_program_of_the_scenario_is_mentioned_with_its_command(tmp_path: Path) -> None:
     programs = (
         "{my.drone1: {command: [fly, '{endpoint}', '{name}']}, watch: {command: [look, '{folder}'], joins: false}}"
     )
@@ -228,7 +228,7 @@ def test_a_program_of_the_scenario_is_told_of_with_its_command(tmp_path: Path) -
 
 
 @ALL
-def test_a_process_without_a_place_is_refused(target: str, tmp_path: Path, step: Scenario) -> None:
+def test_a_process_without_a_host_is_refused(target: str, tmp_path: Path, step: Scenario) -> None:
     text = HOSTS.replace('"controller.*": two, ', "")
     with refused(InventoryError, "roles", "no host", "controller.main"):
         TARGETS[target](placed(tmp_path, text), step)
@@ -252,7 +252,7 @@ LOCKED_UNIT = {
 }
 
 
-def test_units_run_the_host_s_python_as_its_user_and_write_nowhere_else(usual: Texts) -> None:
+def test_units_run_python_of_the_host_as_its_user_and_are_locked_down(usual: Texts) -> None:
     texts = usual["systemd"]
     for path, user, python in [
         ("lab/zsim-world.service", "lab", "/opt/zsim/venv/bin/python"),
@@ -272,8 +272,8 @@ def test_units_run_the_host_s_python_as_its_user_and_write_nowhere_else(usual: T
     assert option(words["router.yard"][1], "--access") == "/home/pi/.zsim/certs/router.yard.access.json"
 
 
-def test_a_recorder_that_is_started_again_has_the_folder_of_its_run(usual: Texts) -> None:
-    """Nothing in it changes with a start: neither an invocation's id nor a Pod's name."""
+def test_a_restarted_recorder_uses_the_same_folder_of_the_run(usual: Texts) -> None:
+    """The path contains nothing that changes with a restart, such as an invocation ID or the name of a Pod."""
     found = {target: option(READ[target](texts)["recorder"][1], "--out") for target, texts in usual.items()}
     assert found == {
         "systemd": "/var/lib/zsim/runs/step-{run}",
@@ -282,7 +282,7 @@ def test_a_recorder_that_is_started_again_has_the_folder_of_its_run(usual: Texts
     }
 
 
-def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
+def test_units_are_restarted_as_on_death_specifies(hosts: InventoryFile) -> None:
     lines = ["processes.on_death={estimator: wait, estimator.drone3: restart, controller: end}"]
     texts = systemd(hosts, scenario_file.load(STEP, lines))
     units = {path.split("zsim-")[1]: options_of(text) for path, text in texts.items() if "zsim-" in path}
@@ -291,12 +291,12 @@ def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
     assert {unit["Restart"][0] for unit in units.values()} == {"no", "on-failure"}
     assert has_terms(texts["one/zsim-estimator.drone1.service"], "# on_death", "wait")
     assert not has_terms(texts["one/zsim-estimator.drone3.service"], "# on_death", "wait")
-    # nor is a name fought for that another process took
+    # A process does not restart to fight for a name that another process has taken.
     assert all(unit["RestartPreventExitStatus"] == ["2 3"] for unit in units.values())
 
 
 def test_the_world_is_stopped_first_and_a_router_last(tmp_path: Path, step: Scenario) -> None:
-    """systemd stops in the reverse of After=."""
+    """systemd stops units in the reverse order of After=."""
     text = HOSTS.replace("host: one", "host: lab").replace("[one, two]", "lab")
     texts = systemd(placed(tmp_path, text), step)
     others = [f"zsim-estimator.drone{i}.service" for i in (1, 2, 3)]
@@ -308,7 +308,7 @@ def test_the_world_is_stopped_first_and_a_router_last(tmp_path: Path, step: Scen
     assert {*others, "zsim-recorder.service", "zsim-router.yard.service"} <= set(order["zsim-world.service"])
 
 
-def test_the_target_wants_every_unit_of_its_host_and_they_stop_with_it(usual: Texts) -> None:
+def test_the_target_starts_and_stops_every_unit_of_its_host(usual: Texts) -> None:
     texts = usual["systemd"]
     for host in ("lab", "one", "two"):
         units = {path.split("/")[1] for path in texts if path.startswith(f"{host}/") and path.endswith(".service")}
@@ -316,8 +316,8 @@ def test_the_target_wants_every_unit_of_its_host_and_they_stop_with_it(usual: Te
         assert all(options_of(texts[f"{host}/{unit}"])["PartOf"] == ["zsim.target"] for unit in units)
 
 
-def test_words_reach_the_process_as_they_are(tmp_path: Path, step: Scenario) -> None:
-    """systemd expands %, and $ where no colon is before the program, and splits at spaces."""
+def test_arguments_reach_the_process_unchanged(tmp_path: Path, step: Scenario) -> None:
+    """systemd expands % and, unless a colon precedes the program, $; it splits at spaces."""
     text = HOSTS.replace("/opt/zsim}", '"/opt/my zsim/100%$A\'"}').replace("192.168.1.10", "fe80::1%eth0")
     texts = systemd(placed(tmp_path, text), step)
     (line,) = options_of(texts["lab/zsim-world.service"])["ExecStart"]
@@ -325,7 +325,7 @@ def test_words_reach_the_process_as_they_are(tmp_path: Path, step: Scenario) -> 
     assert "tls/[fe80::1%%eth0]:7447" in line
 
 
-def test_what_a_unit_needs_and_the_inventory_lacks_is_told_at_once(tmp_path: Path, step: Scenario) -> None:
+def test_everything_that_units_lack_in_the_inventory_is_reported_at_once(tmp_path: Path, step: Scenario) -> None:
     text = HOSTS.replace("user: lab, ", "").replace("22, user: pi", "22, user: 'pi\\nExecStart=/bin/sh'")
     with pytest.raises(InventoryError) as caught:
         systemd(placed(tmp_path, text.replace("/usr/bin/python3.12", "python3")), step)
@@ -337,7 +337,7 @@ def test_what_a_unit_needs_and_the_inventory_lacks_is_told_at_once(tmp_path: Pat
 
 
 @pytest.mark.parametrize("field", ["folder", "python"])
-def test_no_line_of_an_inventory_becomes_an_option(field: str, tmp_path: Path, step: Scenario) -> None:
+def test_a_line_break_in_the_inventory_cannot_add_a_unit_option(field: str, tmp_path: Path, step: Scenario) -> None:
     text = HOSTS.replace("folder: /opt/zsim", f'{field}: "/opt/zsim\\nUser=root"')
     with refused(InventoryError, f"hosts.lab.{field}", "printable"):
         systemd(placed(tmp_path, text), step)
@@ -355,7 +355,7 @@ LOCKED_SERVICE = {
 }
 
 
-def test_containers_may_write_records_and_nothing_else_and_end_as_roles_do(usual: Texts) -> None:
+def test_containers_may_write_only_records_and_restart_like_their_roles(usual: Texts) -> None:
     for path, project in projects(usual["compose"]).items():
         for name, service in project["services"].items():
             binds = {v["target"]: v["read_only"] for v in service["volumes"] if v["type"] == "bind"}
@@ -370,7 +370,7 @@ def test_containers_may_write_records_and_nothing_else_and_end_as_roles_do(usual
             assert {**LOCKED_SERVICE, "restart": restart}.items() <= service.items()
 
 
-def test_an_image_has_the_extras_that_its_host_needs(usual: Texts, step: Scenario, tmp_path: Path) -> None:
+def test_an_image_installs_the_extras_that_its_host_needs(usual: Texts, step: Scenario, tmp_path: Path) -> None:
     texts = usual["compose"]
     extras = {path.split("/")[0]: re.findall(r"whl\[(.*)\]", text) for path, text in texts.items() if "Docker" in path}
     assert extras == {"lab": ["record,world"], "one": ["agents"], "two": ["agents"]}
@@ -382,7 +382,7 @@ def test_an_image_has_the_extras_that_its_host_needs(usual: Texts, step: Scenari
     assert "py3-none-any.whl\"" in router_alone  # fmt: skip
 
 
-def test_what_containers_do_not_need_of_the_inventory_is_said(usual: Texts) -> None:
+def test_inventory_fields_that_containers_ignore_are_mentioned(usual: Texts) -> None:
     texts = usual["compose"]
     assert has_terms(texts["two/compose.yaml"], "# hosts.two", "python", "not used")
     assert "not used" not in texts["one/compose.yaml"]
@@ -395,7 +395,7 @@ LOCKED_BOX = {
 }
 
 
-def test_pods_are_locked_and_have_their_own_certificate_read_only(usual: Texts) -> None:
+def test_pods_are_locked_down_and_mount_their_own_certificate_read_only(usual: Texts) -> None:
     texts = usual["kubernetes"]
     seen = []
     for one in pods(texts):
@@ -429,7 +429,7 @@ def test_roles_are_jobs_and_routers_deployments(usual: Texts) -> None:
     assert [one["metadata"]["name"] for one in found if one["kind"] == "Deployment"] == ["router-yard"]
 
 
-def test_the_service_leads_to_the_world_in_the_federation_s_namespace(hosts: InventoryFile) -> None:
+def test_the_service_selects_the_world_in_the_namespace_of_the_federation(hosts: InventoryFile) -> None:
     found = manifests(kubernetes(hosts, scenario_file.load(STEP, ["federation=lab_2"])))
     assert {one["metadata"]["namespace"] for one in found if one["kind"] != "Namespace"} == {"lab-2"}
     assert [one["metadata"]["name"] for one in found if one["kind"] == "Namespace"] == ["lab-2"]
@@ -441,7 +441,7 @@ def test_the_service_leads_to_the_world_in_the_federation_s_namespace(hosts: Inv
     assert [port["port"] for port in service["spec"]["ports"]] == [7447]
 
 
-def test_names_that_kubernetes_does_not_take_are_told_at_once(tmp_path: Path) -> None:
+def test_all_names_that_kubernetes_cannot_take_are_reported_at_once(tmp_path: Path) -> None:
     names = ["drone1", "drone_2", "drone.2"]
     drones = ", ".join(f"{{name: {name}, position_m: [{10 * i}, 0, 0]}}" for i, name in enumerate(names))
     bad = scenario_file.load(STEP, [f"drones=[{drones}]", "clusters=[]"])
@@ -453,8 +453,8 @@ def test_names_that_kubernetes_does_not_take_are_told_at_once(tmp_path: Path) ->
     assert has_terms(clash, "hosts.yaml", "estimator.drone.2", "estimator.drone_2", "same name")
 
 
-def test_a_scenario_beyond_a_config_map_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert render.CONFIG_BYTES_MAX == 1 << 20  # of Kubernetes; 600 drones have more
+def test_a_scenario_too_large_for_a_config_map_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert render.CONFIG_BYTES_MAX == 1 << 20  # the limit of Kubernetes, which 600 drones exceed
     monkeypatch.setattr(render, "CONFIG_BYTES_MAX", 100_000)
     drones = ", ".join(f"{{name: d{i}, position_m: [{2 * i}, 0, 0]}}" for i in range(60))
     large = scenario_file.load(STEP, [f"drones=[{drones}]", "clusters=[]"])
@@ -470,7 +470,7 @@ def call(folder: Path, target: str, *options: str) -> Any:
 
 @ALL
 @pytest.mark.usefixtures("hosts")
-def test_the_command_writes_what_is_rendered(target: str, usual: Texts, tmp_path: Path) -> None:
+def test_the_command_writes_the_rendered_files(target: str, usual: Texts, tmp_path: Path) -> None:
     done, out = call(tmp_path, target), tmp_path / "out"
     assert done.exit_code == 0, done.output
     assert files(out) == usual[target]
@@ -478,13 +478,13 @@ def test_the_command_writes_what_is_rendered(target: str, usual: Texts, tmp_path
 
 
 def files(out: Path) -> dict[str, str]:
-    """Return the files of a folder that a person sees."""
+    """Return the files of a folder, except hidden ones."""
     found = [path for path in out.rglob("*") if path.is_file() and not path.name.startswith(".")]
     return {str(path.relative_to(out)): path.read_text() for path in found}
 
 
 @pytest.mark.parametrize("target", ["systemd", "compose"])
-def test_nothing_of_an_earlier_rendering_is_left(
+def test_files_of_an_earlier_rendering_are_removed(
     target: str, hosts: InventoryFile, step: Scenario, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
@@ -501,8 +501,8 @@ def test_nothing_of_an_earlier_rendering_is_left(
 
 
 @pytest.mark.usefixtures("hosts")
-def test_what_somebody_else_put_there_stays(usual: Texts, step: Scenario, tmp_path: Path) -> None:
-    """A file beside the rendered ones, one that has a rendered one's text, and the files of another target."""
+def test_files_that_the_rendering_did_not_write_are_kept(usual: Texts, step: Scenario, tmp_path: Path) -> None:
+    """These are a file beside the rendered ones, a copy of a rendered file, and the files of another target."""
     out = tmp_path / "out"
     call(tmp_path, "systemd")
     call(tmp_path, "kubernetes")
@@ -515,7 +515,7 @@ def test_what_somebody_else_put_there_stays(usual: Texts, step: Scenario, tmp_pa
     assert set(files(out)) == kept | set(systemd(moved, step))
 
 
-def test_a_file_that_was_changed_is_not_removed(hosts: InventoryFile, tmp_path: Path) -> None:
+def test_a_changed_file_is_not_removed(hosts: InventoryFile, tmp_path: Path) -> None:
     out = tmp_path / "out"
     call(tmp_path, "systemd")
     (out / "lab/zsim-world.service").write_text("mine now")
@@ -530,7 +530,7 @@ def test_a_file_that_was_changed_is_not_removed(hosts: InventoryFile, tmp_path: 
 
 
 @pytest.mark.parametrize("changed", ["before", "since"])
-def test_a_file_of_somebody_s_is_not_overwritten_unless_forced(tmp_path: Path, changed: str) -> None:
+def test_a_foreign_or_changed_file_is_overwritten_only_by_force(tmp_path: Path, changed: str) -> None:
     out = tmp_path / "out"
     if changed == "since":
         write(out, "compose", {"one/compose.yaml": "a: 1"})
@@ -545,7 +545,7 @@ def test_a_file_of_somebody_s_is_not_overwritten_unless_forced(tmp_path: Path, c
     assert (out / "one/compose.yaml").read_text() == "a: 3"
 
 
-def test_nothing_is_written_or_removed_out_of_the_folder(hosts: InventoryFile, tmp_path: Path) -> None:
+def test_nothing_outside_the_folder_is_written_or_removed(hosts: InventoryFile, tmp_path: Path) -> None:
     with refused(RunError, "../two/compose.yaml", "out"):
         write(tmp_path / "out", "compose", {"one/compose.yaml": "", "../two/compose.yaml": ""})
     assert [path.name for path in tmp_path.iterdir()] == ["hosts.yaml"]
@@ -572,9 +572,7 @@ def test_the_command_takes_the_options_of_a_run(hosts: InventoryFile, tmp_path: 
     assert {one["containers"][0]["image"] for one in pods(texts)} == {"registry.example.org/zsim:7"}
 
 
-def test_a_rate_that_is_none_and_a_folder_that_cannot_be_written_are_lines(
-    hosts: InventoryFile, tmp_path: Path
-) -> None:
+def test_an_invalid_rate_and_an_unwritable_folder_are_refused(hosts: InventoryFile, tmp_path: Path) -> None:
     done = call(tmp_path, "systemd", "--rate", "0")
     assert done.exit_code == 2
     assert has_terms(done.output, ">", "0", "<=", "1000")

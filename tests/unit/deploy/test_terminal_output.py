@@ -1,4 +1,4 @@
-"""Nothing that others have said reaches a terminal with codes that it acts on."""
+"""No text from other processes or hosts reaches a terminal with control codes."""
 
 import ast
 import io
@@ -17,21 +17,21 @@ from zsim_deploy.hosts.push import PushProgress
 
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("zsim", "world", "agents", "deploy")
-ANSWERS = {"probe.py", "on_host.py"}  # they print JSON for a launcher, no terminal
+ANSWERS = {"probe.py", "on_host.py"}  # they print JSON for a launcher, not for a terminal
 SHOWING = {"print", "Text"}
-SAFE = ("printable", "json.dumps", "cell")  # what takes the codes out
+SAFE = ("printable", "json.dumps", "cell")  # these remove or escape the codes
 NASTY = "\x1b]0;owned\x07\x9b2J\u202e[red]x"
 CODES = {"\x1b", "\x07", "\x9b", "\u202e"}
 
 
 def is_safe(text: ast.expr) -> bool:
-    """Return whether a text is a constant, a choice of such, or has its codes taken out."""
+    """Return whether a text is a constant, a choice between constants, or free of codes."""
     if isinstance(text, ast.IfExp):
         return is_safe(text.body) and is_safe(text.orelse)
     return isinstance(text, ast.Constant) or (isinstance(text, ast.Call) and ast.unparse(text.func) in SAFE)
 
 
-def test_all_that_is_printed_or_that_rich_shows_has_no_codes() -> None:
+def test_every_printed_or_rendered_text_is_free_of_codes() -> None:
     found, unsafe = set(), []
     for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py") if path.name not in ANSWERS):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -60,13 +60,13 @@ ROW = {"role": NASTY, "host": NASTY, "pid": 1, "state": NASTY, "lag_ms": None, "
         cell(NASTY),
     ],
 )
-def test_a_table_of_what_hosts_say_holds_no_codes(table: Any) -> None:
+def test_tables_of_texts_from_hosts_contain_no_codes(table: Any) -> None:
     text = shown(table)
     assert not CODES & set(text)
     assert printable(NASTY) in text
 
 
-def test_a_push_shows_no_codes() -> None:
+def test_the_progress_of_a_push_contains_no_codes() -> None:
     console = Console(file=io.StringIO(), width=300)
     PushProgress(console).update("h1", f"waiting for the push of {NASTY}")
     terminal = PushProgress(Console(file=io.StringIO(), force_terminal=True))
@@ -76,7 +76,7 @@ def test_a_push_shows_no_codes() -> None:
     assert text.count(printable(NASTY)) == 2
 
 
-def test_what_a_launcher_and_hosts_answer_holds_no_codes(
+def test_answers_of_launcher_and_hosts_contain_no_codes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(control_socket, "ask", lambda *_, **__: NASTY)

@@ -1,4 +1,4 @@
-"""examples/formation_picture.py: whatever the formation, all of its drones are in the picture."""
+"""examples/formation_picture.py: all drones of any formation are in the picture."""
 
 import formation_picture
 import numpy as np
@@ -11,7 +11,7 @@ from zsim_agents.cameras.scene import DroneStates, Scene, View, camera_motion, d
 
 
 def formation(count: int, radius_m: float, height_m: float, turn_rad: float = 0.0) -> DroneStates:
-    """Return drones that hover on a circle about (50, -20) m."""
+    """Return drones that hover on a circle around (50, -20) m."""
     angles = turn_rad + np.arange(count) * 2 * np.pi / count
     p_WB = np.stack([50 + radius_m * np.cos(angles), -20 + radius_m * np.sin(angles), np.full(count, height_m)], axis=1)
     none = np.zeros((count, 3))
@@ -25,7 +25,7 @@ def view() -> View:
 
 @pytest.mark.parametrize("turn_rad", [0.0, 0.7, 1.4])
 @pytest.mark.parametrize(("count", "radius_m", "height_m"), [(2, 1.0, 3.0), (3, 2.3, 15.0), (30, 40.0, 60.0)])
-def test_the_camera_follows_the_formation(
+def test_all_drones_are_in_the_picture_of_the_following_camera(
     view: View, count: int, radius_m: float, height_m: float, turn_rad: float
 ) -> None:
     bodies = follower(formation(count, radius_m, height_m, turn_rad))
@@ -48,6 +48,6 @@ def test_the_hats_of_all_drones_are_drawn(monkeypatch: pytest.MonkeyPatch) -> No
     assert np.ptp(columns) > CAMERA.width_px / 3
 
 
-def test_sides_are_those_of_the_polygon() -> None:
+def test_the_sides_are_those_of_the_polygon() -> None:
     assert sides(2) == [(0, 1)]
     assert sides(3) == [(0, 1), (1, 2), (2, 0)]

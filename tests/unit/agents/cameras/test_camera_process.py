@@ -1,5 +1,4 @@
-"""The processes of cameras and detectors: which pictures are drawn when there is no time for all, where drones are
-between gates, and what becomes of pictures that are none."""
+"""Camera and detector processes: the choice of pictures under overload, poses between gates, and invalid pictures."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -45,13 +44,13 @@ ZEROS = (0.0, 0.0, 0.0)
 
 
 def truth(gate: int, x: float = 0.0, rotor: float = 100.0) -> Truth:
-    """Return a drone that flies east at 2 m/s and turns its rotors faster and faster."""
+    """Return the truth of a drone that flies east at 2 m/s with steadily accelerating rotors."""
     at, turning = (x + 2.0 * gate * GATE_NS / 1e9, 0.0, 1.0), (0.0, 0.0, 0.1 * gate)
     return Truth(gate * GATE_NS, gate, at, (2.0, 0.0, 0.0), (1.0, *ZEROS), turning, ZEROS, (rotor + gate,) * 4)
 
 
 class Drawing:
-    """A camera process of all drones, whose world goes on by some gates while a picture is drawn."""
+    """A camera process for all drones whose world advances by some gates while a picture is drawn."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, gates_per_picture: int) -> None:
         self.link, self._gate = FakeLink(), 0
@@ -76,12 +75,12 @@ class Drawing:
             self._gate += 1
 
     def pictures(self, camera: str) -> list[int]:
-        """Return of how many exposures each drone has pictures."""
+        """Return the number of exposures with a picture for each drone."""
         return [len({m.t_sample_ns for m in self.link.published_on(keys.camera(d, camera))}) for d in DRONES]
 
 
 @pytest.mark.parametrize("gates_per_picture", [2, 4, 12])
-def test_a_camera_process_that_is_too_slow_leaves_out_pictures_of_all(
+def test_a_slow_camera_process_skips_pictures_of_all_drones_equally(
     monkeypatch: pytest.MonkeyPatch, gates_per_picture: int
 ) -> None:
     drawing = Drawing(monkeypatch, gates_per_picture)
@@ -94,10 +93,10 @@ def test_a_camera_process_that_is_too_slow_leaves_out_pictures_of_all(
         assert max(counts) <= 2 * min(counts), counts
 
 
-def test_a_camera_that_gates_draws_the_first_picture_whatever_is_answered_first(
+def test_a_gating_camera_draws_the_first_picture_despite_early_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An answer to what is asked for may overtake what was published before it."""
+    """The answer to a request may overtake messages published before it."""
     drawing = Drawing(monkeypatch, gates_per_picture=0)
     link = drawing.link
 
@@ -113,7 +112,7 @@ def test_a_camera_that_gates_draws_the_first_picture_whatever_is_answered_first(
     assert link.published_on(keys.camera("d1", "front"))[0].t_sample_ns == 0
 
 
-# Where drones are between two gates
+# Poses between two gates
 
 PLACED = scenario_file.resolve(
     {"name": "t", "duration_s": 1, "drones": [{"name": "d2", "position_m": [7, 0, 0], "yaw_deg": 90}]}
@@ -136,11 +135,11 @@ def test_bodies_are_interpolated_between_two_gates() -> None:
     assert bodies.p_WB[:, 0] == pytest.approx([0.17, 10.17])
     assert bodies.w_WB_B[:, 2] == pytest.approx([0.425, 0.425])
     assert bodies.rotors[1] == pytest.approx([104.25] * 4)
-    assert last is not None  # a gate itself needs no other
+    assert last is not None  # at a gate, no other gate is needed
     assert last.p_WB[0, 0] == pytest.approx(0.2)
 
 
-def test_what_is_too_new_too_old_or_lacks_a_drone_is_not_there() -> None:
+def test_bodies_too_new_too_old_or_incomplete_are_unavailable() -> None:
     kept = history(30)
     kept.add(0, truth(30))
     assert kept.newest_ns == 29 * GATE_NS
@@ -149,7 +148,7 @@ def test_what_is_too_new_too_old_or_lacks_a_drone_is_not_there() -> None:
     assert kept.bodies(26 * GATE_NS) is not None
 
 
-def test_a_gate_that_stays_incomplete_is_passed_over_and_forgotten() -> None:
+def test_a_gate_that_stays_incomplete_is_skipped_and_discarded() -> None:
     kept = history(2)
     kept.add(0, truth(2))
     for gate in range(3, 3 + 2 * PENDING_MAX):
@@ -163,8 +162,8 @@ def test_a_gate_that_stays_incomplete_is_passed_over_and_forgotten() -> None:
     assert np.isfinite(kept.bodies(last * GATE_NS + 1).p_WB).all()  # type: ignore[union-attr]
 
 
-def test_an_external_drone_is_drawn_where_its_last_pose_leads_to() -> None:
-    """Its driver may skip gates, and be away; nothing waits for it."""
+def test_an_external_drone_is_drawn_at_its_extrapolated_pose() -> None:
+    """Its driver may skip gates or be absent; the camera does not wait for it."""
     kept = TruthHistory(2, GATE_NS, 50 * GATE_NS, {1: STANDING})
     for gate in range(5):
         kept.add(0, truth(gate))
@@ -192,11 +191,11 @@ def test_an_external_drone_is_drawn_where_its_last_pose_leads_to() -> None:
 INFO = Info(0, 0, 1, "r", "zsim", "lockstep", 0.0, 1, 1, 1, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", "")
 FRONT, FRONT_INFO = keys.camera("d1", "front"), keys.camera_info("d1", "front")
 SIDE, SIDE_INFO = keys.camera("d1", "side"), keys.camera_info("d1", "side")
-ABSURD_PX = 16_384  # as many as the contract lets a side have
+ABSURD_PX = 16_384  # the longest side that the contract allows
 
 
 class Detecting:
-    """A detector of drone d1, or of others, whatever it says, and what it publishes."""
+    """A detector for drone d1 or for other drones, with its reports and published messages."""
 
     def __init__(self, drones: Sequence[str] = ("d1",)) -> None:
         self.link, self.said = FakeLink(), []
@@ -206,7 +205,7 @@ class Detecting:
         self._process.begin()
 
     def take(self, *arrived: tuple[str, Any]) -> None:
-        """Let messages arrive, and the process take one turn."""
+        """Deliver messages and let the process take one turn."""
         for key, message in arrived:
             self.link.deliver(key, message)
         self._process.turn()
@@ -215,12 +214,12 @@ class Detecting:
         return self.link.published_on(keys.detections("d1"))
 
     def counted(self) -> tuple[int, int, int]:
-        """Return how many it took, refused and left out."""
+        """Return the numbers of pictures received, refused and dropped."""
         health = self.presence.health
         return health.received, health.refused, health.dropped
 
 
-def test_a_picture_is_looked_at_once_its_pixels_mean_something() -> None:
+def test_a_picture_is_processed_once_the_camera_info_is_known() -> None:
     detecting = Detecting()
     detecting.take((FRONT, image(1)))
     assert (detecting.sightings(), detecting.counted()) == ([], (0, 0, 1))
@@ -248,7 +247,7 @@ NO_PICTURES = {
 
 
 @pytest.mark.parametrize("name", NO_PICTURES)
-def test_what_is_no_picture_of_the_camera_is_counted_and_the_next_one_is_looked_at(name: str) -> None:
+def test_an_invalid_picture_is_counted_and_the_next_one_processed(name: str) -> None:
     detecting = Detecting()
     detecting.take((FRONT_INFO, info()), (FRONT, image(0, data=NO_PICTURES[name])))
     detecting.take((FRONT, image(10_000_000)))
@@ -257,7 +256,7 @@ def test_what_is_no_picture_of_the_camera_is_counted_and_the_next_one_is_looked_
     assert has_terms(detecting.said[0], "detector.d1", FRONT)
 
 
-def test_pictures_that_are_none_are_told_of_a_few_times_only() -> None:
+def test_invalid_pictures_are_reported_only_a_few_times() -> None:
     detecting = Detecting()
     for _ in range(50):
         detecting.take((FRONT, image(0, data=NO_JPEG)))
@@ -272,7 +271,7 @@ def test_pictures_that_are_none_are_told_of_a_few_times_only() -> None:
         ({"width": 10**9}, ("width", str(10**9))),
     ],
 )
-def test_what_its_pixels_cannot_mean_is_refused_before_memory_is_taken(
+def test_an_invalid_camera_info_is_refused_before_memory_is_allocated(
     monkeypatch: pytest.MonkeyPatch, fields: dict[str, Any], terms: tuple[str, ...]
 ) -> None:
     monkeypatch.setattr(camera_process, "HatDetector", lambda *_: pytest.fail("was made"))
@@ -283,15 +282,15 @@ def test_what_its_pixels_cannot_mean_is_refused_before_memory_is_taken(
     assert detecting.said[0].count(FRONT_INFO) == 1
 
 
-def test_of_many_pictures_only_the_newest_is_held() -> None:
+def test_only_the_newest_of_many_pictures_is_kept() -> None:
     detecting = Detecting()
     detecting.take((FRONT_INFO, info()), *((FRONT, image(number * 1_000_000)) for number in range(100)))
     assert detecting.counted() == (1, 0, 99)
     assert [seen.t_ns for seen in detecting.sightings()] == [99_000_000]
 
 
-def test_of_too_many_pictures_as_many_are_looked_at_of_each_camera() -> None:
-    """Whenever it has looked at one there are new ones of all."""
+def test_an_overloaded_detector_processes_equally_many_of_each_camera() -> None:
+    """Whenever one picture has been processed, new ones of all cameras have arrived."""
     drones = ["d1", "d2", "d3"]
     detecting = Detecting(drones)
 
@@ -307,7 +306,7 @@ def test_of_too_many_pictures_as_many_are_looked_at_of_each_camera() -> None:
     assert [len(detecting.link.published_on(keys.detections(drone))) for drone in drones] == [4, 4, 4]
 
 
-def test_a_camera_that_no_drone_has_is_not_looked_at() -> None:
+def test_pictures_of_an_unknown_camera_are_ignored() -> None:
     detecting = Detecting()
     detecting.take((SIDE_INFO, info()), (SIDE, image(0)), (FRONT_INFO, info()), (FRONT, image(0)))
     assert [seen.camera for seen in detecting.sightings()] == ["front"]

@@ -1,4 +1,4 @@
-"""What the renderer draws, judged by the lens's own projection and by what must follow from each setting."""
+"""Pictures of the renderer against the projection of the lens and the expected effect of each setting."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from zsim.sensors.camera_model import lens_of
 from zsim.sensors.sensor import Mount
 from zsim_agents.cameras.renderer import Ground
 
-CENTRE_PX = 0.5  # what the issue asks for
+CENTRE_PX = 0.5  # largest error of a hat's centre per axis, by requirement
 AHEAD = bodies([(0, 0, 5), (4, 0.5, 4.6)])
 BARREL = (-0.28, 0.09, 0.001, -0.001, 0.0)
 
@@ -26,7 +26,7 @@ def draw(camera: Any = FRONT, where: Any = AHEAD, number: int = 0, t_s: float = 
 
 
 @pytest.mark.parametrize("distortion", [(0.0,) * 5, BARREL])
-def test_a_hat_is_where_the_lens_projects_it(distortion: Any) -> None:
+def test_a_hat_is_drawn_where_the_lens_projects_it(distortion: Any) -> None:
     camera = FrontCamera(**CLEAN, distortion=distortion)
     drawn = renderer(camera)
     found = 0
@@ -50,21 +50,21 @@ TURNED = Mount(position_m=(0.1, -0.05, 0.06), rpy_deg=(20.0, -10.0, 15.0))
     ],
     ids=["turned and shifted", "bottom"],
 )
-def test_a_hat_of_another_camera_is_where_the_lens_projects_it(camera: Any, where: Any) -> None:
+def test_a_hat_is_drawn_where_other_cameras_project_it(camera: Any, where: Any) -> None:
     assert np.abs(magenta_centre(draw(camera, where)) - hat_pixel(camera, where)).max() < CENTRE_PX
 
 
-def test_the_same_inputs_give_the_same_bits_and_another_seed_or_number_does_not() -> None:
+def test_pictures_are_determined_by_their_inputs_seed_and_number() -> None:
     drawn = renderer()
     first = drawn.picture(0, 1.0, AHEAD).copy()
     drawn.picture(1, 1.1, bodies([(0, 0, 2), (2, 0.5, 2)], [(0.3, 0.2, 0.5), (0, 0, 0)]))
-    assert (drawn.picture(0, 1.0, AHEAD) == first).all()  # it keeps nothing of the pictures before
+    assert (drawn.picture(0, 1.0, AHEAD) == first).all()  # it is independent of earlier pictures
     assert (draw() == first).all()
     assert (draw(number=1) != first).any()
     assert (draw(seed=2) != first).any()
 
 
-def test_noise_has_the_deviation_that_was_set() -> None:
+def test_noise_has_the_configured_standard_deviation() -> None:
     sky = np.s_[:60, 100:500]
     clean, noisy = (draw(FrontCamera(noise=noise, blur_px=0.0))[sky].astype(float) for noise in (0.0, 4.0))
     assert (noisy - clean).std() == pytest.approx(4.0, rel=0.05)
@@ -79,19 +79,19 @@ def test_less_light_makes_a_darker_and_noisier_picture() -> None:
     assert rough[1] == pytest.approx(rough[0] / 0.3, rel=0.1)
 
 
-def test_a_body_rate_blurs_along_its_way_alone() -> None:
+def test_a_body_rate_blurs_only_along_its_motion() -> None:
     camera = FrontCamera(**CLEAN, exposure_ms=20.0)
     still, turning = (draw(camera, bodies(AHEAD.p_WB, w_B=[(0, 0, rate), (0, 0, 0)])) for rate in (0.0, 1.5))
     (u, v), way_px = hat_pixel(camera, AHEAD), lens_of(camera).fx * 1.5 * 0.02
     spread = [magenta_spread(picture) for picture in (still, turning)]
     widened = spread[1] ** 2 - spread[0] ** 2
-    assert widened[0] == pytest.approx(way_px**2 / 12, rel=0.35)  # variance of a uniform way
+    assert widened[0] == pytest.approx(way_px**2 / 12, rel=0.35)  # variance of a uniform distribution
     assert abs(widened[1]) < 0.1 * widened[0]
     assert np.abs(magenta_centre(turning) - (u, v)).max() < CENTRE_PX
 
 
 def magenta_spread(picture: Any) -> np.ndarray:
-    weight = np.clip(picture[..., 2].astype(float) - picture[..., 1], 0, None)  # of hull and grass it is below 0
+    weight = np.clip(picture[..., 2].astype(float) - picture[..., 1], 0, None)  # negative for hull and grass
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
     middle = [(weight * at).sum() / weight.sum() for at in (u, v)]
     return np.sqrt([(weight * (at - m) ** 2).sum() / weight.sum() for at, m in zip((u, v), middle, strict=True)])
@@ -103,7 +103,7 @@ def test_the_ground_is_blurred_by_the_speed_over_it() -> None:
         draw(camera, bodies([(3, 2, 1.5), (9, 9, 9)], v_W=[(speed, 0, 0), (0, 0, 0)])) for speed in (0.0, 3.0)
     )
     along, across = (np.abs(np.diff(fast.astype(int), axis=axis)).mean() for axis in (0, 1))
-    assert along < 0.75 * np.abs(np.diff(still.astype(int), axis=0)).mean()  # ahead is up in the picture
+    assert along < 0.75 * np.abs(np.diff(still.astype(int), axis=0)).mean()  # ahead is upwards in the picture
     assert along < across
 
 
@@ -116,13 +116,13 @@ def test_the_ground_is_blurred_by_the_speed_over_it() -> None:
         ({"shape": "sphere", "position_m": (2.0, 0.27, 4.8), "radius_m": 0.8}, True),
     ],
 )
-def test_an_obstacle_before_a_hat_hides_it_and_one_behind_does_not(obstacle: Any, hides: bool) -> None:
+def test_an_obstacle_hides_a_hat_only_from_in_front_of_it(obstacle: Any, hides: bool) -> None:
     row = tuple(row_of(Obstacle(name="wall", **obstacle)))
     assert has_magenta(draw(of=scene(obstacles=(row,)))) is not hides
 
 
 @pytest.mark.parametrize("lens", [{}, {"distortion": (-0.2, 0.05, 0, 0, 0)}], ids=["flat", "bent"])
-def test_a_surface_before_a_hat_hides_it_from_both_sides_and_one_behind_does_not(lens: dict[str, Any]) -> None:
+def test_a_surface_of_either_side_hides_a_hat_only_from_in_front_of_it(lens: dict[str, Any]) -> None:
     for x, hides in ((2.0, True), (7.0, False)):
         a, b, c = (x, -9.0, 0.0), (x, 9.0, 0.0), (x, 0.0, 20.0)
         for corners in ((a, b, c), (a, c, b)):
@@ -161,7 +161,7 @@ def test_any_attitude_and_height_gives_a_picture(rpy: Any, height_m: float) -> N
     assert picture.shape == (FRONT.height_px, FRONT.width_px, 3)
 
 
-# A checkerboard on the ground: OpenCV's calibration is the authority
+# A checkerboard on the ground: OpenCV's calibration is the reference
 
 SQUARE_M, INNER = 0.15, (8, 6)
 
@@ -178,7 +178,7 @@ def board() -> Ground:
 
 
 @pytest.mark.parametrize("distortion", [pytest.param((0.0,) * 5, marks=pytest.mark.soak), (-0.2, 0.05, 0.0, 0.0, 0.0)])
-def test_calibration_by_a_checkerboard_on_the_ground_finds_the_stated_intrinsics(distortion: Any) -> None:
+def test_checkerboard_calibration_recovers_the_stated_intrinsics(distortion: Any) -> None:
     down = Mount(rpy_deg=(0.0, 90.0, 0.0))
     camera = FrontCamera(noise=1.0, mount=down, distortion=distortion)
     drawn = renderer(camera, scene(1), ground=board())
@@ -188,7 +188,7 @@ def test_calibration_by_a_checkerboard_on_the_ground_finds_the_stated_intrinsics
         tilt, height = rng.uniform(-0.6, 0.6, 2), rng.uniform(1.1, 1.8)
         rpy = (*tilt, rng.choice([0.0, rng.uniform(-3, 3)]))
         x, y, z = rotation_matrix(quaternion_from_rpy(rpy)) @ (0, 0, -height)
-        place = np.array([-x, -y]) * height / -z + rng.uniform(-0.25, 0.25, 2)  # the board about in the middle
+        place = np.array([-x, -y]) * height / -z + rng.uniform(-0.25, 0.25, 2)  # the board is near the centre
         grey = cv2.cvtColor(drawn.picture(0, 1.0, bodies([(*place, height)], [rpy])), cv2.COLOR_BGR2GRAY)
         is_there, found = cv2.findChessboardCornersSB(grey, INNER)
         if is_there:
@@ -209,7 +209,7 @@ def test_calibration_by_a_checkerboard_on_the_ground_finds_the_stated_intrinsics
 def test_the_lines_of_the_meadow_are_a_metre_apart() -> None:
     camera = replace(BOTTOM, **CLEAN)
     grey = draw(camera, bodies([(0.5, 0.5, 4.0), (50, 50, 50)])).astype(float).sum(axis=-1)
-    profile = grey.mean(axis=0)  # to the right is south
+    profile = grey.mean(axis=0)  # south is to the right
     lens = lens_of(camera)
     height_m = 4.0 + camera.mount.position_m[2]
     at = [round(lens.cx + lens.fx * offset / height_m) for offset in (-0.5, 0.5)]

@@ -1,4 +1,4 @@
-"""The estimator of one drone on flights of known truth."""
+"""The estimator of one drone, tested on flights with known truth."""
 
 import math
 
@@ -18,7 +18,7 @@ AIDING = ("gps", "mag", "baro", "sonar", "flow")
 
 
 def flown(seed: int = 1, end_s: float = 20.0, **sections):
-    """Return scenario, flight, readings and the estimates of a flight."""
+    """Return the scenario, flight, readings and estimates of a flight."""
     of = scenario(**sections)
     flight = Flight(seed)
     coming = readings(flight, of, seed, end_s)
@@ -35,7 +35,7 @@ def errors(flight: Flight, estimates, after_s: float = 0.0) -> tuple[np.ndarray,
 
 
 def rms(flight: Flight, estimates, after_s: float = 0.0) -> tuple[np.ndarray, float, float]:
-    """Return the root mean square error of the position by axis, and the worst of velocity and heading."""
+    """Return the RMS error of the position by axis, of the worst axis of the velocity, and of the heading."""
     position, velocity, heading = (np.sqrt(np.mean(e**2, axis=0)) for e in errors(flight, estimates, after_s))
     return position, float(velocity.max()), float(heading)
 
@@ -45,16 +45,16 @@ def covariance(estimate: StateEstimate) -> np.ndarray:
 
 
 def nees(flight: Flight, estimates, after_s: float) -> float:
-    """Mean over time of e^T P^-1 e of position and velocity."""
+    """Return the mean over time of e^T P^-1 e for position and velocity."""
     error = np.hstack(errors(flight, estimates, after_s)[:2])
     P = np.array([covariance(e) for t, e in estimates if t > after_s])
     return float(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[:, :, None])[:, :, 0])))
 
 
-def test_a_flight_is_followed_to_the_sensors_limits_in_plain_numbers():
+def test_errors_are_within_the_limits_of_the_sensors():
     _, flight, _, estimates = flown(end_s=40.0)
     (east, north, up), velocity, heading = rms(flight, estimates, 20.0)
-    assert max(east, north) < 0.45  # m; sigma is 0.2 m and wanders slowly
+    assert max(east, north) < 0.45  # m; sigma is 0.2 m and the error varies slowly
     assert up < 0.03
     assert velocity < 0.04  # m/s
     assert heading < 0.01  # rad
@@ -75,7 +75,7 @@ def test_a_flight_is_followed_to_the_sensors_limits_in_plain_numbers():
     ],
     ids=["beta .1", "gyro alone", "no flow", "no magnetometer"],
 )
-def test_the_covariance_tells_the_truth(sections):
+def test_the_covariance_is_consistent_with_the_errors(sections):
     of = scenario(**sections, yaw_deg=0.0)
     end_s, means = 25.0, []
     for seed in range(6):
@@ -86,8 +86,8 @@ def test_the_covariance_tells_the_truth(sections):
     assert low < np.mean(means) < high
 
 
-def test_innovations_are_white_and_of_the_right_size():
-    """Of every fix against a twin that has not had it; each is independent of the one before."""
+def test_innovations_are_white_with_the_stated_covariance():
+    """Each fix is compared with a twin estimator without it; successive innovations are uncorrelated."""
     of, flight = scenario(estimation={"gate_probability": 0.999999}), Flight(2)
     core, twin, normalised = estimator(of), estimator(of), []
     by_gate: dict[int, list[Reading]] = {}
@@ -123,7 +123,7 @@ def test_an_outlier_is_refused_and_counted(name: str):
         "flow": ((4.0, 0.0, 0.0), 1.0),
     }[name]
     coming = readings(flight, of, 3, 10.0)
-    if name == "sonar":  # on the ground the range is below the least that a sonar reads
+    if name == "sonar":  # on the ground the range is below the sonar's minimum
         coming = [r._replace(values=(0.05, True)) if r.sensor == "sonar" else r for r in coming]
     core = estimator(of)
     before = fly(core, coming, 10.0)[-1][1]
@@ -135,7 +135,7 @@ def test_an_outlier_is_refused_and_counted(name: str):
 
 
 @pytest.mark.parametrize("bad", [NAN, INF, -INF, 1e300], ids=str)
-def test_what_is_no_number_is_refused_counted_and_harmless(bad: float):
+def test_values_that_are_not_finite_are_refused_counted_and_harmless(bad: float):
     of, _, coming, clean = flown(seed=4, end_s=8.0)
     poison = [
         ("imu", ((bad, 0.0, 9.8), (0.0, 0.0, 0.0))),
@@ -159,7 +159,7 @@ def test_what_is_no_number_is_refused_counted_and_harmless(bad: float):
 
 def test_duplicates_change_nothing_and_old_readings_are_refused():
     of, _, coming, clean = flown(seed=5, end_s=8.0)
-    assert fly(estimator(of), coming, 8.0) == clean  # the same readings give the same bits
+    assert fly(estimator(of), coming, 8.0) == clean  # the result is deterministic to the bit
     twice = [r for reading in coming for r in (reading, reading)]
     assert fly(estimator(of), twice, 8.0)[-1][1] == clean[-1][1]
     old = [next(r for r in coming if r.sensor == name)._replace(t_s=5.001) for name in ("gps", "imu")]
@@ -169,7 +169,7 @@ def test_duplicates_change_nothing_and_old_readings_are_refused():
         assert end.sensors[name][1] == clean[-1][1].sensors[name][1] + 1
 
 
-def test_the_order_within_a_gate_does_not_matter_much():
+def test_the_order_within_a_gate_hardly_matters():
     of, _, coming, clean = flown(seed=6, end_s=10.0)
 
     def backwards(reading: Reading) -> tuple[int, int, float]:
@@ -184,7 +184,7 @@ def test_the_order_within_a_gate_does_not_matter_much():
     assert end.position_m == pytest.approx(clean[-1][1].position_m, abs=1e-6)
 
 
-def test_a_fix_without_fix_and_flow_without_quality_are_refused():
+def test_gps_without_a_fix_and_flow_without_quality_are_refused():
     of, _, coming, clean = flown(seed=7, end_s=6.0)
     blind = [
         r._replace(values=(*r.values[:3], 0)) if r.sensor == "gps" and r.t_s > 4.0
@@ -199,17 +199,17 @@ def test_a_fix_without_fix_and_flow_without_quality_are_refused():
 
 
 @pytest.mark.parametrize("yaw_deg", [-170.0, -60.0, 0.0, 95.0, 179.0])
-def test_the_heading_converges_from_anywhere(yaw_deg: float):
+def test_the_heading_converges_from_any_start(yaw_deg: float):
     of = scenario(yaw_deg=yaw_deg + 70.0)  # the scenario's own heading must not matter
     flight = Flight(8, start_s=100.0)
     flight.yaw_start = math.radians(yaw_deg)
     estimates = fly(estimator(of), readings(flight, of, 8, 3.0), 3.0)
     off = np.abs(errors(flight, estimates)[2])
-    assert off[int(0.1 / GATE_S)] < 0.25  # rad, from the first reading or two of 0.05 rad
+    assert off[int(0.1 / GATE_S)] < 0.25  # rad; the first one or two readings have a noise of 0.05 rad
     assert off[-1] < min(0.03, 4.0 * estimates[-1][1].yaw_sigma_rad)
 
 
-def test_without_a_magnetometer_the_heading_is_the_one_it_was_set_down_with():
+def test_the_heading_without_a_magnetometer_starts_at_the_scenario_s():
     flight = Flight(9, start_s=100.0)
     flight.yaw_start = math.radians(-100.0)
     of = scenario(yaw_deg=-100.0, estimation={"magnetometer": False})
@@ -219,7 +219,7 @@ def test_without_a_magnetometer_the_heading_is_the_one_it_was_set_down_with():
     assert estimates[-1][1].sensors["mag"] == (0, 0)
 
 
-def test_a_gyro_bias_is_found_and_the_covariance_stays_positive_and_symmetric():
+def test_a_gyro_bias_is_estimated_with_a_symmetric_positive_covariance():
     quiet = {"gyro_deg_s": {"noise": 0.06, "bias": 0.0, "bias_walk": 0.0, "quantum": 0.0}}
     bias = (0.002, -0.003, 0.0015)  # rad/s; the preset's sigma is 0.0017
     coming = [
@@ -235,8 +235,8 @@ def test_a_gyro_bias_is_found_and_the_covariance_stays_positive_and_symmetric():
     assert end.gyro_bias_rad_s == pytest.approx(bias, abs=3e-4)
 
 
-def test_late_fixes_are_compared_with_the_past():
-    """At a steady 2 m/s, 400 ms of latency are 0.8 m if they are not made good."""
+def test_late_fixes_are_compared_with_the_past_state():
+    """At a steady 2 m/s, an uncompensated latency of 400 ms is an error of 0.8 m."""
     of = scenario(sensors={"gps": {"latency_ms": 400.0, "position_m": {"noise": 0.05}}})
     cruise = 2.0  # m/s
     core = estimator(of)
@@ -256,7 +256,7 @@ def test_late_fixes_are_compared_with_the_past():
     assert end.sensors["gps"][1] == 0
 
 
-def test_latencies_of_all_sensors_are_made_good():
+def test_latencies_of_all_sensors_are_compensated():
     late = {name: {"latency_ms": {"gps": 300.0, "imu": 10.0}.get(name, 80.0)} for name in (*AIDING, "imu")}
     _, flight, _, estimates = flown(seed=11, end_s=30.0, sensors=late)
     _, velocity, heading = rms(flight, estimates, 15.0)
@@ -276,18 +276,18 @@ MOUNTS = {
 }
 
 
-def test_mounts_are_taken_off():
+def test_mounts_of_sensors_are_compensated():
     of, flight = scenario(sensors=MOUNTS), Flight(12, yaw_rate=0.8, accel=0.8)
     coming = readings(flight, of, 12, 30.0)
     estimates = fly(estimator(of), coming, 30.0)
     position, velocity, heading = rms(flight, estimates, 15.0)
-    assert position.max() < 0.05  # m; the antenna alone is 0.9 m off
+    assert position.max() < 0.05  # m; the antenna is offset by 0.9 m in z alone
     assert velocity < 0.045
     assert heading < 0.01
     assert nees(flight, estimates, 15.0) < chi2.ppf(0.999, 6)
     unmounted = {name: {k: v for k, v in s.items() if k != "mount"} for name, s in MOUNTS.items() if name != "imu"}
     wrong = scenario(sensors=unmounted | {"imu": MOUNTS["imu"], "mag": MOUNTS["mag"]})
-    assert rms(flight, fly(estimator(wrong), coming, 30.0), 15.0)[0].max() > 0.15  # without them it is far off
+    assert rms(flight, fly(estimator(wrong), coming, 30.0), 15.0)[0].max() > 0.15  # without the mounts, it is large
 
 
 def test_biases_of_aiding_sensors_widen_the_covariance():
@@ -302,7 +302,7 @@ def test_biases_of_aiding_sensors_widen_the_covariance():
 
 
 @pytest.mark.parametrize("preset", ["paper", "ardrone2"])
-def test_a_warm_start_goes_on_where_it_was(preset: str):
+def test_a_warm_start_continues_the_estimates(preset: str):
     of, flight, coming, unbroken = flown(seed=13, end_s=30.0, preset=preset)
     at = round(20.0 / GATE_S) - 1
     core = estimator(of)
@@ -316,7 +316,7 @@ def test_a_warm_start_goes_on_where_it_was(preset: str):
     assert nees(flight, resumed, 20.0) < chi2.ppf(0.999, 6)
 
 
-def test_a_cold_start_in_flight_converges_and_without_any_imu_the_others_still_place_the_drone():
+def test_a_cold_start_in_flight_converges_even_without_an_imu():
     of, flight, coming, _ = flown(seed=3, end_s=30.0)
     blind = fly(estimator(of), [r for r in coming if r.sensor != "imu"], 20.0)
     assert rms(flight, blind, 10.0)[0].max() < 2.0
@@ -327,7 +327,7 @@ def test_a_cold_start_in_flight_converges_and_without_any_imu_the_others_still_p
     assert nees(flight, estimates, 20.0) < chi2.ppf(0.999, 6)
 
 
-def test_without_an_imu_the_covariance_grows_and_comes_back():
+def test_the_covariance_grows_during_an_imu_dropout_and_recovers():
     of, flight, coming, _ = flown(seed=14, end_s=30.0)
     gap = [r for r in coming if not 15.0 < r.t_s < 20.0 or r.sensor == "gps"]
     estimates = {round(t, 2): e for t, e in fly(estimator(of), gap, 30.0)}
@@ -342,7 +342,7 @@ def test_without_an_imu_the_covariance_grows_and_comes_back():
     assert rms(flight, list(estimates.items()), 25.0)[1] < 0.05
 
 
-def test_nothing_at_all_gives_a_wide_finite_estimate():
+def test_an_estimate_without_readings_is_finite_with_a_wide_covariance():
     core = estimator(scenario())
     estimate = [core.close(k * GATE_S) for k in range(1, 101)][-1]
     assert np.isfinite(estimate.covariance).all()
@@ -350,7 +350,7 @@ def test_nothing_at_all_gives_a_wide_finite_estimate():
     assert estimate.sensors == dict.fromkeys(("gps", "mag", "baro", "sonar", "flow", "imu"), (0, 0))
 
 
-def test_a_jump_of_gps_is_refused_at_first_and_believed_when_it_stays():
+def test_a_gps_jump_is_refused_at_first_and_accepted_if_it_persists():
     of, flight, coming, _ = flown(seed=16, end_s=40.0)
     jumped = [
         r._replace(values=(tuple(np.add(r.values[0], (30.0, 0.0, 0.0)).tolist()), *r.values[1:]))
@@ -364,7 +364,7 @@ def test_a_jump_of_gps_is_refused_at_first_and_believed_when_it_stays():
     assert east[-1] == pytest.approx(30.0, abs=2.0)
 
 
-def test_the_gain_follows_the_accelerometer():
+def test_the_madgwick_gain_follows_the_accelerometer_noise():
     gains = {}
     for name, of in {"paper": scenario(), "printed": scenario(sensors={"as_printed": True})}.items():
         imu = of.drones[0].sensors.imu

@@ -1,4 +1,4 @@
-"""A bank of drones: each as if it were alone, sound whatever comes in; gates are read as their messages are."""
+"""The estimator bank: independence of the drones, robustness to bad readings, and reading of whole gates."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.estimation.estimator_bank import EstimatorBank
 from zsim_world.run.world import World
 
-END_S = 8.0  # s, of a flight that starts at 2 s
+END_S = 8.0  # s, end of a flight that starts at 2 s
 ASIDE = {"mount": {"position_m": [0.1, -0.05, 0.04], "rpy_deg": [10.0, -20.0, 160.0]}}
 BIASED = {"bias": 0.3, "bias_walk": 0.01}
 KINDS = ("imu", "gps", "mag", "baro", "sonar", "flow")
@@ -29,7 +29,7 @@ Change = Callable[[list[Reading], np.random.Generator], list[Reading]]
 
 
 def gates(coming: Sequence[Reading]) -> list[list[Reading]]:
-    """Sort readings by the gate at whose end they are used."""
+    """Group readings by the gate at whose end they are used."""
     sorted_in: list[list[Reading]] = [[] for _ in range(round(END_S / GATE_S) + 1)]
     for reading in coming:
         sorted_in[min(math.ceil(reading.t_s / GATE_S - 1e-6), len(sorted_in) - 1)].append(reading)
@@ -41,7 +41,7 @@ def bank_of(of: Scenario) -> EstimatorBank:
 
 
 def fly(bank: EstimatorBank, by_gate: Sequence[Sequence[Sequence[Reading]]], span: range) -> list[list[StateEstimate]]:
-    """Return the estimates of each gate of a span, from the readings of each drone by gate."""
+    """Return the estimates at each gate of a span, given the readings of each drone by gate."""
     estimates = []
     for gate in span:
         for i, each in enumerate(by_gate):
@@ -52,12 +52,12 @@ def fly(bank: EstimatorBank, by_gate: Sequence[Sequence[Sequence[Reading]]], spa
 
 
 def same(a: list[StateEstimate], b: list[StateEstimate]) -> bool:
-    """Equal to the bit; repr tells numbers apart that differ in any bit, and NaN is NaN."""
+    """Return whether estimates are equal to the bit: repr differs if any bit does, and NaN equals NaN."""
     return repr(a) == repr(b)
 
 
 def as_if_alone(of: Scenario, coming: Sequence[Sequence[Reading]]) -> list[list[StateEstimate]]:
-    """Fly a bank of all drones, and one of each: the estimates must be the same. Return them by gate."""
+    """Assert that one bank of all drones and a bank for each give the same estimates; return them by gate."""
     by_gate, span = [gates(each) for each in coming], range(1, round(END_S / GATE_S) + 1)
     among = fly(bank_of(of), by_gate, span)
     for i, drone in enumerate(of.drones):
@@ -67,7 +67,7 @@ def as_if_alone(of: Scenario, coming: Sequence[Sequence[Reading]]) -> list[list[
 
 
 def nees(flight: Flight, t_s: float, estimate: StateEstimate) -> float:
-    """Return e^T P^-1 e of position and velocity."""
+    """Return e^T P^-1 e for position and velocity."""
     t = np.array([t_s])
     truth = np.concatenate([flight.position(t)[0], flight.velocity(t)[0]])
     error = truth - (*estimate.position_m, *estimate.velocity_m_s)
@@ -75,7 +75,7 @@ def nees(flight: Flight, t_s: float, estimate: StateEstimate) -> float:
 
 
 def three(preset: str = "paper", **sections: Any) -> Scenario:
-    """Return a scenario of three drones with error states of different sizes, the last with every sensor aside."""
+    """Return a scenario of three drones with error states of different sizes; on the last, every sensor is offset."""
     biased = {"gps": "position_m", "baro": "altitude_m", "flow": "velocity_m_s"}
     aside = {kind: ASIDE | ({biased[kind]: BIASED} if kind in biased else {}) for kind in KINDS}
     drones = [
@@ -90,13 +90,13 @@ def three(preset: str = "paper", **sections: Any) -> Scenario:
 
 @cache
 def flights(seed: int) -> list[Flight]:
-    """Return a flight of its own for each drone."""
+    """Return a separate flight for each drone."""
     return [Flight(seed + i, start_s=2.0, yaw_rate=0.3 * i) for i in range(3)]
 
 
 @cache
 def flown(seed: int, preset: str = "paper") -> list[list[Reading]]:
-    """Return what each drone's sensors say of a flight of its own; vectors are tuples, as messages have them."""
+    """Return the readings of each drone's sensors in its own flight; vectors are tuples, as in messages."""
     of = three(preset)
     pairs = zip(of.drones, flights(seed), strict=True)
     alone = [(msgspec.structs.replace(of, drones=[drone]), flight) for drone, flight in pairs]
@@ -122,17 +122,17 @@ def test_each_drone_is_estimated_as_if_it_were_alone(preset: str, settings: dict
 
 
 def lost(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
-    """A third of everything does not come."""
+    """Drop a third of all readings."""
     return [reading for reading in coming if rng.random() > 0.33]
 
 
 def silent_imu(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
-    """The IMU says nothing for a second and a half: dead reckoning coasts."""
+    """Drop IMU readings for 1.5 s: dead reckoning coasts."""
     return [reading for reading in coming if reading.sensor != "imu" or not 4.0 < reading.t_s < 5.5]
 
 
 def shuffled(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
-    """Readings come in any order, some twice, some a second late."""
+    """Deliver readings in any order, some of them twice and some up to a second late."""
     again = [reading for reading in coming if rng.random() < 0.1]
     late = [reading._replace(t_s=reading.t_s + rng.uniform(0.0, 1.0)) for reading in coming if rng.random() < 0.1]
     mixed = [*coming, *again, *late]
@@ -140,7 +140,7 @@ def shuffled(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
 
 
 def impossible(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
-    """One in ten has a value that no sensor can read."""
+    """Give one reading in ten a value that no sensor can measure."""
 
     def spoilt(reading: Reading) -> Reading:
         bad, values = float(rng.choice([math.nan, math.inf, 1e9, -700.0, 0.0])), list(reading.values)
@@ -156,7 +156,7 @@ def impossible(coming: list[Reading], rng: np.random.Generator) -> list[Reading]
 
 
 def displaced(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
-    """From 2.5 s on GPS, barometer and flow are far off: refused until patience ends, then believed."""
+    """Offset GPS, magnetometer, barometer and flow from 2.5 s: they are refused until patience ends, then accepted."""
     shift = {"gps": 60.0, "baro": 30.0, "flow": 9.0, "mag": 40.0}
 
     def moved(reading: Reading) -> Reading:
@@ -169,13 +169,13 @@ def displaced(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
 
 
 def crowded(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
-    """A link stood still and gives half a second's readings to one gate: more than one update can hold."""
+    """Deliver half a second of readings to one gate, as after a stalled link: more than one update can hold."""
     held = [5.4 < r.t_s <= 5.5 or (r.sensor != "imu" and 5.0 < r.t_s <= 5.4) for r in coming]
     return [r._replace(t_s=5.5) if late else r for r, late in zip(coming, held, strict=True)]
 
 
 @pytest.mark.parametrize("change", [lost, silent_imu, shuffled, impossible, displaced, crowded])
-def test_whatever_comes_in(change: Change):
+def test_estimates_stay_sound_under_disturbed_readings(change: Change):
     of, rng = three(), np.random.default_rng(5)
     among = as_if_alone(of, [change(coming, rng) for coming in flown(4)])
     for estimate in among[-1]:
@@ -188,11 +188,11 @@ def test_whatever_comes_in(change: Change):
         assert max(nees(flight, END_S, estimate) for flight, estimate in each) < chi2.ppf(1.0 - 1e-6, 6)
 
 
-def test_a_restart_goes_on_from_what_was_published():
+def test_a_restarted_bank_continues_from_published_estimates():
     of, by_gate = three(), [gates(each) for each in flown(6)]
     last = fly(bank_of(of), by_gate, range(1, 300))[-1]
     bank = bank_of(of)
-    bank.receive(0, "airspeed", object(), 0.02)  # a sensor that it does not know
+    bank.receive(0, "airspeed", object(), 0.02)  # an unknown sensor
     assert same(bank.estimate(0.02), bank_of(of).estimate(0.02))
     bank = bank_of(of)
     for i, estimate in enumerate(last):
@@ -201,7 +201,7 @@ def test_a_restart_goes_on_from_what_was_published():
         assert nees(flight, 399 * GATE_S, estimate) < chi2.ppf(1.0 - 1e-6, 6)
 
 
-# Sensors out of a gate
+# Sensor messages of a gate
 
 DRONES = ("d1", "d2", "d3")
 
@@ -224,7 +224,7 @@ compiled = pytest.mark.skipif(not COMPILES, reason="numba is not installed: gate
 
 
 def estimates(agent: Estimator, gates: list[GateMessages], whole: bool) -> list[object]:
-    """Return what an estimator says of a flight, handed over as gates or as messages in the order of a runner."""
+    """Return an estimator's outputs for a flight, delivered as gates or as messages in the order of a runner."""
     outputs = []
     for gate in gates:
         if whole:
@@ -250,10 +250,10 @@ def test_a_gate_gives_the_estimates_of_its_messages(
 
 
 @compiled
-def test_a_message_that_the_world_would_not_write_so_is_decoded_all_the_same(
+def test_a_message_in_an_unusual_encoding_is_decoded_all_the_same(
     flight: tuple[World, list[GateMessages]],
 ) -> None:
-    """One whose floats are whole numbers on the wire: right, but not what the compiled reader knows."""
+    """Its floats are encoded as integers: valid, but not supported by the compiled reader."""
     world, gates = flight
     gate = next(b for b in gates if any(key.endswith("mag") for key, _ in b.pairs))
     whole_ut = {"field_ut": [20, 0, -40]}
@@ -266,7 +266,7 @@ def test_a_message_that_the_world_would_not_write_so_is_decoded_all_the_same(
     assert estimates(whole, changed, whole=True) == estimates(each, changed, whole=False)
 
 
-def test_columns_that_lead_outside_are_not_followed(flight: tuple[World, list[GateMessages]]) -> None:
+def test_out_of_range_columns_of_a_gate_are_ignored(flight: tuple[World, list[GateMessages]]) -> None:
     world, gates = flight
     b, agent = gates[0], Estimator(world.info(), world.scenario, DRONES)
     for which, ends in (

@@ -1,4 +1,4 @@
-"""The phase machine flown on ideal drones: phases, refusals, faults in flight, plans."""
+"""The phase machine of the engagement with ideal drones: phases, refusals, faults in flight, plans."""
 
 import copy
 import math
@@ -23,7 +23,7 @@ from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 SPACE = cluster_space(3)
 DRONES = ("drone1", "drone2", "drone3")
-GROUND = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # where the drones take off
+GROUND = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # take-off positions, m
 GATE_S = 0.02
 PAPER_3 = {
     "x_c": 5, "y_c": -5, "z_c": 15, "roll": 0, "pitch": 0, "yaw": math.pi / 2,
@@ -46,7 +46,7 @@ class Fleet:
         self.v_W, self.yaw_rate = np.zeros_like(p_W), np.zeros(len(p_W))
         self.states = ["landed"] * len(p_W)
         self.gate = 0
-        self.spoil = {}  # fields of the next inputs, for faults
+        self.spoil = {}  # fields that replace those of the next inputs, to inject faults
         self.modes, self.closest_m, self._output = [], math.inf, None
 
     @property
@@ -111,7 +111,7 @@ class Fleet:
 
 
 def rising_fleet(noise_m=0.0):
-    """Return a fleet that was just told to take off."""
+    """Return a fleet that has just been commanded to take off."""
     fleet = Fleet(Engagement(SPACE, DRONES), noise_m)
     fleet.fly(0.1)
     assert fleet.engagement.request(Order.TAKE_OFF) is None
@@ -135,7 +135,7 @@ def engaged(noise_m):
 
 
 def assert_refused(fleet, request, *terms):
-    """Assert the refusal and that nothing changes by it."""
+    """Assert that the request is refused and changes nothing."""
     before = fleet.engagement.guidance.value(fleet.t_s)
     reason = fleet.engagement.request(request)
     assert reason is not None
@@ -148,7 +148,7 @@ def assert_refused(fleet, request, *terms):
 # The flight from the ground to the paper's formation
 
 
-def test_the_paper_s_first_test_is_flown_from_the_ground_triangle():
+def test_the_paper_s_first_test_reaches_its_target_from_the_ground():
     plan = [Scheduled(20.0, Order.TAKE_OFF), Scheduled(20.0, Order.ENGAGE), Scheduled(20.0, MoveTo(PAPER_3))]
     fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
     outputs = fleet.fly(120.0)
@@ -178,7 +178,7 @@ def test_drones_climb_straight_up_until_they_are_engaged():
     assert fleet.p_W[:, 2] == pytest.approx(np.full(3, 1.5), abs=0.01)
 
 
-def test_engagement_and_every_request_in_flight_start_without_a_bump():
+def test_engagement_and_requests_in_flight_are_bumpless():
     fleet = engaged_fleet()
     outputs = [fleet.output]
     plan = (
@@ -207,7 +207,7 @@ def test_the_reference_starts_at_the_estimate_when_engaged():
     assert not output.desired_rate.any()
 
 
-def test_a_trajectory_is_reached_before_its_start_and_then_followed():
+def test_the_start_of_a_trajectory_is_reached_before_it_begins():
     fleet = engaged_fleet()
     start_s = fleet.t_s + 60.0
     assert fleet.engagement.request(Follow(PAPER_4, {"f": 0.01}, start_s=start_s)) is None
@@ -221,7 +221,7 @@ def test_a_trajectory_is_reached_before_its_start_and_then_followed():
     assert max(np.abs(SPACE.difference(o.desired, o.value)).max() for o in outputs[500:]) < 0.05
 
 
-def test_waypoints_end_and_the_formation_stays():
+def test_the_formation_stays_at_the_last_waypoint():
     fleet = engaged_fleet()
     points = [{"at_s": 0.0, "values": {"z_c": 3.0}}, {"at_s": 10.0, "values": {"z_c": 6.0}}]
     assert fleet.engagement.request(Follow(waypoints=points)) is None
@@ -290,7 +290,7 @@ def test_requests_that_do_not_fit_the_phase_are_refused():
     ],
     ids=["sigma", "heading", "old", "none", "nan", "emergency", "mirrored", "line", "near", "narrow"],
 )
-def test_take_off_is_refused_from_a_bad_start(spoil, terms):
+def test_take_off_is_refused_from_a_bad_initial_state(spoil, terms):
     fleet = Fleet(Engagement(SPACE, DRONES))
     fleet.spoil = spoil
     fleet.fly(0.1)
@@ -300,7 +300,7 @@ def test_take_off_is_refused_from_a_bad_start(spoil, terms):
     assert fleet.engagement.request(Order.TAKE_OFF) is None
 
 
-def test_a_take_off_command_that_was_lost_is_sent_again_and_engagement_waits_for_height_and_says_so():
+def test_a_lost_take_off_is_repeated_and_engagement_is_refused_too_low():
     fleet = rising_fleet()
     fleet.spoil = {"states": ("landed",) * 3}
     fleet.fly(2.5)
@@ -328,7 +328,7 @@ def test_a_take_off_command_that_was_lost_is_sent_again_and_engagement_waits_for
     ],
     ids=["old", "nan", "inf", "sigma", "heading", "emergency", "line", "narrow"],
 )
-def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spoil, terms):
+def test_a_fault_in_flight_holds_the_formation_which_resumes_bumplessly(spoil, terms):
     fleet = engaged_fleet()
     assert fleet.engagement.request(MoveTo({"z_c": 6.0, "x_c": 5.0})) is None
     fleet.fly(5.0)
@@ -353,16 +353,16 @@ def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spo
     assert fleet.output.value[[0, 2]] == pytest.approx([5.0, 6.0], abs=0.02)
 
 
-def test_a_formation_recovers_from_a_shape_in_which_it_could_not_be_engaged():
+def test_a_formation_recovers_from_shapes_unfit_for_engagement():
     fleet = engaged_fleet()
-    fleet.p_W[1:, 0] *= 0.7 / 3.354  # robots 2 and 3 far too near to each other, held and parted by the guard
+    fleet.p_W[1:, 0] *= 0.7 / 3.354  # robots 2 and 3 are much too close: the guard parts them
     fleet.fly(1.0)
     assert fleet.output.phase == "held"
     fleet.fly(40.0)
     assert fleet.output.phase == "engaged"
     assert closest_pair(fleet.p_W)[0] == pytest.approx(3.0, abs=0.05)
     fleet.spoil = {"age_s": np.full(3, 1.0)}
-    # almost in line: spread 0.8 m, between the limit in flight and that of engagement
+    # almost in line: a spread of 0.8 m is between the limits for flight and for engagement
     fleet.p_W[:, :2] = (0.0, 0.4), (-2.47, 0.0), (2.47, 0.0)
     fleet.fly(1.0)
     fleet.spoil = {}
@@ -371,7 +371,7 @@ def test_a_formation_recovers_from_a_shape_in_which_it_could_not_be_engaged():
     assert fleet.output.margin > 2.5
 
 
-def test_a_trajectory_that_has_begun_is_joined_in_motion_also_after_a_fault():
+def test_a_running_trajectory_is_joined_in_motion_even_after_a_fault():
     fleet = engaged_fleet()
     start_s = fleet.t_s - 30.0
     assert fleet.engagement.request(Follow(PAPER_4, {"f": 0.01}, start_s=start_s)) is None
@@ -389,7 +389,7 @@ def test_a_trajectory_that_has_begun_is_joined_in_motion_also_after_a_fault():
     assert fleet.closest_m > 2.0
 
 
-def test_robots_that_are_driven_together_are_parted_and_reported():
+def test_robots_that_are_too_close_are_parted_and_reported():
     fleet = engaged_fleet()
     fleet.fly(1.0)
     fleet.p_W[2] = fleet.p_W[1] + (1.3, 0.0, 0.0)
@@ -401,8 +401,8 @@ def test_robots_that_are_driven_together_are_parted_and_reported():
     assert fleet.output.phase == "engaged"
 
 
-def test_a_reference_that_fails_after_its_check_holds_the_formation(monkeypatch):
-    """Endless trajectories are checked for a while only; this one closes in later."""
+def test_a_reference_that_becomes_infeasible_holds_the_formation(monkeypatch):
+    """Endless trajectories are checked over a finite horizon; this one closes in after it."""
     monkeypatch.setattr(guidance, "HORIZON_S", 30.0)
     fleet = engaged_fleet()
     shape = {"z_c": "5", "beta": "0.93 - max(0, t - 40)/50"}
@@ -415,11 +415,11 @@ def test_a_reference_that_fails_after_its_check_holds_the_formation(monkeypatch)
     assert fleet.closest_m > 1.9
 
 
-# A drone that has landed, and flies again far below its formation
+# A drone that landed and hovers again far below its formation
 
 
 def fleet_out_of_step(height_m=8.0, away_m=(0.0, 0.0)):
-    """Return a fleet of which drone2 was landed in formation flight, moved over the ground, and flown again."""
+    """Return a fleet whose drone2 landed in formation flight, was moved on the ground and took off again."""
     fleet = engaged_fleet()
     assert fleet.engagement.request(MoveTo({"z_c": height_m})) is None
     fleet.fly(40.0)
@@ -435,7 +435,7 @@ def fleet_out_of_step(height_m=8.0, away_m=(0.0, 0.0)):
 
 
 @pytest.mark.parametrize("away_m", [(0.0, 0.0), (6.0, 5.0)], ids=["beneath", "beyond the others"])
-def test_a_drone_far_below_its_formation_stays_there_until_it_is_to_rejoin(away_m):
+def test_a_drone_far_below_its_formation_hovers_until_rejoin_is_requested(away_m):
     fleet = fleet_out_of_step(away_m=away_m)
     fleet.fly(10.0)
     assert has_terms(fleet.output.reason, "roll")
@@ -444,7 +444,7 @@ def test_a_drone_far_below_its_formation_stays_there_until_it_is_to_rejoin(away_
     assert has_terms(fleet.step().reason, "drone2", "place", "1")
     outputs, low_m = [], fleet.p_W[1, 2]
     place = fleet.engagement.space.inverse(fleet.engagement.guidance.value(fleet.t_s)[0])[0][1]
-    while np.linalg.norm(fleet.p_W[1, :2] - place[:2]) > 1.0:  # over the ground first, and then straight up
+    while np.linalg.norm(fleet.p_W[1, :2] - place[:2]) > 1.0:  # first horizontally, then straight up
         outputs.append(fleet.step())
         assert fleet.t_s < 200.0
         assert fleet.p_W[1, 2] == pytest.approx(low_m, abs=0.05)
@@ -456,7 +456,7 @@ def test_a_drone_far_below_its_formation_stays_there_until_it_is_to_rejoin(away_
     assert max(speeds) <= 2.0
 
 
-def test_to_rejoin_needs_a_formation_held_by_a_fault_and_drones_that_fly_and_nothing_else_is_granted():
+def test_rejoin_is_refused_unless_a_fault_holds_a_flying_formation():
     fleet = engaged_fleet()
     assert_refused(fleet, Order.REJOIN, "phase", "engaged", "held")
     fleet.engagement.request(Order.PAUSE)
@@ -474,7 +474,7 @@ def test_to_rejoin_needs_a_formation_held_by_a_fault_and_drones_that_fly_and_not
 
 
 @pytest.mark.parametrize("end", [Order.PAUSE, "landing", "stale"])
-def test_a_hold_a_landing_and_a_lost_estimate_end_the_way_back(end):
+def test_a_hold_a_landing_and_a_lost_estimate_end_the_rejoin(end):
     fleet = fleet_out_of_step(away_m=(6.0, 5.0))
     assert fleet.engagement.request(Order.REJOIN) is None
     fleet.fly(1.0)
@@ -499,7 +499,7 @@ def test_a_hold_a_landing_and_a_lost_estimate_end_the_way_back(end):
 # Hold, resume, land
 
 
-def test_hold_stops_the_formation_where_it_is_also_through_a_fault_and_engage_resumes():
+def test_a_hold_persists_through_a_fault_until_engage_is_requested():
     fleet = engaged_fleet()
     assert fleet.engagement.request(MoveTo({"z_c": 12.0})) is None
     fleet.fly(8.0)
@@ -508,10 +508,10 @@ def test_hold_stops_the_formation_where_it_is_also_through_a_fault_and_engage_re
     height = fleet.p_W[0, 2]
     assert fleet.output.phase == "held"
     assert has_terms(fleet.output.reason, "held", "request")
-    fleet.p_W += (0.5, 0.0, 0.0)  # a push: held formations keep their place
+    fleet.p_W += (0.5, 0.0, 0.0)  # a push: a held formation returns to its place
     fleet.fly(15.0)
     assert fleet.p_W[:, 0].mean() == pytest.approx(0.0, abs=0.05)
-    fleet.spoil = {"age_s": np.full(3, 2.0)}  # a hold is kept through a fault
+    fleet.spoil = {"age_s": np.full(3, 2.0)}  # the hold persists through a fault
     fleet.fly(2.0)
     fleet.spoil = {}
     fleet.fly(5.0)
@@ -525,7 +525,7 @@ def test_hold_stops_the_formation_where_it_is_also_through_a_fault_and_engage_re
     assert fleet.output.value[2] == pytest.approx(12.0, abs=0.02)
 
 
-def test_landing_ends_idle_and_a_second_flight_is_possible_without_the_integral_of_the_last():
+def test_a_second_flight_after_landing_starts_with_a_zero_integral():
     fleet = engaged_fleet()
     fleet.p_W += (1.0, 0.0, 0.0)
     fleet.fly(3.0)
@@ -546,9 +546,9 @@ def test_landing_ends_idle_and_a_second_flight_is_possible_without_the_integral_
     assert not fleet.engagement.law.integral.any()
 
 
-def test_a_drone_that_takes_off_after_it_was_called_off_is_landed():
+def test_a_drone_that_takes_off_after_a_landing_request_is_landed():
     fleet = rising_fleet()
-    fleet.spoil = {"states": ("landed",) * 3}  # the command is on its way
+    fleet.spoil = {"states": ("landed",) * 3}  # the command has not arrived yet
     fleet.step()
     assert fleet.engagement.request(Order.LAND) is None
     fleet.fly(0.2)
@@ -565,7 +565,7 @@ def test_a_drone_that_takes_off_after_it_was_called_off_is_landed():
 FLIGHT = [Scheduled(1.0, Order.TAKE_OFF), Scheduled(1.0, Order.ENGAGE), Scheduled(1.0, MoveTo({"z_c": 8.0}))]
 
 
-def test_a_land_of_the_plan_drops_what_still_waits():
+def test_a_landing_in_the_plan_drops_pending_steps():
     plan = [*FLIGHT[:2], Scheduled(2.0, MoveTo({"beta": 0.1})), Scheduled(15.0, Order.LAND)]
     fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
     fleet.fly(14.0)
@@ -576,7 +576,7 @@ def test_a_land_of_the_plan_drops_what_still_waits():
     fleet.fly_until("idle")
 
 
-def test_a_land_by_request_drops_the_plan():
+def test_a_requested_landing_drops_the_plan():
     fleet = Fleet(Engagement(SPACE, DRONES, plan=[Scheduled(1.0, Order.TAKE_OFF), Scheduled(30.0, Order.TAKE_OFF)]))
     fleet.fly(5.0)
     assert fleet.engagement.request(Order.LAND) is None
@@ -584,7 +584,7 @@ def test_a_land_by_request_drops_the_plan():
     assert fleet.output.phase == "idle"
 
 
-def test_a_controller_that_restarts_in_flight_takes_the_formation_over():
+def test_a_controller_restarted_in_flight_takes_over_the_formation():
     fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
     fleet.fly(20.0)
     modes = len(fleet.modes)
@@ -596,14 +596,14 @@ def test_a_controller_that_restarts_in_flight_takes_the_formation_over():
 
 
 def restarted(fleet, plan):
-    """Put a new engagement in the place of the fleet's, as a controller that restarts does."""
+    """Replace the fleet's engagement by a new one, as a restarting controller does."""
     last = fleet.output
     fleet.engagement = Engagement(SPACE, DRONES, plan=plan)
     fleet.engagement.warm_start(last.phase, last.desired, last.plan_step)
 
 
 def assert_the_same_from_here(fleet, plan, seconds=13.0):
-    """Fly the fleet, and a copy whose engagement is another one with the snapshot of the former."""
+    """Assert that the fleet and a copy whose engagement is restored from a snapshot fly identically."""
     copied = copy.deepcopy(fleet)
     copied.engagement = Engagement(SPACE, DRONES, plan=plan)
     copied.gate -= 1
@@ -635,7 +635,7 @@ ALL_PHASES = [*FLIGHT, Scheduled(12.0, Follow(expressions=PAPER_4, constants={"f
         (Order.LAND, 12.0),
     ],
 )
-def test_one_that_is_restored_goes_on_to_the_same_bits(request_, at_s):
+def test_a_restored_engagement_continues_bit_for_bit(request_, at_s):
     fleet = Fleet(Engagement(SPACE, DRONES, plan=ALL_PHASES))
     fleet.fly(at_s - 1.0 if request_ else at_s)
     if request_:
@@ -644,7 +644,7 @@ def test_one_that_is_restored_goes_on_to_the_same_bits(request_, at_s):
     assert_the_same_from_here(fleet, ALL_PHASES)
 
 
-def test_one_that_is_restored_on_the_way_back_goes_on_to_the_same_bits():
+def test_an_engagement_restored_during_a_rejoin_continues_bit_for_bit():
     fleet = fleet_out_of_step(away_m=(3.0, 0.0))
     assert fleet.engagement.request(Order.REJOIN) is None
     fleet.fly(2.0)
@@ -656,10 +656,10 @@ def test_one_that_is_restored_on_the_way_back_goes_on_to_the_same_bits():
     ("spoil", "at_s", "phase"),
     [
         ({"age_s": np.array([0.0, 5.0, 0.0])}, 15.0, "held"),
-        ({"states": ("landed",) * 3}, 0.9, "taking_off"),  # nobody obeys, so it commands again
+        ({"states": ("landed",) * 3}, 0.9, "taking_off"),  # no drone obeys, so the command is repeated
     ],
 )
-def test_one_that_is_restored_in_a_fault_goes_on_to_the_same_bits(spoil, at_s, phase):
+def test_an_engagement_restored_during_a_fault_continues_bit_for_bit(spoil, at_s, phase):
     fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
     fleet.fly(at_s)
     fleet.spoil = spoil
@@ -671,7 +671,7 @@ def test_one_that_is_restored_in_a_fault_goes_on_to_the_same_bits(spoil, at_s, p
 
 
 @pytest.mark.parametrize("gate", [10, 100, 300, 400, 700])
-def test_a_restart_in_any_phase_goes_on_with_the_plan(gate):
+def test_a_controller_restarted_in_any_phase_continues_the_plan(gate):
     fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
     fleet.fly(gate * GATE_S)
     restarted(fleet, FLIGHT)
@@ -682,7 +682,7 @@ def test_a_restart_in_any_phase_goes_on_with_the_plan(gate):
 
 
 @pytest.mark.parametrize("by_plan", [False, True])
-def test_a_restart_after_a_landing_stays_on_the_ground(by_plan):
+def test_a_controller_restarted_after_landing_stays_idle(by_plan):
     plan = [*FLIGHT, Scheduled(15.0, Order.LAND)] if by_plan else FLIGHT
     fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
     fleet.fly(16.0 if by_plan else 5.0)
@@ -696,7 +696,7 @@ def test_a_restart_after_a_landing_stays_on_the_ground(by_plan):
 
 
 @pytest.mark.parametrize(("request_", "height_m"), [(MoveTo({"z_c": 4.0}), 4.0), (Order.PAUSE, None)])
-def test_a_restart_does_not_undo_what_was_asked_after_the_plan(request_, height_m):
+def test_a_restart_preserves_requests_made_after_the_plan(request_, height_m):
     fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
     fleet.fly(12.0)
     assert fleet.engagement.request(request_) is None
@@ -731,7 +731,7 @@ def test_plans_that_can_never_be_flown_are_refused_at_once(plan, terms):
 
 
 @pytest.mark.parametrize("n", [2, 4])
-def test_other_numbers_of_drones_fly_too(n):
+def test_formations_of_two_and_four_drones_reach_their_targets(n):
     p_W = np.array([(0.0, 1.5, 0), (0.0, -1.5, 0)] if n == 2 else [*GROUND, (0.0, -4.5, 0)])
     plan = [*FLIGHT[:2], Scheduled(1.0, MoveTo({"z_c": 6.0, "p": 4.0}))]
     space = cluster_space(n)
@@ -742,7 +742,7 @@ def test_other_numbers_of_drones_fly_too(n):
     assert fleet.closest_m > 2.0
 
 
-def test_a_large_cluster_comes_into_its_template():
+def test_a_large_cluster_forms_its_template():
     ring = np.array([(4 * np.cos(k * np.pi / 3), 4 * np.sin(k * np.pi / 3), 0.0) for k in range(6)])
     space = TemplateCluster(ring)
     plan = [*FLIGHT[:2], Scheduled(1.0, MoveTo({"z_c": 4.0, "w_1": 0.5}))]
@@ -785,12 +785,12 @@ def test_requests_that_cannot_be_read_are_refused(op, args, terms):
         read_request(op, args)
 
 
-# Whatever comes in
+# Arbitrary inputs
 
 
 @settings(deadline=None, max_examples=60, derandomize=True)
 @given(st.integers(0, 2**32 - 1))
-def test_every_output_is_finite_whatever_the_estimates_states_and_requests(seed):
+def test_outputs_are_finite_for_any_estimates_states_and_requests(seed):
     rng = np.random.default_rng(seed)
     fleet = engaged_fleet()
     bad = [math.nan, math.inf, -math.inf, 1e300, -1e300, 0.0, 1e6]

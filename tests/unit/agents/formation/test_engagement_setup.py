@@ -1,4 +1,4 @@
-"""The engagement that a scenario asks for: its law and space, and plans that no formation can fly."""
+"""The engagement of a scenario: its law, its space, and the refusal of infeasible plans."""
 
 import re
 from pathlib import Path
@@ -72,7 +72,7 @@ class Named(TriadCluster):
 
 
 class Rates(ControlLaw):
-    """Asks for what a test says, and counts how often it is followed."""
+    """A law that commands given rates and adds up the time for which they are followed."""
 
     def __init__(self, space: ClusterSpace, r_dot: Array) -> None:
         super().__init__(space)
@@ -98,7 +98,7 @@ def scenario(**cluster: Any) -> Scenario:
     )
 
 
-def test_a_law_of_the_user_s_own_flies_and_without_a_name_the_stock_one(module: str) -> None:
+def test_a_user_s_law_is_loaded_and_the_built_in_one_by_default(module: str) -> None:
     made = scenario(law=f"{module}:Still")
     law = engagement_of(made, made.clusters[0]).law
     assert type(law).__name__ == "Still"
@@ -110,11 +110,11 @@ def test_a_law_of_the_user_s_own_flies_and_without_a_name_the_stock_one(module: 
     assert scenario_file.from_text(scenario_file.to_text(named)).clusters[0].law == "proportional"
 
 
-def test_a_space_of_the_user_s_own_gets_the_places_of_its_robots(module: str) -> None:
+def test_a_user_s_space_gets_the_places_of_its_robots(module: str) -> None:
     made = scenario(space=f"{module}:Named", template_m="[[1, 0, 0], [0, 1, 0], [0, -1, 0]]")
     space: Any = engagement_of(made, made.clusters[0]).space
     assert space.places.tolist() == [[1, 0, 0], [0, 1, 0], [0, -1, 0]]
-    with refused(ValueError, "11", "2"):  # without the names that it needs
+    with refused(ValueError, "11", "2"):  # its variables do not match the number of robots
         TriadCluster(2)
 
 
@@ -134,7 +134,7 @@ def test_a_space_of_the_user_s_own_gets_the_places_of_its_robots(module: str) ->
         ("space", "nowhere:Space", ("ModuleNotFoundError",)),
     ],
 )
-def test_what_cannot_be_flown_is_one_line(module: str, field: str, name: str, terms: tuple[str, ...]) -> None:
+def test_an_unusable_law_or_space_is_refused(module: str, field: str, name: str, terms: tuple[str, ...]) -> None:
     made = scenario(**{field: name})
     with pytest.raises(RunError) as raised:
         engagement_of(made, made.clusters[0])
@@ -145,7 +145,7 @@ def test_what_cannot_be_flown_is_one_line(module: str, field: str, name: str, te
 
 
 @pytest.mark.parametrize(("field", "stock"), [("space", "triad, template"), ("law", "proportional")])
-def test_a_name_that_is_none_is_a_fault_of_the_scenario(field: str, stock: str) -> None:
+def test_an_unknown_law_or_space_is_a_fault_of_the_scenario(field: str, stock: str) -> None:
     with pytest.raises(ScenarioError) as raised:
         scenario(**{field: "tirad"})
     (line,) = raised.value.faults
@@ -155,7 +155,7 @@ def test_a_name_that_is_none_is_a_fault_of_the_scenario(field: str, stock: str) 
 
 
 @pytest.mark.parametrize(("speed_m_s", "followed_s"), [(0.1, 0.02), (100.0, 0.0)])
-def test_every_law_is_saturated_and_knows_when_it_is_followed(speed_m_s: float, followed_s: float) -> None:
+def test_every_law_is_saturated_and_notified_when_it_is_followed(speed_m_s: float, followed_s: float) -> None:
     space = cluster_space(3)
     law = Rates(space, np.tile([speed_m_s, 0.0, 0.0, 0.0], 3))
     c = space.specimen(5.0)
@@ -194,26 +194,26 @@ def factor(text: str) -> float:
 
 
 @pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_the_scenarios_of_this_product_can_be_flown(path: Path) -> None:
+def test_the_provided_scenarios_can_be_flown(path: Path) -> None:
     scenario = scenario_file.load(path)
     assert [refusal(scenario)] * len(scenario.clusters) == [""] * len(scenario.clusters)
     for cluster in scenario.clusters:
         check_plan(scenario, cluster)
 
 
-def test_a_trajectory_that_is_too_fast_is_refused_with_the_factor_that_fits() -> None:
-    """A cubic from rest to rest over 30 m in 10 s has its peak at 1.5 × 3 m/s, three times the 1.5 m/s of the gains."""
+def test_a_trajectory_that_is_too_fast_is_refused_with_the_factor() -> None:
+    """A cubic from rest to rest over 30 m in 10 s peaks at 1.5 × 3 m/s, three times the 1.5 m/s of the gains."""
     text = refusal(pair(way(30, 10)))
     assert has_terms(text, "clusters[0].plan.trajectory", "3.00", "0.8")
     assert factor(text) == pytest.approx(3.0 / 0.8, rel=0.01)
     assert refusal(pair(way(30, 10 * factor(text)))) == ""
     assert refusal(pair(way(30, 10 * factor(text) / 1.2))) != ""
     assert refusal(pair(way(7, 10))) == ""
-    slow = pair(way(7, 10), limits={"horizontal_speed_m_s": 0.5})  # than its controller asks
+    slow = pair(way(7, 10), limits={"horizontal_speed_m_s": 0.5})  # slower than its controller commands
     assert factor(refusal(slow)) == pytest.approx(1.5 * 0.7 / 0.5 / 0.8, rel=0.01)
 
 
-def test_a_plan_is_not_judged_from_where_the_formation_is_singular(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plan_is_not_judged_if_the_formation_is_singular(monkeypatch: pytest.MonkeyPatch) -> None:
     def condition(self: ClusterSpace, c: Array) -> float:
         raise SingularClusterError("in line")
 
@@ -221,14 +221,14 @@ def test_a_plan_is_not_judged_from_where_the_formation_is_singular(monkeypatch: 
     assert refusal(pair(way(30, 10))) == ""
 
 
-def test_an_expression_is_judged_over_its_time() -> None:
+def test_an_expression_is_judged_over_its_duration() -> None:
     turns = "{{takeoff_s: 2, trajectory: {{start_s: 20, expressions: {{x_c: 0, y_c: 0, z_c: 3, yaw: {}*t}}}}}}"
     assert refusal(pair(turns.format(0.1))) == ""
     assert refusal(pair(way(30, 10).replace("takeoff_s: 2, ", ""))) == ""  # without a take-off it is not judged
     assert factor(refusal(pair(turns.format(2)))) > 1.0
 
 
-def test_what_is_over_before_it_can_begin_is_refused_with_the_earliest_time() -> None:
+def test_a_step_that_ends_before_it_can_begin_is_refused_with_a_time() -> None:
     assert has_terms(refusal(pair(way(1, 1, start_s=1))), "clusters[0].plan.trajectory", "3 s", "5 s")
     far = "{takeoff_s: 2, trajectory: {start_s: 10, waypoints: [{at_s: 0, values: {x_c: 90}}, {at_s: 9, values: {x_c: 92}}]}}"
     assert has_terms(text := refusal(pair(far)), "clusters[0].plan.trajectory", "19 s")
@@ -239,8 +239,8 @@ def test_what_is_over_before_it_can_begin_is_refused_with_the_earliest_time() ->
     assert refusal(pair("{takeoff_s: 2, target: {x_c: 1}, land_s: 3}")).startswith("clusters[0].plan.land_s")
 
 
-def test_a_target_that_is_too_far_for_its_time_is_refused_with_the_time_that_fits() -> None:
-    """A quintic from rest to rest has its peak at 15/8 of its mean speed."""
+def test_a_target_too_far_for_its_time_is_refused_with_a_feasible_time() -> None:
+    """A quintic from rest to rest peaks at 15/8 of its mean speed."""
     text = refusal(pair("{takeoff_s: 2, target: {x_c: 30}, target_over_s: 10}"))
     least_s = 15 / 8 * 30 / (0.8 * 1.5)
     assert has_terms(text, "clusters[0].plan.target_over_s", "10", f"{least_s / 10:.2g} times", f"{least_s:.1f} s")
@@ -257,9 +257,7 @@ def test_a_target_that_is_too_far_for_its_time_is_refused_with_the_time_that_fit
         ("{pitch: 1.2}", ("pitch", "68.8 deg", "30 deg")),
     ],
 )
-def test_a_place_that_is_not_allowed_is_refused_in_a_target_and_on_a_trajectory(
-    target: str, terms: tuple[str, ...]
-) -> None:
+def test_an_invalid_formation_is_refused_in_target_and_trajectory(target: str, terms: tuple[str, ...]) -> None:
     text = refusal(pair(f"{{takeoff_s: 2, target: {target}}}"))
     assert text.startswith("clusters[0].plan.target: ")
     trajectory = f"{{takeoff_s: 2, trajectory: {{start_s: 400, waypoints: [{{at_s: 0, values: {target}}}]}}}}"

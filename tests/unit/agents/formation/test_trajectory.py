@@ -1,4 +1,4 @@
-"""References: expressions with exact rates, waypoints, ramps, and what is refused."""
+"""References: expressions with exact rates, waypoints, ramps and refusals."""
 
 import math
 
@@ -71,7 +71,7 @@ def numeric_rate(reference, t_s, step=1e-5):
         ("+".join(["t"] * 90), 180, 90),
     ],
 )
-def test_expressions_have_their_value_and_exact_rate_at_2_s(text, value, rate):
+def test_expressions_have_the_expected_value_and_rate_at_2_s(text, value, rate):
     found = Expression("x_c", text, {"w": 3.0})(2.0)
     assert found == pytest.approx((value, rate), abs=1e-15, rel=1e-14)
 
@@ -114,13 +114,13 @@ def test_rates_of_nested_expressions_agree_with_finite_differences(t, w):
         ("1e308*10", ("value", "inf")),
         ("9" * 400, ("contains", "'999…")),
         ("t+" * 600 + "t", ("1201", "1000")),
-        ("-" * 990 + "t", ()),  # too deep for Python's parser or for ours
+        ("-" * 990 + "t", ()),  # too deep for Python's parser or for this one
         ("(" * 300 + "t" + ")" * 300, ("read",)),
         ("not " * 240 + "t", ("contains",)),
         ("t\0", ("read",)),
     ],
 )
-def test_what_is_no_allowed_expression_is_refused_in_one_line(text, terms):
+def test_an_invalid_expression_is_refused_in_one_line(text, terms):
     with refused(ExpressionError, *terms) as caught:
         Expression("x_c", text)
     assert str(caught.value).startswith("x_c: ")
@@ -131,7 +131,7 @@ def test_what_is_no_allowed_expression_is_refused_in_one_line(text, terms):
     ("text", "t"),
     [("1/(t - 1)", 1.0), ("log(5 - t)", 6.0), ("exp(t)", 1e4), ("sqrt(t)", 0.0), ("t*1e308", 100)],
 )
-def test_an_expression_without_a_finite_value_says_when(text, t):
+def test_a_value_that_is_not_finite_is_refused_with_its_time(text, t):
     with refused(ExpressionError, "x_c", f"{t:g}"):
         Expression("x_c", text)(t)
 
@@ -156,7 +156,7 @@ def test_bad_constants_are_refused(constants, terms):
         Expression("x_c", "t", constants)
 
 
-def test_the_paper_s_trajectory_is_written_as_in_the_paper():
+def test_the_paper_s_trajectory_has_the_values_of_the_paper():
     f, w = 0.01, 0.02 * math.pi
     trajectory = ExpressionTrajectory(SPACE, PAPER_4, ZERO, {"f": f})
     assert trajectory.duration_s is None
@@ -167,7 +167,7 @@ def test_the_paper_s_trajectory_is_written_as_in_the_paper():
         assert c_dot == pytest.approx(numeric_rate(trajectory, t), abs=1e-7)
 
 
-def test_an_expression_trajectory_stands_still_outside_its_time():
+def test_an_expression_trajectory_is_constant_outside_its_time():
     trajectory = ExpressionTrajectory(SPACE, {"x_c": "2*t"}, GOAL, duration_s=10.0)
     for t, x in ((-5.0, 0.0), (4.0, 8.0), (50.0, 20.0)):
         c, c_dot = trajectory.value(t)
@@ -201,7 +201,7 @@ def waypoints(*pairs):
     return [{"at_s": at_s, "values": values} for at_s, values in pairs]
 
 
-def test_waypoints_are_met_and_joined_smoothly():
+def test_waypoints_are_reached_and_joined_smoothly():
     trajectory = WaypointTrajectory(
         SPACE,
         waypoints((2.0, {"x_c": 1.0}), (5.0, {"x_c": 4.0, "z_c": 10.0}), (9.0, {"x_c": 12.0}), (12.0, {"z_c": 8.0})),
@@ -215,10 +215,10 @@ def test_waypoints_are_met_and_joined_smoothly():
     for knot in (2.0, 5.0, 9.0, 12.0):
         left, right = trajectory.value(knot - 1e-9)[1], trajectory.value(knot + 1e-9)[1]
         assert left == pytest.approx(right, abs=1e-7)
-    assert trajectory.value(5.0)[1][0] > 0.5  # it does not stop at a waypoint in passing
+    assert trajectory.value(5.0)[1][0] > 0.5  # it does not stop at an intermediate waypoint
 
 
-def test_waypoints_do_not_overshoot_turn_the_short_way_and_hold_at_the_ends():
+def test_waypoints_do_not_overshoot_and_turn_the_short_way():
     trajectory = WaypointTrajectory(SPACE, waypoints((0, {"x_c": 0}), (1, {"x_c": 10}), (9, {"x_c": 10.1})), ZERO)
     x = [trajectory.value(t)[0][0] for t in np.linspace(0, 9, 200)]
     assert (min(x), max(x)) == (0.0, pytest.approx(10.1))
@@ -230,7 +230,7 @@ def test_waypoints_do_not_overshoot_turn_the_short_way_and_hold_at_the_ends():
     for t in (-1.0, 20.0):
         assert not trajectory.value(t)[1].any()
     c, c_dot = WaypointTrajectory(SPACE, waypoints((3.0, {"x_c": 1.0})), GOAL).value(100.0)
-    assert (c[:2].tolist(), c_dot.any()) == ([1.0, -5.0], False)  # one waypoint is a place
+    assert (c[:2].tolist(), c_dot.any()) == ([1.0, -5.0], False)  # a single waypoint is a fixed point
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,7 @@ def test_bad_waypoints_are_refused(points, terms):
 # Angles in degrees
 
 
-def test_an_angle_is_given_in_degrees_by_the_suffix_of_its_name():
+def test_the_suffix_deg_of_a_name_gives_an_angle_in_degrees():
     named = named_values(SPACE, {"yaw_deg": 90, "beta_deg": 45, "p": "2*2"}, "target", ZERO)
     assert [named[SPACE.index(name)] for name in ("yaw", "beta", "p")] == pytest.approx([math.pi / 2, math.pi / 4, 4])
     reference = ExpressionTrajectory(SPACE, {"yaw_deg": "6*t", "beta_deg": 45}, ZERO)
@@ -280,7 +280,7 @@ def test_an_angle_is_given_in_degrees_by_the_suffix_of_its_name():
         ({"yaw": "0.1*t"}, ("target", "yaw", "0.1*t")),
     ],
 )
-def test_a_target_whose_unit_is_a_slip_is_refused_with_the_unit(values, terms):
+def test_a_target_probably_in_the_wrong_unit_is_refused_with_the_unit(values, terms):
     with refused(TrajectoryError, *terms):
         named_values(SPACE, values, "target", ZERO)
 
@@ -301,7 +301,7 @@ def test_a_ramp_from_rest_is_the_minimum_jerk_move():
     assert max(yaw) - min(yaw) == pytest.approx(2 * math.pi - 6.0)
 
 
-def test_a_ramp_onto_a_moving_reference_starts_and_ends_without_a_bump():
+def test_a_ramp_onto_a_moving_reference_is_smooth_at_both_ends():
     onto = Shifted(ExpressionTrajectory(SPACE, PAPER_4, ZERO, {"f": 0.01}), 5.0)
     c, c_dot = GOAL + 0.5, np.linspace(-0.2, 0.2, 12)
     ramp = ramp_onto(SPACE, c, c_dot, onto, 20.0, 10.0)
@@ -315,7 +315,7 @@ def test_a_ramp_onto_a_moving_reference_starts_and_ends_without_a_bump():
     assert before == pytest.approx(after, abs=1e-5)
 
 
-def test_a_planned_ramp_uses_the_speed_that_it_may_and_no_more():
+def test_a_planned_ramp_uses_the_allowed_speed_and_no_more():
     gains, limits = FormationGains(), ShapeLimits()
     onto = ExpressionTrajectory(SPACE, {"x_c": "5*sin(t)"}, GOAL)
     assert has_terms(RampPlanner(SPACE, gains, limits).reference_fault(onto, 0.0, 60.0) or "", "limits", "0.8")
@@ -344,7 +344,7 @@ def test_a_planned_ramp_uses_the_speed_that_it_may_and_no_more():
         ({"z_c": -3.0}, None, ("robot", "z", "0.5")),
     ],
 )
-def test_ramps_that_lead_to_a_bad_place_are_refused(changes, over_s, terms):
+def test_ramps_to_an_invalid_formation_are_refused(changes, over_s, terms):
     start, goal = GOAL.copy(), GOAL.copy()
     start[2] = 5.0
     for name, value in changes.items():
@@ -353,8 +353,8 @@ def test_ramps_that_lead_to_a_bad_place_are_refused(changes, over_s, terms):
         RampPlanner(SPACE, FormationGains(), ShapeLimits()).ramp((start, ZERO), Hold(goal), 0.0, over_s)
 
 
-def test_a_way_that_passes_a_bad_place_is_refused_although_its_end_is_good():
-    """Robot 4 swings round robot 1, through the place of robot 2."""
+def test_a_ramp_through_an_invalid_formation_is_refused():
+    """Start and end are valid, but robot 4 swings round robot 1 through the position of robot 2."""
     space = cluster_space(4)
     start = np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 0, 5, 5, math.pi / 2, 5.0, 1.2, 0.0])
     goal = start.copy()
@@ -385,7 +385,7 @@ BETWEEN = WaypointTrajectory(SPACE, [{"at_s": t, "values": {"z_c": 5 + t}} for t
     ],
     ids=lambda reference: type(reference).__name__,
 )
-def test_a_reference_made_of_its_state_has_the_same_bits(reference):
+def test_a_reference_restored_from_its_state_is_identical_to_the_bit(reference):
     again = reference_of(SPACE, unpack(pack(state_of(reference))))
     assert type(again) is type(reference)
     assert again.duration_s == reference.duration_s

@@ -1,4 +1,4 @@
-"""The laws of figures, integrated alone, against their closed forms: rates, lags, ranks and invariants."""
+"""The shape laws, integrated without a simulator, against closed forms: rates, lags, ranks and invariants."""
 
 from collections.abc import Callable, Sequence
 
@@ -72,7 +72,7 @@ def bearings_of(edges: Edges, c: Array, k: float = 1.0) -> Callable[[Array], Arr
 
 
 def flown(u: Callable[[Array], Array], p: Array, h: float, steps: int) -> list[Array]:
-    """Return the places at every step of Euler."""
+    """Return the positions at every Euler step."""
     track = [p]
     for _ in range(steps):
         track.append(track[-1] + h * u(track[-1]))
@@ -80,7 +80,7 @@ def flown(u: Callable[[Array], Array], p: Array, h: float, steps: int) -> list[A
 
 
 def fitted_rate(errors: Sequence[float], h: float) -> float:
-    """Return the rate of decay [1/s] over the last half of some errors, a step h apart."""
+    """Return the rate of decay [1/s] over the last half of errors that are a time step h apart."""
     half = np.log(np.asarray(errors[len(errors) // 2 :]))
     return float(-np.polyfit(h * np.arange(len(half)), half, 1)[0])
 
@@ -100,8 +100,8 @@ def test_consensus_decays_at_lambda_2_and_keeps_its_mean(edges: Edges, lambda_2:
     assert np.mean(track[-1], axis=0) == pytest.approx(np.mean(p, axis=0), abs=1e-12)
 
 
-def test_messages_lost_by_chance_slow_the_mean_as_predicted() -> None:
-    """Each directed link drops with p, and its term is left out: the mean obeys -ln(1 - h (1 - p) lambda_2) / h."""
+def test_random_message_loss_slows_the_mean_as_predicted() -> None:
+    """Each directed link drops with probability p, omitting its term: the rate is -ln(1 - h (1 - p) lambda_2) / h."""
     h, lost, runs, steps, rng = 0.05, 0.3, 400, 60, np.random.default_rng(4)
     values, vectors = np.linalg.eigh(laplacian(RING))
     start = np.column_stack([vectors[:, 1], np.zeros(5)])
@@ -119,7 +119,7 @@ def test_messages_lost_by_chance_slow_the_mean_as_predicted() -> None:
     assert rate == pytest.approx(-np.log(1 - h * (1 - lost) * values[1]) / h, rel=0.03)
 
 
-def test_an_informed_drone_ties_the_figure_to_its_place() -> None:
+def test_an_informed_drone_ties_the_shape_to_its_place() -> None:
     """The rate about the reference is lambda_min(k L + diag(b)); see zsim_agents.laws.shape."""
     b = np.array([0.5, 0, 0, 0, 0])
     law, h = consensus_of(RING, PENTAGON), 0.01
@@ -131,7 +131,7 @@ def test_an_informed_drone_ties_the_figure_to_its_place() -> None:
 @pytest.mark.parametrize(
     ("edges", "rate"), [(PATH, 0.1206), (RING, 0.3820), (STAR, 1.0)], ids=["path", "ring", "hub leads"]
 )
-def test_followers_come_at_the_rate_of_their_part_of_the_laplacian(edges: Edges, rate: float) -> None:
+def test_followers_converge_at_the_rate_of_their_laplacian_block(edges: Edges, rate: float) -> None:
     L_ff, h = laplacian(edges)[1:, 1:], 0.01
     assert np.linalg.eigvalsh(L_ff)[0] == pytest.approx(rate, abs=1e-4)
     law = consensus_of(edges, PENTAGON)
@@ -142,7 +142,7 @@ def test_followers_come_at_the_rate_of_their_part_of_the_laplacian(edges: Edges,
     assert fitted_rate(errors, h) == pytest.approx(-np.log(1 - h * np.linalg.eigvalsh(L_ff)[0]) / h, rel=2e-3)
 
 
-def test_a_chain_of_followers_lags_behind_a_leader_that_moves() -> None:
+def test_a_chain_of_followers_lags_behind_a_moving_leader() -> None:
     k, v, h = 2.0, np.array([0.5, 0.0]), 0.02
     law = consensus_of(PATH, PENTAGON, k)
     track = flown(lambda p: np.vstack([v, law(p)[1:]]), PENTAGON.copy(), h, 6000)
@@ -151,7 +151,7 @@ def test_a_chain_of_followers_lags_behind_a_leader_that_moves() -> None:
     assert lag == pytest.approx(np.linalg.solve(laplacian(PATH)[1:, 1:], np.full(4, v[0] / k)), rel=1e-6)
 
 
-def test_a_virtual_structure_that_moves_turns_and_grows_is_joined_at_the_rate_k() -> None:
+def test_a_moving_virtual_structure_is_joined_at_the_rate_k() -> None:
     reference, k, h, c = FormationReference(("2*t", "sin(t)"), "30*t", "1 + t/10"), 0.8, 1e-3, np.array([1.0, 0.5])
     p, errors = np.array([3.0, -2.0]), []
     for step in range(4000):
@@ -165,17 +165,17 @@ def test_a_virtual_structure_that_moves_turns_and_grows_is_joined_at_the_rate_k(
 # Distances
 
 
-def test_the_rank_of_rigidity() -> None:
+def test_the_rigidity_matrix_has_the_expected_rank() -> None:
     R = rigidity_matrix(PENTAGON, RIGID)
     assert np.linalg.matrix_rank(R) == 2 * 5 - 3
-    assert np.linalg.matrix_rank(rigidity_matrix(PENTAGON, RING)) == 5  # a ring of joints bends
+    assert np.linalg.matrix_rank(rigidity_matrix(PENTAGON, RING)) == 5  # a ring with joints is flexible
     assert np.linalg.eigvalsh(R @ R.T)[0] == pytest.approx(0.80769, abs=1e-5)
     tetrahedron = np.vstack([np.zeros(3), np.eye(3)])
     every = [(i, j) for i in range(4) for j in range(i + 1, 4)]
     assert np.linalg.matrix_rank(rigidity_matrix(tetrahedron, every)) == 3 * 4 - 6
 
 
-def test_distances_settle_at_the_rate_of_the_rigidity_matrix() -> None:
+def test_distances_converge_at_the_rate_of_the_rigidity_matrix() -> None:
     h, start = 0.005, scattered(PENTAGON, 0.02)
     track = flown(distances_of(RIGID, PENTAGON), start, h, 1600)
     wanted = [np.linalg.norm(PENTAGON[j] - PENTAGON[i]) for i, j in RIGID]
@@ -184,7 +184,7 @@ def test_distances_settle_at_the_rate_of_the_rigidity_matrix() -> None:
     assert np.mean(track[-1], axis=0) == pytest.approx(np.mean(start, axis=0), abs=1e-12)
 
 
-def test_distances_descend_their_potential() -> None:
+def test_the_distance_law_descends_its_potential() -> None:
     law, k, dt = distances_of(RIGID, PENTAGON, 0.7), 0.7, 1e-6
 
     def V(p: Array) -> float:
@@ -199,15 +199,15 @@ def test_distances_descend_their_potential() -> None:
     assert rate == pytest.approx(-np.sum(u * u) / k, rel=1e-6)
 
 
-def test_distances_may_settle_mirrored_and_never_leave_a_line() -> None:
+def test_distances_may_converge_mirrored_and_never_leave_a_line() -> None:
     edges: Edges = [(0, 1), (1, 2), (2, 0), (1, 3), (2, 3)]
     c = np.array([[0.0, 0], [1, -0.6], [1, 0.6], [2, 0]])
     mirrored = c.copy()
-    mirrored[3] = [0.05, 0.02]  # beyond the edge 1-2, on the side of drone 0
+    mirrored[3] = [0.05, 0.02]  # across the edge 1-2, on the side of drone 0
     end = flown(distances_of(edges, c), mirrored, 0.01, 6000)[-1]
     lengths = [np.linalg.norm(end[j] - end[i]) - np.linalg.norm(c[j] - c[i]) for i, j in edges]
     assert np.abs(lengths).max() < 1e-9
-    assert np.linalg.norm(end[3] - end[0]) < 0.1  # and not 2
+    assert np.linalg.norm(end[3] - end[0]) < 0.1  # instead of 2
     line = np.column_stack([np.arange(4.0), np.zeros(4)])
     assert np.abs(flown(distances_of(edges, c), line, 0.01, 500)[-1][:, 1]).max() == 0.0
 
@@ -224,17 +224,17 @@ def test_distances_may_settle_mirrored_and_never_leave_a_line() -> None:
     ],
     ids=["square", "braced square", "pentagon"],
 )
-def test_the_rank_of_bearing_rigidity(c: Array, edges: Edges, rank: int, rigid: int) -> None:
+def test_the_bearing_rigidity_matrix_has_the_expected_rank(c: Array, edges: Edges, rank: int, rigid: int) -> None:
     assert rigid == 2 * len(c) - 2 - 1
     assert np.linalg.matrix_rank(bearing_rigidity_matrix(c, edges), tol=1e-9) == rank
 
 
-def test_bearings_leave_centroid_and_size_and_settle_at_the_rate_of_their_linearisation() -> None:
+def test_bearings_keep_centroid_and_size_and_converge_as_linearised() -> None:
     law, h = bearings_of(RIGID, PENTAGON), 0.01
     start = scattered(PENTAGON, 0.1)
     u, arms = law(start), start - np.mean(start, axis=0)
     assert np.sum(u, axis=0) == pytest.approx([0, 0], abs=1e-14)
-    assert float(np.sum(u * arms)) == pytest.approx(0.0, abs=1e-14)  # d/dt of s^2, which is what no rounding changes
+    assert float(np.sum(u * arms)) == pytest.approx(0.0, abs=1e-14)  # d/dt of s^2 / 2, zero up to rounding
 
     size = float(np.sqrt(np.sum(arms * arms) / np.sum(PENTAGON * PENTAGON)))
     wanted = np.mean(start, axis=0) + size * PENTAGON
@@ -249,13 +249,13 @@ def test_bearings_leave_centroid_and_size_and_settle_at_the_rate_of_their_linear
         for a, b in ((i, j), (j, i)):
             M[a, :, a] += P
             M[a, :, b] -= P
-    slowest = np.linalg.eigvalsh(M.reshape(2 * n, 2 * n))[3]  # after those of translation and scale
+    slowest = np.linalg.eigvalsh(M.reshape(2 * n, 2 * n))[3]  # after the three of translation and scale
     final = track[-1]
     errors = [float(np.linalg.norm(p - final)) for p in track[:2000]]
     assert fitted_rate(errors, h) == pytest.approx(slowest, rel=0.02)
 
 
-def test_repulsion_is_the_slope_of_its_potential() -> None:
+def test_repulsion_is_the_negative_slope_of_its_potential() -> None:
     D, eta, dd = 1.5, 0.7, 1e-6
 
     def V(d: float) -> float:
@@ -263,4 +263,4 @@ def test_repulsion_is_the_slope_of_its_potential() -> None:
 
     assert repulsion(0.8, D, eta) == pytest.approx(-(V(0.8 + dd) - V(0.8 - dd)) / (2 * dd), rel=1e-6)
     assert repulsion(D, D, eta) == 0.0
-    assert repulsion(-0.01, 0.0, eta) == 0.0  # inside of an obstacle, with avoidance switched off
+    assert repulsion(-0.01, 0.0, eta) == 0.0  # inside an obstacle, with avoidance switched off

@@ -1,4 +1,4 @@
-"""Flights by reference: fitted to the drone's limits, or refused with the factor; never too near to others."""
+"""Flights along references: fitted to the drone's limits or refused with the factor; distances to other drones."""
 
 import math
 from typing import Any
@@ -36,17 +36,17 @@ def refusal(scenario: Any) -> str:
 @pytest.mark.parametrize(
     ("path", "factor"),
     [
-        # rest to rest: the peak speed is 2.1875 d / T, allowed are 0.8 of 5 m/s
+        # from rest to rest the peak speed is 2.1875 d / T; 0.8 of 5 m/s is allowed
         ({"minimum_snap": FAST}, 2.1875 * 20 / 2 / (SHARE * 5.0)),
-        ({"waypoints": FAST}, 1.5 * 20 / 2 / (SHARE * 5.0)),  # a cubic's is 1.5 d / T
+        ({"waypoints": FAST}, 1.5 * 20 / 2 / (SHARE * 5.0)),  # that of a cubic is 1.5 d / T
         ({"pieces": [{"duration_s": 2, "z": [2, 4]}]}, 4 / (SHARE * 1.0)),
         ({"pieces": [{"duration_s": 2, "z": [2], "yaw": [0, 7]}]}, 7 / (SHARE * math.radians(200))),
-        # an acceleration falls with the square of time; allowed are 0.8 g tan(20 deg)
+        # accelerations fall with the square of time; 0.8 g tan(20 deg) is allowed
         ({"expressions": {"x": "2*t*t", "z": 2}, "duration_s": 0.5}, math.sqrt(4 / (SHARE * 9.80665 * math.tan(math.radians(20))))),
         ({"circle": {"radius_m": 10, "period_s": 10}, "origin_m": [0, 0, 2]}, 2 * math.pi / (SHARE * 5.0)),
     ],
 )  # fmt: skip
-def test_what_is_too_fast_is_refused_with_the_factor_or_fitted_by_it(path: dict[str, Any], factor: float) -> None:
+def test_a_path_that_is_too_fast_is_refused_with_the_factor_or_fitted(path: dict[str, Any], factor: float) -> None:
     assert factor > 1.0
     text = refusal(scenario_of({**path, "start_s": 40}))
     assert has_terms(text, "drones[0].reference", "(drone 'd1')")
@@ -59,14 +59,14 @@ def test_what_is_too_fast_is_refused_with_the_factor_or_fitted_by_it(path: dict[
     check_plans(scenario_of({**path, "start_s": 40, "time_scale": named}), "s.yaml")
 
 
-def test_the_way_to_a_path_ends_in_its_motion() -> None:
+def test_the_approach_to_a_path_ends_with_its_motion() -> None:
     moving = {"expressions": {"x": "3 + cos(0.5*t)", "y": "sin(0.5*t)", "z": 2, "yaw_deg": "45 + 6*t"}, "start_s": 20}
     flight = flight_of(scenario_of(moving), "d1")
     before, after = flight.value(20 - 1e-9), flight.value(20.0)
     assert before[0][:3] == pytest.approx(after[0][:3], abs=1e-6)
     assert math.remainder(before[0][3] - after[0][3], math.tau) == pytest.approx(0.0, abs=1e-6)
     assert before[1] == pytest.approx([0, 0.5, 0, math.radians(6)], abs=1e-6)
-    assert flight.value(0.0)[0] == pytest.approx([0, 0, 1, 0])  # over its start, at the height of its take-off
+    assert flight.value(0.0)[0] == pytest.approx([0, 0, 1, 0])  # above its start, at the take-off height
 
 
 @pytest.mark.parametrize(
@@ -87,8 +87,8 @@ def test_flights_that_cannot_be_flown_are_refused_with_the_field(references: lis
         checked_flight(scenario, "d1")
 
 
-def test_places_are_assigned_and_reached_at_once() -> None:
-    """Four drones in a row turn into a column: no two ways cross, and all arrive together."""
+def test_places_are_assigned_and_reached_simultaneously() -> None:
+    """Four drones in a row get places listed in another order: no paths cross, and all arrive together."""
     places = [[20, 3 * k, 2] for k in (3, 1, 0, 2)]
     stages = [{"start_s": 10, "over_s": 14, "places_m": places}]
     exchange = {"drones": ["d1", "d2", "d3", "d4"], "stages": stages}
@@ -100,7 +100,7 @@ def test_places_are_assigned_and_reached_at_once() -> None:
         assert flight.value(17.0)[0][0] == pytest.approx(10.0, abs=1e-9)
 
 
-def test_a_stage_that_is_too_fast_is_refused_with_its_time_or_fitted() -> None:
+def test_a_stage_that_is_too_fast_is_refused_with_a_time_or_fitted() -> None:
     stages = [{"start_s": 10, "over_s": 2, "places_m": [[20, 0, 1], [20, 3, 1]]}]
     exchange = {"drones": ["d1", "d2"], "stages": stages}
     least_s = 2.1875 * 20 / (SHARE * 5.0)
@@ -134,7 +134,7 @@ def test_a_stage_that_is_too_fast_is_refused_with_its_time_or_fitted() -> None:
         ("follow", {"minimum_snap": SLOW, "duration_s": 9}, ("duration_s", "9", "expressions")),
     ],
 )
-def test_requests_that_cannot_be_understood_are_refused(op: str, args: dict[str, Any], terms: tuple[str, ...]) -> None:
+def test_invalid_requests_are_refused_with_the_field(op: str, args: dict[str, Any], terms: tuple[str, ...]) -> None:
     with pytest.raises(DroneRequestError) as raised:
         read_request(op, args)
     assert all(term in str(raised.value) for term in terms), raised.value
@@ -144,18 +144,18 @@ def test_requests_that_cannot_be_understood_are_refused(op: str, args: dict[str,
 @pytest.mark.parametrize("times", [(0,), (1, 1), (2, 1), (0, 3, 3)])
 @pytest.mark.parametrize("kind", ["minimum_snap", "waypoints"])
 def test_a_request_for_points_without_rising_times_is_refused(kind: str, times: tuple[float, ...]) -> None:
-    """In a scenario the file is judged; what is asked for during a flight is judged here."""
+    """In a scenario, the file is checked; requests during a flight are checked here."""
     drone = scenario_of(None).drones[0]
     points = [{"at_s": at_s, "position_m": [k, 0, 2]} for k, at_s in enumerate(times)]
     asked = read_request("follow", {kind: points, "fit": True})
     if (kind, len(times)) == ("waypoints", 1):
-        return  # a place to stand at
+        return  # a fixed place is allowed
     with pytest.raises(FlightError) as raised:
         requested_flight(asked, 5.0, np.array([0.0, 0, 2, 0]), np.zeros(4), drone, limits_of(drone, 9.81))
     assert raised.value.path == kind
 
 
-def test_flights_are_functions_of_time_alone() -> None:
+def test_flights_depend_only_on_time_and_have_exact_rates() -> None:
     flight = flight_of(scenario_of({"minimum_snap": SLOW, "start_s": 20}), "d1")
     for t in np.linspace(0, 60, 50).tolist():
         (place, rate), slope = flight.value(t), (flight.value(t + 1e-5)[0] - flight.value(t - 1e-5)[0]) / 2e-5
@@ -163,7 +163,7 @@ def test_flights_are_functions_of_time_alone() -> None:
         assert rate == pytest.approx(slope, abs=1e-5)
 
 
-# Formations whose plans lead them into drones with references, as far as that is known before the flight
+# Formations whose plans conflict with the references of other drones, if this is known before the flight
 
 TRIANGLE = [{"name": f"d{k}", "position_m": place} for k, place in enumerate([[0, 2, 0], [0, -2, 0], [4, 0, 0]])]
 CIRCLE = {"start_s": 40, "expressions": {"x_c": "10*cos(t/20)", "y_c": "10*sin(t/20)", "z_c": "3", "yaw": "0"}}
@@ -188,7 +188,7 @@ def hold(place: list[float], at_s: float = 0.0, **reference: Any) -> dict[str, A
 @pytest.mark.parametrize(
     ("plan", "reference", "path"),
     [
-        # no robot is at the centre of the formation
+        # there is no robot at the centre of the formation
         ({"target": {"x_c": 12, "y_c": 0, "z_c": 3, "yaw": 0, **SHAPE}}, hold([12, 0, 3]), None),
         ({"target": {"x_c": 12, "y_c": 0, "z_c": 3, "yaw": 0, **SHAPE}}, hold([12, 0, 9]), None),
         ({"trajectory": CIRCLE, "target": SHAPE}, hold([0, 10, 3]), "clusters[0].plan.trajectory"),
@@ -197,7 +197,7 @@ def hold(place: list[float], at_s: float = 0.0, **reference: Any) -> dict[str, A
         ({"trajectory": CIRCLE, "target": SHAPE}, hold([0, 30, 3]), None),
     ],
 )
-def test_a_plan_is_compared_with_references_where_both_are_known(plan: Any, reference: Any, path: str | None) -> None:
+def test_a_plan_is_compared_with_references_if_both_are_known(plan: Any, reference: Any, path: str | None) -> None:
     made = with_formation(plan, **reference)
     if path is None:
         check_plans(made, "t.yaml")
@@ -209,7 +209,7 @@ def test_a_plan_is_compared_with_references_where_both_are_known(plan: Any, refe
     assert "alone" in line
 
 
-def test_a_formation_at_its_target_is_where_each_of_its_robots_is_to_be() -> None:
+def test_a_reference_to_the_place_of_a_formation_s_robot_is_refused() -> None:
     plan = {"target": {"x_c": 12, "y_c": 0, "z_c": 3, "yaw": 0, **SHAPE}}
     free = with_formation(plan, **hold([12, 0, 9]))
     planned = planned_motion(free, free.clusters[0])

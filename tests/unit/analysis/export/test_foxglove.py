@@ -35,7 +35,7 @@ from zsim_analysis.export.make_export import export
 from zsim_analysis.export.viewers import TIMELINE, drone_mesh, plots
 
 DRONES = ("drone1", "a-b.c", "end")
-GATES = 301  # of six seconds
+GATES = 301  # number of gates in a run of 6 s
 GATE_NS = 20_000_000
 RERUN = shutil.which("rerun", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
 
@@ -50,7 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @cache
 def shown(path: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Return log time and message of every topic, decoded with the descriptors that the file itself brings."""
+    """Return log times and messages by topic, decoded with the descriptors in the file itself."""
     found: dict[str, list[tuple[int, Any]]] = defaultdict(list)
     types: dict[int, Any] = {}
     with open(path, "rb") as file:
@@ -64,7 +64,7 @@ def shown(path: Path) -> dict[str, list[tuple[int, Any]]]:
 
 
 def protobuf_type(data: bytes, name: str) -> Any:
-    """Return the class of a message out of a FileDescriptorSet."""
+    """Return the class of a message from a FileDescriptorSet."""
     pool = descriptor_pool.DescriptorPool()
     waiting = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(data).file}
 
@@ -87,7 +87,7 @@ def wxyz(q: Any) -> tuple[float, float, float, float]:
     return q.w, q.x, q.y, q.z
 
 
-def test_poses_and_frames_are_where_truth_estimate_and_cluster_are(run: Path) -> None:
+def test_poses_and_frames_match_truth_estimate_and_cluster(run: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     frames: dict[str, dict[int, Any]] = defaultdict(dict)
     for t_ns, message in topics["/tf"]:
@@ -130,7 +130,7 @@ def test_the_numbers_of_a_cluster_are_desired_estimated_and_true(run: Path) -> N
         assert [getattr(message, f"true_{name}") for name in state.names] == pytest.approx(true.tolist(), abs=1e-12)
 
 
-def test_the_numbers_and_fixes_of_a_drone_and_events(run: Path) -> None:
+def test_numbers_fixes_and_events_are_as_recorded(run: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     for drone in DRONES:
         recorded = (messages_on(run, key(drone)) for key in (keys.truth, keys.estimate, keys.status))
@@ -148,7 +148,7 @@ def test_the_numbers_and_fixes_of_a_drone_and_events(run: Path) -> None:
     assert [line.name for _, line in topics["/log"]] == [event.source for event in events]
 
 
-def test_the_scene_shows_what_is_there(run: Path) -> None:
+def test_the_scene_shows_drones_formations_estimates_and_trails(run: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     ((_, drones),) = topics["/scene/drones"]
     assert {entity.frame_id for entity in drones.entities} == {f"drone/{drone}" for drone in DRONES}
@@ -173,8 +173,8 @@ def test_the_scene_shows_what_is_there(run: Path) -> None:
     assert len(trails.entities[0].lines[0].points) == len(topics["/scene/trails"]) == 13
 
 
-def test_a_formation_that_cannot_be_has_no_ghosts(tmp_path: Path) -> None:
-    """A desired formation whose robots are in one line: its cluster has no frame, and the file goes on."""
+def test_a_singular_desired_formation_has_no_ghosts(tmp_path: Path) -> None:
+    """The robots of the desired formation coincide, so its cluster has no frame; the file is written all the same."""
     space = cluster_space(3)
     some = tuple(0.0 if name in ("p", "q") else 1.0 for name in space.names)
     with pytest.raises(SingularClusterError):
@@ -188,7 +188,7 @@ def test_a_formation_that_cannot_be_has_no_ghosts(tmp_path: Path) -> None:
     assert "/points/desired" not in file.counts
 
 
-def test_numbers_are_protobuf_as_its_own_library_writes_it() -> None:
+def test_encoded_numbers_are_read_by_the_protobuf_library() -> None:
     numbers = NumericMessageType("Some", [f"n{i}" for i in range(40)], ("text", "more"))
     kind = protobuf_type(numbers.schema, "zsim.Some")
     values = [*np.linspace(-1e300, 1e300, 39), math.nan]
@@ -198,7 +198,7 @@ def test_numbers_are_protobuf_as_its_own_library_writes_it() -> None:
     assert (message.text, message.more) == ("é" * 200, "")
 
 
-def test_the_layout_shows_topics_and_fields_that_are_there(run: Path) -> None:
+def test_the_layout_shows_only_existing_topics_and_fields(run: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     layout = json.loads((run / "foxglove-layout.json").read_text())
     paths = list(values_of(layout, "value"))
@@ -216,14 +216,14 @@ def test_the_layout_shows_topics_and_fields_that_are_there(run: Path) -> None:
 
 
 def values_of(tree: Any, name: str) -> Any:
-    """Yield the values of all fields of a name."""
+    """Yield the values of all fields with this name."""
     for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():
         if key == name:
             yield value
         yield from values_of(value, name)
 
 
-def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
+def test_messages_are_selected_by_keys_and_times(run: Path, tmp_path: Path) -> None:
     chosen = MessageSelection(("drone/end/truth", "world/**"), from_s=2.0, to_s=3.0)
     done = export(run, Format.FOXGLOVE, tmp_path / "some.mcap", chosen)
     topics = shown(tmp_path / "some.mcap")
@@ -235,13 +235,13 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
 
 # Cameras
 
-FILMED = 10  # gates, with a picture each
+FILMED = 10  # number of gates, each with a picture
 FRONT = keys.camera("drone1", "front")
 
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A drone that climbs, and what its front camera published: how it sees once, a picture a gate, and one no JPEG."""
+    """Return the run of a climbing drone whose front camera published its info, a picture per gate and a bad JPEG."""
     folder = tmp_path_factory.mktemp("filmed")
     with RecordWriter(folder / "run.mcap") as writer:
         writer.add_message(keys.camera_info("drone1", "front"), info(), 0)
@@ -256,7 +256,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_pictures_are_those_on_record_at_the_time_of_their_exposure(filmed: Path, tmp_path: Path) -> None:
+def test_pictures_are_as_recorded_with_the_time_of_exposure(filmed: Path, tmp_path: Path) -> None:
     pictures = shown(filmed / "foxglove.mcap")["/drone/drone1/front_camera/image"]
     assert [t_ns for t_ns, _ in pictures] == [gate * GATE_NS for gate in range(FILMED)]
     for gate, (t_ns, picture) in enumerate(pictures):
@@ -267,7 +267,7 @@ def test_pictures_are_those_on_record_at_the_time_of_their_exposure(filmed: Path
     assert len([note for note in again.notes if has_terms(note, "1", "key")]) == 1
 
 
-def test_the_calibration_and_the_camera_s_place_are_as_published_and_in_the_layout(filmed: Path) -> None:
+def test_calibration_and_pose_of_a_camera_are_as_published(filmed: Path) -> None:
     topics = shown(filmed / "foxglove.mcap")
     layout = json.loads((filmed / "foxglove-layout.json").read_text())
     assert list(values_of(layout, "imageTopic")) == ["/drone/drone1/front_camera/image"]
@@ -284,7 +284,7 @@ def test_the_calibration_and_the_camera_s_place_are_as_published_and_in_the_layo
     assert (xyz(placed.translation), wxyz(placed.rotation)) == (FRONT_P_BK, AHEAD)
 
 
-def test_a_part_of_a_flight_has_the_calibration_that_was_said_before(filmed: Path, tmp_path: Path) -> None:
+def test_part_of_a_flight_has_the_calibration_published_before_it(filmed: Path, tmp_path: Path) -> None:
     export(filmed, Format.FOXGLOVE, tmp_path / "late.mcap", MessageSelection(from_s=0.1))
     topics = shown(tmp_path / "late.mcap")
     assert len(topics["/drone/drone1/front_camera/image"]) == FILMED - 5
@@ -296,7 +296,7 @@ def test_a_part_of_a_flight_has_the_calibration_that_was_said_before(filmed: Pat
 
 
 def rerun(home: Path, *arguments: str) -> str:
-    """Run Rerun with a home of its own, in which it is told not to report on its use."""
+    """Run Rerun with a separate home, in which its analytics are disabled."""
     assert RERUN
     own = {**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": str(home / "config")}
     if not home.exists():
@@ -308,7 +308,7 @@ def rerun(home: Path, *arguments: str) -> str:
 
 
 def rows_of(home: Path, path: Path) -> Counter[tuple[str, str]]:
-    """Return the number of rows of each entity and column of a file of Rerun's."""
+    """Return the number of rows of each entity and column in a Rerun file."""
     rows: Counter[tuple[str, str]] = Counter()
     chunk = r"^Chunk\(\w+\) with (\d+) rows .* - (/\S*) - data columns: \[(.*)\]"
     for count, entity, columns in re.findall(chunk, rerun(home, "rrd", "print", "-v", str(path)), re.M):
@@ -319,24 +319,24 @@ def rows_of(home: Path, path: Path) -> Counter[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def converted(run: Path) -> Path:
-    """Return the file as Rerun converts it, beside a home for Rerun."""
+    """Return the file as converted by Rerun, whose home is beside it."""
     path = run / "foxglove.rrd"
     rerun(run / "home", "mcap", "convert", str(run / "foxglove.mcap"), "-o", str(path))
     return path
 
 
-def test_rerun_reads_it_without_a_fault(run: Path, converted: Path) -> None:
+def test_rerun_reads_the_file_without_errors(run: Path, converted: Path) -> None:
     assert has_terms(rerun(run / "home", "rrd", "verify", str(converted)), "verified", "without error")
     assert "num_chunks" in rerun(run / "home", "rrd", "stats", str(converted))
     checked = rerun(run / "home", "mcap", "check", str(run / "foxglove.mcap"))
     assert set(re.findall(r"^(\w+) +\d+ +\d+ +/", checked, flags=re.MULTILINE)) == {"ok"}
 
 
-def test_rerun_has_what_is_drawn_and_plotted_at_every_instant(run: Path, converted: Path) -> None:
+def test_rerun_has_all_drawn_and_plotted_data_at_every_instant(run: Path, converted: Path) -> None:
     rows = rows_of(run / "home", converted)
     topics = shown(run / "foxglove.mcap")
     transforms = sum(len(message.transforms) for _, message in topics["/tf"])
-    assert rows["/tf", "Transform3D:translation"] == transforms == GATES * 8 + 2  # and two cameras
+    assert rows["/tf", "Transform3D:translation"] == transforms == GATES * 8 + 2  # and those of two cameras
     for drone in DRONES:
         assert rows[f"/drone/{drone}/pose", "InstancePoses3D:translations"] == GATES
         assert rows[f"/drone/{drone}/numbers", "zsim.Drone:message"] == GATES
@@ -346,7 +346,7 @@ def test_rerun_has_what_is_drawn_and_plotted_at_every_instant(run: Path, convert
     assert rows["/log", "TextLog:text"] == len(topics["/log"])
 
 
-def test_rerun_plays_pictures_with_their_camera_in_the_drone_s_tree(filmed: Path) -> None:
+def test_rerun_has_pictures_and_camera_in_the_drone_s_tree(filmed: Path) -> None:
     path = filmed / "foxglove.rrd"
     rerun(filmed / "home", "mcap", "convert", str(filmed / "foxglove.mcap"), "-o", str(path))
     assert has_terms(rerun(filmed / "home", "rrd", "verify", str(path)), "verified", "without error")
@@ -356,7 +356,7 @@ def test_rerun_plays_pictures_with_their_camera_in_the_drone_s_tree(filmed: Path
     assert rows["/tf", "Transform3D:translation"] == FILMED + 1
 
 
-def test_the_blueprint_names_what_rerun_reads_of_the_file_and_has_meshes_plots_log_and_time(run: Path) -> None:
+def test_the_blueprint_refers_to_existing_entities_and_has_all_views(run: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     variables = {"main": tuple(topics["/cluster/main/variables"][0][1].DESCRIPTOR.fields_by_name)}
     content = ConvertedRun(dict.fromkeys(topics, 1), variables, {drone: [] for drone in DRONES}, 0)
@@ -378,7 +378,7 @@ def test_the_blueprint_names_what_rerun_reads_of_the_file_and_has_meshes_plots_l
     assert TIMELINE in printed
 
 
-def test_a_drone_s_mesh_reaches_to_the_rims_of_its_rotors() -> None:
+def test_a_drone_s_mesh_extends_to_the_rims_of_its_rotors() -> None:
     rotors = [RotorDisc(0.2, 0.1, 0.1), RotorDisc(-0.2, -0.1, 0.05)]
     mesh = drone_mesh(rotors, "#0072b2")
     assert mesh.vertices_m[:, 0].max() == pytest.approx(0.3)
@@ -390,7 +390,7 @@ def test_a_drone_s_mesh_reaches_to_the_rims_of_its_rotors() -> None:
     assert (area > 0).all()
 
 
-def test_without_rerun_s_library_there_is_no_blueprint(
+def test_no_blueprint_is_written_without_rerun_s_library(
     filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copy(filmed / "run.mcap", tmp_path)

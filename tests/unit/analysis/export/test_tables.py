@@ -40,7 +40,7 @@ from zsim_analysis.export.make_export import export, matlab_names, placed
 from zsim_deploy import arguments
 from zsim_deploy.cli.cli import app
 
-GATES = 301  # of six seconds
+GATES = 301  # number of gates in a run of 6 s
 ROTORS = ("front_left", "front_right", "rear_right", "rear_left")
 
 
@@ -55,13 +55,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def counts(run: Path) -> dict[str, int]:
-    """Return how many messages of each table are on record, repeats of commands for drivers left out."""
+    """Return the number of recorded messages per table, without the commands repeated for drivers."""
     found = Counter[str]()
     with RecordReader(run / "run.mcap") as reader:
         for key, count in reader.topics().items():
             kind = messages.type_of(key)
             if kind is not CameraImage and "/accepted/" not in key:
-                kind = Sighting if kind is Sightings else kind  # each has one hat here
+                kind = Sighting if kind is Sightings else kind  # each shows one hat here
                 found[table_name(kind) if kind else "foreign"] += count
     return found
 
@@ -80,7 +80,7 @@ def test_every_message_is_a_row_of_its_table(run: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("drone", ["drone1", "a-b.c", "end"])
-def test_truth_is_the_same_to_the_bit(run: Path, drone: str) -> None:
+def test_truth_is_exported_bit_for_bit(run: Path, drone: str) -> None:
     truths = messages_on(run, keys.truth(drone))
     for suffix, read in READ.items():
         table = read(run / suffix / f"truth.{suffix}")
@@ -111,7 +111,7 @@ def test_covariances_sensors_and_variables_have_a_column_each(run: Path) -> None
     assert pq.read_schema(run / "parquet" / "status.parquet").field("collision").type == "bool"
 
 
-def test_what_has_no_columns_is_json(run: Path) -> None:
+def test_data_without_columns_is_exported_as_json(run: Path) -> None:
     events = csv(run, "event")
     recorded = messages_on(run, keys.EVENT)
     assert [json.loads(text) for text in events["data"]] == [msgspec.to_builtins(event.data) for event in recorded]
@@ -123,7 +123,7 @@ def test_what_has_no_columns_is_json(run: Path) -> None:
     assert info["origin_latitude_deg"][0] == messages_on(run, keys.INFO)[0].origin.latitude_deg
 
 
-def test_the_manifest_tells_what_the_tables_are(run: Path) -> None:
+def test_the_manifest_describes_the_tables(run: Path) -> None:
     manifest = json.loads((run / "csv" / "export.json").read_bytes())
     assert manifest["complete"] is True
     assert [note for note in manifest["notes"] if not has_terms(note, "2", "pictures")] == []
@@ -133,7 +133,7 @@ def test_the_manifest_tells_what_the_tables_are(run: Path) -> None:
         assert (run / "csv" / file).read_text().splitlines()[0] == ",".join(f'"{name}"' for name in table["columns"])
 
 
-def test_no_table_has_a_column_twice_and_every_sensor_of_a_module_its_own_table() -> None:
+def test_columns_are_unique_and_each_sensor_of_a_module_has_a_table() -> None:
     for kind in set(messages.types_by_shape().values()):
         names = [column for field in table_columns(kind, {}) for column in field.columns]
         assert len(names) == len(set(names)), kind
@@ -161,7 +161,7 @@ def test_a_matlab_file_has_a_struct_per_drone(run: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("octave-cli") is None, reason="Octave is not installed")
-def test_octave_loads_it(run: Path) -> None:
+def test_octave_loads_the_matlab_file(run: Path) -> None:
     script = (
         f"load('{run / 'run.mat'}'); t = truth.a_b_c; "
         "printf('%d %d %.17g %s %s %s\\n', size(t.position_m), t.position_m(end, 3), class(t.t_ns), "
@@ -173,7 +173,7 @@ def test_octave_loads_it(run: Path) -> None:
     assert done.stdout.split() == [str(GATES), "3", f"{z:.17g}", "int64", state, "x_c"], done.stderr
 
 
-def test_matlab_names_are_valid_and_never_the_same() -> None:
+def test_matlab_names_are_valid_and_unique() -> None:
     names = ["a.b", "a-b", "a_b", "2nd", "_x", "end", "for", "é", "q" * 80, "q" * 81]
     made = set(matlab_names(names).values())
     assert len(made) == len(names)
@@ -181,9 +181,7 @@ def test_matlab_names_are_valid_and_never_the_same() -> None:
     assert not made & make_export.KEYWORDS
 
 
-def test_a_variable_that_matlab_would_not_load_is_refused_unless_times_make_it_small_enough(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variable_too_large_for_matlab_is_refused(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(make_export, "VARIABLE_MAX", 100_000)
     estimates = MessageSelection(("drone/*/estimate",))
     with refused(ReportError, "estimate", "GB", "MATLAB", "--keys", "--from", "--to"):
@@ -193,7 +191,7 @@ def test_a_variable_that_matlab_would_not_load_is_refused_unless_times_make_it_s
     assert done.tables == {"estimate": 3 * 6}
 
 
-def test_what_a_message_does_not_have_is_empty(tmp_path: Path) -> None:
+def test_values_absent_from_a_message_are_empty(tmp_path: Path) -> None:
     with RecordWriter(tmp_path / "run.mcap") as writer:
         for k, drones in enumerate([("a", "b"), ("c",)]):
             names = ("x_c", "y_c", "z_c", "yaw", "pitch", "phi_1", "phi_2", "p")[: 4 * len(drones)]
@@ -210,7 +208,7 @@ def test_what_a_message_does_not_have_is_empty(tmp_path: Path) -> None:
     assert (column.null_count, column.to_pylist()) == (1, [1.5, None])
 
 
-def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
+def test_messages_are_selected_by_keys_and_times(run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "run.mcap", tmp_path / "flight1.mcap")
     done = export(tmp_path / "flight1.mcap", Format.CSV, selection=MessageSelection(("clock",)))
     assert (done.paths, done.tables) == ((tmp_path / "csv",), {"clock.csv": counts(run)["clock"]})
@@ -221,7 +219,7 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     assert (times.min(), times.max()) == (1_000_000_000, 2_000_000_000)
     with refused(ReportError, "run.mcap", "drone/nobody/**", "messages"):
         export(run, Format.CSV, tmp_path / "none" / "a" / "b", MessageSelection(("drone/nobody/**",)))
-    assert not (tmp_path / "none").exists()  # nor the folders above
+    assert not (tmp_path / "none").exists()  # not even the parent folders are created
 
 
 def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None:
@@ -248,9 +246,7 @@ def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None
         export(run, Format.CSV, tmp_path / "home", some, force=True)
 
 
-def test_force_does_not_replace_a_folder_that_holds_more_or_files_that_are_not_of_an_export(
-    run: Path, tmp_path: Path
-) -> None:
+def test_force_does_not_replace_files_that_no_export_wrote(run: Path, tmp_path: Path) -> None:
     some, out = MessageSelection(("clock",)), tmp_path / "out"
     export(run, Format.CSV, out, some)
     for name in ("plots", "notes.txt"):
@@ -269,10 +265,10 @@ def test_force_does_not_replace_a_folder_that_holds_more_or_files_that_are_not_o
 
 @pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("step", range(4))
-def test_an_interrupt_while_it_is_put_in_place_changes_nothing(
+def test_an_interrupt_while_an_export_is_put_in_place_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int, after: bool
 ) -> None:
-    """Interrupted before or after any of the four moves that replace a folder and a file, all is as it was."""
+    """An interrupt before or after any of the four moves that replace a folder and a file leaves both as they were."""
     folder, file, moves, replace = tmp_path / "folder", tmp_path / "file", count(), Path.replace
     folder.mkdir()
     (folder / "old").touch()
@@ -299,12 +295,12 @@ def test_an_interrupt_while_it_is_put_in_place_changes_nothing(
     assert {path.name for path in tmp_path.iterdir()} == {"folder", "file"}
 
 
-def test_a_folder_that_cannot_be_looked_for_is_a_line(tmp_path: Path) -> None:
+def test_a_target_whose_name_is_too_long_is_refused(tmp_path: Path) -> None:
     with refused(ReportError, "written", os.strerror(errno.ENAMETOOLONG)), placed(tmp_path / ("x" * 300) / "csv"):
         pass
 
 
-def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> None:
+def test_garbage_in_a_record_is_left_out_and_reported(run: Path, tmp_path: Path) -> None:
     with RecordReader(run / "run.mcap") as reader, RecordWriter(tmp_path / "run.mcap") as writer:
         for each in reader.messages(by_time=False):
             writer.add(each.key, each.payload, messages.encoding(each.key), each.t_ns, each.wall_ns)
@@ -313,14 +309,14 @@ def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> No
         huge = {**msgspec.to_builtins(messages_on(run, "process/controller.main/join")[0]), "incarnation": 2**63}
         writer.add("process/controller.main/join", msgspec.msgpack.encode(huge), "", 5, 5)
     done = export(tmp_path, Format.PARQUET)
-    (note, _) = done.notes  # the other one is that of the pictures
+    (note, _) = done.notes  # the other note is about the pictures
     assert has_terms(note, "3", "messages", "left out")
     assert done.tables["truth.parquet"] == counts(run)["truth"]
     joins: Any = pd.read_parquet(tmp_path / "parquet" / "join.parquet")
     assert joins["incarnation"].isna().sum() == 1
 
 
-def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
+def test_nothing_to_export_is_reported_with_the_path(tmp_path: Path) -> None:
     with pytest.raises(RunError, match=rf"^{tmp_path}: .*run\.mcap"):
         export(tmp_path, Format.CSV)
     RecordWriter(tmp_path / "run.mcap").close()
@@ -330,7 +326,7 @@ def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
 
 
-def test_the_command_line_starts_without_what_exports_need() -> None:
+def test_the_command_line_starts_without_loading_export_packages() -> None:
     loaded = (
         "import sys, zsim_deploy.cli.cli; print({'numba', 'scipy', 'mcap', 'pyarrow', 'foxglove'} & set(sys.modules))"
     )
@@ -338,7 +334,7 @@ def test_the_command_line_starts_without_what_exports_need() -> None:
     assert done.stdout.strip() == "set()"
 
 
-def test_the_command_prints_what_it_wrote_and_what_is_not_installed(
+def test_the_command_prints_what_it_wrote_and_missing_packages(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
@@ -366,7 +362,7 @@ EXPORT = """
 
 
 def long_record(path: Path, gates: int) -> None:
-    """Write the estimates of a run of so many gates."""
+    """Write a record of the estimates of four drones over `gates` gates."""
     covariance = tuple(float(i) for i in range(36))
     with RecordWriter(path) as writer:
         for k in range(gates):
@@ -379,7 +375,7 @@ def long_record(path: Path, gates: int) -> None:
 
 @pytest.mark.parametrize("suffix", [pytest.param("csv", marks=pytest.mark.soak), "parquet"])
 def test_a_longer_record_takes_no_more_memory(tmp_path: Path, suffix: str) -> None:
-    """Ten times as many messages may take a row group's worth more, 30 MB; all of them as objects would be 200 MB."""
+    """Ten times as many messages may take one more row group, 30 MB; all of them as objects would take 200 MB."""
     peaks_mb = []
     for gates in (1_000, 10_000):
         folder = tmp_path / str(gates)
@@ -394,7 +390,7 @@ def test_a_longer_record_takes_no_more_memory(tmp_path: Path, suffix: str) -> No
 @pytest.mark.parametrize(
     "suffix", ["csv", *(pytest.param(each, marks=pytest.mark.soak) for each in ("parquet", "mat", "foxglove"))]
 )
-def test_ctrl_c_leaves_nothing(tmp_path: Path, suffix: str) -> None:
+def test_ctrl_c_leaves_no_files(tmp_path: Path, suffix: str) -> None:
     long_record(tmp_path / "run.mcap", 5_000)
     command = [sys.executable, "-m", "zsim_deploy.cli", "export", str(tmp_path), "--format", suffix]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -409,7 +405,7 @@ def test_ctrl_c_leaves_nothing(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("form", Format)
-def test_a_full_disk_is_one_line_and_leaves_nothing(form: Format, run: Path, tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_in_one_line_and_leaves_no_files(form: Format, run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "run.mcap", tmp_path)
     with files_of_at_most(50_000), refused(ReportError, "room") as raised:
         export(tmp_path, form)
@@ -420,7 +416,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(form: Format, run: Path, tmp
 
 @contextmanager
 def files_of_at_most(size_bytes: int) -> Iterator[None]:
-    """Let no file of this process grow beyond a size."""
+    """Limit the size of the files that this process writes."""
     before, on_excess = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, before[1]))
     try:
@@ -435,7 +431,7 @@ def files_of_at_most(size_bytes: int) -> Iterator[None]:
 
 @pytest.fixture
 def seen(tmp_path: Path) -> Path:
-    """What a detector and the world saw in four pictures: two hats, none, one, and three of the world's."""
+    """Return a record of sightings in four pictures: two, no and one hat by a detector, and three by the world."""
     with RecordWriter(tmp_path / "run.mcap") as writer:
         for number, hats in enumerate((2, 0, 1)):
             t_ns = number * 20_000_000
@@ -447,7 +443,7 @@ def seen(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", [Format.CSV, Format.PARQUET])
-def test_every_hat_that_was_seen_is_a_row_and_so_is_a_picture_without_one(seen: Path, form: Format) -> None:
+def test_every_sighted_hat_and_every_picture_without_one_is_a_row(seen: Path, form: Format) -> None:
     done = export(seen, form)
     assert done.tables == {f"camera_info.{form.value}": 1, f"sighting.{form.value}": 7}
     table = READ[form.value](seen / form.value / f"sighting.{form.value}")
@@ -460,7 +456,7 @@ def test_every_hat_that_was_seen_is_a_row_and_so_is_a_picture_without_one(seen: 
     assert table["t_sample_ns"].tolist() == [0, 0, 16_000_000, 36_000_000] + [56_000_000] * 3
 
 
-def test_pictures_are_left_out_of_tables_with_a_line_that_says_so_and_sightings_are_in_matlab(seen: Path) -> None:
+def test_exports_omit_pictures_with_a_note_but_matlab_has_sightings(seen: Path) -> None:
     for form in (Format.CSV, Format.PARQUET, Format.MAT):
         (note,) = [note for note in export(seen, form).notes if "pictures" in note]
         assert has_terms(note, "3", "foxglove")

@@ -1,4 +1,4 @@
-"""Hunts over flights that are computed, not flown: what is drawn, found and shrunk, whoever is finished first."""
+"""Hunts over computed instead of simulated flights: draws, search and shrinking, in any order of completion."""
 
 import csv
 import random
@@ -42,7 +42,7 @@ KINDS = (
     "mag_noise",
     "sonar_stuck",
 )
-STRONG = 2.8  # of 3
+STRONG = 2.8  # least sum of the causes, of at most 3, for which the defect appears
 DEFECT = {"gps_dropout", "gust", "link_delay"}
 
 
@@ -51,7 +51,7 @@ def gust_m_s(fault: dict[str, Any]) -> float:
 
 
 def separation_m(scenario: Scenario) -> float:
-    """Return a separation that each cause makes smaller, below 1 m for three strong ones together only."""
+    """Return a separation that each cause reduces; only three strong ones together bring it below 1 m."""
     faults = {fault["kind"]: fault for fault in scenario.faults}
     strong = 0.0
     if "gust" in faults:
@@ -68,10 +68,10 @@ def rows_of(hunted: Hunted) -> list[dict[str, str]]:
 
 
 class FakePool:
-    """A pool in which several flights are under way, and any of them is finished first."""
+    """A pool with several flights under way, any of which finishes first."""
 
     separation: Callable[[Scenario], float] = staticmethod(separation_m)
-    stops_after: int | None = None  # flights after which Ctrl-C is pressed
+    stops_after: int | None = None  # number of flights after which Ctrl-C is pressed
     order = random.Random(1)
 
     def __init__(self, count: int, say: Callable[[str], None]) -> None:
@@ -122,7 +122,7 @@ def whole(fly: Callable[..., Hunted]) -> Hunted:
     return fly()
 
 
-def test_three_causes_are_found_and_nothing_else_is_left_of_the_flight(whole: Hunted) -> None:
+def test_three_causes_are_found_and_everything_else_is_removed(whole: Hunted) -> None:
     found = whole.summary.violation
     assert found is not None
     faults = {fault["kind"]: fault for fault in found.shrunk.faults}
@@ -138,9 +138,7 @@ def test_three_causes_are_found_and_nothing_else_is_left_of_the_flight(whole: Hu
     assert found.margin < 0
 
 
-def test_the_same_seed_gives_the_same_flights_and_verdict_whoever_is_finished_first(
-    fly: Callable[..., Hunted], whole: Hunted
-) -> None:
+def test_a_hunt_is_determined_by_its_seed_in_any_order_of_completion(fly: Callable[..., Hunted], whole: Hunted) -> None:
     other = fly(workers=7)
     assert whole.summary.verdict == "violated"
     assert [(each.stage, each.case) for each in whole.flown] == [(each.stage, each.case) for each in other.flown]
@@ -150,7 +148,7 @@ def test_the_same_seed_gives_the_same_flights_and_verdict_whoever_is_finished_fi
     assert whole.flown[1].case != third.flown[1].case
 
 
-def test_search_near_low_margins_needs_fewer_flights_than_drawing_alone(
+def test_search_near_low_margins_needs_fewer_flights_than_random_draws(
     fly: Callable[..., Hunted], whole: Hunted
 ) -> None:
     counts = [sum(each.stage == SEARCH for each in one.flown) for one in (whole, fly(seed=0), fly(seed=2))]
@@ -164,7 +162,7 @@ def test_search_near_low_margins_needs_fewer_flights_than_drawing_alone(
     assert sum(counts) / len(counts) < drawn / max(hits, 1) / 3
 
 
-def test_what_holds_is_flown_to_the_end_and_every_pair_and_triple_of_kinds_is_tried(
+def test_a_requirement_that_holds_is_tried_with_all_pairs_and_triples(
     fly: Callable[..., Hunted], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(FakePool, "separation", staticmethod(lambda _: 3.0))
@@ -183,7 +181,7 @@ def test_what_holds_is_flown_to_the_end_and_every_pair_and_triple_of_kinds_is_tr
     assert rows[0]["faults"] == ""
 
 
-def test_a_flight_without_faults_that_breaks_it_already_needs_none(
+def test_a_violation_without_faults_needs_no_causes(
     fly: Callable[..., Hunted], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(FakePool, "separation", staticmethod(lambda _: 0.5))
@@ -193,7 +191,7 @@ def test_a_flight_without_faults_that_breaks_it_already_needs_none(
 
 
 @pytest.mark.parametrize(("stops_after", "verdict"), [(5, "interrupted"), (None, "violated")])
-def test_ctrl_c_leaves_what_was_found(
+def test_ctrl_c_keeps_the_results_so_far(
     fly: Callable[..., Hunted], whole: Hunted, monkeypatch: pytest.MonkeyPatch, stops_after: int | None, verdict: str
 ) -> None:
     if stops_after is None:
@@ -204,7 +202,7 @@ def test_ctrl_c_leaves_what_was_found(
     assert len(rows_of(hunted)) == len(hunted.flown) <= stops_after
 
 
-def test_a_draw_that_no_scenario_may_have_is_left_out_and_the_hunt_goes_on(fly: Callable[..., Hunted]) -> None:
+def test_an_invalid_draw_is_skipped_and_the_hunt_continues(fly: Callable[..., Hunted]) -> None:
     path = "environment.wind.gust_m_s"
     hunted = fly(vary=(f"{path}=normal(0, 1)",), requirements=("min_separation_m > -9",), flights=60)
     drawn = [each.case.values[path] for each in hunted.flown[1:]]
@@ -213,7 +211,7 @@ def test_a_draw_that_no_scenario_may_have_is_left_out_and_the_hunt_goes_on(fly: 
     assert hunted.summary.verdict == "not violated"
 
 
-def test_the_folder_of_a_hunt_is_not_hunted_into_again(fly: Callable[..., Hunted], tmp_path: Path) -> None:
+def test_the_folder_of_a_hunt_is_not_reused_unless_forced(fly: Callable[..., Hunted], tmp_path: Path) -> None:
     fly(flights=3, out=tmp_path / "a")
     with pytest.raises(RunError) as error:
         fly(flights=3, out=tmp_path / "a")
@@ -238,11 +236,11 @@ def test_the_folder_of_a_hunt_is_not_hunted_into_again(fly: Callable[..., Hunted
         ({"vary": ("wind.gust_m_s=uniform(2)",)}, ("--vary", "uniform(2)")),
         ({"vary": ("environment.wind.gust_m_s=0,much",)}, ("--vary", "environment.wind.gust_m_s", "'much'")),
         ({"vary": ("environment.wind.gust_m_s=uniform(-1, 2)",)}, ("--vary", "environment.wind.gust_m_s", "-1.0")),
-        # hardly any that is drawn is a mass
+        # hardly any draw is a valid mass
         ({"vary": ("drones[0].mass_kg=normal(0.4, 1e7)",), "faults": ()}, ("drones[0].mass_kg", "100")),
     ],
 )
-def test_what_cannot_be_hunted_is_refused(
+def test_an_invalid_hunt_request_is_refused(
     fly: Callable[..., Hunted], more: dict[str, Any], terms: tuple[str, ...]
 ) -> None:
     with pytest.raises(ScenarioError) as error:

@@ -1,4 +1,4 @@
-"""A record as inputs: the agents that are run again, what reached the world before each gate, and links to aircraft."""
+"""A record as input of a rerun: the agents to run again, the inputs of each gate, and links to aircraft."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -92,10 +92,10 @@ def agents(reader: RecordReader, **info: Any) -> RecordedAgents:
     return recorded_agents(reader, msgspec.structs.replace(INFO, **info), SCENARIO)
 
 
-# Who is run again
+# Agents to run again
 
 
-def test_our_agents_are_run_again_by_their_processes_with_their_requests(write: Any):
+def test_zsim_s_agents_are_run_again_with_their_requests(write: Any):
     key, end = keys.cluster_request("main"), event("end", "world", truth_sha256="abc")
     asked = [(key, ClusterRequest(gate * GATE_NS, gate, "hold", {}, "operator.pilot", True)) for gate in range(3)]
     found = agents(write(*reversed(OURS), join("recorder", ""), *asked, end))
@@ -105,7 +105,7 @@ def test_our_agents_are_run_again_by_their_processes_with_their_requests(write: 
     assert list(found.requests) == asked
 
 
-def test_who_served_others_does_so_again(write: Any):
+def test_a_process_that_served_others_serves_them_again(write: Any):
     found = agents(write(join("controller.main", serves=("estimator.d1", "estimator.d2"))))
     assert found.processes == (AgentProcess("controller.main", ("estimator.d1", "estimator.d2", "controller.main")),)
     assert has_terms(str(found.processes[0]), "controller.main", "estimator.d1", "estimator.d2")
@@ -113,7 +113,7 @@ def test_who_served_others_does_so_again(write: Any):
 
 
 @pytest.mark.parametrize("foreign", [join("estimator.d2", ""), join("estimator.d2", PRINT, version="")])
-def test_others_under_our_names_are_not(write: Any, foreign: RecordedEntry):
+def test_foreign_processes_under_zsim_s_names_are_not_run_again(write: Any, foreign: RecordedEntry):
     found = agents(write(join("estimator.d1"), foreign, join("matlab.main"), join("controller.other")))
     assert [process.name for process in found.processes] == ["estimator.d1"]
 
@@ -129,7 +129,7 @@ def test_others_under_our_names_are_not(write: Any, foreign: RecordedEntry):
         (event("control", "fault_add", ok=True, args=KILL), ("process_kill", "asked", "0.10")),
     ],
 )
-def test_why_agents_are_not_run_again(write: Any, entries: RecordedEntry, terms: tuple[str, ...]):
+def test_agents_are_not_run_again_after_a_disturbance(write: Any, entries: RecordedEntry, terms: tuple[str, ...]):
     found = agents(write(*OURS, entries, event("end", "world", gate=9)))
     assert found.processes == ()
     assert has_terms(found.why_not, *terms)
@@ -144,22 +144,22 @@ def test_why_agents_are_not_run_again(write: Any, entries: RecordedEntry, terms:
         event("control", "fault_add", ok=False, args=KILL),
     ],
 )
-def test_what_is_no_reason(write: Any, entries: RecordedEntry):
+def test_irrelevant_events_do_not_prevent_running_agents_again(write: Any, entries: RecordedEntry):
     ends = (event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))
     assert agents(write(*OURS, entries, *ends)).why_not == ""
 
 
-def test_a_run_in_realtime_or_without_ours_or_with_a_planned_kill_has_a_reason(write: Any):
+def test_realtime_foreign_agents_and_planned_kills_prevent_a_rerun(write: Any):
     assert "realtime" in agents(write(*OURS), mode="realtime").why_not
     assert has_terms(agents(write(join("matlab.main"))).why_not, "none", "zsim's")
     scenario = scenario_file.from_text(f"{TEXT}faults: [{{kind: process_kill, target: estimator.d1, at_s: 0.5}}]")
     assert has_terms(recorded_agents(write(*OURS), INFO, scenario).why_not, "process_kill", "planned")
 
 
-# What is fed
+# Inputs of a rerun
 
 
-def test_inputs_count_before_the_clock_that_follows_them(write: Any):
+def test_inputs_belong_to_the_gate_of_the_clock_that_follows_them(write: Any):
     mode = (keys.command("d1", "mode"), Mode(0, 0, "tester.one", "takeoff"))
     estimate = Estimate(0, 0, ZEROS, ZEROS, (1.0, *ZEROS), 0.0, (0.0,) * 36, 0.1, ZEROS, {})
     health = (keys.process("recorder", "health"), Health(0, 0, "recorder", "h", 1, {}, 0, 0, 0, 0))
@@ -172,11 +172,11 @@ def test_inputs_count_before_the_clock_that_follows_them(write: Any):
     assert (first.t_ns, [m.key for m in first.inputs]) == (0, ["process/tester.one/join"])
     assert (second.t_ns, [m.key for m in second.inputs]) == (GATE_NS, [mode[0], keys.estimate("d1")])
     assert first.truth == {drone: messages.encode(truth(0, drone)[1]) for drone in ("d1", "d2")}
-    assert list(gates(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []  # without its clock, no gate
+    assert list(gates(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []  # there is no gate without its clock
 
 
-def test_pictures_are_no_inputs_and_what_detectors_saw_is(write: Any) -> None:
-    """A picture more or less on record changes nothing that is flown again."""
+def test_detections_are_inputs_and_pictures_are_not(write: Any) -> None:
+    """Additional pictures in the record do not change a rerun."""
     pictures: list[RecordedEntry] = [(keys.camera_info("d1", "front"), info())]
     pictures += [(keys.camera("d1", "front"), image(gate * GATE_NS, gate)) for gate in range(3)]
     detected: RecordedEntry = (keys.detections("d1"), sightings(GATE_NS))
@@ -194,14 +194,14 @@ def test_pictures_are_no_inputs_and_what_detectors_saw_is(write: Any) -> None:
 SECOND_NS = 1_000_000_000
 PEER = "192.168.1.20:14580"
 OVERRIDES = ("drones.drone3.body=external",)
-REPORTS = [  # state, age, loss, round trip, refused, of two drivers one after the other
+REPORTS = [  # state, age, loss, round trip and refused, of two successive drivers
     [("waiting", None, None, None, 0), ("armed", 20.0, 1.0, 4.0, 3), ("lost", 1200.0, 1.0, 6.0, 3)],
     [("connected", 30.0, 4.0, 20.0, 2), ("armed", 10.0, None, None, 2)],
 ]
 
 
 def record(path: Path, reports: list[list[tuple]] = REPORTS) -> Path:
-    """Write a flight of 5 s of whose drones one is external, with a report of its link each second."""
+    """Write a flight of 5 s with one external drone whose link is reported every second."""
     flown = Flown(duration_s=5.0, overrides=OVERRIDES)
     links = [(seq, *report) for driver in reports for seq, report in enumerate(driver)]
     with RecordWriter(path) as writer:
@@ -214,7 +214,7 @@ def record(path: Path, reports: list[list[tuple]] = REPORTS) -> Path:
     return path
 
 
-def test_a_link_is_judged_over_all_drivers_of_its_drone(tmp_path: Path):
+def test_a_link_is_summarised_over_all_drivers_of_its_drone(tmp_path: Path):
     (link,) = driver_links(record(tmp_path / "run.mcap")).values()
     assert link == DriverLink(PEER, 1200.0, 2.0, 4.0, 6.0, lost=1, lost_s=1.0, refused=5)
     unknown = driver_links(record(tmp_path / "unknown.mcap", [[("waiting", None, None, None, 0)]]))
@@ -222,7 +222,7 @@ def test_a_link_is_judged_over_all_drivers_of_its_drone(tmp_path: Path):
     assert str(unknown["drone3"]).split(", ")[0] == PEER
 
 
-def test_a_run_with_a_link_is_compared_with_one_without(tmp_path: Path):
+def test_a_run_with_a_link_can_be_compared_with_one_without(tmp_path: Path):
     directories = [tmp_path / name for name in ("simulated", "mixed")]
     for directory in directories:
         directory.mkdir()

@@ -1,4 +1,4 @@
-"""A flight that did not do what its plan says is marked, wherever it is shown; one that did is not."""
+"""A flight that falls short of its plan is marked wherever it is shown; one that follows it is not."""
 
 from collections.abc import Callable, Sequence
 from io import StringIO
@@ -35,7 +35,7 @@ WINDOW_S = (4.0, 30.0)
 
 
 def traffic(state: State, events: Sequence[Event] = (), duration_s: float = 30.0, overrides=SOON, **more: Any):
-    """Yield a synthetic flight whose cluster states are other ones from `state`, by time [s]."""
+    """Yield a synthetic flight whose cluster states have the fields that `state` returns for the time in s."""
     flown = Flown(duration_s=duration_s, overrides=tuple(overrides), events=tuple(events), **more)
     for key, message, wall_ns in synthetic_record.traffic(flown):
         if isinstance(message, ClusterState):
@@ -52,7 +52,7 @@ def found(state: State, **options: Any) -> list[Shortfall]:
 
 
 def write(record: Path, state: State, events: Sequence[Event] = (), **options: Any) -> None:
-    """Write a record that is complete."""
+    """Write a complete record."""
     flown = list(traffic(state, events, **options))
     clock = next(message for _, message, _ in reversed(flown) if isinstance(message, Clock))
     stopped = msgspec.structs.replace(clock, seq=clock.seq + 1, state="stopped")
@@ -64,7 +64,7 @@ def event(t_s: float, what: str, subject: str, by: str = "world", /, **data: Any
 
 
 def numbered(*events: Event) -> tuple[Event, ...]:
-    """Return events as on a record that lacks none."""
+    """Return events numbered as in a record without gaps."""
     return tuple(msgspec.structs.replace(each, seq=seq) for seq, each in enumerate(events))
 
 
@@ -73,7 +73,7 @@ def engaged(t_s: float) -> dict[str, Any]:
 
 
 def refused(t_s: float) -> dict[str, Any]:
-    """Return the state of a cluster that hovers, since its trajectory is refused."""
+    """Return the state of a cluster that hovers because its trajectory is refused."""
     return {"phase": "engaged", "reason": f"the guard parts a and b; trajectory{WAITS}too fast" if t_s > 5 else ""}
 
 
@@ -115,7 +115,7 @@ TIMED = (*SOON, "clusters.main.plan.target_over_s=4")
 
 
 def along(from_s: float, to_s: float = 30.0) -> State:
-    """Return the states of a formation that is led along `WAY` in this time, and is refused that before."""
+    """Return the states of a formation that follows `WAY` in this interval, and is refused it before."""
     space = cluster_space(3)
     at_target = np.array([5, -5, 15, 0, 0, np.pi / 2, 0, 0, 0, 4, 4, np.pi / 4])
     way = WaypointTrajectory(space, WAY, at_target)
@@ -154,7 +154,7 @@ def landing(commander: str, cause: str) -> tuple[Event, ...]:
 
 
 def refusals_before(commander: str, *at_s: float) -> tuple[Event, ...]:
-    """Return a landing at 12 s without commands, after commands of the drone, or of another one, that were refused."""
+    """Return a landing of drone3 at 12 s for lack of commands, after velocity commands refused at these times."""
     key = "drone/drone3/cmd/velocity"
     refusals = (event(t_s, "refused", key, commander, reason="age is 640 ms; must be <= 500 ms") for t_s in at_s)
     return numbered(*refusals, *landing(commander, "silence"))
@@ -166,7 +166,7 @@ def mission(*reports: dict[str, Any]) -> tuple[Event, ...]:
 
 
 class Case(NamedTuple):
-    """A flight; its shortfalls: kind, subject, time if it is known, and "!" if the flight fails; terms of the first."""
+    """A flight, its shortfalls (kind, subject, time if known, "!" if the flight fails) and terms of the first one."""
 
     state: State
     shortfalls: tuple[str, ...]
@@ -238,7 +238,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_shortfalls_of_a_flight(name: str) -> None:
+def test_the_shortfalls_of_a_flight_are_found(name: str) -> None:
     state, expected, terms, options = CASES[name]
     lines = found(state, **options)
     for line, each in zip(lines, expected, strict=True):
@@ -248,7 +248,7 @@ def test_shortfalls_of_a_flight(name: str) -> None:
     assert not terms or has_terms(lines[0].text, *terms)
 
 
-def test_what_is_not_said_or_said_of_other_lines() -> None:
+def test_texts_give_shares_and_durations_and_omit_irrelevant_causes() -> None:
     _, outside = found(by_phases)
     assert has_terms(outside.text, "engaged in 30 %", "held 50 %", "taking_off 10.1 %", "assembling 9.99 %")
     _, parted, _ = found(interrupted(), overrides=TRAJECTORY)
@@ -271,9 +271,7 @@ def test_what_is_not_said_or_said_of_other_lines() -> None:
         ((event(9.9, "commander", "other", "console.1"), event(14, "release", "other", "console.1")), True),
     ],
 )
-def test_a_hold_while_others_fly_or_land_a_drone_of_the_formation_is_reported(
-    events: tuple[Event, ...], fails: bool
-) -> None:
+def test_a_hold_fails_the_flight_unless_others_fly_or_land_a_drone(events: tuple[Event, ...], fails: bool) -> None:
     line = next(line for line in found(held_for(4.0), events=events) if line.kind == "held")
     assert (line.subject, line.fails) == ("main", fails)
 
@@ -283,12 +281,12 @@ def test_a_hold_while_others_fly_or_land_a_drone_of_the_formation_is_reported(
     [
         ((4.0, 3.5, 0.0), (16.0, 30.0), False, True),
         ((4.0, 2.5, 0.0), (16.0, 30.0), False, False),  # nearer than 5 m
-        ((0.0, 0.0, 40.0), (16.0, 17.9), False, False),  # too short
+        ((0.0, 0.0, 40.0), (16.0, 17.9), False, False),  # too brief
         ((0.0, 0.0, 40.0), (3.0, 11.0), False, False),  # on the way to its place
         ((0.0, 0.0, 40.0), (16.0, 30.0), True, False),  # flown by others
     ],
 )
-def test_a_drone_that_is_truly_far_from_its_place_is_one(
+def test_a_drone_whose_true_position_strays_is_a_shortfall(
     away_m: tuple[float, float, float], span_s: tuple[float, float], others: bool, strayed: bool, tmp_path: Path
 ) -> None:
     def moved():
@@ -307,7 +305,7 @@ def test_a_drone_that_is_truly_far_from_its_place_is_one(
         assert [(line.subject, line.t_s, line.fails) for line in kept] == [("drone2", 16.0, True)] * strayed
 
 
-def test_what_others_asked_of_a_formation_is_reported_and_fails_neither_a_hold_nor_a_trajectory() -> None:
+def test_a_request_by_others_excuses_a_hold_and_a_left_trajectory() -> None:
     def state(t_s: float) -> dict[str, Any]:
         return {"phase": "held", "reason": HELD_ON_REQUEST} if t_s > 20 else {"phase": "engaged"}
 
@@ -323,13 +321,13 @@ def test_what_others_asked_of_a_formation_is_reported_and_fails_neither_a_hold_n
     assert {line.kind: line.fails for line in shortfalls(flight, WINDOW_S)} == {"plan": False, "request": False}
 
 
-def test_a_record_without_events_of_falls_shows_that_a_drone_ended_in_an_emergency() -> None:
+def test_a_final_emergency_without_an_event_is_a_shortfall() -> None:
     flight = flight_of(engaged)
     flight.tracks[1].states[-1] = "emergency"
     (line,) = shortfalls(flight, WINDOW_S)
     assert (line.kind, line.subject, line.fails) == ("emergency", "drone2", True)
     flight.events.append(event(29.0, "mode", "drone2", "console.1", mode="emergency"))
-    assert shortfalls(flight, WINDOW_S) == []  # stopped on the ground: in the air there would be an event of it
+    assert shortfalls(flight, WINDOW_S) == []  # stopped on the ground: in the air, an event would be on record
 
 
 EXPECTS_FENCE = 'processes.expect=["estimator.drone1", "fence.main"]'
@@ -346,7 +344,7 @@ DROPS_FENCE, LOSES_FENCE = "processes.on_death={fence: drop}", "processes.on_ove
         ([("overdue", "fence.main", {})], (EXPECTS_FENCE, LOSES_FENCE), []),
         ([("death", "fence.main", DEATH), ("drop", "fence.main", DROP)], (EXPECTS_FENCE,), [True]),
         ([("death", "fence.main", DEATH), ("drop", "fence.main", DROP)], (), []),
-        ([("death", "fence.main", DEATH)], (EXPECTS_FENCE,), []),  # another does its work
+        ([("death", "fence.main", DEATH)], (EXPECTS_FENCE,), []),  # another process serves in its place
         ([("death", "fence.main", DEATH), ("drop", "fence.main", DROP)], (EXPECTS_FENCE, DROPS_FENCE), []),
         ([("death", "fence.main", AWAITED), ("drop", "fence.main", DROP)], (EXPECTS_FENCE,), [True]),
         ([("death", "fence.main", AWAITED), ("drop", "fence.main", DROP)], (EXPECTS_FENCE, LOSES_FENCE), []),
@@ -358,7 +356,7 @@ DROPS_FENCE, LOSES_FENCE = "processes.on_death={fence: drop}", "processes.on_ove
         ([("end", "world", {}), ("death", "fence.main", {"on_death": "end"})], (EXPECTS_FENCE,), []),
     ],
 )
-def test_a_process_that_was_expected_and_is_lost_is_one(
+def test_the_loss_of_an_expected_process_is_a_shortfall(
     events: list[tuple[str, str, dict[str, Any]]], processes: tuple[str, ...], fails: list[bool]
 ) -> None:
     made = [
@@ -380,7 +378,7 @@ def test_a_process_that_was_expected_and_is_lost_is_one(
         (None, 0.0, (0.0, 0.0), ()),
     ],
 )
-def test_window_of_the_statistics(
+def test_the_window_of_the_statistics_is_fitted_to_the_run(
     asked: tuple[float, float] | None, length_s: float, expected: tuple[float, float], terms: tuple[str, ...]
 ) -> None:
     span_s, note = window(asked, length_s)
@@ -388,11 +386,11 @@ def test_window_of_the_statistics(
     assert has_terms(note, *terms) if terms else note == ""
 
 
-# How they are shown
+# Presentation of shortfalls
 
 
-def test_errors_are_those_of_the_engaged_part_of_the_window() -> None:
-    """Where it was not engaged, estimate − desired is zero whatever the drones did."""
+def test_errors_cover_only_the_engaged_part_of_the_window() -> None:
+    """While a formation is not engaged, estimate − desired is zero whatever the drones do."""
     whole, part, none = (
         formations_of(flight_of(state, est_amplitude=np.full(12, 0.2)))[0]
         for state in (engaged, engaged_between(16.0, 22.0), engaged_between(31.0, 32.0))
@@ -406,7 +404,7 @@ def test_errors_are_those_of_the_engaged_part_of_the_window() -> None:
 @pytest.mark.parametrize(
     ("state", "part"), [(engaged_between(17.0, 30.0), "50"), (engaged_between(2.0, 3.0), "no errors")]
 )
-def test_table_figures_and_page_say_of_which_part_the_errors_are(state: State, part: str, tmp_path: Path) -> None:
+def test_table_figures_and_page_state_the_part_the_errors_cover(state: State, part: str, tmp_path: Path) -> None:
     write(tmp_path / "run.mcap", state)
     flight, formations, summary = judge(tmp_path / "run.mcap")
     assert summary.clusters["main"].engaged_share is not None
@@ -415,7 +413,7 @@ def test_table_figures_and_page_say_of_which_part_the_errors_are(state: State, p
     console.print(table(summary, "main"))
     assert summary.clusters["main"].part in console.file.getvalue()  # type: ignore[attr-defined]
     assert part in page(summary, [])
-    if part == "50":  # marks are the same ones whatever a note says
+    if part == "50":  # one case suffices: the marks do not depend on the note
         assert all("window" in figure.drawing.get_suptitle() for figure in figures(flight, formations, summary))
 
 
@@ -427,7 +425,7 @@ def test_table_figures_and_page_say_of_which_part_the_errors_are(state: State, p
         ({"events": numbered(event(21.0, "emergency", "drone2", "console.1", cause="command"))}, "no"),
     ],
 )
-def test_the_head_of_a_page_says_whether_the_plan_was_flown(
+def test_the_head_of_a_page_states_whether_the_plan_was_flown(
     options: dict[str, Any], planned: str, tmp_path: Path
 ) -> None:
     write(tmp_path / "run.mcap", engaged, **options)
@@ -439,7 +437,7 @@ def test_the_head_of_a_page_says_whether_the_plan_was_flown(
 
 @pytest.mark.parametrize("reason", ["too fast", "allowed: " + "sin(beta) min(p, q) is 0.35 m, " * 12])
 @pytest.mark.parametrize("width_in", [COLUMN_IN, PAGE_IN])
-def test_the_mark_of_a_figure_is_whole_and_covers_nothing(reason: str, width_in: float) -> None:
+def test_the_mark_of_a_figure_is_complete_and_covers_nothing(reason: str, width_in: float) -> None:
     figure = new_figure(width_in, 2.0)
     axes = figure.subplots()
     for k in range(6):
@@ -481,13 +479,13 @@ def test_the_verdict_is_the_same_with_and_without_a_report(
     assert (NOT_AS_PLANNED in (table(summary, "main").title or "")) == bool(code)
     if name == "step refused to the end":
         for figure in figures(flight, formations, summary):
-            assert terms[0] in " ".join(figure.drawing.get_suptitle().split())  # on as many lines as it takes
+            assert terms[0] in " ".join(figure.drawing.get_suptitle().split())  # the title may wrap
         assert terms[0] in page(summary, [])
         assert terms[0] in plain[1]
 
 
 def end_of(folder: Path, report: bool, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, int]:
-    """Return a run's exit code, its last line on standard error, and how often what it did not do is marked."""
+    """Return a run's exit code, its last line on standard error and the number of marked shortfalls."""
     outcome = type("Outcome", (), {"interrupted": False, "failed": False, "reason": "over"})()
     code = 0
     try:

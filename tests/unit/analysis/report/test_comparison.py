@@ -1,4 +1,4 @@
-"""The comparison of runs: side by side what each report says of its own, and in words what one has and another has not."""
+"""The comparison of runs: their reports side by side, and notes on what only some of them have."""
 
 import base64
 import errno
@@ -59,7 +59,7 @@ def record(folder: Path, flight: Flown) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Return the folders of a calm run, one with larger errors and another seed, and one without a cluster."""
+    """Return the folders of a calm run, a run with larger errors and another seed, and a run without a cluster."""
     home = tmp_path_factory.mktemp("runs")
     calm = Flown(duration_s=12.0, overrides=(WINDOW,), amplitude=ERRORS, est_amplitude=0.5 * ERRORS)
     rough = Flown(duration_s=12.0, overrides=(WINDOW, "seed=5"), amplitude=3 * ERRORS, est_amplitude=ERRORS)
@@ -78,7 +78,7 @@ def compared(runs: list[Path]) -> list[ComparedRun]:
     return judged(runs)
 
 
-def test_statistics_stand_side_by_side(compared: list[ComparedRun]) -> None:
+def test_statistics_are_shown_side_by_side(compared: list[ComparedRun]) -> None:
     rows = {row.name: row.cells for row in statistics_rows(compared, "main")}
     width = len(STATISTICS)
     for i, name in enumerate(["x_c (m)", "y_c (m)", "z_c (m)"]):
@@ -98,8 +98,8 @@ def test_facts_that_differ_are_marked(compared: list[ComparedRun]) -> None:
     assert rows["Clusters"].cells == ("main of 3", "main of 3", "none")
 
 
-def test_the_scenarios_differ_in_what_was_overridden(compared: list[ComparedRun], tmp_path: Path) -> None:
-    """Faults are a whole each, and differences that rounding hides are shown."""
+def test_scenarios_differ_in_the_overridden_fields(compared: list[ComparedRun], tmp_path: Path) -> None:
+    """Each fault is compared as a whole, and differences that rounding would hide are shown."""
     rows = {row.name: row.cells for row in scenario_rows(compared)}
     assert rows == {"seed": ("1", "5", "1"), "clusters.main": (THERE, THERE, ABSENT)}
     assert scenario_rows(compared[:1] * 2) == []
@@ -117,7 +117,7 @@ def test_the_scenarios_differ_in_what_was_overridden(compared: list[ComparedRun]
     assert has_terms(fault, "at_s 1", "for_s 0.5", "kind gps_bias", "target drone1", "value_m [3, 0, 0]")
 
 
-def test_named_things_are_compared_by_name() -> None:
+def test_named_items_are_compared_by_name() -> None:
     one = dict(
         flattened({"drones": [{"name": "a", "x": 1}, {"name": "b", "x": 2}], "list": [1, 2], "map": {"k": None}})
     )
@@ -125,7 +125,7 @@ def test_named_things_are_compared_by_name() -> None:
                    "drones.b.x": 2, "list": [1, 2], "map.k": None}  # fmt: skip
 
 
-def test_what_one_run_has_and_another_has_not_is_said(runs: list[Path], tmp_path: Path) -> None:
+def test_notes_report_what_only_some_runs_have(runs: list[Path], tmp_path: Path) -> None:
     end = record(tmp_path / "short", Flown(duration_s=3.0, overrides=(WINDOW,), end=None))
     data = (runs[0] / "run.mcap").read_bytes()
     (tmp_path / "cut").mkdir()
@@ -149,7 +149,7 @@ def twins(folder: Path, run: Path) -> list[ComparedRun]:
     return judged([folder / "a" / "calm", folder / "b" / "calm"])
 
 
-def test_other_drones_and_variables_are_said(runs: list[Path], tmp_path: Path) -> None:
+def test_notes_report_drones_of_only_one_run(runs: list[Path], tmp_path: Path) -> None:
     other = "drones=[{name: drone1, position_m: [0, 1.5, 0]}, {name: x, position_m: [5, 5, 0]}, {name: y, position_m: [9, 9, 0]}]"
     members = "clusters.main.drones=[drone1, x, y]"
     record(tmp_path / "others", Flown(duration_s=4.0, overrides=(other, members)))
@@ -181,14 +181,14 @@ def test_a_comparison_of_other_runs_is_not_replaced(runs: list[Path], tmp_path: 
     assert page("A/one", "C/two") == "A/compare-one-two-2.html"
 
 
-def test_names_tell_the_runs_apart(tmp_path: Path) -> None:
+def test_names_of_runs_are_distinct(tmp_path: Path) -> None:
     assert run_names([Path("runs/a"), Path("runs/b")]) == ["a", "b"]
     assert run_names([Path("one/a"), Path("two/a")]) == ["one/a", "two/a"]
     assert run_names([tmp_path / "a", tmp_path / "a"]) == ["a (1)", "a (2)"]
     assert comparison_path([tmp_path / name for name in "abcde"]) == tmp_path / "compare-a-b-c-and-2-more.html"
 
 
-def test_runs_can_be_told_apart_without_colour() -> None:
+def test_line_styles_are_distinct_without_colour() -> None:
     looks = [(str(run_style(i).dashes), run_style(i).marker) for i in range(len(STYLES))]
     assert len({dashes for dashes, _ in looks}) == len({marker for _, marker in looks}) == len(STYLES)
     assert len({(run_style(i).color, str(run_style(i).dashes)) for i in range(24)}) == 24
@@ -210,7 +210,7 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
         assert figure.get_size_inches()[0] * figure.dpi >= 1000
         assert any(axes.has_data() for axes in figure.axes), name
         is_marked = any(UNPLANNED in each.get_text() for each in figure.findobj(Text))
-        assert is_marked == (name != "figure_5_errors_main_1.png")  # of the last two runs
+        assert is_marked == (name != "figure_5_errors_main_1.png")  # the figure of the last two runs
     labels = [axes.get_xlabel() for axes in drawn["rms_main.png"].axes]
     assert [text.rpartition("(")[2] for text in labels] == ["m)", "rad)"]
     lanes, _, x_true, x_measured = drawn["figure_6_position_main.png"].axes[:4]
@@ -218,12 +218,12 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
     largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
     assert [line.get_label() for line in x_true.lines[::2][:3]] == [four[i].label for i in (0, 1, 3)]
     assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
-    assert len(x_measured.lines) == 9  # measured, desired, and the engagement of three runs
+    assert len(x_measured.lines) == 9  # measured, desired and engagement of three runs
     plans = [axes.get_title() for axes in drawn["plan_view.png"].axes]
     assert plans == [f"({letter}) {run.label}" for letter, run in zip("abcd", four, strict=True)]
 
 
-def test_runs_over_each_other_have_each_its_marks_in_its_colour(tmp_path: Path) -> None:
+def test_overlaid_runs_have_marks_in_their_colours(tmp_path: Path) -> None:
     """The first run has a fault, the second a collision; both take off."""
     fault = (event(6.0, 0, "fault"), event(8.0, 1, "fault_end"))
     flights = {
@@ -240,7 +240,7 @@ def test_runs_over_each_other_have_each_its_marks_in_its_colour(tmp_path: Path) 
     marks = {(line.get_marker(), line.get_color()): np.asarray(line.get_xydata())[0].tolist() for line in pointed}
     assert marks[POINTS["take-off"], colours[0]] == pytest.approx([0.4, 0])
     later = marks[POINTS["take-off"], colours[1]]
-    assert later == pytest.approx([0.6, 1], abs=0.03)  # a gate later, where 0.6 s is none
+    assert later == pytest.approx([0.6, 1], abs=0.03)  # one gate later, if 0.6 s is not a gate
     assert marks[POINTS["collision"], colours[1]] == [9.0, 1]
     assert (POINTS["collision"], colours[0]) not in marks
     bars = [bar for bar in lanes.collections if to_hex(np.asarray(bar.get_facecolor())[0]) == colours[0]]
@@ -257,7 +257,7 @@ def event(t_s: float, seq: int, kind: str) -> Event:
     return Event(round(t_s * 1e9), seq, kind, "world", "drone1", kind, {"id": 1})
 
 
-def test_the_page_is_one_file_that_asks_nothing_of_the_network(
+def test_the_page_is_one_file_that_needs_no_network(
     runs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def two(runs: list[ComparedRun]) -> Iterator[ReportFigure]:
@@ -272,7 +272,7 @@ def test_the_page_is_one_file_that_asks_nothing_of_the_network(
     assert len(pictures) == 2
     for each in pictures:
         picture = matplotlib.image.imread(io.BytesIO(base64.b64decode(each)))[:, :, :3]
-        assert picture.shape[1] == 1432  # 7.16 in, a page of a paper
+        assert picture.shape[1] == 1432  # 7.16 in, the width of a page of a paper, at 200 pixels per inch
         assert 0.003 < (picture < 0.9).any(axis=2).mean() < 0.6
     assert not re.search(r"https?:|@import|url\(|<script", text)
     assert has_terms(text, "<title>calm", "rough", "alone", "comparison</title>")
@@ -281,14 +281,14 @@ def test_the_page_is_one_file_that_asks_nothing_of_the_network(
         assert run.summary.truth_sha256 in text
 
 
-def test_a_run_that_did_not_fly_as_planned_is_marked_in_every_table(compared: list[ComparedRun]) -> None:
+def test_a_run_not_flown_as_planned_is_marked_in_every_table(compared: list[ComparedRun]) -> None:
     bad = replace(compared[1], summary=msgspec.structs.replace(compared[1].summary, as_planned=False))
     good = replace(compared[0], summary=msgspec.structs.replace(compared[0].summary, as_planned=True))
     text = comparison_page([good, bad], [])
     heads = re.findall(r"<th[^>]*>((?:calm|rough)[^<]*)</th>", text)
     assert heads == ["calm", f"rough {UNPLANNED}"] * 3
     assert UNPLANNED not in comparison_page([good, replace(good, name="again")], [])
-    many = [replace(compared[0], name=f"run{number}") for number in range(5)]  # more than fit a table
+    many = [replace(compared[0], name=f"run{number}") for number in range(5)]  # more runs than fit a table
     tables = re.findall(r'<table class="numbers">.*?</table>', comparison_page(many, []), re.DOTALL)
     assert [len(re.findall(r'colspan="4"', each)) for each in tables] == [2, 2, 1]
     for each in tables:
@@ -296,8 +296,8 @@ def test_a_run_that_did_not_fly_as_planned_is_marked_in_every_table(compared: li
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_figures_in_other_formats_come_into_a_folder_beside_the_page(runs: list[Path], tmp_path: Path) -> None:
-    page = tmp_path / "page"  # a name without an ending will do
+def test_figures_in_other_formats_are_in_a_folder_beside_the_page(runs: list[Path], tmp_path: Path) -> None:
+    page = tmp_path / "page"  # a name without an extension is allowed
     compare(runs[:2], page, formats=["svg"])
     written = sorted(path.suffix for path in (tmp_path / "page-figures").iterdir())
     assert written == [".svg"]
@@ -307,7 +307,7 @@ def test_figures_in_other_formats_come_into_a_folder_beside_the_page(runs: list[
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_the_command(runs: list[Path], tmp_path: Path) -> None:
+def test_the_command_writes_a_comparison_with_figures(runs: list[Path], tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["report", *map(str, runs[:2]), "--format", "pdf"])
     page = runs[0].parent / "compare-calm-rough.html"
     assert done.exit_code == 0, done.output
@@ -320,7 +320,7 @@ def test_the_command(runs: list[Path], tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -> None:
+def test_runs_that_cannot_be_compared_are_refused(runs: list[Path], tmp_path: Path) -> None:
     with refused(RecordError, "run.mcap", os.strerror(errno.ENOENT)):
         compare([runs[0], tmp_path], tmp_path / "page.html")
     (tmp_path / "file").write_text("in the way")
@@ -328,7 +328,7 @@ def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -
         compare(runs[:2], tmp_path / "file" / "page.html")
     record = runs[0] / "run.mcap"
     before = record.read_bytes()
-    with refused(ReportError, "run.mcap", "--out"):  # no earlier comparison
+    with refused(ReportError, "run.mcap", "--out"):  # the target is not an earlier comparison
         compare(runs[:2], record)
     assert record.read_bytes() == before
     with pytest.raises(ReportError, match="calm: "):

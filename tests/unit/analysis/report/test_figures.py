@@ -1,4 +1,4 @@
-"""Figures for a paper, of few drones one by one, of many as their spread; marks and ranges of their axes of time."""
+"""Figures for a paper: few drones are drawn one by one, many as a spread; marks and ranges of the time axes."""
 
 import dataclasses
 import re
@@ -60,8 +60,8 @@ from zsim_analysis.report.flight_figures import (
 from zsim_analysis.report.make_report import figures, page
 from zsim_analysis.report.summary import ClusterErrors, error_table, summarise
 
-PAGE_HEIGHT_IN = 9.25  # of the text of an IEEE page
-READABLE_PT = 6.0  # least size of text in IEEE's figures after reduction
+PAGE_HEIGHT_IN = 9.25  # text height of an IEEE page
+READABLE_PT = 6.0  # smallest text in IEEE figures after reduction
 WINDOW_S, MARKS = (4.0, 10.0), TimeMarks(1.0, 3.0)
 T_S = np.arange(0.0, 12.0, 0.1)
 
@@ -93,7 +93,7 @@ def apart(count: int) -> Distances:
 
 
 def large(count: int) -> Formation:
-    """Return a formation of so many drones whose variables err by their number in millimetres."""
+    """Return a formation of `count` drones in which variable k has an error of k · 10⁻³."""
     own = [f"{what}_{i}" for i in range(1, count) for what in ("w", "h", "v", "phi")]
     named = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", *own)[: 4 * count]
     error = np.tile(1e-3 * np.arange(len(named)), (len(T_S), 1)).astype(np.float64)
@@ -103,13 +103,13 @@ def large(count: int) -> Formation:
 
 
 def radio(count: int) -> RadioHistory:
-    """Return the links of so many drones in a path that breaks in the middle of the run."""
+    """Return the links of `count` drones in a chain that breaks halfway through the run."""
     path = tuple(tuple(j for j in (i - 1, i + 1) if 0 <= j < count) for i in range(count))
     broken = ((), *path[1:])
     return RadioHistory([RadioLinks(round(t * 1e9), 0, path if t < T_S.mean() else broken) for t in T_S], count)
 
 
-def test_the_radio_is_drawn_with_the_times_at_which_not_all_reach_all() -> None:
+def test_the_radio_figure_shows_when_the_network_is_not_connected() -> None:
     figure = draw_radio(radio(3), names(3), MARKS)
     assert {"drone1", "drone2", "drone3", "not connected"} <= legend_of(figure)
     share = np.asarray(figure.axes[0].images[0].get_array())
@@ -118,14 +118,14 @@ def test_the_radio_is_drawn_with_the_times_at_which_not_all_reach_all() -> None:
 
 
 def legend_of(figure: Figure) -> set[str]:
-    """Return what the legend above a figure names, each once."""
+    """Return the labels in the legends of a figure, which must be unique."""
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert len(set(texts)) == len(texts)
     return set(texts)
 
 
 @pytest.mark.parametrize("count", [30, 100])
-def test_marks_of_many_drones_are_whole_and_named(count: int) -> None:
+def test_figures_of_many_drones_have_unclipped_dots_and_a_legend(count: int) -> None:
     figure = draw_estimates(estimates(count), colours(count), WINDOW_S, MARKS)
     titles = [axes.get_title(loc="left") or axes.get_title() for axes in figure.axes]
     assert [title[:3] for title in titles] == ["(a)", "(b)", "(c)", "(d)"]
@@ -136,7 +136,7 @@ def test_marks_of_many_drones_are_whole_and_named(count: int) -> None:
 
 
 def fits(figure: Figure) -> None:
-    """Judge that a figure fits the page, and that its text is neither too large nor too small for it."""
+    """Assert that a figure fits the page and that its text is neither too large nor too small."""
     width, height = figure.get_size_inches()
     assert width in (COLUMN_IN, PAGE_IN)
     assert height <= PAGE_HEIGHT_IN
@@ -149,7 +149,7 @@ def fits(figure: Figure) -> None:
         assert box.x0 - 1 <= extent.x0 <= extent.x1 <= box.x1 + 1
 
 
-@pytest.mark.parametrize("count", [4, 100])  # the most that have a column each, and as their spread
+@pytest.mark.parametrize("count", [4, 100])  # the most drones with a column each, and drones drawn as a spread
 def test_figures_of_drones_fit_a_page(count: int) -> None:
     for figure in (
         draw_estimates(estimates(count), colours(count), WINDOW_S, MARKS),
@@ -162,7 +162,7 @@ def test_figures_of_drones_fit_a_page(count: int) -> None:
         assert sum(len(axes.lines) for axes in figure.axes) < 100
 
 
-def test_drones_are_drawn_in_their_colours_what_was_flown_over_what_was_commanded() -> None:
+def test_drones_have_their_colours_and_flown_covers_commanded() -> None:
     drawn = draw_velocities(responses(3), colours(3), MARKS)
     assert [axes.lines[0].get_color() for axes in drawn.axes[:3]] == list(colours(3).values())
     for axes in drawn.axes:
@@ -183,11 +183,11 @@ def test_few_drones_have_a_column_each_with_band_and_nees() -> None:
         assert len(axes.collections) == 1  # the band
         assert "2σ" in axes.get_title(loc="right")
     assert all(axes.get_yscale() == "log" for axes in figure.axes[4 * 3 :])
-    assert not any(axes.texts for axes in figure.axes)  # which would stand upon the curves
+    assert not any(axes.texts for axes in figure.axes)  # texts would cover the curves
 
 
-def test_the_axes_of_estimates_hold_all_since_the_engagement() -> None:
-    """An error that is large before the window belongs to the flight; one before the engagement is the start's noise."""
+def test_the_axes_of_estimates_include_all_errors_since_engagement() -> None:
+    """A large error before the window belongs to the flight; one before the engagement is initial noise."""
     errors = estimates(3)
     first = errors["drone1"].error
     first[np.searchsorted(T_S, 3.5), 3], first[np.searchsorted(T_S, 0.5), 3] = 2.0, 50.0
@@ -196,7 +196,7 @@ def test_the_axes_of_estimates_hold_all_since_the_engagement() -> None:
 
 
 @pytest.mark.parametrize("count", [3, 30])
-def test_the_time_axis_of_velocities_is_that_of_the_run_with_its_marks(count: int) -> None:
+def test_the_time_axis_of_velocities_spans_the_run_with_its_marks(count: int) -> None:
     late = {name: VelocityResponse(*(each[T_S >= 5.0] for each in one)) for name, one in responses(count).items()}
     figure = draw_velocities(late, colours(count), replace(MARKS, span_s=(0.0, 20.0)))
     for axes in figure.axes:
@@ -216,7 +216,7 @@ def test_figures_of_formations_fit_a_page(count: int) -> None:
         assert len(figure.axes) <= 2 * ROWS_MAX
 
 
-def test_the_goal_stands_beside_the_reference() -> None:
+def test_errors_from_the_goal_are_beside_those_from_the_reference() -> None:
     flight = synthetic_record.flight(synthetic_record.traffic(Flown(duration_s=12.0, climb_s=4.0)))
     (formation,) = formations_of(flight)
     goal = goal_errors(formation, flight.scenario)
@@ -238,7 +238,7 @@ def test_a_spread_keeps_every_extreme() -> None:
     assert all(len(each) <= SPREAD_INSTANTS for each in drawn)
 
 
-def test_a_large_formation_has_a_table_by_groups_first() -> None:
+def test_a_large_formation_has_a_table_by_groups_and_a_full_one() -> None:
     each = [ParameterErrors(0.1, 0.1, 0.0, 0.2, 0.01 * i, 0.0) for i in range(40)]
     named = [*large(10).names]
     table = error_table(ClusterErrors(tuple(names(10)), dict(zip(named, each, strict=True))))
@@ -251,7 +251,7 @@ def test_a_large_formation_has_a_table_by_groups_first() -> None:
     assert few.rest is None
 
 
-def test_vector_files_have_true_fonts_and_the_same_bytes_each_time() -> None:
+def test_vector_files_have_no_type_3_fonts_and_are_reproducible() -> None:
     def written() -> dict[str, bytes]:
         drawing = draw_distances(apart(3), Separations(2.0, 1.5, 0.52), colours(3), MARKS)
         return {form: ReportFigure("distances.png", "", "", drawing).vector(form) for form in FORMATS}
@@ -265,7 +265,7 @@ def test_vector_files_have_true_fonts_and_the_same_bytes_each_time() -> None:
     assert float(size[1]) == pytest.approx(72 * COLUMN_IN)
 
 
-def test_a_page_of_a_large_formation_has_all_its_parameters_behind_the_figures() -> None:
+def test_the_page_of_a_large_formation_ends_with_all_parameters() -> None:
     each = ParameterErrors(0.1, 0.1, 0.0, 0.2, 0.2, 0.0)
     flight = synthetic_record.flight(
         synthetic_record.traffic(Flown(duration_s=2.0, end={"reason": "over", "command_age_ms": None}))
@@ -280,7 +280,7 @@ def test_a_page_of_a_large_formation_has_all_its_parameters_behind_the_figures()
 
 
 ROLL, ENGAGED_S = 3, 4.0
-ROWS = ("t_s", "desired", "value", "true", "est_error", "true_error", "phases")  # of a formation, an instant each
+ROWS = ("t_s", "desired", "value", "true", "est_error", "true_error", "phases")  # fields with a row per instant
 OBSTACLES = (
     "environment.obstacles=[{name: mast, shape: cylinder, position_m: [1, 2, 0], radius_m: 0.5, height_m: 9}, "
     "{name: wall, shape: box, position_m: [3, 3, 0], size_m: [4, 1, 2], yaw_deg: 30}]",
@@ -294,7 +294,7 @@ EVENTS = (
 
 
 def states(flown: Flown) -> Iterator[tuple[str, Any, int]]:
-    """Yield a flight whose first estimates turn roll by whole rounds, as noise does with small formations."""
+    """Yield a flight whose first estimates of roll wrap around, as noise makes them do in small formations."""
     for key, message, wall_ns in synthetic_record.traffic(flown):
         t_s = message.t_ns / 1e9
         if isinstance(message, ClusterState) and t_s < ENGAGED_S:
@@ -313,7 +313,7 @@ def flight() -> RecordedFlight:
 
 @pytest.fixture(scope="module")
 def formation(flight: RecordedFlight) -> Formation:
-    """Return its formation, of which there are four variables: to draw all would be more of the same."""
+    """Return the flight's formation with only four variables: drawing all would test nothing more."""
     whole = formations_of(flight)[0]
     some = {
         name: getattr(whole, name)[:, : ROLL + 1] for name in ("desired", "value", "true", "est_error", "true_error")
@@ -336,7 +336,7 @@ def test_noise_before_the_engagement_does_not_set_the_scale(flight: RecordedFlig
     assert max(map(abs, whole.get_ylim())) < 0.1
 
 
-def test_marks_stand_on_every_time_axis(flight: RecordedFlight, formation: Formation) -> None:
+def test_marks_are_drawn_on_every_time_axis(flight: RecordedFlight, formation: Formation) -> None:
     marks = time_marks(flight, formation)
     assert [(band.kind, band.from_s, band.to_s) for band in marks.bands] == [
         ("fault", 5.0, 6.0),
@@ -351,9 +351,7 @@ def test_marks_stand_on_every_time_axis(flight: RecordedFlight, formation: Forma
         assert all(len(bands_of(figure, place)) >= 3 for place in range(len(figure.axes)))
 
 
-def test_time_axes_are_those_of_the_run_but_for_that_of_the_window(
-    flight: RecordedFlight, formation: Formation
-) -> None:
+def test_time_axes_span_the_run_except_that_of_the_window(flight: RecordedFlight, formation: Formation) -> None:
     marks = time_marks(flight, formation)
     assert marks.span_s == (0.0, 12.0)
     late = dataclasses.replace(formation, **{name: getattr(formation, name)[300:] for name in ROWS})
@@ -384,8 +382,8 @@ def seconds(t_s: float) -> int:
     return round(t_s * 1e9)
 
 
-def test_a_take_over_of_all_drones_is_marked_once_from_acquisition_to_release_as_are_faults_that_overlap() -> None:
-    """As a console does it: each drone is acquired, flown, and released again; the controller goes on."""
+def test_overlapping_take_overs_and_faults_are_marked_once() -> None:
+    """As with a console, each drone is acquired, flown and released; then the controller continues."""
     done = [
         Event(seconds(t_s + 0.5 * i), i, "control", "eve", op, "done", {"args": {"drone": f"drone{i + 1}"}, "ok": True})
         for t_s, op in ((5.0, "acquire"), (7.0, "release"))
@@ -399,7 +397,7 @@ def test_a_take_over_of_all_drones_is_marked_once_from_acquisition_to_release_as
     assert spans(flight_of(*faults, *ends)) == [("fault", 5.0, 8.0)]
 
 
-def test_a_killed_process_that_is_back_ends_its_fault() -> None:
+def test_the_restart_of_a_killed_process_ends_its_fault() -> None:
     kill = Event(seconds(5.0), 0, "fault", "world", "estimator.drone2", "killed", {"id": 1, "kind": "process_kill"})
     done = {"done_ns": seconds(5.02)}
     back = Event(seconds(5.14), 1, "restart", "estimator.drone2", "estimator.drone2", "", done)
@@ -410,10 +408,10 @@ def test_a_killed_process_that_is_back_ends_its_fault() -> None:
     (axes,) = draw_parameters(formations_of(flight)[0], ["x_c"], time_marks(flight)).axes
     lines = [line for line in axes.lines if line.get_color() == COLOURS[FAULT]]
     (x,) = (float(np.asarray(line.get_xdata())[0]) for line in lines)
-    assert x == pytest.approx(5.01)  # of .02 s nothing else is seen
+    assert x == pytest.approx(5.01)  # a band of 0.02 s is visible only as a line
 
 
-def test_every_band_is_in_the_legend_truth_lies_over_estimates_and_panels_have_letters(flight: RecordedFlight) -> None:
+def test_bands_are_in_the_legend_truth_is_on_top_and_panels_have_letters(flight: RecordedFlight) -> None:
     (formation,) = formations_of(flight)
     marks = time_marks(flight, formation)
     kinds = {band.kind for band in marks.bands}
@@ -435,18 +433,18 @@ def test_every_band_is_in_the_legend_truth_lies_over_estimates_and_panels_have_l
     assert draw_parameters(formation, ["roll"], marks).axes[0].get_title(loc="left") == ""
 
 
-def test_greys_are_told_apart() -> None:
-    """Of window, grid, band of an estimate, and lines: each is a tenth of the way from black to white from the next."""
+def test_greys_are_distinguishable() -> None:
+    """Window, grid, band of an estimate and lines differ by about a tenth of the range from black to white."""
     greys = sorted(float(np.mean(to_rgb(colour))) for colour in ("#ffffff", WINDOW_GREY, GRID, BAND_GREY, DARK))
     assert min(np.diff(greys)) > 0.06
 
 
-def test_captions_name_the_paper_beside_its_tests_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_captions_name_the_paper_only_for_its_own_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     for draw in ("draw_errors", "draw_parameters"):
         monkeypatch.setattr(make_report, draw, lambda *_: new_figure(COLUMN_IN, 1.0))
 
     def titles(*events: Event, overrides: tuple[str, ...] = ()) -> list[str]:
-        end = {"reason": "over", "command_age_ms": None}  # with which no record is looked into
+        end = {"reason": "over", "command_age_ms": None}  # with it, no record is read
         flown = synthetic_record.flight(states(Flown(duration_s=12.0, events=events, overrides=overrides, end=end)))
         summary = summarise(flown, formations_of(flown), Path())
         return [each.title for each in figures(flown, formations_of(flown), summary)]
@@ -462,7 +460,7 @@ def bands_of(figure: Figure, place: int) -> list[Any]:
     return [patch for patch in figure.axes[place].patches if patch.get_alpha() == pytest.approx(ALPHA)]
 
 
-def test_surfaces_lie_in_the_plan_view_the_highest_on_top() -> None:
+def test_the_plan_view_draws_surfaces_with_the_highest_on_top() -> None:
     low, high = [0, 0, 0, 2, 0, 0, 0, 1, 0], [0, 0, 3, 2, 0, 3, 0, 1, 3]
     roof = {"name": "roof", "triangles": packed(np.array([high, low], float)), "position_m": [5, 6, 0]}
     drones = [{"name": "drone1", "position_m": [0, 0, 0]}]
@@ -474,7 +472,7 @@ def test_surfaces_lie_in_the_plan_view_the_highest_on_top() -> None:
     assert drawn.get_array().tolist() == [0.0, 3.0]
 
 
-def test_obstacles_stand_in_the_plan_view(flight: RecordedFlight, formation: Formation) -> None:
+def test_the_plan_view_draws_obstacles(flight: RecordedFlight, formation: Formation) -> None:
     (axes,) = draw_plan(flight, [formation]).axes
     assert [type(patch).__name__ for patch in axes.patches][:2] == ["Circle", "Rectangle"]
     ends = [line for line in axes.lines if line.get_marker() in ("s", "o")]

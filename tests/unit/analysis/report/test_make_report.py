@@ -1,4 +1,4 @@
-"""The report: known flights give their closed-form figures, broken records give what there is."""
+"""The report: known flights yield closed-form statistics, and damaged records are reported as far as possible."""
 
 import errno
 import hashlib
@@ -44,7 +44,7 @@ STATISTICS = {f"{whose}_{what}" for whose in ("est", "true") for what in ("std",
 
 
 def flown(**options) -> Flown:
-    """Return a flight of 12 s whose window of 8 s holds four whole waves of its error."""
+    """Return a flight of 12 s whose window of 8 s covers four periods of the error."""
     wave = {"amplitude": AMPLITUDE, "offset": OFFSET, "est_amplitude": 0.5 * AMPLITUDE, "period_s": 2.0}
     return Flown(**{"duration_s": 12.0, "overrides": ("report.window_s=[2, 9.98]",), **wave, **options})
 
@@ -83,7 +83,7 @@ def report_of(directory: Path, flight: Flown) -> RunSummary:
 
 
 def late(**info: Any) -> synthetic_record.Entries:
-    """Yield a flight from 9 s on, with `world/info`."""
+    """Yield `world/info` and the messages of a flight from 9 s."""
     for key, message, wall_ns in synthetic_record.traffic(flown(end=None)):
         if key == keys.INFO:
             yield key, msgspec.structs.replace(message, **info), wall_ns
@@ -91,7 +91,7 @@ def late(**info: Any) -> synthetic_record.Entries:
             yield key, message, wall_ns
 
 
-def test_errors_are_those_of_the_closed_form(run):
+def test_errors_match_the_closed_form(run):
     _, summary = run
     assert summary.window_s == (2.0, 9.98)
     assert list(summary.errors) == NAMES
@@ -101,8 +101,8 @@ def test_errors_are_those_of_the_closed_form(run):
         assert msgspec.structs.astuple(summary.errors[name]) == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-def test_angles_wrap_the_short_way(tmp_path):
-    # Test 2 turns by 0.1 rad/s and passes pi; estimates are on the wire in [-pi, pi].
+def test_errors_of_angles_are_wrapped(tmp_path):
+    # The paper's test 2 turns at 0.1 rad/s and passes pi; published estimates are in [-pi, pi].
     flight = flown(scenario="trajectory", duration_s=64.0, overrides=("report.window_s=[22, 61.98]",))
     summary = report_of(tmp_path, flight)
     yaw, sine = summary.errors["yaw"], AMPLITUDE[5] / math.sqrt(2)
@@ -124,7 +124,7 @@ def test_summary_json_has_the_fields_of_the_contract(run):
     assert msgspec.json.decode((directory / "summary.json").read_bytes(), type=type(summary)) == summary
 
 
-def test_truth_hash_is_the_one_of_the_contract(run):
+def test_the_truth_hash_is_computed_as_in_the_contract(run):
     directory, summary = run
     digest = hashlib.sha256()
     with RecordReader(directory / "run.mcap") as reader:
@@ -142,7 +142,7 @@ def test_truth_hash_is_the_one_of_the_contract(run):
     assert summary.record.truth_missing == 0
 
 
-def test_truth_that_is_not_on_record_is_told(tmp_path):
+def test_truth_missing_from_the_record_is_reported(tmp_path):
     def is_lost(key: str, message: Any) -> bool:
         return key == keys.truth("drone2") and 3_000_000_000 <= message.t_ns < 4_000_000_000
 
@@ -153,7 +153,7 @@ def test_truth_that_is_not_on_record_is_told(tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
+def test_a_replay_is_reported_and_judged_from_its_beginning(tmp_path):
     synthetic_record.record(tmp_path / "run.mcap", late(replay_of="20261122-run"))
     summary = make_report(tmp_path)
     assert summary.record.truth_missing == 0
@@ -166,8 +166,8 @@ def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
     assert has_terms((tmp_path / "report.html").read_text(), "replay", "20261122-run…")
 
 
-def test_nobody_knows_the_truth_of_a_cluster_with_an_external_drone(tmp_path):
-    """Its figures against truth are null, with the reason; the hash is that of the others, and the map has all."""
+def test_a_cluster_with_an_external_drone_has_no_true_errors(tmp_path):
+    """Errors from the truth are null, with the reason; the hash covers the other drones, and the map shows all."""
     flown = Flown(amplitude=AMPLITUDE, est_amplitude=AMPLITUDE, overrides=("drones.drone2.body=external",))
     synthetic_record.write(tmp_path / "run.mcap", flown)
     flight, formations, summary = judge(tmp_path / "run.mcap")
@@ -186,11 +186,11 @@ def test_nobody_knows_the_truth_of_a_cluster_with_an_external_drone(tmp_path):
     assert [len(track.t_ns) > 0 for track in flight.tracks] == [True] * 3
 
 
-def test_separation_is_the_closest_pair_in_truth_and_in_the_air(tmp_path):
+def test_the_separation_is_that_of_the_closest_pair_in_flight(tmp_path):
     summary = report_of(tmp_path, flown(amplitude=np.zeros(12), offset=np.zeros(12)))
     assert summary.min_separation_m == pytest.approx(8 * math.sin(math.pi / 8), rel=1e-9)  # 2 p sin(beta / 2)
     (tmp_path / "run.mcap").unlink()
-    # p and q grow from 1 m on the ground; the state is landed until 1 s.
+    # p and q grow from 1 m on the ground; the drones are landed until 1 s.
     away, grow = np.zeros(12), np.zeros(12)
     away[9:11], grow[9:11] = -3.0, 3.0
     growing = Flown(duration_s=8.0, climb_s=10.0, offset=away, amplitude=grow, period_s=40.0)
@@ -201,10 +201,10 @@ def test_separation_is_the_closest_pair_in_truth_and_in_the_air(tmp_path):
     assert report_of(tmp_path, nobody_flies).min_separation_m == pytest.approx(2 * math.sin(math.pi / 8))
 
 
-def test_a_world_that_died_leaves_all_that_can_be_known(tmp_path):
+def test_a_run_whose_world_died_is_reported_from_its_record(tmp_path):
     summary = report_of(tmp_path, flown(end=None, other_traffic=True))
     assert has_terms(summary.ended, "12.00", "no end")
-    assert summary.wall_s == pytest.approx(0.6)  # the synthetic recorder takes 1 ms a gate
+    assert summary.wall_s == pytest.approx(0.6)  # the synthetic recorder takes 1 ms per gate
     assert summary.real_time_factor == pytest.approx(20.0)
     assert summary.deadline_misses is None
     assert summary.command_age_ms == {"p50": 0.0, "p99": 0.0, "max": 0.0}
@@ -212,7 +212,7 @@ def test_a_world_that_died_leaves_all_that_can_be_known(tmp_path):
     assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=1e-9)
 
 
-def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
+def test_a_truncated_record_is_reported_up_to_its_end(tmp_path):
     flight = flown(other_traffic=True, end=None)
     synthetic_record.write(tmp_path / "whole.mcap", flight)
     data = (tmp_path / "whole.mcap").read_bytes()
@@ -225,8 +225,8 @@ def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
 
 
 @pytest.mark.usefixtures("unrendered")
-def test_a_run_without_a_cluster_or_whose_cluster_published_nothing(tmp_path, monkeypatch):
-    """As where its controller could not load the user's space: the report does not need it either."""
+def test_a_run_without_cluster_states_is_reported_without_errors(tmp_path, monkeypatch):
+    """A controller that cannot load the user's space publishes no states; the report does not need the space either."""
 
     def load(*_: object) -> None:
         raise DocumentError(["space: nowhere:Space cannot be loaded"])
@@ -246,7 +246,7 @@ def test_a_run_without_a_cluster_or_whose_cluster_published_nothing(tmp_path, mo
 
 
 @pytest.mark.parametrize("length", [0, 1, 100])
-def test_a_record_without_a_message_or_on_which_no_drone_moves_is_refused(tmp_path, length):
+def test_a_record_without_messages_or_without_truth_is_refused(tmp_path, length):
     (tmp_path / "still").mkdir()
     synthetic_record.write(tmp_path / "whole.mcap", flown(duration_s=0.1))
     (tmp_path / "run.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:length])
@@ -259,7 +259,7 @@ def test_a_record_without_a_message_or_on_which_no_drone_moves_is_refused(tmp_pa
         make_report(tmp_path / "still")
 
 
-def test_garbage_on_the_keys_is_counted_and_passed_over(tmp_path):
+def test_garbage_on_known_keys_is_counted_and_skipped(tmp_path):
     with RecordWriter(tmp_path / "run.mcap") as writer:
         for key, message, wall_ns in synthetic_record.traffic(flown()):
             writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
@@ -282,7 +282,7 @@ def test_a_flood_of_events_does_not_hide_a_restart(tmp_path):
     assert "4900 × refused" in page(summary, [])
 
 
-def test_the_page_asks_nothing_of_the_network_and_runs_nothing(run):
+def test_the_page_needs_no_network_and_has_no_scripts(run):
     directory, _ = run
     text = (directory / "report.html").read_text()
     links = re.findall(r"""\b(?:src|href|srcset|action|data)\s*=\s*["']([^"']*)""", text)
@@ -295,19 +295,19 @@ def test_the_page_asks_nothing_of_the_network_and_runs_nothing(run):
     assert "2 of 600 (estimator.drone1 2)" in text
 
 
-def test_figures_show_something(run):
+def test_figures_are_not_blank(run):
     directory, _ = run
     assert {path.name for path in (directory / "figures").iterdir()} == FIGURES
     for name in FIGURES:
         picture = matplotlib.image.imread(directory / "figures" / name)[:, :, :3]
-        assert picture.shape[1] in (700, 1432)  # 3.5 and 7.16 in, at 200 pixels each
+        assert picture.shape[1] in (700, 1432)  # 3.5 and 7.16 in at 200 pixels per inch
         inked = (picture < 0.9).any(axis=2)
         assert 0.005 < inked.mean() < 0.6
         colours = (picture * 255).astype(int) @ (65_536, 256, 1)
         assert len(np.unique(colours)) > 50
 
 
-def test_the_terminal_table_stands_beside_the_paper(run):
+def test_the_terminal_table_compares_with_the_paper(run):
     _, judged = run
     cluster = msgspec.structs.replace(judged.clusters["main"], paper_std=PAPER_TABLE_1)
     summary = msgspec.structs.replace(judged, clusters={"main": cluster})
@@ -315,9 +315,9 @@ def test_the_terminal_table_stands_beside_the_paper(run):
     row = next(line for line in text.splitlines() if line.strip("│ ").startswith("p (m)"))
     assert "0.032" in row
     assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
-    assert any("beta (rad)" in line for line in text.splitlines())  # 80 columns do not break a name …
-    assert table(summary, "main").left_out(80) == []  # … nor leave a figure out
-    assert judged.clusters["main"].paper_std == {}  # too short a flight
+    assert any("beta (rad)" in line for line in text.splitlines())  # 80 columns break no name …
+    assert table(summary, "main").left_out(80) == []  # … and omit no column
+    assert judged.clusters["main"].paper_std == {}  # the flight is too short
     assert COLUMNS[PAPER_COLUMN][0] not in table(judged, "main").columns
     assert PAPER_COLUMN not in page(judged, [])
 
@@ -332,7 +332,7 @@ def test_times_of_a_window_have_two_decimals_at_most(tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_nothing_to_report_on_is_one_line(tmp_path):
+def test_a_report_that_cannot_be_made_is_refused_with_the_path(tmp_path):
     with refused(RecordError, "run.mcap", os.strerror(errno.ENOENT)):
         make_report(tmp_path)
     synthetic_record.write(tmp_path / "run.mcap", flown(duration_s=0.1))
@@ -380,7 +380,7 @@ def test_several_clusters_have_a_table_and_figures_each(tmp_path):
 
 @pytest.mark.parametrize("name", ["figures", "report-figures"])
 def test_a_report_is_not_written_through_a_link(tmp_path: Path, name: str) -> None:
-    """Who sends a run's folder could have its report replace, and remove, files elsewhere."""
+    """Otherwise the report of a received run could replace and remove files elsewhere."""
     elsewhere, folder = tmp_path / "elsewhere", tmp_path / "run"
     elsewhere.mkdir()
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""What a sweep flies: axes, combinations, what is drawn, and the faults of all of it at once."""
+"""The design of a sweep: axes, combinations, random draws, and the report of all faults at once."""
 
 import copy
 from collections import Counter
@@ -57,7 +57,7 @@ def faults(*vary: str, runs: int | None = None, **values: Any) -> list[str]:
         ("a.b= normal(-1e-3, 0.5) ", Draw("a.b", "normal", -1e-3, 0.5)),
     ],
 )
-def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
+def test_variations_are_parsed(text: str, axis: Seeds | Grid | Draw) -> None:
     assert parse(text) == axis
 
 
@@ -80,13 +80,13 @@ def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
         ("wind.gust_m_s=uniform(-1e308,1e308)", ("finite", "<", "finite")),
     ],
 )
-def test_what_is_no_variation(text: str, terms: tuple[str, ...]) -> None:
+def test_an_invalid_variation_is_refused_with_the_reason(text: str, terms: tuple[str, ...]) -> None:
     (fault,) = faults(text)
     assert fault.startswith(f"--vary {text}: ")
     assert has_terms(fault, *terms)
 
 
-def test_runs_are_spread_evenly_over_every_combination() -> None:
+def test_runs_are_distributed_evenly_over_all_combinations() -> None:
     design = SweepDesign(plan("seed", "wind.gust_m_s=0,1,2", "estimation.flow=true,false", runs=20))
     assert design.points == 6
     flown = [(design.values(run)[GUST], design.values(run)["estimation.flow"]) for run in range(20)]
@@ -98,7 +98,7 @@ def test_runs_are_spread_evenly_over_every_combination() -> None:
     assert plan("wind.gust_m_s=0,1,2", "estimation.flow=true,false").runs == 6
 
 
-def test_a_run_s_scenario_is_what_set_would_give() -> None:
+def test_the_scenario_of_a_run_equals_that_of_overrides() -> None:
     design = SweepDesign(plan("seed", "wind.gust_m_s=0,1", "drones.drone2.mass_kg=uniform(0.4,0.5)", runs=5))
     values = design.values(3)
     overrides = [f"{GUST}={values[GUST]}", f"drones.drone2.mass_kg={values['drones.drone2.mass_kg']!r}"]
@@ -106,7 +106,7 @@ def test_a_run_s_scenario_is_what_set_would_give() -> None:
     assert design.varied == [GUST, "drones.drone2.mass_kg"]
 
 
-def test_seeds_are_distinct_and_those_of_a_longer_sweep_begin_alike() -> None:
+def test_seeds_are_distinct_and_a_longer_sweep_begins_with_the_same() -> None:
     short, long = Seeds().draw(7, 50), Seeds().draw(7, 20_000)
     assert long[:50] == short
     assert len(set(long)) == 20_000
@@ -126,7 +126,7 @@ def test_paired_seeds_and_draws_are_the_same_for_every_combination() -> None:
     assert [design.scenario(run).seed for run in range(6)] == [each["seed"] for each in values]
 
 
-def test_seeds_that_are_given_are_flown_at_every_combination() -> None:
+def test_given_seeds_are_flown_at_every_combination() -> None:
     given = plan("wind.gust_m_s=0,1", "seed=5,9,2")
     design = SweepDesign(given)
     assert (given.runs, design.points, design.paired) == (6, 2, True)
@@ -146,7 +146,7 @@ def test_the_section_of_the_one_cluster_may_be_left_out() -> None:
         make_plan(STEP.name, document, ["gains.proportional_1_s=0.4"], None)
 
 
-def test_draws_are_of_their_distribution_and_know_nothing_of_each_other() -> None:
+def test_draws_follow_their_distribution_independently_of_each_other() -> None:
     uniform, normal = Draw("a", "uniform", -1.0, 3.0), Draw("b", "normal", 5.0, 0.5)
     u, n = np.array(uniform.draw(1, 20_000)), np.array(normal.draw(1, 20_000))
     assert u.min() >= -1
@@ -162,7 +162,7 @@ def test_draws_are_of_their_distribution_and_know_nothing_of_each_other() -> Non
     assert [one.values(run)[path] for run in range(4)] == [two.values(run)[path] for run in range(4)]
 
 
-def test_all_faults_are_told_at_once_before_anything_flies() -> None:
+def test_all_faults_are_reported_at_once_before_any_run() -> None:
     found = faults("seed", "wind.gust_m_s=0,-1,-2", "wings=1,2", "estimation.flow", "drones.drone9.mass_kg=1", runs=30)
     assert len(found) == 4
     assert has_terms(found[0], "--vary estimation.flow", "not a variation")
@@ -189,7 +189,7 @@ def test_all_faults_are_told_at_once_before_anything_flies() -> None:
     assert has_terms(programs, "programs", "my.look")
 
 
-def test_a_fault_of_the_file_is_told_once() -> None:
+def test_a_fault_of_the_file_is_reported_once() -> None:
     (fault,) = faults("seed", "wind.gust_m_s=0,1", runs=9, duration_s=-1)
     assert has_terms(fault, "step.yaml", "duration_s", "-1")
     assert has_terms(faults("seed", runs=3, seed=-4)[0], "seed", "-4")
@@ -214,12 +214,12 @@ def test_every_drawn_value_is_checked() -> None:
         (["seed"], 2_000_000, ("--runs", "2000000", "1000000")),
     ],
 )
-def test_a_number_of_runs_that_makes_no_sense(vary: list[str], runs: int, terms: tuple[str, ...]) -> None:
+def test_an_invalid_number_of_runs_is_refused(vary: list[str], runs: int, terms: tuple[str, ...]) -> None:
     (fault,) = faults(*vary, runs=runs)
     assert has_terms(fault, *terms)
 
 
-def test_which_plans_are_the_same_sweep() -> None:
+def test_plans_that_differ_only_in_more_runs_are_the_same_sweep() -> None:
     one = plan("seed", "wind.gust_m_s=0,1", runs=4)
     other = copy.deepcopy(one.document)
     other["duration_s"] = 5
@@ -246,14 +246,14 @@ def test_which_plans_are_the_same_sweep() -> None:
         ("wind.gust_m_s=0,1", "environment.wind={gust_m_s: 2}", ("environment.wind", "contains")),
     ],
 )
-def test_one_field_varies_once_under_whichever_of_its_names(first: str, second: str, terms: tuple[str, ...]) -> None:
+def test_a_field_varied_twice_by_different_names_is_refused(first: str, second: str, terms: tuple[str, ...]) -> None:
     (fault,) = faults(first, second)
     assert has_terms(fault, f"--vary {second}", *terms, first)
     assert plan(first).vary == (first,)
     assert plan(second).vary == (second,)
 
 
-def test_a_place_has_one_name() -> None:
+def test_all_names_of_a_field_give_the_same_path() -> None:
     document = {"drones": [{"name": "a"}, {"name": "b.c"}, 3], "seed": 1}
     for path, steps in {
         "drones.a.mass_kg": ("drones", 0, "mass_kg"),
@@ -271,7 +271,7 @@ def test_a_place_has_one_name() -> None:
 
 
 def test_a_run_does_not_change_the_values_of_an_axis() -> None:
-    """Two axes of one place are refused, so that it takes a plan that nobody checked to set a part of a value."""
+    """Two axes of one field are refused, so only an unchecked plan can set a part of a value."""
     document, _ = read_document(STEP, [])
     gains, part = "clusters.main.gains={proportional_1_s: 0.5}", "clusters.main.gains.proportional_1_s=0.6"
     design = SweepDesign(SweepPlan(source=STEP.name, document=document, vary=(gains, part), runs=1))
@@ -297,7 +297,7 @@ def test_a_file_may_have_any_name(name: str) -> None:
         (f"x={'a' * 30},{'a' * 30}b,c", [f"{'a' * 23}… (1)", f"{'a' * 23}… (2)", "c"]),
     ],
 )
-def test_no_two_values_of_a_field_have_the_same_name(text: str, names: list[str]) -> None:
+def test_values_of_a_field_have_distinct_names(text: str, names: list[str]) -> None:
     grid = parse(text)
     assert isinstance(grid, Grid)
     assert grid.names == names

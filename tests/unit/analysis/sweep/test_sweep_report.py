@@ -30,7 +30,7 @@ X_RMS = "errors.x_c.true_rms"
 
 
 def flown(of: SweepPlan, **known: Any) -> list[Row]:
-    """Return the rows of runs that ended well, with columns of some values."""
+    """Return the rows of runs that ended well, with the known values in their columns."""
     return [{**well(of, run), **known} for run in range(of.runs)]
 
 
@@ -43,7 +43,7 @@ def terminal(of: SweepPlan, rows: list[Row], width: int = 80) -> str:
 
 
 def report_of(folder: Path, of: SweepPlan, rows: list[Row]) -> tuple[str, Any]:
-    """Return the page of a sweep, and its summary as decoded from JSON."""
+    """Write the report of a sweep and return its page and its summary, decoded from JSON."""
     with locked(folder, of) as sweep, sweep.journal() as book:
         for each in rows:
             book.append(each)
@@ -65,7 +65,7 @@ def figures_in(folder: Path) -> set[str]:
     return {path.stem for path in (folder / "figures").iterdir()}
 
 
-def test_figures_of_a_sweep_show_something(tmp_path: Path) -> None:
+def test_figures_of_a_sweep_are_not_blank(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2,3", runs=12)
     report_of(tmp_path, of, flown(of))
     for path in (tmp_path / "figures").glob("*.png"):
@@ -83,7 +83,7 @@ def test_figures_of_a_sweep_show_something(tmp_path: Path) -> None:
         ((), set()),
     ],
 )
-def test_the_report_of_a_sweep(tmp_path: Path, vary: tuple[str, ...], more: set[str]) -> None:
+def test_the_report_has_figures_points_and_spreads(tmp_path: Path, vary: tuple[str, ...], more: set[str]) -> None:
     of = plan(*vary, runs=60 if vary else 1)
     page, summary = report_of(tmp_path, of, flown(of))
     assert figures_in(tmp_path) == {"true_rms", "est_std", "safety"} | more
@@ -96,7 +96,7 @@ def test_the_report_of_a_sweep(tmp_path: Path, vary: tuple[str, ...], more: set[
 
 
 @undrawn
-def test_the_user_s_own_figures_come_first_and_pairs_have_their_differences(tmp_path: Path) -> None:
+def test_the_user_s_metrics_come_first_and_pairs_have_differences(tmp_path: Path) -> None:
     of = plan("seed=paired", "duration_s=1,2", "wind.gust_m_s=uniform(0,1)", runs=10, report={"metrics": "mine:own_m"})
     of = msgspec.structs.replace(of, changed=("duration_s=9",))
     day = {"date": "2026-01-02T03:04:05Z"}
@@ -117,7 +117,7 @@ def test_the_user_s_own_figures_come_first_and_pairs_have_their_differences(tmp_
 
 
 @unrendered
-def test_figures_in_other_formats_stand_beside_the_pictures_until_a_report_without_them(tmp_path: Path) -> None:
+def test_figures_in_other_formats_last_until_a_report_without_them(tmp_path: Path) -> None:
     of = plan("seed", runs=4)
     report_of(tmp_path, of, flown(of))
     own = tmp_path / "figures" / "of_the_user.pdf"
@@ -131,7 +131,7 @@ def test_figures_in_other_formats_stand_beside_the_pictures_until_a_report_witho
 
 
 @undrawn
-def test_a_report_of_failures_and_of_what_is_not_finished(tmp_path: Path) -> None:
+def test_a_report_shows_failed_and_unfinished_runs(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2", runs=40)
     rows = [well(of, run) if run % 4 == 1 else made(of, run, failure="the <world> waits") for run in range(20)]
     page, summary = report_of(tmp_path / "some", of, rows)
@@ -148,7 +148,7 @@ def test_a_report_of_failures_and_of_what_is_not_finished(tmp_path: Path) -> Non
 
 
 def engaged(of: SweepPlan, run: int, **since_s: float | None) -> Row:
-    """Return the row of a run with clusters that were engaged, or never."""
+    """Return the row of a run whose clusters were engaged at these times, or never."""
     begun = {f"clusters.{name}.engaged_s": value for name, value in since_s.items()}
     known = {name: 0.1 if value else None for name, value in since_s.items()}
     errors = {f"clusters.{name}.{X_RMS}": value for name, value in known.items() if name != "main"}
@@ -158,7 +158,7 @@ def engaged(of: SweepPlan, run: int, **since_s: float | None) -> Row:
 
 
 @undrawn
-def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path) -> None:
+def test_the_report_names_clusters_and_counts_engaged_runs(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2", runs=8)
     rows = [
         engaged(of, run, main=5.0 if run % 2 or run < 4 else None, errors=6.0 if run % 2 else None) for run in range(8)
@@ -179,7 +179,7 @@ def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path)
 
 
 @undrawn
-def test_a_sweep_marks_runs_that_left_their_plan_and_shows_window_and_errors(tmp_path: Path) -> None:
+def test_a_report_marks_unplanned_runs_and_shows_window_and_errors(tmp_path: Path) -> None:
     of = plan("seed", "duration_s=1,2", runs=8)
     known = {"window_from_s": 40 / 3, "window_to_s": 1234567.0, "engaged": True, "collisions": 0, "as_planned": True}
     left = {**known, "as_planned": False, "shortfall": "main: target refused"}
@@ -199,8 +199,8 @@ def test_a_sweep_marks_runs_that_left_their_plan_and_shows_window_and_errors(tmp
 
 
 @undrawn
-def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: Path) -> None:
-    """Four of ten runs fall in the same way, at other times: they err by less and keep farther apart."""
+def test_a_mean_excludes_runs_that_crashed_or_were_cut_short(tmp_path: Path) -> None:
+    """Four of ten runs crash alike, at different times; they have smaller errors and larger separations."""
     of = plan("seed", runs=10)
     rows = flown(of, **{X_RMS: 0.2, "min_separation_m": 3.0, "metrics.effort": 2.0, "as_planned": True})
     better = {X_RMS: 0.1, "min_separation_m": 9.0, "metrics.effort": 1.0}
@@ -224,7 +224,7 @@ def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: 
     assert point.least_separation_m == 1.0
     assert point.without_collision is not None
     assert point.without_collision.value == pytest.approx(0.6)
-    assert list(summary.not_as_planned.values()) == [4]  # in one line, whatever the time
+    assert list(summary.not_as_planned.values()) == [4]  # merged into one line whatever the time
     assert summary.window_notes == {cut["window_note"]: 4}
     assert "26.5 s" in page
     assert cut["window_note"] in page
@@ -233,7 +233,7 @@ def test_a_mean_does_not_profit_from_runs_that_fell_or_were_not_flown(tmp_path: 
 # Axes of figures
 
 
-def test_an_axis_is_that_of_its_samples_not_of_an_interval_of_two_runs() -> None:
+def test_an_axis_spans_its_samples_not_the_interval_of_two_runs() -> None:
     of = plan("seed", "duration_s=1,2", runs=4)
     samples = judged(of, flown(of)).values(X_RMS)
     low, high = drawn(of, "true_rms").axes[0].get_ylim()
@@ -241,7 +241,7 @@ def test_an_axis_is_that_of_its_samples_not_of_an_interval_of_two_runs() -> None
     assert samples.max() < high < samples.max() + np.ptp(samples)
 
 
-def test_slices_of_a_drawn_value_hold_as_many_runs_each() -> None:
+def test_slices_of_a_drawn_value_have_equally_many_runs() -> None:
     x = stream(1, "x").uniform(0, 6, 600)
     found = slices(x, 10 * x)
     assert [len(samples) for _, samples in found] == [100] * 6
@@ -250,7 +250,7 @@ def test_slices_of_a_drawn_value_hold_as_many_runs_each() -> None:
         assert samples.mean() == pytest.approx(10 * middle)
 
 
-def test_numbers_stand_at_their_value_under_their_full_name() -> None:
+def test_numbers_are_at_their_value_on_an_axis_with_a_full_name() -> None:
     figure = drawn(plan("seed", "sensors.gps.position_m.noise=0,1,4", runs=15), "true_rms")
     axes = figure.axes[0]
     assert axes.get_xlabel() == "GPS position noise (m)"
@@ -266,7 +266,7 @@ def test_numbers_stand_at_their_value_under_their_full_name() -> None:
     assert decades.get_xticks().tolist() == [0.01, 0.1, 1, 10]
 
 
-def test_combinations_of_other_fields_have_a_colour_each_and_words_stand_side_by_side() -> None:
+def test_each_combination_has_a_colour_and_words_are_side_by_side() -> None:
     both = drawn(plan("seed", "wind.gust_m_s=0,1,2", "estimation.flow=true,false", runs=12), "true_rms")
     assert {"estimation flow true", "estimation flow false"} <= named(both)
     words = drawn(plan("seed", "sensors.preset=paper,ardrone2", runs=4), "true_rms").axes[0]
@@ -275,13 +275,13 @@ def test_combinations_of_other_fields_have_a_colour_each_and_words_stand_side_by
 
 
 def beyond(axes: Axes) -> list[tuple[str, float]]:
-    """Return kind and y of the marks of intervals that leave an axis."""
+    """Return the kind and y of the marks of intervals that exceed the axis."""
     marks = [line for line in axes.lines if line.get_marker() in ("^", "v") and not line.get_clip_on()]
     return [(str(line.get_marker()), float(np.asarray(line.get_ydata())[0])) for line in marks]
 
 
-def test_an_interval_that_leaves_its_axis_is_marked_there_and_named() -> None:
-    """Five runs, all but one of them alike, give an interval that is wider than their spread."""
+def test_an_interval_that_exceeds_its_axis_is_marked_and_in_the_legend() -> None:
+    """Five runs, all but one of them equal, give an interval that is wider than their spread."""
     of = plan("seed", "duration_s=1,2", runs=10)
     figure = drawn(of, "true_rms", [{**well(of, run), X_RMS: 0.2 if run > 7 else 0.1} for run in range(10)])
     ends = dict(zip("v^", figure.axes[0].get_ylim(), strict=True))
@@ -293,7 +293,7 @@ def test_an_interval_that_leaves_its_axis_is_marked_there_and_named() -> None:
     assert BEYOND_AXIS not in named(many)
 
 
-def test_figures_of_the_user_s_own_are_drawn_and_summed_up() -> None:
+def test_the_user_s_metrics_are_drawn_and_summarised() -> None:
     of = plan("seed", "wind.gust_m_s=0,1", runs=6, report={"metrics": "my_figures:overshoot"})
     assert drawn(of, "metrics", flown(of, **{"metrics.overshoot_m": 0.5})).axes[0].get_ylabel() == "overshoot (m)"
     failure = "report.metrics my_figures:overshoot: KeyError: 'main'"
@@ -304,7 +304,7 @@ def test_figures_of_the_user_s_own_are_drawn_and_summed_up() -> None:
     assert summary.unmeasured == {failure: 1}
 
 
-def test_points_without_a_flight_as_planned_are_marked_and_their_share_is_drawn() -> None:
+def test_points_without_a_planned_flight_are_marked_and_shares_drawn() -> None:
     of = plan("seed", "duration_s=1,2", runs=8)
     rows = [{**well(of, run), "as_planned": run % 2 == 1 and run > 1} for run in range(8)]
     drawings = {each.name: each.drawing for each in figures(judged(of, rows))}
@@ -317,7 +317,7 @@ def test_points_without_a_flight_as_planned_are_marked_and_their_share_is_drawn(
     assert [float(y) for line in diamonds for y in np.asarray(line.get_ydata())] == [0.0, 0.75]
 
 
-def test_figures_of_a_sweep_without_a_flight_as_planned_say_so() -> None:
+def test_figures_of_a_sweep_without_a_planned_flight_are_marked() -> None:
     one = plan("seed", runs=4)
     assert drawn(one, "safety", as_planned=False).get_suptitle() == NEVER_AS_PLANNED
     assert [each.name for each in figures(judged(one, flown(one, as_planned=False)))] == ["safety.png"]
@@ -326,7 +326,7 @@ def test_figures_of_a_sweep_without_a_flight_as_planned_say_so() -> None:
 
 
 @pytest.mark.parametrize("vary", [(), ("clusters.main.plan.trajectory.waypoints[0].values.p=1,2",)])
-def test_labels_of_panels_are_whole_and_do_not_touch(vary: tuple[str, ...]) -> None:
+def test_labels_of_panels_are_complete_and_do_not_overlap(vary: tuple[str, ...]) -> None:
     of = plan("seed", *vary, runs=8)
     names = {f"errors.left.phi_{i}.est_std": 0.1 for i in range(3)}
     more = {f"metrics.time_to_the_first_engagement_{i}_s": float(i) for i in range(3)}
@@ -340,7 +340,7 @@ def test_labels_of_panels_are_whole_and_do_not_touch(vary: tuple[str, ...]) -> N
         assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
-# What is not there
+# Missing data
 
 
 def without_errors(of: SweepPlan, run: int) -> Row:
@@ -350,7 +350,7 @@ def without_errors(of: SweepPlan, run: int) -> Row:
 
 
 @unrendered
-def test_what_no_run_has_is_neither_in_tables_nor_in_figures(tmp_path: Path) -> None:
+def test_quantities_without_data_are_neither_in_tables_nor_in_figures(tmp_path: Path) -> None:
     of = plan("seed", runs=2)
     rows = [without_errors(of, run) for run in range(2)]
     page, _ = report_of(tmp_path, of, rows)
@@ -363,7 +363,7 @@ def test_what_no_run_has_is_neither_in_tables_nor_in_figures(tmp_path: Path) -> 
     of = plan("seed", "duration_s=1,2", runs=4)
     rows = [without_errors(of, run) if run % 2 else well(of, run) for run in range(4)]
     page, _ = report_of(tmp_path / "some", of, rows)
-    assert page.count("<table") == 3  # how runs ended, errors of all points, and of the first one
+    assert page.count("<table") == 3  # ends of runs, errors of all points, errors of the first point
     assert has_terms(without_tags(page[page.index("duration 2 s") :]), "No", "formation errors", "here")
 
 
@@ -380,7 +380,7 @@ def test_quantities_without_data_have_no_panel() -> None:
 
 
 @undrawn
-def test_values_that_begin_alike_have_rows_and_labels_that_differ(tmp_path: Path) -> None:
+def test_values_with_a_common_beginning_have_distinct_rows_and_labels(tmp_path: Path) -> None:
     dropouts = [f"[{{kind: gps_dropout, target: {drone}, at_s: 20}}]" for drone in ("drone1", "drone2")]
     of = plan("seed", f"faults={','.join(dropouts)}", "wind.gust_m_s=0,1", runs=4)
     summary = judged(of, flown(of)).summary()
@@ -398,7 +398,7 @@ def test_values_that_begin_alike_have_rows_and_labels_that_differ(tmp_path: Path
         ("wind.gust_m_s=0,1", "duration_s=1,2", "estimation.flow=true,false", "sensors.preset=paper,ardrone2"),
     ],
 )
-def test_the_tables_of_a_terminal_of_80_columns_keep_every_name_and_number(vary: tuple[str, ...]) -> None:
+def test_tables_in_80_columns_keep_every_name_and_number(vary: tuple[str, ...]) -> None:
     of = plan("seed", *vary, runs=32)
     text = terminal(of, [{**well(of, run), "metrics.time_to_engagement_s": 1.0 + run} for run in range(32)])
     assert "…" not in text
@@ -408,15 +408,15 @@ def test_the_tables_of_a_terminal_of_80_columns_keep_every_name_and_number(vary:
 
 
 @pytest.mark.parametrize("width", [50, 56, 62, 80])
-def test_the_columns_of_a_terminal_are_shared_out_so_that_no_table_has_one(width: int) -> None:
+def test_no_table_in_the_terminal_has_a_single_column(width: int) -> None:
     of = plan("seed", "clusters.main.plan.target.p=0.5,4", runs=4)
     lines = terminal(of, flown(of, **{f"errors.v_{i}.true_rms": 0.1 for i in range(6)}), width).splitlines()
-    heads = [lines[place - 1].split() for place, line in enumerate(lines) if "──" in line]  # the last line of each
+    heads = [lines[place - 1].split() for place, line in enumerate(lines) if "──" in line]  # the last line of each head
     assert all(len(head[1:]) >= 2 for head in heads)
 
 
 @undrawn
-def test_no_table_of_the_page_has_more_columns_than_fit_it_or_only_one(tmp_path: Path) -> None:
+def test_no_table_of_the_page_has_too_many_columns_or_only_one(tmp_path: Path) -> None:
     of = plan("seed", "wind.gust_m_s=0,1", "sensors.gps.position_m.noise=1,4", runs=8)
     more = {f"errors.phi_{i}.true_rms": 0.1 for i in range(1, 13)} | {"metrics.overshoot_m": 0.5}
     page, _ = report_of(tmp_path / "wide", of, flown(of, **more))
@@ -433,7 +433,7 @@ def test_no_table_of_the_page_has_more_columns_than_fit_it_or_only_one(tmp_path:
 
 @undrawn
 @pytest.mark.parametrize("vary", [(), ("duration_s=1,2",)])
-def test_a_mean_of_fewer_runs_than_the_legend_says_has_its_number(vary: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_mean_of_fewer_runs_than_the_legend_states_has_its_count(vary: tuple[str, ...], tmp_path: Path) -> None:
     def counts(axes: Axes) -> list[str]:
         return [text.get_text() for text in axes.texts if text.get_text().startswith("n ")]
 
@@ -446,4 +446,4 @@ def test_a_mean_of_fewer_runs_than_the_legend_says_has_its_number(vary: tuple[st
     page, _ = report_of(tmp_path, of, rows)
     assert "<td>10.3000 (n = 1)</td>" in page
     assert page.count("(n = ") == 1
-    assert f"{rows[0][X_RMS]:.4f}, {rows[len(rows) // 2][X_RMS]:.4f}" in page  # two runs are shown as they are
+    assert f"{rows[0][X_RMS]:.4f}, {rows[len(rows) // 2][X_RMS]:.4f}" in page  # both runs are listed

@@ -1,4 +1,4 @@
-"""One run of a sweep, flown in this process: its row is what the report of its record shows, and the user's metrics."""
+"""One run of a sweep, flown in this process: its row has the values of the report and the user's metrics."""
 
 import errno
 import itertools
@@ -58,7 +58,7 @@ def task(text: str = ONE, run: int = 7, record: Path | None = None, varied: dict
     return Task(run, 1, varied or {}, scenario_file.from_text(text), str(record) if record else None)
 
 
-def test_a_row_has_the_least_distance_of_any_drone_from_obstacles(tmp_path: Path) -> None:
+def test_a_row_has_the_least_distance_from_obstacles(tmp_path: Path) -> None:
     ball = "environment: {obstacles: [{name: ball, shape: sphere, position_m: [0, 9, 3], radius_m: 1}]}\n"
     row = fly(task(ONE + ball, record=tmp_path / "000007"))
     distances_m = judge(tmp_path / "000007/run.mcap")[2].obstacle_distance_m
@@ -66,8 +66,8 @@ def test_a_row_has_the_least_distance_of_any_drone_from_obstacles(tmp_path: Path
     assert fly(task())["min_obstacle_distance_m"] is None
 
 
-def test_a_row_is_what_the_report_of_a_record_says(tmp_path: Path) -> None:
-    """The same numbers as from the record of `zsim run --in-process`, and the same from a record of its own."""
+def test_a_row_has_the_values_of_the_report(tmp_path: Path) -> None:
+    """The values are those from the record of `zsim run --in-process` and from the run's own record."""
     row = fly(task(PAIR, record=tmp_path / "000007", varied={"environment.wind.gust_m_s": 0.3}))
     in_process.fly(scenario_file.from_text(PAIR), tmp_path / "run.mcap", changed=("wind.gust_m_s=0.3",))
     for record in (tmp_path / "run.mcap", tmp_path / "000007/run.mcap"):
@@ -80,19 +80,19 @@ def test_a_row_is_what_the_report_of_a_record_says(tmp_path: Path) -> None:
                 assert row[f"errors.{parameter}.{each}"] == getattr(errors, each)
         assert datetime.fromisoformat(row["date"]) <= datetime.fromisoformat(summary.date or "") <= datetime.now(UTC)
     assert judge(tmp_path / "run.mcap")[2].changed == ["wind.gust_m_s=0.3"]
-    assert summary.changed is None  # nobody said: it has no file
+    assert summary.changed is None  # unknown: the scenario has no file
     assert len(summary.errors) == 8
     assert list(row)[:4] == ["run", "point", "seed", "environment.wind.gust_m_s"]
     assert (row["run"], row["failure"], row["collisions"], row["fingerprint"]) == (7, None, 0, fingerprint())
     assert row["engaged"] is True
-    assert 4 < row["clusters.main.engaged_s"] < 6  # take-off is at 0.2 s, and hover from 3.2 s on
+    assert 4 < row["clusters.main.engaged_s"] < 6  # take-off is at 0.2 s, hover from 3.2 s
     text = (tmp_path / "000007/scenario.yaml").read_text()
     assert scenario_file.from_text(text) == scenario_file.from_text(PAIR)
     assert not list(tmp_path.glob("*.part"))
 
 
 def test_a_cluster_that_was_never_engaged_has_no_errors() -> None:
-    """Of two clusters one stays on the ground, and its std of 0 is no merit."""
+    """One of two clusters stays on the ground, and its std of 0 must not count as a merit."""
     text = PAIR.replace("drones:\n", DRONES, 1) + GROUNDED
     row = fly(task(text))
     assert (row["failure"], row["engaged"]) == (None, False)
@@ -104,8 +104,8 @@ def test_a_cluster_that_was_never_engaged_has_no_errors() -> None:
     assert set(grounded.values()) == {None}
 
 
-def test_a_run_in_which_a_drone_falls_is_not_as_planned_and_has_no_errors() -> None:
-    """A rotor is lost in formation: the drone turns over, its firmware stops it, and it hits the ground."""
+def test_a_run_with_a_falling_drone_is_unplanned_and_has_no_errors() -> None:
+    """A rotor fails in formation: the drone flips, its firmware stops the rotors, and it hits the ground."""
     fault = "faults: [{kind: rotor_efficiency, target: drone1, at_s: 8, rotor: front_left, value: 0}]\n"
     row = fly(task(PAIR.replace("duration_s: 6", "duration_s: 13") + fault))
     assert (row["failure"], row["collisions"], row["crashed"], row["as_planned"]) == (None, 0, True, False)
@@ -113,7 +113,7 @@ def test_a_run_in_which_a_drone_falls_is_not_as_planned_and_has_no_errors() -> N
     assert {value for name, value in row.items() if name.startswith("errors.")} == {None}
 
 
-def test_a_run_whose_plan_nobody_can_fly_is_a_row_with_the_factor_that_fits() -> None:
+def test_a_run_with_an_infeasible_plan_is_a_row_with_the_factor() -> None:
     way = "[{at_s: 0, values: {x_c: 0}}, {at_s: 10, values: {x_c: 30}}, {at_s: 20, values: {x_c: 0}}]"
     plan = f"{{takeoff_s: 0.2, trajectory: {{start_s: 9, waypoints: {way}}}}}"
     row = fly(task(PAIR.replace("{takeoff_s: 0.2}", plan)))
@@ -121,7 +121,7 @@ def test_a_run_whose_plan_nobody_can_fly_is_a_row_with_the_factor_that_fits() ->
     assert row["as_planned"] is None
 
 
-def test_only_what_is_within_the_window_is_engaged() -> None:
+def test_engagement_counts_only_within_the_window() -> None:
     no = np.zeros((4, 0))
     phases = ["assembling", "engaged", "engaged", "held"]
     of = Formation("a", (), (), np.array([1.0, 2.0, 3.0, 4.0]), no, no, no, no, no, phases)
@@ -130,7 +130,7 @@ def test_only_what_is_within_the_window_is_engaged() -> None:
     assert engaged_s([of], (3.5, 9.0)) == {"a": None}
 
 
-def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_diverges_is_a_row_with_the_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     diverge(monkeypatch)
     row = fly(task())
     assert has_terms(row["failure"], "d1", "0.120", "finite")
@@ -139,7 +139,7 @@ def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not [name for name in row if name.startswith("errors.")]
 
 
-def test_a_run_that_crashes_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_raises_an_error_is_a_row_with_the_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     row = fly(task(ONE.replace("[]}", "[console.1]}")))
     assert has_terms(row["failure"], "world", "console.1", "processes.expect")
     assert (row["run"], row["seed"], row["truth_sha256"]) == (7, 3, None)
@@ -153,10 +153,8 @@ def test_a_run_that_crashes_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [path.name for path in tmp_path.iterdir()] == ["000007"]  # the record is kept
 
 
-def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What was written of the record keeps the name under which the error speaks of it."""
+def test_a_full_disk_ends_the_sweep_rather_than_fail_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The incomplete record keeps the name that the error gives."""
 
     calls, write = itertools.count(), mcap_layout.write_all
 
@@ -210,7 +208,7 @@ number = 3
 
 @pytest.fixture
 def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the user's module and a scenario."""
+    """Return a folder with the user's module and a scenario."""
     monkeypatch.setenv(plugin.FOLDERS, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "sweep_figures_of_mine.py").write_text(SOURCE)
@@ -219,8 +217,8 @@ def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_example_of_the_documentation() -> None:
-    """The side p is too long by a sine of 1 m that ends at 6 s."""
+def test_the_documented_metric_finds_overshoot_and_settling_time() -> None:
+    """The error of side p is a sine of 1 m that ends at 6 s."""
     flight = flight_of(traffic(Flown(duration_s=10.0)))
     formation = formations_of(flight)[0]
     assert settling(flight) == {"settled_s": 0.0, "overshoot_m": pytest.approx(0.0, abs=1e-6)}
@@ -234,8 +232,8 @@ def test_the_example_of_the_documentation() -> None:
 MEASURED_PAIR = PAIR.replace("duration_s: 6", "duration_s: 8") + "report: {metrics: 'effort:effort'}\n"
 
 
-def test_commands_and_estimates_are_there_for_metrics() -> None:
-    """The example of the documentation: control effort and NEES are those of the messages of the same flight."""
+def test_commands_and_estimates_are_available_to_metrics() -> None:
+    """Control effort and NEES, as in the documentation, equal those computed from the messages of the same flight."""
     found = fly(Task(0, 0, {}, scenario_file.from_text(MEASURED_PAIR)))
     assert found["metrics_failure"] is None
     commands: list[tuple[int, float]] = []
@@ -268,7 +266,7 @@ def measured(function: str) -> dict[str, object]:
     return fly(Task(7, 0, {}, scenario_file.from_text(text)))
 
 
-def test_a_number_is_a_column_of_the_function_s_name_and_a_mapping_one_for_each_name(beside: Path) -> None:
+def test_a_metric_is_a_column_and_a_mapping_is_one_for_each_name(beside: Path) -> None:
     found = measured("highest_m")
     assert found["metrics_failure"] is None
     assert isinstance(found["metrics.highest_m"], float)
@@ -290,7 +288,7 @@ def test_a_number_is_a_column_of_the_function_s_name_and_a_mapping_one_for_each_
         ("number", ("function",)),
     ],
 )
-def test_what_goes_wrong_in_it_is_one_line_and_the_run_is_kept(
+def test_an_error_in_a_metric_is_reported_in_one_line_beside_the_row(
     beside: Path, function: str, terms: tuple[str, ...]
 ) -> None:
     found = measured(function)
@@ -304,7 +302,7 @@ def test_what_goes_wrong_in_it_is_one_line_and_the_run_is_kept(
 
 
 @pytest.mark.parametrize("function", ["sweep_figures_of_mine:nowhere", "no_such_module:f", "sweep_figures_of_mine"])
-def test_a_function_that_is_not_there_is_refused_before_anything_flies(beside: Path, function: str) -> None:
+def test_a_missing_metric_is_refused_before_any_run(beside: Path, function: str) -> None:
     document, _ = read_document(beside / "one.yaml", [f"report.metrics={function}"])
     with refused(ScenarioError, "report.metrics", f"'{function}'"):
         make_plan("one.yaml", document, ["seed"], 2)

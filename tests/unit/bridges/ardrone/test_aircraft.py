@@ -1,4 +1,4 @@
-"""An aircraft: what REF and PCMD make a drone do; navdata, acknowledgement, configuration and refusals."""
+"""The emulated AR.Drone: effects of REF and PCMD, navdata, acknowledgements, configuration and refusals."""
 
 import math
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from zsim.math.rotation import LEVEL
 from zsim_bridges.ardrone import at_commands, navdata
 from zsim_bridges.ardrone.navdata import FULL_TAGS, GPS_TAG, LOST_COM, MAGNETO_CALIBRATION, StateBit
 
-BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from an aircraft
+BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from a real aircraft
 
 ZEROS = (0.0, 0.0, 0.0)
 
@@ -25,22 +25,22 @@ def played() -> PlayedAircraft:
 
 
 class TestNavdata:
-    def test_the_first_packet_is_a_real_aircraft_s(self, played: PlayedAircraft):
+    def test_the_first_packet_equals_that_of_a_real_aircraft(self, played: PlayedAircraft):
         played.listen()
         assert played.datagrams == [BOOTSTRAP]
 
-    def test_nobody_is_sent_what_nobody_asked_for(self, played: PlayedAircraft):
+    def test_navdata_is_sent_only_on_a_valid_request(self, played: PlayedAircraft):
         played.gates(50)
         played.aircraft.on_navdata_request(b"\x00", PILOT)
         played.gates(50)
         assert played.datagrams == []
         assert "navdata" in played.refusals[0]
 
-    def test_the_single_byte_of_npm_ar_drone_asks_too(self, played: PlayedAircraft):
+    def test_the_single_byte_of_npm_ar_drone_requests_navdata(self, played: PlayedAircraft):
         played.aircraft.on_navdata_request(b"\x01", PILOT)
         assert len(played.datagrams) == 1
 
-    def test_demo_fifteen_times_a_second(self, played: PlayedAircraft):
+    def test_demo_navdata_is_sent_15_times_per_second(self, played: PlayedAircraft):
         played.listen()
         played.config("general:navdata_demo", "TRUE")
         played.flown_gates(1)
@@ -49,7 +49,7 @@ class TestNavdata:
         assert len(played.datagrams) == 150
         assert {len(datagram) for datagram in played.datagrams} == {500}
 
-    def test_full_two_hundred_times_a_second(self, played: PlayedAircraft):
+    def test_full_navdata_is_sent_200_times_per_second(self, played: PlayedAircraft):
         played.listen()
         played.config("general:navdata_demo", "FALSE")
         played.flown_gates(1)
@@ -61,7 +61,7 @@ class TestNavdata:
         assert sequences == list(range(first, first + 200))
         assert tuple(navdata.unpack(played.datagrams[-1]).options) == FULL_TAGS
 
-    def test_the_gps_stands_in_what_asked_for_it_alone(self, played: PlayedAircraft):
+    def test_gps_is_included_only_if_its_option_is_requested(self, played: PlayedAircraft):
         played.listen()
         fix = (-34.603, -58.368, 25.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)
         played.aircraft.update(messages.Gps(0, 0, 0, *fix[0], fix[1], fix[2], 2.0, 3, 9))
@@ -73,16 +73,16 @@ class TestNavdata:
         gps = played.packet().options[GPS_TAG]
         assert (gps.latitude_deg, gps.satellites, gps.degree) == (-34.603, 9, 90.0)
 
-    def test_many_programs_are_sent_navdata_and_the_first_goes_when_there_are_too_many(self, played: PlayedAircraft):
+    def test_at_most_eight_receivers_are_sent_navdata(self, played: PlayedAircraft):
         played.flown_gates(1)
         for port in range(9):
             played.aircraft.on_navdata_request(b"\x01", ("127.0.0.1", port))
         played.flown_gates(1)
         played.datagrams.clear()
-        played.flown_gates(10)  # three demos in 0.2 s
+        played.flown_gates(10)  # three demo packets in 0.2 s
         assert len(played.datagrams) == 3 * 8
 
-    def test_signs_and_units_are_the_sdk_s(self, played: PlayedAircraft):
+    def test_signs_and_units_are_those_of_the_sdk(self, played: PlayedAircraft):
         played.listen()
         played.config("general:navdata_demo", "FALSE")
         played.aircraft.update(messages.Sonar(0, 0, 0, 1.5, True))
@@ -108,26 +108,26 @@ class TestNavdata:
         ("state", "major"),
         [("landed", 2), ("taking_off", 6), ("hovering", 4), ("flying", 3), ("landing", 8), ("emergency", 0)],
     )
-    def test_states(self, played: PlayedAircraft, state, major: int):
+    def test_the_state_of_the_drone_is_reported(self, played: PlayedAircraft, state, major: int):
         played.listen()
         played.config("general:navdata_demo", "TRUE")
         played.flown_gates(4, state)
         assert played.packet().options[0].ctrl_state >> 16 == major
         assert (StateBit.FLYING in played.packet().state) == (state not in ("landed", "emergency"))
 
-    def test_a_low_battery_is_shown(self, played: PlayedAircraft):
+    def test_a_low_battery_sets_its_state_bit(self, played: PlayedAircraft):
         played.listen()
         played.battery_percent = 9.0
         played.flown_gates(4)
         assert StateBit.BATTERY_LOW in played.packet().state
 
-    def test_a_sonar_without_echo_is_shown(self, played: PlayedAircraft):
+    def test_a_sonar_without_echo_sets_its_state_bit(self, played: PlayedAircraft):
         played.listen()
         played.aircraft.update(messages.Sonar(0, 0, 0, 6.0, False))
         played.flown_gates(4)
         assert StateBit.ULTRASOUND_DEAF in played.packet().state
 
-    def test_values_beyond_their_fields_are_counted(self, played: PlayedAircraft):
+    def test_a_value_that_overflows_its_field_is_reported(self, played: PlayedAircraft):
         played.listen()
         played.config("general:navdata_demo", "TRUE")
         played.aircraft.update(messages.Flow(0, 0, 0, (1e300, 0.0, 0.0), 1.0))
@@ -137,7 +137,7 @@ class TestNavdata:
 
 
 class TestSequence:
-    def test_old_commands_are_refused_until_the_numbers_begin_again(self, played: PlayedAircraft):
+    def test_old_commands_are_refused_until_the_sequence_restarts(self, played: PlayedAircraft):
         played.gates()
         played.aircraft.on_at(b"AT*COMWDG=100\r")
         played.aircraft.on_at(b"AT*REF=99,512\r")
@@ -146,7 +146,7 @@ class TestSequence:
         played.aircraft.on_at(b"AT*REF=1,512\r")
         assert played.modes() == ["takeoff"]
 
-    def test_npm_ar_drone_begins_with_0(self, played: PlayedAircraft):
+    def test_a_sequence_of_npm_ar_drone_restarts_at_0(self, played: PlayedAircraft):
         played.gates()
         played.aircraft.on_at(b"AT*COMWDG=100\r")
         played.aircraft.on_at(b"AT*REF=0,512\r")
@@ -164,7 +164,7 @@ class TestConfiguration:
             played.flown_gates(4)
             assert StateBit.COMMAND_ACK not in played.packet().state
 
-    def test_it_is_sent_to_the_control_port(self, played: PlayedAircraft):
+    def test_the_configuration_is_sent_to_the_control_port(self, played: PlayedAircraft):
         played.config("video:video_channel", "1")
         played.at(at_commands.Control(0, at_commands.SEND_CONFIGURATION))
         entries = configuration_entries(played.control[0])
@@ -182,7 +182,7 @@ class TestConfiguration:
         assert played.aircraft.configuration.text("video:codec_fps") == "20"
         assert len(played.refusals) == 1
 
-    def test_the_camera_follows_the_channel(self, played: PlayedAircraft):
+    def test_the_camera_follows_the_video_channel(self, played: PlayedAircraft):
         assert played.aircraft.camera == "front"
         for channel, camera in (("1", "bottom"), ("2", "front"), ("3", "bottom"), ("4", "front"), ("4", "bottom")):
             played.config("video:video_channel", channel)
@@ -200,32 +200,32 @@ class TestRefusals:
             (at_commands.Config(0, "control:altitude_max", "high"), "must be a number"),
         ],
     )
-    def test_what_is_not_done_says_why(self, played: PlayedAircraft, command, reason: str):
+    def test_commands_that_are_not_obeyed_are_refused_with_a_reason(self, played: PlayedAircraft, command, reason: str):
         played.gates()
         played.at(command)
         assert reason in played.refusals[0]
         assert played.refusals[0].startswith("drone1: ")
 
-    def test_flat_trim_needs_the_ground(self, played: PlayedAircraft):
+    def test_flat_trim_is_refused_in_flight(self, played: PlayedAircraft):
         played.gates()
         played.at(at_commands.FlatTrim(0))
         assert played.refusals == []
         played.airborne().at(at_commands.FlatTrim(0))
         assert "must be landed" in played.refusals[-1]
 
-    def test_what_changes_nothing_is_let_pass(self, played: PlayedAircraft):
+    def test_commands_without_effect_are_silently_accepted(self, played: PlayedAircraft):
         played.gates()
         played.at(at_commands.Led(0, 3, 2.0, 5), at_commands.Config(0, "leds:leds_anim", "3,1073741824,2"))
         played.aircraft.on_at(b"AT*PMODE=50,2\rAT*MISC=51,2,20,2000,3000\r")
         assert played.refusals == []
         assert played.sent == []
 
-    def test_what_is_no_command_is_counted(self, played: PlayedAircraft):
+    def test_malformed_commands_are_counted(self, played: PlayedAircraft):
         played.aircraft.on_at(b"hello\rworld")
         assert len(played.refusals) == 2
 
 
-def test_there_is_an_end_to_texts_about_what_is_no_command(played: PlayedAircraft):
+def test_the_number_of_distinct_refusal_texts_is_limited(played: PlayedAircraft):
     for k in range(1000):
         played.aircraft.on_at(b"AT*NAME%d=1\r" % k)
     assert len(played.refusals) == 1000
@@ -250,7 +250,7 @@ def gates(count: int, state: DroneState | None = None) -> Step:
 
 
 def flown(count: int, state: DroneState | None = None) -> Step:
-    """Let gates pass while the pilot's program shows that it is there."""
+    """Let gates pass while the pilot's program stays in contact."""
     return lambda played: played.flown_gates(count, state)
 
 
@@ -291,7 +291,7 @@ MODES_IN_THE_AIR: dict[str, tuple[list[Step], list[str]]] = {
 
 
 @pytest.mark.parametrize("name", [*MODES, *MODES_IN_THE_AIR])
-def test_modes_that_are_asked_of_the_drone(name: str):
+def test_ref_commands_the_expected_modes(name: str):
     played = PlayedAircraft()
     if name in MODES:
         played.gates()
@@ -303,22 +303,22 @@ def test_modes_that_are_asked_of_the_drone(name: str):
     assert played.modes() == modes
 
 
-def test_nothing_is_done_before_the_drone_is_there(played: PlayedAircraft):
+def test_commands_before_the_first_status_are_refused(played: PlayedAircraft):
     played.ref(takes_off=True)
     assert played.sent == []
     assert "no status yet" in played.refusals[0]
 
 
 class TestEmergency:
-    def test_the_state_word_has_who_caused_it(self, airborne: PlayedAircraft):
+    def test_an_emergency_by_the_pilot_sets_the_user_bit(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.ref(takes_off=False, emergency=True)
-        airborne.gates(1, "hovering")  # it is on its way
+        airborne.gates(1, "hovering")  # the command has not arrived yet
         airborne.gates(5, "emergency")
         assert StateBit.EMERGENCY | StateBit.USER_EMERGENCY in airborne.packet().state
         assert StateBit.CUTOUT not in airborne.packet().state
 
-    def test_and_not_the_pilot_where_it_was_not_the_pilot(self, airborne: PlayedAircraft):
+    def test_an_emergency_by_another_cause_sets_the_cutout_bit(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.gates(5, "emergency")
         assert StateBit.EMERGENCY | StateBit.CUTOUT in airborne.packet().state
@@ -326,56 +326,56 @@ class TestEmergency:
 
 
 class TestPcmd:
-    def test_shares_are_of_the_configuration_s_limits(self, airborne: PlayedAircraft):
+    def test_shares_scale_the_configured_limits(self, airborne: PlayedAircraft):
         airborne.pcmd(roll=0.5, pitch=-1.0, gaz=0.5, yaw=-1.0)
         forward, left, up, yaw_left, hover = airborne.tilts()[0]
         assert (forward, left) == pytest.approx((tilt_share(INDOOR_DEG), -tilt_share(INDOOR_DEG / 2)))
-        assert (up, yaw_left) == pytest.approx((0.35, 1.7453 / math.radians(200)))  # 0.5 of 0.7 of 1 m/s
+        assert (up, yaw_left) == pytest.approx((0.35, 1.7453 / math.radians(200)))  # 0.35 = 0.5 · 0.7 m/s / 1 m/s
         assert not hover
 
-    def test_outdoor_limits(self, airborne: PlayedAircraft):
+    def test_outdoor_limits_apply_when_configured(self, airborne: PlayedAircraft):
         airborne.config("control:outdoor", "TRUE")
         airborne.pcmd(pitch=-1.0, gaz=1.0, yaw=1.0)
         forward, _, up, yaw_left, _ = airborne.tilts()[0]
         assert (forward, up, yaw_left) == pytest.approx((1.0, 1.0, -1.0), abs=1e-4)
 
-    def test_limits_beyond_the_drone_s_own_are_cut(self):
+    def test_configured_limits_are_clamped_to_those_of_the_drone(self):
         airborne = PlayedAircraft(", limits: {tilt_deg: 5}").airborne()
         airborne.config("control:euler_angle_max", "0.5")
         airborne.pcmd(pitch=-0.5)
         assert airborne.tilts()[0][0] == pytest.approx(tilt_share(2.5, 5.0), abs=1e-4)
 
-    def test_arguments_beyond_one_are_cut(self, airborne: PlayedAircraft):
+    def test_arguments_are_clamped_to_one(self, airborne: PlayedAircraft):
         airborne.pcmd(pitch=-70.0)
         assert airborne.tilts()[0][0] == pytest.approx(tilt_share(INDOOR_DEG))
 
-    def test_flag_0_hovers_and_zeros_do_not(self, airborne: PlayedAircraft):
+    def test_flag_0_hovers_but_zero_arguments_do_not(self, airborne: PlayedAircraft):
         airborne.pcmd(pitch=-1.0, flag=0)
         airborne.gates()
         airborne.pcmd()
         assert airborne.tilts() == [HOVER, (0.0, 0.0, 0.0, 0.0, False)]
 
-    def test_another_command_goes_out_at_once_and_is_repeated(self, airborne: PlayedAircraft):
+    def test_a_changed_command_is_sent_at_once_and_then_repeated(self, airborne: PlayedAircraft):
         airborne.pcmd(pitch=-1.0)
         assert len(airborne.tilts()) == 1
         airborne.pcmd(pitch=-1.0)
         assert airborne.tilts() == []
         airborne.flown_gates(50, "flying")
-        assert len(airborne.tilts()) == 10  # each 0.1 s
+        assert len(airborne.tilts()) == 10  # every 0.1 s
 
-    def test_it_holds_while_the_pilot_s_program_is_there(self, airborne: PlayedAircraft):
+    def test_a_command_holds_while_the_pilot_stays_in_contact(self, airborne: PlayedAircraft):
         airborne.pcmd(pitch=-1.0)
         airborne.flown_gates(500, "flying")
         assert len(airborne.tilts()) == 101
 
-    def test_more_than_a_gate_can_use_waits_for_the_next_and_the_last_wins(self, airborne: PlayedAircraft):
+    def test_only_the_last_excess_command_is_sent_at_the_next_gate(self, airborne: PlayedAircraft):
         for k in range(10):
             airborne.pcmd(pitch=-0.1 * k)
         assert len(airborne.tilts()) == 3
         airborne.gates()
         assert airborne.tilts()[0][0] == pytest.approx(tilt_share(0.9 * INDOOR_DEG))
 
-    def test_what_comes_during_the_take_off_is_flown_after_it(self, played: PlayedAircraft):
+    def test_a_command_during_take_off_is_flown_afterwards(self, played: PlayedAircraft):
         played.gates()
         played.ref(takes_off=True)
         played.gates(1, "taking_off")
@@ -384,20 +384,20 @@ class TestPcmd:
         played.gates(1, "hovering")
         assert len(played.tilts()) == 1
 
-    def test_on_the_ground_it_is_nothing(self, played: PlayedAircraft):
+    def test_commands_on_the_ground_are_ignored(self, played: PlayedAircraft):
         played.gates()
         played.pcmd(pitch=-1.0)
         played.flown_gates(20, "landed")
         assert played.sent == []
 
-    def test_it_ends_with_the_landing(self, airborne: PlayedAircraft):
+    def test_commands_end_with_the_landing(self, airborne: PlayedAircraft):
         airborne.pcmd(pitch=-1.0)
         airborne.ref(takes_off=False)
         airborne.pcmd(pitch=-1.0)
         airborne.flown_gates(30, "landing")
         assert len(airborne.tilts()) == 1
 
-    def test_it_does_not_climb_beyond_altitude_max(self, airborne: PlayedAircraft):
+    def test_the_drone_does_not_climb_beyond_altitude_max(self, airborne: PlayedAircraft):
         airborne.config("control:altitude_max", "2000")
         for altitude_m, up in ((1.0, 0.7), (1.8, 0.3), (2.0, 0.0), (2.4, -0.6)):
             airborne.aircraft.update(messages.Sonar(airborne.now_ns, 0, airborne.now_ns, altitude_m, True))
@@ -422,7 +422,7 @@ class TestPcmd:
 
 
 class TestSilence:
-    def test_the_watchdog_s_bit(self, airborne: PlayedAircraft):
+    def test_brief_silence_sets_the_watchdog_bit(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.at(at_commands.ResetWatchdog(0))
         airborne.gates(3)
@@ -431,18 +431,18 @@ class TestSilence:
         assert StateBit.COM_WATCHDOG in airborne.packet().state
         assert StateBit.COM_LOST not in airborne.packet().state
 
-    def test_it_hovers_after_two_seconds(self, airborne: PlayedAircraft):
+    def test_the_drone_hovers_after_two_seconds(self, airborne: PlayedAircraft):
         airborne.pcmd(pitch=-1.0)
         airborne.gates(101, "flying")
         assert HOVER not in airborne.tilts()
         airborne.gates(1, "flying")
         assert airborne.tilts()[-1] == HOVER
 
-    def test_it_lands_after_four(self, airborne: PlayedAircraft):
+    def test_the_drone_lands_after_four_seconds(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.config("general:navdata_demo", "TRUE")
         airborne.gates(103)
-        airborne.listen()  # it is sent no more
+        airborne.listen()  # navdata has stopped: request it again
         airborne.gates(5)
         assert StateBit.COM_LOST in airborne.packet().state
         assert airborne.packet().options[0].ctrl_state == 4 << 16 | LOST_COM
@@ -451,7 +451,7 @@ class TestSilence:
         airborne.gates(3)
         assert airborne.modes() == ["land"]
 
-    def test_navdata_ends_with_it(self, airborne: PlayedAircraft):
+    def test_silence_ends_navdata(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.at(at_commands.ResetWatchdog(0))
         airborne.gates(103)
@@ -459,28 +459,28 @@ class TestSilence:
         airborne.gates(50)
         assert len(airborne.datagrams) == count
 
-    def test_a_program_that_comes_back_is_obeyed(self, airborne: PlayedAircraft):
+    def test_a_restarted_program_is_obeyed(self, airborne: PlayedAircraft):
         airborne.at(at_commands.ResetWatchdog(0))
         airborne.gates(120)
         airborne.sent.clear()
-        airborne._sequence = 1  # it has begun again
+        airborne._sequence = 1  # the program has restarted
         airborne.pcmd(pitch=-1.0)
         assert len(airborne.tilts()) == 1
 
     def test_a_drone_that_only_took_off_lands_too(self, played: PlayedAircraft):
         played.gates()
         played.ref(takes_off=True)
-        played.gates(1, "landed")  # it is on its way
+        played.gates(1, "landed")  # the command has not arrived yet
         played.gates(60, "taking_off")
         played.gates(145, "hovering")
         assert played.modes() == ["takeoff", "land"]
 
-    def test_a_drone_that_nobody_on_this_wire_flew_is_let_be(self, played: PlayedAircraft):
+    def test_a_drone_that_was_never_flown_by_this_pilot_is_left_alone(self, played: PlayedAircraft):
         played.at(at_commands.ResetWatchdog(0))
         played.gates(300, "hovering")
         assert played.sent == []
 
-    def test_com_watchdog_is_configured(self, airborne: PlayedAircraft):
+    def test_com_watchdog_sets_the_timeout(self, airborne: PlayedAircraft):
         airborne.config("general:com_watchdog", "1")
         airborne.pcmd(pitch=-1.0)
         airborne.gates(53, "flying")
@@ -488,7 +488,7 @@ class TestSilence:
 
 
 class TestAnotherCommander:
-    def test_nothing_is_sent(self, airborne: PlayedAircraft):
+    def test_commands_are_refused_while_another_process_flies(self, airborne: PlayedAircraft):
         airborne.commander = "controller.main"
         airborne.gates(1, "flying")
         airborne.ref(takes_off=False, emergency=True)
@@ -515,7 +515,7 @@ class TestAnotherCommander:
 
 
 class TestCalibration:
-    def test_it_turns_once_in_place(self, airborne: PlayedAircraft):
+    def test_the_drone_turns_once_in_place(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.config("general:navdata_demo", "TRUE")
         airborne.at(at_commands.Calibrate(0, 0))
@@ -526,23 +526,23 @@ class TestCalibration:
         assert turns[0].velocity_m_s == (0.0, 0.0, 0.0)
         assert turns[0].yaw_rate_rad_s == -1.0
         lasted_s = (turns[-1].t_ns - turns[0].t_ns) / 1e9
-        assert lasted_s == pytest.approx(2 * math.pi, abs=0.2)  # it is repeated each 0.1 s
+        assert lasted_s == pytest.approx(2 * math.pi, abs=0.2)  # the command is repeated every 0.1 s
         assert airborne.tilts()[-1] == HOVER
 
-    def test_it_is_shown(self, airborne: PlayedAircraft):
+    def test_calibration_is_reported_in_navdata(self, airborne: PlayedAircraft):
         airborne.listen()
         airborne.config("general:navdata_demo", "TRUE")
         airborne.at(at_commands.Calibrate(0, 0))
         airborne.flown_gates(10, "flying")
         assert airborne.packet().options[0].ctrl_state == 4 << 16 | MAGNETO_CALIBRATION
 
-    def test_a_pilot_who_steers_ends_it(self, airborne: PlayedAircraft):
+    def test_steering_ends_the_calibration(self, airborne: PlayedAircraft):
         airborne.at(at_commands.Calibrate(0, 0))
         airborne.pcmd(pitch=-1.0)
         airborne.flown_gates(10, "flying")
         assert [kind for kind, _ in airborne.sent][1:] == ["ardrone"] * 3
 
-    def test_on_the_ground_it_is_refused(self, played: PlayedAircraft):
+    def test_calibration_on_the_ground_is_refused(self, played: PlayedAircraft):
         played.gates()
         played.at(at_commands.Calibrate(0, 0))
         assert "air" in played.refusals[0]

@@ -1,4 +1,4 @@
-"""AT commands: what is on the wire, what is refused, other programs' commands; the configuration: levels and ranges."""
+"""AT commands: encoding, refusals and dialects of other programs; the configuration: levels and ranges."""
 
 import math
 import random
@@ -23,26 +23,26 @@ def configuration() -> Configuration:
     return Configuration({TILT: 0.4}, {"general:ardrone_name": "drone1"})
 
 
-def test_defaults_are_the_sdk_s(configuration: Configuration):
+def test_defaults_are_those_of_the_sdk(configuration: Configuration):
     assert configuration.text("general:navdata_options") == "65537"
     assert configuration.number(TILT) == pytest.approx(0.20944)
     assert configuration.flag("general:navdata_demo") is False
     assert configuration.text("general:ardrone_name") == "drone1"
 
 
-def test_keys_may_be_in_capitals(configuration: Configuration):
+def test_keys_are_case_insensitive(configuration: Configuration):
     configuration.set("CONTROL:altitude_max", "1500")
     assert configuration.number("control:altitude_max") == 1500
 
 
-def test_values_are_cut_to_their_ranges(configuration: Configuration):
+def test_values_are_clamped_to_their_ranges(configuration: Configuration):
     configuration.set(TILT, "5")
-    assert configuration.number(TILT) == 0.4  # of the aircraft
+    assert configuration.number(TILT) == 0.4  # the limit of the aircraft
     configuration.set("control:control_vz_max", "5")
     assert configuration.number("control:control_vz_max") == 200.0
 
 
-def test_outdoor_changes_the_set_of_limits(configuration: Configuration):
+def test_outdoor_selects_another_set_of_limits(configuration: Configuration):
     configuration.set(TILT, "0.1")
     configuration.set("control:outdoor", "TRUE")
     assert configuration.number(TILT) == pytest.approx(0.34907)
@@ -52,7 +52,7 @@ def test_outdoor_changes_the_set_of_limits(configuration: Configuration):
     assert configuration.number(TILT) == pytest.approx(0.1)
 
 
-def test_levels_have_values_of_their_own(configuration: Configuration):
+def test_levels_have_separate_values(configuration: Configuration):
     configuration.set("custom:profile_id", "11111111")
     configuration.set("custom:profile_desc", "a pilot")
     configuration.set(TILT, "0.1")
@@ -62,14 +62,14 @@ def test_levels_have_values_of_their_own(configuration: Configuration):
     configuration.set("custom:profile_id", "33333333")
     assert configuration.number(TILT) == pytest.approx(0.20944)
     assert configuration.text("general:navdata_options") == "1"
-    assert configuration.number("control:altitude_max") == 900.0  # common
+    assert configuration.number("control:altitude_max") == 900.0  # common to all levels
     configuration.set("custom:profile_id", "11111111")
     assert configuration.number(TILT) == pytest.approx(0.1)
     assert configuration.custom_list()["profiles"] == {"00000000": "default", "11111111": "a pilot", "33333333": ""}
     assert configuration.is_current("00000000", "11111111", "22222222")
 
 
-def test_levels_are_deleted(configuration: Configuration):
+def test_levels_can_be_deleted(configuration: Configuration):
     for identifier in ("aa", "bb", "cc"):
         configuration.set("custom:session_id", identifier)
     configuration.set("custom:session_id", "-aa")
@@ -79,7 +79,7 @@ def test_levels_are_deleted(configuration: Configuration):
     assert configuration.is_current("00000000", "00000000", "00000000")
 
 
-def test_there_is_an_end_to_identifiers(configuration: Configuration):
+def test_the_number_of_identifiers_is_limited(configuration: Configuration):
     for k in range(1, KEPT_MAX):
         configuration.set("custom:session_id", f"{k:08x}")
     with pytest.raises(ConfigurationError, match="delete some"):
@@ -101,14 +101,14 @@ def test_there_is_an_end_to_identifiers(configuration: Configuration):
         ("control:outdoor", "2", "TRUE or FALSE"),
     ],
 )
-def test_what_is_no_value_is_refused_with_a_reason(configuration: Configuration, key: str, value: str, reason: str):
+def test_an_invalid_value_is_refused_with_a_reason(configuration: Configuration, key: str, value: str, reason: str):
     before = configuration.all()
     with pytest.raises(ConfigurationError, match=reason):
         configuration.set(key, value)
     assert configuration.all() == before
 
 
-def test_the_texts_of_the_control_port():
+def test_texts_of_the_control_port_have_the_sdk_s_format():
     entries = {"general:navdata_demo": "TRUE", "leds:leds_anim": "0,0,0", "network:owner_mac": ""}
     text = format_configuration(entries)
     assert text == b"general:navdata_demo = TRUE\nleds:leds_anim = 0,0,0\nnetwork:owner_mac = \n\0"
@@ -128,7 +128,7 @@ FLOATS = {
     0.75: 1061158912,
     0.8: 1061997773,
     1.0: 1065353216,
-}  # AR.Drone Developer Guide, and other programs' tables
+}  # from the AR.Drone Developer Guide and tables of other programs
 COMMANDS = [
     at.ref(1, takes_off=True),
     at.Pcmd(2, 1, 0.5, -0.5, 1.0, -1.0),
@@ -145,29 +145,29 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize(("value", "bits"), FLOATS.items())
-def test_a_float_is_the_integer_of_the_same_bits(value: float, bits: int):
+def test_a_float_is_encoded_as_the_integer_of_the_same_bits(value: float, bits: int):
     assert at.bits_of_float(value) == bits
     assert at.float_of_bits(bits) == struct.unpack("<f", struct.pack("<f", value))[0]
 
 
-def test_the_guide_s_words():
+def test_commands_are_encoded_as_in_the_developer_guide():
     assert at.ref(1, takes_off=True).bits == 290718208
     assert at.ref(1, takes_off=False).bits == 290717696
     assert at.ref(1, takes_off=False, emergency=True).bits == 290717952
     assert at.format_command(at.Pcmd(21625, 1, 0.0, 0.0, 0.0, -0.8)) == b"AT*PCMD=21625,1,0,0,0,-1085485875\r"
 
 
-def test_what_is_written_is_read():
+def test_formatted_commands_are_parsed_back():
     datagram = b"".join(map(at.format_command, COMMANDS))
     assert at.parse(datagram) == at.Parsed(COMMANDS, [])
 
 
-def test_a_comma_after_the_last_argument_is_let_pass():
+def test_a_trailing_comma_is_accepted():
     assert at.parse(b"AT*COMWDG=4,\r").commands == [at.ResetWatchdog(4)]
     assert at.parse(b"AT*REF=5,512,\r").commands == [at.Ref(5, 512)]
 
 
-def test_a_string_may_hold_commas_and_nothing():
+def test_a_string_may_contain_commas_or_be_empty():
     parsed = at.parse(b'AT*CONFIG=1,"leds:leds_anim","3,1073741824,2"\rAT*CONFIG=2,"network:owner_mac",""\r')
     assert parsed.commands == [
         at.Config(1, "leds:leds_anim", "3,1073741824,2"),
@@ -175,7 +175,7 @@ def test_a_string_may_hold_commas_and_nothing():
     ]
 
 
-def test_commands_of_the_sdk_without_a_meaning_here_are_known():
+def test_sdk_commands_without_an_effect_here_are_accepted():
     assert at.parse(b"AT*PMODE=1,2\rAT*MISC=2,2,20,2000,3000\r") == at.Parsed(
         [at.Ignored(1, "PMODE"), at.Ignored(2, "MISC")], []
     )
@@ -205,20 +205,20 @@ def test_commands_of_the_sdk_without_a_meaning_here_are_known():
         (b"A" * 9000, "must have at most 8192"),
     ],
 )
-def test_what_is_no_command_is_refused_with_a_reason(datagram: bytes, reason: str):
+def test_a_malformed_command_is_refused_with_a_reason(datagram: bytes, reason: str):
     commands, refusals = at.parse(datagram)
     assert commands == []
     assert len(refusals) == 1
     assert reason in refusals[0]
 
 
-def test_a_refused_command_leaves_the_others_of_its_datagram():
+def test_a_refused_command_does_not_affect_others_in_its_datagram():
     parsed = at.parse(b"AT*REF=1,512\rgarbage\rAT*COMWDG=2\r")
     assert parsed.commands == [at.Ref(1, 512), at.ResetWatchdog(2)]
     assert len(parsed.refusals) == 1
 
 
-def test_nothing_that_anybody_sends_raises():
+def test_no_datagram_raises_an_error():
     chance = random.Random(1)
     good = b"".join(map(at.format_command, COMMANDS))
     for _ in range(2000):

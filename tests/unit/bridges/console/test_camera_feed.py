@@ -1,4 +1,4 @@
-"""The cameras of a run for pages: what is subscribed to while a page asks, which pictures pass, and the marks on them."""
+"""The camera feed of the console: subscriptions while a page watches, checks of pictures, and marks on them."""
 
 import io
 import json
@@ -41,7 +41,7 @@ JPEG = {name: synthetic_camera.picture(name, 1) for name in ("front", "bottom")}
 
 
 class Link:
-    """A session on which only the test speaks."""
+    """A session on which only the test publishes."""
 
     def __init__(self) -> None:
         self.subscribed: dict[str, Callable[[Any], None]] = {}
@@ -63,7 +63,7 @@ class Link:
 
 
 class Run:
-    """A feed, and what is said to it."""
+    """A camera feed and the messages published to it."""
 
     def __init__(self) -> None:
         self.link = Link()
@@ -74,7 +74,7 @@ class Run:
         self.feed = CameraFeed(link, observer, ["drone1", "drone2"], 0.14, lambda: self.wall_s)
 
     def say(self, key: str, message: Any) -> None:
-        """Publish a message, or bytes, to who subscribes."""
+        """Publish a message, or bytes, to all matching subscribers."""
         payload = message if isinstance(message, bytes) else messages.encode(message)
         for expression, callback in list(self.link.subscribed.items()):
             if keys.matches(expression, key):
@@ -108,17 +108,17 @@ def watched(run: Run) -> Run:
 
 
 def batch(made: PageBatches, feed: CameraFeed, *want: str) -> tuple[dict[str, Any], bytes]:
-    """Return header and pictures of the next message to a page."""
+    """Return the header and the pictures of the next message to a page."""
     data = made.next(feed, want)
     assert data is not None
     end = 4 + int.from_bytes(data[:4], "big")
     return json.loads(data[4:end]), data[end:]
 
 
-# What is subscribed to
+# Subscriptions
 
 
-def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
+def test_only_cameras_watched_by_a_page_are_subscribed_to(run: Run):
     run.watch(FRONT)
     assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
     assert run.feed.cameras() == ()
@@ -138,7 +138,7 @@ def test_what_a_page_looks_at_is_subscribed_to_and_no_more(run: Run):
     assert list(run.link.subscribed) == [keys.camera_info("*", "*")]
 
 
-def test_a_page_that_has_gone_or_sleeps_costs_nothing(watched: Run):
+def test_subscriptions_end_when_pages_close_or_fall_silent(watched: Run):
     watched.feed.ask("another", [FRONT])
     watched.feed.release(PAGE)
     for later_s, keys_left in ((ASKED_S - 0.1, {"drone/drone1/camera/front"}), (0.1, set())):
@@ -150,7 +150,7 @@ def test_a_page_that_has_gone_or_sleeps_costs_nothing(watched: Run):
     assert watched.link.pictures() == set()
 
 
-def test_cameras_of_before_are_asked_for_where_that_is_allowed():
+def test_earlier_cameras_are_queried_if_permitted():
     run = Run()
     for drone in ("drone1", "stranger"):
         payload = messages.encode(synthetic_camera.info_of("front"))
@@ -175,7 +175,7 @@ def test_cameras_of_before_are_asked_for_where_that_is_allowed():
         {"K": (1.0, 0.0, 1.0, 0.0, -1.0, 1.0, 0.0, 0.0, 1.0)},
     ],
 )
-def test_a_camera_that_cannot_be_used_is_counted(run: Run, wrong: Any):
+def test_an_unusable_camera_is_counted(run: Run, wrong: Any):
     message = changed(FRONT_INFO, **wrong) if isinstance(wrong, dict) else wrong
     run.say(keys.camera_info("drone1", "front"), message)
     assert run.feed.cameras() == ()
@@ -185,7 +185,7 @@ def test_a_camera_that_cannot_be_used_is_counted(run: Run, wrong: Any):
 # Pictures
 
 
-def test_the_newest_picture_is_shown_as_it_came(watched: Run):
+def test_the_newest_picture_is_shown_unchanged(watched: Run):
     assert watched.feed.picture(FRONT) is None
     watched.say_picture(t_ns=1)
     watched.say_picture(t_ns=2)
@@ -206,7 +206,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("changes", BAD.values(), ids=BAD)
-def test_a_bad_picture_is_left_out_and_counted_and_nothing_else_is_touched(watched: Run, changes: dict[str, Any]):
+def test_a_bad_picture_is_skipped_and_counted_without_side_effects(watched: Run, changes: dict[str, Any]):
     watched.say_picture(t_ns=1)
     watched.say_picture("bottom", t_ns=1)
     good = watched.feed.picture(FRONT), watched.feed.picture(BOTTOM)
@@ -224,15 +224,15 @@ def test_a_bad_picture_is_left_out_and_counted_and_nothing_else_is_touched(watch
 
 @pytest.mark.parametrize("key", [keys.camera("drone1", "front"), keys.detections("drone1")])
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80"])
-def test_what_is_no_message_is_counted(watched: Run, key: str, payload: bytes):
+def test_undecodable_messages_are_counted(watched: Run, key: str, payload: bytes):
     watched.say(key, payload)
     assert watched.feed.picture(FRONT) is None
     assert watched.health.refused == 1
 
 
-def test_a_picture_too_large_is_not_even_kept(watched: Run):
+def test_an_oversized_picture_is_refused_on_receipt(watched: Run):
     watched.say(keys.camera("drone1", "front"), bytes(PICTURE_BYTES_MAX + 2000))
-    assert watched.feed.state()[0]["refused"] == 1  # before anything looks at it
+    assert watched.feed.state()[0]["refused"] == 1  # before it is decoded
 
 
 # Sightings
@@ -242,7 +242,7 @@ def detected(run: Run, t_ns: int, key: str = keys.detections("drone1")) -> None:
     run.say(key, synthetic_camera.sightings_message(1, t_ns))
 
 
-def test_what_was_seen_at_the_pictures_time_is_drawn_on_it(watched: Run):
+def test_sightings_at_the_time_of_the_picture_are_drawn_on_it(watched: Run):
     watched.say_picture(t_ns=1_000_000_000)
     assert watched.feed.marks(FRONT) == ()
     assert watched.feed.picture(FRONT) is not None
@@ -253,7 +253,7 @@ def test_what_was_seen_at_the_pictures_time_is_drawn_on_it(watched: Run):
     assert watched.feed.marks(BOTTOM) == ()
 
 
-def test_what_a_detector_found_goes_before_what_the_world_saw(watched: Run):
+def test_sightings_by_a_detector_take_precedence_over_the_world_s(watched: Run):
     watched.say_picture(t_ns=0)
     assert watched.feed.picture(FRONT) is not None
     world = msgspec.structs.replace(synthetic_camera.sightings_message(1, 0), seen=())
@@ -263,18 +263,18 @@ def test_what_a_detector_found_goes_before_what_the_world_saw(watched: Run):
     assert watched.feed.marks(FRONT) == ()
 
 
-def test_few_sightings_are_kept(watched: Run):
+def test_only_recent_sightings_are_kept(watched: Run):
     watched.say_picture(t_ns=0)
     assert watched.feed.picture(FRONT) is not None
     for number in range(SIGHTINGS_KEPT + 1):
         detected(watched, number * 1_000_000_000)
-    assert watched.feed.marks(FRONT) == ()  # that of the picture's time is gone
+    assert watched.feed.marks(FRONT) == ()  # the sighting at the picture's time has been dropped
 
 
-# What a page is sent
+# Messages to a page
 
 
-def test_a_page_is_told_of_cameras_and_sent_what_it_asks_for(watched: Run):
+def test_a_page_gets_the_camera_list_and_the_requested_pictures(watched: Run):
     made = PageBatches()
     header, _ = batch(made, watched.feed)
     assert header["cameras"][0] == {"name": FRONT, "width": 640, "height": 360}
@@ -290,7 +290,7 @@ def test_a_page_is_told_of_cameras_and_sent_what_it_asks_for(watched: Run):
     assert data == JPEG["bottom"] + JPEG["front"]
 
 
-def test_only_what_has_changed_is_sent_and_a_later_detection_without_its_picture(watched: Run):
+def test_only_changes_are_sent_and_late_marks_without_their_picture(watched: Run):
     made = PageBatches()
     watched.say_picture()
     watched.say_picture("bottom")
@@ -306,7 +306,7 @@ def test_only_what_has_changed_is_sent_and_a_later_detection_without_its_picture
     assert data == b""
 
 
-def test_a_page_learns_that_a_run_is_over(watched: Run):
+def test_a_page_gets_an_empty_camera_list_when_a_run_is_over(watched: Run):
     made = PageBatches()
     batch(made, watched.feed)
     header, _ = batch(made, Run().feed)
@@ -342,7 +342,7 @@ def changed(info: CameraInfo, **fields: Any) -> CameraInfo:
         (BOTTOM_INFO, (0.0, 0.2, -1.0), True, None),
     ],
 )
-def test_sides_are_those_of_the_body(info: CameraInfo, direction: Any, left: bool | None, above: bool | None):
+def test_marks_are_on_the_correct_side(info: CameraInfo, direction: Any, left: bool | None, above: bool | None):
     (mark,) = marks_of(info, [seen(direction)], HAT_M)
     du, dv = mark.u - (info.width - 1) / 2, mark.v - (info.height - 1) / 2
     assert (du < -10) is bool(left) if left is not None else abs(du) < 0.1
@@ -360,11 +360,11 @@ def test_sides_are_those_of_the_body(info: CameraInfo, direction: Any, left: boo
         (AHEAD, -1.0),
     ],
 )
-def test_what_the_picture_does_not_show_and_a_range_that_is_none_have_no_mark(direction: Any, range_m: float):
+def test_sightings_out_of_view_or_with_an_invalid_range_have_no_mark(direction: Any, range_m: float):
     assert marks_of(FRONT_INFO, [seen(direction, range_m)], HAT_M) == ()
 
 
-def test_a_turned_quaternion_of_any_length_turns_the_camera():
+def test_an_unnormalised_quaternion_turns_the_camera():
     half = math.radians(90) / 2  # the front camera looks to the left
     w, x, y, z = FRONT_INFO.orientation_wxyz
     c, s = math.cos(half), math.sin(half)
@@ -374,7 +374,7 @@ def test_a_turned_quaternion_of_any_length_turns_the_camera():
 
 
 @given(y=st.floats(-0.6, 0.6), z=st.floats(-0.35, 0.35))
-def test_marks_fall_where_opencv_projects_with_distortion(y: float, z: float):
+def test_marks_agree_with_opencv_projection_under_distortion(y: float, z: float):
     cv2 = pytest.importorskip("cv2", reason="pip install opencv-python-headless")
     D = (-0.12, 0.03, 0.001, -0.002, 0.0)
     info = changed(FRONT_INFO, D=D)
@@ -384,39 +384,39 @@ def test_marks_fall_where_opencv_projects_with_distortion(y: float, z: float):
     inside = bool(np.all(expected > 0) and expected[0] < info.width - 1 and expected[1] < info.height - 1)
     assert len(marks) == 1 or not inside
     for mark in marks:
-        assert (mark.u, mark.v) == pytest.approx(tuple(expected), abs=0.06)  # to a tenth of a pixel
+        assert (mark.u, mark.v) == pytest.approx(tuple(expected), abs=0.06)  # marks are rounded to a tenth of a pixel
 
 
-def test_a_lens_that_folds_over_shows_nothing_from_outside_of_its_field():
+def test_a_folding_distortion_shows_nothing_outside_the_field_of_view():
     info = changed(FRONT_INFO, D=(-0.3, 0.0, 0.0, 0.0, 0.0))
-    y = 1.826  # where 1 - 0.3 y² is 0: the polynomial puts it into the middle of the picture
+    y = 1.826  # where 1 - 0.3 y² is 0: the polynomial maps it to the centre of the picture
     assert marks_of(info, [seen((1.0, y, 0.0))], HAT_M) == ()
     assert len(marks_of(info, [seen((1.0, 0.3, 0.0))], HAT_M)) == 1
 
 
-def test_a_circle_is_as_large_as_the_hat_and_two_sigma():
+def test_the_radius_of_a_mark_covers_the_hat_and_two_sigma():
     near, far = marks_of(FRONT_INFO, [seen(AHEAD, 2.0, 0.01), seen(AHEAD, 500.0, 0.0)], HAT_M)
     assert near.radius == pytest.approx(FRONT_INFO.K[0] * (0.07 / 2.0 + 0.02), abs=0.06)
     assert far.radius == RADIUS_MIN_PX
     (huge,) = marks_of(FRONT_INFO, [seen(AHEAD, 1e-9, sigma_m=0.04)], HAT_M)
     assert huge.radius == FRONT_INFO.height
     assert near.text == "2.0 ± 0.2 m"
-    assert range_text(seen(AHEAD, sigma_m=0.04)) == "4.10 ± 0.04 m"  # a range has the digits of its sigma
+    assert range_text(seen(AHEAD, sigma_m=0.04)) == "4.10 ± 0.04 m"  # a range has as many decimals as its sigma
 
 
-def test_the_angle_of_view_is_from_top_to_bottom():
+def test_the_field_of_view_is_the_vertical_one():
     diagonal = 2 * math.atan(math.hypot(320, 180) / FRONT_INFO.K[0])
     assert math.degrees(diagonal) == pytest.approx(92.0)
     assert field_of_view(FRONT_INFO) == pytest.approx(2 * math.atan(180 / FRONT_INFO.K[0]))
 
 
-def test_sightings_of_the_pictures_time_are_taken_and_else_the_nearest_unless_they_are_old():
+def test_the_nearest_sightings_in_time_are_taken_unless_too_old():
     kept = [sightings(t_ns) for t_ns in (0, 100_000_000, 200_000_000)]
     assert sightings_of(100_000_000, kept) is kept[1]
     assert sightings_of(170_000_000, kept) is kept[2]
     assert sightings_of(AGE_MAX_NS, [sightings(0)]) is not None
     assert sightings_of(AGE_MAX_NS + 1, [sightings(0)]) is None
-    assert sightings_of(0, [sightings(AGE_MAX_NS + 1)]) is None  # a replay has gone back
+    assert sightings_of(0, [sightings(AGE_MAX_NS + 1)]) is None  # a replay has jumped back
     assert sightings_of(0, []) is None
 
 
@@ -432,18 +432,18 @@ def encoded(width: int = 40, height: int = 30, kind: str = "JPEG", **options: An
 @pytest.mark.parametrize("options", [{}, {"progressive": True}, {"quality": 10}, {"comment": "x" * 3000}])
 def test_the_size_of_a_jpeg_is_read(options: dict[str, Any]):
     whole = encoded(641, 363, **options)
-    filled = whole[:2] + b"\xff\xff" + whole[2:]  # fill bytes before a marker are passed over
+    filled = whole[:2] + b"\xff\xff" + whole[2:]  # fill bytes before a marker are skipped
     assert frame_of(whole)[1:] == frame_of(filled)[1:] == (641, 363)
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_have_a_size_or_are_refused(middle: bytes):
+def test_any_bytes_yield_a_size_or_are_refused(middle: bytes):
     with suppress(PictureError):
         assert all(0 < side < 2**16 for side in frame_of(b"\xff\xd8" + middle + b"\xff\xd9")[1:])
 
 
 @given(at=st.integers(0, 600), byte=st.integers(0, 255))
-def test_a_byte_that_is_wrong_does_no_harm(at: int, byte: int):
+def test_a_corrupt_byte_does_no_harm(at: int, byte: int):
     data = bytearray(encoded())
     data[at % len(data)] = byte
     with suppress(PictureError):
@@ -465,7 +465,7 @@ NO_JPEG = (
         (encoded()[:-2] + bytes(PICTURE_BYTES_MAX) + encoded()[-2:], 40, 30, (str(PICTURE_BYTES_MAX),)),
     ],
 )
-def test_what_is_no_jpeg_or_of_another_size_or_too_large_is_refused(
+def test_invalid_mismatched_and_oversized_jpegs_are_refused(
     data: bytes, width: int, height: int, terms: tuple[str, ...]
 ):
     check_picture(encoded(), 40, 30)

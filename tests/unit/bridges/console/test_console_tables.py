@@ -1,4 +1,4 @@
-"""Tables of the console: rates of sensors, texts of others as text, drones as a page sorts and filters them, events."""
+"""Tables of the console: sensor rates, escaped texts, the sorting and filtering of drones, and the event log."""
 
 import re
 from typing import Any
@@ -17,7 +17,7 @@ from zsim_bridges.console.view_buffer import ALL, OWN, ROWS_KEPT, EventLog, Even
 S = 1_000_000_000
 
 
-def test_rates_follow_from_counts_and_begin_anew_with_another_estimator():
+def test_rates_follow_from_counts_and_restart_with_another_estimator():
     rates = SensorRates()
     assert rates.update("d1", 0, {"gps": (10, 0)}) == {}
     assert rates.update("d1", 2 * S, {"gps": (19, 1)})["gps"] == pytest.approx(5.0)
@@ -27,7 +27,7 @@ def test_rates_follow_from_counts_and_begin_anew_with_another_estimator():
     assert rates.update("d2", 5 * S, {"gps": (2, 0), "imu": (30, 0)}) == {}
 
 
-def test_a_run_that_stands_still_adds_nothing_to_the_rates():
+def test_a_paused_run_adds_nothing_to_the_rates():
     rates = SensorRates()
     rates.update("d1", 0, {"gps": (0, 0)})
     for _ in range(1000):
@@ -35,15 +35,15 @@ def test_a_run_that_stands_still_adds_nothing_to_the_rates():
     assert len(rates._samples) == 2
 
 
-def test_a_sensor_of_the_user_s_has_a_row_counted_or_not():
-    """The stock estimator counts none; an estimator of the user's own may."""
+def test_a_user_defined_sensor_has_a_row_with_or_without_counts():
+    """The stock estimator does not count its samples; an estimator of the user's own may."""
     own = {"pitot": 20.0, "my_uwb": 10.0}
     table = console_tables.sensor_table("drone1", {"gps": (5, 0), "my_uwb": (7, 1)}, {}, "", own)
     rows = [without_tags(row.replace("</td>", " ")).split() for row in table.split("<tr>")[2:]]
     assert rows == [["gps", "5", "0", "–"], ["my_uwb", "7", "1", "–"], ["pitot", "–", "–", "20", "Hz", "(configured)"]]
 
 
-def test_tables_show_text_of_others_as_text():
+def test_tables_escape_the_texts_of_others():
     condition = DroneCondition("d1", "flying", 9.0, 400.0, commander="<script>")
     html = drone_table([DroneRow(condition, "3 / 1", ("gps_dropout",))])
     assert "<script>" not in html + drone_table([row("<script>'")], selected=("<script>'",))
@@ -57,7 +57,9 @@ def test_tables_show_text_of_others_as_text():
     assert "1.50" in tables[0]
     assert "&lt;b&gt;no" in tables[0]
     assert has_terms(without_tags(tables[0]), "3 ×")
-    marks = [re.findall("data-zsim-event='([0-9a-f]+)'", each) for each in tables]  # by which the page knows them
+    marks = [
+        re.findall("data-zsim-event='([0-9a-f]+)'", each) for each in tables
+    ]  # by which the page recognizes events
     assert marks[0] == marks[1] != []
 
 
@@ -79,14 +81,14 @@ def test_many_formations_leave_room_for_the_emergency_button():
     assert has_terms(without_tags(html), "taking off", "&lt;waits&gt")
 
 
-def test_acting_faults_are_listed():
+def test_active_and_past_faults_are_listed():
     assert console_tables.NO_FAULT in console_tables.fault_lines([])
     lines = console_tables.fault_lines(["gust of world", "link_cut of a/<b>"], ["gps_stuck of drone1"])
     assert has_terms(without_tags(lines), "gust of world", "link_cut of a/&lt;b&gt;", "over", "gps_stuck of drone1")
     assert "<b>" not in lines
 
 
-# How a page sorts and filters its drones, and selects several of them for one command
+# Sorting, filtering and selecting drones
 
 
 def row(
@@ -127,7 +129,7 @@ FILTERED = {
 }
 
 
-def test_rows_are_sorted_the_worst_first_and_filtered():
+def test_rows_are_sorted_and_filtered():
     numbers = lambda rows: "".join(each.name.removeprefix("drone") for each in rows)  # noqa: E731
     selected = frozenset({"drone1", "drone5"})
     assert {order: numbers(filtered_rows(ROWS, order)) for order in SORTINGS} == SORTED
@@ -137,13 +139,13 @@ def test_rows_are_sorted_the_worst_first_and_filtered():
 
 
 @pytest.mark.parametrize(("count", "order"), [(MANY, "as in the scenario"), (MANY + 1, "worst first")])
-def test_of_many_drones_the_worst_stand_first(count: int, order: str):
+def test_many_drones_are_sorted_worst_first_by_default(count: int, order: str):
     gui: Any = Gui()
     FleetTable(gui, [f"drone{i}" for i in range(count)], lambda: None)
     assert gui.at["sort by"].value == order
 
 
-def test_drones_are_selected_one_by_one_and_as_they_are_shown():
+def test_drones_are_selected_individually_or_as_shown():
     gui: Any = Gui()
     seen: list[list[str]] = []
     table = FleetTable(gui, [each.name for each in ROWS], lambda: seen.append(table.selected))
@@ -157,7 +159,7 @@ def test_drones_are_selected_one_by_one_and_as_they_are_shown():
     table.show(ROWS, {}, "drone2")
     html = str(table.table.content)
     assert html.count("aria-checked=true") == 2
-    assert html.count("data-zsim-chosen") == 2  # both rows of the drone whose instruments are shown
+    assert html.count("data-zsim-chosen") == 2  # both rows of the chosen drone
     gui.at["filter"].value = "nothing like that"
     table.show(ROWS, {}, "drone2")
     assert NO_ROW in str(table.table.content)
@@ -166,7 +168,7 @@ def test_drones_are_selected_one_by_one_and_as_they_are_shown():
     assert table.selected == []
 
 
-# Events: counted, kept apart from a flood, chosen by drone and kind
+# Events
 
 OWN_NAME = "console.1"
 
@@ -180,7 +182,7 @@ def event(kind: str, source: str, subject: str, text: str, t_ns: int = 0) -> Eve
     return Event(t_ns, 0, kind, source, subject, text)
 
 
-def test_equal_events_are_one_with_a_count(log: EventLog):
+def test_equal_events_share_a_row_with_a_count(log: EventLog):
     for t_ns in range(20):
         log.add(event("refused", "mine", "drone1", f"age is {t_ns} ms; must be less", t_ns))
     log.add(event("refused", "mine", "drone2", "age is 4 ms; must be less"))
@@ -189,7 +191,7 @@ def test_equal_events_are_one_with_a_count(log: EventLog):
     assert len(log.newest) == 21
 
 
-def test_a_flood_leaves_the_operator_s_own_actions(log: EventLog):
+def test_a_flood_of_events_leaves_the_actions_of_the_operator(log: EventLog):
     log.add(event("accepted", OWN_NAME, "main", "main: takeoff: accepted"))
     for number in range(3 * ROWS_KEPT):
         log.add(event("refused", f"s{number}", "drone1", "no"))
@@ -198,7 +200,7 @@ def test_a_flood_leaves_the_operator_s_own_actions(log: EventLog):
     assert [row.event.subject for row in chosen_rows(rows, kind=OWN)] == ["main"]
 
 
-def test_events_are_chosen_by_drone_and_kind(log: EventLog):
+def test_events_are_filtered_by_drone_and_kind(log: EventLog):
     log.add(event("death", "world", "estimator.drone1", "died"))
     log.add(event("fault", "world", "drone10", "gps_dropout of drone10 begins"))
     log.add(event("fault", "world", "drone1", "gps_dropout of drone1 begins"))

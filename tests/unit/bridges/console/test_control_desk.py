@@ -1,4 +1,4 @@
-"""Controls that each page has for itself: a page that goes takes nothing with it."""
+"""The controls of each page, and which page is in control of what."""
 
 from collections.abc import Sequence
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ def part_of(_: str) -> str:
 
 
 class Figures:
-    """Figures of one page; of a removed one viser lets nothing be set."""
+    """The figures of one page; like viser, they cannot be set once they are removed."""
 
     def __init__(self) -> None:
         self.removed, self.shown = False, ""
@@ -36,7 +36,7 @@ class Figures:
 
 
 class Pages:
-    """A server that notes who wants to know of pages, and the figures of each page."""
+    """A server that records the callbacks for pages and the figures of each page."""
 
     def __init__(self) -> None:
         self.clients: dict[int, Any] = {}
@@ -52,7 +52,7 @@ class Pages:
         return self.clients
 
     def open(self, client_id: int) -> None:
-        """Open a page, whose dropdowns show what they began with."""
+        """Open a page whose dropdowns show their first options."""
         made: list[Figures] = []
         gui = MagicMock()
 
@@ -66,10 +66,10 @@ class Pages:
         )
         self.clients[client_id] = SimpleNamespace(client_id=client_id, gui=gui, scene=MagicMock())
         self.add(self.clients[client_id])
-        *_, self.figures[client_id], _ = made  # the events are last
+        *_, self.figures[client_id], _ = made  # the events come last
 
 
-def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
+def test_a_page_closed_while_it_is_drawn_does_not_affect_the_others():
     pages, shared = Pages(), MagicMock(parts={})
     server: Any = pages
     forms = PageForms(server, MagicMock(), shared, NAMES, MagicMock(), ControlDesk(["main"]), part_of)
@@ -82,7 +82,7 @@ def test_a_page_that_is_closed_while_it_is_drawn_ends_nothing_of_the_others():
     assert forms.chosen(2) == "drone1"
 
 
-def test_the_ground_of_a_page_has_its_theme():
+def test_the_ground_of_a_page_follows_its_theme():
     pages, shared = Pages(), MagicMock(parts={})
     server: Any = pages
     PageForms(server, MagicMock(), shared, NAMES, MagicMock(), ControlDesk(["main"]), part_of)
@@ -97,11 +97,11 @@ def test_the_ground_of_a_page_has_its_theme():
         assert page.scene.add_grid.call_args.kwargs["cell_color"] == colours[1]
 
 
-# Who is in control
+# Control
 
 
 class Desk(ControlDesk):
-    """A desk with three pages, on a clock that the test moves; what pages are told is noted."""
+    """A desk with three pages, on a clock that the test advances; it records the messages to pages."""
 
     def __init__(self) -> None:
         self.wall_s = 100.0
@@ -129,22 +129,22 @@ def test_one_page_is_in_control_and_the_others_see_it(desk: Desk):
     assert desk.use(7, RUN) == ""  # another part
     assert desk.holders() == [ONE, TWO]
     assert desk.others(7) == [ONE, "viewer 3 (10.0.0.9)"]
-    assert desk.refusal(4, "")  # nobody is in control of all
+    assert desk.refusal(4, "")  # neither page controls every part
     assert desk.refusal(7, "")
     desk.release(7, RUN)
     assert desk.refusal(4, "") == ""
 
 
-def test_control_is_asked_for_and_granted_or_kept(desk: Desk):
+def test_control_is_requested_and_granted_or_kept(desk: Desk):
     desk.use(4, "main")
     desk.ask(7, "main")
     assert [page for page, _ in desk.told] == [4]
     assert desk.refusal(7, "main")
-    desk.answer(9, "main", granted=True)  # none of its business
+    desk.answer(9, "main", granted=True)  # not in control, so without effect
     assert desk.holders() == [ONE, ""]
     desk.answer(4, "main", granted=False)
     assert (desk.holders(), desk.told[-1][0]) == ([ONE, ""], 7)
-    desk.answer(4, "main", granted=True)  # nobody asks any more
+    desk.answer(4, "main", granted=True)  # no request is pending
     assert desk.holders() == [ONE, ""]
     desk.ask(7, "main")
     desk.answer(4, "main", granted=True)
@@ -152,7 +152,7 @@ def test_control_is_asked_for_and_granted_or_kept(desk: Desk):
     assert has_terms(desk.refusal(4, "main"), TWO)
 
 
-def test_a_page_that_is_lost_loses_what_another_one_asks_for(desk: Desk):
+def test_a_lost_page_loses_the_parts_that_another_requests(desk: Desk):
     desk.use(4, "main")
     desk.use(4, RUN)
     desk.ask(7, "main")
@@ -163,10 +163,10 @@ def test_a_page_that_is_lost_loses_what_another_one_asks_for(desk: Desk):
     desk.release_lost()
     assert desk.holders() == [TWO, ONE]
     assert {page for page, _ in desk.told[-2:]} == {4, 7}
-    assert desk.holdings(7, [RUN])[0].silent_s > LOST_S  # others see that it stands still
+    assert desk.holdings(7, [RUN])[0].silent_s > LOST_S  # the others see that it is silent
 
 
-def test_a_page_that_is_closed_releases_and_the_one_that_asks_has_it(desk: Desk):
+def test_a_closed_page_releases_its_parts_to_the_requesting_page(desk: Desk):
     desk.use(4, "main")
     desk.use(4, RUN)
     desk.ask(7, "main")
@@ -176,7 +176,7 @@ def test_a_page_that_is_closed_releases_and_the_one_that_asks_has_it(desk: Desk)
     assert desk.holders() == ["", ""]
 
 
-def test_a_page_that_asks_and_is_closed_is_not_given_control(desk: Desk):
+def test_a_closed_page_is_not_granted_control(desk: Desk):
     desk.use(4, "main")
     desk.ask(7, "main")
     desk.close(7)
@@ -185,7 +185,7 @@ def test_a_page_that_asks_and_is_closed_is_not_given_control(desk: Desk):
 
 
 class ControlGui(Gui):
-    """The controls of one page, of which several may have the same label."""
+    """The controls of one page, several of which may have the same label."""
 
     def _add(self, label: str | None, value: Any = None, options: Sequence[str] = ()) -> Control:
         return Control(value, label or "", options)
@@ -194,7 +194,7 @@ class ControlGui(Gui):
         return [button.label for button in self.buttons if button.visible]
 
 
-def test_pages_ask_and_answer_by_their_buttons():
+def test_pages_request_and_grant_control_with_their_buttons():
     desk, guis, forms = Desk(), {}, {}
     for page in (4, 7):
         gui: Any = ControlGui()
@@ -222,11 +222,11 @@ def test_pages_ask_and_answer_by_their_buttons():
     assert offered() == [[], []]
 
 
-def test_a_page_that_is_not_in_control_lands_and_stops_a_drone_and_lets_none_take_off():
+def test_without_control_a_page_may_land_and_stop_but_not_take_off():
     desk, gui, client = Desk(), ControlGui(), MagicMock()
     shown: Any = gui
     form = DroneForm(shown, client, NAMES, lambda drone, use: (desk.use if use else desk.refusal)(7, part_of(drone)))
-    takeoff, back, reset = gui.buttons  # to land and to stop are orders of the page's own
+    takeoff, back, reset = gui.buttons  # land and emergency are orders, not buttons
     run = RunCondition("running", drones={"drone1": "landed", "drone2": "landed"})
     form.refresh(run)
     assert not takeoff.disabled

@@ -1,4 +1,4 @@
-"""The console's forms: what each control of the page asks for. The page is one that notes its controls."""
+"""The console's forms and what each of their controls requests, on a fake page that records its controls."""
 
 import math
 from pathlib import Path
@@ -42,12 +42,12 @@ from zsim_bridges.console.run_condition import RunCondition, ShownRun, fleet_ref
 from zsim_bridges.console.run_forms import DURATION_S, FaultForm, FleetForm, InputError, RunForm
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
-LATER_S = 1e9  # on the wall: long after any move
+LATER_S = 1e9  # wall time, long after any slider has moved
 WAYPOINTS = "waypoints [s, m, deg]"
 
 
 class FakeCommandClient:
-    """Notes what is asked for."""
+    """Records the requests."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
@@ -65,7 +65,7 @@ class FakeCommandClient:
 
 
 class Bench:
-    """A page, its command client, and the outcomes of requests that were refused already here."""
+    """A page, its command client, and the outcomes of the requests that the forms themselves refuse."""
 
     def __init__(self, scenario: str = "step") -> None:
         self.gui: Any = Gui()
@@ -92,7 +92,7 @@ def bench() -> Bench:
     return Bench()
 
 
-# The run, and drones one by one
+# The run and single drones
 
 
 @pytest.mark.parametrize(
@@ -101,12 +101,12 @@ def bench() -> Bench:
         ("Pause", 1.0, 1.0, "pause", {}),
         ("Resume", 1.0, 1.0, "resume", {}),
         ("Step", 7.0, 1.0, "step", {"gates": 7}),
-        ("Step", 2.5, 1.0, "step", {"gates": 2.5}),  # what is typed is sent as it is, and the world refuses it
+        ("Step", 2.5, 1.0, "step", {"gates": 2.5}),  # sent as typed: the world refuses it
         ("Set rate", 1.0, 2.5, "rate", {"value": 2.5}),
         ("Set rate", 1.0, -1.0, "rate", {"value": -1.0}),
     ],
 )
-def test_the_run_is_asked_for_what_the_button_says(
+def test_each_button_of_the_run_requests_its_operation(
     bench: Bench, label: str, gates: float, rate: float, op: str, args: dict[str, Any]
 ):
     RunForm(bench.gui, bench.client, 1.0)
@@ -120,7 +120,7 @@ def test_the_run_is_asked_for_what_the_button_says(
 @pytest.mark.parametrize(
     ("label", "mode"), [("Take off", "takeoff"), ("Reset", "reset"), ("Land", "land"), ("Emergency", "emergency")]
 )
-def test_the_chosen_drone_alone_gets_its_mode_and_another_page_chooses_for_itself(bench: Bench, label: str, mode: str):
+def test_only_the_drone_chosen_on_the_same_page_gets_the_mode(bench: Bench, label: str, mode: str):
     other: Any = Gui()
     form = DroneForm(bench.gui, bench.client, bench.names)
     DroneForm(other, bench.client, bench.names)
@@ -128,7 +128,7 @@ def test_the_chosen_drone_alone_gets_its_mode_and_another_page_chooses_for_itsel
     other.at["drone"].put(bench.names[2])
     button = bench.gui.at[f"{label} {bench.names[0]}"]
     assert (button.label, form.chosen) == (f"{label} {bench.names[1]}", bench.names[1])
-    if isinstance(button, OrderHtml):  # the page makes an order of it
+    if isinstance(button, OrderHtml):  # the browser sends it as an order
         hold = {"zsim-hold": "1"} if mode == "emergency" else {}
         assert button.order == {"zsim-order": mode, "drone": bench.names[1], **hold}
     else:
@@ -136,7 +136,7 @@ def test_the_chosen_drone_alone_gets_its_mode_and_another_page_chooses_for_itsel
         assert bench.client.asked == [((bench.names[1],), mode)]
 
 
-def test_a_command_is_for_all_that_are_selected_and_would_not_refuse_it(bench: Bench):
+def test_a_command_goes_to_the_selected_drones_that_can_obey_it(bench: Bench):
     returning: list[list[str]] = []
     back = returning.append
     form = DroneForm(bench.gui, bench.client, bench.names, request_return=lambda drones: back(list(drones)))
@@ -145,20 +145,20 @@ def test_a_command_is_for_all_that_are_selected_and_would_not_refuse_it(bench: B
     form.select([first, third])
     assert button["land"].label == "Land 2 drones"
     form.refresh(RunCondition("running", drones={first: "flying", second: "flying", third: "landed"}))
-    assert not button["land"].disabled  # of one that flies
+    assert not button["land"].disabled  # one of the two is flying
     button["takeoff"].put(None)
     button["return"].put(None)
     assert bench.client.asked == [((third,), "takeoff")]
     for mode in ("land", "emergency"):
         order = button[mode]
         assert isinstance(order, OrderHtml)
-        assert order.order["drone"] == f"{first},{third}"  # the page makes an order of it for each
+        assert order.order["drone"] == f"{first},{third}"  # the browser sends an order to each
     assert returning == [[first]]
     form.select([])
     assert button["land"].label == f"Land {first}"
 
 
-def test_what_is_previewed_is_flown_once_it_is_asked_for(bench: Bench):
+def test_a_previewed_flight_starts_only_on_request(bench: Bench):
     shown: list[FlightPreview | None] = []
     form = FormationForm(
         bench.gui,
@@ -177,7 +177,9 @@ def test_what_is_previewed_is_flown_once_it_is_asked_for(bench: Bench):
     assert bench.client.asked == []
     ways = [each.paths_W for each in shown if each is not None]
     assert len(ways) == 2
-    assert ways[1][:, -1].mean(axis=0)[[0, 2]] == pytest.approx([7.0, 9.0])  # both, one after the other
+    assert ways[1][:, -1].mean(axis=0)[[0, 2]] == pytest.approx(
+        [7.0, 9.0]
+    )  # the second preview includes the first change
     bench.gui.press("Fly the preview")
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"x_c": 7.0, "z_c": 9.0}})]
     assert shown[-1] is None
@@ -192,7 +194,7 @@ def test_what_is_previewed_is_flown_once_it_is_asked_for(bench: Bench):
 
 
 @pytest.mark.parametrize(("led", "single"), [(True, True), (True, False), (False, True)])
-def test_all_formations_and_all_drones_of_none_take_off(bench: Bench, led: bool, single: bool):
+def test_take_off_all_starts_every_formation_and_every_single_drone(bench: Bench, led: bool, single: bool):
     scenario = mixed()
     drones = scenario.drones[0 if led else 4 : 6 if single else 4]
     clusters = scenario.clusters if led else []
@@ -202,7 +204,7 @@ def test_all_formations_and_all_drones_of_none_take_off(bench: Bench, led: bool,
     assert bench.client.asked == [*formations * led, *[(("d5", "d6"), "takeoff")] * single]
 
 
-def test_a_drone_is_offered_what_its_state_takes_and_orders_in_a_silent_world_too(bench: Bench):
+def test_a_drone_form_enables_what_the_state_allows_and_orders_in_silence(bench: Bench):
     bench.formation().offer(flown(silent_s=79.0))
     form, name = DroneForm(bench.gui, bench.client, bench.names), bench.names[0]
 
@@ -217,14 +219,14 @@ def test_a_drone_is_offered_what_its_state_takes_and_orders_in_a_silent_world_to
 
 
 def mixed() -> Scenario:
-    """Return two formations, and two drones of none."""
+    """Return a scenario of two formations and two drones that belong to neither."""
     drones = [{"name": f"d{k}", "position_m": [3 * k, 0, 0]} for k in range(1, 7)]
     clusters = [{"name": "main", "drones": ["d1", "d2"]}, {"name": "other", "drones": ["d3", "d4"]}]
     return scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones, "clusters": clusters}, "mixed.yaml")
 
 
 def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition:
-    """Return the condition of a run in which a formation is in a phase."""
+    """Return the condition of a run whose formation is in the given phase."""
     state = "landed" if phase == "idle" else "flying"
     drones = dict.fromkeys(("drone1", "drone2", "drone3"), state)
     return RunCondition(**{"clock": "running", "drones": drones, "phases": {"main": (phase, reason)}, **more})
@@ -249,7 +251,7 @@ def flown(phase: str = "engaged", reason: str = "", **more: Any) -> RunCondition
         (flown(replayed=True), {"Take off", "Engage", "Hold", "Land"}),
     ],
 )
-def test_a_formation_is_offered_what_its_controller_would_grant(bench: Bench, run: RunCondition, off: set[str]):
+def test_a_formation_form_enables_what_its_controller_would_grant(bench: Bench, run: RunCondition, off: set[str]):
     bench.formation().offer(run)
     locked = {label for label in OPERATIONS if bench.gui.at[label].visible and bench.gui.at[label].disabled}
     assert locked == off
@@ -260,7 +262,7 @@ def test_a_formation_is_offered_what_its_controller_would_grant(bench: Bench, ru
     assert [bool(each.hint) for each in flights] == [each.disabled for each in flights] == [not steered] * len(FLIGHTS)
 
 
-def test_the_other_variables_and_the_scenarios_trajectory_are_locked_as_the_sliders_are():
+def test_other_variables_and_the_planned_trajectory_lock_like_the_sliders():
     grid, planned = Bench("grid30"), Bench("trajectory")
     for bench, label in ((grid, "Move it"), (planned, "Fly the scenario's")):
         form = bench.formation()
@@ -273,7 +275,7 @@ def test_the_other_variables_and_the_scenarios_trajectory_are_locked_as_the_slid
     ("states", "off"),
     [(("landed", "flying"), False), (("landed", "emergency"), True), (("landing", "landed"), True)],
 )
-def test_a_take_off_is_offered_of_drones_that_can_rise(bench: Bench, states: tuple[str, ...], off: bool):
+def test_take_off_is_enabled_when_the_drones_can_take_off(bench: Bench, states: tuple[str, ...], off: bool):
     names = bench.names[: len(states)]
     run = flown("idle", drones=dict(zip(names, states, strict=True)), members={"main": names})
     bench.formation().offer(run)
@@ -284,7 +286,7 @@ def test_a_take_off_is_offered_of_drones_that_can_rise(bench: Bench, states: tup
     stopped = flown("idle", drones={"d1": "emergency", "d2": "landed"}, members={"main": ("d1",)})
     for run, single, terms in (
         (stopped, [], ("d1", "reset")),
-        (stopped, ["d2"], ()),  # one of them can
+        (stopped, ["d2"], ()),  # d2 can take off
         (RunCondition(drones={"d2": "emergency"}), ["d2"], ("d2", "reset")),
     ):
         refusal = fleet_refusals(run, single)["takeoff"]
@@ -299,7 +301,7 @@ def test_a_take_off_is_offered_of_drones_that_can_rise(bench: Bench, states: tup
         ("held", "roll of the formation is 60.0 deg", True),
     ],
 )
-def test_rejoin_is_there_while_a_fault_holds_the_formation(bench: Bench, phase: str, reason: str, there: bool):
+def test_rejoin_is_visible_only_while_a_fault_holds_the_formation(bench: Bench, phase: str, reason: str, there: bool):
     bench.formation().offer(flown(phase, reason))
     button = bench.gui.at["Rejoin"]
     assert (button.visible, button.disabled and button.visible) == (there, False)
@@ -309,7 +311,7 @@ FLIGHTS = ("Fly the expressions", "Fly the waypoints", "Waypoints from here")
 STEERED = {("engaged", ""), ("held", HELD_ON_REQUEST)}
 
 
-def test_pause_becomes_resume(bench: Bench):
+def test_pause_and_resume_replace_each_other(bench: Bench):
     form = RunForm(bench.gui, bench.client, 1.0)
     for clock, paused in (("running", False), ("paused", True), ("running", False)):
         form.refresh(RunCondition(clock=clock))
@@ -317,13 +319,13 @@ def test_pause_becomes_resume(bench: Bench):
         assert bench.gui.at["Step"].disabled is not paused
     at_end = RunCondition("paused", replayed=True, at_end=True)
     for run in (at_end, at_end._replace(clock="stopped", ended="the record is over")):
-        form.refresh(run)  # a replay at its end is not offered to go on
+        form.refresh(run)  # a replay at its end cannot continue
         assert bench.gui.at["Step"].disabled
         assert all(bench.gui.at[label].disabled for label in ("Pause", "Resume") if bench.gui.at[label].visible)
         assert has_terms(bench.gui.at["Step"].hint, "record")
 
 
-def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
+def test_all_drones_in_emergency_are_reset_at_once(bench: Bench):
     form = FleetForm(bench.gui, bench.client, bench.scenario)
     form.refresh(flown())
     assert not bench.gui.at["Reset all"].visible
@@ -333,7 +335,7 @@ def test_all_drones_that_stopped_are_reset_at_once(bench: Bench):
     assert bench.client.asked == [(("drone1", "drone3"), "reset")]
 
 
-def test_a_slider_shows_a_value_out_of_its_range_as_it_is_and_does_not_ask_for_it(bench: Bench):
+def test_a_slider_shows_but_does_not_request_a_value_out_of_range(bench: Bench):
     form = bench.formation()
     height, tilt, side = (bench.gui.at[label] for label in ("z_c [m]", "pitch [deg]", "p [m]"))
     limits = [(each.min, each.max) for each in (height, tilt, side)]
@@ -351,7 +353,7 @@ def test_a_slider_shows_a_value_out_of_its_range_as_it_is_and_does_not_ask_for_i
     assert side.label == "p [m]"
 
 
-def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: Bench):
+def test_suggested_waypoints_begin_at_the_formation_in_display_units(bench: Bench):
     form = bench.formation()
     form.refresh(bench.view(x_c=3.0, z_c=2.5, yaw=math.pi / 2), LATER_S)
     assert has_terms(bench.gui.at[WAYPOINTS].value, "0:", "x_c = 3", "z_c = 2.5", "yaw = 90")
@@ -361,9 +363,9 @@ def test_waypoints_begin_where_the_formation_is_in_the_units_of_the_page(bench: 
     assert args["waypoints"][1]["values"]["yaw"] == pytest.approx(math.pi / 2)
 
 
-def test_waypoints_follow_the_formation_until_somebody_edits_them(bench: Bench):
+def test_suggested_waypoints_follow_the_formation_until_edited(bench: Bench):
     form, text, shown = bench.formation(), bench.gui.at[WAYPOINTS], []
-    for x_c in (-1.43, 5.0, 5.05, 5.05):  # they stand still in the noise of an estimate, and end where it does
+    for x_c in (-1.43, 5.0, 5.05, 5.05):  # noise of the estimate leaves them; a formation at rest updates them
         form.refresh(bench.view(x_c=x_c), LATER_S)
         shown.append(text.value)
     assert has_terms(shown[1], "x_c = 5")
@@ -398,7 +400,7 @@ def test_waypoints_follow_the_formation_until_somebody_edits_them(bench: Bench):
         ("Kill estimator", None, ("process_kill", "estimator.drone2", {})),
     ],
 )
-def test_a_common_fault_strikes_what_it_says_with_its_magnitude(
+def test_a_common_fault_has_the_labelled_target_and_magnitude(
     bench: Bench, label: str, magnitude: tuple[str, float] | None, asked: tuple[str, str, dict[str, Any]]
 ):
     form = FaultForm(bench.gui, bench.client, bench.outcomes.append, bench.scenario)
@@ -412,11 +414,13 @@ def test_a_common_fault_strikes_what_it_says_with_its_magnitude(
     told = without_tags(form._strikes.content.replace("<br>", "\n"))
     struck = "drones" if target == "world" else target.rpartition("/")[2]
     assert has_terms(told, label, struck)
-    assert has_terms(told, "Messages lost", "processes", "world", "no radio")  # a link of processes is none
+    assert has_terms(
+        told, "Messages lost", "processes", "world", "no radio"
+    )  # a link between processes is no radio link
     assert magnitude is None or has_terms(told, label, f"{magnitude[1]:g}")
 
 
-def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
+def test_a_fault_without_a_duration_lasts_until_it_is_cleared(bench: Bench):
     bench.faults()
     bench.gui.at["for [s]"].value = -1.0
     bench.gui.press("GPS lost")
@@ -429,7 +433,7 @@ def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
     assert bench.client.asked == [("world", "fault_add", lasting), ("world", "fault_clear", {})]
 
 
-def test_any_fault_is_injected_as_it_is_typed_in_a_terminal(bench: Bench):
+def test_any_fault_can_be_typed_with_the_syntax_of_the_command_line(bench: Bench):
     bench.faults()
     bench.gui.at["kind"].put("accel_bias")
     bench.gui.at["target"].value = " drone3 "
@@ -438,12 +442,12 @@ def test_any_fault_is_injected_as_it_is_typed_in_a_terminal(bench: Bench):
     asked = {"kind": "accel_bias", "target": "drone3", "value_m_s2": [0.5, 0, 0], "for_s": 5.0, "at_s": 120.0}
     assert bench.client.asked == [("world", "fault_add", asked)]
     bench.gui.at["kind"].put("process_kill")
-    bench.gui.press("Inject it")  # without a duration
+    bench.gui.press("Inject it")  # a kill has no duration
     assert bench.client.asked[1:] == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_a_kind_that_is_chosen_has_a_target_that_it_may_strike_and_its_magnitudes_stated(bench: Bench, kind: str):
+def test_choosing_a_kind_suggests_a_valid_target_and_the_required_parameters(bench: Bench, kind: str):
     bench.faults()
     bench.gui.at["kind"].put(kind)
     target, text = bench.gui.at["target"].value, bench.gui.at["parameters"].value
@@ -472,7 +476,7 @@ def test_a_kind_that_is_chosen_has_a_target_that_it_may_strike_and_its_magnitude
         ),
     ],
 )
-def test_parameters_that_are_not_understood_are_refused_and_nothing_is_struck(
+def test_invalid_parameters_are_refused_without_a_fault(
     bench: Bench, kind: str | None, text: str, terms: tuple[str, ...]
 ):
     bench.faults()
@@ -487,7 +491,7 @@ def test_parameters_that_are_not_understood_are_refused_and_nothing_is_struck(
 # A formation
 
 
-def test_a_formation_is_asked_for_its_phase_or_ordered_to_hold_and_land(bench: Bench):
+def test_take_off_and_engage_are_requests_hold_and_land_are_orders(bench: Bench):
     bench.formation()
     for label in ("Take off", "Engage"):
         bench.gui.press(label)
@@ -496,11 +500,11 @@ def test_a_formation_is_asked_for_its_phase_or_ordered_to_hold_and_land(bench: B
     assert orders == [{"zsim-order": op, "cluster": bench.cluster.name} for op in ("hold", "land")]
 
 
-def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
+def test_sliders_at_rest_are_sent_together_and_once(bench: Bench):
     form = bench.formation()
     bench.gui.at["p [m]"].put(5.0)
     bench.gui.at["z_c [m]"].put(4.0)
-    form.send(0.0)  # on the wall: no rest yet
+    form.send(0.0)  # the sliders are not yet at rest
     assert bench.client.asked == []
     form.send(LATER_S)
     form.send(LATER_S + REST_S)
@@ -510,7 +514,7 @@ def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
     assert len(bench.client.asked) == 1
 
 
-def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: Bench):
+def test_sliders_follow_the_formation_except_those_being_moved(bench: Bench):
     form = bench.formation()
     bench.gui.at["p [m]"].put(5.0)
     form.refresh(bench.view(p=7.0, q=8.0), LATER_S)
@@ -520,15 +524,15 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
     for step in range(1, 20):
         form.refresh(bench.view(p=7.0 - 0.1 * step), LATER_S + step)
         assert bench.gui.at["p [m]"].value == 5.0  # the formation is on its way there
-    form.refresh(bench.view(p=5.1), LATER_S + 19.0 + 2 * STILL_S)  # it was held
+    form.refresh(bench.view(p=5.1), LATER_S + 19.0 + 2 * STILL_S)  # the formation stopped short of it
     assert bench.gui.at["p [m]"].value == 5.1
 
 
-def test_a_move_lasts_as_long_as_is_asked_for_and_is_told_in_the_units_of_the_page(bench: Bench):
+def test_a_move_has_the_requested_duration_and_is_shown_in_display_units(bench: Bench):
     form, over = bench.formation(), bench.gui.at["over [s]"]
     for over_s in (-5.0, 3601.0):
         over.value = over_s
-        form.send(LATER_S)  # nothing was asked for
+        form.send(LATER_S)  # nothing is pending
         form.request_target({"p": 5.0})
         assert bench.client.asked == []
         assert has_terms(bench.outcomes.pop().refusal, "over", f"{over_s:g} s", "0 to 3600")
@@ -540,7 +544,7 @@ def test_a_move_lasts_as_long_as_is_asked_for_and_is_told_in_the_units_of_the_pa
     assert has_terms(bench.client.shown[0], "p 5 m", "yaw 180 deg")
 
 
-def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_typed(bench: Bench):
+def test_a_typed_number_is_refused_beyond_the_limit_and_sent_at_the_limit(bench: Bench):
     form = bench.formation()
     box = bench.gui.at["y_c [m]"]
     limit = form._ranges["y_c"].high
@@ -555,7 +559,7 @@ def test_a_number_out_of_range_is_refused_and_its_limit_is_flown_when_it_is_type
 
 
 @pytest.mark.parametrize("side", ["p", "q"])
-def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Bench, side: str):
+def test_the_shortest_side_on_a_slider_is_not_refused_for_rounding(bench: Bench, side: str):
     low = next(each.low for each in slider_ranges(bench.space, bench.cluster, bench.scenario) if each.name == side)
     gains, shape = gains_of(bench.cluster.gains), SHAPE
     c = bench.space.specimen(4.0)
@@ -567,7 +571,7 @@ def test_the_least_side_that_a_slider_offers_is_no_refusal_of_rounding(bench: Be
     assert set(refused) == {None}
 
 
-def test_of_many_variables_the_others_are_moved_one_at_a_time():
+def test_variables_without_a_slider_are_moved_one_at_a_time():
     bench = Bench("grid30")
     bench.formation()
     shown = primary_variables(bench.space.names)
@@ -584,7 +588,7 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
     assert bench.client.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
 
 
-def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
+def test_typed_trajectories_are_requested_unchanged(bench: Bench):
     bench.formation()
     bench.gui.at["expressions [m, deg]"].value = "# a circle\nx_c = R*cos(0.1*t)\n\nyaw = 6*t\nR = 5"
     bench.gui.press("Fly the expressions")
@@ -601,7 +605,7 @@ def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
     ]
 
 
-def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there_and_one_that_is_none_is_not(bench: Bench):
+def test_the_planned_trajectory_is_flown_and_invalid_waypoints_are_refused(bench: Bench):
     planned = Bench("trajectory")
     planned.formation()
     planned.gui.press("Fly the scenario's")
@@ -620,7 +624,7 @@ def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there_and_one_that
 # The page
 
 
-def test_switches_change_the_scene(bench: Bench):
+def test_each_switch_changes_the_scene(bench: Bench):
     shown: list[tuple[str, bool]] = []
     info: Any = SimpleNamespace(rate=2.0, drones=(), replay_of="")
     run = ShownRun(info, bench.scenario, {bench.cluster.name: bench.space})
@@ -633,7 +637,7 @@ def test_switches_change_the_scene(bench: Bench):
         assert shown[-1] == (what, False)
 
 
-def test_every_variable_has_a_range_in_its_unit(bench: Bench):
+def test_every_variable_has_a_range_in_its_display_unit(bench: Bench):
     found = {each.name: each for each in slider_ranges(bench.space, bench.cluster, bench.scenario)}
     assert list(found) == list(bench.space.names)
     assert found["p"].low == bench.cluster.gains.separation_min_m
@@ -646,13 +650,13 @@ def test_every_variable_has_a_range_in_its_unit(bench: Bench):
     assert all(found[n].refusal(found[n].to_display(v)) is None for n, v in goal.items())
     assert has_terms(found["p"].refusal(0.5) or "", "p", "0.5")
     assert found["p"].refusal(math.nan) is not None
-    assert found["p"].to_display(1.0) == 1.0  # as it is: only what is asked for must be within
+    assert found["p"].to_display(1.0) == 1.0  # only requested values must be in range
 
 
 @pytest.mark.parametrize(
     ("altitude_m", "separation_m"), [(100.0, 0.0), (1.0, 20.0), (0.8, 25.0), (1e-3, 1e9), (10_000.0, 19.95)]
 )
-def test_every_range_has_room_whatever_the_scenario_allows(altitude_m: float, separation_m: float):
+def test_no_range_is_empty_whatever_the_limits_of_the_scenario(altitude_m: float, separation_m: float):
     given = {"drones.drone1.limits.altitude_m": altitude_m, "clusters.main.gains.separation_min_m": separation_m}
     scenario = scenario_file.load(SCENARIOS / "step.yaml", [f"{path}={value}" for path, value in given.items()])
     cluster = scenario.clusters[0]
@@ -661,7 +665,7 @@ def test_every_range_has_room_whatever_the_scenario_allows(altitude_m: float, se
         assert found.low <= found.start <= found.high
 
 
-def test_expressions_of_angles_are_in_degrees_as_the_sliders_are(bench: Bench):
+def test_expressions_of_angles_are_in_degrees_like_the_sliders(bench: Bench):
     space = bench.space
     text = "yaw = 90 + 6*t\nroll_deg = A\nx_c = 1\nA = 5"
     read = parse_expressions(text, space.names, ("roll", "pitch", "yaw"))
@@ -689,7 +693,7 @@ def test_expressions_of_angles_are_in_degrees_as_the_sliders_are(bench: Bench):
         ),
     ],
 )
-def test_a_text_that_is_no_trajectory_is_refused_by_line_and_value(read: Any, texts: dict[str, tuple[str, ...]]):
+def test_an_invalid_trajectory_is_refused_with_its_line_and_value(read: Any, texts: dict[str, tuple[str, ...]]):
     for text, terms in texts.items():
         with refused(InputError, *terms):
             read(text)

@@ -1,4 +1,4 @@
-"""Trails and curves: how far they go back, what a record adds, and what a plot shows of them."""
+"""Trails and curves: how far back they go, what a record adds, and how plots show them."""
 
 import math
 from pathlib import Path
@@ -34,7 +34,7 @@ NAMES = ("x_c", "y_c", "z_c", "p")
 # Trails
 
 
-def test_a_trail_goes_back_as_far_as_is_chosen():
+def test_a_trail_has_the_chosen_length():
     trails = CanvasTrails(2)
     for k in range(300):
         trails.add(k * 0.5, np.array([(k * 2 * SPACING_M, 0.0, 1.0), (5.0, 5.0, 1.0)]))
@@ -42,16 +42,16 @@ def test_a_trail_goes_back_as_far_as_is_chosen():
     for length_s in TRAILS_S[:3]:
         number = trails.number
         trails.choose_length(length_s)
-        assert trails.number != number  # a map that has trails of another length asks for them anew
+        assert trails.number != number  # a map with trails of the old length requests them again
         segments, whose, since_s = trails.segments(150.0, now)
-        assert set(whose) == {0}  # one that stands has no trail
+        assert set(whose) == {0}  # a drone that does not move has no trail
         assert len(segments) == 2 * length_s
         assert since_s[0] == 150.0 - length_s
         assert segments[0, 0, 0] == pytest.approx(2 * (150.0 - length_s) * 2 * SPACING_M)
         assert segments[-1, 1].tolist() == [1000.0, 0.0, 1.0]
 
 
-def test_a_drone_that_is_not_there_leaves_no_trail():
+def test_an_absent_drone_has_no_trail():
     trails = CanvasTrails(2)
     nowhere = (np.nan, np.nan, np.nan)
     for k in range(5):
@@ -59,12 +59,12 @@ def test_a_drone_that_is_not_there_leaves_no_trail():
     segments, whose, _ = trails.segments(5.0, np.array([(9.0, 0.0, 1.0), nowhere]))
     assert whose.tolist() == [0] * 5
     assert np.isfinite(segments).all()
-    trails.add(0.0, np.zeros((2, 3)))  # back in time, all begins anew
+    trails.add(0.0, np.zeros((2, 3)))  # going back in time clears the trails
     assert trails.segments(0.0, np.zeros((2, 3)))[0].shape == (0, 2, 3)
 
 
 @pytest.mark.parametrize("count", [3, 50])
-def test_many_points_are_thinned_out_the_same_ones_each_time(count: int):
+def test_long_trails_are_thinned_out_consistently(count: int):
     trails = CanvasTrails(count)
     trails.choose_length(180.0)
     kept: list[set[float]] = []
@@ -77,16 +77,16 @@ def test_many_points_are_thinned_out_the_same_ones_each_time(count: int):
     assert len(kept[0] ^ kept[1]) <= 3
 
 
-def test_trails_of_a_record_are_there_on_both_sides_of_what_was_read_last():
+def test_trails_of_a_record_cover_all_pieces_that_were_read():
     trails, here = CanvasTrails(1, around=True), np.array([(100.0, 0.0, 1.0)])
-    for t_s in (*np.arange(60.0, 80.0, 0.25), *np.arange(0.0, 20.0, 0.25)):  # a piece, and an earlier one
+    for t_s in (*np.arange(60.0, 80.0, 0.25), *np.arange(0.0, 20.0, 0.25)):  # one piece, then an earlier one
         trails.add(t_s, np.array([(t_s, 0.0, 1.0)]))
     trails.choose_length(30.0)
     for at_s in (79.9, 19.9):
         segments, _, since_s = trails.segments(at_s, here)
         assert len(segments) > 70
         assert since_s.min() >= at_s - 30.0
-    assert trails.segments(45.0, here)[0][:, 1, 0].max() < 20.0  # nothing is drawn across what was not read
+    assert trails.segments(45.0, here)[0][:, 1, 0].max() < 20.0  # no line crosses the gap that was not read
     trails.keep(50.0, 70.0)
     assert len(trails.segments(19.9, here)[0]) == 0
 
@@ -95,14 +95,14 @@ def test_trails_of_a_record_are_there_on_both_sides_of_what_was_read_last():
 
 
 def curve(*points: tuple[float, float, float, Any], around: bool = False) -> VariableHistory:
-    """Return the history of one variable, of points (t [s], desired, estimated, true)."""
+    """Return the history of one variable, with points (t [s], desired, estimated, true)."""
     history = VariableHistory(1, around)
     for t_s, desired, estimated, true in points:
         history.add(t_s, (desired,), (estimated,), None if true is None else np.array([true]))
     return history
 
 
-def test_curves_of_a_record_stand_around_the_shown_instant():
+def test_curves_of_a_record_surround_the_shown_instant():
     pieces = (*np.arange(100.0, 110.0, INTERVAL_S), *np.arange(80.0, 90.0, INTERVAL_S), 105.01)
     history = curve(*((t_s, t_s, t_s, None) for t_s in pieces), around=True)
     t, desired, *_ = history.curves(0, angular=False, span_s=60.0, at_s=95.0)
@@ -128,7 +128,7 @@ def test_curves_keep_the_last_minutes():
     assert np.isnan(true[0])
 
 
-def test_curves_of_a_fast_run_go_back_no_further_and_a_window_shows_the_newest():
+def test_curves_of_a_fast_run_keep_the_same_span_of_time():
     t, *_ = curve(*((k * SPAN_S / 10, 1.0, 2.0, None) for k in range(100))).curves(0, angular=False)
     assert len(t) == 11
     assert t[-1] - t[0] == pytest.approx(SPAN_S)
@@ -137,7 +137,7 @@ def test_curves_of_a_fast_run_go_back_no_further_and_a_window_shows_the_newest()
     assert len(desired) == 21
 
 
-def test_an_angle_that_goes_round_breaks_the_curve_and_errors_are_from_what_is_desired():
+def test_a_wrapping_angle_breaks_the_curve_but_not_its_error():
     turning = curve(*((float(k), angle, 0.0, None) for k, angle in enumerate((3.0, 3.1, 3.2, 3.3))))
     _, desired, _, _ = turning.curves(0, angular=True)
     assert np.isnan(desired[2])
@@ -153,7 +153,7 @@ def test_an_angle_that_goes_round_breaks_the_curve_and_errors_are_from_what_is_d
 
 
 def poses(t_s: float) -> DronePoses:
-    """drone1 at (1, 2, 3), turned by 30 degrees and rolled by 6; drone2 is not in the view."""
+    """Return poses with drone1 at (1, 2, 3), yawed by 30 degrees and rolled by 6; drone2 is not in the view."""
     p_W = np.array([(1.0, 2.0, 3.0), (math.nan,) * 3, (7.0, 8.0, 9.0)])
     q_WB = frames.quaternion_from_rpy(np.radians([(6.0, 0.0, 30.0)] * 3))
     return DronePoses(round(t_s * 1e9), tuple(CLUSTER.drones), p_W, q_WB, np.zeros((3, 8)), np.zeros(3))
@@ -168,7 +168,7 @@ def filled(seconds: int) -> FlightHistory:
 
 
 class Plotted:
-    """Plots of a formation and its drones, whose flight of some seconds is known."""
+    """The plots of a formation and its drones, with a history of some seconds."""
 
     def __init__(self, seconds: int = 100) -> None:
         self.gui: Any = Gui()
@@ -180,7 +180,7 @@ class Plotted:
         self.choice.put(next(each for each in self.choice.options if each.startswith(drone)))
 
 
-def test_every_drone_has_its_flight_true_and_estimated():
+def test_every_drone_has_its_true_and_estimated_flight():
     flights = filled(3)
     shown = {each.label.partition(" ")[0]: each for each in flights.variables("drone1")}
     last = {name: [c[-1] for c in each.history.curves(each.column, each.angular)[1:]] for name, each in shown.items()}
@@ -192,7 +192,7 @@ def test_every_drone_has_its_flight_true_and_estimated():
     assert np.isnan(gone.history.curves(gone.column, False)[3]).all()
 
 
-def test_any_variable_of_any_drone_can_be_chosen_with_its_error_and_its_window():
+def test_any_variable_can_be_plotted_with_its_error_and_window():
     shown = Plotted()
     assert len(shown.choice.options) == 1 + 2 + 2 * len(CLUSTER.drones)
     shown.choose("drone1")
@@ -207,7 +207,7 @@ def test_any_variable_of_any_drone_can_be_chosen_with_its_error_and_its_window()
     assert np.ptp(shown.gui.plots[0].data[0]) < SPAN_S / 2
 
 
-def test_plots_that_stand_still_keep_what_they_show():
+def test_frozen_plots_keep_their_data():
     shown = Plotted()
     shown.choice.value = shown.choice.options[-1]
     shown.plots.draw()
@@ -219,7 +219,7 @@ def test_plots_that_stand_still_keep_what_they_show():
     assert shown.gui.plots[0].data is before
 
 
-def test_the_time_axis_holds_all_points_and_moves_on_by_whole_steps():
+def test_the_time_axis_contains_all_points_and_moves_in_whole_steps():
     span_s = WINDOWS_S[0]
     ends = np.arange(1.0, 900.0, 0.5)
     times = [np.array([max(0.0, end - span_s), end]) for end in ends]
@@ -229,7 +229,7 @@ def test_the_time_axis_holds_all_points_and_moves_on_by_whole_steps():
     assert len(set(found)) == math.ceil(ends[-1] / (span_s / STEPS_PER_WINDOW))
 
 
-def test_values_have_a_range_of_their_own_where_a_curve_is_not_known_at_all():
+def test_values_get_an_explicit_range_when_a_curve_is_unknown():
     unknown, known = np.full(3, np.nan), np.array([np.nan, -1.0, 4.0])
     assert AxisRange.of_values((unknown, unknown)) is None
     assert AxisRange.of_values((known, known)) is None
@@ -238,7 +238,7 @@ def test_values_have_a_range_of_their_own_where_a_curve_is_not_known_at_all():
     assert found.low < -1.0 < 4.5 < found.high
 
 
-def test_a_plot_is_made_anew_only_where_its_time_axis_moves_on():
+def test_a_plot_is_recreated_only_when_its_time_axis_moves():
     shown = Plotted(10)
     shown.choose("drone1")
     scales = shown.gui.plots[0].scales
@@ -252,7 +252,7 @@ def test_a_plot_is_made_anew_only_where_its_time_axis_moves_on():
     assert shown.gui.plots[0].scales["x"]["range"][1] > high
 
 
-def test_what_is_chosen_is_shown_though_nothing_is_drawn_any_more_and_without_points_has_no_curve():
+def test_a_choice_is_plotted_at_once_even_without_new_data():
     shown = Plotted()
     shown.choose("drone3")
     assert shown.gui.plots[0].data[3][-1] == pytest.approx(7.0)

@@ -1,4 +1,4 @@
-"""Drones flown from pages: who may, what is sent when, the geofence, what a silent page leaves behind, and returns."""
+"""Drones flown from pages: permission, commands and their timing, the geofence, lost pages, and return flights."""
 
 import math
 from collections import Counter
@@ -44,7 +44,7 @@ PAGE, OTHER = "page", "other"
 
 
 class Client:
-    """A command client that notes what is sent, and answers at once unless it is to wait."""
+    """A command client that records what is sent, and answers at once unless the test holds the answers back."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, tuple[float, float, float]]] = []
@@ -72,7 +72,7 @@ class Client:
 
 
 class Cockpit:
-    """Two drones that hover, seen and flown by pages; time goes when the test says so."""
+    """Two hovering drones, seen and flown from pages, on a clock that only the test advances."""
 
     def __init__(self) -> None:
         self.client = Client()
@@ -89,7 +89,7 @@ class Cockpit:
         )
 
     def sight(self, drone: str) -> DroneSight:
-        """Return what is seen of a drone now."""
+        """Return the current sight of a drone."""
         seen = self.sights[drone]
         return seen if seen.pose is None else seen._replace(pose=seen.pose._replace(t_s=self.now_s))
 
@@ -97,7 +97,7 @@ class Cockpit:
         self.sights[drone] = self.sights[drone]._replace(**changes)
 
     def after(self, seconds: float) -> list[tuple[float, float, float]]:
-        """Let time pass in periods; return the velocities that were sent meanwhile."""
+        """Advance the time period by period and return the velocities sent meanwhile."""
         before = len(self.client.sent)
         for _ in range(round(seconds / PERIOD_S)):
             self.now_s += PERIOD_S
@@ -120,18 +120,18 @@ def flown() -> Cockpit:
     return Cockpit().flying()
 
 
-def test_a_drone_that_nobody_flies_is_taken_and_flown_while_the_stick_is_held(flown: Cockpit):
+def test_a_free_drone_is_flown_while_the_stick_is_held(flown: Cockpit):
     assert flown.client.taken == ["drone2"]
     flown.control.steer(PAGE, FORWARD)
     assert flown.after(STALE_S / 2) == [pytest.approx((1.0, 0.0, 0.0))] * 5
     assert flown.control.steer(PAGE, None).text == "hovers"
     flown.control.tick()
     assert flown.client.sent[-1] == ("drone2", STILL)  # at once, not with the next command
-    assert flown.after(1.0) == [STILL] * 20  # and on: a firmware that gets nothing lands
+    assert flown.after(1.0) == [STILL] * 20  # and repeatedly, because firmware that receives nothing lands
     assert {drone for drone, _ in flown.client.sent} == {"drone2"}
 
 
-def test_a_page_that_is_silent_or_lost_lets_its_drone_hover_and_gives_it_back(flown: Cockpit):
+def test_the_drone_of_a_silent_page_hovers_and_is_released(flown: Cockpit):
     flown.control.steer(PAGE, FORWARD)
     velocities = flown.after(STALE_S + 0.5)
     assert velocities[-1] == STILL
@@ -142,7 +142,7 @@ def test_a_page_that_is_silent_or_lost_lets_its_drone_hover_and_gives_it_back(fl
     assert flown.after(1.0) == []
 
 
-def test_a_connection_that_is_lost_lets_the_drone_hover_at_once_and_has_it_back_by_its_request(cockpit: Cockpit):
+def test_after_a_lost_connection_the_same_request_regains_the_drone(cockpit: Cockpit):
     assert cockpit.control.take(PAGE, "drone2", False, "one").state == "flying"
     cockpit.see("drone2", commander=NAME)
     cockpit.control.steer(PAGE, FORWARD)
@@ -157,7 +157,7 @@ def test_a_connection_that_is_lost_lets_the_drone_hover_at_once_and_has_it_back_
     assert cockpit.client.given_back == ["drone2"]
 
 
-def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over(cockpit: Cockpit):
+def test_a_drone_of_a_formation_must_be_taken_over_to_be_flown(cockpit: Cockpit):
     cockpit.see("drone2", commander="controller.main")
     refused = cockpit.control.take(PAGE, "drone2", over=False)
     assert (refused.state, refused.over) == ("none", True)
@@ -183,7 +183,7 @@ def test_a_drone_of_a_formation_is_flown_only_when_it_is_taken_over(cockpit: Coc
     ],
     ids=["landed", "unseen", "replay", "too fast"],
 )
-def test_what_cannot_be_flown_is_refused_with_its_reason(
+def test_a_drone_that_cannot_be_flown_is_refused_with_the_reason(
     sight: dict, run: dict, terms: tuple[str, ...], cockpit: Cockpit
 ):
     cockpit.see("drone2", **sight)
@@ -194,7 +194,7 @@ def test_what_cannot_be_flown_is_refused_with_its_reason(
     assert cockpit.client.taken == []
 
 
-def test_a_request_that_is_repeated_is_carried_out_once(cockpit: Cockpit):
+def test_a_repeated_request_is_carried_out_once(cockpit: Cockpit):
     cockpit.client.waiting = []
     for _ in range(3):
         assert cockpit.control.take(PAGE, "drone2", True, "one").state == "taking"
@@ -203,19 +203,19 @@ def test_a_request_that_is_repeated_is_carried_out_once(cockpit: Cockpit):
     cockpit.see("drone2", commander=NAME)
     assert cockpit.control.take(PAGE, "drone2", True, "one").state == "flying"
     cockpit.control.leave(PAGE)
-    again = cockpit.control.take(PAGE, "drone2", True, "one")  # a repetition that was late takes it no more
+    again = cockpit.control.take(PAGE, "drone2", True, "one")  # a late repetition has no effect
     assert (again.state, again.id) == ("none", "one")
     assert cockpit.client.taken == ["drone2"]
 
 
-def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_for_how_long(cockpit: Cockpit):
+def test_a_request_is_repeated_once_a_silent_world_returns(cockpit: Cockpit):
     cockpit.client.waiting = []
     cockpit.control.take(PAGE, "drone2", True, "one")
     cockpit.run = RunSight(silence="the world has not answered for 5 s")
     cockpit.client.waiting.pop()(NoAnswer("no answer came within 5 s"))
     for _ in range(3):
         cockpit.after(2.0)
-        cockpit.control.take(PAGE, "drone2", True, "one")  # the page is there
+        cockpit.control.take(PAGE, "drone2", True, "one")  # the page is still connected
     waits = cockpit.control.answer(PAGE)
     assert waits.state == "taking"
     assert has_terms(waits.text, "6.0 s", "not confirmed", "world", "5 s")
@@ -227,7 +227,7 @@ def test_a_drone_is_asked_for_again_of_a_world_that_has_not_answered_and_says_fo
     assert cockpit.control.answer(PAGE).state == "flying"
 
 
-def test_a_console_that_stood_still_says_so_where_it_gives_a_drone_back(flown: Cockpit):
+def test_a_stall_of_the_console_is_given_as_the_reason_for_a_release(flown: Cockpit):
     flown.control.steer(PAGE, FORWARD)
     flown.after(0.5)
     flown.now_s += 29.0
@@ -235,14 +235,14 @@ def test_a_console_that_stood_still_says_so_where_it_gives_a_drone_back(flown: C
     assert has_terms(flown.control.answer(PAGE).text, "console", "29 s")
 
 
-def test_one_drone_is_flown_from_one_page_and_a_page_flies_one_drone(flown: Cockpit):
+def test_a_drone_is_flown_from_one_page_and_a_page_flies_one_drone(flown: Cockpit):
     assert has_terms(flown.control.take(OTHER, "drone2", over=True).text, "drone2", "another page")
     assert flown.control.take(PAGE, "drone1", over=False).state == "flying"
     flown.control.tick()
     assert flown.client.given_back == ["drone2"]
 
 
-def test_a_page_that_gives_up_before_the_answer_gives_the_drone_back_twice_rather_than_never(cockpit: Cockpit):
+def test_a_drone_left_before_the_answer_is_released_again_after_it(cockpit: Cockpit):
     cockpit.client.waiting = []
     assert cockpit.control.take(PAGE, "drone2", over=False).state == "taking"
     assert cockpit.after(0.5) == []
@@ -255,7 +255,7 @@ def test_a_page_that_gives_up_before_the_answer_gives_the_drone_back_twice_rathe
 
 
 @pytest.mark.parametrize("end", ["landing", "mode", "commander", "silent"])
-def test_what_ends_a_flight_gives_the_drone_back_and_says_why(end: str, flown: Cockpit):
+def test_the_end_of_a_flight_releases_the_drone_and_gives_the_reason(end: str, flown: Cockpit):
     flown.control.steer(PAGE, None)
     flown.after(SETTLED_S + PERIOD_S)
     flown.control.steer(PAGE, FORWARD)
@@ -274,8 +274,8 @@ def test_what_ends_a_flight_gives_the_drone_back_and_says_why(end: str, flown: C
     assert answer.text
 
 
-def test_a_drone_whose_last_command_came_after_the_release_is_given_back_again(flown: Cockpit):
-    """The world makes whoever commands a drone that nobody flies its commander; a silent one would be landed."""
+def test_a_command_that_arrives_after_the_release_causes_another_release(flown: Cockpit):
+    """Commanding a free drone makes the sender its commander, and the world lands the drone of a silent commander."""
     flown.control.leave(PAGE)
     flown.after(PERIOD_S)
     assert flown.client.given_back == ["drone2"]
@@ -286,17 +286,17 @@ def test_a_drone_whose_last_command_came_after_the_release_is_given_back_again(f
     assert flown.client.given_back == ["drone2"] * 2
 
 
-def test_a_run_that_stands_still_is_sent_nothing_and_a_slow_one_a_command_for_each_gate(flown: Cockpit):
+def test_a_paused_run_gets_no_commands_and_a_slow_one_a_command_per_gate(flown: Cockpit):
     flown.run = RunSight(paused=True)
     assert flown.after(1.0) == []
-    flown.run = RunSight(rate=0.1)  # a gate of 20 ms each 0.2 s
+    flown.run = RunSight(rate=0.1)  # one gate of 20 ms every 0.2 s
     flown.control.steer(PAGE, None)
     assert 7 <= len(flown.after(2.0)) <= 10
 
 
-def test_a_drone_is_sent_to_a_place_at_its_height_and_the_stick_ends_that(flown: Cockpit):
+def test_a_drone_flies_to_a_place_until_the_stick_is_used(flown: Cockpit):
     flown.see("drone2", pose=DronePose((0.0, 0.0, 4.0), math.pi / 2))
-    assert flown.control.go(PAGE, 3.0, 0.0, 7.0).goal == (3.0, 0.0, 7.0)  # a height that was confirmed
+    assert flown.control.go(PAGE, 3.0, 0.0, 7.0).goal == (3.0, 0.0, 7.0)  # a confirmed altitude
     assert flown.after(PERIOD_S)[0][2] > 0.0
     answer = flown.control.go(PAGE, 0.0, 20.0)
     assert answer.state == "flying"
@@ -307,17 +307,18 @@ def test_a_drone_is_sent_to_a_place_at_its_height_and_the_stick_ends_that(flown:
         flown.after(0.4)
     flown.control.steer(PAGE, None)
     last = flown.after(PERIOD_S)[0]
-    # the way's own velocity the law's lead ahead, from rest; the drone does not move, so it hurries up to the cruise
+    # From rest, the velocity of the path one lead of the law ahead. The drone does not move, so the command then
+    # catches up, to the cruise.
     assert first == pytest.approx((ACCEL_M_S2 * LAW.lead_s, 0.0, 0.0), abs=0.05)
     assert last == pytest.approx((1.5, 0.0, 0.0), abs=0.02)
-    flown.control.steer(PAGE, None)  # the page is there, its dead-man key is not held
+    flown.control.steer(PAGE, None)  # the page is alive but its dead-man key is not held
     assert flown.after(0.1)[-1] != STILL
     flown.control.steer(PAGE, FORWARD)
     flown.control.steer(PAGE, None)
     assert set(flown.after(0.2)) == {STILL}
 
 
-def test_places_are_flown_to_one_after_the_other_and_one_that_is_repeated_is_one(flown: Cockpit):
+def test_places_are_visited_in_order_and_a_repeated_one_counts_once(flown: Cockpit):
     flown.control.go(PAGE, 10.0, 0.0, 5.0)
     flown.control.go(PAGE, 10.0, 10.0, 5.0, then=True)
     answer = flown.control.go(PAGE, 10.0, 10.0, 5.0, then=True)
@@ -329,12 +330,12 @@ def test_places_are_flown_to_one_after_the_other_and_one_that_is_repeated_is_one
     assert (answer.goal, answer.then) == ((10.0, 10.0, 5.0), ())
     flown.see("drone2", pose=DronePose((10.0, 10.0, 5.0), 0.0))
     flown.after(PERIOD_S)
-    assert flown.control.answer(PAGE).goal == (10.0, 10.0, 5.0)  # where it stays
+    assert flown.control.answer(PAGE).goal == (10.0, 10.0, 5.0)  # the drone stays there
     flown.control.steer(PAGE, FORWARD)
     assert flown.control.answer(PAGE).goal is None
 
 
-def test_a_place_outside_of_the_fence_or_without_an_estimate_is_refused(flown: Cockpit):
+def test_a_place_outside_the_geofence_or_without_an_estimate_is_refused(flown: Cockpit):
     assert has_terms(flown.control.go(PAGE, 80.0, 0.0).text, "x", "80.0", "50")
     flown.see("drone2", pose=None)
     assert has_terms(flown.control.go(PAGE, 8.0, 0.0).text, "drone2")
@@ -342,7 +343,7 @@ def test_a_place_outside_of_the_fence_or_without_an_estimate_is_refused(flown: C
     assert set(flown.after(0.2)) == {STILL}
 
 
-def test_nothing_flies_on_when_the_run_is_left(flown: Cockpit):
+def test_drones_are_released_when_the_run_is_left(flown: Cockpit):
     with flown.control.running():
         pass
     assert flown.client.given_back == ["drone2"]
@@ -354,7 +355,7 @@ MIDDLE = DronePose((0.0, 0.0, 5.0), math.pi / 2)
 deflections = st.floats(-1.0, 1.0)
 
 
-def test_the_fence_is_around_all_starts_and_keeps_drones_within():
+def test_the_geofence_surrounds_all_starts_and_confines_drones():
     drones = [
         {"name": "one", "position_m": [0, 10, 0]},
         {"name": "two", "position_m": [-20, 0, 0], "limits": {"altitude_m": 12}},
@@ -372,7 +373,7 @@ def test_the_fence_is_around_all_starts_and_keeps_drones_within():
 
 
 @given(deflections, deflections, deflections, deflections, st.floats(0.0, 100.0), st.floats(-4.0, 4.0))
-def test_a_stick_never_asks_for_more_than_the_drone_s_limits(
+def test_a_stick_never_exceeds_the_limits_of_the_drone(
     forward: float, left: float, up: float, turn: float, speed: float, yaw: float
 ):
     pose = DronePose((0.0, 0.0, 15.0), yaw)
@@ -383,12 +384,12 @@ def test_a_stick_never_asks_for_more_than_the_drone_s_limits(
     assert abs(flown.yaw_rate_rad_s) <= math.radians(30.0)
 
 
-def test_a_velocity_is_in_the_heading_frame_and_within_the_fence():
+def test_a_velocity_is_in_the_heading_frame_and_within_the_geofence():
     flown = stick_velocity(Stick(1.0, 0.0, 0.0, 0.5, 1.5), MIDDLE, LIMITS, FENCE)
     assert flown.velocity_m_s == pytest.approx((1.5, 0.0, 0.0))
     assert flown.yaw_rate_rad_s == pytest.approx(math.radians(15.0))
 
-    # it looks north at the fence in the north: nothing is left of forward, all of left
+    # The drone faces north at the northern fence: nothing remains of forward, all of left.
     flown = stick_velocity(Stick(1.0, 1.0, 0.0, 0.0, 1.0), DronePose((0.0, 50.0, 5.0), math.pi / 2), LIMITS, FENCE)
     assert flown.velocity_m_s == pytest.approx((0.0, math.sqrt(0.5), 0.0), abs=1e-9)
 
@@ -398,7 +399,7 @@ NAMES = ("x_c", "y_c", "z_c")
 
 
 class Returns:
-    """Returns in a run that only the test performs."""
+    """Return flights in a run that the test simulates."""
 
     def __init__(self) -> None:
         self.said: list[Any] = []
@@ -449,9 +450,9 @@ def returns() -> Returns:
     return Returns()
 
 
-def test_a_drone_is_sent_over_its_start_and_lands_there(returns: Returns):
+def test_a_returning_drone_flies_above_its_start_and_lands_there(returns: Returns):
     returns.flights.request_drones(["drone1"])
-    assert returns.tick() == []  # it is being taken
+    assert returns.tick() == []  # the drone is still being acquired
     returns.answer = FlightAnswer("drone1", "flying")
     assert returns.tick() == [("go", 0.0, 1.5)]
     assert returns.tick() == []
@@ -461,7 +462,7 @@ def test_a_drone_is_sent_over_its_start_and_lands_there(returns: Returns):
     assert returns.notes == []
 
 
-def test_a_drone_that_somebody_else_takes_does_not_land(returns: Returns):
+def test_a_returning_drone_taken_by_another_process_does_not_land(returns: Returns):
     returns.flights.request_drones(["drone1"])
     returns.answer = FlightAnswer("drone1", "none", "drone1 is flown by driver.x now")
     assert returns.tick() == []
@@ -470,18 +471,18 @@ def test_a_drone_that_somebody_else_takes_does_not_land(returns: Returns):
     assert returns.tick() == []
 
 
-def test_a_drone_that_may_not_be_taken_says_why(returns: Returns):
+def test_a_refused_return_is_reported_with_the_reason(returns: Returns):
     returns.answer = FlightAnswer("drone1", "none", "drone1 is landed")
     returns.flights.request_drones(["drone1"])
     assert returns.notes == [("drone1", "drone1 is landed")]
     assert returns.tick() == []
 
 
-def test_a_formation_is_led_over_the_middle_of_its_starts_and_lands_there(returns: Returns):
+def test_a_returning_formation_lands_at_the_centre_of_its_starts(returns: Returns):
     returns.flights.request_formation("main")
     assert returns.said == [("target", {"values": {"x_c": 0.0, "y_c": -0.5}})]
     assert returns.tick() == []
-    returns.fly_to(0.0, -0.5, desired=(2.0, -2.0))  # it happens to be there, on its way
+    returns.fly_to(0.0, -0.5, desired=(2.0, -2.0))  # it only passes through
     assert returns.tick() == []
     returns.fly_to(0.1, -0.4, desired=(0.0, -0.5))
     assert returns.tick() == [("land", {})]
@@ -489,7 +490,7 @@ def test_a_formation_is_led_over_the_middle_of_its_starts_and_lands_there(return
 
 
 @pytest.mark.parametrize("how", ["request", "elsewhere", "held", "refused"])
-def test_a_formation_that_does_not_return_any_more_does_not_land(returns: Returns, how: str):
+def test_a_formation_that_no_longer_returns_does_not_land(returns: Returns, how: str):
     returns.flights.request_formation("main")
     returns.fly_to(1.0, -1.0)
     assert returns.tick() == []

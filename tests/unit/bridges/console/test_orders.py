@@ -1,4 +1,4 @@
-"""Requests of operators: how orders are repeated until they are confirmed, and what the command client sends."""
+"""Operators' requests: how orders are repeated until confirmed, and what the command client sends."""
 
 import threading
 from collections import Counter
@@ -29,7 +29,7 @@ S = 1_000_000_000  # ns
 
 
 class Client:
-    """A command client that notes what is sent."""
+    """A command client that records what is sent."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, str]] = []
@@ -48,7 +48,7 @@ class Client:
 
 
 class Desk:
-    """An order book of two drones in a formation and one of none; the test is the world."""
+    """An order book for a formation of two drones and a single drone; the test plays the world."""
 
     def __init__(self) -> None:
         self.client = Client()
@@ -64,12 +64,12 @@ class Desk:
         return self.book.place(OrderRequest(op, order_id, **of))
 
     def end(self, name: str, op: str, refusal: str = "", unanswered: bool = False, order: str = "one") -> bool:
-        """Let an attempt end; return whether operators are told."""
+        """End an attempt and return whether operators are notified."""
         outcome = RequestOutcome(f"{name}: {op}", refusal, name, op, order=order, unanswered=unanswered)
         return self.book.note(outcome)
 
     def after(self, seconds: float, *, paused: bool = False, **states: str) -> dict[str, Any]:
-        """Let time pass, and views come; return the newest order."""
+        """Advance the time, deliver new states, and return the newest order."""
         self.wall_s += seconds
         self.now_ns += round(seconds * S)
         self.states |= states
@@ -97,15 +97,13 @@ def desk() -> Desk:
         ("hold", {"cluster": "main"}, [("main", "hold")]),
     ],
 )
-def test_an_order_concerns_whom_it_names_and_is_carried_out_once(
-    op: str, of: dict[str, str], sent: list[Any], desk: Desk
-):
+def test_an_order_goes_once_to_those_it_names(op: str, of: dict[str, str], sent: list[Any], desk: Desk):
     for _ in range(5):
         assert desk.place(op, **of)["state"] == "sent"
     assert desk.client.sent == sent
 
 
-def test_what_has_another_id_is_another_order(desk: Desk):
+def test_an_order_with_another_id_is_a_new_order(desk: Desk):
     desk.place("emergency", drone="drone1")
     desk.place("emergency", "two", drone="drone1")
     desk.place("emergency", "", drone="drone1")
@@ -126,15 +124,15 @@ def test_an_emergency_is_repeated_until_every_drone_has_stopped(desk: Desk):
     assert (order["state"], order["t_s"]) == ("confirmed", desk.now_ns / 1e9)
     desk.after(10 * REPEAT_S)
     assert len(desk.client.sent) == 5
-    assert desk.place("emergency")["state"] == "confirmed"  # a page that has not heard of it repeats it still
+    assert desk.place("emergency")["state"] == "confirmed"  # a page that missed the confirmation repeats it
     assert len(desk.client.sent) == 5
     assert desk.after(SHOWN_S) == {}
 
 
-def test_one_attempt_at_a_time_is_under_way_and_none_at_a_world_that_is_silent(desk: Desk):
+def test_one_attempt_is_made_at_a_time_and_no_repetition_in_silence(desk: Desk):
     desk.silent_s = 3.0
     order = desk.place("emergency", drone="drone1")
-    assert desk.client.sent == [("drone1", "emergency")]  # at once: it may be heard yet
+    assert desk.client.sent == [("drone1", "emergency")]  # at once: the world may still receive it
     assert has_terms(order["reason"], "world", "3 s")
     desk.after(5.0)
     desk.end("drone1", "emergency", "no answer came", unanswered=True)
@@ -147,7 +145,7 @@ def test_one_attempt_at_a_time_is_under_way_and_none_at_a_world_that_is_silent(d
     assert len(desk.client.sent) == 2
 
 
-def test_a_stamp_that_grew_old_is_sent_anew_and_what_else_is_refused_is_told(desk: Desk):
+def test_an_order_refused_for_its_age_is_repeated_others_are_refused(desk: Desk):
     desk.place("emergency", drone="drone1")
     desk.end("drone1", "emergency")
     desk.happen("refused", "drone/drone1/cmd/mode", reason="age is 12000 ms; must be <= 200 ms")
@@ -161,7 +159,7 @@ def test_a_stamp_that_grew_old_is_sent_anew_and_what_else_is_refused_is_told(des
     assert len(desk.client.sent) == 2
 
 
-def test_the_event_of_a_mode_confirms_it_but_of_a_drone_that_the_world_only_hands_it_to(desk: Desk):
+def test_a_mode_event_confirms_an_order_except_for_external_drones(desk: Desk):
     desk.place("land", drone="drone1")
     desk.place("land", "two", drone="drone3")
     desk.happen("mode", "drone1", mode="land")
@@ -171,14 +169,14 @@ def test_the_event_of_a_mode_confirms_it_but_of_a_drone_that_the_world_only_hand
     assert desk.after(0.1, drone3="landing")["state"] == "confirmed"
 
 
-def test_what_was_shown_before_an_order_does_not_confirm_it(desk: Desk):
+def test_a_state_from_before_an_order_does_not_confirm_it(desk: Desk):
     desk.states["drone1"] = "landing"
     desk.place("land", drone="drone1")
     desk.book.update(desk.states, desk.now_ns, paused=False)
     assert desk.book.rows()[0]["state"] == "sent"
 
 
-def test_a_paused_run_has_the_order_and_is_not_sent_it_again(desk: Desk):
+def test_an_order_that_a_paused_run_has_received_is_not_repeated(desk: Desk):
     desk.place("emergency", drone="drone1")
     desk.end("drone1", "emergency")
     desk.happen("command", "drone1", message={"mode": "emergency"})
@@ -189,7 +187,7 @@ def test_a_paused_run_has_the_order_and_is_not_sent_it_again(desk: Desk):
     assert has_terms(order["reason"], "paused")
 
 
-def test_a_controller_that_answers_confirms_or_refuses_and_one_that_does_not_is_asked_again(desk: Desk):
+def test_an_unanswered_request_to_a_controller_is_repeated(desk: Desk):
     desk.place("hold")
     told = desk.end("main", "hold", "no answer came within 5 s", unanswered=True)
     assert not told
@@ -207,15 +205,15 @@ def test_a_controller_that_answers_confirms_or_refuses_and_one_that_does_not_is_
     assert has_terms(order["reason"], "main", "ground")
 
 
-def test_what_a_silent_controller_did_all_the_same_counts(desk: Desk):
+def test_the_state_confirms_an_order_whose_answer_was_lost(desk: Desk):
     desk.place("hold")
-    assert desk.after(0.1, main="held")["state"] == "sent"  # it may be held by a fault
+    assert desk.after(0.1, main="held")["state"] == "sent"  # a fault may be holding it
     desk.end("main", "hold", "no answer", unanswered=True)
     desk.after(REPEAT_S, main="engaged")
     assert desk.after(0.1, main="held")["state"] == "confirmed"
 
 
-def test_a_later_order_replaces_what_it_contradicts_and_never_an_emergency(desk: Desk):
+def test_a_later_order_replaces_earlier_ones_but_never_an_emergency(desk: Desk):
     desk.place("hold")
     desk.place("land", "two")
     desk.place("emergency", "three")
@@ -241,14 +239,16 @@ def test_a_reset_ends_the_repetition_of_an_emergency(desk: Desk):
         (OrderRequest("hold", cluster="nobody"), ("'nobody'",)),
     ],
 )
-def test_what_concerns_nobody_or_another_run_is_refused(request_: OrderRequest, terms: tuple[str, ...], desk: Desk):
+def test_an_order_for_an_unknown_subject_or_another_run_is_refused(
+    request_: OrderRequest, terms: tuple[str, ...], desk: Desk
+):
     order = desk.book.place(request_)
     assert order["state"] == "refused"
     assert has_terms(order["reason"], *terms)
     assert desk.client.sent == []
 
 
-def test_a_run_that_is_over_refuses_what_it_has_not_confirmed(desk: Desk):
+def test_the_end_of_a_run_refuses_unconfirmed_orders(desk: Desk):
     desk.place("emergency")
     desk.refusal = "the run is over: 330 s were flown"
     order = desk.after(0.1)
@@ -261,19 +261,19 @@ PATIENCE_S = 120.0
 
 
 class Link:
-    """A session that notes what is asked of it."""
+    """A session that records the requests."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[Any, ...]] = []
         self.refusals: dict[str, str] = {}
         self.given_back = threading.Event()
-        self.answers = threading.Event()  # whether anybody answers those who ask for what never ends
-        self.held: dict[int, threading.Event] = {}  # by priority, what keeps an acquire from being answered
+        self.answers = threading.Event()  # set to answer the requests that hang
+        self.held: dict[int, threading.Event] = {}  # by priority: set to answer an acquire
         self.acquiring: SimpleQueue[int] = SimpleQueue()
 
     @property
     def modes(self) -> list[str]:
-        """What has been sent, in order."""
+        """The modes sent, in order."""
         return [entry[1].mode for entry in self.sent if len(entry) == 2]
 
     def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
@@ -298,7 +298,7 @@ class Link:
 
 
 class FakeViewBuffer:
-    """Hears at once that a command was taken."""
+    """Behaves as if every command were answered at once."""
 
     def answered_commands(self, drone: str) -> int:
         return 0
@@ -308,7 +308,7 @@ class FakeViewBuffer:
 
 
 class Table:
-    """A command client, what it sent, and the outcomes that it reported."""
+    """A command client with its session and the outcomes that it reports."""
 
     def __init__(self) -> None:
         self.link = Link()
@@ -327,7 +327,7 @@ def table() -> Iterator[Table]:
     made.client.close()
 
 
-def test_a_request_goes_out_in_the_console_s_name(table: Table):
+def test_a_request_is_sent_in_the_name_of_the_console(table: Table):
     table.client.request_cluster("main", "target", values={"p": 4.0}, over_s=5.0)
     outcome = table.outcome()
     assert has_terms(outcome.request, "main", "target", "p=4", "over_s 5")
@@ -336,7 +336,7 @@ def test_a_request_goes_out_in_the_console_s_name(table: Table):
     assert table.link.sent == [("cluster/main/control", "target", "console.1", args)]
 
 
-def test_waypoints_are_told_by_how_many_they_are(table: Table):
+def test_waypoints_are_described_by_their_number(table: Table):
     points = [{"at_s": 10.0 * k, "values": {"x_c": 5.0}} for k in range(3)]
     table.client.request_cluster("main", "trajectory", waypoints=points)
     assert has_terms(table.outcome().request, "main", "waypoints (3)")
@@ -348,7 +348,7 @@ def test_waypoints_are_told_by_how_many_they_are(table: Table):
     ("op", "terms"),
     [("pause", ("not now",)), ("broken", ("session", "closed")), ("wrong", ("ValueError", "no such thing"))],
 )
-def test_a_refusal_or_whatever_goes_wrong_is_told(table: Table, op: str, terms: tuple[str, ...]):
+def test_a_refusal_or_an_error_is_reported(table: Table, op: str, terms: tuple[str, ...]):
     table.link.refusals["pause"] = "not now"
     table.client.request_world(op)
     outcome = table.outcome()
@@ -356,7 +356,7 @@ def test_a_refusal_or_whatever_goes_wrong_is_told(table: Table, op: str, terms: 
     assert has_terms(outcome.refusal, *terms)
 
 
-def test_a_page_that_outlives_its_run_is_told_so(table: Table):
+def test_requests_after_the_end_of_the_run_are_refused(table: Table):
     table.client.close()
     table.client.request_world("pause")
     table.client.send_mode(["drone1"], "land")
@@ -366,7 +366,7 @@ def test_a_page_that_outlives_its_run_is_told_so(table: Table):
     assert table.link.sent == []
 
 
-def test_a_drone_is_taken_told_and_given_back(table: Table):
+def test_a_drone_is_acquired_commanded_and_released(table: Table):
     table.client.send_mode(["drone1"], "land")
     assert table.outcome()[:2] == ("drone1: land", "")
     assert table.link.given_back.wait(PATIENCE_S)
@@ -376,7 +376,7 @@ def test_a_drone_is_taken_told_and_given_back(table: Table):
     assert release == ("world/control", "release", "console.1", {"drone": "drone1"})
 
 
-def test_a_drone_that_another_operator_has_is_not_commanded(table: Table):
+def test_a_drone_of_another_operator_is_not_commanded(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 10"
     table.client.send_mode(["drone1"], "takeoff")
     assert has_terms(table.outcome().refusal, "drone1", "'console.2'", "10")
@@ -392,7 +392,7 @@ def test_an_emergency_reaches_every_drone(table: Table):
     assert {key for key, _ in modes} == {f"drone/{name}/cmd/mode" for name in names}
 
 
-def test_an_emergency_comes_before_whoever_flies_and_is_sent_even_where_the_drone_is_refused(table: Table):
+def test_an_emergency_is_sent_even_if_the_drone_is_refused(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 100"
     table.client.send_mode(["drone1"], "emergency")
     assert has_terms(table.outcome().refusal, "drone1", "'console.2'", "100", "emergency")
@@ -401,7 +401,7 @@ def test_an_emergency_comes_before_whoever_flies_and_is_sent_even_where_the_dron
     assert table.link.modes == ["emergency"]
 
 
-def test_an_emergency_does_not_wait_for_those_who_do_not_answer(table: Table):
+def test_an_emergency_does_not_wait_for_unanswered_requests(table: Table):
     for _ in range(3 * THREADS_PER_POOL):
         table.client.request_cluster("main", "hangs")
     table.client.send_mode(["drone1"], "emergency")
@@ -410,7 +410,7 @@ def test_an_emergency_does_not_wait_for_those_who_do_not_answer(table: Table):
     table.link.answers.set()
 
 
-def test_what_is_given_back_keeps_no_emergency_waiting(table: Table):
+def test_an_emergency_does_not_wait_for_pending_releases(table: Table):
     answered = threading.Event()
     table.views.await_answer = lambda *_: answered.wait(PATIENCE_S)  # type: ignore[method-assign, assignment]
     names = [f"drone{i}" for i in range(3 * THREADS_PER_POOL)]
@@ -421,7 +421,7 @@ def test_what_is_given_back_keeps_no_emergency_waiting(table: Table):
     answered.set()
 
 
-def test_modes_of_one_drone_go_out_in_the_order_of_the_clicks(table: Table):
+def test_modes_of_one_drone_are_sent_in_the_order_of_the_clicks(table: Table):
     table.link.held[PRIORITY] = threading.Event()
     for mode in ("reset", "takeoff", "land"):
         table.client.send_mode(["drone1"], mode)
@@ -436,7 +436,7 @@ def test_modes_of_one_drone_go_out_in_the_order_of_the_clicks(table: Table):
     assert sent == ["reset", "takeoff", "land"]
 
 
-def test_nothing_that_was_asked_for_before_an_emergency_is_sent_after_it(table: Table):
+def test_nothing_requested_before_an_emergency_is_sent_after_it(table: Table):
     table.link.held[PRIORITY] = threading.Event()
     table.client.send_mode(["drone1"], "takeoff")
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY
@@ -449,7 +449,7 @@ def test_nothing_that_was_asked_for_before_an_emergency_is_sent_after_it(table: 
     assert table.link.modes == ["emergency"]
 
 
-def test_the_end_of_an_emergency_comes_after_it(table: Table):
+def test_a_reset_is_sent_after_the_emergency_that_it_ends(table: Table):
     table.link.held[PRIORITY_EMERGENCY] = threading.Event()
     table.client.send_mode(["drone1"], "emergency")
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY_EMERGENCY
@@ -462,7 +462,7 @@ def test_the_end_of_an_emergency_comes_after_it(table: Table):
     assert table.link.modes == ["land", "emergency", "reset"]
 
 
-def test_who_presses_emergency_again_and_again_does_not_keep_it_from_being_sent(table: Table):
+def test_pressing_emergency_repeatedly_does_not_delay_it(table: Table):
     table.link.held[PRIORITY_EMERGENCY] = threading.Event()
     for _ in range(3):
         table.client.send_mode(["drone1"], "emergency")

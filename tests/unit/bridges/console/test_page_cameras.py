@@ -1,4 +1,4 @@
-"""Frusta in the scene: where they stand, and on whose page. Which way the page's camera goes with the formation, and what it has in view. What a page's camera has in view."""
+"""Camera frusta in the scene (their poses, and the pages that show them), and how a page's camera follows a formation."""
 
 import math
 import re
@@ -34,7 +34,7 @@ def drones(x_m: float = 0.0) -> DronePoses:
     return DronePoses(0, ("drone1", "drone2"), p_W, np.tile(LEVEL, (2, 1)), np.zeros((2, 4)), np.zeros(3))
 
 
-def test_cameras_look_where_their_drone_does():
+def test_a_frustum_follows_the_attitude_of_its_drone():
     north = frames.quaternion_from_heading(np.array(math.pi / 2))
     p_WK, q_WK = frustum_pose(FRONT, np.array([1.0, 2.0, 3.0]), north)
     assert p_WK == pytest.approx((1.0 - 0.0, 2.162, 3.012))
@@ -50,13 +50,13 @@ def test_cameras_look_where_their_drone_does():
 @pytest.mark.parametrize(
     ("camera", "index"), [("drone1/front", 0), ("drone2/front", None), ("drone9/front", None), ("", None)]
 )
-def test_only_a_drone_in_the_view_has_a_place(camera: str, index: int | None):
+def test_only_the_camera_of_a_visible_drone_has_an_index(camera: str, index: int | None):
     assert drone_index(drones(), camera) == index
     assert drone_index(None, camera) is None
 
 
 class Page:
-    """A page of viser's that notes its frusta; its camera looks north from 6 m south of the origin, 2 m above it."""
+    """A viser page that records its frusta; its camera looks north from 6 m south of and 2 m above the origin."""
 
     def __init__(self, client_id: int, aspect: float = 1.5) -> None:
         self.client_id = client_id
@@ -90,7 +90,7 @@ class Page:
         return float(np.linalg.norm(self.camera.position - self.camera.look_at))
 
     def shows(self, p_W: np.ndarray) -> bool:
-        """Return whether it has all points within its picture."""
+        """Return whether all points are within the page's picture."""
         camera = self.camera
         back = (camera.position - camera.look_at) / self.distance_m
         right = np.cross(UP_W, back)
@@ -100,7 +100,7 @@ class Page:
 
 
 class Pages:
-    """Pages that come and go, and their cameras."""
+    """Pages that connect and disconnect, and their cameras."""
 
     def __init__(self) -> None:
         self.there: dict[int, Any] = {}
@@ -129,7 +129,7 @@ def followed() -> Pages:
 @pytest.fixture
 def pages(followed: Pages) -> list[Page]:
     made = [followed.come(Page(number)) for number in (1, 2)]
-    for page in made:  # as the cameras stood before they were aimed
+    for page in made:  # back to the pose from before the page's camera was aimed
         page.camera.position, page.camera.look_at = np.array([0.0, -6.0, 2.0]), np.array([0.0, 0.0, 2.0])
     return made
 
@@ -140,7 +140,7 @@ def frustums(followed: Pages) -> PageCameras:
 
 
 def shown(camera: str, number: int = 1) -> Any:
-    """Return what a camera shows: every one has the same picture."""
+    """Return the information and picture of a camera; all cameras have the same picture."""
     if not camera.startswith("drone"):
         return None
     name = camera.split("/")[1]
@@ -148,9 +148,7 @@ def shown(camera: str, number: int = 1) -> Any:
     return synthetic_camera.info_of(name), SimpleNamespace(number=number, image=image)
 
 
-def test_a_page_shows_the_frustum_that_was_clicked_on_it_and_the_others_do_not(
-    frustums: PageCameras, pages: list[Page]
-):
+def test_a_clicked_frustum_appears_only_on_its_page(frustums: PageCameras, pages: list[Page]):
     frustums.show_frustum(pages[0].key, "drone1/front")
     frustums.draw_frusta(drones(5.0), shown)
     (node,) = pages[0].nodes
@@ -164,7 +162,7 @@ def test_a_page_shows_the_frustum_that_was_clicked_on_it_and_the_others_do_not(
     assert node._image_data == b"JPEG 2"
 
 
-def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: PageCameras, pages: list[Page]):
+def test_a_frustum_out_of_view_is_brought_into_view_once(frustums: PageCameras, pages: list[Page]):
     frustums.show_frustum(pages[1].key, "drone1/front")
     frustums.draw_frusta(drones(1.0), shown)
     assert pages[1].camera.position.tolist() == [0.0, -6.0, 2.0]
@@ -178,7 +176,7 @@ def test_a_frustum_that_appears_out_of_view_is_brought_into_it_once(frustums: Pa
     assert camera.look_at[0] == pytest.approx(50.162)
 
 
-def test_another_camera_takes_its_place_and_another_click_hides_it(frustums: PageCameras, pages: list[Page]):
+def test_another_camera_replaces_the_frustum_and_deselection_hides_it(frustums: PageCameras, pages: list[Page]):
     for camera in ("drone1/front", "drone1/bottom"):
         frustums.show_frustum(pages[0].key, camera)
         frustums.draw_frusta(drones(), shown)
@@ -193,14 +191,16 @@ def test_another_camera_takes_its_place_and_another_click_hides_it(frustums: Pag
 
 
 @pytest.mark.parametrize("camera", ["drone2/front", "elsewhere", "drone9/front"])
-def test_a_camera_without_a_picture_or_a_place_has_none(frustums: PageCameras, pages: list[Page], camera: str):
+def test_a_camera_without_a_picture_or_a_visible_drone_has_no_frustum(
+    frustums: PageCameras, pages: list[Page], camera: str
+):
     frustums.show_frustum(pages[0].key, camera)
     frustums.draw_frusta(drones(), shown)
     frustums.draw_frusta(None, shown)
     assert pages[0].nodes == []
 
 
-def test_nobody_chooses_for_a_page_without_its_key(frustums: PageCameras, pages: list[Page]):
+def test_a_frustum_is_chosen_only_with_the_key_of_the_page(frustums: PageCameras, pages: list[Page]):
     for key in ("", "guessed", pages[0].key[:-1]):
         frustums.show_frustum(key, "drone1/front")
     frustums.draw_frusta(drones(), shown)
@@ -208,7 +208,7 @@ def test_nobody_chooses_for_a_page_without_its_key(frustums: PageCameras, pages:
     assert pages[0].key != pages[1].key
 
 
-def test_a_page_or_run_that_has_gone_leaves_no_frustum(frustums: PageCameras, pages: list[Page], followed: Pages):
+def test_a_closed_page_or_run_leaves_no_frustum(frustums: PageCameras, pages: list[Page], followed: Pages):
     frustums.show_frustum(pages[1].key, "drone1/front")
     frustums.draw_frusta(drones(), shown)
     frustums.clear_frusta()
@@ -223,7 +223,7 @@ def test_a_page_or_run_that_has_gone_leaves_no_frustum(frustums: PageCameras, pa
     assert pages[0].nodes == []
 
 
-def test_clicks_are_for_their_page_and_told_once(frustums: PageCameras, pages: list[Page], followed: Pages):
+def test_a_click_is_returned_once_and_only_to_its_page(frustums: PageCameras, pages: list[Page], followed: Pages):
     frustums.click(2, "drone1")
     assert frustums.take_click(pages[0].key) == ""
     assert [frustums.take_click(pages[1].key) for _ in range(2)] == ["drone1", ""]
@@ -238,15 +238,15 @@ def test_clicks_are_for_their_page_and_told_once(frustums: PageCameras, pages: l
     ("direction", "drone"),
     [
         ((0.0, 0.0, -1.0), "near"),
-        ((5.0, 0.2, -10.0), "far"),  # passes by it at 0.2 m
+        ((5.0, 0.2, -10.0), "far"),  # passes it at 0.2 m
         ((5.0, 0.4, -10.0), None),
-        ((0.1, 0.0, -5.0), "near"),  # hits the one behind it, too, further from its centre
-        ((0.0, 50.5, -10.0), "distant"),  # passes by it at 0.5 m, 0.01 rad
-        ((0.0, 0.0, 1.0), None),  # all are behind
+        ((0.1, 0.0, -5.0), "near"),  # also hits the one behind, farther from its centre
+        ((0.0, 50.5, -10.0), "distant"),  # passes it at 0.5 m, 0.01 rad
+        ((0.0, 0.0, 1.0), None),  # all drones are behind
         ((0.0, 0.0, 0.0), None),
     ],
 )
-def test_a_click_is_on_the_drone_that_its_ray_hits(direction: tuple[float, ...], drone: str | None):
+def test_a_click_selects_the_drone_that_its_ray_hits(direction: tuple[float, ...], drone: str | None):
     p_W = np.array([(0.0, 0.0, 5.0), (0.0, 0.0, 4.0), (5.0, 0.0, 0.0), (0.0, 50.0, 0.0), (math.nan,) * 3])
     names = ("near", "behind", "far", "distant", "gone")
     poses = DronePoses(0, names, p_W, np.tile(LEVEL, (5, 1)), np.zeros((5, 4)), np.zeros(3))
@@ -261,7 +261,7 @@ TRIANGLE = np.array([(0.0, 3.5, 15.0), (-3.5, -3.5, 15.0), (3.5, -3.5, 15.0)])
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.2])
 @pytest.mark.parametrize("direction", ["reset", "top", "side"])
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_a_formation_is_in_view_whatever_its_size_and_the_page_s(
+def test_a_formation_fits_the_view_whatever_its_size_and_the_aspect(
     aspect: float, direction: str, scale: float, followed: Pages
 ):
     page = followed.come(Page(1, aspect))
@@ -271,12 +271,12 @@ def test_a_formation_is_in_view_whatever_its_size_and_the_page_s(
     assert page.distance_m >= DISTANCE_MIN_M
 
 
-def test_a_hidden_page_has_a_camera_all_the_same():
+def test_the_distance_is_finite_even_on_a_page_without_width():
     distance_m = fit_distance_m(TRIANGLE, TRIANGLE.mean(axis=0), np.array([0.0, -1.0, 0.3]), UP_W, 1.31, 0.0)
     assert math.isfinite(distance_m)
 
 
-def test_cameras_follow_and_keep_their_direction(followed: Pages):
+def test_a_camera_follows_a_growing_and_shrinking_formation(followed: Pages):
     page = followed.come(Page(1))
     for t in range(60):
         flown = (1.0 + t / 10) * TRIANGLE + np.array((t, -t, 0.0))
@@ -287,7 +287,7 @@ def test_cameras_follow_and_keep_their_direction(followed: Pages):
     assert page.distance_m < before_m
 
 
-def test_a_camera_keeps_the_direction_that_its_page_gave_it(followed: Pages):
+def test_a_following_camera_keeps_the_direction_set_on_its_page(followed: Pages):
     page = followed.come(Page(1))
     followed.cameras.follow(TRIANGLE)
     page.camera.position = page.camera.look_at + np.array((0.0, page.distance_m, 0.0))
@@ -297,7 +297,7 @@ def test_a_camera_keeps_the_direction_that_its_page_gave_it(followed: Pages):
     assert page.camera.look_at[0] == pytest.approx(40.0)
 
 
-def test_a_formation_that_hovers_moves_no_camera(followed: Pages):
+def test_a_hovering_formation_moves_no_camera(followed: Pages):
     page = followed.come(Page(1))
     followed.cameras.follow(TRIANGLE)
     before = page.camera.position.copy()
@@ -305,7 +305,7 @@ def test_a_formation_that_hovers_moves_no_camera(followed: Pages):
     assert page.camera.position.tolist() == before.tolist()
 
 
-def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place(followed: Pages):
+def test_a_zoomed_page_keeps_its_distance_and_an_unfollowing_one_its_place(followed: Pages):
     zoomed, still = followed.come(Page(1)), followed.come(Page(2))
     followed.cameras.follow(TRIANGLE)
     zoomed.camera.position = zoomed.camera.look_at + np.array((0.0, -2.0, 0.0))
@@ -316,12 +316,12 @@ def test_who_zooms_keeps_the_distance_and_who_does_not_follow_the_place(followed
     assert zoomed.distance_m == pytest.approx(2.0)
     assert zoomed.camera.look_at[0] == pytest.approx(40.0)
     assert still.camera.look_at.tolist() == place
-    followed.cameras.restart()  # another run: everybody looks there
+    followed.cameras.restart()  # for another run, every page aims anew
     followed.cameras.follow(TRIANGLE + np.array((80.0, 0.0, 0.0)))
     assert still.camera.look_at[0] == pytest.approx(80.0)
 
 
-def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distance(followed: Pages):
+def test_fitting_again_after_a_zoom_restores_the_fitting_distance(followed: Pages):
     page = followed.come(Page(1))
     followed.cameras.follow(TRIANGLE)
     fitting_m = page.distance_m
@@ -334,7 +334,7 @@ def test_who_follows_again_after_a_zoom_has_all_in_view_from_the_fitting_distanc
     assert page.distance_m == pytest.approx(fitting_m)
 
 
-def test_nothing_moves_a_camera_without_drones_or_of_a_page_that_went_before_it_was_known(followed: Pages):
+def test_no_camera_moves_without_drones_or_on_a_closed_page(followed: Pages):
     there, gone = followed.come(Page(2)), Page(1)
     before = there.camera.position.tolist()
     followed.cameras.follow(np.zeros((0, 3)))
@@ -354,7 +354,7 @@ NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0
     ("p_W", "seen"),
     [
         ((0.0, 5.0, 0.0), True),
-        ((6.0, 5.0, 0.0), True),  # to the right, where a page is wider than high
+        ((6.0, 5.0, 0.0), True),  # far to the right: the page is wider than high
         ((0.0, 5.0, 6.0), False),
         ((0.0, 5.0, -6.0), False),
         ((-9.0, 5.0, 0.0), False),
@@ -362,5 +362,5 @@ NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0
         ((0.0, FAR_M + 1.0, 0.0), False),
     ],
 )
-def test_a_point_is_in_view_where_the_page_shows_it(p_W: tuple[float, float, float], seen: bool):
+def test_a_point_is_in_view_if_the_page_shows_it(p_W: tuple[float, float, float], seen: bool):
     assert NORTHWARDS.contains(np.array(p_W)) == seen

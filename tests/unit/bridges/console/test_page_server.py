@@ -1,4 +1,4 @@
-"""Who may open a page, what a run leaves behind for open pages, and which of their messages reach viser."""
+"""Who may open a page, the files that a run leaves for open pages, and which of the pages' messages reach viser."""
 
 import asyncio
 import os
@@ -41,10 +41,10 @@ COOKIE, VIEWERS = {"zsim_operator_8080": "steer"}, {"zsim_viewer_8080": "look"}
 @pytest.mark.parametrize(
     ("token", "request_", "role"),
     [
-        (None, asked(), OPERATOR),  # on this machine alone
+        (None, asked(), OPERATOR),  # only this machine can connect
         (None, asked("/view/state"), VIEWER),
         (None, asked(origin="http://127.0.0.1:8080"), OPERATOR),
-        (None, asked(host="evil.example:8080"), None),  # a stranger's page
+        (None, asked(host="evil.example:8080"), None),  # a page of another site
         (None, asked(origin="http://evil.example"), None),
         (None, asked(origin="http://127.0.0.1:9000"), None),
         (None, asked(origin="null"), None),
@@ -63,21 +63,21 @@ COOKIE, VIEWERS = {"zsim_operator_8080": "steer"}, {"zsim_viewer_8080": "look"}
         ("steer", asked("/", zsim_operator_8080="look", **VIEWERS), None),
     ],
 )
-def test_a_page_is_opened_by_who_shows_its_token_or_is_on_this_machine(
+def test_a_page_is_opened_with_its_token_or_from_this_machine(
     token: str | None, request_: PageRequest, role: str | None
 ):
     listen = "127.0.0.1" if token is None else "0.0.0.0"
     assert PageTokens(listen, 8080, token, "look").role_of(request_) == role
 
 
-def test_others_need_a_token():
+def test_serving_other_machines_needs_a_token():
     with pytest.raises(RunError, match=r"0\.0\.0\.0"):
         PageTokens("0.0.0.0", 8080, None, "look")
     with pytest.raises(RunError, match="token"):
         PageTokens("127.0.0.1", 8080, "", "look")
 
 
-def test_a_link_names_this_machine_where_all_may_come():
+def test_a_link_names_this_machine_when_listening_on_all_addresses():
     assert ListenAddress("127.0.0.1", 8080).url() == "http://127.0.0.1:8080/"
     assert ListenAddress("::1", 8080).url("/view") == "http://[::1]:8080/view"
     for everywhere in ("0.0.0.0", "::"):
@@ -90,10 +90,10 @@ PAGE = "a page"
 
 
 class Clock:
-    """Wall time that passes only while somebody sleeps.
+    """Wall time that passes only during sleeps.
 
     Attributes:
-        now_s: the time.
+        now_s: the current time.
     """
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return made
 
 
-def test_sizes_are_those_of_the_files_that_are_there(tmp_path: Path) -> None:
+def test_existing_files_are_shown_with_their_sizes(tmp_path: Path) -> None:
     files = RunFiles(tmp_path)
     (tmp_path / "run.mcap").write_bytes(b"1234567")
     shown = files.shown(PAGE, has_copies=False)
@@ -127,7 +127,7 @@ def test_sizes_are_those_of_the_files_that_are_there(tmp_path: Path) -> None:
     assert shown["files"]["record"]["path"] == str(tmp_path / "run.mcap")
 
 
-def test_a_console_that_does_not_know_the_folder_shows_none() -> None:
+def test_a_console_without_a_folder_shows_no_files() -> None:
     assert RunFiles(None).shown(PAGE, has_copies=False) == {"files": {}, "leaves": False}
 
 
@@ -137,13 +137,13 @@ def test_a_console_that_does_not_know_the_folder_shows_none() -> None:
         ({}, None, None, 0.0),
         ({PAGE: False}, 5.0, None, 5.0),
         ({PAGE: True}, None, None, 0.0),
-        ({PAGE: False}, 1e9, None, 20.0),  # one that never has its copies
-        ({PAGE: False, "another page": True}, None, None, page_server.LOOKED_S),  # one that was closed
-        ({"": False}, None, None, 0.0),  # who is no page
+        ({PAGE: False}, 1e9, None, 20.0),  # never gets its copies
+        ({PAGE: False, "another page": True}, None, None, page_server.LOOKED_S),  # the other page was closed
+        ({"": False}, None, None, 0.0),  # not a page
         ({PAGE: False}, None, 1.0, 1.0),
     ],
 )
-def test_pages_that_are_open_are_waited_for_until_they_have_their_copies(
+def test_the_console_waits_until_open_pages_have_their_copies(
     clock: Clock,
     tmp_path: Path,
     looks: dict[str, bool],
@@ -161,14 +161,14 @@ def test_pages_that_are_open_are_waited_for_until_they_have_their_copies(
     assert files.shown(PAGE, has_copies=True)["leaves"]
 
 
-def test_the_pages_that_are_known_have_a_bound(clock: Clock, tmp_path: Path) -> None:
+def test_the_number_of_known_pages_is_bounded(clock: Clock, tmp_path: Path) -> None:
     files = RunFiles(tmp_path)
     for number in range(10 * page_server.LOOKS_MAX):
         files.shown(f"page {number}", has_copies=False)
     assert len(files._looked_s) == page_server.LOOKS_MAX
 
 
-def test_a_report_of_another_run_in_the_folder_is_not_shown(tmp_path: Path) -> None:
+def test_a_report_of_an_earlier_run_is_not_shown(tmp_path: Path) -> None:
     report = tmp_path / "report.html"
     report.write_text("of another run")
     os.utime(report, (1.0, 1.0))
@@ -184,7 +184,7 @@ CAMERA = msgspec.to_builtins(
 UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": True}}
 
 
-def test_a_viewer_steers_nothing_but_its_own_page():
+def test_a_viewer_controls_only_the_camera_of_its_page():
     packed = msgspec.msgpack.encode
     there = controls(a=True)
     assert is_permitted(packed(CAMERA), VIEWER, there)
@@ -203,7 +203,7 @@ CLICK = {
 
 
 @pytest.mark.parametrize("role", [OPERATOR, VIEWER])
-def test_every_page_may_click_into_its_scene(role: str):
+def test_every_page_may_click_in_its_scene(role: str):
     def permitted(**fields: Any) -> bool:
         return is_permitted(msgspec.msgpack.encode({**CLICK, **fields}), role, controls())
 
@@ -218,7 +218,7 @@ def test_every_page_may_click_into_its_scene(role: str):
 
 
 def controls(**values: Any) -> PageControls:
-    """Return what is known of controls that hold such values; a list is that of a dropdown."""
+    """Return controls with the given values; a list holds the options of a dropdown."""
     handles = {
         uuid: SimpleNamespace(value=now[0], options=now) if isinstance(now, list) else SimpleNamespace(value=now)
         for uuid, now in values.items()
@@ -237,7 +237,7 @@ def controls(**values: Any) -> PageControls:
         (["gust", "updraught"], ["gust"], ["Gust", "", 1, True]),
     ],
 )
-def test_a_control_takes_what_its_page_could_put_into_it(now: Any, good: list[Any], bad: list[Any]):
+def test_a_control_accepts_only_values_that_a_page_could_enter(now: Any, good: list[Any], bad: list[Any]):
     there = controls(a=now)
     change = {value: msgspec.msgpack.encode({**UPDATE, "updates": {"value": value}}) for value in good}
     assert all(is_permitted(change[value], OPERATOR, there) for value in good)
@@ -249,7 +249,7 @@ def test_a_control_takes_what_its_page_could_put_into_it(now: Any, good: list[An
 @pytest.mark.parametrize(
     "change",
     [
-        msgspec.msgpack.encode({"type": "ShareUrlRequest"}),  # would show the page on the Internet
+        msgspec.msgpack.encode({"type": "ShareUrlRequest"}),  # would publish the page on the Internet
         msgspec.msgpack.encode({"type": "FileTransferStartUpload"}),
         msgspec.msgpack.encode({"type": ["GuiUpdateMessage"]}),
         msgspec.msgpack.encode({"type": "ViewerCameraMessage"}),
@@ -266,11 +266,11 @@ def test_a_control_takes_what_its_page_could_put_into_it(now: Any, good: list[An
         msgspec.msgpack.encode({**UPDATE, "updates": {"value": "x" * 200_000}}),
     ],
 )
-def test_nobody_says_what_no_control_says(change: bytes):
+def test_messages_that_no_control_sends_are_refused(change: bytes):
     assert not is_permitted(change, OPERATOR, controls(a=True))
 
 
-def test_another_thread_marks_it_and_the_loop_wakes_who_waits():
+def test_an_event_set_in_a_thread_wakes_its_waiters_only_in_the_loop():
     async def steps() -> None:
         event = AnyThreadEvent()
         waiting = [asyncio.ensure_future(event.wait()) for _ in range(3)]
@@ -287,7 +287,7 @@ def test_another_thread_marks_it_and_the_loop_wakes_who_waits():
     asyncio.run(steps())
 
 
-def test_visers_buffers_are_ours():
+def test_viser_uses_the_replaced_buffers():
     made = PrivateViser()
     try:
         assert isinstance(made.server._websock_server._broadcast_buffer, Buffer)
@@ -296,7 +296,7 @@ def test_visers_buffers_are_ours():
         made.close()
 
 
-def test_a_write_to_a_page_that_has_closed_is_dropped_without_a_warning():
+def test_a_write_to_a_closed_page_is_dropped_without_a_warning():
     async def steps() -> None:
         buffer = Buffer(asyncio.get_running_loop(), persistent_messages=False)
         buffer.done = True

@@ -1,4 +1,4 @@
-"""What a page may do in its scene. A page's socket: what is sent when, and what becomes of a page that says nothing."""
+"""The sockets of a page: the actions that it may send, and when it is sent camera pictures."""
 
 import asyncio
 import json
@@ -21,7 +21,7 @@ LOOK = {"do": "look", "page": "key", "follows": True, "fits": False, "direction"
 
 
 class Actions:
-    """The actions of one page, whose key is `key` and whose number 7."""
+    """The actions of one page, with the key `key` and the client ID 7."""
 
     def __init__(self) -> None:
         self.looked: list[tuple[Any, ...]] = []
@@ -40,7 +40,7 @@ def actions() -> Actions:
 
 
 @pytest.mark.parametrize("role", [OPERATOR, VIEWER])
-def test_every_page_moves_its_own_camera(role: str, actions: Actions):
+def test_every_page_may_move_its_own_camera(role: str, actions: Actions):
     assert actions.act(role, **LOOK)
     assert actions.act(role, **LOOK | {"page": "gone"})
     assert actions.looked == [(7, True, False, "top")]
@@ -61,7 +61,7 @@ NO_ACTIONS = [
 
 
 @pytest.mark.parametrize("action", NO_ACTIONS)
-def test_what_is_no_action_closes_the_socket(action: dict[str, Any], actions: Actions):
+def test_an_invalid_action_closes_the_socket(action: dict[str, Any], actions: Actions):
     assert not actions.act(OPERATOR, **action)
     assert (actions.looked, actions.played) == ([], [])
     flying, sockets = flying_sockets()
@@ -69,7 +69,7 @@ def test_what_is_no_action_closes_the_socket(action: dict[str, Any], actions: Ac
     assert flying.done == []
 
 
-def test_an_operator_plays_a_record_and_a_viewer_does_not(actions: Actions):
+def test_only_an_operator_may_play_a_record(actions: Actions):
     assert actions.act(OPERATOR, do="play", op="seek", value=5.0)
     assert not actions.act(VIEWER, do="play", op="seek", value=5.0)
     actions.record = None  # without a run nothing is played
@@ -78,11 +78,11 @@ def test_an_operator_plays_a_record_and_a_viewer_does_not(actions: Actions):
 
 
 class FakeFlying:
-    """What pages may do with single drones, noted."""
+    """Records what pages do with single drones."""
 
     def __init__(self) -> None:
         self.chosen: list[tuple[Any, str]] = []
-        self.refused: int | None = -1  # page that another one keeps from flying
+        self.refused: int | None = -1  # the page that another one keeps from flying
         self.done: list[tuple[Any, ...]] = []
         does = ("take", "steer", "go", "leave", "lose")
         self.control: Any = SimpleNamespace(**{what: partial(self._note, what) for what in does})
@@ -113,7 +113,7 @@ def flying_sockets() -> tuple[FakeFlying, ActionSockets]:
     return flying, ActionSockets(cameras, lambda: None, lambda: flying)
 
 
-def test_an_operator_flies_a_drone_and_is_answered():
+def test_an_operator_may_fly_a_drone_and_is_answered():
     flying, sockets = flying_sockets()
     for action in FLYING:
         answer = sockets.act(json.dumps(action), OPERATOR, "here") or {}
@@ -126,26 +126,26 @@ def test_an_operator_flies_a_drone_and_is_answered():
     assert flying.done[-1] == ("lose", "here")
 
 
-def test_a_page_takes_no_drone_of_a_formation_that_another_page_is_in_control_of():
+def test_a_drone_of_a_formation_held_by_another_page_is_refused():
     flying, sockets = flying_sockets()
     flying.refused = 7
     sockets.act(json.dumps({"do": "plan", "page": "key"}), OPERATOR, "here")
     answer = sockets.act(json.dumps(FLYING[0]), OPERATOR, "here") or {}
     assert (answer["flight"]["state"], answer["flight"]["text"]) == ("none", "main is held")
     assert flying.done == []
-    sockets.lose("here")  # the next page at that socket is not yet known
+    sockets.lose("here")  # the next page on that socket is not yet known
     assert (sockets.act(json.dumps(FLYING[0]), OPERATOR, "here") or {})["flight"]["state"] == "flying"
 
 
 @pytest.mark.parametrize("action", FLYING, ids=lambda action: action["do"])
-def test_a_viewer_who_would_fly_is_closed(action: dict[str, Any]):
+def test_a_viewer_that_tries_to_fly_is_disconnected(action: dict[str, Any]):
     flying, sockets = flying_sockets()
     assert sockets.act(json.dumps(action), VIEWER, "here") is None
     assert flying.done == []
 
 
 @pytest.mark.parametrize("role", [OPERATOR, VIEWER])
-def test_every_page_sees_the_plan_and_chooses_a_drone_of_its_own(role: str):
+def test_every_page_sees_the_plan_and_may_choose_a_drone(role: str):
     flying, sockets = flying_sockets()
     looked = sockets.act(json.dumps({"do": "plan", "page": "key", "whole": True}), role)
     assert looked == {"plan": {"page": 7, "whole": True}}
@@ -158,7 +158,7 @@ CAMERA = "drone1/front"
 
 
 class Feed:
-    """A camera with another picture each time that one looks."""
+    """A camera that has a new picture at every look."""
 
     def __init__(self) -> None:
         self.looked = 0
@@ -213,7 +213,7 @@ class Socket:
 
 
 class Page:
-    """A page, its socket, and what it is about."""
+    """A page with its socket and its feed."""
 
     def __init__(self) -> None:
         self.socket: Any = Socket()
@@ -229,7 +229,7 @@ class Page:
 
 @pytest.fixture
 def periods(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Let no time pass between two looks; return how long each would have been."""
+    """Skip the sleeps between looks; return their durations."""
     passed: list[float] = []
     sleep = asyncio.sleep
 
@@ -242,7 +242,7 @@ def periods(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def with_page(steps: Callable[[Page], Coroutine[Any, Any, None]]) -> Page:
-    """Do steps while a page's socket is served; return the page after it has closed."""
+    """Run steps while a page's socket is served; return the page after it has closed."""
     page = Page()
 
     async def both() -> None:
@@ -256,19 +256,19 @@ def with_page(steps: Callable[[Page], Coroutine[Any, Any, None]]) -> Page:
 
 
 async def settled(more: int = 20) -> None:
-    """Wait until the socket has had that many turns to send, if it wanted to."""
+    """Give the socket a number of turns in which it could send."""
     for _ in range(more):
         await asyncio.tasks.sleep(0)
 
 
-def test_the_next_picture_is_sent_when_the_last_is_shown(periods: list[float]):
+def test_the_next_picture_is_sent_only_on_request(periods: list[float]):
     async def steps(page: Page) -> None:
         await settled()
-        assert (page.socket.sent.empty(), page.feed.looked) == (True, 0)  # it has not asked
+        assert (page.socket.sent.empty(), page.feed.looked) == (True, 0)  # nothing was requested
         page.socket.say(want=(CAMERA,))
         assert (await page.socket.sent.get()).endswith(b"JPEG 1")
         await settled()
-        assert page.socket.sent.empty()  # however many pictures there are
+        assert page.socket.sent.empty()  # although newer pictures exist
         page.socket.say(want=(CAMERA,))
         assert (await page.socket.sent.get()).endswith(b"JPEG 2")
 
@@ -276,7 +276,7 @@ def test_the_next_picture_is_sent_when_the_last_is_shown(periods: list[float]):
     assert set(periods) == {page_sockets.PERIOD_S}
 
 
-def test_what_is_asked_for_is_asked_of_the_feed_the_frustums_picture_too(periods: list[float]):
+def test_requested_cameras_and_the_frustum_are_requested_from_the_feed(periods: list[float]):
     async def steps(page: Page) -> None:
         page.socket.say(want=(CAMERA,), frustum="drone2/front", page="key")
         await page.socket.sent.get()
@@ -285,7 +285,7 @@ def test_what_is_asked_for_is_asked_of_the_feed_the_frustums_picture_too(periods
 
     page = with_page(steps)
     assert page.feed.asked == {}
-    assert page.chosen[-1] == ("key", "")  # closed: its frustum goes
+    assert page.chosen[-1] == ("key", "")  # closing the page removes its frustum
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ def test_what_is_asked_for_is_asked_of_the_feed_the_frustums_picture_too(periods
         "[" * 50_000,
     ],
 )
-def test_a_page_that_says_what_is_no_request_is_left(periods: list[float], said: str | bytes):
+def test_an_invalid_request_ends_the_socket(periods: list[float], said: str | bytes):
     page = Page()
 
     async def steps() -> None:
@@ -325,7 +325,7 @@ def test_without_a_run_a_page_waits_for_one(periods: list[float]):
     with_page(steps)
 
 
-def test_a_page_is_told_once_which_drone_was_clicked_in_its_scene(periods: list[float]):
+def test_a_page_is_told_once_which_drone_was_clicked(periods: list[float]):
     async def steps(page: Page) -> None:
         page.clicked = ["drone1"]
         page.socket.say(want=(CAMERA,))

@@ -1,4 +1,4 @@
-"""The picture of a run as arrays: poses, the plan view, and the ways that a formation would fly."""
+"""The picture of a run as arrays: poses, the plan view, and the paths that a formation would fly."""
 
 import json
 import math
@@ -33,7 +33,7 @@ def some_attitudes(count: int) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
-def test_a_view_becomes_arrays_in_which_drones_keep_their_places():
+def test_a_view_becomes_arrays_in_the_order_of_the_drones():
     views = tuple(DroneView(f"d{i}", (i, 2.0, 3.0), LEVEL, (1.0, 2.0, 3.0, 4.0), "flying", 80.0) for i in range(2))
     found = pic.drone_poses(ViewDrones(7, 0, views, ((1.0, 0.0, 0.0), (3.0, 0.0, 0.0))), ("d0", "d1"))
     assert found.t_ns == 7
@@ -52,23 +52,25 @@ def test_a_view_becomes_arrays_in_which_drones_keep_their_places():
     assert not pic.drone_poses(ViewDrones(7, 0, ()), ("d0",)).present.any()
 
 
-def test_links_of_the_radio_are_lines_between_drones_that_are_there():
+def test_radio_links_are_lines_between_present_drones():
     views = tuple(DroneView(f"d{i}", (i, 0.0, 0.0), LEVEL, (1.0,) * 4, "flying", 80.0) for i in (0, 1, 3))
     drones = pic.drone_poses(ViewDrones(7, 0, views), ("d0", "d1", "d2", "d3"))
-    both, single = pic.radio_lines(((1, 2), (0, 3, 4), (0,), (), (0, 1, 2, 3)), drones)  # the station's is the fifth
+    both, single = pic.radio_lines(
+        ((1, 2), (0, 3, 4), (0,), (), (0, 1, 2, 3)), drones
+    )  # the fifth entry is that of the station
     assert both[:, :, 0].tolist() == [[0, 1]]
     assert single[:, :, 0].tolist() == [[1, 3]]
 
 
-def test_many_names_are_shown_by_what_tells_them_apart():
+def test_many_names_are_shown_by_their_numbers_if_these_are_unambiguous():
     many = range(10, 10 + pic.LARGE_MAX + 1)
     assert pic.shown_names([f"drone{i}" for i in many]) == [str(i) for i in many]
-    assert pic.shown_names(["drone1", "drone2"]) == ["drone1", "drone2"]  # there is room
+    assert pic.shown_names(["drone1", "drone2"]) == ["drone1", "drone2"]  # few enough for full names
     for names in (["drone", *(f"drone{i}" for i in many)], [*(f"{'abcdefghijklmn'[i % 14]}{i}" for i in many)]):
         assert pic.shown_names(names) == names
 
 
-def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
+def test_rotors_sit_on_their_drone_and_turn_about_its_vertical_axis():
     hubs = np.array([(0.1, 0.1, 0.03), (0.1, -0.1, 0.03), (-0.1, -0.1, 0.03), (-0.1, 0.1, 0.03)])
     q = some_attitudes(5)
     p = RNG.normal(size=(5, 3))
@@ -81,12 +83,12 @@ def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
             assert frames.rotation_matrix(turns)[4 * n + k][:, 2] == pytest.approx(R[n][:, 2])
 
 
-def test_rotors_turn_so_slowly_that_eyes_see_which_way():
-    fastest, ways = np.full(4, 503.0), np.array([1.0, -1.0, 1.0, -1.0])  # rad/s, of the AR.Drone
-    turned = pic.rotor_angles(np.zeros(4), fastest, ways, 0.1)  # ten pictures a second, the fewest
+def test_rotors_turn_slowly_enough_to_show_their_direction():
+    fastest, ways = np.full(4, 503.0), np.array([1.0, -1.0, 1.0, -1.0])  # rad/s, the maximum of the AR.Drone
+    turned = pic.rotor_angles(np.zeros(4), fastest, ways, 0.1)  # 0.1 s, at the lowest picture rate of 10 Hz
     steps = np.abs((turned + math.pi) % math.tau - math.pi)
     assert (steps > 0.1).all()
-    assert (steps < math.pi / 2).all()  # a propeller of two blades looks the same after half a turn
+    assert (steps < math.pi / 2).all()  # a two-bladed propeller looks the same after half a turn
     assert pic.rotor_angles(turned, fastest, ways, 0.0) == pytest.approx(turned)
 
 
@@ -110,7 +112,7 @@ def test_an_ellipsoid_is_the_covariance_at_two_sigma():
 
 
 @pytest.mark.parametrize("name", ["step", "ring10", "triads", "grid30"])
-def test_ghosts_stand_where_the_formation_is_to_be(name: str):
+def test_ghosts_are_drawn_at_the_desired_formation(name: str):
     scenario = scenario_file.load(SCENARIOS / f"{name}.yaml")
     cluster = scenario.clusters[0]
     space = scenario_space(scenario, cluster)
@@ -123,7 +125,7 @@ def test_ghosts_stand_where_the_formation_is_to_be(name: str):
     assert pic.ghosts(space, msgspec.structs.replace(view, phase="idle")) is None
 
 
-def test_a_formation_is_drawn_with_its_sides_and_its_corner():
+def test_a_formation_is_drawn_with_its_sides_and_its_angle():
     p_W = np.array([(0.0, 0.0, 2.0), (3.0, 0.0, 2.0), (0.0, 4.0, 2.0)])
     found = pic.formation_shape(cluster_space(3), p_W, np.zeros(3))
     assert found is not None
@@ -155,7 +157,7 @@ def changed(**values: float) -> np.ndarray:
     return c
 
 
-def test_a_preview_shows_the_way_and_its_figures():
+def test_a_preview_shows_the_paths_and_their_figures():
     preview = preview_of(SPACE, "target", {"values": {"x_c": BASE[0] + 3.0, "yaw_deg": 90.0}}, BASE, APART_M)
     assert np.allclose(preview.paths_W[:, 0], SPACE.inverse(BASE)[0])
     goal = changed(x_c=BASE[0] + 3.0, yaw=np.pi / 2)
@@ -169,7 +171,7 @@ def test_a_preview_shows_the_way_and_its_figures():
     preview = preview_of(SPACE, "trajectory", {"waypoints": waypoints}, BASE, APART_M)
     assert np.allclose(preview.paths_W[:, 0], SPACE.inverse(BASE)[0])
     assert np.allclose(preview.paths_W[:, -1], SPACE.inverse(changed(x_c=21.0, z_c=12.0))[0])
-    # a cubic from rest to rest is 1.5 times as fast in its middle as on the whole: 1.5 * hypot(20, 4) / 20
+    # A cubic from rest to rest has a peak of 1.5 times its mean speed: 1.5 * hypot(20, 4) / 20.
     assert has_terms(preview.text, "20 s", "heights 8.0 to 12.0 m", "1.5 m/s at most")
 
     preview = preview_of(SPACE, "target", {"values": {"p": 1.0}}, BASE, APART_M)
@@ -184,44 +186,44 @@ def test_a_preview_shows_the_way_and_its_figures():
         ("trajectory", {"waypoints": []}, "expressions or waypoints"),
     ],
 )
-def test_what_no_formation_can_fly_has_no_preview(op: str, args: dict[str, object], finding: str):
+def test_an_invalid_request_has_no_preview(op: str, args: dict[str, object], finding: str):
     with pytest.raises(PreviewError) as refused:
         preview_of(SPACE, op, args, BASE, APART_M)
     assert finding in str(refused.value)
 
 
-# Colours of the scene's lines
+# Colours of the scene
 
-CONTRAST_MIN = 2.3  # of what is drawn with the ground; text, which is finer, needs 4.5 (WCAG 2.2)
+CONTRAST_MIN = 2.3  # of drawings against the ground; text, which is finer, needs 4.5 (WCAG 2.2)
 
 
-def test_colours_of_lines_are_in_linear_light() -> None:
-    """Half of the light of white is 188 of 255 in sRGB."""
+def test_colours_of_lines_are_converted_to_linear_light() -> None:
+    """Half the luminance of white is 188 of 255 in sRGB."""
     assert linear(np.array([[0, 188, 255], [5, 10, 128]])).tolist() == [[0, 128, 255], [0, 1, 55]]
 
 
 @pytest.mark.parametrize("ground", [LIGHT[0], DARK[0]])
 @pytest.mark.parametrize("part", ["cross", "hull", "rotor"])
-def test_drones_are_seen_on_the_ground_of_both_themes(ground: tuple[int, int, int], part: str):
+def test_drones_contrast_with_the_ground_in_both_themes(ground: tuple[int, int, int], part: str):
     light, dark = sorted((luminance(scene.COLOURS[part]), luminance(ground)), reverse=True)
     assert (light + 0.05) / (dark + 0.05) > CONTRAST_MIN
 
 
 @pytest.mark.parametrize("count", [3, 30])
-def test_trails_are_seen_on_dark_ground_and_light_ones_are_as_they_were(count: int):
+def test_trails_contrast_with_dark_ground_and_light_colours_are_kept(count: int):
     for colour in map(rgb, drone_colours(count)):
         seen = lightened(colour)
         assert (luminance(seen) + 0.05) / (luminance(DARK[0]) + 0.05) > CONTRAST_MIN
         assert luminance(colour) < LUMINANCE_MIN or list(seen) == list(colour)
 
 
-def test_paths_of_drones_that_fly_by_themselves_are_lines_from_their_hover_to_their_end():
+def test_reference_paths_are_lines_from_the_hover_to_the_end():
     scenario = scenario_file.load(SCENARIOS.parent / "examples" / "exchange.yaml")
     lines = pic.reference_lines(scenario)
     assert lines.shape == (4 * 2 * (pic.PATH_POINTS - 1), 2, 3)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).max() < 0.6
     first = lines[: pic.PATH_POINTS - 1]
-    assert first[0, 0] == pytest.approx([0, 0, 1])  # over its start
+    assert first[0, 0] == pytest.approx([0, 0, 1])  # above its start
     assert isinstance(scenario.exchanges, list)
     ends = np.array(scenario.exchanges[0].stages[0].places_m)
     assert np.linalg.norm(ends - first[-1, 1], axis=1).min() < 1e-9
@@ -247,7 +249,7 @@ def drone_view(name: str, x: float = 0.0) -> DroneView:
     return DroneView(name, (x, 2.0, 5.0), NORTH, (0.0,) * 4, "flying", 90.0)
 
 
-def test_what_stands_around_the_drones():
+def test_the_surroundings_list_drones_and_obstacles():
     scenario = scenario_file.from_text(FIELD)
     around = pic.surroundings(scenario)
     assert around["names"] == around["labels"] == ["drone1", "drone2"]
@@ -262,14 +264,14 @@ def test_what_stands_around_the_drones():
     assert outline_of(stone) == outline
 
 
-def test_drones_by_place_heading_and_state_and_none_where_one_is_not_seen():
+def test_plan_positions_have_place_heading_and_state_of_visible_drones():
     poses = pic.drone_poses(ViewDrones(0, 0, (drone_view("drone2", 3.456),), ()), ("drone1", "drone2"))
     nobody, seen = pic.plan_positions(poses, {"drone2": "flying"})
     assert nobody is None
     assert seen == [3.46, 2.0, 5.0, 1.571, "flying"]
 
 
-def test_a_formation_has_its_places_while_it_has_somewhere_to_be():
+def test_a_formation_has_target_places_only_while_it_has_a_target():
     space = cluster_space(3)
     p_W = np.array([(0.0, 1.5, 5.0), (-1.5, -1.5, 5.0), (1.5, -1.5, 5.0)])
     c = tuple(space.forward(p_W, np.zeros(3)).tolist())
@@ -282,19 +284,19 @@ def test_a_formation_has_its_places_while_it_has_somewhere_to_be():
     assert np.allclose(shown[1]["places"], p_W[:, :2])
 
 
-def test_trails_are_the_last_stretch_of_each_way():
+def test_trails_are_the_recent_part_of_each_path():
     names, trails = ("drone1", "drone2"), CanvasTrails(2)
     poses = pic.drone_poses(ViewDrones(0, 0, (drone_view("drone1"),), ()), names)
     for x in range(4):
         poses = pic.drone_poses(ViewDrones(x * 10**9, 0, (drone_view("drone1", float(x)),), ()), names)
         trails.add(float(x), poses.p_W)
     way, nothing = trails.lines(3.0, poses.p_W)
-    assert way == [[0.0, 2.0, 0.0], [1.0, 2.0, 1.0], [2.0, 2.0, 2.0]]  # and from there to where it is
+    assert way == [[0.0, 2.0, 0.0], [1.0, 2.0, 1.0], [2.0, 2.0, 2.0]]  # the page continues it to the current position
     assert nothing == []
 
 
-def test_a_look_at_a_hundred_drones_is_small():
-    """Ten looks a second of a page: a few kilobytes each."""
+def test_plan_positions_of_a_hundred_drones_are_small():
+    """A page requests them ten times a second, at a few kilobytes each."""
     names = tuple(f"drone{i}" for i in range(1, 101))
     poses = pic.drone_poses(ViewDrones(0, 0, tuple(drone_view(name, 123.456) for name in names), ()), names)
     assert len(json.dumps(pic.plan_positions(poses, dict.fromkeys(names, "flying")))) < 6_000

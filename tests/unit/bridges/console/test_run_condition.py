@@ -1,4 +1,4 @@
-"""Alarms, faults and the check before a take-off: what is told, with its cause, and for how long."""
+"""Alarms, losses and preflight checks: what is shown, with its cause, and for how long."""
 
 from typing import Any
 
@@ -45,16 +45,16 @@ def losses() -> Losses:
     return Losses()
 
 
-# The board
+# The alarm board
 
 
-def test_a_red_alarm_that_is_over_stays_until_it_is_acknowledged(board: AlarmBoard):
+def test_a_red_alarm_remains_until_it_is_acknowledged(board: AlarmBoard):
     board.update([DEAD, LOW], 1.0)
     board.update([], 4.0)
     assert shown(board) == [(DEAD.subject, 5.0, False, 1)]
-    assert board.severity_of(DEAD.subject) is None  # nothing is wrong with it now
+    assert board.severity_of(DEAD.subject) is None  # the alarm is over
     board.update([LOW], 4.5)
-    assert [row[0] for row in shown(board)] == [DEAD.subject, LOW.subject]  # red ones first
+    assert [row[0] for row in shown(board)] == [DEAD.subject, LOW.subject]  # red alarms come first
     board.update([DEAD], 5.0)
     assert shown(board) == [(DEAD.subject, None, False, 2)]
     board.update([], 6.0)
@@ -62,7 +62,7 @@ def test_a_red_alarm_that_is_over_stays_until_it_is_acknowledged(board: AlarmBoa
     assert shown(board) == []
 
 
-def test_an_alarm_that_was_acknowledged_stays_while_it_stands_and_goes_when_it_is_over(board: AlarmBoard):
+def test_an_acknowledged_alarm_disappears_when_it_is_over(board: AlarmBoard):
     board.update([DEAD], 1.0)
     board.acknowledge()
     board.update([DEAD], 2.0)
@@ -80,29 +80,29 @@ def test_an_acknowledged_alarm_that_becomes_red_is_new(board: AlarmBoard):
     assert shown(board) == [("drone1", None, False, 1)]
 
 
-# What is lost
+# Lost processes
 
 
 @pytest.mark.parametrize("kind", sorted(run_condition.LOST))
 @pytest.mark.parametrize("back", sorted(run_condition.BACK))
-def test_what_is_lost_is_so_until_it_is_back(kind: str, back: str, losses: Losses):
+def test_a_lost_process_remains_lost_until_it_returns(kind: str, back: str, losses: Losses):
     losses.note(event(kind, "detector.main", host="lab", pid=7))
     assert list(losses.now) == ["detector.main"]
-    losses.note(event("drop", "detector.main"))  # the run goes on without it: it is dead all the same
+    losses.note(event("drop", "detector.main"))  # the run continues without it, but it is still dead
     assert list(losses.now) == ["detector.main"]
     losses.note(event(back, "detector.main"))
     assert losses.now == {}
 
 
-def test_a_process_whose_work_another_does_is_lost_no_longer(losses: Losses):
+def test_a_process_whose_work_another_has_taken_over_is_no_longer_lost(losses: Losses):
     for name in ("estimator.drone1", "estimator.drone2", "controller.main"):
         losses.note(event("death", name, host="lab", pid=7))
     losses.note(event("join", "estimator.main", serves=["estimator.drone1", "estimator.drone2"]))
     assert list(losses.now) == ["controller.main"]
 
 
-def test_a_process_that_publishes_its_health_again_is_lost_no_longer(losses: Losses):
-    """The event that it was started again may have come while the console had no link."""
+def test_a_process_that_publishes_its_health_is_no_longer_lost(losses: Losses):
+    """The event of its restart may have been sent while the console had no link."""
     losses.note(event("death", "estimator.drone1", host="lab", pid=7))
     health = Health(0, 0, "estimator", "lab", 7, {}, 0, 0, 0, 0)
     losses.note_health("estimator.drone1", health)  # published before its death, received after it
@@ -111,7 +111,7 @@ def test_a_process_that_publishes_its_health_again_is_lost_no_longer(losses: Los
     assert losses.now == {}
 
 
-def test_a_join_behind_which_nobody_is_makes_nobody_missing(losses: Losses):
+def test_a_no_show_is_not_counted_as_lost(losses: Losses):
     losses.note(event("no_show", "estimator.drone1", host="lab", pid=9, incarnation=4))
     assert losses.now == {}
 
@@ -128,10 +128,10 @@ def test_a_join_behind_which_nobody_is_makes_nobody_missing(losses: Losses):
         ({"tilt_deg": 178.0}, ("upside down", "tilted by 178°")),
     ],
 )
-def test_a_failsafe_and_a_drone_on_its_back_are_alarms_with_their_cause(change: dict[str, Any], alarm: tuple[str, str]):
+def test_a_failsafe_and_a_drone_upside_down_are_alarms_with_their_cause(change: dict[str, Any], alarm: tuple[str, str]):
     assert run_condition.drone_alarms(FIT._replace(state="flying")) == []
     assert run_condition.drone_alarms(FIT._replace(**change)) == [Alarm("red", "drone1", *alarm)]
-    assert run_condition.drone_alarms(FIT._replace(state="landing")) == []  # as somebody has commanded
+    assert run_condition.drone_alarms(FIT._replace(state="landing")) == []  # a commanded landing
 
 
 @pytest.mark.parametrize(
@@ -145,14 +145,14 @@ def test_a_failsafe_and_a_drone_on_its_back_are_alarms_with_their_cause(change: 
         ((None,) * 3, {}, {}),
     ],
 )
-def test_who_flies_a_drone_instead_of_its_formation_s_controller(
+def test_foreign_commanders_are_those_other_than_the_controller(
     commanders: tuple[str | None, ...], roles: dict[str, str], found: dict[str, str]
 ):
     of_drones: dict[str, str | None] = dict(zip(MEMBERS, commanders, strict=True))
     assert run_condition.foreign_commanders("controller.main", MEMBERS, of_drones, roles) == found
 
 
-def test_an_engaged_formation_with_a_drone_flown_by_hand_is_an_alarm_with_its_figures():
+def test_a_formation_off_its_reference_or_with_a_foreign_commander_alarms():
     view = ViewCluster(0, 0, "engaged", ("p", "yaw"), (11.6, 3.0), (4.0, 0.0), "")
     foreign = {"main": {"drone2": "console.run"}}
     found = run_condition.formation_alarms({"main": ("engaged", "")}, foreign, {"main": view})
@@ -166,14 +166,14 @@ def test_an_engaged_formation_with_a_drone_flown_by_hand_is_an_alarm_with_its_fi
     assert run_condition.formation_alarms({"main": ("engaged", "")}, {}, {"main": near}) == []
 
 
-def test_an_alarm_of_a_fault_has_its_magnitudes_as_the_terminal_writes_them():
+def test_a_fault_alarm_shows_its_parameters_as_on_the_command_line():
     fault = Fault(1, "link_loss", "world/a", {"probability": 0.3, "one_way": False, "place": {}}, 0)
     assert run_condition.run_alarms({}, [fault], 0.0) == [
         Alarm("amber", "world/a", "link_loss", "probability=0.3 one_way=False")
     ]
 
 
-# Before a take-off
+# Preflight checks
 
 
 def run(drone: DroneCondition, phase: str = "idle", foreign: str = "", in_formation: bool = True) -> RunCondition:
@@ -197,7 +197,7 @@ def run(drone: DroneCondition, phase: str = "idle", foreign: str = "", in_format
         ({"is_external": True, "link_state": "armed", "link_age_s": 9.0}, ("link", "9 s")),
     ],
 )
-def test_no_take_off_is_offered_of_a_drone_that_is_not_fit(change: dict[str, Any], terms: tuple[str, ...]):
+def test_take_off_is_refused_for_an_unfit_drone(change: dict[str, Any], terms: tuple[str, ...]):
     assert formation_refusals(run(FIT), "main")["takeoff"] == ""
     unfit = run(FIT._replace(**change))
     for refusal in (formation_refusals(unfit, "main")["takeoff"], fleet_refusals(unfit)["takeoff"]):
@@ -206,23 +206,23 @@ def test_no_take_off_is_offered_of_a_drone_that_is_not_fit(change: dict[str, Any
     assert drone_refusals(unfit, "drone1")["emergency"] == ""
 
 
-def test_who_else_flies_a_drone_keeps_its_formation_on_the_ground():
+def test_take_off_is_refused_while_another_process_flies_a_member():
     refusal = formation_refusals(run(FIT, foreign="console.2"), "main")["takeoff"]
     assert has_terms(refusal, "control", "console.2")
 
 
 @pytest.mark.parametrize("change", [{"sigma_m": None}, {"battery_percent": 15.0}, {"lag_ms": 900.0}])
-def test_a_drone_of_no_formation_takes_off_with_a_warning(change: dict[str, Any]):
+def test_a_drone_outside_formations_may_take_off_with_a_warning(change: dict[str, Any]):
     warned = run(FIT._replace(**change), in_formation=False)
     assert drone_refusals(warned, "drone1")["takeoff"] == fleet_refusals(warned, ["drone1"])["takeoff"] == ""
     assert "✗" in preflight_lines(warned.checks)
 
 
-def test_the_check_of_a_fit_drone_names_all_its_points():
+def test_the_check_of_a_fit_drone_lists_all_its_items():
     checks = preflight_checks(FIT._replace(is_external=True, link_state="armed", link_age_s=0.2), True)
     assert [check.name for check in checks] == ["battery", "upright", "estimator", "link", "control"]
     assert not any(check.blocks and not check.ok for check in checks)
-    stray = FIT._replace(link_state="lost", link_age_s=9.0)  # anybody may publish the link of a drone that has none
+    stray = FIT._replace(link_state="lost", link_age_s=9.0)  # anyone may publish a link of a drone that has none
     assert formation_refusals(run(stray), "main")["takeoff"] == ""
     lines = preflight_lines({"drone1": checks})
     assert has_terms(without_tags(lines), "✓", "73 %", "σ 0.20 m", "armed", "free")
@@ -237,7 +237,7 @@ def test_the_check_of_a_fit_drone_names_all_its_points():
         ("landing", ("landing", "landed", "landed"), ("main is landing",)),
     ],
 )
-def test_why_nobody_takes_off_is_true(phase: str, states: tuple[str, ...], terms: tuple[str, ...]):
+def test_a_refused_fleet_take_off_gives_the_true_reason(phase: str, states: tuple[str, ...], terms: tuple[str, ...]):
     found = RunCondition(
         "running",
         drones=dict(zip(MEMBERS, states, strict=True)),

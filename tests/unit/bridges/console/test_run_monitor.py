@@ -1,4 +1,4 @@
-"""What the console receives of a run: its time, or silence; estimators, alive or dead; faults; the texts on them."""
+"""What the console receives from a run (time or silence, estimates, faults, links), and the texts that show it."""
 
 import math
 from collections.abc import Callable
@@ -39,7 +39,7 @@ UNIT = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
 
 
 class Link:
-    """A session on which only the test speaks."""
+    """A session on which only the test publishes."""
 
     host = "lab"
     reads: tuple[str, ...] = ()
@@ -68,7 +68,7 @@ class Link:
 
 
 class MonitoredRun:
-    """View buffer and time monitor of a run of two drones, and a wall clock that only the test moves."""
+    """The view buffer and time monitor of a run with two drones, on a wall clock that only the test advances."""
 
     def __init__(self, stamp_age_s: float = 0.1) -> None:
         self.wall_s = 100.0
@@ -85,7 +85,7 @@ class MonitoredRun:
         self.views.open()
 
     def run_for(self, seconds: float) -> None:
-        """Let time go by while the console runs."""
+        """Advance the wall clock while the console runs."""
         for _ in range(round(seconds / BEAT_S)):
             self.wall_s += BEAT_S
             self.monitor._awake.beat()
@@ -132,19 +132,19 @@ def monitored() -> MonitoredRun:
     return MonitoredRun()
 
 
-# The run's time
+# The time of the run
 
 
-def test_a_stamp_is_of_the_present_however_fast_the_run(monitored: MonitoredRun):
+def test_a_time_stamp_is_current_at_any_rate_of_the_run(monitored: MonitoredRun):
     monitored.link.now = clock(1 * S, rate=4.0)
     assert monitored.monitor.now_ns() == 1 * S
     monitored.link.now = clock(2 * S, rate=4.0)
-    monitored.wall_s += 0.02  # 80 ms of the run
+    monitored.wall_s += 0.02  # 80 ms of simulated time
     assert monitored.monitor.now_ns() == 1 * S
     monitored.wall_s += 0.01
     assert monitored.monitor.now_ns() == 2 * S
     assert monitored.link.asked == 2
-    monitored.link.now = None  # the world answers nothing
+    monitored.link.now = None  # the world does not answer
     monitored.wall_s += 60.0
     assert monitored.monitor.now_ns() == 2 * S
     careless = MonitoredRun(stamp_age_s=float("inf"))
@@ -153,7 +153,7 @@ def test_a_stamp_is_of_the_present_however_fast_the_run(monitored: MonitoredRun)
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\xc1", b"\x80", messages.encode(drones(0)[1])])
-def test_a_foreign_answer_is_no_clock(garbage: bytes, monitored: MonitoredRun):
+def test_an_invalid_clock_is_ignored_and_counted(garbage: bytes, monitored: MonitoredRun):
     for answer, known in ((garbage, None), (clock(3 * S), clock(3 * S)), (garbage, clock(3 * S))):
         monitored.link.now = answer
         monitored.monitor.poll()
@@ -164,13 +164,13 @@ def test_a_foreign_answer_is_no_clock(garbage: bytes, monitored: MonitoredRun):
 @pytest.mark.parametrize(
     ("now", "over"), [(clock(0, run_id="r2"), "another run"), (clock(0, state="stopped"), "the run ended")]
 )
-def test_the_end_of_a_run_is_heard(now: Clock, over: str, monitored: MonitoredRun):
+def test_the_end_of_a_run_is_noticed(now: Clock, over: str, monitored: MonitoredRun):
     monitored.link.now = now
     monitored.monitor.poll()
     assert over in monitored.observer.end_reason
 
 
-def test_silence_of_the_world_is_told_and_for_how_long(monitored: MonitoredRun):
+def test_silence_of_the_world_is_shown_with_its_duration(monitored: MonitoredRun):
     with monitored.monitor.polling():
         monitored.run_for(SILENT_S - 0.1)
         assert monitored.monitor.silent_s == 0.0
@@ -184,11 +184,11 @@ def test_silence_of_the_world_is_told_and_for_how_long(monitored: MonitoredRun):
         monitored.run_for(5.0)
         shown = monitored.state()
         assert (shown["clock"], shown["silent_s"]) == ("silent", pytest.approx(5.0))
-    assert monitored.monitor.silent_s == 0.0  # nobody is asked any more
+    assert monitored.monitor.silent_s == 0.0  # the world is no longer polled
     assert monitored.state()["clock"] == "running"
 
 
-def test_a_console_that_stood_still_itself_does_not_call_the_world_silent(monitored: MonitoredRun):
+def test_a_stall_of_the_console_is_not_taken_for_silence_of_the_world(monitored: MonitoredRun):
     with monitored.monitor.polling():
         monitored.run_for(0.5)
         assert monitored.monitor.stall is None
@@ -217,7 +217,7 @@ def test_a_console_that_stood_still_itself_does_not_call_the_world_silent(monito
         (RunCondition("waiting"), (Waiting("controller.main", "", 18.0),), "waiting", ("main (18.0 s) in 'lab'",)),
     ],
 )
-def test_only_a_world_in_which_time_goes_is_called_running(
+def test_only_a_world_whose_time_advances_is_called_running(
     run: RunCondition, waiting: tuple[Waiting, ...], level: str, terms: tuple[str, ...]
 ):
     head = page_head("step", run, clock(7 * S, state=run.clock, waiting_for=waiting), 7 * S, world="'lab'")
@@ -226,10 +226,10 @@ def test_only_a_world_in_which_time_goes_is_called_running(
     assert ("running" in head["title"]) == (level == "running")
 
 
-def test_a_replay_is_named_as_one():
+def test_a_replay_is_labelled_as_such():
     emergency = RunCondition("paused", replayed=True, drones={"drone1": "emergency"})
     head = page_head("step", emergency, clock(15 * S), 15 * S, record_s=(10.0, 20.0))
-    assert (head["level"], head["replay"]) == ("paused", True)  # of a record nobody has to act: no red head
+    assert (head["level"], head["replay"]) == ("paused", True)  # no red head: a record needs no action
     assert has_terms(head["title"], "REPLAY", "15.0 of 20.0 s", "50 %")
     flight = page_head("step", emergency._replace(replayed=False), clock(S), S)
     assert (flight["level"], flight["replay"]) == ("emergency", False)
@@ -238,7 +238,7 @@ def test_a_replay_is_named_as_one():
 # Estimators
 
 
-def test_a_dead_estimator_is_not_shown_as_a_healthy_one(monitored: MonitoredRun):
+def test_a_dead_estimator_is_not_shown_as_healthy(monitored: MonitoredRun):
     for second in range(3):
         monitored.deliver(drones(second * S), estimate(second * S, used=5 * second), health())
         monitored.words.sensor_table("drone1")
@@ -258,12 +258,12 @@ def test_a_dead_estimator_is_not_shown_as_a_healthy_one(monitored: MonitoredRun)
 @pytest.mark.parametrize(
     ("estimated_s", "waited_s", "seen_s", "fresh"),
     [
-        (1.0, 0.05, 9.0, True),  # in a fast run a view may be seconds older than another
-        (1.0, 9.0, 1.5, True),  # in a slow run a view may be seconds old
+        (1.0, 0.05, 9.0, True),  # in a fast run, views may be seconds apart in simulated time
+        (1.0, 9.0, 1.5, True),  # in a slow run, a view may be seconds old in wall time
         (60.0, 5.0, 10.0, None),  # a replay has gone back
     ],
 )
-def test_an_estimate_is_of_the_present_by_its_time_or_by_when_it_came(
+def test_an_estimate_is_fresh_by_its_time_or_by_its_arrival(
     monitored: MonitoredRun, estimated_s: float, waited_s: float, seen_s: float, fresh: bool | None
 ):
     monitored.deliver(estimate(round(estimated_s * S)), health())
@@ -275,7 +275,7 @@ def test_an_estimate_is_of_the_present_by_its_time_or_by_when_it_came(
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int], monitored: MonitoredRun):
+def test_the_later_of_two_estimates_of_a_drone_is_shown(order: tuple[int, int], monitored: MonitoredRun):
     samples = (estimate(1 * S, "estimator.old", used=1), estimate(2 * S, "estimator.new", used=2))
     healths = health("estimator.new", 3_000_000), health("estimator.old")
     monitored.deliver(drones(2 * S), *(samples[i] for i in order), *healths)
@@ -285,7 +285,7 @@ def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int
     assert "<td align=left>2</td>" in monitored.words.sensor_table("drone1")
 
 
-def test_a_covariance_that_is_none_has_no_sigma():
+def test_an_invalid_covariance_has_no_sigma():
     estimate = EstimateView("drone1", ORIGIN, (-9.0, 0.0, 0.0, 1.0, 0.0, 1.0), 0.0, 0.1, {})
     assert ReceivedEstimate("estimator.drone1", 0, estimate, True).sigma_m == 0.0
 
@@ -293,7 +293,7 @@ def test_a_covariance_that_is_none_has_no_sigma():
 # Faults and refusals
 
 
-def test_faults_are_shown_on_a_drone_while_they_act(monitored: MonitoredRun):
+def test_faults_are_shown_on_a_drone_while_active(monitored: MonitoredRun):
     planned = Fault(1, "gps_bias", "drone1", {}, 20 * S)
     acting = Fault(2, "gps_dropout", "drone1", {}, 5 * S, 15 * S)
     ended = Fault(3, "motor", "drone1", {}, 0, 10 * S)
@@ -303,7 +303,7 @@ def test_faults_are_shown_on_a_drone_while_they_act(monitored: MonitoredRun):
     assert [(fault["from_s"], fault["until_s"]) for fault in shown] == [(20.0, None), (5.0, 15.0), (0.0, 10.0)]
 
 
-def test_faults_that_were_heard_are_not_replaced_by_an_older_answer(monitored: MonitoredRun):
+def test_received_faults_are_not_replaced_by_an_older_answer(monitored: MonitoredRun):
     newer = Fault(2, "gps_dropout", "drone1", {}, 0)
     monitored.link.last, monitored.link.meanwhile = Faults(0, 0, ()), Faults(0, 1, (newer,))
     monitored.views.open()
@@ -311,7 +311,7 @@ def test_faults_that_were_heard_are_not_replaced_by_an_older_answer(monitored: M
     assert monitored.views.faults == (newer,)
 
 
-def test_the_console_hears_what_is_refused_of_its_own(monitored: MonitoredRun):
+def test_the_console_receives_only_refusals_of_its_own_commands(monitored: MonitoredRun):
     for kind, source in (("refused", "console.2"), ("command", "console.1"), ("refused", "console.1")):
         monitored.link.tell(sample(keys.EVENT, Event(0, 0, kind, source, "drone/drone1/cmd/mode", "no")))
     assert [(event.kind, event.source) for event in monitored.refused] == [("refused", "console.1")]
@@ -327,7 +327,7 @@ def link(state: Any, **figures: float | None) -> tuple[str, LinkState]:
     return keys.link("drone2"), LinkState(0, 0, "driver.drone2", "<10.0.0.7>", state, **numbers, refused=3)
 
 
-def test_of_an_external_drone_the_link_of_its_driver_is_shown(monitored: MonitoredRun):
+def test_an_external_drone_shows_the_link_of_its_driver(monitored: MonitoredRun):
     monitored.deliver(drones(1 * S))
     plain, external = monitored.words.drone_rows()
     assert (plain.link, external.link[1]) == (("", ""), console_tables.AMBER)
@@ -343,7 +343,7 @@ def test_of_an_external_drone_the_link_of_its_driver_is_shown(monitored: Monitor
     assert (shown, "10 s" in text) == (console_tables.RED, True)
 
 
-# Figures of flight
+# Flight figures
 
 
 def view(t_s: float, x_m: float, battery: float = 80.0) -> ViewDrones:
@@ -353,7 +353,7 @@ def view(t_s: float, x_m: float, battery: float = 80.0) -> ViewDrones:
     )
 
 
-def test_a_drone_s_distance_is_that_to_the_nearest_obstacle():
+def test_the_obstacle_distance_is_that_to_the_nearest_obstacle():
     poles = [
         Obstacle(name=f"p{x}", shape="cylinder", position_m=(x, 0, 0), radius_m=0.5, height_m=9) for x in (3.0, 9.0)
     ]
@@ -365,7 +365,7 @@ def test_a_drone_s_distance_is_that_to_the_nearest_obstacle():
     assert meter.figures["drone1"].obstacle_m == pytest.approx(1.2, abs=1e-6)
 
 
-def test_figures_of_flight_come_from_where_a_drone_was():
+def test_flight_figures_are_derived_from_past_positions():
     meter = FlightMeter(Environment())
     for step in range(10):
         meter.update(view(0.1 * step, 0.2 * step))
@@ -376,7 +376,7 @@ def test_figures_of_flight_come_from_where_a_drone_was():
     assert (figures.battery_left_s, figures.obstacle_m) == (None, None)
     meter.update(view(40.0, 0.0, 70.0))
     assert meter.figures["drone1"].battery_left_s == pytest.approx(70.0 / 0.25)
-    meter.update(view(1.0, 50.0))  # a replay that goes back begins anew
+    meter.update(view(1.0, 50.0))  # a replay that goes back restarts the figures
     assert meter.figures["drone1"].speed_m_s == 0.0
 
 
@@ -407,12 +407,12 @@ def player(state: str, is_replay: bool = True) -> tuple[RecordPlayer, list[Any]]
         ("running", "rate", 0.5, ("rate", {"value": 0.5})),
         ("running", "seek", 4.0, ("seek", 4.0, False)),
         ("stopped", "seek", 4.0, ("seek", 4.0, False)),
-        ("paused", "seek", 4.0, ("seek", 4.0, True)),  # it shows where it was put
+        ("paused", "seek", 4.0, ("seek", 4.0, True)),  # a paused replay shows the instant it was set to
     ],
 )
-def test_a_replay_is_asked_for_what_its_page_asks(state: str, op: str, value: float, request_: Any):
+def test_a_replay_receives_the_requests_of_its_page(state: str, op: str, value: float, request_: Any):
     made, asked = player(state)
-    assert asked == ([("seek", 8.0, True)] if state == "paused" else [])  # the last instant again, for this console
+    assert asked == ([("seek", 8.0, True)] if state == "paused" else [])  # shows this console the current instant
     made.play(op, value)
     assert asked[-1] == request_
     flight, asked = player(state, is_replay=False)
@@ -429,12 +429,12 @@ def test_a_replay_is_asked_for_what_its_page_asks(state: str, op: str, value: fl
         (RunCondition("stopped", replayed=True, ended="it is over"), {"pause", "resume", "step", "rate", "seek"}),
     ],
 )
-def test_the_timeline_has_what_would_be_refused(run: RunCondition, refused: set[str]):
+def test_the_timeline_lists_what_would_be_refused(run: RunCondition, refused: set[str]):
     refusals = player("paused")[0].state(run)["refusals"]
     assert {op for op, reason in refusals.items() if reason} == refused
 
 
-def test_a_record_is_read_around_the_shown_instant_the_nearest_first():
+def test_a_record_is_read_around_the_shown_instant_nearest_first():
     asked: list[tuple[float, float]] = []
     tasks: list[Any] = []
     client: Any = SimpleNamespace(
@@ -449,7 +449,7 @@ def test_a_record_is_read_around_the_shown_instant_the_nearest_first():
     def read(t_s: float) -> list[float]:
         asked.clear()
         made.fill(t_s)
-        made.fill(t_s)  # it is read once at a time
+        made.fill(t_s)  # no second reading while one is under way
         while tasks:
             tasks.pop()()
         return [from_s for from_s, _ in asked]
@@ -461,7 +461,7 @@ def test_a_record_is_read_around_the_shown_instant_the_nearest_first():
     assert read(505.0) == []
     assert read(515.0) == [600.0]
     assert read(5.0)[0] == 0.0
-    assert read(505.0)[0] == 500.0  # it was forgotten, so far away
+    assert read(505.0)[0] == 500.0  # too far from the shown instant to be kept
     assert made.take() == [(500.0, 509.875)]
 
 
@@ -472,7 +472,7 @@ FIT = DroneCondition("drone1", "landed", 73.0, lag_ms=10.0, sigma_m=0.2)
 
 
 class Watched:
-    """Two drones of a formation, and a fault."""
+    """A fault and two drones of a formation."""
 
     def __init__(self, fault: Fault) -> None:
         self.watch, self.fault = FaultWatch(), fault
@@ -488,7 +488,7 @@ class Watched:
         self.drones[drone] = self.drones[drone]._replace(**change)
 
 
-def test_a_fault_of_a_drone_tells_what_it_did_to_it_and_to_nobody_else():
+def test_a_fault_of_a_drone_reports_effects_on_that_drone_only():
     of = Watched(Fault(3, "gps_dropout", "drone1", {"probability": 0.4}, 12_000_000_000, 42_000_000_000))
     assert has_terms(of.see(), "#3 gps_dropout of drone1 probability=0.4", "12.0 s to 42.0 s", "no effect seen")
     of.change("drone2", sigma_m=9.0, state="emergency")
@@ -496,12 +496,12 @@ def test_a_fault_of_a_drone_tells_what_it_did_to_it_and_to_nobody_else():
     of.change("drone1", sigma_m=1.4, state="landing")
     assert has_terms(of.see(phase="held"), "σ 0.20 → 1.40 m", "drone1 flying → landing", "main engaged → held")
     of.change("drone1", sigma_m=0.3)
-    assert has_terms(of.see(acts=False), "σ 0.20 → 1.40 m")  # the worst
+    assert has_terms(of.see(acts=False), "σ 0.20 → 1.40 m")  # the worst value is kept
     of.change("drone1", sigma_m=5.0)
     assert has_terms(of.see(acts=False), "σ 0.20 → 1.40 m")  # the fault is over
 
 
-def test_a_gust_tells_its_wind_and_a_link_its_lag():
+def test_a_gust_reports_its_wind_and_a_slow_link_its_lag():
     gust = Watched(Fault(1, "gust", "world", {"velocity_m_s": [4.0, 0.0, 0.0]}, 0))
     gust.see()
     assert has_terms(gust.see(wind=4.4), "velocity_m_s=[4.0, 0.0, 0.0]", "wind 0.5 → 4.4 m/s")
@@ -511,14 +511,14 @@ def test_a_gust_tells_its_wind_and_a_link_its_lag():
     assert has_terms(link.see(), "world/estimator.drone2", "delay_ms=300.0", "lag 10 → 310 ms")
 
 
-def test_a_kill_tells_the_death_and_the_return_of_its_process():
+def test_a_kill_reports_the_death_and_return_of_its_process():
     of = Watched(Fault(1, "process_kill", "estimator.drone1", {}, 0, 20_000_000))
     of.see(acts=False)
     assert has_terms(of.see(acts=False, lost=("estimator.drone1",)), "estimator.drone1 alive → dead")
     assert has_terms(of.see(acts=False), "estimator.drone1 alive → dead → alive")
 
 
-def test_many_faults_that_are_over_are_not_kept():
+def test_only_the_latest_finished_faults_are_kept():
     watch = FaultWatch()
     for number in range(3 * FAULTS_KEPT):
         fault = Fault(number, "gps_stuck", "drone1", {}, 0)

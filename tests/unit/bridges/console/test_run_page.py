@@ -1,4 +1,4 @@
-"""One run on the page, drawn by a viser of its own that nobody looks at but the test."""
+"""A run on the page, drawn by a private viser that only the test sees."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -52,7 +52,7 @@ environment:
 
 
 class Link:
-    """A session on which only the test speaks."""
+    """A session on which only the test publishes."""
 
     host = "lab"
 
@@ -80,7 +80,7 @@ class Link:
 
 
 class Seen:
-    """A run on a page: its messages, a picture after the other."""
+    """A run on a page, which is fed messages and drawn picture by picture."""
 
     def __init__(self, server: Any, watched: bool) -> None:
         self.link: Any = Link()
@@ -97,7 +97,7 @@ class Seen:
         self.show = RunPage(server, self.link, info, self.observer, PageCameras(server), 1000.0)
 
     def draw(self, *samples: tuple[str, Any]) -> dict[str, Any]:
-        """Say something, draw a picture, and return what is shown."""
+        """Publish samples, draw a picture, and return what is shown."""
         turns = iter((False, True))
 
         def stopped() -> bool:
@@ -125,7 +125,7 @@ def seen(viser: PrivateViser) -> Iterator[Seen]:
 
 
 def drones(*names: str, t_ns: int = 20_000_000, away_m: float = 0.0) -> tuple[str, ViewDrones]:
-    """A triangle, or what a replay has of it."""
+    """Return a view of the named drones, which stand in a triangle; a replay may have only some of them."""
     places = {name: (4.0 * (i == 1) + away_m, 3.0 * (i == 2), 2.0) for i, name in enumerate(NAMES)}
     views = tuple(DroneView(n, places.get(n, ORIGIN), LEVEL, ROTORS, "flying", 80.0) for n in names)
     return keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((3.0, 0.0, 0.0),))
@@ -137,11 +137,11 @@ def cluster(name: str = CLUSTER, names: tuple[str, ...] = SPACE.names) -> tuple[
 
 
 @pytest.mark.parametrize(("drones", "rate", "hz"), [(3, 1.0, 20.0), (50, 1.0, 10.0), (3, 25.0, 10.0), (3, 0.0, 20.0)])
-def test_pictures_are_as_many_as_an_eye_can_follow(drones: int, rate: float, hz: float):
+def test_the_picture_rate_falls_with_many_drones_or_a_fast_run(drones: int, rate: float, hz: float):
     assert picture_rate_hz(drones, rate) == hz
 
 
-def test_the_view_from_above_has_the_newest_of_all(seen: Seen):
+def test_the_plan_view_has_the_newest_positions_and_formations(seen: Seen):
     seen.draw(drones(*NAMES[:2]), cluster())
     plan = seen.show.flying.plan(None, whole=True)
     assert [each and each[:2] for each in plan["drones"]] == [[0.0, 0.0], [4.0, 0.0], None]
@@ -150,7 +150,7 @@ def test_the_view_from_above_has_the_newest_of_all(seen: Seen):
     assert "names" not in seen.show.flying.plan(None, whole=False)
 
 
-def test_a_drone_is_taken_from_a_page_and_given_back(seen: Seen):
+def test_a_drone_is_acquired_from_a_page_and_released(seen: Seen):
     seen.draw(drones(*NAMES))
     flying = seen.show.flying.control
     assert flying.take("page", NAMES[1], over=False).state in ("taking", "flying")
@@ -160,7 +160,7 @@ def test_a_drone_is_taken_from_a_page_and_given_back(seen: Seen):
 
 
 @pytest.mark.parametrize("watched", [True, False])
-def test_a_replay_of_some_drones_is_shown_as_far_as_it_goes(viser: PrivateViser, watched: bool):
+def test_a_replay_of_some_drones_shows_those_it_has(viser: PrivateViser, watched: bool):
     seen = Seen(viser.server, watched)
     state = seen.draw(drones(NAMES[1]), cluster())
     assert [drone["name"] for drone in state["drones"]] == [NAMES[1]]
@@ -170,7 +170,7 @@ def test_a_replay_of_some_drones_is_shown_as_far_as_it_goes(viser: PrivateViser,
     seen.show.close()
 
 
-def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(viser: PrivateViser):
+def test_a_missing_drone_is_hidden_and_the_others_keep_their_places(viser: PrivateViser):
     stage = stages.SceneNodes(viser.server, DRONES, ARMS_M, 3, 1)
     found = drone_poses(drones(NAMES[2])[1], NAMES)
     stage.drones(found, 0.05)
@@ -184,12 +184,12 @@ def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(vise
     stage.wind(drone_poses(drones()[1], NAMES))
     assert not stage._wind.visible
     stage.trails(np.ones((2, 2, 3)), np.array([0, 1]))
-    stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))  # a replay has gone back
+    stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))  # as after a replay has gone back
     assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
 
 
-def test_each_drone_is_drawn_with_the_rotors_that_it_has(viser: PrivateViser):
-    """Beside two of an old record, which names none, one of six rotors, half as large."""
+def test_each_drone_is_drawn_with_its_own_rotors(viser: PrivateViser):
+    """Two drones come from an old record, which lists no rotors; the third has six rotors of half the size."""
     ends = [(0.09 * math.cos(k), 0.09 * math.sin(k)) for k in np.arange(6) * math.pi / 3]
     six = DroneInfo(NAMES[2], "mine", tuple(RotorInfo(f"r{k}", x, y, 1, 0.05) for k, (x, y) in enumerate(ends)))
     stage = stages.SceneNodes(viser.server, (*DRONES[:2], six), ARMS_M, 3, 1)
@@ -201,7 +201,7 @@ def test_each_drone_is_drawn_with_the_rotors_that_it_has(viser: PrivateViser):
     np.testing.assert_allclose(stage._rotors._node.batched_scales[:, 0], [1.0] * 8 + [0.5] * 6)
 
 
-def test_views_of_another_controller_are_left_out(seen: Seen):
+def test_views_of_an_unknown_formation_are_ignored(seen: Seen):
     fewer = SPACE.names[:-1]
     state = seen.draw(drones(*NAMES), cluster(names=fewer), cluster("strange"))
     assert state["clusters"] == []
@@ -213,7 +213,7 @@ def test_views_of_another_controller_are_left_out(seen: Seen):
     assert state["t_s"] == pytest.approx(0.02)
 
 
-def test_estimates_of_strangers_are_left_out(seen: Seen):
+def test_estimates_of_unknown_drones_are_ignored(seen: Seen):
     strangers = [EstimateView(f"s{i}", ORIGIN, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), 0.0, 0.1, {}) for i in range(9)]
     mine = EstimateView(NAMES[0], ORIGIN, (4.0, 0.0, 0.0, 4.0, 0.0, 4.0), 0.0, 0.1, {"gps": (1, 0)})
     view = ViewEstimates(20_000_000, 0, (*strangers, mine))
@@ -221,7 +221,7 @@ def test_estimates_of_strangers_are_left_out(seen: Seen):
     assert state["drones"][0]["sigma_m"] == pytest.approx(2.0)
 
 
-def test_trails_of_a_replay_that_goes_back_before_anybody_looks_go_too(viser: PrivateViser):
+def test_a_replay_that_goes_back_clears_trails_even_unwatched(viser: PrivateViser):
     seen = Seen(viser.server, watched=False)
     for t_ns, away_m in ((1_000_000_000, 0.0), (2_000_000_000, 5.0)):
         seen.draw(drones(*NAMES, t_ns=t_ns, away_m=away_m))
@@ -236,7 +236,7 @@ def trails(seen: Seen) -> np.ndarray:
     return seen.show._scene.trails.segments(seen.show._scene.drones.t_ns / 1e9, seen.show._scene.drones.p_W)[0]
 
 
-def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner(seen: Seen):
+def test_refused_commands_of_the_console_are_shown_as_notifications(seen: Seen):
     shown: list[tuple[str, str]] = []
     seen.draw(drones(*NAMES))
     client = SimpleNamespace(add_notification=lambda title, body, **_: shown.append((title, body)))
@@ -249,7 +249,7 @@ def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner
     assert [event.kind for event in seen.show.views.log.newest] == ["refused", "refused"]
 
 
-def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytest.MonkeyPatch):
+def test_a_silent_world_is_shown_and_locks_the_controls(seen: Seen, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(TimeMonitor, "silent_s", 12.0)
     state = seen.draw(drones(*NAMES))
     assert (state["clock"], state["silent_s"]) == ("silent", 12.0)
@@ -263,13 +263,13 @@ def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytes
         *page.run_form._controls.values(),
     ]
     assert all(control.disabled for control in locked)
-    order = seen.show.command(OrderRequest("land", id="one"))  # whoever is silent may hear it yet
+    order = seen.show.command(OrderRequest("land", id="one"))  # a silent world may still receive it
     assert order["state"] == "sent"
     assert has_terms(order["reason"], "world", "12 s")
     assert seen.show.head()["orders"][0]["id"] == "one"
 
 
-def test_a_run_that_is_over_is_told_with_its_reason(seen: Seen):
+def test_a_finished_run_is_shown_with_its_reason(seen: Seen):
     seen.draw(drones(*NAMES), cluster())
     event = Event(30_000_000, 0, "end", "world", "world", "330 s were flown")
     seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
@@ -283,7 +283,7 @@ def test_a_run_that_is_over_is_told_with_its_reason(seen: Seen):
     assert has_terms(order["reason"], "330 s")
 
 
-def test_an_emergency_is_in_the_head_of_the_page(seen: Seen):
+def test_an_emergency_is_shown_in_the_head_of_the_page(seen: Seen):
     key, view = drones(*NAMES)
     stopped = msgspec.structs.replace(view.drones[1], state="emergency", battery_percent=8.0)
     seen.draw((key, msgspec.structs.replace(view, drones=(view.drones[0], stopped, view.drones[2]))), cluster())
@@ -303,16 +303,16 @@ def happen(seen: Seen, kind: str, subject: str, **data: Any) -> None:
 
 
 def alarmed(seen: Seen) -> list[tuple[Any, ...]]:
-    """Return the alarms in the head: subject, name, whether it is over."""
+    """Return the alarms in the head as (subject, name, whether it is over)."""
     return [(each["subject"], each["name"], each["over_s"] is not None) for each in seen.show.head()["alarms"]]
 
 
 def drone_rows(seen: Seen) -> str:
-    """Return what every page shows of the drones."""
+    """Return the table of drones that every page shows."""
     return console_tables.drone_table(seen.show._table_rows.drone_rows())
 
 
-def test_the_death_of_a_process_is_an_alarm_until_it_is_back_and_acknowledged(seen: Seen):
+def test_a_death_is_an_alarm_until_the_return_is_acknowledged(seen: Seen):
     seen.draw(drones(*NAMES))
     for kind, is_over in (("death", False), ("drop", False), ("restart", True)):
         happen(seen, kind, "recorder")
@@ -322,7 +322,7 @@ def test_the_death_of_a_process_is_an_alarm_until_it_is_back_and_acknowledged(se
     assert alarmed(seen) == []
 
 
-def test_a_world_that_was_silent_is_an_alarm_until_it_is_acknowledged(seen: Seen, monkeypatch: pytest.MonkeyPatch):
+def test_silence_of_the_world_remains_an_alarm_when_it_is_over(seen: Seen, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as patch:
         patch.setattr(TimeMonitor, "silent_s", 12.0)
         seen.draw(drones(*NAMES))
@@ -331,7 +331,7 @@ def test_a_world_that_was_silent_is_an_alarm_until_it_is_acknowledged(seen: Seen
     assert alarmed(seen) == [("world", "silent", True)]
 
 
-def test_alarms_of_later_times_are_forgotten_by_a_replay_that_goes_back(seen: Seen):
+def test_a_replay_that_goes_back_clears_later_alarms(seen: Seen):
     seen.draw(drones(*NAMES, t_ns=40_000_000))
     happen(seen, "death", "recorder")
     seen.draw(drones(*NAMES, t_ns=60_000_000))
@@ -341,13 +341,13 @@ def test_alarms_of_later_times_are_forgotten_by_a_replay_that_goes_back(seen: Se
 
 
 def flown(change: dict[str, Any], of: str = NAMES[1]) -> tuple[str, ViewDrones]:
-    """Return a view of the triangle with one drone changed."""
+    """Return a view of the triangle in which one drone is changed."""
     key, view = drones(*NAMES)
     changed = (msgspec.structs.replace(each, **(change if each.name == of else {})) for each in view.drones)
     return key, msgspec.structs.replace(view, drones=tuple(changed))
 
 
-def test_a_formation_with_a_drone_flown_by_hand_is_not_told_to_be_engaged_alone(seen: Seen):
+def test_an_engaged_formation_names_its_drone_flown_from_the_console(seen: Seen):
     key, view = flown({"commander": "console.run"})
     led = (
         each if each.commander else msgspec.structs.replace(each, commander="controller.main") for each in view.drones
@@ -358,7 +358,7 @@ def test_a_formation_with_a_drone_flown_by_hand_is_not_told_to_be_engaged_alone(
         assert has_terms(without_tags(told), "engaged", NAMES[1], "console.run")
 
 
-def test_a_drone_that_lands_by_itself_tells_why_until_it_is_commanded(seen: Seen):
+def test_an_autonomous_landing_shows_its_cause_until_the_next_command(seen: Seen):
     seen.draw(drones(*NAMES))
     happen(seen, "landing", NAMES[1], cause="battery")
     seen.draw(flown({"state": "landing"}), cluster())
@@ -377,7 +377,7 @@ def test_a_drone_that_lands_by_itself_tells_why_until_it_is_commanded(seen: Seen
     ("change", "terms"),
     [({"battery_percent": 2.0}, ("2 %",)), ({"orientation_wxyz": (0.0, 1.0, 0.0, 0.0)}, ("180°",))],
 )
-def test_no_take_off_of_a_drone_that_is_empty_or_on_its_back(
+def test_take_off_is_refused_with_an_empty_battery_or_upside_down(
     seen: Seen, change: dict[str, Any], terms: tuple[str, ...]
 ):
     seen.draw(flown({"state": "landed", **change}))
@@ -386,7 +386,7 @@ def test_no_take_off_of_a_drone_that_is_empty_or_on_its_back(
     assert any(each[0] == NAMES[1] for each in alarmed(seen))
 
 
-def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
+def test_obstacles_are_drawn_where_the_scenario_puts_them(viser: PrivateViser):
     obstacles = scenario_file.from_text(OBSTACLES).environment.obstacles
     added: dict[str, Any] = {}
     scene: Any = viser.server.scene
@@ -418,7 +418,7 @@ def test_surfaces_are_drawn_where_the_scenario_puts_them(viser: PrivateViser):
     assert added == {name: [[[5, 6, 7], [7, 6, 7], [5, 7, 8]]] for name in ("/surfaces/ramp", "/surfaces/ramp/edges")}
 
 
-def test_a_run_that_nobody_watched_leaves_its_last_picture_and_sends_what_was_moved_now_or_never(viser: PrivateViser):
+def test_an_unwatched_run_draws_its_last_picture_and_sends_the_sliders(viser: PrivateViser):
     seen = Seen(viser.server, watched=False)
     sent: list[float] = []
     for form in seen.show._page.forms.values():
@@ -430,12 +430,12 @@ def test_a_run_that_nobody_watched_leaves_its_last_picture_and_sends_what_was_mo
     seen.show.close()
 
 
-def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
+def test_requests_to_formations_and_all_refusals_are_in_the_event_log(seen: Seen):
     seen.show._on_outcome(RequestOutcome("main: engage", "", CLUSTER, "engage"))
     assert [event.kind for event in seen.show.views.log.newest] == ["accepted"]
     seen.draw(drones(*NAMES), cluster())
     assert [event.kind for event in seen.show.views.log.newest] == ["done", "accepted"]
-    seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
+    seen.show._server.get_clients = dict  # type: ignore[assignment]  # no page is open
     for outcome in (
         RequestOutcome("main: takeoff", "", "main", "takeoff"),
         RequestOutcome("rate value 2", ""),

@@ -1,4 +1,4 @@
-"""An FMU as an agent, in this process: what it takes and gives, and what is refused in one line."""
+"""An FMU as an agent in this process: its inputs and outputs, and what is refused in one line."""
 
 import math
 import zipfile
@@ -56,7 +56,7 @@ MAP = {"x": "estimate.position_m.0", "vx": "velocity_m_s.0", "up": "mode.takeoff
 
 @pytest.fixture(scope="module", params=[2, 3])
 def everything(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An FMU with variables of all types, of FMI 2 and of FMI 3."""
+    """Return an FMU with variables of all types, for FMI 2 and FMI 3."""
     version = request.param
     return fmus.build(tmp_path_factory.mktemp("fmu"), f"Everything{version}", version, EVERYTHING, LAW)
 
@@ -71,7 +71,7 @@ def flight(fmu: Fmu, **changed: Any) -> zsim.Simulation:
 
 
 def commands_of(sim: zsim.Simulation) -> list[Velocity]:
-    """Fly to the end; return the velocity commands of the FMU."""
+    """Fly to the end and return the velocity commands of the FMU."""
     sent: list[Velocity] = []
     add_message = sim._flight.bus._sink
 
@@ -90,7 +90,7 @@ def test_fmpy_finds_no_fault_in_the_fmus_of_these_tests(everything: Path, waypoi
     assert validate_fmu(str(everything)) == []
 
 
-def test_a_flag_takes_off_and_numbers_fly(everything: Path) -> None:
+def test_a_boolean_output_takes_off_and_numbers_command_the_velocity(everything: Path) -> None:
     sim = flight(Fmu(everything, "drone1", MAP, param={"gain": "0.8"}, frame="world"))
     sent = commands_of(sim)
     assert abs(sim.truth.position_m[0, 0] - 1.0) < 0.5
@@ -98,7 +98,7 @@ def test_a_flag_takes_off_and_numbers_fly(everything: Path) -> None:
     assert sent[0].velocity_m_s[1:] == (0.0, 0.0)
 
 
-def test_the_state_is_given_and_taken_back_to_the_same_bits(everything: Path) -> None:
+def test_restoring_or_resetting_the_state_repeats_a_flight_bit_for_bit(everything: Path) -> None:
     sim = flight(Fmu(everything, "drone1", MAP))
     sim.run(5.0)
     snapshot = sim.snapshot()
@@ -112,7 +112,7 @@ def test_the_state_is_given_and_taken_back_to_the_same_bits(everything: Path) ->
     assert sim.truth.position_m.tobytes() == first
 
 
-def test_an_fmu_without_states_says_so_and_cannot_be_restored(tmp_path: Path) -> None:
+def test_an_fmu_without_state_access_reports_it_and_has_no_snapshot(tmp_path: Path) -> None:
     said: list[str] = []
     path = fmus.build(tmp_path, "Stateless", 3, EVERYTHING, LAW, restores=False)
     sim = flight(Fmu(path, "drone1", MAP, say=said.append))
@@ -121,7 +121,7 @@ def test_an_fmu_without_states_says_so_and_cannot_be_restored(tmp_path: Path) ->
         sim.snapshot()
 
 
-def test_elements_of_an_array_of_fmi_2_are_mapped_as_one(everything: Path) -> None:
+def test_elements_of_an_array_of_fmi_2_are_mapped_together(everything: Path) -> None:
     sim = flight(Fmu(everything, "drone1", {**MAP, "p": "truth.position_m"}))
     sim.run(5.0)
     agent = next(agent for agent in sim._flight.agents if agent.name == "fmu.drone1")
@@ -129,7 +129,7 @@ def test_elements_of_an_array_of_fmi_2_are_mapped_as_one(everything: Path) -> No
     assert read == list(agent._latest[keys.truth("drone1")].position_m)  # type: ignore[attr-defined]
 
 
-def test_units_are_converted_where_both_are_of_one_quantity_and_said(tmp_path: Path) -> None:
+def test_units_of_one_quantity_are_converted_and_reported(tmp_path: Path) -> None:
     variables = """
 variable("yaw", 0.0, I, unit="deg")
 variable("height", 0.0, I, unit="K")
@@ -154,7 +154,7 @@ variable("vx", 0.0, O, unit="km/h")
     assert has_terms(text, "vx=velocity_m_s.0:", "km/h", "m/s", "converted")
 
 
-def test_an_fmu_is_an_estimator_in_the_place_of_the_stock_one(tmp_path: Path) -> None:
+def test_an_fmu_replaces_the_stock_estimator(tmp_path: Path) -> None:
     variables = """
 variable("p", [0.0] * 3, I)
 variable("v", [0.0] * 3, I)
@@ -173,7 +173,7 @@ variable("yaw", 0.0, O)
     assert np.allclose(sim.estimates.orientation_wxyz[0], (math.cos(0.5), 0.0, 0.0, math.sin(0.5)), atol=1e-15)
 
 
-def test_its_step_is_a_multiple_of_the_gate(everything: Path) -> None:
+def test_the_step_of_an_fmu_may_be_a_multiple_of_the_gate(everything: Path) -> None:
     sent = commands_of(flight(Fmu(everything, "drone1", MAP, period_s=0.1)))
     assert sent
     assert {command.t_ns % 100_000_000 for command in sent} == {0}
@@ -186,7 +186,7 @@ def test_its_step_is_a_multiple_of_the_gate(everything: Path) -> None:
         (8.0, "output yaw_rate is nan; must be finite"),
     ],
 )
-def test_what_a_running_fmu_does_amiss_ends_the_flight_with_its_name_and_the_gate(
+def test_a_fault_of_a_running_fmu_ends_the_flight_with_name_and_time(
     everything: Path, gain: float, reason: str
 ) -> None:
     fmu = Fmu(everything, "drone1", {**MAP, "yaw_rate": "yaw_rate_rad_s"}, param={"gain": gain}, say=lambda line: None)
@@ -227,13 +227,15 @@ REFUSALS: list[tuple[Any, dict[str, Any], tuple[str, ...]]] = [
 
 
 @pytest.mark.parametrize(("mapping", "more", "terms"), REFUSALS, ids=[" ".join(terms) for _, _, terms in REFUSALS])
-def test_refuses_in_one_line(everything: Path, mapping: Any, more: dict[str, Any], terms: tuple[str, ...]) -> None:
+def test_a_bad_mapping_or_option_is_refused_in_one_line(
+    everything: Path, mapping: Any, more: dict[str, Any], terms: tuple[str, ...]
+) -> None:
     with refused(RunError, *terms) as raised:
         flight(Fmu(everything, **{"drone": "drone1", "map": mapping, **more}))
     assert "\n" not in str(raised.value)
 
 
-def test_a_file_that_is_no_such_fmu_is_refused(tmp_path: Path, waypoint: Path) -> None:
+def test_a_file_that_is_no_usable_fmu_is_refused(tmp_path: Path, waypoint: Path) -> None:
     def refuses(path: Path, *terms: str) -> None:
         with refused(RunError, path.name, *terms):
             FmuModel(path)
@@ -256,7 +258,7 @@ def test_a_file_that_is_no_such_fmu_is_refused(tmp_path: Path, waypoint: Path) -
 
 
 def rewritten(fmu: Path, path: Path, change: Callable[[str], str], without: str = "\0") -> Path:
-    """Write an FMU with another description, and without the files whose names hold a text; return its path."""
+    """Write an FMU with a changed description, without the files whose names contain a text; return its path."""
     with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(path, "w") as target:
         for name in source.namelist():
             content = source.read(name)

@@ -1,4 +1,4 @@
-"""The parts of the gateway that know neither sockets nor Zenoh."""
+"""The parts of the gateway that use neither sockets nor Zenoh."""
 
 import asyncio
 import json
@@ -63,14 +63,14 @@ def info(mode: Literal["lockstep", "realtime"] = "lockstep") -> Info:
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False), st.integers(0, 2**63 - 1))
-def test_json_has_every_field_and_comes_back_to_the_same_bytes(number: float, t_ns: int):
+def test_json_has_every_field_and_converts_back_to_the_same_bytes(number: float, t_ns: int):
     sent = messages.encode(Velocity(t_ns, 3, "pilot", (number, -0.0, 1e-300), 0.1))
     value = json.loads(payload_to_json(VELOCITY, sent))
     assert value["frame"] == "heading"
     assert json_to_payload(VELOCITY, value) == sent
 
 
-def test_whole_numbers_may_come_as_doubles_but_not_as_fractions():
+def test_integers_may_be_sent_as_doubles_but_not_as_fractions():
     value = {"t_ns": 2e7, "seq": 0.0, "source": "m", "velocity_m_s": [0, 1, 2], "yaw_rate_rad_s": 0}
     assert messages.decode(VELOCITY, json_to_payload(VELOCITY, value)).t_ns == 20_000_000
     for t_ns, term in ((0.5, "0.5"), (1e30, "1e…")):
@@ -78,7 +78,7 @@ def test_whole_numbers_may_come_as_doubles_but_not_as_fractions():
             json_to_payload(VELOCITY, {**value, "t_ns": t_ns})
 
 
-def test_lists_in_each_other_without_end_are_refused():
+def test_deeply_nested_lists_are_refused():
     nested: Any = 1
     for _ in range(5000):
         nested = [nested]
@@ -92,15 +92,15 @@ def test_lists_in_each_other_without_end_are_refused():
         (msgspec.msgpack.encode({"a": b"\x00\x01"}), {"a": "AAE="}),
         (msgspec.msgpack.encode([1, "x", None]), [1, "x", None]),
         (b"\xc1 no msgpack", "wSBubyBtc2dwYWNr"),
-        (b"\xca\x7f\x80\x00\x00", None),  # infinity, which JSON cannot say
+        (b"\xca\x7f\x80\x00\x00", None),  # infinity, which JSON cannot represent
     ],
 )
-def test_what_the_contract_does_not_know_is_shown_as_well_as_json_can(payload: bytes, text: Any):
+def test_payloads_of_unknown_keys_are_shown_as_far_as_json_allows(payload: bytes, text: Any):
     assert json.loads(payload_to_json("my/key", payload)) == text
 
 
 @pytest.mark.parametrize("payload", [b"\xc0", msgspec.msgpack.encode({"t_ns": 1}), b"\xc1 no msgpack", b""])
-def test_what_is_no_message_of_its_key_is_not_shown(payload: bytes):
+def test_a_payload_that_is_no_message_of_its_key_is_not_shown(payload: bytes):
     assert not is_sound(VELOCITY, payload)
     with pytest.raises(DecodeError):
         payload_to_json(VELOCITY, payload)
@@ -109,22 +109,22 @@ def test_what_is_no_message_of_its_key_is_not_shown(payload: bytes):
     assert is_sound("my/key", payload)
 
 
-def test_results_that_json_cannot_say_are_base64_and_a_deleted_key_is_null():
+def test_values_unknown_to_json_become_base64_and_a_deleted_key_null():
     assert json_value({"a": 1}) == {"a": 1}
     assert isinstance(json_value(msgspec.msgpack.Ext(1, b"x")), str)
     line = value_line(RawSample("DELETE", "my/key", b"", "zenoh/bytes", None))
     assert json.loads(line) == {"op": "value", "key": "my/key", "value": None}
 
 
-def test_time_number_and_source_are_filled_in_where_they_are_left_out():
+def test_missing_time_sequence_number_and_source_are_filled_in():
     defaults = MessageDefaults("client.a")
     first = defaults.fill(VELOCITY, {"velocity_m_s": [0, 0, 0]}, 40)
     assert first == {"t_ns": 40, "seq": 0, "source": "client.a", "velocity_m_s": [0, 0, 0]}
     assert defaults.fill(VELOCITY, {"seq": 7, "source": "b"}, 40) == {"t_ns": 40, "seq": 7, "source": "b"}
     assert defaults.fill(VELOCITY, {"seq": 2**63 - 1}, 40)["seq"] == 2**63 - 1
-    with suppress(ZeroDivisionError), defaults.transaction():  # what is refused takes no number
+    with suppress(ZeroDivisionError), defaults.transaction():  # a refused message uses no number
         defaults.fill(VELOCITY, {}, 1 // 0 if defaults.fill(VELOCITY, {}, 0) else 0)
-    assert defaults.fill(VELOCITY, {}, 60)["seq"] == 1  # one's own count goes on
+    assert defaults.fill(VELOCITY, {}, 60)["seq"] == 1  # the sender's own count continues
     assert defaults.fill("drone/drone1/cmd/mode", {}, 60)["seq"] == 0
     assert defaults.fill("my/key", {}, 60) == {}
     assert defaults.fill(VELOCITY, [1], 60) == [1]
@@ -133,7 +133,7 @@ def test_time_number_and_source_are_filled_in_where_they_are_left_out():
 # Last values
 
 
-def test_last_values_are_the_newest_of_what_passed():
+def test_last_values_are_the_newest_of_each_key():
     table = key_table(("drone1", "drone2"))
     values = LastValues(table)
     entries = [
@@ -155,20 +155,20 @@ def values() -> LastValues:
     return LastValues(key_table(("drone1",)))
 
 
-def test_values_of_ones_own_have_a_bound_in_bytes(monkeypatch: pytest.MonkeyPatch, values: LastValues):
+def test_own_values_are_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch, values: LastValues):
     monkeypatch.setattr(run_access, "OWN_BYTES_MAX", 10)
     values.add("a", b"12345678")
     values.add_own("b", b"12", "text/plain")
     values.add("c", b"1")
     assert [key for key, _ in values.matching("*")] == ["a", "b"]
-    values.add("b", b"123")  # does not fit any more: no value is better than an old one
+    values.add("b", b"123")  # no longer fits: no value is better than an old one
     assert (values.matching("b"), values.encoding("b")) == ([], "application/msgpack")
     values.drop("a")
     values.add("c", b"1234567890")
     assert [key for key, _ in values.matching("*")] == ["c"]
 
 
-def test_an_echo_does_not_undo_what_was_said_since(values: LastValues):
+def test_an_echo_does_not_overwrite_a_later_value(values: LastValues):
     def echoed(payload: bytes) -> list[bytes]:
         values.add_passed("my/own", payload)
         return [entries for _, entries in values.matching("my/own")]
@@ -176,25 +176,25 @@ def test_an_echo_does_not_undo_what_was_said_since(values: LastValues):
     values.add_own("my/own", b"1", "text/plain")
     values.add_own("my/own", b"2", "text/plain")
     assert (echoed(b"1"), values.encoding("my/own")) == ([b"2"], "text/plain")
-    assert echoed(b"other") == [b"other"]  # it came to the world before ours
+    assert echoed(b"other") == [b"other"]  # another sender's, which reached the world before ours
     assert echoed(b"2") == [b"2"]
     values.add_own("my/own", b"3")
     values.drop("my/own")
     assert echoed(b"3") == []
-    assert echoed(b"3") == [b"3"]  # somebody else's
+    assert echoed(b"3") == [b"3"]  # another sender's
     values.drop("my/own")
     assert echoed(b"3") == [b"3"]
     for payload in (b"lost", b"1"):
         values.add_own("my/own", payload)
-    assert [echoed(b"1"), echoed(b"lost")][1] == [b"lost"]  # an echo that never came is forgotten with the next
+    assert [echoed(b"1"), echoed(b"lost")][1] == [b"lost"]  # the next echo discards one that never came
 
 
-def test_echoes_that_are_waited_for_have_a_bound():
+def test_expected_echoes_are_bounded():
     echoes = EchoFilter(keys_max=1)
     for i in range(1000):
         echoes.add("a", b"%d" % i)
     assert [echoes.is_stale("a", each) for each in (b"0", b"998", b"999")] == [False, True, False]
-    for key in ("a", "b"):  # echoes of more keys than may be are taken as news
+    for key in ("a", "b"):  # echoes beyond the limit of keys count as new values
         for payload in (b"1", b"2"):
             echoes.add(key, payload)
     assert [echoes.is_stale(key, b"1") for key in ("a", "b")] == [True, False]
@@ -217,7 +217,7 @@ def test_echoes_that_are_waited_for_have_a_bound():
         ("my/key", ("GET", "PUT", "POST")),
     ],
 )
-def test_clients_speak_where_nobody_else_does(key: str, allowed: tuple[str, ...]):
+def test_clients_may_write_only_keys_that_no_role_owns(key: str, allowed: tuple[str, ...]):
     assert methods_of(key) == allowed
     assert is_control_key(key) == (allowed == ("POST",))
     assert is_reserved(key) == ("PUT" not in allowed)
@@ -239,18 +239,18 @@ def test_clients_speak_where_nobody_else_does(key: str, allowed: tuple[str, ...]
         b"[" * 100_000,
     ],
 )
-def test_what_is_no_request_is_refused(line: bytes):
+def test_an_invalid_request_is_refused(line: bytes):
     with pytest.raises(DecodeError, match="request: "):
         decode_request(line)
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_are_more_than_refused(line: bytes):
+def test_any_bytes_are_decoded_or_refused(line: bytes):
     with suppress(DecodeError):
         decode_request(line)
 
 
-def test_a_bucket_lets_a_burst_through_and_then_its_rate():
+def test_a_rate_limit_admits_a_burst_and_then_its_rate():
     now = [0.0]
     limit = RateLimit(0.1, 3.0, lambda: now[0])
     for _ in range(3):
@@ -261,7 +261,7 @@ def test_a_bucket_lets_a_burst_through_and_then_its_rate():
     count_request(limit)
 
 
-def test_a_limit_lets_so_many_in():
+def test_a_client_limit_admits_only_its_number_of_clients():
     limit = ClientLimit(1)
     limit.enter()
     with pytest.raises(TooManyError):
@@ -271,7 +271,7 @@ def test_a_limit_lets_so_many_in():
 
 
 class FakeGateway:
-    """Of one client, without a run."""
+    """A gateway with one client and without a run."""
 
     name = "gateway.main"
 
@@ -293,13 +293,13 @@ class FakeGateway:
         return [json.loads(line) for line in asyncio.run(ask())]
 
 
-def test_a_client_that_floods_is_slowed_down_and_told():
+def test_a_flooding_client_is_limited_and_told_when_to_try_again():
     entries = FakeGateway().answers(*[b'{"op": "hello"}'] * 4)
     assert [message["op"] for message in entries] == ["hello"] * 3 + ["error"]
     assert "1.000 s" in entries[-1]["error"]
 
 
-def test_a_client_has_the_name_of_a_process_other_than_the_gateway():
+def test_a_client_needs_a_valid_name_other_than_that_of_the_gateway():
     for name, own in {"myctrl": "client.myctrl", "matlab.main": "matlab.main"}.items():
         assert FakeGateway().answers(b'{"op": "hello", "name": "%b"}' % name.encode())[0]["name"] == own
     for op in (b'"hello"', b'"join", "period_s": 0.02'):
@@ -308,7 +308,7 @@ def test_a_client_has_the_name_of_a_process_other_than_the_gateway():
             assert has_terms(answer["error"], "name", f"'{name}'"), answer
 
 
-def test_a_fault_of_ours_is_an_answer_and_a_line_for_a_person():
+def test_an_internal_error_is_answered_and_reported():
     gateway = FakeGateway()
     (answer,) = gateway.answers(b'{"op": "subscribe", "key": "a"}')  # this gateway has no feed
     assert "AttributeError" in answer["error"]
@@ -316,7 +316,9 @@ def test_a_fault_of_ours_is_an_answer_and_a_line_for_a_person():
 
 
 @pytest.mark.parametrize(("droppable", "left", "cuts"), [(True, [b"lost 3\n", b"abc3", b"abc4"], 0), (False, None, 1)])
-def test_a_full_outbox_loses_the_oldest_values_but_no_answers(droppable: bool, left: list[bytes] | None, cuts: int):
+def test_a_full_outbox_drops_old_values_but_cuts_off_rather_than_lose_answers(
+    droppable: bool, left: list[bytes] | None, cuts: int
+):
     cut: list[str] = []
 
     async def fill() -> list[bytes]:
@@ -338,7 +340,7 @@ ESTIMATES = ("drone/drone1/estimate", "drone/drone2/estimate")
 
 
 class LockstepLines(LockstepSession):
-    """A session in a run, whose loop is now; it keeps the lines that it sends."""
+    """A session in a run whose event loop calls at once; it records the lines that it sends."""
 
     def __init__(
         self,
@@ -369,18 +371,18 @@ class LockstepLines(LockstepSession):
         (["**"], "eye.one", (), (*(f"drone/drone{k}/{what}" for k in (1, 2) for what in ("sensor/status", "truth")),)),
     ],
 )
-def test_what_closes_the_gates_of_a_session_comes_at_every_gate_and_is_not_its_own(
+def test_the_gate_keys_of_a_session_come_every_gate_from_other_processes(
     reads: list[str], name: str, required: Any, gates: tuple[str, ...]
 ):
     assert sorted(gate_keys_of(info(), reads, name, required)) == sorted(gates)
 
 
-def test_an_agent_reads_what_closes_its_gates_and_counts_the_sensors_that_it_takes():
+def test_an_agent_reads_its_gate_keys_and_counts_its_sensors():
     session = LockstepLines(reads=["drone/drone1/sensor/*"], gates=["clock"])
     assert (session.reads, session.counted) == (("drone/drone1/sensor/*", "clock"), ("drone1",))
 
 
-def test_a_step_hands_over_what_came_and_returns_the_answer():
+def test_a_step_passes_the_inputs_and_returns_the_answer():
     session = LockstepLines()
     session.receive("drone/drone1/estimate", "e")
     session.reply(["out"])
@@ -390,7 +392,7 @@ def test_a_step_hands_over_what_came_and_returns_the_answer():
     assert session.step(60) == []
 
 
-def test_in_realtime_a_late_gate_goes_with_a_newer_one():
+def test_in_realtime_a_late_gate_is_merged_into_the_next():
     session = LockstepLines(mode="realtime")
     session.run.now_ns = 10 * GATE_NS  # type: ignore[misc]
     session.receive("a", 1)
@@ -410,7 +412,7 @@ def test_in_realtime_a_late_gate_goes_with_a_newer_one():
         ({"gates": ["drone/*/truth"]}, ("gates…",)),
     ],
 )
-def test_an_invalid_join_is_refused_by_its_field(given: dict[str, Any], terms: tuple[str, ...]):
+def test_an_invalid_join_is_refused_with_its_field(given: dict[str, Any], terms: tuple[str, ...]):
     with refused(DecodeError, *terms):
         LockstepLines(**given)
 
@@ -421,13 +423,15 @@ def test_an_invalid_join_is_refused_by_its_field(given: dict[str, Any], terms: t
 @pytest.mark.parametrize(
     ("connected", "fault", "raised"),
     [
-        (False, RuntimeError("Connection closed."), ConnectionResetError),  # a body that is cut: no line of it
+        (False, RuntimeError("Connection closed."), ConnectionResetError),  # the body was cut off: nothing to report
         (True, RuntimeError("a fault"), None),
         (False, KeyError("a fault"), None),
         (False, ValueError("x"), None),
     ],
 )
-def test_a_fault_of_the_gateway_is_printed(connected: bool, fault: Exception, raised: Any) -> None:
+def test_an_internal_error_is_reported_unless_the_client_has_left(
+    connected: bool, fault: Exception, raised: Any
+) -> None:
     reported: list[str] = []
     request = make_mocked_request("PUT", "/json/mine", headers={"Host": "localhost"})
     if not connected:
@@ -454,13 +458,13 @@ def test_a_fault_of_the_gateway_is_printed(connected: bool, fault: Exception, ra
         ("text/plain", b"", None),
     ],
 )
-def test_values_are_described_as_the_plugin_does(encoding: str, payload: bytes, value: Any):
+def test_values_are_described_as_the_rest_plugin_of_zenoh_does(encoding: str, payload: bytes, value: Any):
     entries = described_sample(RawSample("PUT", "zsim/a", payload, encoding, None))
     assert entries == {"key": "zsim/a", "value": value, "encoding": encoding, "timestamp": None}
     assert described_sample(RawSample("ERROR", "", b"no", encoding, None))["key"] == "ERROR"
 
 
-def test_the_description_has_every_message_and_where_clients_speak():
+def test_the_description_has_every_message_and_the_writable_keys():
     paths = description()["paths"]
     for shape in messages.types_by_shape():
         kind, _, rest = shape.partition("/*")
@@ -470,7 +474,7 @@ def test_the_description_has_every_message_and_where_clients_speak():
     assert "post" in paths["/json/world/control"]
     json.dumps(description())
     sent = description()["components"]["schemas"]["VelocitySent"]
-    assert sent["required"] == ["velocity_m_s", "yaw_rate_rad_s"]  # not what is filled in
+    assert sent["required"] == ["velocity_m_s", "yaw_rate_rad_s"]  # without the fields that the gateway fills in
     velocity = sent["properties"]["velocity_m_s"]
     assert (velocity["minItems"], velocity["maxItems"], velocity["items"]["maximum"]) == (3, 3, sys.float_info.max)
 
@@ -484,7 +488,7 @@ def sample(number: int, data: bytes | None = None) -> RawSample:
 
 
 class Publisher:
-    """Counts subscriptions, and publishes to those that are there."""
+    """Counts subscriptions and publishes to the current subscribers."""
 
     def __init__(self) -> None:
         self.subscribers: list[Callable[[RawSample], None]] = []
@@ -501,7 +505,7 @@ class Publisher:
             subscriber(published)
 
 
-def test_who_comes_late_gets_the_newest_and_nothing_twice() -> None:
+def test_a_late_viewer_gets_the_newest_picture_and_none_twice() -> None:
     async def look() -> list[int | None]:
         feed = PictureFeed(FRONT, lambda reason: None)
         for number in range(5):
@@ -516,7 +520,7 @@ def test_who_comes_late_gets_the_newest_and_nothing_twice() -> None:
     assert asyncio.run(look()) == [4, None, 9]
 
 
-def test_who_waits_gets_the_next_picture() -> None:
+def test_a_waiting_viewer_gets_the_next_picture() -> None:
     async def look() -> int:
         feed = PictureFeed(FRONT, lambda reason: None)
         waiting = asyncio.create_task(feed.after(-1, 60.0))
@@ -530,7 +534,7 @@ def test_who_waits_gets_the_next_picture() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG)), b""])
-def test_what_is_no_picture_is_refused_and_not_shown(payload: bytes) -> None:
+def test_an_invalid_picture_is_refused_and_not_shown(payload: bytes) -> None:
     refused: list[str] = []
 
     async def look() -> PictureFeed:
@@ -546,7 +550,7 @@ def test_what_is_no_picture_is_refused_and_not_shown(payload: bytes) -> None:
     assert refused[0].startswith(FRONT)
 
 
-def test_a_hundred_who_look_cost_one_subscription_and_it_ends_after_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_viewers_share_one_subscription_which_ends_with_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client_streams, "LINGER_S", 0.0)
     publisher = Publisher()
 
@@ -564,14 +568,14 @@ def test_a_hundred_who_look_cost_one_subscription_and_it_ends_after_the_last(mon
         publisher.publish(sample(0))
         await asyncio.gather(*watchers)
         closed = asyncio.Event()
-        asyncio.get_running_loop().call_later(0.0, closed.set)  # after what the watchers had called later
+        asyncio.get_running_loop().call_later(0.0, closed.set)  # runs after the calls that the watchers scheduled
         await closed.wait()
         return [*counts, len(publisher.subscribers)]
 
     assert asyncio.run(look()) == [1, 0]
 
 
-def test_pictures_of_another_run_are_forgotten() -> None:
+def test_pictures_of_an_earlier_run_are_dropped() -> None:
     async def look() -> bool:
         publisher = Publisher()
         feeds = PictureFeeds(publisher.subscribe, lambda reason: None)
@@ -584,7 +588,7 @@ def test_pictures_of_another_run_are_forgotten() -> None:
     assert asyncio.run(look())
 
 
-def test_a_part_ends_with_the_boundary() -> None:
+def test_a_part_has_its_headers_and_ends_with_the_boundary() -> None:
     head, _, rest = picture_part(image(20 * MS)).partition(b"\r\n\r\n")
     assert rest == jpeg() + f"\r\n--{BOUNDARY}\r\n".encode()
     assert b"Content-Length: %d" % len(jpeg()) in head

@@ -1,4 +1,4 @@
-"""Which states of a run the gateway sends to its clients, by what its world and its link do."""
+"""The states of a run that the gateway reports to its clients, and the limit of unauthenticated clients."""
 
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ from zsim_bridges.gateway.gateway_server import UNAUTHENTICATED_MAX, Gateway, Ga
 
 
 class StateLog:
-    """A client that keeps the states that it is sent."""
+    """A client that records the states that it is sent."""
 
     def __init__(self) -> None:
         self.states: list[tuple[str, str]] = []
@@ -35,7 +35,7 @@ def log(gateway: Gateway) -> StateLog:
     return log
 
 
-def test_the_oldest_client_without_the_token_makes_room_for_the_next(gateway: Gateway) -> None:
+def test_the_oldest_unauthenticated_client_makes_room_for_the_next(gateway: Gateway) -> None:
     outboxes = [Outbox(lambda: None, lambda count: b"") for _ in range(UNAUTHENTICATED_MAX + 1)]
     clients = [gateway._new_client(outbox, authenticated=False) for outbox in outboxes]
     lines = [gateway.loop.run_until_complete(outbox.take()) for outbox in (outboxes[0],)]
@@ -47,10 +47,10 @@ def test_the_oldest_client_without_the_token_makes_room_for_the_next(gateway: Ga
     gateway.admit(clients[-1])
 
 
-def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost(gateway: Gateway, log: StateLog) -> None:
+def test_a_world_that_leaves_after_the_end_of_its_run_is_not_lost(gateway: Gateway, log: StateLog) -> None:
     first = a_run("first")
     gateway._begin(first)
-    for up in (True, False, True):  # the link is up at first, which is no news
+    for up in (True, False, True):  # a link that is up at the beginning is not reported
         gateway._notify_link(first, up)
     gateway._end(first)
     gateway._notify_link(first, False)
@@ -65,21 +65,21 @@ def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost(gateway: Gateway
     ]
 
 
-def test_a_link_is_back_before_its_run_ends_by_another_one(gateway: Gateway, log: StateLog) -> None:
+def test_a_lost_link_is_back_before_another_run_ends_its_run(gateway: Gateway, log: StateLog) -> None:
     first = a_run("first")
     gateway._begin(first)
     gateway._notify_link(first, False)
     gateway._end(first, another=True)
-    gateway._notify_link(first, True)  # the link's own report, late
+    gateway._notify_link(first, True)  # the late report of the link itself
     assert [state for state, _ in log.states] == ["begun", "lost", "back", "ended"]
 
 
-def test_a_link_that_was_lost_before_it_was_observed_is_reported(gateway: Gateway, log: StateLog) -> None:
-    """A world may die between the first words of a run and the first look at its link."""
+def test_a_link_lost_before_it_is_observed_is_reported(gateway: Gateway, log: StateLog) -> None:
+    """A world may die between the beginning of a run and the first check of its link."""
 
     class DeadLink:
         def on_link(self, callback: Any) -> None:
-            pass  # there is no link, and so no event of it
+            pass  # without a link, there is no event
 
         def links(self) -> int:
             return 0

@@ -1,4 +1,4 @@
-"""A vehicle is flown from the ground to the ground, PX4 and ArduPilot; nothing is sent that was not demanded."""
+"""A session with a fake PX4 or ArduPilot autopilot: flights, take-overs, link figures, axes and units of readings."""
 
 import itertools
 import math
@@ -22,7 +22,7 @@ AUTOPILOTS = pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
 
 
 class Loop:
-    """A session and its vehicle, joined by a link without delay."""
+    """A session and its vehicle, connected without delay."""
 
     def __init__(self, autopilot: int, height_m: float = 2.0) -> None:
         self.vehicle = FakeAutopilot(autopilot)
@@ -57,7 +57,7 @@ class Loop:
 
 
 @AUTOPILOTS
-def test_a_flight_from_the_ground_to_the_ground(autopilot: int):
+def test_a_flight_runs_from_take_off_to_landing(autopilot: int):
     loop = Loop(autopilot)
     loop.run(1)
     assert loop.session.state.state == "landed"
@@ -77,7 +77,7 @@ def test_a_flight_from_the_ground_to_the_ground(autopilot: int):
 
 
 @AUTOPILOTS
-def test_nothing_that_starts_or_steers_a_motor_is_sent_unasked(autopilot: int):
+def test_nothing_that_moves_the_vehicle_is_sent_without_a_demand(autopilot: int):
     loop = Loop(autopilot)
     loop.run(20)
     kinds = {type(message) for message in loop.sent}
@@ -86,7 +86,7 @@ def test_nothing_that_starts_or_steers_a_motor_is_sent_unasked(autopilot: int):
 
 
 @AUTOPILOTS
-def test_a_command_that_is_lost_is_sent_again(autopilot: int):
+def test_a_lost_command_is_sent_again(autopilot: int):
     loop = Loop(autopilot)
     loop.run(1)
     loop.cut = True
@@ -96,11 +96,11 @@ def test_a_command_that_is_lost_is_sent_again(autopilot: int):
 
 
 @AUTOPILOTS
-def test_a_pilot_who_takes_over_is_left_alone_until_the_next_take_off(autopilot: int):
+def test_after_a_pilot_takes_over_nothing_is_sent_until_the_next_take_off(autopilot: int):
     loop = Loop(autopilot)
     loop.until("hovering", Demand("take_off"))
     loop.run(2, Demand("hold"))
-    loop.vehicle.mode = 3 << 16 if autopilot == PX4 else 5  # position, loiter
+    loop.vehicle.mode = 3 << 16 if autopilot == PX4 else 5  # the modes POSITION and LOITER
     loop.run(1, Demand("hold"))
     loop.sent.clear()
     loop.run(5, Demand("fly", (1.0, 0.0, 0.0)))
@@ -118,8 +118,8 @@ def test_a_pilot_who_takes_over_is_left_alone_until_the_next_take_off(autopilot:
 
 @AUTOPILOTS
 @pytest.mark.parametrize("landed", [IN_AIR, LANDING])
-def test_who_is_landed_by_somebody_else_is_not_led_back(autopilot: int, landed: int):
-    """Also before its landed state shows it."""
+def test_a_landing_commanded_elsewhere_is_not_overridden(autopilot: int, landed: int):
+    """This holds even before the landed state shows the landing."""
     loop = Loop(autopilot)
     loop.until("hovering", Demand("take_off"))
     loop.run(2, Demand("hold"))
@@ -133,7 +133,7 @@ def test_who_is_landed_by_somebody_else_is_not_led_back(autopilot: int, landed: 
 
 
 @AUTOPILOTS
-def test_a_landing_of_its_own_is_no_take_over(autopilot: int):
+def test_a_demanded_landing_is_no_take_over(autopilot: int):
     loop = Loop(autopilot)
     loop.until("hovering", Demand("take_off"))
     loop.run(2, Demand("hold"))
@@ -143,7 +143,7 @@ def test_a_landing_of_its_own_is_no_take_over(autopilot: int):
     assert not any("control" in text for text in loop.session.texts)
 
 
-def test_an_autopilot_that_fell_back_to_hold_is_led_back():
+def test_an_autopilot_that_fell_back_to_hold_is_switched_back_to_offboard():
     loop = Loop(PX4)
     loop.until("hovering", Demand("take_off"))
     loop.run(2, Demand("hold"))
@@ -155,7 +155,7 @@ def test_an_autopilot_that_fell_back_to_hold_is_led_back():
     assert loop.pose.velocity_m_s[0] == pytest.approx(1.0, abs=0.01)
 
 
-def test_kill_is_repeated_until_the_motors_stand():
+def test_kill_is_repeated_until_the_motors_stop():
     loop = Loop(PX4)
     loop.until("hovering", Demand("take_off"))
     loop.sent.clear()
@@ -169,7 +169,7 @@ def test_kill_is_repeated_until_the_motors_stand():
     assert not loop.vehicle.armed
 
 
-def test_a_changed_setpoint_is_sent_at_once_and_one_that_holds_is_repeated():
+def test_a_changed_setpoint_is_sent_at_once_and_the_current_one_repeated():
     loop = Loop(PX4)
     loop.until("hovering", Demand("take_off"))
     loop.run(1, Demand("hold"))
@@ -182,7 +182,7 @@ def test_a_changed_setpoint_is_sent_at_once_and_one_that_holds_is_repeated():
     assert len(loop.vehicle.setpoints) - count >= 49
 
 
-def test_the_first_autopilot_or_the_one_asked_for_is_the_vehicle_and_others_are_refused():
+def test_the_first_or_the_requested_autopilot_is_accepted_and_no_other():
     loop = Loop(PX4)
     loop.run(1)
     stranger = Link(9, 1)
@@ -199,7 +199,7 @@ def test_the_first_autopilot_or_the_one_asked_for_is_the_vehicle_and_others_are_
 
 
 @pytest.mark.parametrize(("key", "flies"), [(KEY, True), (bytes(32), False)], ids=["the same key", "another"])
-def test_with_a_key_both_sides_sign(key: bytes, flies: bool):
+def test_with_a_key_both_sides_must_sign(key: bytes, flies: bool):
     now_s = 1.8e9
     signing = Signing(KEY)
     signing.advance(now_s)
@@ -212,7 +212,7 @@ def test_with_a_key_both_sides_sign(key: bytes, flies: bool):
     assert (loop.session.figures().refused > 100) is not flies
 
 
-def test_loss_round_trip_and_offset_are_measured():
+def test_message_loss_round_trip_and_clock_offset_are_measured():
     loop = Loop(PX4)
     loop.run(5)
     figures = loop.session.figures()
@@ -249,7 +249,7 @@ def telemetry(*messages: Any) -> TelemetryReadings:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_attitudes_agree_with_scipys_rotations(seed: int):
+def test_attitudes_agree_with_the_rotations_of_scipy(seed: int):
     q_NF = Rotation.random(rng=np.random.default_rng(seed))
     x, y, z, w = q_NF.as_quat()
     ned_to_enu = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -261,14 +261,14 @@ def test_attitudes_agree_with_scipys_rotations(seed: int):
     assert np.abs(dialect.attitude_ned(turned)) == pytest.approx(np.abs([w, x, y, z]), abs=1e-12)
 
 
-def test_vectors_and_headings():
+def test_vectors_and_headings_are_converted_between_frames():
     assert dialect.ned((1, 2, 3)) == (2, 1, -3)
     assert dialect.frd((1, 2, 3)) == (1, -2, -3)
     assert dialect.yaw_ned(math.pi / 2) == pytest.approx(0.0)
     assert dialect.yaw_ned(dialect.yaw_ned(0.7)) == pytest.approx(0.7)
 
 
-def test_a_pose_stands_in_w_where_the_vehicles_own_origin_is():
+def test_a_pose_in_w_accounts_for_the_origin_of_the_vehicle():
     origin = dialect.GpsGlobalOrigin(-345930000, -583680000, 35000)  # 0.01 deg north, 10 m higher
     north = dialect.AttitudeQuaternion(0, 1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3)
     made = telemetry(origin, north, dialect.LocalPositionNed(0, 1.0, 2.0, -3.0, 0.5, 0.25, -0.125)).pose
@@ -300,7 +300,7 @@ READINGS: dict[str, tuple[Any, str, tuple]] = {
 
 
 @pytest.mark.parametrize("name", READINGS)
-def test_readings_have_our_units_and_axes(name: str):
+def test_readings_are_converted_to_si_units_and_body_axes(name: str):
     message, sensor, expected = READINGS[name]
     (reading,) = telemetry(message).readings
     assert reading.sensor == sensor
@@ -313,10 +313,10 @@ def test_readings_have_our_units_and_axes(name: str):
     [
         dialect.LocalPositionNed(0, math.nan),
         dialect.HighresImu(5, xacc=math.inf, fields_updated=0x3F),
-        dialect.VfrHud(),  # a kind that is not read
+        dialect.VfrHud(),  # a message that is not used
     ],
 )
-def test_what_is_no_reading_is_left_out(message: Any):
+def test_invalid_and_unused_messages_give_no_reading(message: Any):
     made = TelemetryReadings(ORIGIN)
     made.receive(message, 0)
     assert made.readings == []

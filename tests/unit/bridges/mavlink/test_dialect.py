@@ -1,4 +1,4 @@
-"""Frames: whole, cut, damaged, foreign, signed; the codec against pymavlink's generated dialect, the authority."""
+"""MAVLink frames: whole, truncated, damaged, foreign and signed; the codec against the reference, pymavlink's dialect."""
 
 import os
 import random
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-os.environ["MAVLINK20"] = "1"  # pymavlink reads it when it is imported
+os.environ["MAVLINK20"] = "1"  # pymavlink reads it on import
 from mavlink_values import random_message
 from pymavlink.dialects.v10 import ardupilotmega as dialect_1
 from pymavlink.dialects.v20 import ardupilotmega as dialect_2
@@ -31,14 +31,14 @@ KEY, OTHER = b"k" * 32, b"o" * 32
 HEARTBEAT = dialect.Heartbeat(type=2)
 MESSAGES = [HEARTBEAT, dialect.Statustext(6, "hello"), dialect.Attitude(1, 0.5), dialect.Ping()]
 SEED = 17
-COMMAND_CANCEL = 80  # in common.xml, not in the authority's release
-COMMAND_CANCEL_CRC_EXTRA = 14  # of the C library's table
+COMMAND_CANCEL = 80  # in common.xml, but not in the release of the reference
+COMMAND_CANCEL_CRC_EXTRA = 14  # from the table of the C library
 LAYOUTS = [BY_ID[id_] for id_ in sorted(BY_ID) if id_ != COMMAND_CANCEL]
 LAYOUTS_1 = [layout for layout in LAYOUTS if layout.id <= dialect.ID_MAX_1]
 
 
-def test_the_checksum_is_mcrf4xx() -> None:
-    assert checksum(b"123456789") == 0x6F91  # check value of CRC-16/MCRF4XX
+def test_the_checksum_is_crc_16_mcrf4xx() -> None:
+    assert checksum(b"123456789") == 0x6F91  # the check value of CRC-16/MCRF4XX
 
 
 def test_all_frames_of_a_datagram_are_read() -> None:
@@ -73,21 +73,21 @@ def damaged(version: Version) -> bytes:
         (b"hello", "noise", 8),
     ],
 )
-def test_what_is_no_frame_of_ours_is_counted_and_the_next_one_is_read(data: bytes, reason: str, count: int) -> None:
+def test_an_invalid_frame_is_counted_and_the_next_one_read(data: bytes, reason: str, count: int) -> None:
     parser = Parser()
     datagram = data + Link(1, 1).pack(MESSAGES[0]) + b"bye"
     assert [received.message for received in parser.feed(datagram)] == [MESSAGES[0]]
     assert parser.refused[reason] == count
 
 
-def test_a_cut_datagram_is_counted_and_does_not_reach_into_the_next() -> None:
+def test_a_truncated_datagram_is_counted_and_does_not_affect_the_next() -> None:
     link, parser = Link(1, 1), Parser()
     assert parser.feed(link.pack(MESSAGES[1])[:-1]) == []
     assert parser.refused["truncated"] >= 1
     assert [received.message for received in parser.feed(link.pack(MESSAGES[0]))] == [MESSAGES[0]]
 
 
-def test_a_payload_longer_than_known_is_read_as_far_as_known() -> None:
+def test_unknown_extension_fields_are_ignored() -> None:
     payload = bytes(9) + b"extension to come"
     body = bytes((len(payload), 0, 0, 0, 1, 1, 0, 0, 0)) + payload
     (received,) = Parser().feed(framed(body, HEARTBEAT_EXTRA))
@@ -101,7 +101,7 @@ def test_a_value_out_of_range_is_refused() -> None:
         Link(1, 1, version=1).pack(dialect.SetupSigning())
 
 
-def test_garbage_yields_nothing_but_what_is_in_it() -> None:
+def test_garbage_yields_no_messages() -> None:
     rng = random.Random(5)
     parser = Parser()
     for _ in range(2000):
@@ -109,12 +109,12 @@ def test_garbage_yields_nothing_but_what_is_in_it() -> None:
     assert sum(parser.refused.values()) > 0
 
 
-def test_a_key_has_32_bytes() -> None:
+def test_a_signing_key_must_have_32_bytes() -> None:
     with pytest.raises(ValueError, match=r"5.*32"):
         Signing(b"short")
 
 
-def test_a_signed_frame_is_accepted_once_and_no_other_is() -> None:
+def test_only_a_correctly_signed_frame_is_accepted_and_only_once() -> None:
     parser, signed = Parser(Signing(KEY)), Link(1, 1, Signing(KEY)).pack(HEARTBEAT)
     assert [(each.message, each.signed) for each in parser.feed(signed)] == [(HEARTBEAT, True)]
     changed = signed[:-1] + bytes([signed[-1] ^ 1])
@@ -123,7 +123,7 @@ def test_a_signed_frame_is_accepted_once_and_no_other_is() -> None:
     assert dict(+parser.refused) == {"replayed": 1, "bad_signature": 2, "unsigned": 1}
 
 
-def test_a_stream_that_begins_more_than_a_minute_ago_is_refused() -> None:
+def test_a_stream_with_a_time_stamp_over_a_minute_old_is_refused() -> None:
     receiver, sender = Signing(KEY), Signing(KEY)
     receiver.advance(EPOCH_S + 3600.0)
     sender.timestamp = receiver.timestamp - BEHIND_MAX - 2
@@ -133,7 +133,7 @@ def test_a_stream_that_begins_more_than_a_minute_ago_is_refused() -> None:
     assert parser.refused["replayed"] == 1
 
 
-def test_timestamps_follow_the_clock_and_the_newest_frame_and_never_go_back() -> None:
+def test_signing_time_stamps_never_decrease() -> None:
     signing = Signing(KEY)
     signing.advance(EPOCH_S + 1.0)
     assert signing.timestamp == 100_000
@@ -145,13 +145,13 @@ def test_timestamps_follow_the_clock_and_the_newest_frame_and_never_go_back() ->
     assert signing.timestamp == 500_001
 
 
-def test_without_a_key_signed_frames_are_read_unchecked() -> None:
+def test_without_a_key_signatures_are_not_checked() -> None:
     (received,) = Parser().feed(Link(1, 1, Signing(KEY)).pack(HEARTBEAT))
     assert received.signed
 
 
 def their_message(module: Any, layout: MessageLayout, ours: WireMessage) -> Any:
-    """Return the authority's message with the same values."""
+    """Return the reference's message with the same values."""
     kind = module.mavlink_map[layout.id]
     return kind(**{name: their_value(getattr(ours, name)) for name in kind.fieldnames})
 
@@ -168,7 +168,7 @@ def their_link(module: Any) -> Any:
     return link
 
 
-def test_definitions_are_the_authority_s() -> None:
+def test_definitions_equal_those_of_the_reference() -> None:
     for layout in LAYOUTS:
         theirs = dialect_2.mavlink_map[layout.id]
         assert (layout.name, layout.crc_extra, layout.size) == (theirs.msgname, theirs.crc_extra, theirs.unpacker.size)
@@ -176,12 +176,12 @@ def test_definitions_are_the_authority_s() -> None:
         assert layout.wire_order == tuple(theirs.ordered_fieldnames), layout.name
 
 
-def test_command_cancel_sums_up_to_the_known_crc_extra() -> None:
+def test_the_crc_extra_of_command_cancel_is_the_known_one() -> None:
     assert BY_ID[COMMAND_CANCEL].crc_extra == COMMAND_CANCEL_CRC_EXTRA
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
-def test_a_frame_of_mavlink_2_is_the_authority_s_byte_for_byte(layout: MessageLayout) -> None:
+def test_mavlink_2_frames_equal_those_of_the_reference(layout: MessageLayout) -> None:
     rng = random.Random(SEED + layout.id)
     ours, theirs = Link(7, 1), their_link(dialect_2)
     parser, reader = Parser(), their_link(dialect_2)
@@ -195,7 +195,7 @@ def test_a_frame_of_mavlink_2_is_the_authority_s_byte_for_byte(layout: MessageLa
 
 
 @pytest.mark.parametrize("layout", LAYOUTS_1, ids=lambda layout: layout.name)
-def test_a_frame_of_mavlink_1_is_the_authority_s_byte_for_byte(layout: MessageLayout) -> None:
+def test_mavlink_1_frames_equal_those_of_the_reference(layout: MessageLayout) -> None:
     rng = random.Random(SEED + layout.id)
     ours, theirs, parser = Link(7, 1, version=1), their_link(dialect_1), Parser()
     for _ in range(5):
@@ -212,14 +212,14 @@ def theirs_packed(link: Any, message: Any) -> bytes:
     return bytes(packed)
 
 
-def test_the_authority_s_frames_are_read_as_they_were_meant() -> None:
+def test_frames_of_the_reference_are_read_correctly() -> None:
     link = their_link(dialect_2)
     sent = link.statustext_encode(4, b"low battery")
     (received,) = Parser().feed(bytes(sent.pack(link)))
     assert received == dialect.Received(dialect.Statustext(4, "low battery"), 7, 1, 0, False)
 
 
-def test_signatures_are_the_authority_s() -> None:
+def test_signatures_equal_those_of_the_reference() -> None:
     key = bytes(range(32))
     link = their_link(dialect_2)
     link.signing.secret_key, link.signing.sign_outgoing, link.signing.timestamp = key, True, 1000
@@ -233,7 +233,7 @@ def test_signatures_are_the_authority_s() -> None:
 
 
 def read_by_the_authority(count: int) -> None:
-    """Let the authority's parser read a stream of random messages, cut anywhere; each is there once, in order."""
+    """Check that the reference reads each message of a random stream once and in order, wherever the stream is split."""
     rng, ours, theirs = random.Random(SEED), Link(7, 1), their_link(dialect_2)
     while count > 0:
         layouts = rng.choices(LAYOUTS, k=min(count, 500))
@@ -244,10 +244,10 @@ def read_by_the_authority(count: int) -> None:
         count -= len(layouts)
 
 
-def test_the_authority_reads_ten_thousand_messages() -> None:
+def test_the_reference_reads_ten_thousand_messages() -> None:
     read_by_the_authority(10_000)
 
 
 @pytest.mark.soak
-def test_the_authority_reads_a_million_messages() -> None:
+def test_the_reference_reads_a_million_messages() -> None:
     read_by_the_authority(1_000_000)

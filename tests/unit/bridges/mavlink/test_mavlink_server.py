@@ -1,4 +1,4 @@
-"""The process: who is obeyed, what goes into a datagram, whose pace, which options."""
+"""The MAVLink process: its peers, datagrams, system IDs, mission reports, pace and options."""
 
 import asyncio
 import socket
@@ -55,7 +55,7 @@ def test_programs_on_this_machine_become_peers_until_they_are_silent() -> None:
 
 @pytest.fixture
 def program() -> Iterator[socket.socket]:
-    """A program that has a port of its own."""
+    """Yield the socket of a program with its own port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
         opened.bind(("127.0.0.1", 0))
         opened.settimeout(120.0)
@@ -70,7 +70,7 @@ def served_vehicle(program: socket.socket, received: list[Received]) -> ServedVe
 
 
 @pytest.mark.parametrize("is_taken", [True, False])
-def test_a_port_that_cannot_be_had_is_refused_with_the_option_to_change(program: socket.socket, is_taken: bool) -> None:
+def test_a_port_that_cannot_be_opened_is_refused_with_its_option(program: socket.socket, is_taken: bool) -> None:
     local = ("127.0.0.1" if is_taken else "nowhere.invalid", program.getsockname()[1])
     with pytest.raises(RunError, match=f"{local[0]}:{local[1]}.*{'--api-local' if is_taken else '--listen'}"):
         VehiclePort(local, GCS, None, print)
@@ -118,7 +118,7 @@ def close(served: ServedVehicle) -> None:
         port._socket.close()
 
 
-def test_vehicles_of_two_simulations_are_told_apart_by_one_ground_station() -> None:
+def test_vehicles_of_two_simulations_have_different_ids() -> None:
     addresses, unique_ids = set(), set()
     for run_id, first in (("one", 1), ("two", 11)):
         served = server_of(SimpleNamespace(put=lambda *_: None), first, run_id)._served["drone1"]
@@ -135,7 +135,7 @@ def test_vehicles_of_two_simulations_are_told_apart_by_one_ground_station() -> N
         server_of(SimpleNamespace(put=lambda *_: None), 255)
 
 
-def test_how_far_a_mission_was_flown_is_reported_to_the_world_in_order() -> None:
+def test_mission_reports_are_sent_to_the_world_in_order() -> None:
     asked: list[tuple[Any, ...]] = []
     link = SimpleNamespace(request=lambda *arguments: asked.append(arguments), put=lambda *_: None)
     server = server_of(link)
@@ -171,7 +171,7 @@ def test_a_run_without_a_pace_is_refused_unless_one_is_set() -> None:
         ask("lockstep", 0.0, 3.0, Unanswered(ok=False, error="nobody answers there"))
 
 
-def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:
+def test_endpoints_are_reachable_hosts_and_ports() -> None:
     assert _endpoint("--gcs", "127.0.0.1:14550", "127.0.0.1") == ("127.0.0.1", 14550)
     assert _endpoint("--gcs", "192.0.2.7:14550", "0.0.0.0") == GCS
     for text in ("14550", "127.0.0.1:", "127.0.0.1:0", "127.0.0.1:70000", ":5"):
@@ -181,14 +181,14 @@ def test_endpoints_are_hosts_and_ports_that_can_be_reached() -> None:
         _endpoint("--gcs", "192.0.2.7:14550", "127.0.0.1")
 
 
-def test_a_key_is_bytes_digits_or_a_passphrase(tmp_path: Path) -> None:
+def test_a_key_is_32_bytes_hexadecimal_digits_or_a_passphrase(tmp_path: Path) -> None:
     path, key = tmp_path / "key", bytes(range(32))
     path.write_bytes(key)
     assert read_key(path) == key
     path.write_text(f"{key.hex()}\n")
     assert read_key(path) == key
     path.write_text("open sesame\n")
-    assert read_key(path).hex().startswith("41ef4bb0")  # sha256sum of it
+    assert read_key(path).hex().startswith("41ef4bb0")  # as sha256sum prints it
     path.write_text("\n")
     with pytest.raises(RunError, match="is empty"):
         read_key(path)

@@ -1,4 +1,4 @@
-"""A vehicle as its clients see it: arming, modes, setpoints, missions, fence, parameters, what is refused."""
+"""A vehicle as its clients see it: arming, modes, setpoints, missions, geofence, parameters and refusals."""
 
 import itertools
 import math
@@ -26,7 +26,7 @@ AUTOPILOTS = pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 
 
 def flying(autopilot: str = "px4", altitude_m: float = 3.0) -> FlownDrone:
-    """Return a vehicle that holds at a height."""
+    """Return a vehicle that hovers at the given altitude."""
     drone = FlownDrone(autopilot)
     if autopilot == "ardupilot":
         set_mode(drone, COPTER_MODES[FlightMode.OFFBOARD])
@@ -61,7 +61,7 @@ def velocity_setpoint(
 
 
 @AUTOPILOTS
-def test_it_arms_takes_off_holds_lands_and_is_disarmed(autopilot: str) -> None:
+def test_a_vehicle_arms_takes_off_holds_lands_and_disarms(autopilot: str) -> None:
     drone = flying(autopilot)
     assert heartbeat(drone).base_mode & 128
     assert abs(drone.position[2] - 3.0) < 0.3
@@ -73,7 +73,7 @@ def test_it_arms_takes_off_holds_lands_and_is_disarmed(autopilot: str) -> None:
     assert drone.texts() == ["Armed", "Landed; disarmed"]
 
 
-def test_only_an_armed_vehicle_takes_off_and_one_that_does_not_is_disarmed() -> None:
+def test_only_an_armed_vehicle_takes_off_and_it_disarms_if_it_does_not() -> None:
     drone = FlownDrone()
     assert drone.command(Cmd.NAV_TAKEOFF, 0, 0, 0, NAN, NAN, NAN, 403.0) == Result.DENIED
     assert drone.texts() == ["Denied: not armed"]
@@ -83,7 +83,7 @@ def test_only_an_armed_vehicle_takes_off_and_one_that_does_not_is_disarmed() -> 
     assert drone.texts()[-1] == "Disarmed: no take-off"
 
 
-def test_in_flight_it_disarms_only_by_force_which_is_an_emergency() -> None:
+def test_a_flying_vehicle_disarms_only_by_force_which_is_an_emergency() -> None:
     drone = flying()
     assert drone.command(Cmd.COMPONENT_ARM_DISARM, 0) == Result.DENIED
     assert "Denied" in drone.texts()[-1]
@@ -97,7 +97,7 @@ def test_in_flight_it_disarms_only_by_force_which_is_an_emergency() -> None:
     assert drone.command(Cmd.COMPONENT_ARM_DISARM, 1) == Result.ACCEPTED
 
 
-def test_px4_begins_offboard_only_with_a_stream_and_holds_without_it() -> None:
+def test_px4_needs_a_setpoint_stream_for_offboard_and_holds_without_it() -> None:
     drone = flying()
     assert set_mode(drone, PX4_MODES[FlightMode.OFFBOARD]) == Result.DENIED
     drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
@@ -105,7 +105,7 @@ def test_px4_begins_offboard_only_with_a_stream_and_holds_without_it() -> None:
     for _ in range(50):
         drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
         drone.step()
-    assert drone.position[1] > 0.8  # north is y of W
+    assert drone.position[1] > 0.8  # north is the y axis of W
     assert heartbeat(drone).custom_mode == PX4_MODES[FlightMode.OFFBOARD]
     drone.step(52)
     assert heartbeat(drone).custom_mode == PX4_MODES[FlightMode.HOLD]
@@ -114,7 +114,7 @@ def test_px4_begins_offboard_only_with_a_stream_and_holds_without_it() -> None:
     assert drone._velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.05)
 
 
-def test_guided_velocity_of_ardupilot_stops_after_three_seconds() -> None:
+def test_a_guided_velocity_of_ardupilot_expires_after_three_seconds() -> None:
     drone = flying("ardupilot")
     drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
     drone.step(140)
@@ -124,7 +124,7 @@ def test_guided_velocity_of_ardupilot_stops_after_three_seconds() -> None:
     assert heartbeat(drone).custom_mode == COPTER_MODES[FlightMode.OFFBOARD]
 
 
-def test_a_new_setpoint_is_sent_at_once_and_one_that_holds_is_repeated() -> None:
+def test_a_new_setpoint_is_sent_at_once_and_the_current_one_repeated() -> None:
     drone = flying("ardupilot")
     before = len(drone.commands)
     drone.receive(velocity_setpoint(0.5, 0.0, 0.0))
@@ -134,7 +134,7 @@ def test_a_new_setpoint_is_sent_at_once_and_one_that_holds_is_repeated() -> None
     assert len(drone.commands) - before == 2 + 10
 
 
-def test_a_flood_of_setpoints_does_not_use_up_what_the_world_takes() -> None:
+def test_a_flood_of_setpoints_stays_within_the_rate_limit_of_the_world() -> None:
     drone = flying("ardupilot")
     before = len(drone.commands)
     for i in range(2000):
@@ -145,7 +145,7 @@ def test_a_flood_of_setpoints_does_not_use_up_what_the_world_takes() -> None:
     assert drone.commands[-1].velocity_m_s == (0.0, 0.25, 0.0)
 
 
-def test_a_velocity_along_the_body_is_forward_and_left_of_the_heading() -> None:
+def test_a_velocity_in_the_body_frame_is_sent_in_the_heading_frame() -> None:
     drone = flying("ardupilot")
     drone.receive(velocity_setpoint(0.5, 0.25, -0.1, MavFrame.BODY_NED))
     last = drone.commands[-1]
@@ -153,14 +153,14 @@ def test_a_velocity_along_the_body_is_forward_and_left_of_the_heading() -> None:
     assert (last.frame, last.velocity_m_s) == ("heading", (0.5, -0.25, 0.1))
 
 
-def test_a_position_is_flown_to_and_held() -> None:
+def test_a_position_setpoint_is_reached_and_held() -> None:
     drone = flying("ardupilot")
     drone.receive(dialect.SetPositionTargetLocalNed(0, 1, 1, MavFrame.LOCAL_NED, POSITION_ONLY, x=4.0, y=-2.0, z=-5.0))
     drone.step(600)
     assert drone.position == pytest.approx([-2.0, 4.0, 5.0], abs=0.1)
 
 
-def test_a_setpoint_upwards_takes_off_an_armed_vehicle() -> None:
+def test_an_upward_setpoint_makes_an_armed_vehicle_take_off() -> None:
     drone = FlownDrone()
     drone.command(Cmd.COMPONENT_ARM_DISARM, 1)
     up = dialect.SetPositionTargetLocalNed(0, 1, 1, MavFrame.LOCAL_NED, POSITION_ONLY, z=-2.0)
@@ -173,7 +173,7 @@ def test_a_setpoint_upwards_takes_off_an_armed_vehicle() -> None:
 
 
 @pytest.mark.parametrize("frames", [[MavFrame.MISSION], [MavFrame.LOCAL_ENU], range(100, 140)])
-def test_a_frame_that_is_not_flown_is_refused_once(frames: Sequence[int]) -> None:
+def test_an_unsupported_frame_is_refused_once(frames: Sequence[int]) -> None:
     drone = flying("ardupilot")
     before = len(drone.commands)
     for frame in (*frames, *frames):
@@ -183,7 +183,7 @@ def test_a_frame_that_is_not_flown_is_refused_once(frames: Sequence[int]) -> Non
 
 
 @AUTOPILOTS
-def test_it_returns_home_and_lands(autopilot: str) -> None:
+def test_a_return_flies_home_and_lands(autopilot: str) -> None:
     drone = flying(autopilot)
     drone.position[0] = 20.0
     assert drone.command(Cmd.NAV_RETURN_TO_LAUNCH) == Result.ACCEPTED
@@ -230,8 +230,8 @@ def test_a_mission_takes_off_visits_its_waypoints_and_lands() -> None:
     assert {each.items for each in drone.vehicle.flight.mission.reports} == {5}
 
 
-def test_a_mission_is_flown_straight_at_the_speed_of_its_items_and_a_new_place_turns_it_without_a_jump() -> None:
-    """The drone obeys at once: what it flies is what is commanded."""
+def test_a_mission_flies_straight_legs_at_its_speed_and_turns_smoothly() -> None:
+    """The drone follows at once, so its velocity is the commanded one."""
     drone = FlownDrone()
     items = [
         item(0, Cmd.NAV_TAKEOFF, 0, 3),
@@ -246,7 +246,7 @@ def test_a_mission_is_flown_straight_at_the_speed_of_its_items_and_a_new_place_t
     for _ in range(600):
         drone.step()
         flown.append(drone._velocity)
-        low_m = 0.35 if drone.position[1] < 4.0 else 0.1  # the climb is over within 0.3 m of its height
+        low_m = 0.35 if drone.position[1] < 4.0 else 0.1  # the climb may end 0.3 m off its altitude
         assert drone.position[2] == pytest.approx(3.0 + drone.position[1] / 40.0 * (8.0 - 3.0), abs=low_m)
         assert abs(drone.position[0]) < 0.1
     assert flown[300][1] == pytest.approx(2.0, abs=0.03)
@@ -256,14 +256,14 @@ def test_a_mission_is_flown_straight_at_the_speed_of_its_items_and_a_new_place_t
         flown.append(drone._velocity)
     steps = [math.dist(one[:2], other[:2]) for one, other in itertools.pairwise(flown)]
     accel_m_s2 = SHARE * 9.80665 * math.tan(math.radians(20.0))
-    lead_s, period_s = Piloted().lead_s, 0.04  # of the law: a new acceleration is seen ahead by its lead
+    lead_s, period_s = Piloted().lead_s, 0.04  # of the control law, which anticipates a new acceleration
     assert max(steps[25:]) < accel_m_s2 * (lead_s + period_s)
     assert drone.position[:2] == pytest.approx([0.0, 0.0], abs=0.6)
     assert drone.position[2] == pytest.approx(5.0, abs=0.1)
 
 
 def on_mission(*last: dialect.MissionItemInt) -> FlownDrone:
-    """Return a vehicle that flies on to the second of two waypoints, 30 m away, before the last items."""
+    """Return a vehicle on its way to the second waypoint, 30 m away, which the given items follow."""
     drone = FlownDrone()
     way = [item(0, Cmd.NAV_TAKEOFF, 0, 3), item(1, Cmd.NAV_WAYPOINT, 2, 4), item(2, Cmd.NAV_WAYPOINT, 30, 4)]
     assert upload(drone, [*way, *last]) == 0
@@ -304,7 +304,7 @@ def choose_hold(drone: FlownDrone) -> None:
         (choose_hold, "HOLD", False),
     ],
 )
-def test_a_mission_that_is_not_flown_to_its_end_is_reported_with_its_progress_and_the_reason(
+def test_an_aborted_mission_is_reported_with_its_progress_and_the_reason(
     abort: Callable[[FlownDrone], None], reason: str, failsafe: bool
 ) -> None:
     drone = on_mission()
@@ -314,7 +314,7 @@ def test_a_mission_that_is_not_flown_to_its_end_is_reported_with_its_progress_an
     assert reason in last.reason
 
 
-def test_a_mission_that_a_client_resumes_is_finished_where_its_return_ends_on_the_ground() -> None:
+def test_a_resumed_mission_is_finished_once_its_return_has_landed() -> None:
     drone = on_mission(item(3, Cmd.NAV_RETURN_TO_LAUNCH))
     choose_hold(drone)
     assert set_mode(drone, PX4_MODES[FlightMode.MISSION]) == Result.ACCEPTED
@@ -345,8 +345,8 @@ NO_INT = 2**31 - 1  # INT32_MAX
 
 
 @AUTOPILOTS
-def test_int32_max_in_an_item_is_the_nan_of_the_other_kind_of_items_and_back(autopilot: str) -> None:
-    """https://mavlink.io/en/services/mission.html: a waypoint without a place is above where the vehicle is."""
+def test_int32_max_in_an_integer_item_is_nan_in_a_float_item(autopilot: str) -> None:
+    """A waypoint without a position is above the vehicle (https://mavlink.io/en/services/mission.html)."""
     drone = flying(autopilot)
     drone.position[:2] = [7.0, -4.0]
     frame = MavFrame.GLOBAL_RELATIVE_ALT_INT
@@ -363,7 +363,7 @@ def test_int32_max_in_an_item_is_the_nan_of_the_other_kind_of_items_and_back(aut
     drone.receive(dialect.MissionRequestInt(1, 1, 1))
     assert (drone.all(dialect.MissionItemInt)[-1].x, drone.all(dialect.MissionItemInt)[-1].y) == (NO_INT, NO_INT)
     assert drone.command(Cmd.MISSION_START, 1) == Result.ACCEPTED
-    drone.until(lambda: drone.position[2] > 4.8)  # within the radius in which it is reached
+    drone.until(lambda: drone.position[2] > 4.8)  # within the acceptance radius
     assert drone.position[:2] == pytest.approx([7.0, -4.0], abs=0.5)
 
 
@@ -378,7 +378,7 @@ def test_int32_max_in_an_item_is_the_nan_of_the_other_kind_of_items_and_back(aut
         (MavFrame.LOCAL_NED, NO_INT, 20_000, (2.0, -4.0)),
     ],
 )
-def test_int32_max_in_a_command_keeps_the_place(
+def test_int32_max_in_a_command_keeps_that_coordinate(
     autopilot: str, frame: int, x: int, y: int, place: tuple[float, float]
 ) -> None:
     drone = flying(autopilot)
@@ -392,7 +392,7 @@ def test_int32_max_in_a_command_keeps_the_place(
 
 
 @AUTOPILOTS
-def test_a_command_without_a_height_in_a_local_frame_keeps_the_height(autopilot: str) -> None:
+def test_a_command_without_an_altitude_in_a_local_frame_keeps_the_altitude(autopilot: str) -> None:
     drone = flying(autopilot)
     drone.receive(
         dialect.CommandInt(1, 1, MavFrame.LOCAL_NED, Cmd.DO_REPOSITION, param1=-1.0, param4=NAN, x=0, y=30_000, z=NAN)
@@ -403,7 +403,7 @@ def test_a_command_without_a_height_in_a_local_frame_keeps_the_height(autopilot:
 
 @AUTOPILOTS
 @pytest.mark.parametrize("whole", [{"x": NO_INT}, {"y": NO_INT}, {"x": NO_INT, "y": NO_INT}])
-def test_a_fence_needs_all_of_a_place(autopilot: str, whole: dict[str, int]) -> None:
+def test_a_fence_needs_both_coordinates(autopilot: str, whole: dict[str, int]) -> None:
     circle = item(0, Cmd.FENCE_CIRCLE_INCLUSION, 0, 0, 2.0, type_=FENCE)
     assert upload(FlownDrone(autopilot), [msgspec.structs.replace(circle, **whole)], FENCE) == MissionResult.INVALID
 
@@ -417,7 +417,7 @@ def test_a_fence_needs_all_of_a_place(autopilot: str, whole: dict[str, int]) -> 
         (NO_INT, round(8.5e7), NAN, (0.0, -4.0, 3.0)),
     ],
 )
-def test_int32_max_in_a_setpoint_is_an_axis_that_is_not_given(
+def test_int32_max_in_a_setpoint_leaves_that_axis_unset(
     autopilot: str, lat: int, lon: int, alt: float, place: tuple[float, float, float]
 ) -> None:
     drone = flying(autopilot)
@@ -434,13 +434,13 @@ def test_int32_max_in_a_setpoint_is_an_axis_that_is_not_given(
     assert not any(text.startswith("Denied") for text in drone.texts())
 
 
-def test_an_item_that_is_not_flown_ends_an_upload() -> None:
+def test_an_unsupported_item_ends_the_upload() -> None:
     drone = FlownDrone()
     assert upload(drone, [item(0, 206)]) == 3  # DO_SET_CAM_TRIGG_DIST: unsupported
     assert set_mode(drone, PX4_MODES[FlightMode.MISSION]) == Result.DENIED
 
 
-def test_an_item_that_does_not_come_is_requested_again_and_in_the_end_given_up() -> None:
+def test_a_missing_item_is_requested_again_until_the_upload_is_given_up() -> None:
     drone = FlownDrone()
     drone.receive(dialect.MissionCount(1, 1, 2))
     for i in range(1, 13):
@@ -451,16 +451,16 @@ def test_an_item_that_does_not_come_is_requested_again_and_in_the_end_given_up()
     assert drone.all(dialect.MissionAck)[-1].type == 15
 
 
-def test_a_go_to_of_older_clients_is_flown() -> None:
+def test_a_guided_waypoint_of_older_clients_is_flown() -> None:
     drone = flying("ardupilot")
     place = {"x": 47.4 + 5 / 111_170.0, "y": 8.5, "z": 3.0}
     drone.receive(dialect.MissionItem(1, 1, 0, MavFrame.GLOBAL_RELATIVE_ALT, Cmd.NAV_WAYPOINT, current=2, **place))
     assert drone.all(dialect.MissionAck)[-1].type == 0
     drone.step(500)
-    assert abs(drone.position[1] - 5.0) < 0.6  # degrees in 32 bits are steps of 0.4 m
+    assert abs(drone.position[1] - 5.0) < 0.6  # 32-bit floats resolve this longitude to 0.4 m
 
 
-def test_beyond_a_fence_it_holds_and_says_so() -> None:
+def test_a_vehicle_beyond_a_geofence_holds_and_reports_it() -> None:
     drone = flying()
     drone.receive(dialect.ParamSet(1, 1, "GF_MAX_HOR_DIST", 5.0, 9))
     drone.receive(velocity_setpoint(1.0, 0.0, 0.0))
@@ -477,7 +477,7 @@ def test_beyond_a_fence_it_holds_and_says_so() -> None:
     assert drone.texts().count("Geofence breached: hold") == 2
 
 
-def test_parameters_are_listed_read_set_within_their_range_and_kept() -> None:
+def test_parameters_are_listed_read_and_set_within_their_ranges() -> None:
     drone = FlownDrone("ardupilot")
     drone.receive(dialect.ParamRequestList(1, 1))
     listed = drone.all(dialect.ParamValue)
@@ -492,14 +492,14 @@ def test_parameters_are_listed_read_set_within_their_range_and_kept() -> None:
     assert drone.all(dialect.ParamError)[-1].param_id == "NO_SUCH"
 
 
-def test_integers_of_px4_travel_as_their_bytes() -> None:
+def test_integer_parameters_of_px4_are_sent_bytewise() -> None:
     drone = FlownDrone()
     drone.receive(dialect.ParamRequestRead(1, 1, "SYS_AUTOSTART", -1))
     value = drone.all(dialect.ParamValue)[-1]
     assert struct.unpack("<i", struct.pack("<f", value.param_value)) == (4001,)
 
 
-def test_every_command_is_answered_unknown_ones_with_unsupported() -> None:
+def test_every_command_is_acknowledged_unknown_ones_as_unsupported() -> None:
     drone = FlownDrone()
     for command in range(0, 3000, 7):
         drone.command(command, 0.0)
@@ -508,7 +508,7 @@ def test_every_command_is_answered_unknown_ones_with_unsupported() -> None:
     assert drone.command(2000) == Result.UNSUPPORTED
 
 
-def test_who_is_flown_by_somebody_else_denies_and_shows_it() -> None:
+def test_a_vehicle_flown_by_another_process_denies_commands() -> None:
     drone = flying()
     drone.commander = "controller.main"
     drone.step(2)
@@ -520,7 +520,7 @@ def test_who_is_flown_by_somebody_else_denies_and_shows_it() -> None:
     assert len(drone.commands) == before
 
 
-def test_a_sensor_that_fails_is_reported_and_keeps_it_from_arming() -> None:
+def test_a_failed_sensor_is_reported_and_prevents_arming() -> None:
     drone = FlownDrone()
     drone.step(100)
     drone.silent = {"gps"}
@@ -535,7 +535,7 @@ def test_a_sensor_that_fails_is_reported_and_keeps_it_from_arming() -> None:
     assert drone.texts()[-1] == "GPS back"
 
 
-def test_events_about_the_drone_and_a_low_battery_are_texts() -> None:
+def test_events_of_the_drone_and_a_low_battery_are_sent_as_status_texts() -> None:
     drone = FlownDrone()
     for kind, source, subject, data in (
         ("fault", "tester", "drone1", {"kind": "rotor_efficiency", "target": "drone1"}),
@@ -551,7 +551,7 @@ def test_events_about_the_drone_and_a_low_battery_are_texts() -> None:
     assert drone.all(dialect.SysStatus)[-1].battery_remaining == 15
 
 
-def test_rates_are_as_asked() -> None:
+def test_messages_are_sent_at_the_requested_rates() -> None:
     drone = FlownDrone()
     assert drone.command(Cmd.SET_MESSAGE_INTERVAL, 30, 20_000) == Result.ACCEPTED
     assert drone.command(Cmd.SET_MESSAGE_INTERVAL, 32, -1) == Result.ACCEPTED
@@ -565,7 +565,7 @@ def test_rates_are_as_asked() -> None:
     assert drone.all(dialect.MessageInterval)[-1].interval_us == 20_000
 
 
-def test_messages_for_others_are_left_to_them_and_time_and_ping_are_answered() -> None:
+def test_messages_for_other_systems_are_ignored_timesync_and_ping_answered() -> None:
     drone = FlownDrone()
     drone.receive(dialect.CommandLong(command=400, param1=1.0, target_system=2, target_component=1))
     drone.receive(dialect.CommandLong(command=400, param1=1.0, target_system=1, target_component=154))

@@ -1,4 +1,4 @@
-"""Well-formed messages with any values: no exception, and what is answered can be packed."""
+"""Well-formed messages with arbitrary values cause no exception, and every answer can be packed."""
 
 import math
 import random
@@ -58,11 +58,11 @@ def fly_at_random(autopilot: str, seed: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_any_values_are_survived(autopilot: str) -> None:
+def test_a_vehicle_survives_messages_with_any_values(autopilot: str) -> None:
     fly_at_random(autopilot, 17, 3_000)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
-def test_any_values_are_survived_for_long(autopilot: str) -> None:
+def test_a_vehicle_survives_many_messages_with_any_values(autopilot: str) -> None:
     fly_at_random(autopilot, 18, 200_000)

@@ -1,4 +1,4 @@
-"""ardrone_autonomy's units, signs and frames by physical examples, and what a cmd_vel means by its rules."""
+"""The units, signs and frames of ardrone_autonomy, by physical examples, and the meaning of cmd_vel."""
 
 import math
 from typing import Any
@@ -34,7 +34,7 @@ def estimate(q: flight_messages.Quaternion) -> flight_messages.Estimate:
 
 
 def aircraft(state: Any = "hovering", **angles: float) -> OnboardState:
-    """An aircraft 1.234 m over the ground, on its way forward, left and up."""
+    """Return an aircraft 1.234 m above the ground that moves forward, left and up."""
     own = OnboardState()
     own.update(estimate(attitude(**angles)))
     own.attitude = attitude()
@@ -55,7 +55,7 @@ def without_sensors() -> OnboardState:
 
 
 def on_wire(kind: str, message: Any) -> Any:
-    """Return a message as a node reads it."""
+    """Return a message as a node would read it."""
     return wire.deserialize(kind, wire.serialize(kind, message))
 
 
@@ -64,12 +64,12 @@ def navdata(state: Any = "hovering", **angles: float) -> Any:
 
 
 @pytest.mark.parametrize(("t_ns", "stamp"), [(12_340_000_005, (12, 340_000_005)), (0, (0, 0)), (-5_000_000, (0, 0))])
-def test_a_time_is_seconds_and_nanoseconds_and_none_is_before_the_start(t_ns, stamp):
+def test_a_time_has_seconds_and_nanoseconds_and_is_never_negative(t_ns, stamp):
     time = ros1_bridge.ros_time(t_ns)
     assert (time.sec, time.nanosec) == stamp
 
 
-def test_names_have_letters_digits_and_underscores():
+def test_names_are_reduced_to_letters_digits_and_underscores():
     assert ros1_name("drone-1.a") == "drone_1_a"
 
 
@@ -80,14 +80,14 @@ def test_navdata_has_the_units_of_the_driver():
     assert (message.vx, message.vy, message.vz) == (1000.0, 250.0, 500.0)  # mm/s, forward, left, up
     assert (message.ax, message.ay, message.az) == (0.0, 0.0, 1.0)  # g
     assert message.pressure == 101_325  # Pa
-    assert (message.magX, message.magY, message.magZ) == (10, 0, -13)  # 0.3 uT each
+    assert (message.magX, message.magY, message.magZ) == (10, 0, -13)  # in units of 0.3 uT
     assert message.tm == pytest.approx(61_040_000.0)  # us
     assert message.tags_count == 0
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (61, 40_000_000)
     assert (message.header.frame_id, message.header.seq) == ("drone1/ardrone_base_link", 3)
 
 
-def test_right_side_down_nose_down_and_counter_clockwise_are_positive():
+def test_right_down_nose_down_and_counter_clockwise_are_positive():
     assert navdata(roll_deg=10.0).rotX == pytest.approx(10.0)
     assert navdata(pitch_deg=7.0).rotY == pytest.approx(7.0)
     assert Rotation.from_euler("ZYX", [0, 7.0, 0], degrees=True).apply([1.0, 0.0, 0.0])[2] < 0  # the nose
@@ -97,16 +97,16 @@ def test_right_side_down_nose_down_and_counter_clockwise_are_positive():
 @pytest.mark.parametrize(
     ("state", "number"), [("landed", 2), ("flying", 3), ("hovering", 4), ("taking_off", 6), ("landing", 8), ("emergency", 0)]
 )  # fmt: skip
-def test_states_have_the_numbers_of_the_sdk(state, number):
+def test_states_have_the_numbers_of_the_ardrone_sdk(state, number):
     assert navdata(state).state == number
 
 
-def test_an_aircraft_that_has_said_little_has_navdata_too():
+def test_navdata_without_samples_is_zero():
     message = on_wire("ardrone_autonomy/Navdata", ros1_bridge.navdata(0, without_sensors(), FRAMES))
     assert (message.altd, message.vx, message.pressure, message.az) == (0, 0.0, 0, 0.0)
 
 
-def test_an_imu_tells_specific_force_rate_and_attitude():
+def test_an_imu_message_has_specific_force_rate_and_attitude():
     own = aircraft(yaw_deg=90.0)
     assert own.imu is not None
     message = on_wire("sensor_msgs/Imu", ros1_bridge.imu(0, own.imu, own.attitude, FRAMES))
@@ -116,14 +116,14 @@ def test_an_imu_tells_specific_force_rate_and_attitude():
 
 
 @pytest.mark.parametrize(("field", "direction"), [((3.0, 0.0, -4.0), (0.6, 0.0, -0.8)), (ZERO, ZERO)])
-def test_the_magnetic_field_is_a_direction(field, direction):
+def test_the_magnetic_field_is_a_unit_vector(field, direction):
     message = ros1_bridge.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, field), FRAMES)
     assert xyz(message.vector) == pytest.approx(direction)
-    assert message.header.stamp.nanosec == 35_000_000  # of the sample, not of its arrival
+    assert message.header.stamp.nanosec == 35_000_000  # the time of the sample, not of its arrival
 
 
 @pytest.mark.parametrize(("fix", "status"), [(3, 0), (0, -1)])
-def test_a_fix_is_where_and_how_well(fix, status):
+def test_a_fix_has_a_position_a_status_and_a_covariance(fix, status):
     gps = messages.Gps(T_NS, 0, T_NS - 100_000_000, -34.6, -58.4, 31.0, ZERO, ZERO, 2.0, fix, 9)
     message = on_wire("sensor_msgs/NavSatFix", ros1_bridge.fix(0, gps, FRAMES))
     assert (message.latitude, message.longitude, message.altitude) == (-34.6, -58.4, 31.0)
@@ -131,14 +131,14 @@ def test_a_fix_is_where_and_how_well(fix, status):
     assert message.position_covariance.tolist() == [4.0, 0, 0, 0, 4.0, 0, 0, 0, 4.0]
 
 
-def test_odometry_is_the_aircraft_s_own():
+def test_odometry_is_that_of_the_aircraft_itself():
     message = on_wire("nav_msgs/Odometry", ros1_bridge.odometry(0, aircraft(), FRAMES))
     assert (message.header.frame_id, message.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
     assert message.pose.pose.position.z == pytest.approx(1.234)
     assert (message.twist.twist.linear.x, message.twist.twist.linear.y) == (1.0, 0.25)
 
 
-def test_ground_truth_is_in_the_world():
+def test_ground_truth_is_in_the_world_frame():
     truth = flight_messages.Truth(
         T_NS, 0, (1.0, 2.0, 3.0), (0.0, 4.0, 0.0), attitude(yaw_deg=90.0), (1.0, 0.0, 0.5), ZERO, STILL
     )  # fmt: skip
@@ -146,10 +146,12 @@ def test_ground_truth_is_in_the_world():
     assert message.header.frame_id == "world"
     assert xyz(message.pose.pose.position) == (1.0, 2.0, 3.0)
     assert xyz(message.twist.twist.linear) == (0.0, 4.0, 0.0)
-    assert xyz(message.twist.twist.angular) == pytest.approx((0.0, 1.0, 0.5))  # rolling about the nose, to the north
+    assert xyz(message.twist.twist.angular) == pytest.approx(
+        (0.0, 1.0, 0.5)
+    )  # a roll about the nose, which points north
 
 
-def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be():
+def test_transforms_lead_from_the_world_to_the_estimated_pose():
     own = aircraft(yaw_deg=30.0)
     own.update(estimate(attitude(yaw_deg=30.0)))
     to_base, to_odom = on_wire("tf2_msgs/TFMessage", ros1_bridge.transforms(0, own, FRAMES)).transforms
@@ -172,7 +174,7 @@ def twist(*, x: float = 0.0, y: float = 0.0, z: float = 0.0, wx: float = 0.0, wy
 
 
 class Pilot:
-    """Commands of a drone, and what they send."""
+    """The commands of a drone, and the messages that they send."""
 
     def __init__(self, state: Any = "flying", gate: int = 0) -> None:
         self.sent: list[tuple[str, Any]] = []
@@ -180,7 +182,7 @@ class Pilot:
         self.gates(state, gate, 1)
 
     def gates(self, state: Any, first: int, count: int) -> list[Any]:
-        """Let some gates pass; return what is sent meanwhile."""
+        """Let a number of gates pass; return the messages sent meanwhile."""
         self.sent.clear()
         for gate in range(first, first + count):
             self.commands.on_status(flight_messages.Status(gate * GATE_NS, gate, state, 100.0, False, None, 1))
@@ -195,17 +197,17 @@ class Pilot:
         ({}, TiltCommand(0.0, 0.0, 0.0, 0.0, True)),
         ({"x": 9e-7}, TiltCommand(9e-7, 0.0, 0.0, 0.0, True)),
         ({"x": 2e-6}, TiltCommand(2e-6, 0.0, 0.0, 0.0, False)),
-        ({"wx": 1.0}, TiltCommand(0.0, 0.0, 0.0, 0.0, False)),  # a tilt rate only switches hovering off
+        ({"wx": 1.0}, TiltCommand(0.0, 0.0, 0.0, 0.0, False)),  # a tilt rate does nothing but switch hovering off
         ({"wy": -0.5}, TiltCommand(0.0, 0.0, 0.0, 0.0, False)),
     ],
 )
-def test_a_cmd_vel_is_shares_forward_left_up_and_counter_clockwise_or_hovering(components, expected):
+def test_a_cmd_vel_is_a_share_of_tilt_climb_and_turn_or_hovering(components, expected):
     assert tilt_of(twist(**components)) == expected
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("component", ["x", "y", "z", "wx", "wy", "wz"])
-def test_what_is_not_finite_is_refused(component, number):
+def test_a_non_finite_value_is_refused(component, number):
     pilot = Pilot()
     with pytest.raises(ValueError, match="cmd_vel"):
         pilot.commands.on_cmd_vel(twist(**{component: number}))
@@ -214,7 +216,7 @@ def test_what_is_not_finite_is_refused(component, number):
 
 def test_a_cmd_vel_holds_until_the_next():
     pilot = Pilot()
-    assert pilot.gates("flying", 0, 1) == []  # nobody is flown before a node wants it
+    assert pilot.gates("flying", 0, 1) == []  # nothing is sent before a node publishes
     pilot.commands.on_cmd_vel(twist(x=0.5))
     sent = pilot.gates("flying", 1, 101)
     assert [m.t_ns // GATE_NS for m in sent] == list(range(1, 102, REPEAT_NS // GATE_NS))
@@ -225,7 +227,7 @@ def test_a_cmd_vel_holds_until_the_next():
     assert {(m.forward, m.hover) for m in pilot.gates("flying", 102, 20)} == {(0.0, True)}
 
 
-def test_what_is_wanted_on_the_way_up_is_flown_when_it_hovers():
+def test_a_cmd_vel_during_take_off_is_flown_from_the_hover_on():
     pilot = Pilot("taking_off")
     pilot.commands.on_cmd_vel(twist(z=0.5))
     assert pilot.gates("taking_off", 1, 10) == []
@@ -233,7 +235,7 @@ def test_what_is_wanted_on_the_way_up_is_flown_when_it_hovers():
 
 
 @pytest.mark.parametrize("state", ["landing", "landed", "emergency"])
-def test_a_drone_that_came_down_does_not_go_on(state):
+def test_a_drone_that_has_come_down_forgets_its_cmd_vel(state):
     pilot = Pilot()
     pilot.commands.on_cmd_vel(twist(x=1.0))
     assert pilot.gates("flying", 1, 1) != []
@@ -242,7 +244,7 @@ def test_a_drone_that_came_down_does_not_go_on(state):
     assert pilot.gates("hovering", 12, 10) == []
 
 
-def test_modes_are_sent_under_our_name():
+def test_modes_are_sent_in_the_name_of_the_bridge():
     pilot = Pilot("landed", 7)
     pilot.commands.send_mode("takeoff")
     pilot.commands.send_mode("land")
@@ -259,7 +261,7 @@ def test_reset_toggles_the_emergency(state, mode):
     assert pilot.sent[-1][1].mode == mode
 
 
-def test_only_a_drone_that_stands_is_trimmed():
+def test_only_a_landed_drone_is_trimmed():
     assert "not there" in (DriverCommands("drone1", "ros1.main", lambda *_: None).trim_refusal() or "")
     assert has_terms(Pilot("flying").commands.trim_refusal() or "", "landed")
     assert Pilot("landed").commands.trim_refusal() is None

@@ -1,4 +1,4 @@
-"""Nodes of ours among each other, among those that talk nonsense, and on the wire: bytes, published sums, garbage."""
+"""ROS 1 nodes: headers and checksums on the wire, connections among themselves and to misbehaving peers."""
 
 import asyncio
 import socket
@@ -21,7 +21,7 @@ from zsim_bridges.ros1.master_api import own_address
 from zsim_bridges.ros1.node import PublishedTopic, Ros1Node, TopicType
 
 CMD_VEL = TopicType("/drone1/cmd_vel", "geometry_msgs/Twist", "9f195f881246fdfa2798d1d3eebca84a", "float64 x\n")
-MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy's generated code has it
+MD5 = {  # from `rosmsg md5` of Noetic; that of Navdata from the generated code of ardrone_autonomy
     "std_msgs/String": "992ce8a1687cec8c8bd883ec73ca41d1",
     "std_msgs/Empty": "d41d8cd98f00b204e9800998ecf8427e",
     "geometry_msgs/Twist": "9f195f881246fdfa2798d1d3eebca84a",
@@ -37,7 +37,7 @@ MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy
 }
 
 
-def test_a_header_is_its_length_and_fields_behind_their_lengths():
+def test_a_header_and_its_fields_are_prefixed_by_their_lengths():
     encoded = wire.encode_header({"topic": "/chat", "md5sum": "*"})
     assert encoded == b"\x1b\0\0\0" + b"\x0b\0\0\0topic=/chat" + b"\x08\0\0\0md5sum=*"
     assert wire.decode_header(encoded[4:]) == {"topic": "/chat", "md5sum": "*"}
@@ -46,13 +46,13 @@ def test_a_header_is_its_length_and_fields_behind_their_lengths():
 @pytest.mark.parametrize(
     "body", [b"\x05", b"\xff\xff\xff\xff", b"\x05\0\0\0abc", b"\x03\0\0\0abc", struct.pack("<I", 2**31) + b"a=b"]
 )
-def test_no_header_is_refused(body):
+def test_an_invalid_header_is_refused(body):
     with pytest.raises(ValueError, match=r"header|key=value"):
         wire.decode_header(body)
 
 
 @given(st.binary(max_size=200))
-def test_garbage_is_a_header_or_refused(body):
+def test_garbage_decodes_to_strings_or_is_refused(body):
     try:
         fields = wire.decode_header(body)
     except ValueError:
@@ -61,7 +61,7 @@ def test_garbage_is_a_header_or_refused(body):
 
 
 @given(st.dictionaries(st.text("abc_", min_size=1, max_size=8), st.text("=\nA#ä ", max_size=20), max_size=6))
-def test_what_is_encoded_is_decoded(fields):
+def test_a_decoded_header_equals_the_encoded_one(fields):
     assert wire.decode_header(wire.encode_header(fields)[4:]) == fields
 
 
@@ -76,13 +76,13 @@ def test_what_is_encoded_is_decoded(fields):
         ({"md5sum": "*"}, ("missing",)),
     ],
 )
-def test_the_type_of_a_header_fits_or_the_reason_names_both(header, terms):
+def test_a_mismatch_of_types_names_both_types(header, terms):
     reason = wire.mismatch(CMD_VEL, header, "/zsim")
     assert (reason is None) == (not terms)
     assert all(term in (reason or "") for term in terms)
 
 
-def test_both_sides_of_our_own_connections_understand_each_other():
+def test_headers_of_subscriber_and_publisher_match():
     subscriber = wire.subscriber_header(CMD_VEL, "/a")
     publisher = wire.publisher_header(CMD_VEL, "/b")
     assert wire.mismatch(CMD_VEL, subscriber, "/b") is None
@@ -92,17 +92,17 @@ def test_both_sides_of_our_own_connections_understand_each_other():
 
 
 @pytest.mark.parametrize(("kind", "md5"), MD5.items())
-def test_md5_sums_are_those_of_ros(kind, md5):
+def test_md5_sums_equal_those_of_ros(kind, md5):
     assert wire.topic_type_of("/topic", kind).md5 == md5
 
 
-def test_a_definition_brings_those_of_its_fields():
+def test_a_definition_includes_those_of_its_fields():
     definition = wire.topic_type_of("/topic", "ardrone_autonomy/Navdata").definition
     assert "float32 batteryPercent\n" in definition
     assert "MSG: std_msgs/Header" in definition
 
 
-def test_a_number_that_does_not_go_into_its_field_is_refused():
+def test_a_number_out_of_range_for_its_field_is_refused():
     point = wire.message_class("geometry_msgs/Point32")(x=1e300, y=0.0, z=0.0)
     with pytest.raises(ValueError, match="geometry_msgs/Point32"):
         wire.serialize("geometry_msgs/Point32", point)
@@ -110,7 +110,7 @@ def test_a_number_that_does_not_go_into_its_field_is_refused():
 
 @pytest.mark.parametrize("kind", ["geometry_msgs/Twist", "std_msgs/Empty", "std_msgs/String"])
 @given(data=st.binary(min_size=1, max_size=60).filter(lambda data: len(data) != 48))
-def test_other_bytes_are_refused(kind, data):
+def test_bytes_of_another_type_are_refused(kind, data):
     if kind == "std_msgs/String" and len(data) - 4 == int.from_bytes(data[:4], "little"):
         return
     with pytest.raises(ValueError, match=kind):
@@ -127,7 +127,7 @@ def twist(x: float) -> Any:
 
 
 class Graph:
-    """A master, nodes at it, and what they say to people."""
+    """A master, its nodes, and the lines that they report."""
 
     def __init__(self) -> None:
         self.master = Master()
@@ -142,17 +142,17 @@ class Graph:
         return node, node.publish("/t", TWIST, 10)
 
     def restart(self) -> None:
-        """Let the master forget everything."""
+        """Replace the master by one without registrations."""
         self.master.stop()
         self.master = Master(self.master.port)
 
     async def uri(self, topic: str) -> str:
-        """Return the URI of the slave API of who publishes a topic."""
+        """Return the URI of the slave API of the node that publishes a topic."""
         await until(lambda: self.master.graph.publishers[topic] != [])
         return self.master.graph.publishers[topic][-1]
 
     async def port(self, topic: str) -> int:
-        """Return where a topic is to be had."""
+        """Return the TCPROS port of a topic."""
         code, _, address = await call(await self.uri(topic), "requestTopic", topic, [["TCPROS"]])
         assert (code, address[:2]) == (1, ["TCPROS", "127.0.0.1"])
         return address[2]
@@ -162,7 +162,7 @@ class Graph:
 
 
 async def call(uri: str, method: str, *arguments: Any) -> Any:
-    """Ask a node."""
+    """Call a method of a node's slave API."""
 
     def ask() -> Any:
         with xmlrpc.client.ServerProxy(uri) as proxy:
@@ -172,7 +172,7 @@ async def call(uri: str, method: str, *arguments: Any) -> Any:
 
 
 async def until(true: Callable[[], bool]) -> None:
-    """Wait for what other tasks and threads are to bring about."""
+    """Wait until other tasks and threads make a condition true."""
     async with asyncio.timeout(PATIENCE_S):
         while not true():
             await asyncio.sleep(0.005)
@@ -212,7 +212,7 @@ async def test_what_one_publishes_the_other_takes(graph) -> None:
     assert graph.master.graph.subscribers["/t"] == []
 
 
-def test_nothing_is_made_where_nobody_listens(graph):
+def test_no_message_is_built_without_subscribers(graph):
     topic = graph.node("/a").publish("/t", TWIST, 10)
     topic.publish(lambda _: pytest.fail("made"))
     assert topic.sent == 0
@@ -260,7 +260,7 @@ async def test_who_wants_something_else_is_refused_as_ros_does(graph, header, te
     async with a.running():
         reader, writer = await connect(await graph.port("/t"), header)
         answer = await wire.read_header(reader)
-        assert await reader.read() == b""  # and hung up
+        assert await reader.read() == b""  # the node closed the connection
         writer.close()
     assert has_terms(answer["error"], *terms)
 
@@ -341,7 +341,7 @@ async def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(gr
 
 
 class Slave(Master):
-    """A publisher's slave API, whose only answer is where its topics are to be had."""
+    """The slave API of a publisher, which answers only `requestTopic`, with the given port."""
 
     def __init__(self, port: int) -> None:
         super().__init__()
@@ -408,7 +408,7 @@ async def test_a_publisher_that_went_and_came_back_is_heard_again(graph) -> None
 
 @in_loop
 async def test_what_a_node_said_just_before_it_left_is_heard(graph) -> None:
-    """A node that publishes a landing and ends has left the graph before its bytes have been read."""
+    """A node that publishes a landing and ends may leave the graph before the message has been read."""
     received: list[float] = []
     node = graph.node("/b")
     node.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
@@ -563,12 +563,12 @@ async def test_a_node_whose_name_is_taken_ends_and_leaves_the_other_registered(g
 
 
 @pytest.mark.parametrize("uri", ["127.0.0.1:11311", "https://x:1", "http://", "http://x:99999", ""])
-def test_what_is_no_master_is_refused(uri):
+def test_an_invalid_master_uri_is_refused(uri):
     with pytest.raises(RunError, match=repr(uri)):
         own_address(uri)
 
 
-def test_we_are_reached_as_ros_s_own_variables_say_or_from_where_we_reach_the_master():
+def test_the_own_address_follows_the_ros_variables_or_the_route_to_the_master():
     assert own_address("http://127.0.0.1:11311", {}) == "127.0.0.1"
     assert own_address("http://127.0.0.1", {"ROS_IP": "10.0.0.7"}) == "10.0.0.7"
     both = {"ROS_IP": "10.0.0.7", "ROS_HOSTNAME": "lab"}

@@ -1,4 +1,4 @@
-"""The bridge between the keys and the topics: what is published from what, which pictures are read, what is let go."""
+"""The bridge between keys and ROS 1 topics: what it publishes, which pictures it reads, and what it drops."""
 
 import asyncio
 import threading
@@ -29,7 +29,7 @@ FRONT = keys.camera("quad-1", "front")
 
 
 class Bench:
-    """A bridge without a graph."""
+    """A bridge without a ROS graph."""
 
     def __init__(self, *drones: str) -> None:
         drone_infos = tuple(messages.DroneInfo(name, "ardrone2") for name in drones or ("quad-1",))
@@ -44,7 +44,7 @@ class Bench:
         self.bridge = Ros1Bridge(link, about, self.observer, self.node, self.lines.append)
 
 
-def test_the_namespace_is_the_drone_s_name_as_ros_can_write_it():
+def test_the_namespace_is_the_name_of_the_drone_made_valid_for_ros():
     node = Drone().node
     assert "/quad_1/ardrone/navdata" in node.published
     assert set(node.subscribed) == {
@@ -53,7 +53,7 @@ def test_the_namespace_is_the_drone_s_name_as_ros_can_write_it():
     assert set(node.services) == {"/quad_1/ardrone/flattrim", "/quad_1/ardrone/togglecam"}
 
 
-def test_a_gate_is_navdata_odometry_and_transforms():
+def test_each_gate_publishes_navdata_odometry_and_transforms():
     drone = Drone()
     subscribers = [drone.subscriber(topic) for topic in ("/quad_1/ardrone/navdata", "/quad_1/ardrone/odometry", "/tf")]
     for gate in range(3):
@@ -62,8 +62,8 @@ def test_a_gate_is_navdata_odometry_and_transforms():
     assert [message.header.seq for message in subscribers[0].ros_messages] == [0, 1, 2]
 
 
-def test_truth_is_on_ground_truth_alone():
-    """Whatever the truth says, nothing else that is published changes with it."""
+def test_the_truth_appears_only_on_the_ground_truth_topic():
+    """Nothing else that is published depends on the truth."""
     topics = [
         f"/quad_1/{topic}" for topic in ("ardrone/navdata", "ardrone/odometry", "ardrone/imu", "ardrone/mag", "fix")
     ]
@@ -88,7 +88,7 @@ def test_truth_is_on_ground_truth_alone():
     assert published[0] == published[1]
 
 
-def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
+def test_a_published_take_off_is_sent_to_the_drone():
     drone = Drone()
     drone.deliver(status(GATE_NS))
     drone.node.subscribed["/quad_1/ardrone/takeoff"].callback(wire.message_class("std_msgs/Empty")())
@@ -98,12 +98,12 @@ def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
     messages.decode(key, messages.encode(command))
 
 
-def test_drones_that_ros_cannot_tell_from_each_other_are_refused():
+def test_drones_with_the_same_name_in_ros_are_refused():
     with pytest.raises(RunError, match=r"'quad-1'.*'quad\.1'.*'quad_1'"):
         Bench("drone1", "quad-1", "quad.1")
 
 
-def test_the_clock_is_simulated_time():
+def test_the_clock_topic_carries_simulated_time():
     bench = Bench()
     clock = Subscriber(bench.node, "/clock")
     t_ns = 61_040_000_000
@@ -112,7 +112,7 @@ def test_the_clock_is_simulated_time():
     assert (message.clock.sec, message.clock.nanosec) == (61, 40_000_000)
 
 
-def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next_are_passed_on():
+def test_values_beyond_the_fields_of_ros_are_refused_and_reported_once():
     bench = Bench()
     navdata = Subscriber(bench.node, "/quad_1/ardrone/navdata")
     bench.bridge.forward(keys.status("quad-1"), b"garbage")
@@ -128,7 +128,7 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
 
 
 class Link:
-    """A session whose only subscription holds some payloads, and then waits to be closed."""
+    """A session whose only subscription returns the given payloads and then blocks until it is closed."""
 
     def __init__(self, payloads: list[bytes]) -> None:
         self._payloads = iter(payloads)
@@ -153,7 +153,7 @@ class Link:
         self._closed.set()
 
 
-def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.MonkeyPatch):
+def test_a_slow_consumer_continues_with_the_newest_gates(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zsim_bridges.vehicle_links.server.BACKLOG", 3)
     about: Any = type("Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")], "sensors_beside": ()})()
     table = key_table(["drone1"])
@@ -184,24 +184,24 @@ def test_who_is_too_slow_goes_on_with_the_newest_gates(monkeypatch: pytest.Monke
 
 
 def picture_subscribers(drone: Drone) -> dict[str, Subscriber]:
-    """Return a subscriber to every topic of the cameras."""
+    """Return a subscriber for every camera topic."""
     topics = [OWN.format(camera, leaf) for camera in ("front", "bottom") for leaf in (IMAGE, INFO)]
     return {topic: drone.subscriber(topic) for topic in [*topics, ACTIVE.format(IMAGE), ACTIVE.format(INFO)]}
 
 
-def test_a_picture_is_on_its_camera_s_topic_and_on_the_active_one() -> None:
+def test_a_picture_is_published_on_its_own_and_on_the_active_topic() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
     drone.topics.cameras.publish("front", image(GATE_NS))
     counts = {topic: len(s.ros_messages) for topic, s in subscribers.items() if s.ros_messages}
     assert counts == {OWN.format("front", IMAGE): 1, ACTIVE.format(IMAGE): 1}
     (got,) = subscribers[OWN.format("front", IMAGE)].ros_messages
-    assert (got.header.stamp.sec, got.header.stamp.nanosec) == (0, 16_000_000)  # of the exposure
+    assert (got.header.stamp.sec, got.header.stamp.nanosec) == (0, 16_000_000)  # the time of exposure
     assert (got.header.frame_id, got.format) == ("quad_1/ardrone_base_frontcam", "jpeg")
     assert bytes(got.data) == jpeg()
 
 
-def test_togglecam_makes_the_other_camera_the_active_one_and_again_the_first() -> None:
+def test_togglecam_switches_the_active_camera_back_and_forth() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
     for _ in range(2):
@@ -212,7 +212,7 @@ def test_togglecam_makes_the_other_camera_the_active_one_and_again_the_first() -
     assert frames == ["quad_1/ardrone_base_bottomcam", "quad_1/ardrone_base_frontcam"]
 
 
-def test_how_a_camera_sees_comes_with_each_picture_and_its_stamp() -> None:
+def test_camera_info_comes_with_each_picture_and_its_stamp() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
     drone.topics.cameras.learn("front", info())
@@ -227,7 +227,7 @@ def test_how_a_camera_sees_comes_with_each_picture_and_its_stamp() -> None:
     np.testing.assert_array_equal(got[0].P.reshape(3, 4)[:, 3], np.zeros(3))
 
 
-def test_the_cameras_are_in_the_tree_of_frames() -> None:
+def test_the_cameras_are_in_the_frame_tree() -> None:
     drone = Drone()
     tf = drone.subscriber("/tf")
     drone.topics.cameras.learn("front", info())
@@ -248,14 +248,14 @@ def test_the_cameras_are_in_the_tree_of_frames() -> None:
         ("/quad_1/ardrone/imu", []),
     ],
 )
-def test_a_camera_is_read_while_somebody_subscribes(topic: str, wanted: list[str]) -> None:
+def test_a_camera_is_read_only_while_subscribed(topic: str, wanted: list[str]) -> None:
     bench = Bench()
     assert bench.bridge.wanted_pictures() == []
     Subscriber(bench.node, topic)
     assert bench.bridge.wanted_pictures() == [keys.camera("quad-1", camera) for camera in wanted]
 
 
-def test_subscriptions_come_and_go_with_those_who_look() -> None:
+def test_pictures_are_received_only_while_wanted() -> None:
     link: Any = FakeLink()
     received: list[tuple[str, bytes]] = []
 
@@ -271,7 +271,7 @@ def test_subscriptions_come_and_go_with_those_who_look() -> None:
     assert received == [(FRONT, messages.encode(image(1, 1)))]
 
 
-def test_a_loop_that_is_busy_gets_the_newest() -> None:
+def test_a_busy_event_loop_gets_the_newest_pictures() -> None:
     link: Any = FakeLink()
     received: list[int] = []
 
@@ -287,7 +287,7 @@ def test_a_loop_that_is_busy_gets_the_newest() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG))])
-def test_what_is_no_picture_is_counted_and_not_published(payload: bytes) -> None:
+def test_an_invalid_picture_is_counted_and_not_published(payload: bytes) -> None:
     bench = Bench()
     subscriber = Subscriber(bench.node, OWN.format("front", IMAGE))
     bench.bridge.forward(FRONT, payload)

@@ -1,4 +1,4 @@
-"""rmw_zenoh's wire against its sources, deployed nodes, xxHash's specification; CDR against an encoder of the test's."""
+"""The wire format of rmw_zenoh against its sources, deployed nodes and xxHash; CDR against the test's own encoder."""
 
 import math
 import struct
@@ -26,12 +26,12 @@ from zsim_bridges.ros2.rmw_zenoh import MESSAGES, Attachment, Endpoint, NodeId, 
         ("std_srvs/srv/Trigger", "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"),
     ],
 )
-def test_hashes_are_those_of_deployed_nodes(name: str, digits: str) -> None:
+def test_type_hashes_equal_those_of_deployed_nodes(name: str, digits: str) -> None:
     assert rmw_zenoh.type_hash(name) == f"RIHS01_{digits}"
 
 
-def test_hashes_of_our_own_messages_are_those_that_somebody_else_computes() -> None:
-    """zenoh-ros2-sdk parses the texts itself."""
+def test_type_hashes_of_own_messages_equal_those_of_another_library() -> None:
+    """zenoh-ros2-sdk parses the definitions on its own."""
     utils = pytest.importorskip("zenoh_ros2_sdk.utils", reason="PyPI zenoh-ros2-sdk is not installed")
     store, names = get_typestore(Stores.ROS2_JAZZY), ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     header = {name: store.gendefhash(name, {}, 2)[0] for name in names}
@@ -40,7 +40,7 @@ def test_hashes_of_our_own_messages_are_those_that_somebody_else_computes() -> N
 
 
 class Cdr:
-    """Plain CDR, little-endian, as OMG's DDSI-RTPS 9.3.1.2 and 10.2 describe it: each number at a multiple of its size."""
+    """Plain little-endian CDR (OMG DDSI-RTPS, 9.3.1.2 and 10.2): each number is aligned to a multiple of its size."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -68,7 +68,7 @@ def header(sec: int, nanosec: int, frame: str) -> Any:
     return of("std_msgs/msg/Header", of("builtin_interfaces/msg/Time", sec, nanosec), frame)
 
 
-def test_cdr_of_our_cluster_state() -> None:
+def test_the_cdr_of_a_cluster_state_is_correct() -> None:
     numbers = np.array([1.0, 2.0])
     state = of(
         "zsim_msgs/msg/ClusterState", header(0, 20_000_000, "map"), "engaged", ["drone1", "d2"], ["x_c", "y_c"],
@@ -82,14 +82,14 @@ def test_cdr_of_our_cluster_state() -> None:
     assert rmw_zenoh.encode(state, "zsim_msgs/msg/ClusterState") == wanted.whole()
 
 
-def test_what_is_empty_has_one_byte_on_the_wire() -> None:
+def test_an_empty_message_has_one_byte_on_the_wire() -> None:
     for name in ("std_msgs/msg/Empty", "std_srvs/srv/Trigger_Request"):
         assert rmw_zenoh.encode(rmw_zenoh.message_class(name)(), name) == bytes.fromhex("0001000000")
 
 
 @pytest.mark.parametrize("name", ["geometry_msgs/msg/Twist", "std_msgs/msg/Empty", "std_srvs/srv/Trigger_Response"])
 @given(data=st.binary(max_size=80), head=st.sampled_from([b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"]))
-def test_garbage_is_a_message_or_a_refusal(name: str, data: bytes, head: bytes) -> None:
+def test_garbage_is_decoded_or_refused(name: str, data: bytes, head: bytes) -> None:
     with suppress(ValueError):
         assert isinstance(rmw_zenoh.decode(head + data, name), rmw_zenoh.message_class(name))
 
@@ -99,14 +99,14 @@ TF_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f0
 NODE = NodeId(0, ZID, 3, "/", "listener")
 
 
-def test_token_of_a_subscription_is_as_deployed_peers_write_it() -> None:
+def test_the_token_of_a_subscription_equals_that_of_deployed_peers() -> None:
     endpoint = Endpoint("MS", "/tf", "tf2_msgs::msg::dds_::TFMessage_", TF_HASH)
     token = rmw_zenoh.endpoint_token(NODE, 7, endpoint, rmw_zenoh.TF)
     assert token == f"@ros2_lv/0/{ZID}/3/7/MS/%/%/listener/%tf/tf2_msgs::msg::dds_::TFMessage_/{TF_HASH}/::,100:,:,:,,"
     assert rmw_zenoh.endpoint_of(token) == endpoint
 
 
-def test_token_of_a_node_has_its_number_twice_and_its_namespace_mangled() -> None:
+def test_the_token_of_a_node_has_its_number_twice_and_a_mangled_namespace() -> None:
     assert (
         rmw_zenoh.node_token(NODE._replace(namespace="/drone1", name="zsim"))
         == f"@ros2_lv/0/{ZID}/3/3/NN/%/%drone1/zsim"
@@ -124,11 +124,11 @@ def test_token_of_a_node_has_its_number_twice_and_its_namespace_mangled() -> Non
         (Qos(depth=3, best_effort=True, transient_local=True), "2:1:,3:,:,:,,"),
     ],
 )
-def test_quality_of_service(qos: Qos, text: str) -> None:
+def test_quality_of_service_is_encoded_as_in_rmw_zenoh(qos: Qos, text: str) -> None:
     assert qos.text() == text
 
 
-def test_data_key() -> None:
+def test_a_data_key_has_domain_topic_type_and_hash() -> None:
     name = rmw_zenoh.dds_name("sensor_msgs/msg/Imu")
     assert name == "sensor_msgs::msg::dds_::Imu_"
     assert (
@@ -137,7 +137,7 @@ def test_data_key() -> None:
     assert rmw_zenoh.dds_name("std_srvs/srv/SetBool") == "std_srvs::srv::dds_::SetBool_"
 
 
-def test_attachment_is_33_bytes() -> None:
+def test_an_attachment_has_33_bytes() -> None:
     packed = Attachment(1, 0x0102030405060708, bytes(range(16))).packed()
     assert packed.hex() == "0100000000000000" + "0807060504030201" + "10" + "000102030405060708090a0b0c0d0e0f"
     assert packed == struct.pack("<qqB", 1, 0x0102030405060708, 16) + bytes(range(16))
@@ -145,18 +145,18 @@ def test_attachment_is_33_bytes() -> None:
 
 
 @pytest.mark.parametrize("data", [b"", bytes(32), bytes(34), bytes(33), b"\x0fsequence_number" + bytes(17)])
-def test_other_attachments_are_refused(data: bytes) -> None:
+def test_invalid_attachments_are_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="33"):
         rmw_zenoh.attachment_of(data)
 
 
-def test_gid_is_low_half_first_each_little_endian() -> None:
-    """XXH3-128 of nothing is 99aa06d3014798d8 6001c324468d497f (xxHash's own test vectors)."""
+def test_a_gid_is_the_hash_with_its_low_half_first_each_little_endian() -> None:
+    """The XXH3-128 hash of no bytes is 99aa06d3014798d8 6001c324468d497f (test vectors of xxHash)."""
     assert rmw_zenoh.gid_of("").hex() == "7f498d4624c30160" + "d8984701d306aa99"
 
 
 @given(st.text(max_size=200))
-def test_whatever_stands_in_a_token_is_taken_or_left(text: str) -> None:
+def test_any_token_is_parsed_or_ignored(text: str) -> None:
     found = rmw_zenoh.endpoint_of(f"@ros2_lv/0/{text}")
     assert found is None or len(found) == 4
 
@@ -165,11 +165,11 @@ def test_whatever_stands_in_a_token_is_taken_or_left(text: str) -> None:
     ("name", "ros"),
     [("drone1", "drone1"), ("quad-1.a", "quad_1_a"), ("7", "drone_7"), ("a--b", "a_b"), ("a__b", "a_b"), ("-", "_")],
 )
-def test_ros_names(name: str, ros: str) -> None:
+def test_names_are_made_valid_for_ros(name: str, ros: str) -> None:
     assert ros_name(name, "drone") == ros
 
 
-def test_names_that_would_be_the_same_get_numbers() -> None:
+def test_names_that_would_coincide_get_numbers() -> None:
     assert ros_names(["a-b", "a.b", "a_b", "a_b_2"], "drone") == {
         "a-b": "a_b",
         "a.b": "a_b_2",
@@ -179,7 +179,7 @@ def test_names_that_would_be_the_same_get_numbers() -> None:
 
 
 @given(st.lists(st.from_regex(r"[a-z0-9_.-]{1,32}", fullmatch=True), unique=True, max_size=8))
-def test_every_name_of_the_contract_has_one_of_its_own_that_ros_takes(names: list[str]) -> None:
+def test_every_name_of_the_contract_has_a_unique_valid_ros_name(names: list[str]) -> None:
     found = ros_names(names, "drone")
     assert len(set(found.values())) == len(names)
     assert all(ros.replace("_", "a").isalnum() and not ros[0].isdigit() and "__" not in ros for ros in found.values())

@@ -1,4 +1,4 @@
-"""The bridge without Zenoh: what it converts and when, what it sends on, what it refuses."""
+"""The ROS 2 bridge without Zenoh: what it converts and when, what it forwards, and what it refuses."""
 
 import math
 from collections.abc import Callable
@@ -34,7 +34,7 @@ IMU, TWIST, EMPTY, TRIGGER = (
 
 
 class Link:
-    """A session to both sides; a test delivers what others say."""
+    """A session to both sides, on which the test delivers what others publish."""
 
     host = "laptop"
 
@@ -92,7 +92,7 @@ class Link:
 
 
 class FakeSubscription:
-    """A subscription."""
+    """A subscription that the test's session feeds."""
 
     def __init__(self, link: Link, key: str) -> None:
         self._arrived: list[ReceivedSample] = []
@@ -106,7 +106,7 @@ class FakeSubscription:
 
 
 class Query:
-    """A request of ROS's."""
+    """A service request from ROS."""
 
     def __init__(self, payload: bytes, attachment: bytes) -> None:
         self.payload, self.attachment = payload, attachment
@@ -121,7 +121,7 @@ class Query:
 
 
 class Bench:
-    """A bridge in a run of two drones, whose names ROS does not take as they are."""
+    """A bridge in a run of two drones, with names that ROS does not allow."""
 
     def __init__(self, mode: Mode = "lockstep") -> None:
         text = scenario_file.to_text(scenario_file.from_text(PAIR.replace("drone1", "drone-1").replace("main", "m.x")))
@@ -141,7 +141,7 @@ class Bench:
         self.bridge.process(0.0)
 
     def reader(self, topic: str, kind: str, alive: bool = True) -> None:
-        """Let a subscription come or go."""
+        """Announce or withdraw a subscription."""
         endpoint = Endpoint("MS", topic, rmw_zenoh.dds_name(kind), rmw_zenoh.type_hash(kind))
         self.link.on_token_of(rmw_zenoh.endpoint_token(READER, 2, endpoint, rmw_zenoh.DEFAULT), alive)
         self.turn()
@@ -150,7 +150,7 @@ class Bench:
         return rmw_zenoh.data_key(0, topic, rmw_zenoh.dds_name(kind), rmw_zenoh.type_hash(kind))
 
     def publish(self, topic: str, kind: str, message: Any, attachment: bytes = BESIDE) -> None:
-        """Let a ROS node publish."""
+        """Publish as a ROS node."""
         payload = message if isinstance(message, bytes) else rmw_zenoh.encode(message, kind)
         self.link.deliver(self.key(topic, kind), payload, attachment)
         self.turn()
@@ -175,7 +175,7 @@ def imu(t_ns: int) -> bytes:
     return messages.encode(messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)))
 
 
-def test_a_topic_is_read_and_converted_only_while_somebody_subscribes() -> None:
+def test_a_topic_is_read_and_converted_only_while_subscribed() -> None:
     bench, key = Bench(), keys.sensor("drone-1", "imu")
     assert not bench.link.hearing.get(key)
     bench.reader("/drone_1/imu", IMU)
@@ -194,7 +194,7 @@ def test_a_topic_is_read_and_converted_only_while_somebody_subscribes() -> None:
     assert not bench.link.hearing[key]
 
 
-def test_topics_of_one_source_share_it_until_the_last_is_left() -> None:
+def test_topics_of_one_source_share_its_subscription() -> None:
     bench, key = Bench(), keys.estimate("drone-1")
     bench.reader("/drone_1/odometry", "nav_msgs/msg/Odometry")
     bench.reader("/tf", "tf2_msgs/msg/TFMessage")
@@ -205,14 +205,14 @@ def test_topics_of_one_source_share_it_until_the_last_is_left() -> None:
     assert not bench.link.hearing[key]
 
 
-def test_who_subscribes_to_another_type_is_told_of_and_gets_nothing() -> None:
+def test_a_subscription_with_another_type_is_reported_and_ignored() -> None:
     bench = Bench()
     bench.reader("/drone_1/imu", "std_msgs/msg/String")
     assert not bench.link.hearing.get(keys.sensor("drone-1", "imu"))
     assert any(has_terms(s, "std_msgs::msg::dds_::String_", "sensor_msgs/msg/Imu") for s in bench.lines)
 
 
-def test_names_that_ros_does_not_take_are_told() -> None:
+def test_names_changed_for_ros_are_reported() -> None:
     published = "\n".join(Bench().lines)
     assert has_terms(published, "drone-1", "drone_1", "ROS")
     assert has_terms(published, "m.x", "m_x", "ROS")
@@ -233,12 +233,12 @@ def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() ->
     assert (second.seq, second.velocity_m_s[0]) == (1, 0.5)
 
 
-def test_modes_and_the_emergency_button() -> None:
+def test_mode_topics_send_modes_and_reset_toggles_the_emergency() -> None:
     bench, empty = Bench(), rmw_zenoh.message_class(EMPTY)()
     status = keys.status("drone-1")
     bench.publish("/drone_1/takeoff", EMPTY, empty)
     bench.publish("/drone_1/land", EMPTY, empty)
-    bench.publish("/drone_1/reset", EMPTY, empty)  # nobody tells the state: neither
+    bench.publish("/drone_1/reset", EMPTY, empty)  # refused, since the state is unknown
     for state in ("flying", "emergency"):
         bench.link.last[status] = messages.encode(flight_messages.Status(0, 0, state, 50.0, False, None, 1))
         bench.publish("/drone_1/reset", EMPTY, empty)
@@ -261,7 +261,7 @@ def test_modes_and_the_emergency_button() -> None:
         (twist(0, 0, 0, 0, 0, math.inf), BESIDE, ("finite",)),
     ],
 )
-def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: bytes, terms: tuple[str, ...]) -> None:
+def test_garbage_is_refused_counted_and_reported_once(message: Any, attachment: bytes, terms: tuple[str, ...]) -> None:
     bench = Bench()
     for _ in range(3):
         bench.publish("/drone_1/cmd_vel", TWIST, message, attachment)
@@ -272,7 +272,7 @@ def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: byte
     assert has_terms(refusals[0], *terms)
 
 
-def test_what_does_not_fit_a_ros_type_is_refused() -> None:
+def test_a_value_that_does_not_fit_its_ros_type_is_refused() -> None:
     bench, key = Bench(), keys.sensor("drone-1", "baro")
     bench.reader("/drone_1/navdata", "zsim_msgs/msg/Navdata")
     bench.link.deliver(key, messages.encode(messages.Baro(0, 0, 0, 1e300, 0.0)))
@@ -285,7 +285,7 @@ def test_what_does_not_fit_a_ros_type_is_refused() -> None:
     assert bench.observer.health.refused == 2
 
 
-def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
+def test_a_service_calls_the_controller_and_echoes_the_attachment() -> None:
     bench = Bench()
     query = bench.ask("/cluster/m_x/engage")
     assert bench.link.asked == [("cluster/m.x/control", "engage", "ros2.main", {})]
@@ -297,7 +297,7 @@ def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
     assert rmw_zenoh.attachment_of(beside) == (7, WALL_NS, bytes(range(16)))
 
 
-def test_a_request_that_is_none_ends_without_a_reply() -> None:
+def test_an_invalid_request_ends_without_a_reply() -> None:
     bench = Bench()
     for query in (bench.ask("/drone_1/release", b"\x00\x01\x00\x00"), bench.ask("/drone_1/release", attachment=b"")):
         assert query.ended
@@ -306,8 +306,8 @@ def test_a_request_that_is_none_ends_without_a_reply() -> None:
     assert bench.observer.health.refused == 2
 
 
-def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
-    """Also where several gates wait at once, and the status was read before the sensors were."""
+def test_a_summary_of_a_gate_uses_data_up_to_that_gate() -> None:
+    """This also holds if several gates are waiting and the status was read before the sensors."""
     bench, imu_key, status_key = Bench(), keys.sensor("drone-1", "imu"), keys.status("drone-1")
     bench.reader("/drone_1/state", "std_msgs/msg/String")
     bench.reader("/drone_1/navdata", "zsim_msgs/msg/Navdata")
@@ -321,7 +321,7 @@ def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
     assert [rmw_zenoh.decode(each, "zsim_msgs/msg/Navdata").az for each in navdata] == pytest.approx([0.0, 1.0, 2.0])
 
 
-def test_frames_that_never_move_are_kept_for_who_comes_later() -> None:
+def test_static_transforms_are_cached_for_late_subscribers() -> None:
     ((key, payload, _),) = Bench().link.kept
     assert key == rmw_zenoh.data_key(
         0, "/tf_static", "tf2_msgs::msg::dds_::TFMessage_", rmw_zenoh.type_hash("tf2_msgs/msg/TFMessage")
@@ -330,14 +330,14 @@ def test_frames_that_never_move_are_kept_for_who_comes_later() -> None:
     assert {"drone_1/odom", "drone2/odom", "drone_1/sonar_link", "drone2/imu_link"} <= children
 
 
-def test_closed_it_hears_nothing() -> None:
+def test_a_closed_bridge_has_no_subscriptions() -> None:
     bench = Bench()
     bench.reader("/drone_1/imu", IMU)
     bench.bridge.close()
     assert not any(bench.link.hearing.values())
 
 
-def test_samples_that_nobody_takes_go_the_oldest_first_and_acts_never() -> None:
+def test_a_full_queue_drops_the_oldest_samples_but_no_tasks() -> None:
     inbox, done = CallbackQueue(3), []
     for k in range(5):
         inbox.add_sample("key", bytes([k]))
@@ -351,7 +351,7 @@ def test_samples_that_nobody_takes_go_the_oldest_first_and_acts_never() -> None:
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_what_is_dropped_is_told_in_health(mode: Mode) -> None:
+def test_dropped_samples_are_counted_in_the_health(mode: Mode) -> None:
     bench, key, estimate = Bench(mode), keys.sensor("drone-1", "imu"), keys.estimate("drone-1")
     bench.reader("/drone_1/imu", IMU)
     bench.reader("/tf", "tf2_msgs/msg/TFMessage")
@@ -371,12 +371,12 @@ FRONT_INFO = keys.camera_info("drone-1", "front")
 
 
 def published(bench: Bench, topic: str, kind: str) -> list[Any]:
-    """Return what was published on a topic."""
+    """Return the messages published on a topic."""
     key = bench.key(topic, kind)
     return [rmw_zenoh.decode(payload, kind) for at, payload, _ in bench.link.sent if at == key]
 
 
-def test_a_picture_is_on_its_camera_s_topic_with_its_bytes_and_the_time_of_exposure() -> None:
+def test_a_picture_is_published_unchanged_with_its_exposure_time() -> None:
     bench = Bench()
     bench.reader("/drone_1/ardrone/front/image_raw/compressed", IMAGE)
     assert not bench.link.hearing.get(BOTTOM)
@@ -390,7 +390,7 @@ def test_a_picture_is_on_its_camera_s_topic_with_its_bytes_and_the_time_of_expos
     assert not bench.link.hearing[FRONT]
 
 
-def test_how_a_camera_sees_was_said_before_anybody_asked_and_comes_with_each_picture() -> None:
+def test_camera_info_from_before_the_subscription_comes_with_each_picture() -> None:
     bench = Bench()
     bench.link.last[FRONT_INFO] = messages.encode(info())
     bench.reader("/drone_1/ardrone/front/camera_info", CAMERA_INFO)
@@ -404,7 +404,7 @@ def test_how_a_camera_sees_was_said_before_anybody_asked_and_comes_with_each_pic
     assert [m.header.stamp.nanosec for m in (first, second)] == [16_000_000, 36_000_000]
 
 
-def test_togglecam_makes_the_other_camera_the_active_one() -> None:
+def test_togglecam_switches_the_active_camera() -> None:
     bench = Bench()
     bench.reader("/drone_1/ardrone/image_raw/compressed", IMAGE)
     for _ in range(2):
@@ -418,7 +418,7 @@ def test_togglecam_makes_the_other_camera_the_active_one() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG)), messages.encode(info())])
-def test_what_is_no_picture_is_refused_and_the_next_is_passed_on(payload: bytes) -> None:
+def test_an_invalid_picture_is_refused_and_the_next_forwarded(payload: bytes) -> None:
     bench = Bench()
     bench.reader("/drone_1/ardrone/front/image_raw/compressed", IMAGE)
     bench.link.deliver(FRONT, payload)
@@ -428,7 +428,7 @@ def test_what_is_no_picture_is_refused_and_the_next_is_passed_on(payload: bytes)
     assert len(published(bench, "/drone_1/ardrone/front/image_raw/compressed", IMAGE)) == 1
 
 
-def test_the_cameras_of_the_scenario_are_among_the_frames_that_never_move() -> None:
+def test_cameras_of_the_scenario_have_static_transforms() -> None:
     text = PAIR.replace("preset: paper", "preset: paper, front_camera: {}, bottom_camera: {}")
     drone = scenario_file.resolve(msgspec.yaml.decode(text.encode())).drones[0]
     frames = {frame.child_frame_id: frame for frame in topics.static_transforms("d", drone.sensors)}

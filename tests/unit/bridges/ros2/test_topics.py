@@ -1,4 +1,4 @@
-"""From zsim's messages to ROS's: stamps, frames, signs, units and covariances."""
+"""The conversion from zsim's messages to ROS 2: stamps, frames, signs, units and covariances."""
 
 import math
 from pathlib import Path
@@ -20,7 +20,7 @@ from zsim_bridges.ros2.topics import DroneCameras, NavdataSummary
 
 SENSORS = scenario_file.from_text(ONE).drones[0].sensors
 T_NS = 3_020_000_000
-NORTH: Quaternion = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # x forward is north
+NORTH: Quaternion = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # the body's x axis points north
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
@@ -54,13 +54,13 @@ def all_topics() -> dict[str, topics.Topic]:
 
 
 def convert(topic: str, message: Any) -> Any:
-    """Return what a topic makes of a message on its first source, after a way through CDR."""
+    """Return the ROS message into which a topic converts a message of its first source, after a CDR round trip."""
     found = all_topics()[topic]
     converted = found.convert(found.sources[0], message)
     return rmw_zenoh.decode(rmw_zenoh.encode(converted, found.kind), found.kind)
 
 
-def test_samples_are_stamped_with_the_time_for_which_they_hold() -> None:
+def test_samples_are_stamped_with_their_sampling_time() -> None:
     imu = convert("/drone1/imu", messages.Imu(T_NS, 0, T_NS - 15_000_000, (0.0, 0.0, 9.81), (0.1, 0.2, 0.3)))
     assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (3, 5_000_000)
     assert (imu.header.frame_id, xyz(imu.angular_velocity)) == ("drone1/imu_link", [0.1, 0.2, 0.3])
@@ -68,13 +68,13 @@ def test_samples_are_stamped_with_the_time_for_which_they_hold() -> None:
     assert imu.orientation_covariance[0] == -1.0
 
 
-def test_times_before_the_start_are_written_as_ros_writes_them() -> None:
-    """A sample may hold for a time before the start: seconds go down, nanoseconds stay positive."""
+def test_times_before_the_start_are_encoded_as_in_ros() -> None:
+    """A sample may precede the start: the seconds are then negative and the nanoseconds stay positive."""
     stamp = topics.stamp(-20_000_000)
     assert (stamp.sec, stamp.nanosec) == (-1, 980_000_000)
 
 
-def test_covariances_are_those_of_the_scenario() -> None:
+def test_covariances_follow_the_error_models_of_the_scenario() -> None:
     error = ErrorModel(noise=0.3, density=0.02, quantum=0.1)
     assert topics.variance(error, 100.0) == pytest.approx(0.09 + 0.04 + 0.01 / 12)
     imu = convert("/drone1/imu", messages.Imu(T_NS, 0, T_NS, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)))
@@ -82,7 +82,7 @@ def test_covariances_are_those_of_the_scenario() -> None:
     assert imu.angular_velocity_covariance.reshape(3, 3) == pytest.approx(np.eye(3) * gyro**2)
 
 
-def test_fix_has_ellipsoidal_height_and_variance() -> None:
+def test_a_fix_has_ellipsoidal_height_and_variance() -> None:
     gps = messages.Gps(T_NS, 0, T_NS, -34.6, -58.4, 27.5, (0.0, 0.0, 2.5), (1.0, -2.0, 0.5), 1.5, 3, 9)
     fix = convert("/drone1/fix", gps)
     assert (fix.latitude, fix.longitude, fix.altitude, fix.status.status) == (-34.6, -58.4, 27.5, 0)
@@ -90,15 +90,15 @@ def test_fix_has_ellipsoidal_height_and_variance() -> None:
     assert xyz(convert("/drone1/fix_velocity", gps).twist.linear) == [1.0, -2.0, 0.5]
 
 
-def test_field_is_in_tesla_and_range_without_echo_infinite() -> None:
+def test_the_field_is_in_tesla_and_a_range_without_echo_is_infinite() -> None:
     mag = convert("/drone1/mag", messages.Mag(T_NS, 0, T_NS, (20.0, -3.0, 14.0)))
     assert xyz(mag.magnetic_field) == pytest.approx([20e-6, -3e-6, 14e-6])
     assert convert("/drone1/range", messages.Sonar(T_NS, 0, T_NS, 1.25, True)).range == 1.25
     assert convert("/drone1/range", messages.Sonar(T_NS, 0, T_NS, 6.0, False)).range == math.inf
 
 
-def test_true_twist_is_in_the_body() -> None:
-    """A drone that heads north and flies north and up flies ahead and up."""
+def test_the_true_twist_is_in_the_body_frame() -> None:
+    """A drone that heads north and flies north and up moves forward and up."""
     still, rotors = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
     truth = flight_messages.Truth(T_NS, 0, (1.0, 2.0, 3.0), (0.0, 2.0, 0.5), NORTH, (0.1, 0.2, 0.3), still, rotors)
     odometry = convert("/drone1/ground_truth", truth)
@@ -110,8 +110,8 @@ def test_true_twist_is_in_the_body() -> None:
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "drone1/base_link")
 
 
-def test_odometry_has_the_estimates_covariance_where_it_belongs() -> None:
-    """East and north change places in the body of a drone that heads north; of angles only the yaw has a sigma."""
+def test_odometry_has_the_covariance_of_the_estimate_in_its_frames() -> None:
+    """East and north are swapped in the body frame of a drone that heads north; only the yaw angle has a sigma."""
     odometry = convert("/drone1/odometry", estimate(T_NS, NORTH))
     assert odometry.pose.covariance.reshape(6, 6) == pytest.approx(np.diag([1, 2, 3, 0, 0, 0.01]))
     assert odometry.twist.covariance.reshape(6, 6) == pytest.approx(np.diag([5, 4, 6, 0, 0, 0]))
@@ -120,8 +120,8 @@ def test_odometry_has_the_estimates_covariance_where_it_belongs() -> None:
 
 
 @pytest.mark.parametrize("rate", [(0.0, 0.0, 0.5), (0.0, 0.0, -0.5), (2.0, -1.0, 0.3), (0.0, 0.0, 0.0)])
-def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
-    """Two attitudes 20 ms apart, the second turned by the body rate; also where the quaternion changes its sign."""
+def test_the_angular_rate_of_odometry_follows_from_its_attitudes(rate: Vector3) -> None:
+    """Two attitudes 20 ms apart differ by the body rate; the sign of the quaternion does not matter."""
     maker = topics.OdometryTopic("odom", "base")
     half = [0.01 * each for each in rate]
     angle = math.hypot(*half)
@@ -135,13 +135,13 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
         assert xyz(odometry.twist.twist.angular) == pytest.approx(rate, abs=1e-9)
 
 
-def test_into_body_is_the_inverse_of_the_frames_rotation() -> None:
+def test_into_body_is_the_inverse_of_rotate() -> None:
     q = quaternion(0.3, -0.4, 2.0)
     assert rotate(q, topics.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
 
 
-def test_sonar_frame_looks_along_the_beam_of_a_turned_mount() -> None:
-    """ROS's range finders look along x; this sonar is tilted by 30 deg about y, its beam from down to the front."""
+def test_the_sonar_frame_points_along_the_beam_of_a_tilted_mount() -> None:
+    """Range finders of ROS look along x. The sonar is tilted by -30 deg about y, which turns its beam forward."""
     mount = Mount(position_m=(0.1, 0.0, -0.02), rpy_deg=(0.0, -30.0, 0.0))
     spec = _with_sonar(mount)
     placed = {frame.child_frame_id: frame for frame in topics.static_transforms("drone1", spec)}
@@ -159,7 +159,7 @@ def _with_sonar(mount: Mount) -> Sensors:
     return scenario_file.from_text(ONE.replace("sensors: {preset: paper}", mounted)).drones[0].sensors
 
 
-def test_tf_goes_from_odom_to_base_and_from_map_to_the_cluster() -> None:
+def test_tf_links_odom_to_base_and_map_to_the_cluster() -> None:
     tf: Any = all_topics()["/tf"]
     (moved,) = tf.convert("drone/drone1/estimate", estimate(T_NS, NORTH)).transforms
     assert (moved.header.frame_id, moved.child_frame_id) == ("drone1/odom", "drone1/base_link")
@@ -177,7 +177,7 @@ def cluster_state(**others: Any) -> flight_messages.ClusterState:
     )
 
 
-def test_cluster_pose_and_state() -> None:
+def test_a_cluster_has_a_pose_and_a_state() -> None:
     pose = convert("/cluster/main/pose", cluster_state())
     assert xyz(pose.pose.position) == [1.0, 2.0, 3.0]
     assert (pose.pose.orientation.w, pose.pose.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
@@ -191,7 +191,7 @@ def status(t_ns: int, state: flight_messages.DroneState = "flying") -> flight_me
     return flight_messages.Status(t_ns, 0, state, 62.5, False, None, 1)
 
 
-def test_battery_comes_each_second_and_state_when_it_changes_too() -> None:
+def test_the_battery_is_published_every_second_and_the_state_on_change_too() -> None:
     found = all_topics()
     battery, state = found["/drone1/battery"].convert, found["/drone1/state"].convert
     times = range(0, 2_000_000_000, 20_000_000)
@@ -203,8 +203,8 @@ def test_battery_comes_each_second_and_state_when_it_changes_too() -> None:
     assert convert("/drone1/battery", status(0)).percentage == pytest.approx(0.625)
 
 
-def test_navdata_is_in_the_drivers_units_and_signs() -> None:
-    """Right side down, nose down and counter-clockwise are positive; g, mm, mm/s, deg, Pa, us."""
+def test_navdata_has_the_units_and_signs_of_the_driver() -> None:
+    """Right side down, nose down and counter-clockwise are positive; the units are g, mm, mm/s, deg, Pa and us."""
     navdata = NavdataSummary("base")
     converted: dict[str, Any] = {
         "imu": messages.Imu(T_NS, 0, T_NS, (0.0, -4.903325, 9.80665), (0.0, 0.0, 0.0)),
@@ -224,7 +224,7 @@ def test_navdata_is_in_the_drivers_units_and_signs() -> None:
     assert rmw_zenoh.encode(made, "zsim_msgs/msg/Navdata")
 
 
-def test_navdata_of_a_drone_that_has_told_nothing_yet() -> None:
+def test_navdata_without_samples_is_zero_or_nan() -> None:
     navdata = NavdataSummary("base")
     made: Any = navdata.update("drone/drone1/sensor/status", status(0, "emergency"))
     assert (made.state, made.pressure, made.altd) == (0, 0, 0)
@@ -232,8 +232,8 @@ def test_navdata_of_a_drone_that_has_told_nothing_yet() -> None:
     assert math.isnan(made.az)
 
 
-def test_the_documents_table_has_every_topic() -> None:
-    """docs/ros2.md: topic, type, frame, QoS; the drone's and the cluster's name is NAME there."""
+def test_the_table_in_the_documentation_has_every_topic() -> None:
+    """The table in docs/ros2.md has topic, type, frame and QoS; NAME stands for the drone or the cluster."""
     page = (Path(__file__).parents[4] / "docs" / "ros2.md").read_text()
     qos = {rmw_zenoh.SENSOR: "sensor", rmw_zenoh.DEFAULT: "default", rmw_zenoh.CLOCK: "clock", rmw_zenoh.TF: "tf"}
     rows = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]

@@ -1,4 +1,4 @@
-"""The driver's process, with a session and an aircraft of the test's own on a UDP port of loopback."""
+"""The driver process, with a fake session and a fake aircraft on a UDP port of loopback."""
 
 import asyncio
 from collections.abc import Iterator
@@ -57,7 +57,7 @@ def info(mode: Any = "realtime") -> Info:
 
 
 class Session(VehicleSession):
-    """Sends its demands by name, and takes what arrives for the state that it then has."""
+    """Sends the name of each demand, and takes each datagram as the aircraft's new state."""
 
     state: AircraftState = AircraftState()  # type: ignore[assignment]
 
@@ -76,7 +76,7 @@ class Session(VehicleSession):
 
 
 class Aircraft(asyncio.DatagramProtocol):
-    """Keeps what it is sent; answers with its state."""
+    """Records the demands that it receives, and answers with its state."""
 
     def __init__(self) -> None:
         self.demands: list[str] = []
@@ -104,7 +104,7 @@ class Aircraft(asyncio.DatagramProtocol):
 
 
 class Flight:
-    """A run whose clock the test lets go on, its driver, and the aircraft."""
+    """A run whose clock the test advances, its driver, and the aircraft."""
 
     def __init__(self, armed: bool) -> None:
         self.link, self.lines, self.armed = FakeLink(), [], armed
@@ -127,7 +127,7 @@ class Flight:
         )
         self.task = loop.create_task(process.run(lambda: self.stop))
         await self.aircraft.until("none")
-        assert self.links() == []  # there is no time yet
+        assert self.links() == []  # without a clock there is nothing to publish
         self.link.deliver(keys.CLOCK, Clock(0, 0, "r", 1, "waiting", 1.0))
         return self
 
@@ -138,7 +138,7 @@ class Flight:
         self._transport.close()
 
     async def gate(self) -> None:
-        """Let the world reach its next gate, and the driver take it."""
+        """Let the world reach its next gate and the driver handle it."""
         self.t_ns += GATE_NS
         self.link.deliver(keys.CLOCK, Clock(self.t_ns, 0, "r", 1, "running", 1.0))
         await asyncio.sleep(0)
@@ -147,14 +147,14 @@ class Flight:
         self.link.deliver(keys.accepted("drone2", kind), message)
 
     def links(self) -> list[str]:
-        """Return the states of the link that were published."""
+        """Return the published states of the link."""
         return [report.state for report in self.link.published_on(keys.link("drone2"))]
 
     def take_off(self) -> None:
         self.command("mode", flight_messages.Mode(0, 0, "controller.main", "takeoff"))
 
     async def fly(self) -> None:
-        """Let the aircraft be in the air, where the driver holds it."""
+        """Put the aircraft in the air, where the driver makes it hold."""
         self.aircraft.state = "flying"
         await self.aircraft.until("hold")
 
@@ -192,7 +192,7 @@ async def test_it_flies_when_it_is_armed_and_lands_what_flies_before_it_leaves()
         await flight.gate()
         flight.take_off()
         assert (await flight.answered("arm")).ok
-        assert flight.aircraft.demands == ["none"]  # what was commanded before is forgotten
+        assert flight.aircraft.demands == ["none"]  # commands from before arming are discarded
         flight.take_off()
         await flight.aircraft.until("take_off")
         flight.aircraft.state = "hovering"
@@ -312,7 +312,7 @@ async def test_what_is_no_request_is_answered_with_the_reason(name: str) -> None
         assert (await flight.answered("arm")).ok
 
 
-def test_what_cannot_be_driven_is_refused():
+def test_a_drone_or_run_that_cannot_be_driven_is_refused():
     for drone, run, name, term in (
         ("ghost", info(), ME, "drone1, drone2"),
         ("drone1", info(), ME, "body: external"),
@@ -324,7 +324,7 @@ def test_what_cannot_be_driven_is_refused():
     check_run(info(), ME, "drone2")
 
 
-def test_addresses_and_places():
+def test_addresses_and_positions_are_parsed_or_refused():
     assert udp_channel("udp://192.168.1.20:14580", 14540) == UdpChannel("192.168.1.20", 14580, 14540)
     assert position(" 1, -2.5,0") == (1.0, -2.5, 0.0)
     for bad in ("", "192.168.1.20", "tcp://a:1", "udp://a", "udp://:14540", "udp://a:x", "udp://a:99999"):
@@ -353,15 +353,15 @@ async def test_the_link_is_a_message_of_the_contract() -> None:
         assert (first.source, first.loss_percent, first.round_trip_ms) == (ME, 1.0, None)
 
 
-def test_four_rotors_carry_an_ardrone_at_the_speed_of_its_hover():
+def test_the_hover_speed_of_an_ardrone_matches_its_weight():
     drone = scenario_file.from_text(SCENARIO).drone("drone2")
-    assert hover_speed(drone, 4, 9.80665) == pytest.approx(361.6, abs=0.5)  # rad/s, of 0.429 kg (Li, MSc thesis)
+    assert hover_speed(drone, 4, 9.80665) == pytest.approx(361.6, abs=0.5)  # rad/s, for 0.429 kg (Li, MSc thesis)
 
 
 # Messages of a gate
 
 MS = 1_000_000
-BEGUN_NS = 5_000 * MS  # by the driver's clock
+BEGUN_NS = 5_000 * MS  # the start of the run, on the driver's clock
 
 
 def external() -> ExternalDrone:
@@ -377,7 +377,7 @@ def vehicle(t_ms: float) -> AircraftState:
     return AircraftState("flying", 80.0, pose, pose.taken_ns)
 
 
-def test_a_gate_of_messages():
+def test_a_gate_has_sorted_samples_the_truth_and_the_status():
     drone = external()
     drone.readings.extend([imu(18), imu(8), Reading("sonar", BEGUN_NS + 11 * MS, (1.5, True))])
     *samples, (truth_key, truth), (status_key, status) = drone.gate(20 * MS, vehicle(10), "controller.main")
@@ -390,7 +390,7 @@ def test_a_gate_of_messages():
     assert (status.count, status.state, status.commander) == (4, "flying", "controller.main")
 
 
-def test_every_message_passes_the_contract():
+def test_every_message_satisfies_the_contract():
     drone = external()
     values = {
         "imu": ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0)),
@@ -407,14 +407,14 @@ def test_every_message_passes_the_contract():
         assert messages.decode(key, messages.encode(message)) == message
 
 
-def test_none_is_of_the_future_nor_of_before_the_run():
+def test_samples_are_clamped_between_the_start_of_the_run_and_the_gate():
     drone = external()
     drone.readings.extend([imu(-50), imu(25)])
     (_, first), (_, second), *_ = drone.gate(20 * MS, vehicle(0), None)
     assert (first.t_sample_ns, second.t_sample_ns) == (0, 20 * MS)
 
 
-def test_a_gate_is_published_once_and_none_without_a_pose():
+def test_a_gate_is_published_once_and_only_with_a_pose():
     drone = external()
     assert drone.gate(20 * MS, AircraftState(), None) == []
     assert drone.gate(40 * MS, vehicle(0), None)
@@ -425,12 +425,12 @@ def test_a_gate_is_published_once_and_none_without_a_pose():
 @pytest.mark.parametrize(
     ("state", "turns"), [("landed", 0.0), ("taking_off", 400.0), ("flying", 400.0), ("emergency", 0.0)]
 )
-def test_rotors_turn_as_in_hover_while_it_is_in_the_air(state: Any, turns: float):
+def test_rotors_turn_at_hover_speed_while_airborne(state: Any, turns: float):
     drone = ExternalDrone("drone2", lambda now_ns: now_ns - BEGUN_NS, (400.0,) * 6)
     (_, truth), _ = drone.gate(20 * MS, vehicle(0)._replace(state=state), None)
     assert truth.rotor_rad_s == (turns,) * 6
 
 
-def test_an_old_pose_is_carried_on_for_half_a_second():
+def test_a_pose_is_extrapolated_for_at_most_half_a_second():
     (_, truth), _ = external().gate(10_000 * MS, vehicle(0), None)
     assert truth.position_m == pytest.approx((1.5, 2.0, 2.5))

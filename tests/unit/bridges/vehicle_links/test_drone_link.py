@@ -1,4 +1,4 @@
-"""What the aircraft makes of its sensors: altitude, integrated position, its own attitude."""
+"""What the aircraft derives from its sensors: altitude, integrated position and attitude."""
 
 import math
 
@@ -41,25 +41,25 @@ def status(t_ns: int) -> flight_messages.Status:
     return flight_messages.Status(t_ns, 0, "flying", 90.0, False, None, 1)
 
 
-def test_own_velocity_integrates_along_the_heading():
+def test_the_own_velocity_is_integrated_along_the_heading():
     own = OnboardState()
-    own.update(estimate(0, (0.0, 0.0, 0.0), yaw_rad=math.pi / 2))  # nose to the north
+    own.update(estimate(0, (0.0, 0.0, 0.0), yaw_rad=math.pi / 2))  # the nose points north
     for n in range(11):
         own.update(flow(0.1 * n, x=2.0, y=0.5))
-    assert own.position_m == pytest.approx((-0.5, 2.0, 0.0))  # north by 2 m; left of it is west
+    assert own.position_m == pytest.approx((-0.5, 2.0, 0.0))  # 2 m north; left is west
 
 
-def test_turning_to_the_left_leads_to_the_left():
-    """The driver's own integration has the sign of the yaw wrong; its positions mirror."""
+def test_a_left_turn_leads_to_the_left():
+    """The integration in ardrone_autonomy has the wrong sign of yaw, which mirrors its positions."""
     own = OnboardState()
     for n in range(101):
         own.update(estimate(0, (0.0, 0.0, 0.0), yaw_rad=0.01 * n * math.pi / 2))
         own.update(flow(0.01 * n, x=1.0, y=0.0))
-    quarter = 2 / math.pi  # radius of the arc of 1 m
+    quarter = 2 / math.pi  # the radius of a quarter circle whose arc is 1 m long
     assert own.position_m == pytest.approx((quarter, quarter, 0.0), abs=0.01)
 
 
-def test_altitude_is_the_sonar_s_and_the_barometer_s_beyond_its_range():
+def test_altitude_comes_from_the_sonar_or_beyond_its_range_the_barometer():
     own = OnboardState()
     own.update(baro(100.0))
     own.update(sonar(2.0))
@@ -82,14 +82,14 @@ def test_a_tilted_beam_is_longer_than_the_altitude():
     assert own.altitude_m == pytest.approx(math.cos(tilt))
 
 
-def test_without_an_estimator_its_own_gyroscope_tells_the_heading_since_power_on():
+def test_without_an_estimator_the_gyroscope_gives_the_heading():
     own = OnboardState()
     for n in range(401):
         own.update(imu(0.005 * n, gyro=(0.0, 0.0, 0.5)))
     assert heading(own.attitude) == pytest.approx(1.0, abs=0.01)
 
 
-def test_without_an_estimator_its_own_accelerometer_tells_the_tilt():
+def test_without_an_estimator_the_accelerometer_gives_the_tilt():
     own = OnboardState()
     roll = math.radians(5)
     for n in range(2000):
@@ -97,7 +97,7 @@ def test_without_an_estimator_its_own_accelerometer_tells_the_tilt():
     assert rpy_from_quaternion(own.attitude)[0] == pytest.approx(roll, abs=0.002)
 
 
-def test_an_estimator_is_believed_from_its_first_word_on():
+def test_an_estimator_is_trusted_from_its_first_estimate_on():
     own = OnboardState()
     own.update(imu(0.0))
     own.update(estimate(0, (0.0, 0.0, 0.0), yaw_rad=1.0))
@@ -105,7 +105,7 @@ def test_an_estimator_is_believed_from_its_first_word_on():
     assert heading(own.attitude) == pytest.approx(1.0)
 
 
-def test_an_estimator_that_knows_no_attitude_is_believed_about_its_place_only():
+def test_an_estimate_without_an_attitude_is_used_for_position_only():
     own = OnboardState()
     own.update(status(S))
     own.update(msgspec.structs.replace(estimate(S, (1.0, 2.0, 3.0)), orientation_wxyz=(0.0, 0.0, 0.0, 0.0)))
@@ -115,9 +115,9 @@ def test_an_estimator_that_knows_no_attitude_is_believed_about_its_place_only():
     assert own.origin_m == pytest.approx((1.0, 2.0, 3.0))
 
 
-def test_samples_of_a_turned_sensor_are_in_the_axes_of_the_body():
+def test_samples_of_a_rotated_sensor_are_converted_to_body_axes():
     own = OnboardState(imu=Mount(rpy_deg=(0.0, 0.0, 90.0)), mag=Mount(rpy_deg=(180.0, 0.0, 0.0)))
-    sample = own.update(imu(0.0, gyro=(1.0, 0.0, 0.0)))  # about the sensor's x, which is the body's y
+    sample = own.update(imu(0.0, gyro=(1.0, 0.0, 0.0)))  # about the sensor's x axis, which is the body's y axis
     assert sample.gyro_rad_s == pytest.approx((0.0, 1.0, 0.0))
     assert own.imu is not None
     assert own.imu.gyro_rad_s == pytest.approx((0.0, 1.0, 0.0))
@@ -130,5 +130,5 @@ def test_the_origin_of_odometry_follows_from_an_estimate_of_the_same_gate():
         own.update(flow(float(gate), x=1.0, y=0.0))
         own.update(status(gate * S))
     assert own.origin_m is None
-    own.update(estimate(2 * S, (12.0, 5.0, 1.0)))  # two gates late: it had come 2 m by then
+    own.update(estimate(2 * S, (12.0, 5.0, 1.0)))  # for two gates ago, when the aircraft had moved 2 m
     assert own.origin_m == pytest.approx((10.0, 5.0, 1.0))

@@ -1,4 +1,4 @@
-"""The failsafe: nothing moves unasked, silence holds and lands, a fence is kept; the aircraft's clock, loss, readings."""
+"""The failsafe (arming, silence, the geofence), and the measurement of the aircraft's clock and of message loss."""
 
 import math
 import random
@@ -26,7 +26,7 @@ LIMITS = FlightLimits(speed_m_s=2.0, radius_m=10.0)
 
 
 class Flight:
-    """A failsafe, its aircraft, and the time."""
+    """A failsafe and its aircraft, with the time."""
 
     def __init__(self, armed: bool = True, state: Any = "landed") -> None:
         self.failsafe = Failsafe(Silence(), LIMITS, armed)
@@ -43,7 +43,7 @@ class Flight:
         return AircraftState(self.state, 90.0, pose, self.received_ns or self.now_ns)
 
     def after(self, seconds: float) -> str:
-        """Let time pass; return what is asked of the aircraft then."""
+        """Advance the time and return the action then demanded of the aircraft."""
         until_ns = self.now_ns + round(seconds * S)
         action = ""
         while self.now_ns < until_ns:
@@ -69,25 +69,25 @@ class Flight:
         return self
 
 
-def test_nothing_is_asked_before_it_is_armed():
+def test_nothing_is_demanded_before_arming():
     flight = Flight(armed=False)
     assert "arm" in (flight.mode("takeoff") or "")
     assert "arm" in (flight.fly(1, 0, 0) or "")
     assert flight.after(1) == "none"
-    flight.state = "flying"  # by its own pilot
+    flight.state = "flying"  # flown by its own pilot
     assert flight.after(1) == "none"
     assert flight.failsafe.arm(flight.now_ns, flight.vehicle) is None
     assert flight.after(0.1) == "hold"
 
 
-def test_it_is_not_armed_without_a_link():
+def test_arming_is_refused_without_a_link():
     flight = Flight(armed=False)
     assert flight.failsafe.arm(flight.now_ns, AircraftState())
     assert flight.failsafe.arm(flight.now_ns, flight.vehicle._replace(received_ns=flight.now_ns - 2 * S))
     assert not flight.failsafe.armed
 
 
-def test_a_flight():
+def test_a_commanded_flight_runs_from_take_off_to_landing():
     flight = Flight().takes_off()
     flight.fly(1, 0, 0, yaw_rate=0.5)
     demand = flight.failsafe.demand(flight.now_ns, flight.vehicle)
@@ -102,7 +102,7 @@ def test_a_flight():
     assert flight.failsafe.armed
 
 
-def test_the_heading_frame_is_turned_by_the_aircrafts_own_yaw():
+def test_the_heading_frame_is_turned_by_the_yaw_of_the_aircraft():
     flight = Flight().takes_off()
     flight.yaw = math.pi / 2
     flight.fly(1, 0, 0.2, frame="heading")
@@ -121,11 +121,11 @@ def test_a_silent_commander_holds_and_then_lands():
     assert "controller.main" in flight.failsafe.reason
 
 
-def test_a_drone_that_nobody_flies_holds_for_ever():
+def test_an_uncommanded_drone_holds_indefinitely():
     assert Flight().takes_off().after(60) == "hold"
 
 
-def test_a_silent_world_is_a_landing():
+def test_a_silent_world_causes_a_landing():
     flight = Flight().takes_off()
     flight.hears_clock = False
     assert flight.after(2.0) == "hold"
@@ -134,7 +134,7 @@ def test_a_silent_world_is_a_landing():
 
 
 @pytest.mark.parametrize("landing", ["its own", "the driver's"])
-def test_who_came_down_without_a_command_is_not_started_by_one_until_it_is_armed_again(landing: str):
+def test_after_an_uncommanded_landing_take_off_needs_arming_again(landing: str):
     flight = Flight().takes_off()
     flight.after(2)
     flight.fly(1, 0, 0)
@@ -154,7 +154,7 @@ def test_who_came_down_without_a_command_is_not_started_by_one_until_it_is_armed
     assert flight.failsafe.armed
 
 
-def test_outside_the_fence_it_lands():
+def test_an_aircraft_outside_the_geofence_is_landed():
     flight = Flight().takes_off()
     flight.position = (9.99, 0, 1)
     flight.fly(1, 0, 0)
@@ -163,7 +163,7 @@ def test_outside_the_fence_it_lands():
     assert flight.after(0.1) == "land"
 
 
-def test_a_takeoff_is_watched_as_a_flight():
+def test_a_take_off_is_monitored_like_a_flight():
     flight = Flight()
     flight.position = (11.5, 0, 0)
     assert flight.mode("takeoff")
@@ -180,8 +180,8 @@ def test_a_takeoff_is_watched_as_a_flight():
 
 
 @pytest.mark.parametrize("airborne", [True, False])
-def test_an_aircraft_in_an_emergency_of_its_own_is_sent_nothing_more(airborne: bool):
-    """Else the repeated take-off would start it again as soon as the emergency is over."""
+def test_an_aircraft_in_its_own_emergency_is_sent_nothing_more(airborne: bool):
+    """Otherwise the repeated take-off would restart the aircraft as soon as its emergency is over."""
     flight = Flight()
     flight.mode("takeoff")
     flight.state = "hovering" if airborne else "taking_off"
@@ -194,14 +194,14 @@ def test_an_aircraft_in_an_emergency_of_its_own_is_sent_nothing_more(airborne: b
     assert not flight.failsafe.armed
 
 
-def test_an_emergency_of_its_own_is_left_by_reset_which_is_given_up():
+def test_a_reset_of_an_own_emergency_is_repeated_until_given_up():
     flight = Flight(armed=False, state="emergency")
     assert flight.mode("reset") is None
     assert flight.after(RESET_S - 0.1) == "reset"
     assert flight.after(0.2) == "none"
 
 
-def test_an_aircraft_that_lands_by_itself_is_landed_and_disarmed():
+def test_an_aircraft_that_lands_by_itself_is_told_to_land_and_disarmed():
     flight = Flight().takes_off()
     flight.fly(1, 0, 0)
     flight.state = "landing"
@@ -211,7 +211,7 @@ def test_an_aircraft_that_lands_by_itself_is_landed_and_disarmed():
     assert not flight.failsafe.armed
 
 
-def test_to_a_silent_aircraft_nothing_but_a_landing_or_a_stop_is_sent():
+def test_a_silent_aircraft_is_sent_only_land_or_kill():
     flight = Flight().takes_off()
     flight.fly(1, 0, 0)
     flight.received_ns = flight.now_ns
@@ -227,14 +227,14 @@ def test_to_a_silent_aircraft_nothing_but_a_landing_or_a_stop_is_sent():
     assert flight.after(2) == "kill"
 
 
-def test_a_driver_that_begins_in_flight_holds():
+def test_a_driver_that_starts_in_flight_holds():
     flight = Flight(state="flying")
     assert flight.after(0.1) == "hold"
     flight.fly(0, 1, 0)
     assert flight.after(0.1) == "fly"
 
 
-def test_kill_stops_the_motors_armed_or_not_until_it_is_armed_again():
+def test_kill_stops_the_motors_until_the_driver_is_armed_again():
     for armed in (True, False):
         flight = Flight(armed=armed, state="flying")
         flight.failsafe.kill(flight.now_ns, "operator")
@@ -247,7 +247,7 @@ def test_kill_stops_the_motors_armed_or_not_until_it_is_armed_again():
 
 
 @pytest.mark.parametrize("armed", [True, False])
-def test_an_accepted_emergency_stops_the_motors_armed_or_not_and_disarms(armed: bool):
+def test_an_accepted_emergency_stops_the_motors_and_disarms(armed: bool):
     flight = Flight(armed=armed, state="flying")
     assert flight.mode("emergency") is None
     assert flight.after(1) == "kill"
@@ -264,7 +264,7 @@ def test_an_accepted_emergency_stops_the_motors_armed_or_not_and_disarms(armed: 
     flight.takes_off()
 
 
-def test_it_is_disarmed_on_the_ground_alone():
+def test_disarming_is_possible_only_on_the_ground():
     flight = Flight().takes_off()
     assert "land" in (flight.failsafe.disarm(flight.vehicle) or "")
     flight.state = "landed"
@@ -272,7 +272,7 @@ def test_it_is_disarmed_on_the_ground_alone():
     assert flight.after(1) == "none"
 
 
-def test_a_takeoff_that_does_not_succeed_is_given_up():
+def test_a_take_off_that_does_not_succeed_is_abandoned():
     flight = Flight()
     flight.mode("takeoff")
     assert flight.after(TAKEOFF_S - 1) == "take_off"
@@ -280,7 +280,7 @@ def test_a_takeoff_that_does_not_succeed_is_given_up():
     assert flight.after(2) == "none"
 
 
-def test_a_drone_that_is_released_holds():
+def test_a_released_drone_holds():
     flight = Flight().takes_off()
     flight.fly(1, 0, 0)
     hover = Ardrone(0, 0, "world", 0, 0, 0, 0, hover=True)
@@ -289,7 +289,7 @@ def test_a_drone_that_is_released_holds():
     assert flight.failsafe.commander is None
 
 
-def test_what_a_driver_does_not_take_is_refused_with_what_it_does():
+def test_unsupported_commands_are_refused_with_the_supported_ones():
     flight = Flight().takes_off()
     command = Ardrone(0, 0, "controller.main", 0, 0, 0, 0)
     assert "velocity" in (flight.failsafe.on_command(command, flight.now_ns, flight.vehicle) or "")
@@ -305,12 +305,12 @@ FENCED = FlightLimits(speed_m_s=3.0, climb_m_s=1.0, radius_m=20.0, ceiling_m=10.
     ("asked", "expected"),
     [((6, 8, 0), (1.8, 2.4, 0)), ((0, 0, 9), (0, 0, 1)), ((0, 0, -9), (0, 0, -1)), ((1, 0, 0.5), (1, 0, 0.5))],
 )
-def test_speeds_are_cut_in_their_direction(asked, expected):
+def test_speeds_are_limited_without_changing_direction(asked, expected):
     assert FENCED.limited(asked, (0, 0, 2)) == pytest.approx(expected)
     assert FENCED.limited(asked, None) == pytest.approx(expected)
 
 
-def test_who_flies_at_the_fence_stays_inside_and_may_come_back():
+def test_the_limits_keep_an_aircraft_inside_the_geofence_and_let_it_return():
     draw = random.Random(2)
     position = [0.0, 0.0, 1.0]
     course = 0.0
@@ -325,17 +325,17 @@ def test_who_flies_at_the_fence_stays_inside_and_may_come_back():
     assert FENCED.limited((-3, 0, 0), (25, 0, 2)) == pytest.approx((-3, 0, 0))
 
 
-def test_along_the_fence_nothing_is_taken_away():
+def test_motion_along_the_geofence_is_not_limited():
     assert FENCED.limited((0, 2, 0), (20, 0, 2)) == pytest.approx((0, 2, 0))
 
 
-def test_it_is_slow_enough_to_stop():
+def test_the_speed_allows_stopping_before_the_geofence():
     for distance in (0.5, 2.0, 4.0):
         x, *_ = FENCED.limited((3, 0, 0), (20 - distance, 0, 2))
         assert x * x / (2 * BRAKING_M_S2) <= distance + 1e-9
 
 
-def test_breaches():
+def test_a_geofence_breach_has_a_tolerance():
     assert not FENCED.is_breached((20.5, 0, 5))
     assert FENCED.is_breached((0, 21.5, 5))
     assert FENCED.is_breached((0, 0, 11.5))
@@ -346,7 +346,7 @@ def test_breaches():
 MS = 1_000_000
 
 
-def test_the_least_delayed_message_counts():
+def test_the_clock_offset_follows_the_least_delayed_message():
     offset, draw = ClockOffset(), random.Random(1)
     for k in range(500):
         sent_ns = k * 20 * MS
@@ -355,14 +355,14 @@ def test_the_least_delayed_message_counts():
     assert offset.to_remote(123 + offset.offset_ns) == 123
 
 
-def test_a_clock_that_is_set_is_followed_within_a_window():
+def test_a_step_of_the_remote_clock_is_followed_within_a_window():
     offset = ClockOffset()
     offset.add(0, 10 * MS)
     offset.add(100 * MS, 10_110 * MS)
     assert offset.offset_ns == 10_010 * MS
 
 
-def test_half_a_round_trip_is_the_way_of_the_fastest():
+def test_the_latency_is_half_the_shortest_round_trip():
     offset = ClockOffset()
     offset.add(0, 30 * MS)
     for duration_ms in (50, 20, 40):
@@ -372,7 +372,7 @@ def test_half_a_round_trip_is_the_way_of_the_fastest():
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_it_is_known_from_the_first_message_on(known: bool):
+def test_the_clock_offset_is_known_from_the_first_message(known: bool):
     offset = ClockOffset()
     if known:
         offset.add(5, 5)
@@ -380,7 +380,7 @@ def test_it_is_known_from_the_first_message_on(known: bool):
     assert offset.offset_ns == 0
 
 
-def test_the_share_that_is_lost_is_counted_over_the_wrap():
+def test_message_loss_is_measured_across_the_sequence_wrap():
     draw, loss = random.Random(3), StreamLoss(256)
     for number in range(4000):
         if draw.random() > 0.1:

@@ -1,4 +1,4 @@
-"""Connections that send no request: they make room, or are closed, and others are served all the time."""
+"""HTTP connections that send no complete request make room or are closed, while others are served."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
@@ -11,16 +11,16 @@ from jumping_time import run_jumping
 
 from zsim_bridges.web.web_server import BODY_BYTES_MAX, SMALL_BYTES, HttpConnection, HttpConnections
 
-HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"  # the head never ends
+HALF = b"GET / HTTP/1.1\r\nHost: localhost\r\n"  # an incomplete head
 WHOLE = HALF + b"\r\n"
-LONG_S = 600.0  # wall time that no test takes
+LONG_S = 600.0  # wall time, longer than any test
 STRANGERS, CONNECTIONS = 5, 8
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 async def answer(request: web.Request) -> web.Response:
-    """Answer at once, on /wait when the test lets it."""
+    """Answer at once, except on /wait, where the test releases the answer."""
     if request.path == "/wait":
         request.app[STARTED].release()
         await request.app[RELEASE].wait()
@@ -35,7 +35,7 @@ STARTED = web.AppKey("started", asyncio.Semaphore)
 async def server(
     request_s: float = LONG_S, body_bytes_max: int = BODY_BYTES_MAX
 ) -> AsyncIterator[tuple[Callable[[], Coroutine[Any, Any, Stream]], str, Any]]:
-    """Yield what connects, the URL, and the application."""
+    """Yield a function that connects, the URL, and the application."""
     connections = HttpConnections(STRANGERS, CONNECTIONS, request_s, body_bytes_max)
     app = web.Application(middlewares=[connections.observe])
     app[RELEASE], app[STARTED] = asyncio.Event(), asyncio.Semaphore(0)
@@ -70,7 +70,7 @@ def in_loop(test: Callable[[], Coroutine[Any, Any, None]]) -> Callable[[], None]
 
 
 async def status(stream: Stream, request: bytes) -> int:
-    """Send a request; return the status of its answer, whose empty body is read too."""
+    """Send a request and return the status of its answer, which has an empty body."""
     reader, writer = stream
     writer.write(request)
     head = await reader.readuntil(b"\r\n\r\n")
@@ -147,10 +147,10 @@ async def test_a_request_whose_body_does_not_end_is_answered_and_its_connection_
     async with server(request_s=SHORT_S) as (connect, _, _):
         slow, known = await connect(), await connect()
         assert await status(known, WHOLE) == 200
-        for stream in (slow, known):  # who was answered before may not take longer
+        for stream in (slow, known):  # an answered connection gets no longer
             assert await status(stream, head_of(100) + b"half") == 408
         for reader, _ in (slow, known):
-            await reader.read()  # to the end of the connection
+            await reader.read()  # until the connection is closed
 
 
 @in_loop

@@ -1,4 +1,4 @@
-"""`zsim fault`: what a person types becomes a request, or a line."""
+"""`zsim fault`: what is typed becomes a request or is refused."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -23,7 +23,7 @@ EXAMPLES = Path(__file__).parents[4] / "examples"
 
 @pytest.fixture
 def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A scenario with a sensor of the user's."""
+    """Return a scenario with a sensor of the user's own."""
     monkeypatch.syspath_prepend(str(EXAMPLES))
     path = tmp_path / "mine.yaml"
     sensors, drones = "{my_uwb: {module: uwb_range}}", "[{name: d1, position_m: [0, 0, 0]}]"
@@ -32,18 +32,18 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("text", ["10s", "500ms", "2min", "3", "1.5 s", None])
-def test_durations(text: str | None):
+def test_durations_with_a_unit_are_accepted(text: str | None):
     assert duration(text) == text
 
 
 @pytest.mark.parametrize("text", ["", "s", "-1s", "10h", "1e3s", "nan"])
-def test_what_is_no_duration(text: str):
+def test_invalid_durations_are_refused(text: str):
     with refused(typer.BadParameter, "10s", "500ms", "2min"):
         duration(text)
 
 
 def added(monkeypatch: pytest.MonkeyPatch, parameters: list[str], **times: str) -> dict[str, Any]:
-    """Return what `zsim fault add` asks of the world."""
+    """Return the arguments that `zsim fault add` sends to the world."""
     asked: list[dict[str, Any]] = []
 
     def request(link: object, op: str, args: dict[str, Any]) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def added(monkeypatch: pytest.MonkeyPatch, parameters: list[str], **times: str) 
     return asked[0]
 
 
-def test_what_is_typed_is_asked_of_the_world(monkeypatch: pytest.MonkeyPatch):
+def test_typed_parameters_are_requested_from_the_world(monkeypatch: pytest.MonkeyPatch):
     typed = ["factor=3", "value_m=[2, 0, -1]", "place={controller.main: d1}", "rotor=all", "one_way=true"]
     values = {"factor": 3, "value_m": [2, 0, -1], "place": {"controller.main": "d1"}, "rotor": "all", "one_way": True}
     fault = {"kind": "gps_dropout", "target": "drone2"}
@@ -79,7 +79,7 @@ def test_what_is_typed_is_asked_of_the_world(monkeypatch: pytest.MonkeyPatch):
         (["factor=2", "factor=3"], ("factor", "twice", "once")),
     ],
 )
-def test_what_is_no_parameter_given_elsewhere_or_twice_is_refused(
+def test_invalid_misplaced_or_repeated_parameters_are_refused(
     monkeypatch: pytest.MonkeyPatch, given: list[str], terms: tuple[str, ...]
 ):
     with refused(typer.BadParameter, *terms):
@@ -88,7 +88,7 @@ def test_what_is_no_parameter_given_elsewhere_or_twice_is_refused(
 
 
 @pytest.mark.parametrize("value", [10**20, [0, 10**24], {10**20: 1}, "\udcff"], ids=ascii)
-def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
+def test_a_value_that_fits_into_no_message_is_refused(value: Any):
     nowhere: Any = SimpleNamespace()
     with refused(SessionError, "world/control", "fault_add", "64-bit"):
         Session.request(nowhere, keys.CONTROL, "fault_add", "zsim.fault", {"value": value})
@@ -105,11 +105,11 @@ def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
         ("other_bias", {"target": "other_bias"}),
     ],
 )
-def test_which_are_cleared(mine: Path, which: str, args: dict[str, object]):
+def test_faults_are_cleared_by_number_target_or_kind(mine: Path, which: str, args: dict[str, object]):
     assert selector(which, scenario_file.to_text(scenario_file.load(mine))) == args
 
 
-def test_a_row_says_when_and_what():
+def test_a_row_shows_the_time_and_the_parameters_of_a_fault():
     fault = Fault(1, "gps_dropout", "drone1", {"probability": 0.5}, 2_000_000_000, None, "me")
     cells = [cell.strip() for cell in row(fault, 3_000_000_000)]
     assert cells == ["1", "active", "drone1", "gps_dropout", "2.00 to ... s", "probability=0.5"]
@@ -126,10 +126,10 @@ def test_the_list_of_kinds_fits_a_terminal(
     assert list(dict.fromkeys(line.split()[0] for line in text.splitlines() if line[0] != " ")) == list(KINDS)
     assert max(map(len, text.splitlines())) <= columns
     named = {f"{parameter.name}:" for kind in KINDS.values() for parameter in kind.parameters}
-    assert named <= set(text.split())  # none is broken
+    assert named <= set(text.split())  # no name is split across lines
 
 
-def test_with_a_scenario_those_of_its_users_sensors_are_listed(mine: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_scenario_adds_the_kinds_of_its_own_sensors(mine: Path, capsys: pytest.CaptureFixture[str]):
     federation_commands.kinds(mine, trust=True)
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     own = [kind for kind in listed if kind not in KINDS]

@@ -1,4 +1,4 @@
-"""`zsim logs`: which roles there are, and that following ends with the run. `zsim ps`: which of them are shown."""
+"""`zsim logs`: known roles, and following until the end of the run. `zsim ps`: which processes are shown."""
 
 import json
 import threading
@@ -17,13 +17,13 @@ ROLES = ["world", "recorder", "estimator.d1"]
 
 
 def row(role: str) -> dict[str, object]:
-    """Return what is known of a process that has not begun."""
+    """Return the row of a process that has not started yet."""
     unknown = dict.fromkeys(("pid", "lag_ms", "messages_per_s", "round_trip_ms"))
     return {"role": role, "host": "h1", "state": "starting", "restarts": 0, **unknown}
 
 
 class Run:
-    """A run that is up until it is closed."""
+    """A run that is up until it is ended."""
 
     def __init__(self, out: Path) -> None:
         self.out = out
@@ -56,14 +56,14 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
 
 
 @pytest.mark.usefixtures("run")
-def test_an_unknown_role_is_refused_with_those_that_there_are() -> None:
+def test_an_unknown_role_is_refused_with_the_known_ones() -> None:
     with refused(RunError, "role", "'nobody'", "world", "recorder", "estimator.d1"):
         logs("nobody", federation="zsim")
     with refused(RunError, "role", "'controller.*'", "world", "recorder", "estimator.d1"):
         ps(["controller.*"], federation="zsim")
 
 
-def test_what_was_said_is_printed_and_silence_is_no_fault(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_is_printed_and_an_empty_one_is_no_error(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     logs("estimator.d1", federation="zsim")
     logs("world", federation="zsim")
     silent, world = capsys.readouterr().err.splitlines()
@@ -74,8 +74,8 @@ def test_what_was_said_is_printed_and_silence_is_no_fault(run: Run, capsys: pyte
     assert capsys.readouterr().out == "drone ä\n"
 
 
-def test_following_ends_with_the_run_and_prints_its_last_words(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    """The file comes only after the follower."""
+def test_following_a_log_ends_with_the_run_after_its_last_line(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    """The file is created only after following has begun."""
     follower = threading.Thread(target=logs, args=("estimator.d1", True, "zsim"), daemon=True)
     follower.start()
     assert run.asked.wait(120.0)
@@ -90,7 +90,7 @@ def test_following_ends_with_the_run_and_prints_its_last_words(run: Run, capsys:
 @pytest.mark.parametrize(
     ("patterns", "shown"), [(None, ROLES), (["estimator.*"], ["estimator.d1"]), (["wor*", "recorder"], ROLES[:2])]
 )
-def test_processes_are_chosen_by_patterns(
+def test_processes_are_selected_by_patterns(
     capsys: pytest.CaptureFixture[str], patterns: list[str] | None, shown: list[str]
 ) -> None:
     ps(patterns, federation="zsim", as_json=True)

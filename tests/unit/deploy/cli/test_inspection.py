@@ -1,4 +1,4 @@
-"""Keys inspected, and messages and requests sent by hand."""
+"""Inspecting keys, and sending messages and requests by hand."""
 
 import json
 
@@ -26,7 +26,7 @@ FOREIGN = [
 
 
 class Clock:
-    """Wall time that passes only while somebody sleeps; `due` are (time, key, payload) that arrive meanwhile."""
+    """Wall time that passes only during sleeps; `due` lists the samples (time, key, payload) that then arrive."""
 
     def __init__(self, link: FakeLink, due: list[tuple[float, str, bytes]]) -> None:
         self.link, self.due, self.now_s = link, due, 0.0
@@ -43,7 +43,7 @@ class Clock:
 
 
 def rates(monkeypatch: pytest.MonkeyPatch, due: list[tuple[float, str, bytes]], seconds: float) -> list[str]:
-    """Return the lines of `hz` while messages arrive."""
+    """Return the lines that `hz` prints while messages arrive."""
     link, lines = FakeLink(), []
     monkeypatch.setattr(inspection, "time", Clock(link, due))
     inspection.hz(link, keys.CLOCK, 1000, seconds, lines.append)  # type: ignore[arg-type]
@@ -59,14 +59,14 @@ def test_garbage_is_shown_as_refused(key: str, payload: bytes):
 
 
 @pytest.mark.parametrize(("said", "shown"), FOREIGN, ids=["bytes", "numbers", "inside", "none", "flag"])
-def test_what_json_cannot_say_is_shown_all_the_same(said: object, shown: object):
+def test_values_unknown_to_json_are_shown_nevertheless(said: object, shown: object):
     assert inspection.readable(ReceivedSample("of/somebody", msgspec.msgpack.encode(said))) == shown
     event = run_messages.Event(0, 0, "note", "eve", "drone1", "", {"said": said})
     read = inspection.readable(ReceivedSample(keys.EVENT, messages.encode(event)))
     assert json.loads(json.dumps(read)) == read
 
 
-def test_the_rate_is_told_once_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch):
+def test_the_rate_is_printed_every_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch):
     due = [(0.5, keys.CLOCK, b"\x80"), (1.2, keys.CLOCK, b"\x80")]
     first, last = rates(monkeypatch, due, 1.5)
     assert first == "1 message"
@@ -78,13 +78,13 @@ def test_the_rate_is_told_once_a_second_and_at_the_end(monkeypatch: pytest.Monke
             call()
 
 
-def test_the_gaps_are_those_of_the_messages(monkeypatch: pytest.MonkeyPatch):
+def test_the_rate_follows_from_the_gaps_between_messages(monkeypatch: pytest.MonkeyPatch):
     due = [(0.02 * (k + 1), keys.CLOCK, msgspec.msgpack.encode({"t_ns": 20_000_000 * k})) for k in range(10)]
     (line,) = rates(monkeypatch, due, 0.3)
     assert has_terms(line, "50.0 Hz wall", "20.0", "20.0 ms", "50.0 Hz simulated", "10 messages")
 
 
-def test_a_key_that_fell_silent_is_told_and_not_one_of_few_messages():
+def test_a_silent_key_is_reported_but_a_slow_one_is_not():
     rate, slow = inspection.MessageRate(10), inspection.MessageRate(10)
     for number in range(5):
         rate.add(10 + 0.02 * number, 20_000_000 * number)
@@ -115,7 +115,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_message_that_cannot_be_meant_is_a_line(name: str):
+def test_an_invalid_message_is_refused_in_one_line(name: str):
     key, text, terms = BAD[name]
     link = FakeLink()
     with refused(RunError, *terms) as error:
@@ -124,7 +124,7 @@ def test_a_message_that_cannot_be_meant_is_a_line(name: str):
     assert link.published == []
 
 
-def test_messages_keep_to_their_schedule(monkeypatch: pytest.MonkeyPatch):
+def test_messages_are_published_on_schedule(monkeypatch: pytest.MonkeyPatch):
     link, sent_s = FakeLink(), []
     watch = Clock(link, [])
     monkeypatch.setattr(inspection, "time", watch)
@@ -141,7 +141,7 @@ def test_messages_keep_to_their_schedule(monkeypatch: pytest.MonkeyPatch):
     assert (first.t_ns, first.seq, first.source) == (60_000_000, 0, "zsim.pub")
 
 
-def test_time_goes_on_while_it_publishes():
+def test_time_stamps_advance_while_publishing():
     link = FakeLink()
     stamps = iter((20_000_000, 40_000_000))
 
@@ -163,19 +163,19 @@ def test_time_goes_on_while_it_publishes():
         (keys.CONTROL, "{}", ("nobody answered",)),
     ],
 )
-def test_a_request_that_cannot_be_meant_is_a_line(key: str, text: str, terms: tuple[str, ...]):
+def test_an_invalid_request_is_refused(key: str, text: str, terms: tuple[str, ...]):
     with refused(RunError, *terms):
         inspection.ask(FakeLink(), key, "step", text)  # type: ignore[arg-type]
 
 
-def test_arguments_may_be_named_like_anything():
+def test_arguments_may_have_any_name():
     link = FakeLink()
     link.on_request = lambda key, args: ControlAnswer(ok=True, result=args)
     args = {"source": "me", "key": 1, "op": 2, "timeout_s": 3}
     assert inspection.ask(link, keys.CONTROL, "step", msgspec.json.encode(args).decode()) == args  # type: ignore[arg-type]
 
 
-def test_messages_in_an_answer_are_shown_as_messages():
+def test_messages_in_an_answer_are_decoded():
     link = FakeLink()
     passed = [[keys.process("a.b", "bye"), messages.encode(run_messages.Bye(0, 0, "over"))]]
     link.on_request = lambda key, args: ControlAnswer(ok=True, result=passed)
@@ -191,7 +191,7 @@ def test_messages_in_an_answer_are_shown_as_messages():
         ("my/key", {"my/key": 1}),
     ],
 )
-def test_keys_are_chosen_by_an_expression(
+def test_keys_are_selected_by_an_expression(
     monkeypatch: pytest.MonkeyPatch, expression: str, found: dict[str, int]
 ) -> None:
     link = FakeLink()
@@ -229,7 +229,7 @@ OURS = f"{MODE}: drone1 flies"
     ],
     ids=["refused at once", "carried out", "another's refused", "refused when due", "not known"],
 )
-def test_what_became_of_a_command_is_told(
+def test_the_outcome_of_a_command_is_reported(
     monkeypatch: pytest.MonkeyPatch, answers: list[msgspec.Struct], refused_count: int, reason: str, note: str
 ):
     link = FakeLink()
@@ -249,7 +249,7 @@ def test_what_became_of_a_command_is_told(
 TRUTH = (1.5, "drone/drone1/truth", b"\x80")
 
 
-def test_who_waits_for_a_key_that_nobody_publishes_is_told_so_with_keys_like_it(monkeypatch: pytest.MonkeyPatch):
+def test_a_key_without_messages_is_reported_with_similar_keys(monkeypatch: pytest.MonkeyPatch):
     notes, lines, wrong = [], [], TRUTH[1][:-1]
     link = FakeLink()
     monkeypatch.setattr(inspection, "time", Clock(link, [TRUTH]))
@@ -263,8 +263,8 @@ def test_who_waits_for_a_key_that_nobody_publishes_is_told_so_with_keys_like_it(
 
 
 @pytest.mark.parametrize(("count", "heard"), [(1, 1), (None, 2)])
-def test_who_hears_something_is_told_nothing(monkeypatch: pytest.MonkeyPatch, count: int | None, heard: int):
-    """The first message comes while it is not yet told that there is none; the second after that time."""
+def test_a_key_with_messages_causes_no_note(monkeypatch: pytest.MonkeyPatch, count: int | None, heard: int):
+    """The first message arrives before the note would be printed, the second after that time."""
     link, shown, notes = FakeLink(), [], []
     monkeypatch.setattr(inspection, "time", Clock(link, [TRUTH, (5.0, *TRUTH[1:])]))
     came = inspection.echo(link, TRUTH[1], count, lambda key, _: shown.append(key), True, 8.0, notes.append)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""What the commands of bridges do beside bridging: the ROS package of our own messages, and what they refuse."""
+"""What the bridge commands do besides bridging: they write the ROS package of zsim's messages, and refuse bad options."""
 
 import os
 from collections.abc import Callable
@@ -15,7 +15,9 @@ from zsim_bridges.ros2.rmw_zenoh import MESSAGES, type_hash
 from zsim_deploy.cli.role_commands import console, gateway, ros1, ros2
 
 
-def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_ros_package_has_the_message_types_of_the_bridge(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     ros2(write_package=tmp_path)
     package = tmp_path / "zsim_msgs"
     assert has_terms(capsys.readouterr().out, str(package), "colcon")
@@ -29,7 +31,7 @@ def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys:
     assert "<name>zsim_msgs</name>" in (package / "package.xml").read_text()
 
 
-def test_a_secured_world_needs_a_router_for_ros_and_its_package_a_folder(tmp_path: Path) -> None:
+def test_ros2_needs_a_router_with_tls_and_a_writable_folder_for_its_package(tmp_path: Path) -> None:
     with refused(typer.BadParameter, "--tls", "--router"):
         ros2(tls=tmp_path)
     (tmp_path / "zsim_msgs").write_text("a file is there")
@@ -37,8 +39,8 @@ def test_a_secured_world_needs_a_router_for_ros_and_its_package_a_folder(tmp_pat
         ros2(write_package=tmp_path)
 
 
-def test_a_console_gives_way_to_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An operator's emergency goes through it; and one that gives way is late with its health, and reported silent."""
+def test_a_console_does_not_lower_its_priority(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Emergency orders pass through it, and at a lower priority its health would be late and be taken for silence."""
     pytest.importorskip("viser", reason="viser is not installed; pip install '.[console]'")
     own = os.nice(0), os.sched_getscheduler(0)
     served: list[tuple[int, int]] = []
@@ -61,7 +63,7 @@ def test_a_console_gives_way_to_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
         (ros2, "xxhash", "ros2"),
     ],
 )
-def test_a_bridge_without_its_extra_is_a_line(
+def test_a_bridge_without_its_extra_is_refused_with_the_install_command(
     monkeypatch: pytest.MonkeyPatch, command: Callable[[], None], module: str, extra: str
 ) -> None:
     monkeypatch.setattr("zsim_deploy.arguments.find_spec", lambda name: None if name == module else find_spec(name))

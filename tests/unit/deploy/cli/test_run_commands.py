@@ -1,4 +1,4 @@
-"""What is shown, and with which exit code, when a run is over."""
+"""What is shown at the end of a run, and the exit code."""
 
 import json
 from pathlib import Path
@@ -41,7 +41,9 @@ def raising(error: BaseException) -> Any:
 
 
 @pytest.mark.parametrize("where", ["before", "flight", "report"])
-def test_ctrl_c(recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, where: str):
+def test_after_ctrl_c_the_exit_code_is_130_and_the_record_is_named(
+    recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, where: str
+):
     record = recorded / "run.mcap"
     record.unlink() if where == "before" else None
     monkeypatch.setattr(run_commands, "_report", raising(KeyboardInterrupt()))
@@ -54,7 +56,7 @@ def test_ctrl_c(recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch:
         assert has_terms(err, "record", f"zsim report {recorded}")
 
 
-def test_a_failed_run_of_which_nothing_can_be_reported(
+def test_a_failed_run_without_messages_has_no_report_but_its_reason(
     recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(run_commands, "_report", raising(NO_MESSAGE))
@@ -68,7 +70,7 @@ def test_a_failed_run_of_which_nothing_can_be_reported(
 
 
 def write(path: Path, missing: range = range(0), gates: int = 50, end: bool = True) -> Path:
-    """Write the record of a run of so many gates that lacks some."""
+    """Write the record of a run with a number of gates, some of which may be missing."""
     flown = synthetic_record.Flown(duration_s=(gates - 1) * 0.02)
     with RecordWriter(path / "run.mcap") as writer:
         for key, message, wall_ns in synthetic_record.traffic(flown):
@@ -82,7 +84,7 @@ def write(path: Path, missing: range = range(0), gates: int = 50, end: bool = Tr
 
 
 class Judged(NamedTuple):
-    """What is shown of a record: the exit code, the terminal's lines, summary.json and the report's head."""
+    """What is shown of a record: the exit code, the terminal output, summary.json and the page of the report."""
 
     code: int
     out: str
@@ -134,7 +136,7 @@ def test_summary_page_terminal_and_exit_code_agree(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.parametrize("report", [True, False])
-def test_the_last_line_is_why_a_run_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str], report: bool):
+def test_the_last_line_gives_the_reason_of_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str], report: bool):
     (tmp_path / "logs").mkdir()
     shown = judged(write(tmp_path, end=False), capsys, DIED, report)
     assert shown.code == 1
@@ -142,13 +144,13 @@ def test_the_last_line_is_why_a_run_failed(tmp_path: Path, capsys: pytest.Captur
     assert has_terms(shown.err.splitlines()[-1], DIED.reason)
 
 
-def test_a_run_of_which_nothing_was_recorded_has_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_run_without_a_record_has_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     shown = judged(tmp_path, capsys, report=False)
     assert shown.code == 1
     assert has_terms(shown.err.splitlines()[-1], "nothing", "recorded")
 
 
-def test_a_rerun_and_a_sweep_that_fail_end_with_why(
+def test_a_failed_rerun_or_sweep_ends_with_the_reason(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setattr("zsim_analysis.rerun.rerun_record", lambda *_: "truth differs")
@@ -163,7 +165,7 @@ def test_a_rerun_and_a_sweep_that_fail_end_with_why(
 
 @pytest.fixture
 def formats(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
-    """Return the formats in which reports are asked for; none is made."""
+    """Return the requested formats of reports, none of which is made."""
     asked: list[tuple[str, ...]] = []
     monkeypatch.setattr(run_commands, "_report", lambda _, wanted=(): asked.append(tuple(wanted)))
     return asked
@@ -173,13 +175,13 @@ def report(*arguments: str) -> int:
     return CliRunner().invoke(app, ["report", *arguments]).exit_code
 
 
-def test_figures_are_asked_for_in_other_formats(recorded: Path, formats: list[tuple[str, ...]]) -> None:
+def test_figures_can_be_requested_in_other_formats(recorded: Path, formats: list[tuple[str, ...]]) -> None:
     assert report(str(recorded)) == report(str(recorded), "--format", "svg") == 0
     assert report(str(recorded), "--format", "pdf,svg") == 0
     assert formats == [(), ("svg",), ("pdf", "svg")]
 
 
 @pytest.mark.parametrize("wrong", ["png", "pdf svg", "pdf,", ","])
-def test_formats_that_are_none_are_refused(wrong: str, recorded: Path, formats: list[tuple[str, ...]]) -> None:
+def test_invalid_formats_are_refused(wrong: str, recorded: Path, formats: list[tuple[str, ...]]) -> None:
     assert report(str(recorded), "--format", wrong) == 2
     assert formats == []

@@ -36,7 +36,7 @@ def line():
 
 
 @pytest.mark.usefixtures("line")
-def test_an_answer_comes_back_and_a_federation_is_up_only_once():
+def test_a_request_is_answered_and_a_federation_is_up_only_once():
     assert control_socket.ask("zsim", "add", a=2, b=3) == 5
     assert control_socket.place("zsim").parent.stat().st_mode & 0o077 == 0
     with refused(RunError, "already up", "zsim down --federation zsim", "--set federation=NAME"):
@@ -55,13 +55,13 @@ def test_an_answer_comes_back_and_a_federation_is_up_only_once():
         ("add", {"a": 1}, ("not a request",)),
     ],
 )
-def test_what_is_refused_says_why(op, args, terms):
+def test_a_refusal_gives_the_reason(op, args, terms):
     with refused(RunError, *terms):
         control_socket.ask("zsim", op, **args)
 
 
 @pytest.mark.usefixtures("line")
-def test_garbage_is_answered_and_the_next_one_served():
+def test_garbage_is_answered_and_the_next_request_served():
     with socket.socket(socket.AF_UNIX) as raw:
         raw.connect(str(control_socket.place("zsim")))
         raw.sendall(b"\xff\n")
@@ -69,7 +69,7 @@ def test_garbage_is_answered_and_the_next_one_served():
     assert control_socket.ask("zsim", "add", a=1, b=1) == 2
 
 
-def test_the_socket_of_a_killed_launcher_is_no_hindrance():
+def test_the_socket_of_a_killed_launcher_is_replaced():
     place = control_socket.place("zsim")
     place.parent.mkdir(mode=0o700)
     with socket.socket(socket.AF_UNIX) as dead:
@@ -80,7 +80,7 @@ def test_the_socket_of_a_killed_launcher_is_no_hindrance():
     assert not place.exists()
 
 
-def test_a_launcher_that_does_not_answer_is_not_taken_for_none(monkeypatch):
+def test_a_launcher_that_does_not_answer_is_not_reported_as_absent(monkeypatch):
     monkeypatch.setattr(control_socket, "ANSWER_S", 0.05)
     place = control_socket.place("zsim")
     place.parent.mkdir(mode=0o700)
@@ -92,7 +92,7 @@ def test_a_launcher_that_does_not_answer_is_not_taken_for_none(monkeypatch):
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o750, None])
-def test_a_folder_in_which_others_may_write_or_read_or_a_link_is_refused(tmp_path, mode):
+def test_a_folder_open_to_others_or_a_symbolic_link_is_refused(tmp_path, mode):
     folder = control_socket.place("zsim").parent
     if mode is None:
         (tmp_path / "elsewhere").mkdir(mode=0o700)
@@ -113,7 +113,7 @@ def test_a_folder_of_another_user_is_refused():
         ControlSocket("zsim", {})
 
 
-def test_a_path_that_is_too_long_is_a_line(tmp_path, monkeypatch):
+def test_a_path_that_is_too_long_is_refused(tmp_path, monkeypatch):
     long = tmp_path / ("x" * 120)
     long.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(long))

@@ -1,4 +1,4 @@
-"""What `zsim doctor` makes of what hosts say; and the probe's round trip and bandwidth over loopback."""
+"""How `zsim doctor` judges the reports of hosts; and the probe's round trip and bandwidth over loopback."""
 
 import asyncio
 import errno
@@ -60,8 +60,8 @@ def report(offset_s: float = 0.0, **changes) -> HostReport:
     return HostReport({**SOUND, **changes}, round_trip_s=0.01, clock_offset_s=offset_s)
 
 
-def test_hosts_without_a_difference_that_matters_raise_nothing():
-    """A host that computes nothing has no fingerprint to compare."""
+def test_hosts_without_a_relevant_difference_have_no_faults_or_warnings():
+    """The fingerprint of a host that computes nothing is not compared."""
     router = report(fingerprint="b" * 16, machine={"libc": "glibc-2.31"})
     for other in (report(), router):
         assert compare_reports({"h1": other, "h2": report()}) == ([], [])
@@ -79,7 +79,7 @@ def test_hosts_without_a_difference_that_matters_raise_nothing():
         (report(fingerprint="b" * 16), (), ("fingerprints", "h1 bbbbbbbb", "h2 aaaaaaaa")),
     ],
 )
-def test_what_keeps_a_host_from_flying_is_a_fault_and_what_slows_or_differs_a_warning(found, fault, warning):
+def test_blocking_findings_are_faults_and_the_others_warnings(found, fault, warning):
     faults, warnings = compare_reports({"h1": found, "h2": report()})
     assert [has_terms(line, *fault) for line in faults] == [True] * bool(fault)
     assert [has_terms(line, *warning) for line in warnings] == [True] * bool(warning)
@@ -90,7 +90,7 @@ def test_processors_python_and_libraries_may_differ():
     assert compare_reports({"h1": other, "h2": report()}) == ([], [])
 
 
-def test_other_code_is_named_part_by_part():
+def test_different_code_is_named_part_by_part():
     other = report(fingerprint="b" * 16, parts={"zsim": __version__, "code": "d1ff"})
     faults, (different,) = compare_reports({"h1": other, "h2": report()})
     assert faults == []
@@ -98,13 +98,13 @@ def test_other_code_is_named_part_by_part():
     assert "zsim:" not in different
 
 
-def test_a_package_that_one_host_lacks_is_named():
+def test_a_package_missing_on_one_host_is_named():
     faults, (lacking,) = compare_reports({"h1": report(machine={"libc": "musl", "scipy": "1.17.1"}), "h2": report()})
     assert faults == []
     assert has_terms(lacking, "h1", "numba", "zsim push --hosts")
 
 
-def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
+def test_an_unreachable_path_is_a_fault_and_a_slow_one_a_warning():
     figures = [
         {"error": "Connection refused"},
         {"round_trip_s": 0.1, "bits_per_s": 2e6},
@@ -122,7 +122,7 @@ def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
         ({"error": os.strerror(errno.EACCES), "taken": False}, (os.strerror(errno.EACCES), "another port")),
     ],
 )
-def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, terms):
+def test_a_port_that_cannot_be_opened_is_not_called_unreachable(found, terms):
     (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(json.dumps(found) + "\n"), {"h1": "python"}, 7447))
     (line,), warnings = path_faults([path])
     assert has_terms(line, "h1", "port 7447", *terms)
@@ -130,12 +130,12 @@ def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, ter
 
 
 def checked_up(folder: Path) -> CheckResult:
-    """Check up a host that does not answer, of an inventory in a folder."""
-    host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux; nobody has it
+    """Check a host that does not answer, with an inventory in the given folder."""
+    host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux, which no machine runs
     return check_hosts(InventoryFile(Inventory(hosts={"h1": host}, roles={"world": "h1"}), folder, "lab.yaml"), None)
 
 
-def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_warning(tmp_path):
+def test_bad_certificates_are_faults_and_readable_keys_a_warning(tmp_path):
     (fault, _) = checked_up(tmp_path).faults
     assert has_terms(fault, f"{tmp_path}/certs", "no certificates", f"zsim certs init {tmp_path}/lab.yaml")
     then = datetime.now(UTC) - timedelta(days=60)
@@ -152,7 +152,7 @@ def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_war
 
 
 class Silent(HostLink):
-    """A host that takes commands and never says anything, or says some lines and ends with a code."""
+    """A host whose commands print nothing and never end, or print the given lines and end with a code."""
 
     def __init__(self, out: str | None = None, error: str = "", code: int = 1, python: str | None = None) -> None:
         super().__init__("h1", Host(address="192.0.2.1", python=python), Path())
@@ -179,13 +179,13 @@ class Silent(HostLink):
         )
 
 
-def test_a_greeting_of_the_login_shell_is_passed_over():
+def test_a_greeting_of_the_login_shell_is_ignored():
     clocks = [json.dumps({"time_ns": 10**18})] * doctor.OFFSET_SAMPLES
     output = "\n".join(["Welcome to lab", "17", json.dumps(SOUND), *clocks, ""])
     assert asyncio.run(doctor.host_report(Silent(output), "python")).facts == SOUND
 
 
-def test_a_host_that_says_nothing_is_a_line(monkeypatch):
+def test_a_host_that_does_not_answer_is_reported(monkeypatch):
     monkeypatch.setattr(doctor, "ABOUT_S", 0.01)
     monkeypatch.setattr(doctor, "READY_S", 0.01)
     with refused(HostsError, "h1", "no answer", "0.01 s"):
@@ -209,12 +209,12 @@ PUSH = "zsim push --hosts lab.yaml"
         (None, 0, "", ("PYTHON", "code 0", "nothing")),
     ],
 )  # fmt: skip
-def test_a_host_without_zsim_is_told_from_one_with_another_fault(python, code, error, terms):
+def test_a_host_without_zsim_is_distinguished_from_other_faults(python, code, error, terms):
     with refused(HostsError, "h1", *terms):
         asyncio.run(doctor.host_report(Silent("Welcome to lab\n", error, code, python), "PYTHON", "lab.yaml"))
 
 
-def test_the_clock_is_told_for_each_line(monkeypatch, capsys):
+def test_the_clock_is_printed_for_each_line(monkeypatch, capsys):
     monkeypatch.setattr(probe.time, "time_ns", itertools.count(5).__next__)
     probe.clock(io.StringIO("\n\n"))
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [{"time_ns": 5}, {"time_ns": 6}]
@@ -222,7 +222,7 @@ def test_the_clock_is_told_for_each_line(monkeypatch, capsys):
 
 @contextmanager
 def served():
-    """Let the probe answer one connection, and yield its port."""
+    """Let the probe answer one connection and yield its port."""
     with probe.listening(0) as server:
 
         def answer() -> None:
@@ -233,12 +233,12 @@ def served():
         thread.start()
         port = server.getsockname()[1]
         yield port
-        socket.create_connection(("127.0.0.1", port)).close()  # whoever did not come is not waited for
+        socket.create_connection(("127.0.0.1", port)).close()  # ends the wait if the test did not connect
         thread.join()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "::1"])
-def test_the_probe_measures_what_answers(address):
+def test_the_probe_measures_round_trip_and_bandwidth(address):
     try:
         socket.create_server((address, 0), family=socket.getaddrinfo(address, 0)[0][0]).close()
     except OSError:
@@ -250,7 +250,7 @@ def test_the_probe_measures_what_answers(address):
 
 
 class Slow(nullcontext):
-    """A link of some bandwidth and round trip, on a clock of its own; it gives up as sockets do."""
+    """A link of the given bandwidth and round trip, on its own clock; it times out like a socket."""
 
     def __init__(self, bits_per_s: float, round_trip_s: float) -> None:
         super().__init__(self)
@@ -271,7 +271,7 @@ class Slow(nullcontext):
 
 @pytest.mark.parametrize("round_trip_s", [0.001, 0.6, 2.0])
 @pytest.mark.parametrize("bits_per_s", [50e3, 1e6, 4e6, 30e6, 1e9])
-def test_a_slow_link_is_measured_and_soon(monkeypatch, bits_per_s, round_trip_s):
+def test_any_link_is_measured_in_time(monkeypatch, bits_per_s, round_trip_s):
     link = Slow(bits_per_s, round_trip_s)
     monkeypatch.setattr(probe.socket, "create_connection", lambda *_: link)
     monkeypatch.setattr(probe.time, "monotonic", lambda: link.now_s)
@@ -281,13 +281,13 @@ def test_a_slow_link_is_measured_and_soon(monkeypatch, bits_per_s, round_trip_s)
     assert link.now_s < doctor.REACH_S
 
 
-def test_the_probe_says_why_nothing_answers():
+def test_the_probe_reports_why_nothing_answers():
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     assert "refused" in probe.reach("127.0.0.1", port)["error"]
 
 
-def test_governors_are_read_where_the_system_tells(tmp_path):
+def test_governors_are_read_where_the_system_has_them(tmp_path):
     for cpu, text in (("cpu0", "powersave\n"), ("cpu1", "performance\n")):
         folder = tmp_path / cpu / "cpufreq"
         folder.mkdir(parents=True)
@@ -296,13 +296,13 @@ def test_governors_are_read_where_the_system_tells(tmp_path):
     assert probe.governors(tmp_path / "nowhere") == []
 
 
-def test_a_port_that_is_taken_is_said(capsys):
+def test_a_port_in_use_is_reported(capsys):
     with probe.listening(0) as taken:
         probe.serve(taken.getsockname()[1])
     assert json.loads(capsys.readouterr().out) == {"error": os.strerror(errno.EADDRINUSE), "taken": True}
 
 
-def test_a_folder_is_asked_for_where_it_would_be_made(tmp_path, monkeypatch):
+def test_the_nearest_existing_parent_of_a_folder_is_checked(tmp_path, monkeypatch):
     assert probe.unwritable(tmp_path / "zsim" / "runs") is None
     (tmp_path / "file").touch()
     assert has_terms(probe.unwritable(tmp_path / "file" / "zsim"), f"{tmp_path}/file", "not a folder")
@@ -324,7 +324,7 @@ def run_of(folder: Path, run: str, *files: str) -> None:
         path.touch()
 
 
-def test_records_and_keys_are_told_in_a_line_each(tmp_path: Path) -> None:
+def test_leftover_records_and_keys_are_reported_in_a_line_each(tmp_path: Path) -> None:
     assert asyncio.run(leftovers(local(tmp_path / "not there"), tmp_path)) == []
     folder = tmp_path / "our zsim"
     run_of(folder, "ghi", "scenario.yaml", "identity/world/ca.pem")
@@ -338,7 +338,7 @@ def test_records_and_keys_are_told_in_a_line_each(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("ps") is None, reason="needs ps (apt-get install procps)")
-def test_a_run_that_goes_on_is_no_earlier_one(tmp_path: Path) -> None:
+def test_files_of_a_current_run_are_no_leftovers(tmp_path: Path) -> None:
     run_of(tmp_path, "abcdef", "run.mcap", "identity/world/key.pem")
     words = [sys.executable, "-c", WAITS, "world", "--launched", "abcdef", "--host", "h1"]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -349,14 +349,14 @@ def test_a_run_that_goes_on_is_no_earlier_one(tmp_path: Path) -> None:
     assert len(asyncio.run(leftovers(local(tmp_path), tmp_path))) == 2
 
 
-def test_the_way_of_a_copy_is_that_of_the_launcher() -> None:
+def test_the_advised_copy_uses_the_ssh_options_of_the_launcher() -> None:
     host = Host(address="::1", ssh="fe80::1", key="keys/a b", known_hosts="/etc/known")
     command = "scp -i '/lab/keys/a b' -o UserKnownHostsFile=/etc/known '[fe80::1]:.zsim/runs/1/run.mcap' ."
     assert scp(host, Path("/lab"), "~/.zsim/runs/1/run.mcap") == command
     assert scp(Host(address="h1"), Path(), "~/.zsim/runs/1/run.mcap") == "scp h1:.zsim/runs/1/run.mcap ."
 
 
-def test_a_port_on_which_somebody_listens_is_a_line() -> None:
+def test_a_port_in_use_on_a_host_is_a_fault() -> None:
     link = LocalHost()
     with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as free:
         numbers = [found.getsockname()[1] for found in (taken, free)]

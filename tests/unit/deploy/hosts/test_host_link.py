@@ -1,4 +1,4 @@
-"""The launcher's way to one host: how many channels a connection carries, and what is left of files cut short."""
+"""The launcher's link to a host: channels per connection, and files that are sent or fetched only in part."""
 
 import asyncio
 import errno
@@ -26,7 +26,7 @@ FILES = {"identity/world/key.pem": b"secret\n", "scenario.yaml": b"name: one\n" 
 
 @pytest.fixture
 def connections(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Let every link have connections that do nothing; return those that were opened."""
+    """Give every link connections that do nothing; return those that are opened."""
     opened: list[Any] = []
 
     class Connection:
@@ -47,7 +47,7 @@ def link() -> HostLink:
     return HostLink("h1", Host(address="127.0.0.1"), Path())
 
 
-def test_more_channels_than_sshd_allows_are_spread_over_connections_and_given_back(connections: list[Any]) -> None:
+def test_channels_are_spread_over_connections_and_reused(connections: list[Any]) -> None:
     async def lend(count: int) -> list[Any]:
         host = link()
         for _ in range(3 * CHANNELS):  # one after the other
@@ -60,7 +60,7 @@ def test_more_channels_than_sshd_allows_are_spread_over_connections_and_given_ba
     assert [used.count(connection) for connection in connections] == [CHANNELS, CHANNELS, 1]
 
 
-def test_a_connection_that_is_lost_is_made_anew(connections: list[Any]) -> None:
+def test_a_lost_connection_is_replaced(connections: list[Any]) -> None:
     async def lose() -> bool:
         host = link()
         async with host.channel() as lost:
@@ -71,7 +71,7 @@ def test_a_connection_that_is_lost_is_made_anew(connections: list[Any]) -> None:
     assert not asyncio.run(lose())
 
 
-def test_files_come_below_a_folder_and_are_their_owners_alone(tmp_path: Path) -> None:
+def test_files_are_put_into_a_folder_readable_by_their_owner_alone(tmp_path: Path) -> None:
     asyncio.run(LocalHost().put_files(str(tmp_path / "a run"), FILES))
     found = {str(path.relative_to(tmp_path / "a run")): path for path in (tmp_path / "a run").rglob("*.*")}
     assert {name: path.read_bytes() for name, path in found.items() if path.is_file()} == FILES
@@ -79,13 +79,13 @@ def test_files_come_below_a_folder_and_are_their_owners_alone(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("takes", [0, 600, 20_000])
-def test_of_files_that_come_in_part_none_is_seen(tmp_path: Path, takes: int) -> None:
+def test_files_sent_only_in_part_do_not_appear(tmp_path: Path, takes: int) -> None:
     with refused(HostsError, "writing", "in part"):
         asyncio.run(LocalHost(takes).put_files(str(tmp_path / "run"), FILES))
     assert [path.name for path in tmp_path.rglob("*")] == ["run"]
 
 
-def test_two_that_write_into_one_folder_do_not_disturb_each_other(tmp_path: Path) -> None:
+def test_two_transfers_into_one_folder_do_not_disturb_each_other(tmp_path: Path) -> None:
     host = LocalHost()
     for name in ("one", "two"):
         asyncio.run(host.put_files(str(tmp_path / "run"), {name: name.encode() * 9000}))
@@ -109,7 +109,7 @@ def links() -> Any:
     loop.close()
 
 
-def test_what_all_hosts_say_comes_back_by_name_and_each_that_is_late_or_fails_is_named(links: HostLinks) -> None:
+def test_results_are_returned_by_host_and_late_or_failed_hosts_named(links: HostLinks) -> None:
     async def name(host: HostLink) -> str:
         return host.name
 
@@ -131,7 +131,7 @@ Get = Callable[[Path, Callable[..., None]], Awaitable[None]]
 
 
 class Link:
-    """A link to a host whose sftp does what is given; None never lets us in."""
+    """A link to a host whose SFTP behaves as given; with None, no session is ever opened."""
 
     name = "h2"
 
@@ -185,13 +185,11 @@ def raising(error: Exception) -> Get:
     return get
 
 
-def test_a_file_comes_under_its_name_and_may_take_longer_than_a_stall(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of the slow one something comes three times as often as it has to; all of it takes longer than one stall."""
+def test_a_fetched_file_may_take_longer_than_the_stall_timeout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The slow transfer makes progress well within every stall timeout, but takes longer than one in total."""
     monkeypatch.setattr(host_link, "STALL_S", 0.8)
     for get in (whole, slowly):
-        assert fetched(get, tmp_path / "run.mcap").asked == [".zsim/runs/1/run.mcap"]  # sftp starts at the home
+        assert fetched(get, tmp_path / "run.mcap").asked == [".zsim/runs/1/run.mcap"]  # SFTP starts in the home folder
         assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"all of it"]
     (tmp_path / "run.mcap").unlink()
     fetched(raising(asyncssh.SFTPNoSuchFile("No such file")), tmp_path / "run.mcap", there=False)
@@ -206,7 +204,7 @@ def test_a_file_comes_under_its_name_and_may_take_longer_than_a_stall(
         (raising(asyncssh.SFTPPermissionDenied("Permission denied")), ("h2", os.strerror(errno.EACCES)), []),
     ],
 )
-def test_what_keeps_a_file_from_coming_is_a_line(
+def test_a_failed_fetch_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, get: Get | None, terms: tuple[str, ...], left: list[str]
 ) -> None:
     monkeypatch.setattr(host_link, "STALL_S", 0.05)

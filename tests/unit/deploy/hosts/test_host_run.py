@@ -1,4 +1,4 @@
-"""What a run puts on each host; how `zsim up` ends, with its record; and a process on another host over a made link."""
+"""What a run puts on each host; how `zsim up` ends and fetches its record; remote processes over a fake link."""
 
 import asyncio
 import errno
@@ -62,7 +62,7 @@ def plan(paths: tuple[Path, Path]) -> HostPlan:
     return HostPlan(inventory.load(hosts), scenario_file.load(scenario), "abc", ["--rate", "4"])
 
 
-def test_where_what_runs(plan: HostPlan) -> None:
+def test_a_plan_lists_processes_hosts_and_ports(plan: HostPlan) -> None:
     assert list(plan.processes) == ["router.field", "world", "recorder", "estimator.drone1", "estimator.-d2"]
     assert plan.hosts() == ["h1"]
     assert (sorted(plan.ports("h1")), plan.ports("h3")) == ([7447, 7448], [])
@@ -70,7 +70,7 @@ def test_where_what_runs(plan: HostPlan) -> None:
     assert has_terms(remark, "my.drone1", "h2")
 
 
-def test_the_command_line_of_a_process(plan: HostPlan) -> None:
+def test_a_process_has_its_endpoint_identity_and_options_on_its_command_line(plan: HostPlan) -> None:
     reach = ["--connect", "tls/127.0.0.1:7447", "--federation", "zsim", "--host", "h1"]
     tls = ["--tls", "/z/runs/abc/identity/estimator.-d2"]
     assert plan.arguments("estimator.-d2") == ["estimator", "--launched", "abc", *reach, *tls, "--", "-d2"]
@@ -80,7 +80,7 @@ def test_the_command_line_of_a_process(plan: HostPlan) -> None:
     assert world[world.index("--rate") + 1] == "4"
 
 
-def test_a_move_changes_one_place_and_keeps_the_others(plan: HostPlan) -> None:
+def test_a_move_changes_one_host_and_keeps_the_others(plan: HostPlan) -> None:
     moved = plan.moved("estimator.drone1", "h3").moved("estimator.-d2", "h2")
     assert {name: moved.host(name) for name in moved.processes} == {
         "router.field": "h1",
@@ -93,7 +93,7 @@ def test_a_move_changes_one_place_and_keeps_the_others(plan: HostPlan) -> None:
     assert plan.host("estimator.drone1") == "h1"
 
 
-def test_the_files_of_a_host_and_a_certificate_that_is_not_there(plan: HostPlan, tmp_path: Path) -> None:
+def test_a_host_gets_its_files_and_a_missing_certificate_is_reported(plan: HostPlan, tmp_path: Path) -> None:
     for name in plan.processes:
         for file in ("ca.pem", "certificate.pem", "key.pem"):
             path = tmp_path / "certs" / "h1" / name / file
@@ -113,10 +113,10 @@ def test_the_files_of_a_host_and_a_certificate_that_is_not_there(plan: HostPlan,
 
 
 @pytest.mark.parametrize("given", [None, "out", "there"])
-def test_a_start_that_is_refused_leaves_no_folder(
+def test_a_refused_start_leaves_no_new_folder(
     paths: tuple[Path, Path], given: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody listens on port 1; a folder that was there before stays."""
+    """Nothing listens on port 1. A folder that existed before is kept."""
     (tmp_path / "there").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -127,7 +127,7 @@ def test_a_start_that_is_refused_leaves_no_folder(
     assert left == {"there"}
 
 
-def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
+def test_a_federation_already_up_is_refused_before_any_host_is_contacted(
     paths: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -143,7 +143,7 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
         )
 
 
-def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_asked(
+def test_bad_certificates_are_reported_before_any_host_is_contacted(
     paths: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -162,7 +162,7 @@ def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_as
     assert not (tmp_path / "out").exists()
 
 
-def test_without_tls_as_the_command_line_says_it(paths: tuple[Path, Path]) -> None:
+def test_insecure_processes_use_tcp_and_need_no_certificates(paths: tuple[Path, Path]) -> None:
     placed = inventory.insecure(inventory.load(paths[1]))
     plan = HostPlan(placed, scenario_file.load(paths[0]), "abc")
     assert "--insecure" in plan.arguments("world")
@@ -170,7 +170,7 @@ def test_without_tls_as_the_command_line_says_it(paths: tuple[Path, Path]) -> No
     assert (plan.files("h1").keys(), plan.certificate_faults(datetime.now(UTC))) == ({"scenario.yaml"}, [])
 
 
-def test_a_host_whose_python_lacks_the_agents_takes_no_role(tmp_path: Path) -> None:
+def test_a_host_whose_python_lacks_the_agents_gets_no_role(tmp_path: Path) -> None:
     bare = tmp_path / "python"
     bare.write_text(f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
     bare.chmod(0o755)
@@ -192,7 +192,7 @@ AT = r"h1:~/\.zsim/runs/abc/run\.mcap \(fetch it with `scp pi@10\.0\.0\.1:\.zsim
 
 
 class Said(StatusTable):
-    """A board without a terminal."""
+    """A status table without a terminal."""
 
     def __init__(self) -> None:
         super().__init__(1.0, Console(file=io.StringIO(), width=500))
@@ -209,7 +209,7 @@ def board() -> Said:
 
 @pytest.fixture
 def up(board: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a run whose host is never asked for."""
+    """Return a run whose host is never contacted."""
     scenario, hosts = tmp_path / "one.yaml", tmp_path / "hosts.yaml"
     scenario.write_text(ONE_DRONE)
     hosts.write_text(yaml.safe_dump(ONE_HOST))
@@ -220,7 +220,7 @@ def up(board: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def ends_as(up: Any, outcome: Any, fetched: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the processes of a run and the fetching of its record end so, by a result or an exception."""
+    """Make a run's processes, and the fetching of its record, end with the given results or exceptions."""
 
     def result_of(found: Any) -> Any:
         if isinstance(found, BaseException):
@@ -235,7 +235,7 @@ def ends_as(up: Any, outcome: Any, fetched: Any, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("early", [True, False], ids=["processes end", "record is fetched"])
-def test_a_second_ctrl_c_does_not_wait_and_says_where_the_record_is(
+def test_a_second_ctrl_c_ends_at_once_and_shows_where_the_record_is(
     up: Any, board: Said, monkeypatch: pytest.MonkeyPatch, early: bool
 ) -> None:
     def interrupt(work: Any) -> None:
@@ -251,16 +251,14 @@ def test_a_second_ctrl_c_does_not_wait_and_says_where_the_record_is(
     assert has_terms(board.text(), "fetching") is not early
 
 
-def test_a_run_that_was_ended_before_it_flew_has_no_record(
-    up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_ended_before_its_start_has_no_record(up: Any, board: Said, monkeypatch: pytest.MonkeyPatch) -> None:
     ends_as(up, INTERRUPTED, False, monkeypatch)
     assert up._fly() == INTERRUPTED
     assert has_terms(board.text(), "nothing", "recorded")
     assert not up._record_stays
 
 
-def test_a_record_that_stays_away_fails_a_run_that_ended_well(up: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_record_that_cannot_be_fetched_fails_the_run(up: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     ends_as(up, Outcome("duration"), HostsError("h1: gone"), monkeypatch)
     outcome = up._fly()
     assert outcome.failed
@@ -269,9 +267,7 @@ def test_a_record_that_stays_away_fails_a_run_that_ended_well(up: Any, monkeypat
 
 
 @pytest.mark.parametrize("reason", [CLOSED, UNREAD])
-def test_a_run_that_nobody_sees_any_more_is_ended_and_lines_are_shown_from_then_on(
-    up: Any, board: Said, reason: str
-) -> None:
+def test_a_run_whose_output_is_closed_ends_and_then_prints_lines(up: Any, board: Said, reason: str) -> None:
     with board:
         up._signals.reason = reason
         up._signals._hung_up()
@@ -283,11 +279,11 @@ def test_a_run_that_nobody_sees_any_more_is_ended_and_lines_are_shown_from_then_
 
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
-PATIENCE_S = 120.0  # after which a test that waits for ever fails
+PATIENCE_S = 120.0  # the timeout of a test that would otherwise wait for ever
 
 
 class Stream:
-    """What a process says."""
+    """The output of a process."""
 
     def __init__(self, *lines: str) -> None:
         self._lines = list(lines)
@@ -304,7 +300,7 @@ class Stream:
 
 
 class Process:
-    """A process that says some lines and ends."""
+    """A process that prints some lines and ends."""
 
     exit_signal, exit_status = None, 0
 
@@ -321,7 +317,7 @@ class Process:
 
 
 class Link:
-    """A link to a host on which every command is the process given, a fault, or never comes to be."""
+    """A link to a host on which every command starts the given process."""
 
     name = "h1"
 
@@ -344,7 +340,7 @@ class Link:
 
 
 class Absent(Link):
-    """A link to a host that is not there."""
+    """A link to an absent host, which fails with the given fault or waits for ever."""
 
     @asynccontextmanager
     async def channel(self, retry: bool = False) -> AsyncIterator[Link]:
@@ -371,7 +367,7 @@ def started(tmp_path: Path) -> Iterator[Start]:
     loop.close()
 
 
-def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(started: Start, tmp_path: Path) -> None:
+def test_output_is_kept_and_a_greeting_is_not_taken_for_the_pid(started: Start, tmp_path: Path) -> None:
     output: list[str] = []
     link = Link(Process("Welcome to h1\n", "zsim-pid 77\n", '{"say": 1}\n', complains=("here\n", "\n")))
     remote = started(link, output.append)
@@ -381,7 +377,7 @@ def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(s
     assert (tmp_path / "estimator.d1.log").read_text() == "here\n\n"
 
 
-def test_a_link_that_breaks_or_a_fault_of_whoever_takes_its_lines_ends_it(started: Start) -> None:
+def test_a_broken_link_or_a_failing_line_handler_ends_a_remote_process(started: Start) -> None:
     def fail(line: str) -> None:
         raise TypeError("not iterable")
 
@@ -395,7 +391,7 @@ def test_a_link_that_breaks_or_a_fault_of_whoever_takes_its_lines_ends_it(starte
         assert has_terms(remote.outcome(), *terms)
 
 
-def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:
+def test_an_unwritable_log_is_reported_once_and_the_process_continues(started: Start, tmp_path: Path) -> None:
     output: list[str] = []
     log = ProcessLog(tmp_path / "gone" / "estimator.d1.log", output.append)
     remote = started(Link(Process("zsim-pid 77\n", complains=("one\n", "two\n"))), log=log)
@@ -405,7 +401,7 @@ def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(start
     assert has_terms(line, "gone/estimator.d1.log", "written", os.strerror(errno.ENOENT))
 
 
-def test_one_that_waits_for_its_host_can_be_given_up(started: Start) -> None:
+def test_a_process_waiting_for_its_host_can_be_killed(started: Start) -> None:
     remote = started(Absent(None))
     assert remote.state == "starting"
     remote.kill()
@@ -413,7 +409,7 @@ def test_one_that_waits_for_its_host_can_be_given_up(started: Start) -> None:
     assert remote.code == LOST
 
 
-def test_one_that_is_started_again_gets_its_key_again_which_it_has_taken_away(started: Start) -> None:
+def test_a_restarted_process_is_sent_its_files_again(started: Start) -> None:
     link = Link(Process("zsim-pid 77\n"))
     remote = started(link)
     assert remote.wait(PATIENCE_S)

@@ -1,4 +1,4 @@
-"""What a push leaves alone, what it copies, and how the failures of several hosts are shown."""
+"""What a push skips, what it copies, and how the failures of several hosts are shown."""
 
 import asyncio
 import errno
@@ -44,8 +44,8 @@ HOUSE = WheelSet(wheel("zsim-1"), wheel("pip-26"), (wheel("numpy-2", 9), wheel("
 NOTE = HOUSE.manifest()
 
 
-def test_what_is_installed_is_known_by_the_note_of_the_last_push() -> None:
-    """More than is needed may be there."""
+def test_the_manifest_of_the_last_push_tells_what_is_installed() -> None:
+    """A host may have more installed than is needed."""
     there = [HOUSE, HOUSE._replace(extras=(), others=(wheel("numpy-2"),)), HOUSE._replace(pip=wheel("pip-27"))]
     assert all(is_installed(wanted, NOTE) for wanted in there)
     assert not is_installed(HOUSE, None)
@@ -65,7 +65,7 @@ def test_what_is_installed_is_known_by_the_note_of_the_last_push() -> None:
         (None, {"numpy-2.whl": "sha of numpy-2", "scipy-1.whl": "cut short"}, ["scipy-1", "zsim-1", "pip-26"]),
     ],
 )
-def test_what_is_installed_or_was_copied_before_is_not_copied_again(
+def test_installed_or_copied_wheels_are_not_copied_again(
     installed: Any, copied: dict[str, str], lacking: list[str]
 ) -> None:
     found = missing(HOUSE, {"installed": installed, "wheels": copied})
@@ -73,7 +73,7 @@ def test_what_is_installed_or_was_copied_before_is_not_copied_again(
 
 
 class Local:
-    """A process of this machine, as asyncssh gives one of another."""
+    """A local process with the interface of asyncssh's remote one."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self.process = process
@@ -99,7 +99,7 @@ class Local:
 
 
 class Greeting(HostLink):
-    """This machine, as a host whose login shell greets."""
+    """This machine as a host whose login shell prints a greeting."""
 
     def __init__(self) -> None:
         super().__init__("h1", Host(address="192.0.2.1"), Path())
@@ -112,7 +112,7 @@ class Greeting(HostLink):
         finally:
             for each in self.processes:
                 each.close()
-                await each.process.wait()  # whoever is asked to end and does not, hangs the test
+                await each.process.wait()  # a process that does not end hangs the test
 
     async def create_process(self, command: str, **_: Any) -> Local:
         pipe = asyncio.subprocess.PIPE
@@ -139,7 +139,7 @@ def ask(folder: Path, act: str, **order: Any) -> dict[str, Any]:
 
 
 def start_refusal(python: str, folder: Path) -> str:
-    """Return what keeps an installer from starting."""
+    """Return the error with which an installer fails to start."""
 
     async def work() -> None:
         async with installer(folder, python=python):
@@ -150,8 +150,8 @@ def start_refusal(python: str, folder: Path) -> str:
     return str(caught.value)
 
 
-def test_what_keeps_a_host_from_being_asked_is_a_line(tmp_path: Path) -> None:
-    """Not a login shell that greets."""
+def test_an_installer_that_cannot_start_is_reported(tmp_path: Path) -> None:
+    """A greeting of the login shell does no harm."""
     assert ask(tmp_path, "look")["folder"] == str(tmp_path)
     silent = shutil.which("true") or ""
     assert has_terms(start_refusal(silent, tmp_path), "h1", str(silent), "nothing")
@@ -161,15 +161,15 @@ def test_what_keeps_a_host_from_being_asked_is_a_line(tmp_path: Path) -> None:
 
 
 def write_pip(folder: Path, text: str) -> dict[str, Any]:
-    """Write what stands for pip, and return an order that runs it first."""
+    """Write a stand-in for pip and return an order that runs it first."""
     script = folder / "wheels/pip-1.whl/pip/__main__.py"
     script.parent.mkdir(parents=True)
     script.write_text(text)
     return {"project": "zsim-1.whl", "pip": "pip-1.whl", "wheels": [], "extras": [], "modules": [], "note": {}}
 
 
-def test_what_is_being_installed_ends_with_the_channel(tmp_path: Path) -> None:
-    """Nobody but pip holds the writing end of the pipe; it is at its end when pip is gone."""
+def test_an_installation_ends_with_its_channel(tmp_path: Path) -> None:
+    """Only pip holds the writing end of the pipe, so reading meets the end of file once pip is gone."""
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     order = write_pip(tmp_path, f"import signal; held = open({str(pipe)!r}, 'w'); signal.pause()")
@@ -189,13 +189,13 @@ def test_what_is_being_installed_ends_with_the_channel(tmp_path: Path) -> None:
     asyncio.run(work())
 
 
-def test_a_program_ends_whose_launcher_fell_silent(tmp_path: Path) -> None:
+def test_the_program_on_the_host_ends_when_its_launcher_falls_silent(tmp_path: Path) -> None:
     command = [sys.executable, "-P", on_host.__file__, str(tmp_path), "anna", "0.1"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as program:
         assert program.wait(ASK_S) == 0  # its standard input is still open
 
 
-def test_a_launcher_that_lives_shows_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_running_launcher_sends_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("zsim_deploy.hosts.push.BEAT_S", 0.01)
 
     async def work() -> dict[str, Any]:
@@ -207,14 +207,14 @@ def test_a_launcher_that_lives_shows_it(tmp_path: Path, monkeypatch: pytest.Monk
     assert asyncio.run(work())["installed"] is None
 
 
-def test_what_pip_says_is_a_line(tmp_path: Path) -> None:
+def test_an_error_of_pip_is_reported_in_one_line(tmp_path: Path) -> None:
     order = write_pip(tmp_path, "import sys; sys.exit('ERROR: No space left on device\\nnote: more')")
     with refused(HostsError, "h1", "ERROR", os.strerror(errno.ENOSPC)) as raised:
         ask(tmp_path, "install", **order)
     assert "\n" not in str(raised.value)
 
 
-def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
+def test_a_second_push_reports_the_process_that_it_waits_for(tmp_path: Path) -> None:
     steps: list[str] = []
 
     async def second(waits: asyncio.Event) -> dict[str, Any]:
@@ -238,7 +238,7 @@ def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
     assert has_terms(line, f"{getpass.getuser()}@{socket.gethostname()}", f"process {pid}")
 
 
-def test_who_pushes_for_too_long_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_push_that_takes_too_long_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("zsim_deploy.hosts.push.WAIT_S", 0.01)
 
     async def work() -> str:
@@ -254,7 +254,7 @@ def pushed(cache: Path, names: list[str], extras: list[str], progress: Any = pri
     return asyncio.run(push(where, names, extras, progress, cache))
 
 
-def test_a_host_with_an_interpreter_of_its_own_is_left_alone(tmp_path: Path) -> None:
+def test_a_host_with_its_own_interpreter_is_skipped(tmp_path: Path) -> None:
     own = Host(address="192.0.2.1", python="/opt/zsim/bin/python")
     assert pushed(tmp_path, [], [], a=own) == {"a": False}
 
@@ -266,19 +266,19 @@ def test_a_host_with_an_interpreter_of_its_own_is_left_alone(tmp_path: Path) -> 
         ([], ["agents", "nonsense"], ("--extra nonsense", "agents", "all", "world")),
     ],
 )
-def test_a_host_or_an_extra_that_is_none_is_a_line_with_those_that_are(
+def test_an_unknown_host_or_extra_is_refused_with_the_known_ones(
     tmp_path: Path, names: list[str], extras: list[str], terms: tuple[str, ...]
 ) -> None:
     with refused(InventoryError, *terms):
         pushed(tmp_path, names, extras, a=Host(address="192.0.2.1"), b=Host(address="192.0.2.2"))
 
 
-def test_every_host_that_fails_has_its_line(tmp_path: Path) -> None:
-    closed = Host(address="127.0.0.1", port=1)  # tcpmux; nobody has it
+def test_every_failed_host_is_reported_in_a_line(tmp_path: Path) -> None:
+    closed = Host(address="127.0.0.1", port=1)  # tcpmux, which no machine runs
     steps: list[tuple[str, ...]] = []
     with pytest.raises(HostsError) as caught:
         pushed(tmp_path, [], [], lambda *step: steps.append(step), a=closed, b=closed, c=Host(address="h", python="/p"))
-    assert {("a", "failed"), ("b", "failed")} <= set(steps)  # why is said once, in the end
+    assert {("a", "failed"), ("b", "failed")} <= set(steps)  # the reason is given once, at the end
     lines = str(caught.value).splitlines()
     assert [line.partition(": ")[0] for line in lines] == ["a", "b"]
     assert all(has_terms(line, os.strerror(errno.ECONNREFUSED)) for line in lines)
@@ -288,12 +288,12 @@ HERE = (3, 11)
 
 
 def found(**versions: str) -> list[Interpreter]:
-    """Return interpreters: python3_12="3.12.1" is the command python3.12."""
+    """Return interpreters; python3_12="3.12.1" stands for the command python3.12."""
     lines = (f"{name.replace('_', '.')} {version} /usr/bin/{name}" for name, version in versions.items())
     return parse_interpreters("\n".join(lines))
 
 
-def test_the_launchers_minor_version_is_taken_as_python3_where_it_is_that() -> None:
+def test_python3_is_preferred_if_it_has_the_minor_version_of_the_launcher() -> None:
     several = found(python3="3.13.2", python3_12="3.12.1", python3_11="3.11.9")
     assert choose_interpreter("h", several, HERE).command == "python3.11"
     assert choose_interpreter("h", found(python3="3.11.2", python3_11="3.11.9"), HERE).command == "python3"
@@ -307,15 +307,13 @@ def test_the_launchers_minor_version_is_taken_as_python3_where_it_is_that() -> N
         ([], ("python3", "3.11", "python3.11")),
     ],
 )  # fmt: skip
-def test_a_python_of_another_minor_version_is_a_line_before_anything_is_copied(
-    there: list[Interpreter], terms: tuple[str, ...]
-) -> None:
-    """No run takes a host with another one."""
+def test_another_minor_version_of_python_is_refused(there: list[Interpreter], terms: tuple[str, ...]) -> None:
+    """A run does not accept a host with another minor version."""
     with refused(HostsError, "onboard1", *terms):
         choose_interpreter("onboard1", there, HERE)
 
 
-def test_the_question_finds_the_pythons_of_a_machine_and_no_greeting() -> None:
+def test_the_query_finds_interpreters_and_ignores_a_greeting() -> None:
     answer = subprocess.run(["sh", "-c", interpreter_query()], capture_output=True, text=True, check=True).stdout
     assert parse_interpreters(answer)
     for each in parse_interpreters(answer):

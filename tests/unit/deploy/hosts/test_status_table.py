@@ -1,4 +1,4 @@
-"""The table of `zsim up`: what a row says of a process, and which host is named as silent."""
+"""The table of `zsim up`: the rows of processes, and which hosts are reported as silent."""
 
 import io
 import random
@@ -36,7 +36,7 @@ def board():
 
 @pytest.fixture
 def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The monotonic time, which a test sets."""
+    """Return the monotonic time, which the test sets."""
     at = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: at[0])
     return at
@@ -50,24 +50,24 @@ def clock(t_s: float, **more: Any) -> dict[str, Any]:
     return {"t_s": t_s, "rate": 2.0, "state": "running", "phase": "", "waiting_for": [], **more}
 
 
-def test_a_row_says_where_and_how_a_process_is(board, now):
+def test_a_row_shows_the_host_and_figures_of_a_process(board, now):
     board.health({"name": "estimator.d1", "lag_ns": 20_000_000, "received": 100})
     now[0] = 101.0
     board.health({"name": "estimator.d1", "lag_ns": 40_000_000, "received": 350})
     figures = {"age_s": 0.0, "lag_ms": 40.0, "messages_per_s": 250.0, "round_trip_ms": 4.0, "restarts": 1}
     assert board.rows()[0] == {"role": "estimator.d1", "host": "h1", "pid": 7, "state": "running", **figures}
     now[0] = 110.0
-    assert board.rows()[0]["lag_ms"] is None  # nobody knows by now
+    assert board.rows()[0]["lag_ms"] is None  # too old to be shown
 
 
 @pytest.mark.parametrize(("more", "terms"), [({}, ("waited for", "3 s")), ({"held_by": ["planner.d1"]}, ("waits for planner.d1",))])  # fmt: skip
-def test_who_is_waited_for_is_said_and_not_who_waits_itself(board, more, terms):
+def test_a_row_tells_a_process_waited_for_from_one_that_waits(board, more, terms):
     waiting = {"name": "estimator.d1", "host": "h1", "since_wall_s": 3.2, **more}
     board.clock(clock(1.0, waiting_for=[waiting]))
     assert has_terms(board.rows()[0]["state"], *terms)
 
 
-def test_a_silent_host_is_named_once_with_its_roles_and_once_when_it_is_back(board):
+def test_a_silent_host_is_reported_once_and_again_when_it_returns(board):
     board.links["h1"].silent = 1.5
     board.report_silent_hosts()
     board.report_silent_hosts()
@@ -81,7 +81,7 @@ def test_a_silent_host_is_named_once_with_its_roles_and_once_when_it_is_back(boa
     assert has_terms(line, "h1", "again")
 
 
-def test_what_always_answers_late_is_not_silent(board):
+def test_a_host_that_always_answers_late_is_not_silent(board):
     board.links["h1"].round_trip_s, board.links["h1"].silent = 1.2, 1.2
     board.report_silent_hosts()
     assert printed(board) == ""
@@ -91,7 +91,7 @@ def test_what_always_answers_late_is_not_silent(board):
     assert has_terms(printed(board), "h1", "not answer", "4.0 s")
 
 
-def test_the_start_is_told_with_where_the_time_went(board):
+def test_the_start_is_reported_with_the_duration_of_its_stages(board):
     board.stages_s = {"connect": 0.25, "check": 0.5}
     board.clock(clock(0.0, state="waiting"))
     assert "flies after" not in printed(board)
@@ -102,7 +102,7 @@ def test_the_start_is_told_with_where_the_time_went(board):
 
 
 @pytest.mark.parametrize("last_line", ["exit code 2", "cannot open [/tmp/x]", "[/]", "[red]no"])
-def test_an_ended_process_says_how_and_its_words_are_shown_as_they_are(board, last_line):
+def test_an_ended_process_shows_its_outcome_without_markup(board, last_line):
     board.members[0].state, board.members[0].code, board.members[0].outcome = "ended", 2, lambda: last_line
     assert any(f"ended ({last_line})" in line for line in lines(table(board.rows()), 200))
 
@@ -114,7 +114,7 @@ def test_a_process_without_a_sign_of_life_is_shown_within_two_seconds(board, now
     assert has_terms(board.rows()[0]["state"], "life")
 
 
-def test_while_the_world_is_silent_only_the_world_is_said_to_be(board, now):
+def test_while_the_world_is_silent_only_the_world_is_shown_as_silent(board, now):
     world: Any = SimpleNamespace(name="world", host="h1", pid=8, state="running", code=None, restarts=0)
     board.members = [*board.members, world]
     board.health({"name": "estimator.d1", "lag_ns": 0, "received": 100})
@@ -154,7 +154,7 @@ def roles(choice: RowChoice) -> list[str]:
         (["pi-?"], ["drone1", "drone12"]),
     ],
 )
-def test_patterns_are_of_roles_of_what_they_work_for_and_of_hosts(only: list[str], shown: list[str]) -> None:
+def test_patterns_match_roles_their_subjects_and_hosts(only: list[str], shown: list[str]) -> None:
     assert roles(RowChoice(only)) == shown
 
 
@@ -169,7 +169,7 @@ def test_patterns_are_of_roles_of_what_they_work_for_and_of_hosts(only: list[str
         (RowOrder.ATTENTION, ["drone1", "main", "world", "drone12"]),
     ],
 )
-def test_the_greatest_figure_is_first(sort: RowOrder, shown: list[str]) -> None:
+def test_rows_are_sorted_by_the_chosen_order(sort: RowOrder, shown: list[str]) -> None:
     assert roles(RowChoice(sort=sort)) == shown
 
 
@@ -193,7 +193,9 @@ def live(table: StatusTable, width: int) -> list[str]:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_of_200_processes_those_in_need_are_on_the_screen(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_200_processes_those_in_need_of_attention_are_on_the_screen(
+    width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rows = [row(f"estimator.formation-alpha-drone{i}", f"onboard-computer-{i}") for i in range(200)]
     rows[150]["state"], rows[199]["state"] = "ended (exit code 1: no such file)", "no sign of life for 12 s"
     table = StatusTable(10.0)
@@ -206,14 +208,14 @@ def test_of_200_processes_those_in_need_are_on_the_screen(width: int, monkeypatc
     assert "180 more" in shown[-1]
 
 
-def test_where_all_processes_have_a_line_they_stay_in_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_keep_their_order_when_all_of_them_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     table = StatusTable(10.0, choice=RowChoice(["drone1*", "world"]))
     monkeypatch.setattr(table, "rows", lambda: ROWS)
     names = [line.split()[0] for line in live(table, 100)[-3:]]
     assert names == ["world", "estimator.drone1", "estimator.drone12"]
 
 
-COLUMNS = 80  # of a terminal, by default
+COLUMNS = 80  # the default width of a terminal
 ROLES = [f"estimator.formation-alpha-drone-{i:04}" for i in range(200)]
 HOST = "onboard-computer-of-drone-0012"
 LARGE = {"pid": 123456, "lag_ms": 1234.0, "messages_per_s": 12345.0, "round_trip_ms": 123.4, "restarts": 3}
@@ -230,11 +232,11 @@ def lines(shown: FittedTable, width: int = COLUMNS) -> list[str]:
     ("name", "width", "text"),
     [("estimator.drone2", 16, "estimator.drone2"), ("estimator.drone2", 7, "…drone2"), ("d1", 1, "…")],
 )
-def test_the_beginning_of_a_name_is_left_out(name: str, width: int, text: str) -> None:
+def test_a_long_name_is_shortened_at_its_beginning(name: str, width: int, text: str) -> None:
     assert shortened(name, width) == text
 
 
-def test_processes_are_told_apart_in_a_terminal_of_80_columns() -> None:
+def test_processes_are_distinguishable_in_80_columns() -> None:
     rows = [{"role": role, "host": HOST, "state": "host silent 12 s", **LARGE} for role in ROLES]
     shown = lines(table(rows))[-len(ROLES) :]
     ends = [line.split()[0].removeprefix("…") for line in shown]
@@ -248,7 +250,7 @@ def test_a_table_with_room_shows_whole_names() -> None:
     assert row.split()[:2] == ["estimator.drone2", "lab-pc"]
 
 
-def test_hosts_are_told_apart_in_a_terminal_of_80_columns() -> None:
+def test_hosts_are_distinguishable_in_80_columns() -> None:
     hosts = [f"onboard-computer-of-drone-{i:04}" for i in range(3)]
     checked = lines(hosts_table({name: HostReport(FACTS, 0.001, 0.0) for name in hosts}))
     paths = lines(paths_table([NetworkPath(name, HOST, 7447, {"error": "no route " * 9}) for name in hosts]))

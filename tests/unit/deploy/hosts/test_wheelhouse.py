@@ -1,4 +1,4 @@
-"""The wheelhouse: what it is keyed by, what pip is asked for, and that nothing is fetched or built twice."""
+"""The wheelhouse: its key, the requests to pip, and that nothing is fetched or built twice."""
 
 import asyncio
 import errno
@@ -49,7 +49,7 @@ ELSEWHERE = WheelTarget((3, 12), "cp312", ("manylinux_2_31_aarch64", "linux_aarc
 
 
 def write_project(folder: Path, name: str, needs: str = "") -> Path:
-    """Write a project that builds itself without an index."""
+    """Write a project that builds without an index."""
     (folder / "source").mkdir(parents=True)
     texts = {"pyproject.toml": PYPROJECT, "backend.py": BACKEND.format(name=name, needs=needs), "README.md": ""}
     for file, text in {**texts, "PKG-INFO": f"Name: {name}\n", "source/flight.py": "height_m = 4\n"}.items():
@@ -58,7 +58,7 @@ def write_project(folder: Path, name: str, needs: str = "") -> Path:
 
 
 def write_wheel(index: Path, name: str) -> None:
-    """Put a wheel of this name into an index."""
+    """Put a wheel of the given name into an index."""
     backend: dict[str, Any] = {}
     exec(BACKEND.format(name=name, needs=""), backend)
     backend["build_wheel"](index)
@@ -66,7 +66,7 @@ def write_wheel(index: Path, name: str) -> None:
 
 @pytest.fixture
 def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that is all that pip knows; in it a wheel of pip 1.0, and gadget 1.0 as sources only."""
+    """Return the only folder that pip searches, with a wheel of pip 1.0 and gadget 1.0 as sources only."""
     folder = tmp_path / "index"
     gadget = write_project(folder / "gadget-1.0", "gadget")
     with tarfile.open(folder / "gadget-1.0.tar.gz", "w:gz") as archive:
@@ -82,15 +82,15 @@ def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout of a project that needs gadget with its extra agents; there is a wheel of gadget."""
+    """Return a checkout of a project whose extra `agents` needs gadget; the index has a wheel of gadget."""
     write_wheel(index, "gadget")
     folder = write_project(tmp_path / "checkout", "zsim", NEEDS)
     monkeypatch.setattr(wheelhouse, "checkout", lambda: folder)
     return folder
 
 
-def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
-    """A project without wheels is built here, for others, too."""
+def test_other_versions_than_the_local_ones_are_taken_only_if_necessary(index: Path, tmp_path: Path) -> None:
+    """A project without wheels is built on this machine, even for another target."""
 
     def download(*held: str) -> bool:
         into = tmp_path / " ".join(held)
@@ -106,18 +106,18 @@ def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: 
 
 
 def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
-    """Return a house of the wheelhouse in a folder, and the lines printed on the way."""
+    """Return a wheel set of the wheelhouse in a folder, and the lines printed meanwhile."""
     lines: list[str] = []
     return asyncio.run(Wheelhouse(folder, lines.append).wheel_set(host, ELSEWHERE, extras)), lines
 
 
-def test_a_house_holds_what_a_host_needs_and_is_gathered_once(
+def test_a_wheel_set_has_what_a_host_needs_and_is_gathered_once(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unless a wheel of it was lost. A changed file builds the project and nothing else.
+    """A lost wheel causes another gathering, and a changed file the build of the project alone.
 
-    Wheels that are kept need no index, also where something else has been installed here since, by which the house
-    would be another.
+    Wheels that are kept need no index, even if other packages have since been installed on this machine, which
+    changes the key of the set.
     """
     first, lines = house(tmp_path / "cache", ["agents"])
     wheels = (first.project, first.pip, *first.others)
@@ -143,12 +143,12 @@ def test_a_house_holds_what_a_host_needs_and_is_gathered_once(
     assert (again, lines) == (third, [gathering])
 
 
-def test_a_missing_wheel_is_a_line_with_host_package_and_system(no_gadget: None, tmp_path: Path) -> None:
+def test_a_missing_wheel_is_reported_with_host_package_and_system(no_gadget: None, tmp_path: Path) -> None:
     with refused(HostsError, "onboard1", "gadget", str(ELSEWHERE), "PIP_FIND_LINKS"):
         house(tmp_path / "cache", ["agents"], "onboard1")
 
 
-def test_a_project_that_cannot_be_built_is_a_line(checkout: Path, tmp_path: Path) -> None:
+def test_a_project_that_cannot_be_built_is_reported_in_one_line(checkout: Path, tmp_path: Path) -> None:
     (checkout / "backend.py").write_text("raise ImportError('no backend')\n")
     with refused(HostsError, "launcher", "zsim", str(checkout)) as raised:
         house(tmp_path / "cache", [])
@@ -157,7 +157,7 @@ def test_a_project_that_cannot_be_built_is_a_line(checkout: Path, tmp_path: Path
 
 @pytest.fixture
 def no_gadget(index: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let there be no gadget, of whatever version."""
+    """Remove every version of gadget."""
     monkeypatch.setattr(wheelhouse, "constraints", list)
     (index / "gadget-1.0.tar.gz").unlink()
     (index / "gadget-1.0-py3-none-any.whl").unlink()
@@ -165,14 +165,14 @@ def no_gadget(index: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.fixture
 def no_index(index: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An index at which nobody listens, beside the folder."""
+    """Add an index that refuses connections to the folder."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     monkeypatch.delenv("PIP_NO_INDEX")
     monkeypatch.setenv("PIP_INDEX_URL", f"http://127.0.0.1:{port}/simple")
 
 
-def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
+def test_an_unreachable_index_is_not_reported_as_a_missing_wheel(
     no_gadget: None, no_index: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[tuple[str, ...]] = []
@@ -194,14 +194,14 @@ def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
 
 
 def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave pip an index at which nobody listens, and no folder."""
+    """Give pip an index that refuses connections and no folder."""
     monkeypatch.delenv("PIP_NO_INDEX", raising=False)
     monkeypatch.delenv("PIP_FIND_LINKS")
-    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")  # tcpmux; nobody has it
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")  # tcpmux, which no machine runs
 
 
 @pytest.mark.soak
-def test_what_builds_the_project_is_kept(
+def test_the_build_requirements_of_the_project_are_kept(
     checkout: Path, index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (checkout / "pyproject.toml").write_text(PYPROJECT.replace("requires = []", 'requires = ["gadget"]'))
@@ -213,7 +213,7 @@ def test_what_builds_the_project_is_kept(
     assert has_terms(line, "building", "zsim")
 
 
-def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_path: Path) -> None:
+def test_wheels_in_a_folder_need_no_index(checkout: Path, no_index: None, tmp_path: Path) -> None:
     assert house(tmp_path / "cache", ["agents"])[0].others
 
 
@@ -225,7 +225,7 @@ def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_
         ("'Cannot connect to proxy.', OSError('Tunnel connection failed: 403 Forbidden')", ('403',)),
     ],
 )  # fmt: skip
-def test_why_an_index_does_not_answer_is_said_without_what_surrounds_it(shown: str, terms: tuple[str, ...]) -> None:
+def test_the_reason_of_an_unreachable_index_is_extracted(shown: str, terms: tuple[str, ...]) -> None:
     assert has_terms(wheelhouse._reason(shown), *terms)
 
 
@@ -240,7 +240,7 @@ def test_why_an_index_does_not_answer_is_said_without_what_surrounds_it(shown: s
         ),
     ],
 )
-def test_an_installed_distribution_is_had_from_where_it_came(origin: str, wanted: str) -> None:
+def test_an_installed_distribution_is_required_from_its_origin(origin: str, wanted: str) -> None:
     installed: Any = SimpleNamespace(version="0.1.0", read_text={"direct_url.json": origin}.get)
     assert requirement(installed) == wanted
 
@@ -254,7 +254,7 @@ SAID = {
 }
 
 
-def test_linux_takes_the_wheels_of_its_glibc_and_of_older_ones_and_a_mac_its_own() -> None:
+def test_linux_takes_wheels_up_to_its_glibc_and_macos_its_own() -> None:
     aim = wheel_target("h", SAID)
     assert (aim.version, aim.abi) == ((3, 12), "cp312")
     assert aim.platforms[0] == "manylinux_2_31_aarch64"
@@ -273,6 +273,6 @@ def test_linux_takes_the_wheels_of_its_glibc_and_of_older_ones_and_a_mac_its_own
         ({"platform": "win-amd64"}, ("h", "win-amd64", "glibc 2.31", "glibc", "macOS")),
     ],
 )  # fmt: skip
-def test_what_wheels_are_not_made_for_is_a_line(other: dict[str, object], terms: tuple[str, ...]) -> None:
+def test_a_system_without_wheels_is_refused(other: dict[str, object], terms: tuple[str, ...]) -> None:
     with refused(HostsError, *terms):
         wheel_target("h", {**SAID, **other})

@@ -1,4 +1,4 @@
-"""Roles that are forked look to a launcher as any program that it starts; the console of a run outlives it."""
+"""Forked roles behave towards the launcher like programs that it starts; the console of a run outlives the run."""
 
 import os
 import signal
@@ -30,18 +30,26 @@ from zsim_deploy.launch.role_launcher import (
 from zsim_deploy.launch.supervisor import Outcome
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
-WAITING = ["record", "--connect", "tcp/127.0.0.1:1", "--launched", "0", "--wait", "100"]  # for a world that never comes
+WAITING = [
+    "record",
+    "--connect",
+    "tcp/127.0.0.1:1",
+    "--launched",
+    "0",
+    "--wait",
+    "100",
+]  # for a world that never starts
 VERSION = f"zsim {__version__}\n"
 LIGHT = (
     *(sys.executable, "-P", "-c"),
     "from zsim_deploy.cli import forkserver as it; it._prepare = lambda: None; it.main()",
-)  # a fork server that imports nothing beforehand: each role does
+)  # a fork server that imports nothing in advance, which leaves it to each role
 END_S = 120.0
 LOOK_S = 0.02
 
 
 def quiet(_: str) -> None:
-    """Say nothing."""
+    """Discard a line."""
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +90,7 @@ def end(*roles: RoleProcess) -> None:
         (["estimator"], False, None, 2, "missing argument"),
     ],
 )
-def test_what_a_role_prints_and_its_exit_code_come_back(
+def test_the_output_and_the_exit_code_of_a_role_are_returned(
     role_launcher: RoleLauncher,
     log: Path,
     arguments: list[str],
@@ -99,7 +107,7 @@ def test_what_a_role_prints_and_its_exit_code_come_back(
     end(role)
 
 
-def test_a_role_that_is_killed_says_so_by_its_code(role_launcher: RoleLauncher, log: Path) -> None:
+def test_a_killed_role_has_the_exit_code_of_its_signal(role_launcher: RoleLauncher, log: Path) -> None:
     role = start(role_launcher, log, *WAITING)
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
@@ -110,10 +118,12 @@ def test_a_role_that_is_killed_says_so_by_its_code(role_launcher: RoleLauncher, 
     end(role)
 
 
-def test_it_is_a_child_under_its_own_name_and_heeds_what_it_is_told(role_launcher: RoleLauncher, log: Path) -> None:
+def test_a_role_is_a_child_with_its_own_command_line_and_stops_on_request(
+    role_launcher: RoleLauncher, log: Path
+) -> None:
     role = start(role_launcher, log, *WAITING)
     until_s = time.monotonic() + END_S
-    while not log.read_text() and time.monotonic() < until_s:  # until it has begun to do what it is for
+    while not log.read_text() and time.monotonic() < until_s:  # until it has begun its work
         time.sleep(LOOK_S)
     seen = psutil.Process(role.pid)
     assert seen.ppid() == psutil.Process().pid
@@ -132,12 +142,12 @@ def test_no_role_holds_the_pipes_of_another(role_launcher: RoleLauncher, log: Pa
     assert first.stdout is not None
     first.stdin.close()
     first.wait(END_S)
-    assert first.stdout.read() == ""  # it ends, so nobody can write to it any more
+    assert first.stdout.read() == ""  # end of file, so no other role holds the writing end
     assert second.poll() is None
     end(first, second)
 
 
-def test_where_the_fork_server_fails_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_fork_server_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
     monkeypatch.setattr(progress, "SLOW_S", 0.0)
     monkeypatch.setattr(module, "FORKSERVER", (sys.executable, "-c", "pass"))
@@ -153,9 +163,7 @@ def test_where_the_fork_server_fails_a_role_is_started_as_a_program(log: Path, m
 @LINUX
 @pytest.mark.usefixtures("light")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_fork_server_that_dies_or_stands_is_done_without(
-    number: int, log: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dead_or_stopped_fork_server_is_bypassed(number: int, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ANSWER_S", 0.2)
     with RoleLauncher(quiet) as role_launcher:
         assert role_launcher._forkserver is not None
@@ -169,8 +177,8 @@ def test_a_fork_server_that_dies_or_stands_is_done_without(
 
 @LINUX
 @pytest.mark.usefixtures("light")
-def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One launcher within another leaves it its children."""
+def test_a_fork_that_the_launcher_has_lost_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A launcher within another leaves the outer one its children."""
     with RoleLauncher(quiet) as outer:
         with RoleLauncher(quiet) as inner:
             monkeypatch.setattr(inner, "_receive", lambda: b"")
@@ -179,7 +187,7 @@ def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monk
             end(role)
         assert inner._forkserver is not None
         assert inner._forkserver.poll() is not None
-        assert log.read_text() == VERSION  # once: the one that was forked has printed nothing
+        assert log.read_text() == VERSION  # once: the lost fork has printed nothing
         role = start(outer, log, "estimator")
         assert isinstance(role, ForkedProcess)
         assert role.wait(END_S) == 2
@@ -188,7 +196,7 @@ def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monk
 
 @LINUX
 @pytest.mark.usefixtures("light")
-def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_command_too_long_for_a_packet_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with RoleLauncher(quiet) as role_launcher:
         monkeypatch.setattr(module, "PACKET_MAX", 5)
         role = start(role_launcher, log, "--version")
@@ -211,7 +219,7 @@ def test_the_fork_server_ends_with_its_launcher() -> None:
 
 
 @LINUX
-def test_ctrl_c_while_it_loads_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_loading_leaves_no_fork_server(monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupt(_: RoleLauncher) -> bytes:
         raise KeyboardInterrupt
 
@@ -223,7 +231,7 @@ def test_ctrl_c_while_it_loads_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -
     assert role_launcher._forkserver.poll() is not None
 
 
-def test_an_exit_code_that_somebody_else_took_is_no_error() -> None:
+def test_an_exit_code_collected_elsewhere_is_no_error() -> None:
     with subprocess.Popen([sys.executable, "-c", "pass"], stdin=subprocess.PIPE, text=True) as child:
         child.wait()
         assert child.stdin is not None
@@ -241,10 +249,8 @@ STARTS = {
 
 
 @pytest.mark.parametrize("command", STARTS.values(), ids=STARTS)
-def test_nothing_that_is_started_imports_from_the_working_folder_first(
-    command: tuple[str, ...], tmp_path: Path
-) -> None:
-    """`python -m` alone imports a file there that is named as a module of the standard library."""
+def test_no_started_program_imports_from_the_working_folder_first(command: tuple[str, ...], tmp_path: Path) -> None:
+    """`python -m` alone would import a file there that has the name of a standard module."""
     for name in ("argparse", "typing_extensions", "typer", "json", "socket"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()\n")
     subprocess.run([*command, "--version"], cwd=tmp_path, stdin=subprocess.DEVNULL, capture_output=True, timeout=END_S)
@@ -255,7 +261,7 @@ REASON = "over"
 
 
 class LateConsole:
-    """A console that ends so long after it is asked to stop; meanwhile a signal may come."""
+    """A console that ends some time after a request to stop; a signal may arrive meanwhile."""
 
     name = "console.run"
 
@@ -283,7 +289,7 @@ class LateConsole:
 
 
 def end_with(console: LateConsole, interrupted: bool = False, error: BaseException | None = None) -> None:
-    """End a run with a console, or break its report off."""
+    """End a run that has a console, or interrupt its report."""
     process: Any = console
     with RunConsole() as run_console:
         run_console.own(process)
@@ -302,7 +308,7 @@ def end_with(console: LateConsole, interrupted: bool = False, error: BaseExcepti
         (1000.0, True, INTERRUPTED_S, False),
     ],
 )
-def test_a_console_is_asked_to_stop_when_the_report_is_there_and_waited_for_so_long(
+def test_a_console_is_stopped_after_the_report_with_limited_patience(
     capfd: pytest.CaptureFixture[str], ends_after_s: float, interrupted: bool, waited_s: float, named: bool
 ) -> None:
     console = LateConsole(ends_after_s)
@@ -313,7 +319,7 @@ def test_a_console_is_asked_to_stop_when_the_report_is_there_and_waited_for_so_l
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(130)])
-def test_who_interrupts_the_report_waits_no_longer_than_in_flight(error: BaseException) -> None:
+def test_interrupting_the_report_shortens_the_wait_for_the_console(error: BaseException) -> None:
     console = LateConsole(1000.0)
     with pytest.raises(type(error)):
         end_with(console, error=error)
@@ -321,7 +327,7 @@ def test_who_interrupts_the_report_waits_no_longer_than_in_flight(error: BaseExc
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_wait_and_the_run_has_ended_as_it_did(number: int) -> None:
+def test_a_signal_ends_the_wait_and_keeps_the_outcome_of_the_run(number: int) -> None:
     console = LateConsole(1000.0, number)
     end_with(console)
     assert (console.waited_s, console.closed) == (0.0, True)
@@ -330,7 +336,7 @@ def test_a_signal_ends_the_wait_and_the_run_has_ended_as_it_did(number: int) -> 
         end_with(failed, error=ValueError("the run failed"))
 
 
-def test_a_run_that_is_broken_off_before_it_has_an_outcome_leaves_nothing() -> None:
+def test_an_interrupt_before_the_outcome_closes_the_console() -> None:
     console = LateConsole(1000.0)
     process: Any = console
 
@@ -344,7 +350,7 @@ def test_a_run_that_is_broken_off_before_it_has_an_outcome_leaves_nothing() -> N
     assert (console.waited_s, console.closed) == (INTERRUPTED_S, True)
 
 
-def test_the_console_of_a_run_whose_port_was_taken_makes_way() -> None:
+def test_a_second_console_replaces_the_first() -> None:
     first, second = LateConsole(0.5), LateConsole(0.5)
     processes: Any = [first, second]
     with RunConsole() as run_console:

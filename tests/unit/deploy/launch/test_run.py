@@ -1,4 +1,4 @@
-"""`zsim run` before and around its processes: their command lines, the port, the folder."""
+"""`zsim run` around its processes: their command lines, the port, and runs in one process."""
 
 import io
 from itertools import pairwise
@@ -27,7 +27,7 @@ TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Add
 
 
 class Say:
-    """A screen that keeps what is said."""
+    """A screen that records its lines."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -39,7 +39,7 @@ class Say:
 
 
 class FakeSupervisor:
-    """A supervisor whose runs end as given; keeps on which port each world was to listen."""
+    """A supervisor whose runs end with the given outcomes; it records the ports on which worlds were to listen."""
 
     outcomes: ClassVar[list[str]] = []
     ports: ClassVar[list[int]] = []
@@ -85,12 +85,12 @@ def options(out: Path, *overrides: str, cameras: bool = False, detect: bool = Fa
     ("outcomes", "listen", "fails", "tries"),
     [
         ([TAKEN, TAKEN, "ended"], None, False, 3),
-        ([TAKEN], "tcp/127.0.0.1:20001", True, 1),  # a port that is asked for is tried once
+        ([TAKEN], "tcp/127.0.0.1:20001", True, 1),  # a requested port is tried once
         (["the world died: killed by signal 9"], None, True, 1),
         ([TAKEN] * 100, None, True, run.PORTS_TRIED),
     ],
 )
-def test_a_port_taken_in_between_is_another_port(
+def test_a_port_taken_meanwhile_is_replaced_by_another(
     watched: type[FakeSupervisor], tmp_path: Path, outcomes: list[str], listen: str | None, fails: bool, tries: int
 ):
     watched.outcomes = list(outcomes)
@@ -105,7 +105,7 @@ def lines_of(made: RunOptions) -> dict[str, list[str]]:
     return {child.name: child._arguments for child in children if isinstance(child, ChildProcess)}
 
 
-def test_the_world_is_told_what_was_changed_of_the_file_and_no_name_is_taken_for_an_option(tmp_path: Path):
+def test_the_world_gets_changed_fields_and_names_are_not_read_as_options(tmp_path: Path):
     changed = changed_fields(["wind.gust_m_s=1"], 12345678, 20.0)
     assert changed == ["wind.gust_m_s=1", "seed=12345678", "duration_s=20.0"]
     overrides = ("drones.drone1.name=-._", "clusters.main.drones=[-._, drone2, drone3]")
@@ -121,7 +121,7 @@ BOTH = {"camera.main": [], "detector.main": []}
 EACH = {f"detector.drone{i}": [f"drone{i}"] for i in (1, 2, 3)}
 THE_OTHERS = {"camera.drone2": ["drone2"], "camera.main": ["drone1", "drone3"]}
 
-# name: (overrides, --cameras, --detect; process: drones, none for all with cameras)
+# name: (overrides, --cameras, --detect, {process: drones, of which none stands for all with cameras})
 CAMERAS: dict[str, tuple[list[str], bool, bool, dict[str, list[str]]]] = {
     "none": ([EYES], False, False, {}),
     "gating": ([EYES, "processes.gating=[camera]"], False, False, {"camera.main": []}),
@@ -136,7 +136,7 @@ CAMERAS: dict[str, tuple[list[str], bool, bool, dict[str, list[str]]]] = {
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_which_cameras_are_started(tmp_path: Path, name: str):
+def test_the_requested_cameras_and_detectors_are_started(tmp_path: Path, name: str):
     overrides, cameras, detect, started = CAMERAS[name]
     made = options(tmp_path, *overrides, cameras=cameras, detect=detect)
     lines = {name: line for name, line in lines_of(made).items() if name.startswith(("camera.", "detector."))}
@@ -145,7 +145,7 @@ def test_which_cameras_are_started(tmp_path: Path, name: str):
 
 
 @pytest.mark.parametrize(("cameras", "rate", "says"), [(True, 0.0, True), (True, 1.0, False), (False, 0.0, False)])
-def test_a_run_that_leaves_its_cameras_no_time_says_so(
+def test_a_run_too_fast_for_its_cameras_gives_a_hint(
     watched: type[FakeSupervisor], tmp_path: Path, cameras: bool, rate: float, says: bool
 ):
     watched.outcomes = ["ended"]
@@ -164,7 +164,7 @@ def test_an_endpoint_is_checked_before_anything_starts(endpoint: str):
         run.check_endpoint(endpoint, insecure=False)
 
 
-def test_a_run_in_one_process_says_where_it_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_run_in_one_process_reports_where_it_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr("zsim_api.flight.fly", lambda *_: "over")
     screen, made = Say(), options(tmp_path, in_process=True)
     run.run_in_process(made, screen)  # type: ignore[arg-type]
@@ -189,7 +189,7 @@ class NoStopChannel:
     def restore_signals(self) -> None: ...
 
 
-def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_diverged_run_in_one_process_fails_and_keeps_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     diverge(monkeypatch)
     monkeypatch.setattr(run, "StopChannel", NoStopChannel)
     options = run.RunOptions(scenario_file.from_text(ONE), tmp_path, new_launch(in_process=True))

@@ -1,4 +1,4 @@
-"""The watch over a run's processes, with ones that only say how they end; signals, and a terminal that is closed."""
+"""The supervision of a run's processes, with fakes that end as scripted; signals, and a closed terminal."""
 
 import json
 import os
@@ -30,7 +30,7 @@ from zsim_deploy.launch.supervisor import (
 
 
 class Show:
-    """Keeps the lines shown."""
+    """Records the lines shown."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -44,7 +44,7 @@ class Show:
 
 
 class Member:
-    """A process that ends with the codes given, one per start; None lives until it is told to stop."""
+    """A process that ends with the given exit codes, one per start; with None, it runs until it is stopped."""
 
     is_program = False
 
@@ -86,7 +86,7 @@ class Member:
 
 
 class Team:
-    """A world that lives for so many looks, a recorder, and others; the looks let the others live on too."""
+    """A world, which runs for a number of looks, a recorder, and other processes, which each look advances too."""
 
     def __init__(self, *others: Member, looks: int = 20, world: Sequence[int] = (0,), **deaths: Any) -> None:
         self.show = Show()
@@ -106,19 +106,19 @@ class Team:
         return self.watch.run(live)
 
     def tell(self, kind: str, subject: str = "", text: str = "", **data: Any) -> None:
-        """Let the world say an event."""
+        """Let the world print an event."""
         event = {"kind": kind, "subject": subject, "text": text, "data": data}
         self.watch.handle_line(json.dumps({"event": event}))
 
 
-def test_a_run_that_ends_well():
+def test_a_run_that_ends_normally_has_not_failed():
     team = Team(Member("estimator.d1"))
     outcome = team.go()
     assert (outcome.failed, outcome.interrupted) == (False, False)
     assert all(member.closed for member in team.members)
 
 
-def test_a_process_that_goes_on_after_the_run_is_left_to_the_caller():
+def test_a_process_that_outlives_the_run_is_left_to_the_caller():
     console = Member("console.run")
     team = Team(console, Member("estimator.d1"))
     team.watch.lasting = team.others[0]
@@ -128,7 +128,7 @@ def test_a_process_that_goes_on_after_the_run_is_left_to_the_caller():
 
 
 @pytest.mark.parametrize("name", ["recorder", "world"])
-def test_who_fails_after_the_end_is_why_the_run_failed(name: str):
+def test_a_failure_after_the_end_is_the_reason_why_the_run_failed(name: str):
     team = Team(world=(143 if name == "world" else 0,))
     if name == "recorder":
         team.recorder = team.watch.members[1] = Member("recorder", 143, lives_for=21)
@@ -154,20 +154,22 @@ DEATHS: list[tuple[str, list[int], dict[str, Any], bool, int]] = [
     # too many in a row
     ("estimator.d1", [1] * 20, {}, True, RESTARTS_MAX),
     ("estimator.d1", [1] * 20, {"return_s": 1, "on_overdue": {"estimator": "drop"}}, False, RESTARTS_MAX),
-    ("camera.main", [1] * 20, {}, False, RESTARTS_MAX),  # no gate waits for it
+    ("camera.main", [1] * 20, {}, False, RESTARTS_MAX),  # no gate waits for a camera
     ("camera.drone1", [1] * 20, {}, False, RESTARTS_MAX),
     ("detector.main", [1] * 20, {}, False, RESTARTS_MAX),
     ("camera.main", [1] * 20, {"return_s": 1, "on_overdue": {"camera": "end"}}, True, RESTARTS_MAX),
     ("camera.d1", [1] * 20, {"expect": ["camera.d1"]}, True, RESTARTS_MAX),  # the run cannot begin without it
     ("world", [-signal.SIGKILL, -signal.SIGKILL, 0], {}, False, 2),
     ("world", [-signal.SIGKILL] * 20, {}, True, RESTARTS_MAX),
-    ("world", [USER_FAULT, 0], {}, True, 0),  # it cannot begin
+    ("world", [USER_FAULT, 0], {}, True, 0),  # the world cannot start
     ("world", [1, 0], {}, True, 0),
 ]
 
 
 @pytest.mark.parametrize(("name", "codes", "processes", "fails", "restarts"), DEATHS)
-def test_what_a_death_means(name: str, codes: list[int], processes: dict[str, Any], fails: bool, restarts: int):
+def test_a_death_restarts_drops_or_ends_as_configured(
+    name: str, codes: list[int], processes: dict[str, Any], fails: bool, restarts: int
+):
     if name == "world":
         team = Team(Member("estimator.d1"), world=codes, looks=1)
     else:
@@ -182,7 +184,7 @@ def test_what_a_death_means(name: str, codes: list[int], processes: dict[str, An
         assert "on_death: restart" in team.show.lines[0]
 
 
-def test_a_run_that_has_begun_goes_on_without_a_camera_that_it_expected():
+def test_a_started_run_continues_without_an_expected_camera():
     team = Team(Member("camera.d1", *[1] * 20), looks=100, expect=["camera.d1"])
     team.watch.handle_line('{"clock": {"state": "running"}}')
     assert not team.go().failed
@@ -195,7 +197,12 @@ def test_a_run_that_has_begun_goes_on_without_a_camera_that_it_expected():
         ("controller.main", {"on_death": {"controller": "restart"}}, True, "end"),
         ("controller.main", {"on_death": {"controller": "drop"}}, True, "drop"),
         ("controller.main", {"on_death": {"controller.main": "wait"}}, True, "wait"),
-        ("controller.main", {"on_death": {"controller": "drop"}}, False, "end"),  # a world that has not begun waits
+        (
+            "controller.main",
+            {"on_death": {"controller": "drop"}},
+            False,
+            "end",
+        ),  # the world waits for it before the run begins
         ("controller.main", {"on_death": {"controller.main": "wait"}}, False, "end"),
         ("camera.main", {}, True, "drop"),
         ("camera.main", {"expect": ["camera.main"]}, True, "drop"),  # the run has begun
@@ -203,15 +210,17 @@ def test_a_run_that_has_begun_goes_on_without_a_camera_that_it_expected():
         ("camera.drone1", {"gating": ["camera"]}, True, "end"),
     ],
 )
-def test_what_follows_where_no_restart_helps(name: str, processes: dict[str, Any], flies: bool, action: str):
-    """As the world decides of one whose class has raised: what it goes on without, its launcher does not end."""
+def test_without_a_useful_restart_the_policy_drops_waits_or_ends(
+    name: str, processes: dict[str, Any], flies: bool, action: str
+):
+    """The launcher decides as the world does when a process raises: it does not end a run that the world continues."""
     assert DeathPolicy(Processes(**processes)).decide(name, USER_FAULT, flies).action == action
     policy = DeathPolicy(Processes(gating=["camera"]))
     decisions = [policy.decide("camera.main", 1, flies=True).action for _ in range(RESTARTS_MAX + 1)]
     assert decisions == ["restart"] * RESTARTS_MAX + ["end"]
 
 
-def test_who_has_left_its_place_takes_it_back_when_its_successor_is_dead():
+def test_a_superseded_process_is_restarted_when_its_successor_dies():
     team = Team(Member("estimator.d1", SUPERSEDED, None))
 
     def look() -> None:
@@ -223,8 +232,8 @@ def test_who_has_left_its_place_takes_it_back_when_its_successor_is_dead():
 
 
 @pytest.mark.parametrize("codes", [(0, None), (0,) * (RESTARTS_MAX + 2)])
-def test_who_ends_with_0_without_a_bye_has_died(codes: tuple[int | None, ...]):
-    """As by `os._exit(0)`; again and again, it ends the run."""
+def test_exit_code_0_without_a_goodbye_counts_as_a_death(codes: tuple[int | None, ...]):
+    """For example by `os._exit(0)`; too many of them end the run."""
     team = Team(Member("estimator.d1", *codes), looks=60)
 
     def look() -> None:
@@ -237,21 +246,21 @@ def test_who_ends_with_0_without_a_bye_has_died(codes: tuple[int | None, ...]):
     assert not outcome.failed or has_terms(outcome.reason, "estimator.d1", "exit code 0")
 
 
-def test_nobody_is_started_twice_for_one_death():
+def test_a_process_is_not_started_twice_for_one_death():
     team = Team(Member("estimator.d1", None))
     team.go(lambda: team.tell("death", "estimator.d1", on_death="restart"))
     assert team.others[0].restarts == 0
 
 
 @pytest.mark.parametrize(("action", "fails"), [("drop", False), ("end", True)])
-def test_who_does_not_come_back_in_its_time(action: str, fails: bool):
+def test_an_overdue_process_is_dropped_or_ends_the_run(action: str, fails: bool):
     team = Team(Member("estimator.d1"))
     outcome = team.go(lambda: team.tell("overdue", "estimator.d1", "late", on_overdue=action))
     assert outcome.failed == fails
     assert team.others[0].killed is not fails
 
 
-def test_deaths_far_apart_do_not_add_up(monkeypatch):
+def test_deaths_far_apart_do_not_count_together(monkeypatch):
     now = iter(range(0, 100_000, 100))
     monkeypatch.setattr("zsim_deploy.launch.supervisor.time.monotonic", lambda: float(next(now)))
     team = Team(Member("estimator.d1", *[1] * 8, None), looks=12)
@@ -267,14 +276,14 @@ def test_a_dead_world_fails_the_run_and_stops_the_rest():
     assert team.others[0].stopped_for == outcome.reason
 
 
-def test_an_interrupt_ends_everybody():
+def test_an_interrupt_stops_every_process():
     team = Team(Member("estimator.d1"), looks=1000)
     outcome = team.go(lambda: team.watch.interrupt("down"))
     assert outcome.interrupted
     assert {member.stopped_for for member in team.members} == {"down"}
 
 
-def test_a_process_takes_the_place_of_another():
+def test_a_process_replaces_another():
     old, new = Member("estimator.d1", SUPERSEDED, lives_for=1000), Member("estimator.d1")
     team = Team(old)
     team.watch.submit(lambda: team.watch.replace(new))
@@ -285,7 +294,7 @@ def test_a_process_takes_the_place_of_another():
     assert new in team.watch.members
 
 
-def test_the_second_of_two_restarts_at_once_is_refused_and_the_run_goes_on():
+def test_the_second_of_two_simultaneous_replacements_is_refused():
     first, second = Member("estimator.d1"), Member("estimator.d1")
     team = Team(Member("estimator.d1", SUPERSEDED, lives_for=1000))
     orders = [team.watch.submit(lambda new=new: team.watch.replace(new)) for new in (first, second)]
@@ -296,7 +305,7 @@ def test_the_second_of_two_restarts_at_once_is_refused_and_the_run_goes_on():
     assert (first.pid, second.pid) == (1, 0)
 
 
-def test_one_restart_after_another_takes_the_place_of_the_first():
+def test_a_later_replacement_replaces_the_earlier_one():
     first, second = Member("estimator.d1", SUPERSEDED, lives_for=2), Member("estimator.d1")
     old = Member("estimator.d1", SUPERSEDED, lives_for=1)
     team = Team(old, looks=40)
@@ -315,14 +324,14 @@ def test_one_restart_after_another_takes_the_place_of_the_first():
     assert second.restarts == 2
 
 
-def test_an_order_that_fails_is_told_to_who_gave_it_and_the_run_goes_on():
+def test_a_failed_order_is_reported_to_its_caller_and_the_run_continues():
     team = Team(Member("estimator.d1"))
     outcome = team.watch.submit(lambda: [].index(1))
     assert not team.go().failed
     assert isinstance(outcome.exception(), ValueError)
 
 
-def test_an_order_that_comes_too_late_is_not_carried_out():
+def test_an_order_that_comes_too_late_is_cancelled():
     team = Team(Member("estimator.d1"))
     done = []
     late = []
@@ -335,7 +344,7 @@ def test_an_order_that_comes_too_late_is_not_carried_out():
     assert not done
 
 
-def test_a_process_that_does_not_make_way_is_killed(monkeypatch):
+def test_a_process_that_does_not_yield_to_its_successor_is_killed(monkeypatch):
     monkeypatch.setattr("zsim_deploy.launch.supervisor.TAKE_OVER_S", -1.0)
     old, new = Member("estimator.d1", lives_for=1000), Member("estimator.d1")
     team = Team(old)
@@ -345,7 +354,7 @@ def test_a_process_that_does_not_make_way_is_killed(monkeypatch):
     assert has_terms(team.show.lines[0], "estimator.d1", "pid 1")
 
 
-def test_a_process_that_waits_for_its_host_is_given_up_when_another_takes_its_place():
+def test_a_process_waiting_for_its_host_is_killed_when_replaced():
     old, new = Member("estimator.d1"), Member("estimator.d1")
     old.start = lambda: None  # type: ignore[method-assign]
     old.wait = lambda timeout_s: False  # type: ignore[method-assign]
@@ -355,8 +364,8 @@ def test_a_process_that_waits_for_its_host_is_given_up_when_another_takes_its_pl
     assert old.code == -signal.SIGKILL
 
 
-def test_all_are_closed_at_once():
-    """Each close waits for the other's."""
+def test_all_processes_are_closed_concurrently():
+    """Each close waits for all the others."""
     together = threading.Barrier(4, timeout=120.0)
 
     class Slow(Member):
@@ -369,7 +378,7 @@ def test_all_are_closed_at_once():
     assert all(member.closed for member in team.members)
 
 
-def test_a_run_that_is_ended_before_it_starts_starts_nobody():
+def test_a_run_interrupted_before_its_start_starts_no_process():
     team = Team(Member("estimator.d1"))
     team.watch.interrupt("down")
     outcome = team.go()
@@ -378,14 +387,14 @@ def test_a_run_that_is_ended_before_it_starts_starts_nobody():
 
 
 @pytest.mark.parametrize("text", ["1234\n", "[1]\n", "null\n", "Welcome\n"])
-def test_what_is_no_progress_is_passed_over(text):
+def test_lines_that_are_no_progress_are_ignored(text):
     team = Team()
     team.watch.handle_line(text)
     assert team.show.lines == []
 
 
 @pytest.mark.parametrize("begins", [False, True])
-def test_a_world_that_does_not_begin_is_named_to_those_who_wait(monkeypatch: pytest.MonkeyPatch, begins: bool):
+def test_a_world_that_does_not_start_is_reported_once(monkeypatch: pytest.MonkeyPatch, begins: bool):
     wall_s = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: wall_s[0])
     team = Team(looks=5)
@@ -400,9 +409,9 @@ def test_a_world_that_does_not_begin_is_named_to_those_who_wait(monkeypatch: pyt
     assert len(named) == (0 if begins else 1)
 
 
-def test_a_stopped_world_is_named_once_within_two_seconds_and_once_when_it_is_back():
+def test_a_stopped_world_is_reported_once_and_again_when_it_returns():
     watch = WorldWatch()
-    assert watch.change(100.0, 7) is None  # it may still compile
+    assert watch.change(100.0, 7) is None  # it may still be compiling
     watch.last_s = 100.0
     assert watch.change(100.0 + 0.9 * QUIET_WORLD_S, 7) is None
     assert has_terms(watch.change(102.0, 7) or "", "world", "2.0 s", "stopped")
@@ -412,7 +421,7 @@ def test_a_stopped_world_is_named_once_within_two_seconds_and_once_when_it_is_ba
     assert watch.change(110.2, 7) is None
 
 
-def test_a_world_that_ends_is_not_taken_for_the_one_that_it_waits_for():
+def test_an_ending_world_is_not_reported_as_waiting_for_a_process():
     watch = WorldWatch()
     watch.last_s = 100.0
     watch.clock({"state": "running", "waiting_for": [{"name": "estimator.d1"}]})
@@ -437,25 +446,25 @@ with EndSignals(Path(sys.argv[1]), lambda: told.append(1)):
 """
 
 
-def test_who_loses_the_terminal_goes_on_and_what_it_says_is_in_a_file(tmp_path: Path) -> None:
+def test_after_the_terminal_is_lost_output_goes_to_a_file(tmp_path: Path) -> None:
     master, slave = os.openpty()
     command = [sys.executable, "-c", TALKS, str(tmp_path / "up.log")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=slave, stderr=slave, start_new_session=True) as talker:
         os.close(slave)
         output = b""
-        while not output.endswith(b"\n"):  # it may come in parts
+        while not output.endswith(b"\n"):  # output may arrive in parts
             output += os.read(master, 100)
         assert output.strip() == b"ready"
         os.close(master)
-        for _ in range(2):  # as the system and a shell do
+        for _ in range(2):  # one from the system, one from the shell
             talker.send_signal(signal.SIGHUP)
         talker.communicate(b"\n", timeout=60.0)
     assert talker.returncode == 0
     assert (tmp_path / "up.log").read_text().splitlines() == ["fetching", "ended"]
 
 
-def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path) -> None:
-    """A reader of a pipe may be gone a moment later, so nothing but that line is sent there."""
+def test_a_terminal_that_still_exists_shows_where_output_continues(tmp_path: Path) -> None:
+    """Nothing but that line is written there, because the reader of a pipe may be gone a moment later."""
     log = tmp_path / "up.log"
     command = [sys.executable, "-c", TALKS, str(log)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -484,7 +493,7 @@ with EndSignals(Path(sys.argv[1]), lambda: told.append(1)) as signals:
 
 
 @pytest.mark.parametrize("both", [False, True], ids=["stdout", "both"])
-def test_who_is_read_by_nobody_notices_without_writing(tmp_path: Path, both: bool) -> None:
+def test_a_closed_output_pipe_is_noticed_without_writing(tmp_path: Path, both: bool) -> None:
     log = tmp_path / "up.log"
     read, write = os.pipe()
     errors = write if both else subprocess.PIPE
@@ -494,12 +503,15 @@ def test_who_is_read_by_nobody_notices_without_writing(tmp_path: Path, both: boo
             assert reader.readline() == "ready\n"
         complained = talker.communicate(timeout=60.0)[1]
     assert talker.returncode == 0
-    assert log.read_text().splitlines() == [UNREAD, f"fetching {int(both)}"]  # the screen is on standard error
+    assert log.read_text().splitlines() == [
+        UNREAD,
+        f"fetching {int(both)}",
+    ]  # the callback runs only once standard error, where the screen is, is closed too
     assert both or has_terms(complained.decode(), UNREAD, str(log))
 
 
-def test_a_command_behind_a_head_has_the_exit_code_of_shells(tmp_path: Path) -> None:
-    """As Click has it, that would be 1, without a word."""
+def test_a_broken_pipe_gives_the_exit_code_of_shells(tmp_path: Path) -> None:
+    """Click alone would exit with 1, without a message."""
     read, write = os.pipe()
     os.close(read)
     command = [sys.executable, "-m", "zsim_deploy.cli", "validate", "scenarios/step.yaml"]
@@ -510,7 +522,7 @@ def test_a_command_behind_a_head_has_the_exit_code_of_shells(tmp_path: Path) -> 
     assert (done.returncode, done.stderr) == (141, b"")
 
 
-def test_under_nohup_nothing_happens(tmp_path: Path) -> None:
+def test_under_nohup_sighup_is_ignored(tmp_path: Path) -> None:
     former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with EndSignals(tmp_path / "up.log", lambda: pytest.fail("hung up")):
@@ -520,7 +532,7 @@ def test_under_nohup_nothing_happens(tmp_path: Path) -> None:
         signal.signal(signal.SIGHUP, former)
 
 
-def test_sigterm_is_as_ctrl_c_wherever_it_comes(tmp_path: Path) -> None:
+def test_sigterm_acts_like_ctrl_c(tmp_path: Path) -> None:
     former = signal.getsignal(signal.SIGTERM)
     with EndSignals(tmp_path / "up.log", lambda: None), pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""Roles as processes: who serves run after run, the folder of a record, and the links of a router."""
+"""Roles as processes: serving run after run, the folder of a record, and the links of a router."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,7 +26,7 @@ INFO = Info(0, 0, 1, "r", "zsim", "lockstep", 1.0, 1, 1, 1, 1, Origin(0.0, 0.0, 
 
 
 class NotStopped:
-    """Nobody stops it."""
+    """A stop channel on which no stop arrives."""
 
     def stopped(self) -> bool:
         return False
@@ -35,10 +35,10 @@ class NotStopped:
         return None
 
     def exit_if_terminated(self) -> None:
-        """Nothing has ended it."""
+        """Do nothing: there was no signal."""
 
 
-def test_who_refuses_a_run_says_bye_with_the_reason():
+def test_a_process_that_refuses_a_run_says_goodbye_with_the_reason():
     link: Any = FakeLink()
     participant = Participant(link, INFO, ME)
     stop: Any = NotStopped()
@@ -52,10 +52,10 @@ def test_who_refuses_a_run_says_bye_with_the_reason():
     assert bye.reason == "no such drone"
 
 
-def test_who_serves_run_after_run_waits_for_the_next_where_a_world_goes_as_it_comes(
+def test_a_server_waits_for_the_next_run_when_a_world_vanishes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """`zsim mavlink serve --rate 1` asks the world for its pace at first."""
+    """`zsim mavlink serve --rate 1`, for example, first requests a pace from the world."""
     said: list[str] = []
     monkeypatch.setattr(roles, "log_printer", lambda _: said.append)
     runs = iter("ab")
@@ -85,12 +85,12 @@ def test_who_serves_run_after_run_waits_for_the_next_where_a_world_goes_as_it_co
 @pytest.mark.parametrize(
     ("out", "folder"), [("runs/step-{run}", "runs/step-0badcafe"), ("runs/step", "runs/step"), (".", "."), ("{run}/x", "{run}/x")]
 )  # fmt: skip
-def test_the_id_of_the_run_is_put_into_the_last_name(out: str, folder: str) -> None:
+def test_the_run_id_is_put_into_the_last_part_of_a_path(out: str, folder: str) -> None:
     assert record_folder(Path(out), "0badcafe") == Path(folder)
 
 
 @pytest.mark.parametrize("run_id", ["../../etc", "", "a/b", "a" * 65, "\x1b[2J", ".."])
-def test_an_id_that_leads_elsewhere_is_a_line(run_id: str) -> None:
+def test_a_run_id_that_leads_out_of_the_folder_is_refused(run_id: str) -> None:
     with refused(RecordError, "runs/step-{run}", repr(run_id[:40]), "1", "64", "--out"):
         record_folder(Path("runs/step-{run}"), run_id)
     assert record_folder(Path("runs/step"), run_id) == Path("runs/step")
@@ -100,7 +100,7 @@ ESTIMATOR, RECORDER, CONSOLE, OWN = "estimator.d1", "recorder", "console.1", "pl
 
 
 class Case:
-    """A router, and the lines that it shows."""
+    """A router and the lines that it shows."""
 
     def __init__(self) -> None:
         self.link, self.lines = FakeLink(), list[str]()
@@ -115,28 +115,28 @@ class Case:
         return {name for each in self.links.awaited() for name in each.names}
 
 
-def test_who_gates_or_is_recorded_by_must_lose_nothing_and_who_only_reads_may() -> None:
+def test_only_gating_processes_and_recorders_are_awaited() -> None:
     case = Case()
     for name in (ESTIMATOR, RECORDER, CONSOLE):
         case.link.show(keys.session_token(name, name))
-    assert case.names() == {ESTIMATOR, RECORDER, CONSOLE}  # whoever has not said may be waited for
+    assert case.names() == {ESTIMATOR, RECORDER, CONSOLE}  # without a join, a process may be gating
     case.joins(ESTIMATOR, period_ns=20_000_000)
     case.joins(RECORDER, slack_ns=20_000_000)
     case.joins(CONSOLE)
     assert case.names() == {ESTIMATOR, RECORDER}
 
 
-def test_a_program_without_a_token_of_its_session_is_known_by_its_process() -> None:
+def test_a_program_without_a_session_token_is_known_by_its_process_token() -> None:
     case = Case()
     case.joins(OWN, period_ns=20_000_000)
-    assert case.links.awaited() == []  # nobody is behind it
+    assert case.links.awaited() == []  # a join without a token
     case.link.show(keys.token(OWN))
     assert case.links.awaited() == [Awaited((OWN,), 7)]
     case.link.show(keys.token(OWN), alive=False)
     assert case.links.awaited() == []
 
 
-def test_names_without_end_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_remembered_joins_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(roles, "JOINS_MAX", 10)
     case = Case()
     for number in range(105):
@@ -147,7 +147,7 @@ def test_names_without_end_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> No
     assert len(case.names()) == 5
 
 
-def test_a_link_that_was_closed_is_a_line_with_process_address_and_names() -> None:
+def test_a_closed_link_is_reported_with_process_address_and_names() -> None:
     case = Case()
     case.links.watch.closed.append(ClosedLink("192.0.2.7:4000", "pid 9 (python reader.py)", (CONSOLE,), 400_000, 2))
     case.links.report()

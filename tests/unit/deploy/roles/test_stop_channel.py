@@ -1,4 +1,4 @@
-"""How a process is stopped, the private key that a launcher lends it, and its priority."""
+"""How a process is stopped, the private key that a launcher lends to it, and its priority."""
 
 import os
 import signal
@@ -38,9 +38,7 @@ def key(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("given", "printed"), [("", ["True", "False"]), ("stop enough\n", ["False", "True"])])
-def test_a_process_that_is_told_to_stop_keeps_its_key_and_a_deserted_one_gives_it_back_first(
-    key: Path, given: str, printed: list[str]
-) -> None:
+def test_an_orphaned_process_returns_its_key_before_it_stops(key: Path, given: str, printed: list[str]) -> None:
     command = [sys.executable, "-c", ROLE, str(key.parent)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin
@@ -69,12 +67,12 @@ except KeyboardInterrupt as error:
 
 
 @pytest.mark.parametrize("system", ["posix", "windows"])
-def test_code_that_does_not_look_whether_to_stop_is_interrupted(system: str) -> None:
+def test_code_that_does_not_check_for_a_stop_is_interrupted(system: str) -> None:
     done = subprocess.run([sys.executable, "-c", HELD, system], capture_output=True, text=True, timeout=60.0)
     assert (done.stdout, done.stderr) == ("terminated|terminated, in a law\n", "")
 
 
-def test_a_key_that_was_brought_for_a_successor_stays(key: Path) -> None:
+def test_a_key_sent_for_a_successor_is_kept(key: Path) -> None:
     old = KeyLease(key.parent)
     key.unlink()
     key.write_text("another")
@@ -85,7 +83,7 @@ def test_a_key_that_was_brought_for_a_successor_stays(key: Path) -> None:
     old.release()
 
 
-def test_a_key_of_the_hosts_own_is_not_lent(key: Path) -> None:
+def test_the_own_key_of_a_host_is_not_treated_as_lent(key: Path) -> None:
     certs = Path("certs/h1/estimator.d1")
     for tls, launched in ((None, "run1"), (key.parent, None), (key.parent, "run2"), (certs, "run1")):
         assert key_lease(Identity(tls=tls), launched) is None
@@ -101,7 +99,7 @@ threading.Event().wait()
 """
 
 
-def test_who_hangs_after_its_launcher_is_gone_is_ended_and_its_log_ends_with_why() -> None:
+def test_a_process_that_hangs_without_its_launcher_is_ended_with_a_reason() -> None:
     done = subprocess.run(
         [sys.executable, "-c", HANGS], input="", capture_output=True, text=True, timeout=60.0, check=False
     )
@@ -126,33 +124,33 @@ raise SystemExit(7 if stop.reason() == sys.argv[2] else 0)
 @pytest.mark.parametrize(
     ("before", "numbers", "reason"),
     [
-        ("SIG_DFL", (signal.SIGHUP, signal.SIGHUP), CLOSED),  # shells send it more than once
+        ("SIG_DFL", (signal.SIGHUP, signal.SIGHUP), CLOSED),  # shells send SIGHUP more than once
         ("SIG_IGN", (signal.SIGHUP, signal.SIGTERM), REASONS[signal.SIGTERM]),
     ],
     ids=["terminal", "nohup"],
 )
-def test_a_closed_terminal_ends_a_process_in_order(
+def test_a_closed_terminal_ends_a_process_in_an_orderly_way(
     before: str, numbers: tuple[signal.Signals, ...], reason: str
 ) -> None:
     command = [sys.executable, "-c", BY_HAND, before, reason]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         assert process.stdout.readline() == "ready\n"
-        process.stdout.close()  # as a terminal: what is written to it fails
+        process.stdout.close()  # like a closed terminal: writing to it fails
         for number in numbers:
             process.send_signal(number)
         assert process.wait(60.0) == 7
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_interrupts(number: signal.Signals) -> None:
+def test_a_signal_raises_an_interrupt(number: signal.Signals) -> None:
     former = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt), interruptible():
         signal.raise_signal(number)
     assert signal.getsignal(number) is former
 
 
-def test_what_a_library_makes_of_it_is_an_interrupt_still() -> None:
+def test_an_interrupt_that_a_library_turns_into_an_error_stays_an_interrupt() -> None:
     def fail(number: int = 0) -> None:
         with suppress(KeyboardInterrupt):
             signal.raise_signal(number) if number else None
@@ -165,7 +163,7 @@ def test_what_a_library_makes_of_it_is_an_interrupt_still() -> None:
 
 
 AUTOGROUP = Path("/proc/self/autogroup")
-NICEST = 19  # of what Linux knows
+NICEST = 19  # the maximum on Linux
 PROGRAM = """
 import os
 from pathlib import Path
@@ -177,8 +175,8 @@ print(os.nice(0), Path("/proc/self/autogroup").read_text().split()[-1])
 
 @pytest.mark.skipif(not AUTOGROUP.exists(), reason="sessions are not scheduled as groups by this kernel")
 @pytest.mark.parametrize("leads", [True, False])
-def test_a_process_that_leads_its_session_lowers_all_of_it(leads: bool) -> None:
-    """As a role of a run does; in a terminal, where the session is the shell's, the shell keeps its place."""
+def test_a_session_leader_lowers_the_priority_of_its_whole_session(leads: bool) -> None:
+    """A role of a run leads its session. In a terminal, the session is the shell's, and keeps its priority."""
     start = [sys.executable, "-c", PROGRAM]
     shell = [] if leads else ["sh", "-c", '"$@"; exit $?', "sh"]
     done = subprocess.run([*shell, *start], capture_output=True, text=True, check=True, start_new_session=True)

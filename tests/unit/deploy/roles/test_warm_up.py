@@ -1,4 +1,4 @@
-"""What `zsim push` compiles on a host: what its roles run, and no more."""
+"""What `zsim push` compiles on a host: exactly the code that its roles run."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ from zsim_deploy.roles import warm_up
         (("all",), ["world", "agents"]),
     ],
 )
-def test_what_the_roles_of_a_host_run_is_compiled(
+def test_only_the_code_of_the_roles_of_a_host_is_compiled(
     monkeypatch: pytest.MonkeyPatch, extras: tuple[str, ...], built: list[str]
 ) -> None:
     done: list[str] = []

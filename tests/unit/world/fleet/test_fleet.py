@@ -1,6 +1,6 @@
-"""The fleet's interface: samples and their times, refusals, same bits, contacts; vehicles fly by their parameters alone.
+"""The fleet: samples and their times, refusals, reproducible bits, contacts, and vehicles defined by parameters alone.
 
-What flies with six rotors is compiled for these tests alone, which takes longer than all others here: it is for the soak.
+Six-rotor vehicles are compiled for these tests only, which takes longer than all others here: they run in the soak.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ WIDTH = {"imu": 6, "gps": 9, "mag": 3, "baro": 2, "sonar": 2, "flow": 4}
 
 
 def scenario(count: int = 2, seed: int = 1, gust=0.5, spacing=3.0, drone: Any = None, sensors: Any = None, **top: Any):
-    """Return drones in a row with the paper's sensors, or others of these."""
+    """Return a scenario of drones in a row with the paper's sensors, some of which may be replaced."""
     drones = [{"name": f"d{k}", "position_m": [spacing * k, 0, 0], **(drone or {})} for k in range(count)]
     document = {"name": "t", "duration_s": 1, "seed": seed, "drones": drones}
     environment = {"wind": {"gust_m_s": gust}, **top.pop("environment", {})}
@@ -33,7 +33,7 @@ def scenario(count: int = 2, seed: int = 1, gust=0.5, spacing=3.0, drone: Any = 
 
 
 def gates(fleet, count, name=None):
-    """Advance; return all samples, or those of a sensor."""
+    """Advance; return all samples, or those of one sensor."""
     out = []
     for _ in range(count):
         fleet.advance()
@@ -64,7 +64,7 @@ def flown(fleet, count=500):
 # Samples
 
 
-def test_at_the_start_everybody_stands_and_has_sampled_once():
+def test_at_the_start_all_drones_stand_and_have_sampled_once():
     fleet = Fleet(scenario())
     assert (fleet.t_ns, fleet.names) == (0, ["d0", "d1"])
     assert [fleet.status(i) for i in range(2)] == [("landed", 100.0, False)] * 2
@@ -74,7 +74,7 @@ def test_at_the_start_everybody_stands_and_has_sampled_once():
     assert Fleet(scenario(1)).closest_m == math.inf
 
 
-def test_samples_are_plain_floats_of_the_right_number_in_order():
+def test_samples_come_in_order_with_the_right_number_of_plain_floats():
     fleet = Fleet(scenario())
     for sample in gates(fleet, 25):
         assert len(sample.values) == WIDTH[sample.sensor]
@@ -86,40 +86,40 @@ def test_samples_are_plain_floats_of_the_right_number_in_order():
 
 
 @pytest.mark.parametrize(("sensor", "rate"), [("imu", 200), ("gps", 5), ("mag", 25), ("flow", 15), ("sonar", 25)])
-def test_samples_fall_due_at_the_first_tick_and_never_drift(sensor, rate):
+def test_samples_are_due_at_the_first_possible_tick_and_never_drift(sensor, rate):
     times = [s.t_ns for s in gates(Fleet(scenario(1)), 1000, sensor)]
     tick = 2_500_000
     due = [math.ceil(n * 1_000_000_000 / rate / tick - 1e-9) * tick for n in range(1, 20 * rate + 1)]
     assert times == due
 
 
-def test_imu_of_a_lower_rate_shows_samples_of_the_board():
-    """At 60 Hz every third or fourth board sample is published, the very ones that 200 Hz would show."""
+def test_an_imu_at_a_lower_rate_publishes_samples_of_the_board():
+    """At 60 Hz every third or fourth board sample is published, with the same values as at 200 Hz."""
     full = {s.t_ns: s.values for s in gates(Fleet(scenario(1)), 50, "imu")}
     shown = gates(Fleet(scenario(1, sensors={"imu": {"rate_hz": 60}})), 50, "imu")
     assert len(shown) == 60
     assert all(full[s.t_ns] == s.values for s in shown)
 
 
-def test_a_sensor_faster_than_the_ticks_gives_several_samples_at_one():
+def test_a_sensor_faster_than_the_ticks_gives_several_samples_per_tick():
     times = [s.t_ns for s in gates(Fleet(scenario(1, sensors={"baro": {"rate_hz": 1000}})), 50, "baro")]
     assert len(times) == 1000
     assert all(t % 2_500_000 == 0 for t in times)
 
 
-def test_latency_delays_publication_loses_nothing_and_changes_no_value():
+def test_latency_only_delays_publication():
     fleet = Fleet(scenario(2, sensors={"gps": {"latency_ms": 211.0}, "imu": {"latency_ms": 7.0}}))
     out = [*samples_of(fleet), *gates(fleet, 200)]
     assert in_order(out)
     late = [s for s in out if s.sensor == "gps" and s.drone == 0]
     assert [s.t_ns - s.t_sample_ns for s in late] == [211_000_000] * len(late)
     assert [s.t_sample_ns for s in late] == [200_000_000 * n for n in range(len(late))]
-    assert len(late) == 19  # of 21 sampled up to 4 s, the last two are on their way
+    assert len(late) == 19  # of 21 sampled up to 4 s, the last two are still delayed
     plain = [s.values for s in gates(Fleet(scenario(2)), 200, "gps") if s.drone == 0]
     assert [s.values for s in late[1:]] == plain[: len(late) - 1]
 
 
-def test_gps_place_is_its_position_on_the_earth():
+def test_geodetic_and_local_gps_positions_agree():
     fleet = Fleet(scenario())
     for sample in gates(fleet, 30, "gps"):
         position = geodetic_to_enu(sample.values[:3], (-34.603, -58.368, 25.0))
@@ -127,8 +127,8 @@ def test_gps_place_is_its_position_on_the_earth():
     assert fleet.gps_sigma_m == [2.0, 2.0]
 
 
-def test_the_sigma_that_a_gps_tells_is_that_of_its_errors():
-    """noise 3 m and density 2 m/sqrt(Hz) at 4 Hz: 5 m."""
+def test_the_sigma_that_a_gps_reports_is_that_of_its_errors():
+    """A noise of 3 m and a density of 2 m/sqrt(Hz) at 4 Hz give 5 m."""
     gps = {"rate_hz": 4, "position_m": {"noise": 3.0, "density": 2.0}}
     fleet = Fleet(scenario(1, sensors={"gps": gps}))
     fixes = [m for _, m in GatePublication(fleet).gate([None]).decoded() if isinstance(m, messages.Gps)]
@@ -136,34 +136,34 @@ def test_the_sigma_that_a_gps_tells_is_that_of_its_errors():
 
 
 @pytest.mark.parametrize("rate_hz", [0.01, 0.0137, 999.9])
-def test_rates_from_the_least_to_the_largest_are_kept(rate_hz):
+def test_rates_from_the_lowest_to_the_highest_are_kept(rate_hz):
     sensors = fleet_sensors(scenario(1, sensors={"baro": {"rate_hz": rate_hz}}))
     numerator, denominator = schedule(sensors, 2.5)[0, 3, :2]
     assert denominator / numerator / 0.0025 == pytest.approx(rate_hz, rel=5e-4)
 
 
-def test_pressure_is_a_number_however_high_a_drone_gets():
+def test_pressure_is_finite_however_high_a_drone_gets():
     fleet = Fleet(scenario(1, environment={"height_m": 10_900}, sensors={"baro": {"rate_hz": 200}}))
     fleet.bodies.state[0, 2] = 60_000.0
     assert {s.values[0] for s in gates(fleet, 2, "baro")} == {0.0}
 
 
-def test_barometer_is_zero_at_the_origin_and_its_pressure_that_of_the_field():
+def test_the_barometer_altitude_is_relative_and_its_pressure_absolute():
     quiet = scenario(1, sensors={"baro": {"altitude_m": {"noise": 0.0}}})
     pressure, altitude = next(s.values for s in samples_of(Fleet(quiet)) if s.sensor == "baro")
     assert altitude == pytest.approx(0.058)
     assert pressure == pytest.approx(101325.0 * (1 - 2.25577e-5 * 25.058) ** 5.25588)
 
 
-# The same bits
+# Reproducibility
 
 
-def test_same_seed_same_bits_other_seed_other_bits():
+def test_only_the_same_seed_gives_the_same_bits():
     digests = [flown(Fleet(scenario(seed=seed))) for seed in (1, 1, 2)]
     assert digests[0] == digests[1] != digests[2]
 
 
-def test_gates_of_another_length_give_the_same_physics():
+def test_the_length_of_a_gate_does_not_change_the_physics():
     def end(gate_ms, count):
         fleet = Fleet(scenario(time={"gate_ms": gate_ms}))
         fleet.takeoff(0)
@@ -176,8 +176,8 @@ def test_gates_of_another_length_give_the_same_physics():
     assert one == other
 
 
-def test_adding_a_drone_or_a_sensor_changes_no_other_stream():
-    """Far apart nothing but random streams could couple them; eleven are a block of eight and a part of one."""
+def test_more_drones_or_samples_change_no_other_random_stream():
+    """Far apart, only random streams could couple the drones; eleven fill a block of eight and part of another."""
     apart: Any = {"spacing": 200.0}
     alone, many = Fleet(scenario(1, **apart)), Fleet(scenario(11, **apart))
     alone.takeoff(0)
@@ -192,7 +192,7 @@ def test_adding_a_drone_or_a_sensor_changes_no_other_stream():
 
 
 @pytest.mark.parametrize("dt_ms", [0.5, 1.0, 5.0])
-def test_other_physics_steps_fly_the_same_flight_nearly(dt_ms):
+def test_other_physics_steps_give_nearly_the_same_flight(dt_ms):
     def end(dt):
         fleet = Fleet(scenario(2, time={"physics_dt_ms": dt}))
         for i in range(2):
@@ -207,10 +207,10 @@ def test_other_physics_steps_fly_the_same_flight_nearly(dt_ms):
     np.testing.assert_allclose(end(dt_ms), end(2.5), atol=0.3)
 
 
-# What it takes, and what it tells
+# Commands and reports
 
 
-def test_refusals_say_who_what_and_what_is_needed():
+def test_refusals_give_the_drone_its_state_and_the_required_states():
     fleet = Fleet(scenario())
     for refusal in (
         fleet.set_velocity(0, (1, 0, 0)),
@@ -234,7 +234,7 @@ def test_refusals_say_who_what_and_what_is_needed():
     assert "landing" in str(fleet.set_velocity(1, (1, 0, 0)))
 
 
-def test_a_collision_is_told_once_when_it_begins():
+def test_a_collision_is_reported_only_when_it_begins():
     fleet = Fleet(scenario(2, gust=0.0, spacing=2.0))
     fleet.takeoff(0)
     fleet.takeoff(1)
@@ -256,12 +256,12 @@ def test_a_collision_is_told_once_when_it_begins():
     assert fleet.collisions == []
 
 
-def test_wind_is_told():
+def test_the_wind_is_reported():
     windy = scenario(environment={"wind": {"steady_m_s": [1.0, 2.0, 0.0], "gust_m_s": 0.0}})
     np.testing.assert_array_equal(Fleet(windy).wind_m_s, [(1.0, 2.0, 0.0)] * 2)
 
 
-def test_a_diverged_state_names_drone_and_time():
+def test_a_diverged_state_is_reported_with_drone_and_time():
     fleet = Fleet(scenario(drone={"inertia_kg_m2": [1e-9, 1e-9, 1e-9]}, gust=0.0))
     fleet.takeoff(1)
     with refused(DivergedError, "d1", "s", "finite") as raised:
@@ -270,7 +270,7 @@ def test_a_diverged_state_names_drone_and_time():
     assert has_terms(str(raised.value), f"{(fleet.t_ns + 20_000_000) / 1e9:.3f}")
 
 
-def test_truth_is_a_copy_and_a_drone_placed_above_the_ground_falls_onto_it():
+def test_truth_is_a_copy_and_a_drone_above_the_ground_falls():
     fleet = Fleet(scenario(1, drone={"position_m": [0, 0, 0.3]}))
     before = fleet.truth()
     kept = before.position_m.copy()
@@ -279,7 +279,7 @@ def test_truth_is_a_copy_and_a_drone_placed_above_the_ground_falls_onto_it():
     assert fleet.truth().position_m[0, 2] == pytest.approx(0.058, abs=2e-3)
 
 
-def test_a_hundred_drones_in_a_crowd_collide_and_stay_finite():
+def test_a_hundred_crowded_drones_collide_and_stay_finite():
     drones = [{"name": f"d{k}", "position_m": [0.61 * (k % 10), 0.61 * (k // 10), 0]} for k in range(100)]
     crowd = {"name": "t", "duration_s": 1, "environment": {"wind": {"gust_m_s": 1.0}}, "drones": drones}
     fleet = Fleet(resolve(crowd))
@@ -332,7 +332,7 @@ def velocity_ahead(flight: Fleet, i: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("model", ALL_MODELS)
-def test_every_vehicle_takes_off_hovers_flies_a_velocity_and_lands(model: str):
+def test_every_vehicle_takes_off_hovers_follows_a_velocity_and_lands(model: str):
     flight = airborne(model)
     height = vehicle_of(model).takeoff_height_m
     start = flight.truth().position_m[0]
@@ -367,7 +367,7 @@ def test_hover_thrust_is_the_weight_shared_by_all_rotors(model: str):
 
 
 @six_rotors
-def test_vehicles_of_different_size_and_rotors_fly_side_by_side():
+def test_vehicles_of_different_sizes_and_rotor_counts_fly_side_by_side():
     flight = airborne("ardrone2", "crazyflie2", "hexacopter")
     closest = math.inf
     for _ in range(20):
@@ -381,7 +381,7 @@ def test_vehicles_of_different_size_and_rotors_fly_side_by_side():
 
 
 @six_rotors
-def test_a_quadrotor_flies_with_the_same_bits_beside_one_of_six_rotors():
+def test_a_quadrotor_flies_the_same_bits_alone_and_beside_a_hexacopter():
     alone, beside = airborne("ardrone2"), airborne("ardrone2", "hexacopter")
     for flight in (alone, beside):
         fly(flight, 2.0, (0.5, 0.2, 0.1))
@@ -390,7 +390,7 @@ def test_a_quadrotor_flies_with_the_same_bits_beside_one_of_six_rotors():
 
 
 @six_rotors
-def test_truth_and_commands_have_a_number_for_each_rotor():
+def test_truth_and_commands_have_one_value_per_rotor():
     flight = airborne("crazyflie2", "hexacopter")
     bundle = GatePublication(flight).gate([None, None])
     quad, hexa = (message.rotor_rad_s for key, message in bundle.decoded() if key.endswith("truth"))

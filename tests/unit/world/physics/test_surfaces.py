@@ -29,8 +29,8 @@ ROTORS = one_drone()[1]
 ROOF_M = 1.0
 BOX = {"name": "box", "shape": "box", "position_m": [0, 0, 0], "size_m": [6, 6, ROOF_M]}
 PILLAR = {"name": "pillar", "shape": "cylinder", "position_m": [0, 0, 0], "radius_m": 3, "height_m": ROOF_M}
-HILL_M = 200.0  # radius of a ball, large against a drone
-WIDE_M = 4.0  # as far as anything gets here; a wider sheet takes half a second to be made
+HILL_M = 200.0  # radius of a ball that is large compared with a drone
+WIDE_M = 4.0  # half width of a sheet: nothing gets any further, and a wider one takes half a second to build
 ANGLE, UNIT = st.floats(-3.2, 3.2), st.floats(-1.0, 1.0)
 
 
@@ -56,7 +56,7 @@ def stand(row, state, seconds, push=CALM):
     return np.array(track)
 
 
-def test_a_drop_settles_and_never_gains_energy(row):
+def test_a_dropped_drone_settles_and_never_gains_energy(row):
     state = placed(0.5, (0.2, -0.3, 1.0))
     track = stand(row, state, 4.0)
     inertia = row[VEHICLE.inertia : VEHICLE.inertia + 3]
@@ -69,11 +69,11 @@ def test_a_drop_settles_and_never_gains_energy(row):
 
 
 @pytest.mark.parametrize(("share", "moves"), [(0.9, False), (1.1, True)])
-def test_friction_holds_up_to_the_cone(row, share, moves):
+def test_friction_holds_within_the_friction_cone(row, share, moves):
     weight = row[VEHICLE.mass] * row[VEHICLE.gravity]
     state = placed()
     stand(row, state, 2.0, (share * FRAME.friction * weight, 0.0, 0.0))
-    if moves:  # slides with what friction leaves, against the drag of still air
+    if moves:  # accelerated by the push in excess of friction, against the drag of still air
         left = (share - 1.0) * FRAME.friction * weight
         tau = row[VEHICLE.mass] / row[VEHICLE.drag]
         expected = left / row[VEHICLE.drag] * (1 - math.exp(-2.0 / tau))
@@ -83,27 +83,27 @@ def test_friction_holds_up_to_the_cone(row, share, moves):
         assert abs(state[3]) < 1e-6
 
 
-def test_a_held_push_does_not_creep(row):
+def test_a_drone_does_not_creep_under_a_constant_push(row):
     state = placed()
     track = stand(row, state, 20.0, (0.15, -0.1, 0.0))
     np.testing.assert_allclose(track[-1, :2], track[2000, :2], atol=1e-9)
 
 
-def test_no_force_in_the_air(row):
+def test_there_is_no_contact_force_in_the_air(row):
     anchor = np.zeros((8, 2))
     force, moment = contact(row, anchor, (0.0, 0.0, 0.2), CALM, (1.0, 0.0, 0.0, 0.0), CALM)
     assert force == CALM
     assert moment == CALM
 
 
-def test_ground_never_pulls(row):
+def test_the_ground_never_pulls(row):
     anchor = np.zeros((8, 2))
     force, _ = contact(row, anchor, (0.0, 0.0, 0.0599), (0.0, 0.0, 5.0), (1.0, 0.0, 0.0, 0.0), CALM)
     assert force == CALM
 
 
 def plane(slope: float = 0.0, cell_m: float = 0.5, half_m: float = WIDE_M, z_m: float = ROOF_M) -> np.ndarray:
-    """Return the triangles of a plane that rises to the west, in cells, (T, 9)."""
+    """Return the triangles of a gridded plane that rises to the west, (T, 9)."""
     x = np.arange(-half_m, half_m + 1e-9, cell_m)
     points = np.stack(np.broadcast_arrays(x[None, :], x[:, None], z_m - math.tan(slope) * x[None, :]), axis=2)
     a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
@@ -111,7 +111,7 @@ def plane(slope: float = 0.0, cell_m: float = 0.5, half_m: float = WIDE_M, z_m: 
 
 
 def block(*size_m: float) -> np.ndarray:
-    """Return the triangles of a box about x = y = 0 that stands on the ground, in no order and of no direction."""
+    """Return the triangles, unordered and of mixed winding, of a box centred at x = y = 0 on the ground."""
     wide, long, high = size_m
     p = np.array([[x * wide / 2, y * long / 2, z * high] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)])
     faces = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
@@ -119,7 +119,7 @@ def block(*size_m: float) -> np.ndarray:
 
 
 def on(*obstacles: Any, sheet: np.ndarray | None = None, drones: int = 1, **drone: Any) -> Fleet:
-    """Return drones with still rotors, far from obstacles and sheet, in calm air."""
+    """Return drones with still rotors, far from the obstacles and the sheet, in calm air."""
     start = [{"name": f"d{k}", "position_m": [3.0 * k, 900, 0], **drone} for k in range(drones)]
     around: dict[str, Any] = {"obstacles": list(obstacles)}
     if sheet is not None:
@@ -128,11 +128,11 @@ def on(*obstacles: Any, sheet: np.ndarray | None = None, drones: int = 1, **dron
 
 
 def put(fleet: Fleet, p: Any, q: Any = (1, 0, 0, 0), v: Any = (0, 0, 0), w: Any = (0, 0, 0), i: int = 0) -> None:
-    """Put a drone into a state, and take one gate that finds what is in its reach."""
+    """Put a drone into a state and clear its contacts."""
     state = fleet.bodies.state[i]
     state[:] = 0.0
     state[: STATE.size] = *p, *v, *q, *w
-    fleet.bodies.held[i] = np.nan  # what is left of the place before must not matter
+    fleet.bodies.held[i] = np.nan  # contacts at the previous place must not matter
     fleet.bodies.solid[i] = -1
     fleet.bodies.plane[i] = 0.0
     fleet.bodies.braced[i], fleet.bodies.twist[i] = 1, 0.0
@@ -149,7 +149,7 @@ def test_feet_carry_the_weight_at_their_sag(solid: Any, top_m: float, model: str
     fleet = on(*([solid] if solid else []), model=model)
     put(fleet, (0.3, 0.2, top_m + frame.foot_depth_m + 0.05), quaternion_from_rpy((0.1, -0.1, 0.5)))
     end = fly(fleet, 4.0)[-1, 0]
-    assert end[2] == pytest.approx(top_m + frame.foot_depth_m - frame.foot_sag_m, abs=1e-6)  # four springs: m g
+    assert end[2] == pytest.approx(top_m + frame.foot_depth_m - frame.foot_sag_m, abs=1e-6)  # four springs carry m g
     np.testing.assert_allclose(end[3:6], 0.0, atol=1e-6)
     assert np.degrees(np.abs(end[10:13])).max() < 1e-3
     assert tilt_deg(end) < 0.01
@@ -159,8 +159,8 @@ def test_feet_carry_the_weight_at_their_sag(solid: Any, top_m: float, model: str
 @pytest.mark.parametrize(
     "cell_m", [None, 0.05, 0.1, 7.0], ids=["box", "sheet of 0.05 m", "sheet of 0.1 m, feet on edges", "sheet of 7 m"]
 )
-def test_it_rests_as_it_rests_on_the_ground(cell_m: float | None) -> None:
-    """The same fall on the feet, to the ground and to a roof or a sheet: the same slide, the same place."""
+def test_a_roof_or_sheet_carries_a_drone_as_the_ground_does(cell_m: float | None) -> None:
+    """The same fall on the feet ends in the same slide and place on the ground and on a roof or a sheet."""
     low = on()
     if cell_m is None:
         high = on({**BOX, "size_m": [90, 90, ROOF_M]})
@@ -178,7 +178,7 @@ def test_it_rests_as_it_rests_on_the_ground(cell_m: float | None) -> None:
 
 
 @pytest.mark.parametrize(("solid", "top_m"), [(GROUND, 0.0), (BOX, ROOF_M)], ids=["ground", "box"])
-def test_on_its_back_it_rests_on_its_rim(solid: Any, top_m: float) -> None:
+def test_a_drone_on_its_back_rests_on_its_rim(solid: Any, top_m: float) -> None:
     fleet = on(*([solid] if solid else []))
     put(fleet, (0.0, 0.0, top_m + 0.3), quaternion_from_rpy((math.pi, 0.0, 0.0)))
     end = fly(fleet, 4.0)[-1, 0]
@@ -188,12 +188,10 @@ def test_on_its_back_it_rests_on_its_rim(solid: Any, top_m: float) -> None:
 
 @pytest.mark.parametrize(("share", "slides"), [(0.95, False), (1.05, True)])
 @pytest.mark.parametrize("cell_m", [None, 0.5, 40.0], ids=["side of a ball", "sheet of 0.5 m", "sheet of 40 m"])
-def test_on_a_slope_it_slides_where_the_tangent_exceeds_the_friction(
-    share: float, slides: bool, cell_m: float | None
-) -> None:
+def test_a_drone_slides_where_the_slope_exceeds_the_friction(share: float, slides: bool, cell_m: float | None) -> None:
     """Coulomb: on a plane of slope s a block slides if and only if tan s > mu, and then at g (sin s - mu cos s)."""
     slope, away, base_m = math.atan(share * FRAME.friction), FRAME.foot_depth_m - FRAME.foot_sag_m, ROOF_M
-    if cell_m is None:  # here at the side of a ball that is large against the drone
+    if cell_m is None:  # on the side of a ball that is large compared with the drone
         fleet = on({"name": "hill", "shape": "sphere", "position_m": [0, 0, 0], "radius_m": HILL_M}, drag_n_s_m=1e-9)
         away, base_m = away + HILL_M, 0.0
     else:
@@ -204,7 +202,7 @@ def test_on_a_slope_it_slides_where_the_tangent_exceeds_the_friction(
 
 @pytest.mark.parametrize("drop_m", [0.05, 0.5, 2.0])
 def test_a_rebound_is_lower_than_the_fall(drop_m: float) -> None:
-    """Restitution: flat falls from so high, and how high they come again; never above 1."""
+    """The restitution of a flat fall, as the height of the rebound per height of the fall, stays well below 1."""
     fleet = on(BOX)
     rest = ROOF_M + FRAME.foot_depth_m
     put(fleet, (0.0, 0.0, rest + drop_m))
@@ -215,7 +213,7 @@ def test_a_rebound_is_lower_than_the_fall(drop_m: float) -> None:
     assert track[:, 2].min() > ROOF_M - 0.06
 
 
-def test_with_its_outer_feet_over_an_edge_it_leans_on_its_hull() -> None:
+def test_a_drone_with_its_outer_feet_over_an_edge_leans_on_its_hull() -> None:
     fleet = on(BOX)
     put(fleet, (3.0 - 0.03, 0.0, ROOF_M + FRAME.foot_depth_m))
     end = fly(fleet, 4.0)[-1, 0]
@@ -224,7 +222,7 @@ def test_with_its_outer_feet_over_an_edge_it_leans_on_its_hull() -> None:
 
 
 @pytest.mark.parametrize(("over_m", "falls"), [(-0.12, False), (0.03, True)])
-def test_over_an_edge_it_tips_when_its_centre_is_beyond(over_m: float, falls: bool) -> None:
+def test_a_drone_tips_when_its_centre_is_beyond_the_edge(over_m: float, falls: bool) -> None:
     fleet = on(BOX)
     put(fleet, (3.0 + over_m, 0.0, ROOF_M + FRAME.foot_depth_m))
     track = fly(fleet, 4.0)[:, 0]
@@ -236,8 +234,8 @@ def test_over_an_edge_it_tips_when_its_centre_is_beyond(over_m: float, falls: bo
         assert track[-1, 2] == pytest.approx(ROOF_M + FRAME.foot_depth_m - FRAME.foot_sag_m, abs=1e-3)
 
 
-def test_a_force_beside_the_centre_turns() -> None:
-    """One foot on the roof: M = r × F about the centre, F = k depth along the normal."""
+def test_an_off_centre_force_exerts_a_moment() -> None:
+    """One foot on the roof: M = r × F about the centre, F = k × depth along the normal."""
     fleet = on(BOX)
     row, q = fleet.bodies.vehicle[0], quaternion_from_rpy((0.0, 0.0, 0.4))
     r_B = np.array([FRAME.foot_xy_m, FRAME.foot_xy_m, -FRAME.foot_depth_m])
@@ -258,7 +256,7 @@ def test_a_force_beside_the_centre_turns() -> None:
 @pytest.mark.parametrize("half_m", [0.02, 0.05, 0.3])
 @pytest.mark.parametrize("speed_m_s", [1.0, 4.0])
 @pytest.mark.parametrize("heading_deg", [0.0, 15.0, 40.0])
-def test_a_post_is_not_passed(half_m: float, speed_m_s: float, heading_deg: float) -> None:
+def test_a_drone_does_not_pass_through_a_post(half_m: float, speed_m_s: float, heading_deg: float) -> None:
     post = {"name": "post", "shape": "cylinder", "position_m": [0, 0, 0], "radius_m": half_m, "height_m": 60}
     fleet = on(post)
     put(fleet, (-1.0, 0.0, 40.0), quaternion_from_rpy((0.0, 0.0, math.radians(heading_deg))), (speed_m_s, 0.0, 0.0))
@@ -270,7 +268,7 @@ def test_a_post_is_not_passed(half_m: float, speed_m_s: float, heading_deg: floa
 
 
 @pytest.mark.parametrize("fall_m", [0.5, 2.0])
-def test_a_thin_slab_bears_a_fall(fall_m: float) -> None:
+def test_a_thin_slab_stops_a_falling_drone(fall_m: float) -> None:
     fleet = on({"name": "table", "shape": "box", "position_m": [0, 0, 10], "size_m": [3, 3, 0.05]})
     put(fleet, (0.0, 0.0, 10.05 + FRAME.foot_depth_m + fall_m))
     assert fly(fleet, 3.0)[-1, 0, 2] == pytest.approx(10.05 + FRAME.foot_depth_m - FRAME.foot_sag_m, abs=1e-3)
@@ -296,7 +294,7 @@ def solid_of(shape: str, size: tuple[float, ...], yaw_deg: float) -> dict[str, A
     rates=st.tuples(UNIT, UNIT, UNIT),
     model=st.sampled_from(["ardrone2", "crazyflie2"]),
 )
-def test_energy_never_grows_at_an_obstacle(
+def test_a_collision_with_an_obstacle_adds_no_energy(
     shape: str,
     size: tuple[float, ...],
     yaw_deg: float,
@@ -306,7 +304,7 @@ def test_energy_never_grows_at_an_obstacle(
     rates: tuple[float, ...],
     model: str,
 ) -> None:
-    """Thrown at a solid from anywhere, in any attitude, turning: kinetic and potential energy never exceed the first."""
+    """Thrown at a solid from anywhere, in any attitude and turning, a drone never exceeds its initial total energy."""
     fleet = on(solid_of(shape, size, yaw_deg), model=model)
     solid = fleet.bodies.obstacle[0]
     n = np.array(towards) / math.hypot(*towards)
@@ -329,7 +327,7 @@ def test_energy_never_grows_at_an_obstacle(
     rates=st.tuples(UNIT, UNIT, UNIT),
     models=st.tuples(*[st.sampled_from(["ardrone2", "crazyflie2"])] * 2),
 )
-def test_two_hulls_keep_momentum_and_gain_no_energy(
+def test_colliding_hulls_keep_momentum_and_gain_no_energy(
     aside: tuple[float, ...],
     rpy: tuple[float, ...],
     closing: float,
@@ -337,7 +335,7 @@ def test_two_hulls_keep_momentum_and_gain_no_energy(
     rates: tuple[float, ...],
     models: tuple[str, str],
 ) -> None:
-    """Two drones in free fall without drag; angular momentum is kept but for what they move in a tick of held forces."""
+    """Two drones in free fall without drag; angular momentum is kept except for motion within a tick of held forces."""
     start = [
         {"name": f"d{k}", "position_m": [9.0 * k, 0, 0], "model": model, "drag_n_s_m": 0.0}
         for k, model in enumerate(models)
@@ -374,8 +372,8 @@ def turned(q: np.ndarray, a: np.ndarray) -> np.ndarray:
     return a + 2.0 * np.cross(u, np.cross(u, a) + q[0] * a)
 
 
-def test_a_glancing_hull_turns_both() -> None:
-    """Friction at the point of contact, half a metre from one centre to the other: both turn the same way."""
+def test_a_glancing_collision_turns_both_drones() -> None:
+    """Friction at the contact between centres half a metre apart turns both drones the same way."""
     fleet = on(drones=2)
     put(fleet, (0.0, 0.0, 500.0))
     put(fleet, (2 * FRAME.hull_radius_m + 0.01, 0.0, 500.0), v=(-1.5, 2.0, 0.0), i=1)
@@ -385,8 +383,8 @@ def test_a_glancing_hull_turns_both() -> None:
     assert end[1, 12] == pytest.approx(end[0, 12], rel=1e-6)
 
 
-def test_more_solids_than_slots_are_those_in_reach() -> None:
-    """A roof of forty planks: it stands on those below it, whichever were found first."""
+def test_with_more_solids_than_slots_those_within_reach_are_used() -> None:
+    """On a roof of forty planks, a drone stands on those below it, whichever were found first."""
     planks = [
         {"name": f"p{k}", "shape": "box", "position_m": [0.1 * k - 2.0, 0, 0], "size_m": [0.1, 4, ROOF_M]}
         for k in range(40)
@@ -397,7 +395,7 @@ def test_more_solids_than_slots_are_those_in_reach() -> None:
     assert end[2] == pytest.approx(ROOF_M + FRAME.foot_depth_m - FRAME.foot_sag_m, abs=1e-4)
 
 
-def test_a_drone_that_starts_upon_a_sheet_stays() -> None:
+def test_a_drone_that_starts_on_a_sheet_stays_there() -> None:
     fleet = on(sheet=plane(), position_m=[0, 0, ROOF_M])
     track = fly(fleet, 1.0)[:, 0]
     assert np.abs(track[:, 2] - ROOF_M - FRAME.foot_depth_m + FRAME.foot_sag_m).max() < 1e-6
@@ -405,7 +403,7 @@ def test_a_drone_that_starts_upon_a_sheet_stays() -> None:
 
 @pytest.mark.parametrize("speed_m_s", [1.0, 6.0, 15.0])
 @pytest.mark.parametrize("rpy_deg", [(0, 0, 0), (180, 0, 0), (70, 20, 0)], ids=["feet", "back", "side"])
-def test_a_sheet_is_not_passed_from_either_side_and_gives_no_energy(speed_m_s: float, rpy_deg: Any) -> None:
+def test_a_sheet_stops_a_drone_from_either_side_without_adding_energy(speed_m_s: float, rpy_deg: Any) -> None:
     for below in (False, True):
         fleet = on(sheet=plane(z_m=20.0), drag_n_s_m=1e-9)
         toward = 1.0 if below else -1.0
@@ -418,13 +416,13 @@ def test_a_sheet_is_not_passed_from_either_side_and_gives_no_energy(speed_m_s: f
         before = energy(fleet, fleet.bodies.state[:, : STATE.size])[0]
         track = fly(fleet, 1.0)
         beyond = toward * (track[:, 0, 2] - 20.0)
-        assert beyond.max() < FRAME.hull_radius_m  # its centre, dented by 15 m/s
+        assert beyond.max() < FRAME.hull_radius_m  # penetration of its centre: 15 m/s dents the hull
         assert beyond[-1] < 0.0
         assert energy(fleet, track).max() <= before * (1.0 + 1e-3)
 
 
-def test_a_block_of_triangles_is_as_the_box() -> None:
-    """Falls upon its top, its side and its edge, of triangles whose directions are mixed: the paths differ by 2 cm."""
+def test_a_block_of_triangles_behaves_like_a_box() -> None:
+    """Falls on the top, a side and an edge, with triangles of mixed winding: the paths differ by at most 2 cm."""
     mesh = on(sheet=block(4.0, 4.0, ROOF_M), drag_n_s_m=1e-9)
     solid = on({**BOX, "size_m": [4, 4, ROOF_M]}, drag_n_s_m=1e-9)
     falls = [
@@ -440,17 +438,17 @@ def test_a_block_of_triangles_is_as_the_box() -> None:
         assert tilt_deg(other[-1]) == pytest.approx(tilt_deg(one[-1]), abs=5.0)
 
 
-def test_beside_the_rim_it_falls_off_and_nothing_holds_it() -> None:
-    """It slides over the edge of a table without sides, and falls to the ground as from one."""
+def test_a_drone_slides_off_a_sheet_and_nothing_holds_it() -> None:
+    """It slides over the edge of a sheet, which has no sides, and falls to the ground as from a table."""
     fleet = on(sheet=plane(half_m=1.0), drag_n_s_m=1e-9)
     put(fleet, (0.5, 0.0, ROOF_M + FRAME.foot_depth_m), v=(3.0, 0.0, 0.0))
     track = fly(fleet, 3.0)[:, 0]
     assert track[-1, 0] > 1.2
     assert track[-1, 2] < 0.2
-    assert np.linalg.norm(track[:, 3:6], axis=1).max() < 6.0  # of a fall of 1 m, 4.4 m/s
+    assert np.linalg.norm(track[:, 3:6], axis=1).max() < 6.0  # a fall of 1 m gives 4.4 m/s
 
 
-def test_a_contact_goes_on_to_the_same_bits_from_a_saved_state() -> None:
+def test_a_contact_continues_bit_identically_from_a_saved_state() -> None:
     one, other = on(sheet=plane(0.3)), on(sheet=plane(0.3))
     put(one, (0.0, 0.0, ROOF_M + 0.2), quaternion_from_rpy((0.4, 0.2, 0.1)), (0.5, 0.3, 0.0))
     fly(one, 0.3)
@@ -459,7 +457,7 @@ def test_a_contact_goes_on_to_the_same_bits_from_a_saved_state() -> None:
     np.testing.assert_array_equal(fly(one, 0.3), fly(other, 0.3))
 
 
-def test_a_hull_that_hits_a_surface_bumps_once_into_what_has_its_name() -> None:
+def test_a_bump_into_a_surface_is_reported_by_its_name() -> None:
     far = {"name": "far", "shape": "sphere", "position_m": [0, 0, 90], "radius_m": 1}
     fleet, bumps = on(far, sheet=plane()), []
     put(fleet, (0.0, 0.0, ROOF_M + 0.3), quaternion_from_rpy((math.pi, 0.0, 0.0)))

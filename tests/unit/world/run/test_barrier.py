@@ -1,4 +1,4 @@
-"""The barrier: who is waited for, since when, and what a join, a done, a death or a bye changes."""
+"""The barrier: which processes are waited for, since when, and what a join, a done, a death or a bye changes."""
 
 from typing import Any
 
@@ -39,10 +39,10 @@ def incomplete(made: Barrier) -> list[str]:
     return [participant.name for participant in made.incomplete()]
 
 
-# Who takes part
+# Participants
 
 
-def test_the_run_waits_for_everybody_expected():
+def test_the_run_waits_for_every_expected_process():
     made = Barrier(RUN, GATE_NS, ["estimator.d1", "controller.main"])
     made.join("controller.main", join(), 0, 0)
     made.expect("console.1")
@@ -52,7 +52,7 @@ def test_the_run_waits_for_everybody_expected():
     assert made.absent() == []
 
 
-def test_one_process_may_stand_for_several_that_are_expected():
+def test_one_process_may_serve_for_several_expected_ones():
     made = Barrier(RUN, GATE_NS, ["estimator.d1", "estimator.d2", "controller.main"])
     made.join("controller.main", join(serves=("estimator.d1", "estimator.d2")), 0, 0)
     assert (made.absent(), blocked(made, 0)) == ([], ["controller.main"])
@@ -62,7 +62,7 @@ def test_one_process_may_stand_for_several_that_are_expected():
     assert made.absent() == ["estimator.d2"]
 
 
-def test_who_does_the_work_of_the_dead_takes_their_place_and_goes_on_where_they_were():
+def test_a_substitute_replaces_dead_processes_and_continues_from_them():
     made = barrier("estimator.d2", "controller.main", "estimator.d3")
     for name, gate in (("estimator.d2", 7), ("controller.main", 5), ("estimator.d3", 6)):
         made.done(name, done(gate), 9 * GATE_NS, 0)
@@ -74,7 +74,7 @@ def test_who_does_the_work_of_the_dead_takes_their_place_and_goes_on_where_they_
     assert (joined.from_ns, joined.done_ns) == (0, 5 * GATE_NS)
 
 
-def test_a_join_again_changes_nothing_and_a_newcomer_of_a_known_name_replaces():
+def test_a_repeated_join_changes_nothing_but_a_new_process_replaces():
     made = barrier("estimator.d1")
     first = made.participants["estimator.d1"]
     first.away = True
@@ -90,7 +90,7 @@ def test_a_join_again_changes_nothing_and_a_newcomer_of_a_known_name_replaces():
     assert made.participants["estimator.d1"].rejoined
 
 
-def test_nobody_takes_the_place_of_one_that_lives_or_does_more():
+def test_a_process_that_lives_or_does_more_is_not_replaced():
     made = barrier("estimator.d1")
     made.join("estimator.d3", join(serves=("estimator.d2",)), 0, 0)
     made.mark_dead("estimator.d3", WALL_NS)
@@ -98,7 +98,7 @@ def test_nobody_takes_the_place_of_one_that_lives_or_does_more():
     assert list(made.participants) == ["estimator.d1", "estimator.d3", "controller.main"]
 
 
-def test_whose_work_is_done_twice():
+def test_work_done_by_two_processes_is_detected():
     made = barrier("estimator.d2")
     made.join("controller.main", join(serves=("estimator.d1", "estimator.d2")), 0, 0)
     assert made.duplicates("controller.main") == {"estimator.d2": {"estimator.d2"}}
@@ -109,14 +109,14 @@ def test_whose_work_is_done_twice():
     assert (made.duplicates("estimator.d2"), made.substitute("estimator.d2")) == ({}, None)
 
 
-def test_two_that_serve_each_other_are_substitutes():
+def test_two_processes_that_serve_each_other_are_substitutes():
     made = barrier()
     for name, other in (("group.a", "group.b"), ("group.b", "group.a")):
         made.join(name, join(serves=(other,)), 0, 0)
     assert made.substitute("group.a") is made.participants["group.b"]
 
 
-def test_everybody_owes_a_done_for_the_instant_that_commands_come_from():
+def test_every_participant_owes_a_done_for_the_instant_of_the_commands():
     made = barrier("a", "b")
     assert (blocked(made, -1), blocked(made, 0)) == ([], ["a", "b"])  # before the first gate, and after it
     for name, others in (("a", ["b"]), ("b", [])):
@@ -131,16 +131,16 @@ def test_a_participant_that_does_not_gate_is_never_waited_for():
     assert not made.is_gating("recorder")
 
 
-def test_one_with_slack_is_waited_for_when_it_is_further_behind():
+def test_a_participant_with_slack_is_awaited_only_beyond_it():
     made = barrier("recorder", period_ns=0, slack_ns=10 * GATE_NS)
     assert not made.is_gating("recorder")
     made.done("recorder", done(5), 15 * GATE_NS, 0)
     assert (blocked(made, 15), blocked(made, 16)) == ([], ["recorder"])
-    made.done("recorder", done(9, seq=7), 16 * GATE_NS, 0)  # it sends one now and then, so a gap is no loss
+    made.done("recorder", done(9, seq=7), 16 * GATE_NS, 0)  # it sends a done only now and then, so a gap is no loss
     assert blocked(made, 16) == made.incomplete() == []
 
 
-def test_one_with_slack_that_is_started_again_is_waited_for_from_where_the_former_was():
+def test_a_restarted_participant_with_slack_continues_from_its_predecessor():
     made = barrier("recorder", period_ns=0, slack_ns=10 * GATE_NS)
     made.done("recorder", done(5), 8 * GATE_NS, 0)
     made.mark_dead("recorder", WALL_NS)
@@ -149,7 +149,7 @@ def test_one_with_slack_that_is_started_again_is_waited_for_from_where_the_forme
 
 
 @pytest.mark.parametrize(("period", "need", "owed"), [(5, 4, 0), (5, 5, 5), (5, 9, 5), (2, 7, 6), (1, 7, 7)])
-def test_a_longer_period_owes_only_its_own_instants(period: int, need: int, owed: int):
+def test_a_participant_owes_dones_only_at_its_own_period(period: int, need: int, owed: int):
     made = barrier("a", period_ns=period * GATE_NS)
     if owed:
         made.done("a", done(owed - period, seq=0), need * GATE_NS, 0)
@@ -159,7 +159,7 @@ def test_a_longer_period_owes_only_its_own_instants(period: int, need: int, owed
 
 
 @pytest.mark.parametrize(("period", "first"), [(1, 7), (5, 10)])
-def test_a_late_joiner_is_waited_for_from_its_own_first_instant_on(period: int, first: int):
+def test_a_late_joiner_is_waited_for_from_its_own_first_instant(period: int, first: int):
     made = barrier(expected=[])
     made.join("late", join(period_ns=period * GATE_NS), 7 * GATE_NS, 0)
     assert [gate for gate in range(13) if blocked(made, gate)] == [*range(first, 13)]
@@ -178,7 +178,7 @@ def test_a_late_joiner_is_waited_for_from_its_own_first_instant_on(period: int, 
         ("a\nb", join(), "name", "'a\\nb'"),
     ],
 )
-def test_a_join_that_breaks_a_rule_is_refused_with_the_reason(name: str, message: Join, where: str, found: str):
+def test_an_invalid_join_is_refused_with_the_reason(name: str, message: Join, where: str, found: str):
     made = barrier("b")
     refusal = made.join(name, message, 0, 0)
     assert refusal is not None
@@ -190,7 +190,7 @@ def test_a_join_that_breaks_a_rule_is_refused_with_the_reason(name: str, message
 # Incarnations
 
 
-def test_a_new_incarnation_goes_on_where_the_former_was():
+def test_a_new_incarnation_continues_from_its_predecessor():
     made = barrier("a")
     made.done("a", done(3), 3 * GATE_NS, 0)
     made.participants["a"].deadline_misses = 7
@@ -203,7 +203,7 @@ def test_a_new_incarnation_goes_on_where_the_former_was():
     assert blocked(made, 4) == []
 
 
-def test_the_same_join_again_changes_nothing():
+def test_a_repeated_join_keeps_the_output_counts_and_the_first_gate():
     made = barrier("a")
     made.count_output("a")
     made.join("a", join(1), 9 * GATE_NS, WALL_NS)
@@ -217,7 +217,7 @@ def test_a_watcher_that_begins_to_gate_is_waited_for_from_then_on():
     assert (blocked(made, 7), blocked(made, 8)) == ([], ["a"])
 
 
-def test_a_rejoin_forgets_the_account_of_the_former():
+def test_a_rejoin_resets_the_output_counts():
     made = barrier("a")
     made.done("a", done(0, sent=3), 0, 0)
     assert incomplete(made) == ["a"]
@@ -228,7 +228,7 @@ def test_a_rejoin_forgets_the_account_of_the_former():
 # Dones, and the outputs that they count
 
 
-def test_dones_out_of_order_never_go_back():
+def test_an_older_done_never_moves_a_participant_back():
     made = barrier("a")
     made.done("a", done(5), 9 * GATE_NS, WALL_NS)
     assert made.done("a", done(3), 9 * GATE_NS, 2 * WALL_NS) is None
@@ -241,11 +241,11 @@ def test_dones_out_of_order_never_go_back():
         ("nobody", done(0), "join", "missing"),
         ("a", done(0, run_id="run0"), "run_id", "'run0'"),
         ("a", done(0, incarnation=9), "incarnation", "9"),
-        ("a", done(0, incarnation=1), "incarnation", "1"),  # the former one's
+        ("a", done(0, incarnation=1), "incarnation", "1"),  # of the former incarnation
         ("a", done(2, incarnation=2), "done_ns", "40000000"),
     ],
 )
-def test_a_done_that_cannot_be_is_refused_with_the_reason(name: str, message: Done, where: str, found: str):
+def test_an_invalid_done_is_refused_with_the_reason(name: str, message: Done, where: str, found: str):
     made = barrier("a")
     made.join("a", join(2), 0, 0)
     refusal = made.done(name, message, GATE_NS, 0)
@@ -254,7 +254,7 @@ def test_a_done_that_cannot_be_is_refused_with_the_reason(name: str, message: Do
     assert blocked(made, 0) == ["a"]
 
 
-def test_what_is_short_of_two_dones_adds_up():
+def test_missing_outputs_of_two_dones_add_up():
     made = barrier("a")
     made.done("a", done(0, sent=2), GATE_NS, 0)
     made.done("a", done(1, sent=2), GATE_NS, 0)
@@ -265,7 +265,7 @@ def test_what_is_short_of_two_dones_adds_up():
     assert incomplete(made) == blocked(made, 1) == []
 
 
-def test_in_realtime_what_is_missing_for_a_whole_gate_is_lost():
+def test_outputs_missing_for_a_whole_gate_are_given_up_in_realtime():
     made = barrier("a")
     made.done("a", done(0, sent=2), GATE_NS, 0)
     made.give_up_late()
@@ -282,7 +282,7 @@ def test_in_realtime_what_is_missing_for_a_whole_gate_is_lost():
 
 
 @pytest.mark.parametrize(("recovered", "missing"), [(0, 2), (1, 1), (2, 0), (3, 0)])
-def test_after_a_reset_a_loss_hides_none_that_comes_after(recovered: int, missing: int):
+def test_a_loss_before_a_reset_does_not_hide_a_later_one(recovered: int, missing: int):
     made = barrier("a")
     made.done("a", done(0, sent=2), GATE_NS, 0)
     for _ in range(recovered):
@@ -293,8 +293,8 @@ def test_after_a_reset_a_loss_hides_none_that_comes_after(recovered: int, missin
     assert incomplete(made) == ["a"]
 
 
-def test_a_lost_done_takes_the_count_of_what_was_lost_before_it_with_it():
-    """Of gate 1 one output came, the other and the done did not; the surplus must not pay for what is lost of 2."""
+def test_a_surplus_from_a_lost_done_does_not_hide_a_later_loss():
+    """Of gate 1 only one of the outputs arrived, and no done; this surplus must not offset a loss in gate 2."""
     made = barrier("a")
     made.done("a", done(0), 2 * GATE_NS, 0)
     for _ in range(3):
@@ -306,8 +306,8 @@ def test_a_lost_done_takes_the_count_of_what_was_lost_before_it_with_it():
 
 
 @pytest.mark.parametrize(("pid", "lost_done"), [(42, True), (43, False)])
-def test_a_done_that_was_lost_with_the_link_shows_after_the_return(pid: int, lost_done: bool):
-    """A process goes on counting its dones; another one in its place begins anew."""
+def test_a_done_lost_with_the_link_is_detected_after_the_return(pid: int, lost_done: bool):
+    """The same process continues numbering its dones; another in its place starts anew."""
     made = barrier("a")
     made.done("a", done(0), 3 * GATE_NS, 0)
     assert made.join("a", join(2, pid=pid), 3 * GATE_NS, 0) is None
@@ -315,7 +315,7 @@ def test_a_done_that_was_lost_with_the_link_shows_after_the_return(pid: int, los
     assert bool(incomplete(made)) == lost_done
 
 
-def test_a_done_that_was_refused_was_not_lost():
+def test_a_refused_done_does_not_count_as_lost():
     made = barrier("a")
     made.done("a", done(0), 3 * GATE_NS, 0)
     assert made.join("a", join(incarnation=2), 3 * GATE_NS, 0) is None
@@ -326,8 +326,8 @@ def test_a_done_that_was_refused_was_not_lost():
 
 @settings(max_examples=200, deadline=None)
 @given(sents=st.lists(st.integers(0, 4), min_size=1, max_size=8), order=st.randoms(use_true_random=False))
-def test_when_all_is_in_nothing_is_missing_whatever_came_first(sents: list[int], order):
-    """Outputs and dones come on different subscriptions: only the dones among themselves keep their order."""
+def test_nothing_is_missing_once_everything_has_arrived_in_any_order(sents: list[int], order):
+    """Outputs and dones arrive on different subscriptions; only dones keep their order among themselves."""
     made = barrier("a")
     last = len(sents) - 1
     arrivals = ["output"] * sum(sents) + ["done"] * len(sents)
@@ -341,10 +341,10 @@ def test_when_all_is_in_nothing_is_missing_whatever_came_first(sents: list[int],
     assert incomplete(made) == blocked(made, last) == []
 
 
-# Death, drop, and what `clock` says
+# Death, drop, and the processes that `clock` reports as waited for
 
 
-def test_the_dead_are_waited_for_until_they_are_dropped_and_may_come_back_as_newcomers():
+def test_a_dead_process_is_awaited_until_dropped_and_may_rejoin():
     made = barrier("a", "b")
     made.count_output("nobody")
     made.done("b", done(0), 0, 0)
@@ -360,7 +360,7 @@ def test_the_dead_are_waited_for_until_they_are_dropped_and_may_come_back_as_new
     assert "a" in blocked(made, 6)
 
 
-def test_the_same_incarnation_may_come_back_from_its_death():
+def test_an_incarnation_declared_dead_may_rejoin():
     made = barrier("a")
     made.mark_dead("a", 0)
     made.join("a", join(1), GATE_NS, WALL_NS)
@@ -368,7 +368,7 @@ def test_the_same_incarnation_may_come_back_from_its_death():
     assert made.participants["a"].alive
 
 
-def test_waiting_for_names_who_where_and_since_when():
+def test_waiting_for_gives_name_host_and_duration():
     def waiting_for(gate: int, wall_ns: int, start_wall_ns: int = 0) -> tuple[Waiting, ...]:
         return made.waiting_for(gate * GATE_NS, wall_ns, start_wall_ns, lambda writer, reader: False)
 
@@ -378,5 +378,5 @@ def test_waiting_for_names_who_where_and_since_when():
     assert waiting == (Waiting("estimator.d1", "", 10.0), Waiting("controller.main", "ground", 5.0))
     made.done("controller.main", done(0), 0, 4 * WALL_NS)
     assert [waiting.name for waiting in waiting_for(0, 4 * WALL_NS)] == ["estimator.d1"]
-    made.mark_dead("controller.main", 3 * WALL_NS)  # of the dead since their death
+    made.mark_dead("controller.main", 3 * WALL_NS)  # for a dead process, since its death
     assert waiting_for(2, 5 * WALL_NS)[1] == Waiting("controller.main", "ground", 10.0)

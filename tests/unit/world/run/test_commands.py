@@ -1,4 +1,4 @@
-"""Who flies a drone, the order of commands of one instant, what is refused, and commands to external drones."""
+"""Commands: who commands a drone, the order at one instant, refusals, and commands to external drones."""
 
 import random
 from typing import Any
@@ -38,7 +38,7 @@ def queue() -> CommandQueue:
 
 
 def fly(made: CommandQueue, t_ns: int) -> list[tuple[QueuedCommand, Refusal | None]]:
-    """Apply what is due as a world does: check, then make the source of a setpoint the commander."""
+    """Apply due commands as the world does: check each, then make the source of a setpoint the commander."""
     checked = []
     for command in made.pop(t_ns):
         reason = made.refusal(command)
@@ -67,7 +67,7 @@ def test_a_command_waits_for_its_instant(queue: CommandQueue):
 @settings(max_examples=100, deadline=None)
 @given(order=st.randoms(use_true_random=False))
 def test_commands_of_one_instant_are_ordered_by_priority_source_and_number(order: random.Random):
-    """Whatever the order of arrival; instants before later ones, and the last one wins."""
+    """Whatever the order of arrival, earlier instants come first; the last command applied wins."""
     made = CommandQueue(["drone1"])
     made.acquire(D1, "a.operator", OPERATOR)
     wanted = [(0, "b", 2), (0, "b", 9), (0, "c", 1), (0, "c", 10), (10, "a.operator", 0), (10, "a.operator", 3)]
@@ -82,7 +82,7 @@ def test_commands_of_one_instant_are_ordered_by_priority_source_and_number(order
 
 @settings(max_examples=50, deadline=None)
 @given(order=st.randoms(use_true_random=False))
-def test_equal_places_do_not_fall_back_on_the_order_of_arrival(order: random.Random):
+def test_ties_are_not_broken_by_the_order_of_arrival(order: random.Random):
     made = CommandQueue(["drone1", "drone2"])
     in_order = [(drone, kind) for drone in (D1, D2) for kind in ("mode", "velocity")]
     arrivals = [*in_order]
@@ -92,8 +92,8 @@ def test_equal_places_do_not_fall_back_on_the_order_of_arrival(order: random.Ran
     assert [(command.drone, command.kind) for command in made.pop(0)] == in_order
 
 
-def test_a_command_that_comes_again_takes_effect_once(queue: CommandQueue):
-    """As after a rejoin: an old setpoint must not replace a newer one."""
+def test_a_repeated_command_takes_effect_once(queue: CommandQueue):
+    """After a rejoin, for example, an old setpoint must not replace a newer one."""
     old, new = velocity("a", 1, 0, x=1.0), velocity("a", 2, GATE_NS, x=2.0)
     pushed = [(old, GATE_NS), (old, GATE_NS), (new, 2 * GATE_NS)]
     assert [queue.push(D1, "velocity", *each) for each in pushed] == [True, False, True]
@@ -102,7 +102,7 @@ def test_a_command_that_comes_again_takes_effect_once(queue: CommandQueue):
     assert queue.pop(9 * GATE_NS) == []
 
 
-def test_the_same_number_for_another_drone_kind_or_instant_is_another_command(queue: CommandQueue):
+def test_a_sequence_number_may_recur_for_another_drone_kind_or_instant(queue: CommandQueue):
     command = velocity("a")
     assert queue.push(D1, "velocity", command, GATE_NS)
     assert queue.push(D2, "velocity", command, GATE_NS)
@@ -112,17 +112,17 @@ def test_the_same_number_for_another_drone_kind_or_instant_is_another_command(qu
     assert len(queue.pop(2 * GATE_NS)) == 5
 
 
-def test_what_is_remembered_of_commands_is_bounded(queue: CommandQueue):
+def test_the_memory_of_recent_commands_is_bounded(queue: CommandQueue):
     for seq in range(10 * RECENT_PER_DRONE):
         queue.push(D1, "velocity", velocity("a", seq), 0)
         queue.pop(0)
     assert len(queue._recent) <= 2 * RECENT_PER_DRONE
 
 
-# Who flies
+# The commander
 
 
-def test_the_first_setpoint_makes_the_commander_and_others_are_refused_with_its_name(queue: CommandQueue):
+def test_the_first_setpoint_takes_command_and_other_sources_are_refused(queue: CommandQueue):
     assert queue.commanders() == [None, None]
     assert send(queue, D1, "controller.main") is None
     reason = send(queue, D1, "console.1")
@@ -133,11 +133,11 @@ def test_the_first_setpoint_makes_the_commander_and_others_are_refused_with_its_
     assert send(queue, D2, "console.1") is None
 
 
-def test_claim_tells_whether_the_commander_is_new(queue: CommandQueue):
+def test_claim_returns_whether_the_commander_is_new(queue: CommandQueue):
     assert [queue.claim(D1, source) for source in ("a", "a", "b")] == [True, False, False]
 
 
-def test_a_drone_is_acquired_with_a_higher_priority_only(queue: CommandQueue):
+def test_only_a_higher_priority_acquires_a_commanded_drone(queue: CommandQueue):
     send(queue, D1, "controller.main")
     refusal = queue.acquire(D1, "console.1", PROGRAM)
     assert refusal is not None
@@ -151,7 +151,7 @@ def test_a_drone_is_acquired_with_a_higher_priority_only(queue: CommandQueue):
     assert queue.acquire(D1, "console.3", PROGRAM + 1) is None
 
 
-def test_a_released_drone_is_free_and_the_priority_is_gone(queue: CommandQueue):
+def test_a_release_frees_the_drone_and_drops_the_priority(queue: CommandQueue):
     queue.acquire(D1, "console.1", OPERATOR)
     assert queue.release(D1, "console.1") is None
     assert queue.commanders()[D1] is None
@@ -160,7 +160,7 @@ def test_a_released_drone_is_free_and_the_priority_is_gone(queue: CommandQueue):
 
 
 @pytest.mark.parametrize(("holder", "who"), [("a", "'a'"), (None, "nobody")])
-def test_only_the_commander_releases(queue: CommandQueue, holder: str | None, who: str):
+def test_only_the_commander_can_release_a_drone(queue: CommandQueue, holder: str | None, who: str):
     if holder:
         queue.claim(D1, holder)
     refusal = queue.release(D1, "b")
@@ -170,7 +170,7 @@ def test_only_the_commander_releases(queue: CommandQueue, holder: str | None, wh
     assert queue.commanders()[D1] == holder
 
 
-def test_a_setpoint_on_its_way_does_not_undo_a_release(queue: CommandQueue):
+def test_a_pending_setpoint_does_not_undo_a_release(queue: CommandQueue):
     send(queue, D1, "a")
     queue.push(D1, "velocity", velocity("a", 1), GATE_NS)
     queue.push(D1, "mode", mode("a", "land"), GATE_NS)
@@ -180,7 +180,7 @@ def test_a_setpoint_on_its_way_does_not_undo_a_release(queue: CommandQueue):
     assert queue.commanders() == [None, "a"]
 
 
-def test_who_is_gone_flies_nothing_any_more_and_has_no_priority(queue: CommandQueue):
+def test_a_removed_source_commands_no_drone_and_has_no_priority(queue: CommandQueue):
     queue.acquire(D1, "a", OPERATOR)
     send(queue, D2, "a")
     queue.push(D1, "velocity", velocity("a", 1), GATE_NS)
@@ -193,7 +193,7 @@ def test_who_is_gone_flies_nothing_any_more_and_has_no_priority(queue: CommandQu
     assert [command.priority for command in queue.pop(0)] == [PROGRAM]
 
 
-def test_one_that_was_outbid_keeps_no_priority_either(queue: CommandQueue):
+def test_an_outbid_source_loses_its_priority_when_removed(queue: CommandQueue):
     queue.acquire(D1, "console.1", OPERATOR)
     queue.acquire(D1, "console.2", OPERATOR + 1)
     assert queue.remove_source("console.1") == []
@@ -208,14 +208,14 @@ def test_one_that_was_outbid_keeps_no_priority_either(queue: CommandQueue):
 @pytest.mark.parametrize(
     ("priority", "refused"), [(PROGRAM, True), (OPERATOR - 1, True), (OPERATOR, False), (OPERATOR + 1, False)]
 )
-def test_modes_are_open_to_a_priority_no_lower_than_the_commander_s(queue: CommandQueue, priority: int, refused: bool):
+def test_modes_require_at_least_the_priority_of_the_commander(queue: CommandQueue, priority: int, refused: bool):
     queue.acquire(D1, "a", OPERATOR)
     reason = queue.refusal(QueuedCommand(0, priority, "b", 0, D1, "mode", mode("b", "land")))
     assert (reason is not None) is refused
 
 
 @pytest.mark.parametrize("commander", [None, "controller.main"])
-def test_modes_are_open_to_all_while_nobody_or_a_program_flies(queue: CommandQueue, commander: str | None):
+def test_modes_are_open_to_all_unless_an_operator_commands(queue: CommandQueue, commander: str | None):
     if commander:
         send(queue, D1, commander)
     queue.push(D1, "mode", mode("other", "land"), 0)
@@ -230,7 +230,7 @@ AGE_MAX_MS = 400
 
 
 def refusals(mode: str, age_ms: int, kind: str = "velocity") -> list[dict[str, Any]]:
-    """Return the refusals of a command of gate 0 that comes so much later."""
+    """Return the refusals of a command stamped at gate 0 that arrives this much later."""
     world = small_world(mode, duration_s=10, time={"max_command_age_ms": AGE_MAX_MS})
     for _ in range(1 + age_ms * 1_000_000 // GATE_NS):
         world.advance(0)
@@ -240,14 +240,14 @@ def refusals(mode: str, age_ms: int, kind: str = "velocity") -> list[dict[str, A
 
 
 @pytest.mark.parametrize("kind", ["velocity", "mode"])
-def test_an_old_command_is_refused_in_realtime_alone(kind: str):
+def test_an_old_command_is_refused_only_in_realtime(kind: str):
     (refusal,) = refusals("realtime", AGE_MAX_MS + 20, kind)
     assert has_terms(refusal["reason"], "age", "420 ms", "400 ms")
     assert refusals("realtime", AGE_MAX_MS, kind) == refusals("lockstep", 10 * AGE_MAX_MS, kind) == []
 
 
 @pytest.mark.parametrize(("priority", "ok"), [(0, True), (PRIORITY_MAX, True), (-1, False), (PRIORITY_MAX + 1, False)])
-def test_a_drone_is_acquired_with_any_priority_of_the_protocol(priority: int, ok: bool):
+def test_acquire_takes_exactly_the_priorities_of_the_protocol(priority: int, ok: bool):
     world = small_world("realtime")
     answer = world.control(ControlRequest("acquire", {"drone": "d1", "priority": priority}, "me.x"))
     assert answer.ok == ok
@@ -257,14 +257,14 @@ MISSION = {"drone": "d1", "state": "aborted", "items": 5, "done": 3, "reason": "
 
 
 def reported(**changed: Any) -> tuple[str, list[Event]]:
-    """Report a mission; return the refusal and the events of missions."""
+    """Report a mission; return the refusal and the mission events."""
     world = small_world("realtime")
     world.advance(0)
     answer = world.control(ControlRequest("mission", MISSION | changed, "mavlink.main"))
     return answer.error, events_of(world, "mission")
 
 
-def test_a_mission_that_is_reported_is_an_event_of_its_drone():
+def test_a_reported_mission_becomes_an_event_of_its_drone():
     error, (event,) = reported()
     assert (error, event.subject, event.source) == ("", "d1", "mavlink.main")
     assert event.data == {name: value for name, value in MISSION.items() if name != "drone"}
@@ -274,7 +274,7 @@ def test_a_mission_that_is_reported_is_an_event_of_its_drone():
 @pytest.mark.parametrize(
     "changed", [{"drone": "d9"}, {"state": "lost"}, {"items": -1}, {"done": "3"}, {"done": 10**9}, {"items": True}]
 )
-def test_a_report_of_a_mission_that_is_none_is_refused_and_is_no_event(changed: dict[str, Any]):
+def test_an_invalid_mission_report_is_refused_without_an_event(changed: dict[str, Any]):
     error, found = reported(**changed)
     ((name, value),) = changed.items()
     assert error.startswith(f"{name} is {value!r}; must be ")
@@ -318,7 +318,7 @@ def to_fly(world: World, source: str = ME, seq: int = 0, speed: float = 1.0) -> 
 
 
 def command(world: World, message: Any, kind: str = "velocity", drone: str = "d2") -> list[tuple[str, Any]]:
-    """Send a command; return what the world publishes because of it, without passing time."""
+    """Send a command; return what the world publishes in response, without advancing time."""
     world.handle(keys.command(drone, kind), message, 0)
     return world.take_outbox()
 
@@ -327,14 +327,14 @@ def kinds(published: list[tuple[str, Any]]) -> list[str]:
     return [message.kind for _, message in published if isinstance(message, Event)]
 
 
-def test_an_accepted_command_is_repeated_at_once(world: World):
+def test_an_accepted_command_is_republished_at_once(world: World):
     sent = [to_fly(world, seq=10 + seq) for seq in range(3)]
     for seq, each in enumerate(sent):
         published = command(world, each)
         accepted = [message for key, message in published if key == keys.accepted("d2", "velocity")]
         assert accepted == [Velocity(each.t_ns, seq, ME, each.velocity_m_s, 0.2, "world")]
         assert kinds(published) == (["commander"] if seq == 0 else [])
-        assert command(world, each) == []  # the same again
+        assert command(world, each) == []  # a repetition is ignored
     assert world.queue.commanders() == [None, ME]
     world.advance(0)
     assert not [key for key, _ in world.take_outbox() if "/accepted/" in key]
@@ -354,7 +354,7 @@ def test_a_second_source_is_refused_until_it_acquires_the_drone(world: World):
     assert "refused" in kinds(command(world, to_fly(world, seq=5)))
 
 
-def test_modes_are_judged_by_the_state_of_the_driver(world: World):
+def test_modes_are_checked_against_the_state_the_driver_reports(world: World):
     published = command(world, Mode(world.now_ns, 0, ME, "takeoff"), "mode")
     assert kinds(published) == ["refused"]
     assert has_terms(published[0][1].text, "d2 is hovering", "landed")
@@ -364,7 +364,7 @@ def test_modes_are_judged_by_the_state_of_the_driver(world: World):
     assert dict(published)[keys.accepted("d2", "mode")] == Mode(world.now_ns, 0, ME, "takeoff")
 
 
-def test_an_old_command_is_refused(world: World):
+def test_an_old_command_to_an_external_drone_is_refused(world: World):
     world.take_outbox()
     message = Velocity(0, 0, ME, ZEROS, 0.0)
     for _ in range(10):
@@ -373,19 +373,19 @@ def test_an_old_command_is_refused(world: World):
     assert kinds(command(world, message)) == ["refused"]
 
 
-def test_one_who_has_not_joined_has_the_event_of_his_command(world: World):
+def test_a_command_from_a_source_that_has_not_joined_is_an_event(world: World):
     published = command(world, to_fly(world, OTHER))
     assert kinds(published) == ["command", "commander"]
     assert published[0][1].data["apply_t_ns"] == world.now_ns
     assert keys.accepted("d2", "velocity") in dict(published)
 
 
-def test_a_command_to_an_unknown_drone_is_refused_with_the_start_of_its_name(world: World):
+def test_a_command_to_an_unknown_drone_is_refused_with_a_shortened_name(world: World):
     ((_, refused),) = command(world, to_fly(world), drone="d" * 60)
     assert (refused.kind, parts(refused.data["reason"])) == ("refused", ("drone", repr("d" * 40)))
 
 
-def test_a_simulated_drone_whose_commander_releases_it_hovers():
+def test_a_released_simulated_drone_hovers():
     made = small_world()
     made.handle(keys.command("d1", "mode"), Mode(0, 0, ME, "takeoff"), 0)
     for _ in range(300):
@@ -399,7 +399,7 @@ def test_a_simulated_drone_whose_commander_releases_it_hovers():
     assert made.view(0).drones[0].state == "hovering"
 
 
-def test_who_releases_it_lets_it_hover(world: World):
+def test_a_released_external_drone_is_commanded_to_hover(world: World):
     command(world, to_fly(world))
     assert world.control(ControlRequest("release", {"drone": "d2"}, ME)).ok
     hover = dict(world.take_outbox())[keys.accepted("d2", "ardrone")]
@@ -409,7 +409,7 @@ def test_who_releases_it_lets_it_hover(world: World):
     assert dict(world.take_outbox())[keys.accepted("d2", "ardrone")].seq == 1
 
 
-def test_faults_of_its_link_delay_and_lose_a_command(world: World):
+def test_a_link_fault_delays_a_command(world: World):
     asked = {"kind": "link_delay", "target": f"{ME}/world", "delay_ms": 30, "for_s": 0.2}
     assert world.control(ControlRequest("fault_add", asked, "x")).ok
     world.advance(0)
@@ -424,14 +424,14 @@ def test_faults_of_its_link_delay_and_lose_a_command(world: World):
 
 
 @pytest.mark.parametrize("kind", ["gps_noise", "rotor_efficiency", "imu_dropout"])
-def test_no_fault_acts_on_what_nobody_simulates(world: World, kind: str):
+def test_faults_of_an_external_drone_are_refused(world: World, kind: str):
     more = {"gps_noise": {"factor": 2}, "rotor_efficiency": {"rotor": "all", "value": 0.5}}.get(kind, {})
     answer = world.control(ControlRequest("fault_add", {"kind": kind, "target": "d2", **more}, "x"))
     assert has_terms(answer.error, "target", "'d2'", "external")
     assert world.control(ControlRequest("fault_add", {"kind": kind, "target": "d1", **more}, "x")).ok
 
 
-def test_views_and_the_hash_know_who_is_external(world: World):
+def test_an_external_drone_is_in_the_views_but_not_in_gates_or_hash(world: World):
     pose = Truth(world.now_ns, 0, (4.0, 1.0, 2.0), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (300.0,) * 4)
     world.take_of_driver("d2", pose)
     world.advance(0)
@@ -450,7 +450,7 @@ def test_views_and_the_hash_know_who_is_external(world: World):
     assert moved.result()["truth_sha256"] != alone.result()["truth_sha256"]
 
 
-def test_the_result_has_the_least_distance_of_the_whole_run(world: World):
+def test_the_result_has_the_shortest_distance_of_the_whole_run(world: World):
     for x_m in (4.0, 2.0, 3.0):
         pose = Truth(world.now_ns, 0, (x_m, 0.0, 0.058), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (300.0,) * 4)
         assert world.take_of_driver("d2", pose) is None
@@ -458,7 +458,7 @@ def test_the_result_has_the_least_distance_of_the_whole_run(world: World):
     assert world.result()["closest_m"] == pytest.approx(2.0, abs=0.01)
 
 
-def test_the_hash_is_that_of_the_simulated_drones():
+def test_the_hash_covers_only_the_simulated_drones():
     only = world_of(MIXED.replace("  - {name: d2, position_m: [4, 0, 0], body: external}\n", ""), "lockstep")
     mixed = world_of()
     for _ in range(30):
@@ -467,7 +467,7 @@ def test_the_hash_is_that_of_the_simulated_drones():
     assert mixed.result()["truth_sha256"] == only.result()["truth_sha256"]
 
 
-def test_estimators_of_it_have_no_deadlines_and_may_wait_for_the_driver_as_long_as_it_takes(world: World):
+def test_estimators_of_an_external_drone_have_no_deadlines(world: World):
     for name in ("estimator.d2", "estimator.d1"):
         world.handle(keys.process(name, "join"), Join(0, 0, "run1", 1, "estimator", "h", 1, GATE_NS), 0)
     waits = {name: world.must_wait_for(p) for name, p in world.barrier.participants.items()}
@@ -481,7 +481,7 @@ def test_estimators_of_it_have_no_deadlines_and_may_wait_for_the_driver_as_long_
     assert world.barrier.participants["estimator.d2"].done_ns == world.now_ns
 
 
-def test_a_world_that_goes_on_elsewhere_has_what_drivers_published(world: World):
+def test_a_continued_world_keeps_what_drivers_published(world: World):
     command(world, to_fly(world))
     other = world_of()
     continue_from(world, other)
@@ -492,12 +492,12 @@ def test_a_world_that_goes_on_elsewhere_has_what_drivers_published(world: World)
     assert other.view(0) == world.view(0)
 
 
-def test_lockstep_is_refused_with_the_reason():
+def test_lockstep_with_an_external_drone_is_refused_with_the_reason():
     with refused(ScenarioError, "mixed", "d2", "external", "lockstep", "--realtime"):
         world_of(mode="lockstep")
 
 
-def test_an_emergency_that_a_driver_reports_in_flight_is_an_event_once(world: World):
+def test_an_emergency_reported_in_flight_is_an_event_once(world: World):
     for state in ("emergency", "emergency", "landed", "emergency"):
         assert world.take_of_driver("d2", status(world.now_ns, state)) is None
     (event,) = [m for _, m in world.take_outbox() if isinstance(m, Event) and m.kind == "emergency"]

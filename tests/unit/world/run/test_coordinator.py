@@ -1,4 +1,4 @@
-"""What a loss means for a run: who comes back in its time, and what is done without it."""
+"""How a run reacts to processes that die, stay away, fail or leave early."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ def say_bye(made: World, name: str = ME, reason: str = "enough", **of: Any) -> N
 
 
 def world(processes: str = "on_death: {}", mode: str = "lockstep") -> World:
-    """Return a world that ME has taken part in since wall time 0, and whose time stands for ME."""
+    """Return a world that ME joined at wall time 0 and that now waits for ME."""
     made = small_world(mode, processes=yaml.safe_load(f"{{{processes}}}"))
     join(made, ME)
     while made.may_advance():
@@ -42,11 +42,11 @@ def world(processes: str = "on_death: {}", mode: str = "lockstep") -> World:
 
 
 def events(made: World) -> list[tuple[str, str]]:
-    """Return kinds and subjects of the events since the last look."""
+    """Return the kinds and subjects of the events since the last call."""
     return [(event.kind, event.subject) for event in events_of(made)]
 
 
-def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
+def test_a_dead_process_is_overdue_exactly_after_its_return_time() -> None:
     made = world("return_s: 2")
     assert made.overdue(10 * RETURN_NS) is None
     made.died(ME, 1)
@@ -57,7 +57,7 @@ def test_one_that_died_is_overdue_after_its_time_and_not_before() -> None:
 
 
 @pytest.mark.parametrize(("processes", "changes"), [("on_death: {}", ["death"]), ("return_s: 2", ["silence", "back"])])
-def test_without_a_time_or_after_its_return_nobody_is_overdue(processes: str, changes: list[str]) -> None:
+def test_no_process_is_overdue_without_a_return_time_or_once_it_is_back(processes: str, changes: list[str]) -> None:
     made = world(processes)
     for change in changes:
         made.died(ME, 1) if change == "death" else made.silence_changed(ME, 5 if change == "silence" else None)
@@ -65,7 +65,7 @@ def test_without_a_time_or_after_its_return_nobody_is_overdue(processes: str, ch
 
 
 @pytest.mark.parametrize("whose", ["estimator", ME])
-def test_or_goes_on_without_it(whose: str) -> None:
+def test_a_run_continues_without_an_overdue_process_if_configured(whose: str) -> None:
     made = world(f"return_s: 2, on_overdue: {{{whose}: drop}}")
     made.died(ME, 1)
     assert not made.may_advance()
@@ -76,7 +76,7 @@ def test_or_goes_on_without_it(whose: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["camera.main", "detector.d1"])
-def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> None:
+def test_an_overdue_process_that_does_not_gate_does_not_end_the_run(name: str) -> None:
     made = world("return_s: 2")
     join(made, name, 2, period_ns=0)
     made.died(name, 1)
@@ -86,7 +86,7 @@ def test_one_for_which_no_gate_waits_ends_nothing_by_staying_away(name: str) -> 
 
 
 @pytest.mark.parametrize(("on_death", "ends"), [("wait", True), ("restart", True), ("end", True), ("drop", False)])
-def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_death: str, ends: bool) -> None:
+def test_a_silent_process_is_overdue_too_and_handled_by_on_death(on_death: str, ends: bool) -> None:
     made = world(f"return_s: 2, on_death: {{estimator: {on_death}}}")
     made.silence_changed(ME, 5)
     assert (made.overdue(RETURN_NS + 5), made.overdue(RETURN_NS + 6)) == (None, ME)
@@ -94,7 +94,7 @@ def test_one_that_is_stopped_is_overdue_too_and_on_death_says_what_it_means(on_d
     assert (made.ended is not None) is ends
 
 
-def test_nobody_overdue_is_waited_for() -> None:
+def test_on_overdue_cannot_be_wait() -> None:
     with pytest.raises(ScenarioError, match=r"processes\.on_overdue\.estimator"):
         small_world(processes={"return_s": 1, "on_overdue": {"estimator": "wait"}})
 
@@ -114,7 +114,7 @@ def test_nobody_overdue_is_waited_for() -> None:
         ("silence_changed", (ME, 5)),
     ],
 )
-def test_a_loss_a_join_and_a_request_are_the_same_from_the_journal(method: str, args: tuple[Any, ...]) -> None:
+def test_calls_replayed_from_the_journal_have_the_same_effect(method: str, args: tuple[Any, ...]) -> None:
     assert method in inputs.CALLS
     (entry,) = inputs.decode(inputs.encode([Called(method, args)]))
     made, again = world("return_s: 2"), world("return_s: 2")
@@ -123,7 +123,7 @@ def test_a_loss_a_join_and_a_request_are_the_same_from_the_journal(method: str, 
     assert made.barrier.participants == again.barrier.participants
 
 
-# One that never comes
+# A process that never joins
 
 
 def waiting(processes: str, is_launched: bool = True) -> World:
@@ -143,19 +143,19 @@ def waiting(processes: str, is_launched: bool = True) -> World:
         ("start_timeout_s: 500", True, 400.0, None),
     ],
 )
-def test_one_that_never_joins_is_overdue_after_its_time(
+def test_a_process_that_never_joins_is_overdue_after_the_timeout(
     processes: str, is_launched: bool, after_s: float, name: str | None
 ) -> None:
     assert waiting(processes, is_launched).overdue(round(after_s * 1e9)) == name
 
 
-def test_one_that_the_launcher_starts_may_compile_first() -> None:
+def test_a_process_started_by_the_launcher_has_time_to_compile() -> None:
     made = waiting("on_death: {}")
     join(made, OWN)
     assert (made.overdue(61 * 10**9), made.overdue(601 * 10**9)) == (None, ME)
 
 
-def test_then_the_run_fails_and_names_it() -> None:
+def test_a_run_fails_if_an_expected_process_never_joins() -> None:
     made = waiting("start_timeout_s: 5")
     made.expired(OWN)
     assert events(made) == [("overdue", OWN)]
@@ -164,7 +164,7 @@ def test_then_the_run_fails_and_names_it() -> None:
     assert made.ended == str(made.failure)
 
 
-def test_or_begins_without_it_where_the_scenario_says_so() -> None:
+def test_a_run_starts_without_an_overdue_process_if_configured() -> None:
     made = waiting("start_timeout_s: 5, on_overdue: {fence: drop}")
     join(made, ME)
     assert not made.may_advance()
@@ -174,7 +174,7 @@ def test_or_begins_without_it_where_the_scenario_says_so() -> None:
     assert made.failure is None
 
 
-# One that cannot go on, and who leaves
+# Processes that fail or leave
 
 
 @pytest.mark.parametrize(
@@ -186,7 +186,7 @@ def test_or_begins_without_it_where_the_scenario_says_so() -> None:
         ("drop", ["failure", "drop"], False, False),
     ],
 )
-def test_one_that_cannot_go_on_is_named_and_on_death_says_what_follows(
+def test_a_failed_process_is_reported_and_handled_by_on_death(
     on_death: str, kinds: list[str], ends: bool, waits: bool
 ) -> None:
     made = world(f"on_death: {{estimator: {on_death}}}")
@@ -229,7 +229,7 @@ def test_a_late_bye_of_a_former_incarnation_ends_nothing() -> None:
 
 
 @pytest.mark.parametrize("failed", [UNSET, True])
-def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(failed: Any) -> None:
+def test_a_bye_without_an_incarnation_counts_once_the_token_is_gone(failed: Any) -> None:
     made = world("on_death: {estimator: drop}")
     say_bye(made, failed=failed)
     assert events(made) == []
@@ -239,7 +239,7 @@ def test_a_bye_without_an_incarnation_counts_when_the_token_is_gone_as_well(fail
 
 
 @pytest.mark.parametrize("is_over", [False, True])
-def test_or_when_nobody_ever_showed_a_token_or_the_run_is_over(is_over: bool) -> None:
+def test_a_bye_without_an_incarnation_counts_without_a_token_or_at_the_end(is_over: bool) -> None:
     made = world()
     say_bye(made)
     made.publish_end() if is_over else made.not_shown(ME, "has no liveliness token", 6)
@@ -248,8 +248,8 @@ def test_or_when_nobody_ever_showed_a_token_or_the_run_is_over(is_over: bool) ->
     assert (made.left_early == []) is is_over
 
 
-def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:
-    """A living estimator that somebody else says bye for takes part as before, and its death is a death."""
+def test_a_done_after_a_bye_without_an_incarnation_refutes_the_bye() -> None:
+    """A living estimator for which another process says bye takes part as before, and its death counts as a death."""
     made = world()
     say_bye(made)
     made.handle(keys.process(ME, "done"), Done(0, 0, "run1", 1, 0, 0), 6)
@@ -269,7 +269,7 @@ def test_who_says_done_after_such_a_bye_has_not_said_it() -> None:
         ("on_death: {}", (ME,), False),
     ],
 )
-def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
+def test_an_early_leaver_is_reported_and_fails_the_run_unless_allowed(
     processes: str, serves: tuple[str, ...], fails: bool
 ) -> None:
     made = world(processes)
@@ -287,7 +287,7 @@ def test_who_leaves_early_is_named_and_fails_the_run_unless_that_is_allowed(
 
 
 @pytest.mark.parametrize("name", ["console.1", "recorder"])
-def test_who_is_not_needed_may_leave_and_a_recorder_ends_the_run(name: str) -> None:
+def test_an_unneeded_process_may_leave_but_a_recorder_ends_the_run(name: str) -> None:
     made = world()
     join(made, name, 4, period_ns=0)
     say_bye(made, name, run_id="run1", incarnation=4)
@@ -295,13 +295,13 @@ def test_who_is_not_needed_may_leave_and_a_recorder_ends_the_run(name: str) -> N
     assert (made.ended is not None) is (name == "recorder")
 
 
-# Who is held up by whom
+# Which processes hold up which
 
 PAIR: dict[str, Any] = {"drones": 2, "clusters": [{"name": "main", "drones": ["d1", "d2"]}]}
 ESTIMATORS, CONTROLLER = ("estimator.d1", "estimator.d2"), "controller.main"
 
 
-def test_estimators_feed_the_controller_and_nobody_else_anybody():
+def test_only_estimators_feed_the_controller_and_the_planner():
     flow = DataFlow(small_world(**PAIR).scenario)
     names = (*ESTIMATORS, CONTROLLER, "planner.main", "tester.one")
     pairs = {(writer, reader) for writer in names for reader in names if flow.feeds(writer, reader)}
@@ -315,7 +315,7 @@ def test_estimators_feed_the_controller_and_nobody_else_anybody():
         (ESTIMATORS, {CONTROLLER: ()}),  # or the cause
     ],
 )
-def test_who_lacks_an_estimate_is_a_victim(done: list[str], held_by: dict[str, tuple[str, ...]]):
+def test_a_process_that_lacks_an_estimate_is_reported_as_held_up(done: list[str], held_by: dict[str, tuple[str, ...]]):
     made = small_world(**PAIR)
     for name in (*ESTIMATORS, CONTROLLER):
         join(made, name)

@@ -1,4 +1,4 @@
-"""Requested faults: added, begun, ended, cleared, and published before the first gate that they change."""
+"""Faults during a run: added, begun, ended, cleared, and published before the first gate that they affect."""
 
 import json
 from typing import Any
@@ -48,18 +48,18 @@ def go(made: World, gates: int) -> None:
 
 
 def events(made: World) -> list[tuple[int, str, int]]:
-    """Return (gate, kind, id) of the events of faults since the last time."""
+    """Return (gate, kind, id) of the fault events since the last call."""
     published = [message for key, message in made.take_outbox() if key == keys.EVENT]
     return [(e.t_ns // GATE_NS, e.kind, e.data["id"]) for e in published if e.kind.startswith("fault")]
 
 
 def listed(made: World) -> list[list[int]]:
-    """Return the ids of every list since the last time."""
+    """Return the fault ids of every list published since the last call."""
     return [[fault.id for fault in m.faults] for _, m in made.take_outbox() if isinstance(m, Faults)]
 
 
-def test_where_agents_talk_without_a_radio_a_fault_of_it_is_refused_while_flying():
-    """No gate tells these agents who hears whom; a fault that is planned, or a radio, brings it."""
+def test_a_radio_fault_is_refused_during_a_run_whose_agents_have_no_radio():
+    """Gates tell agents which of them hear each other only given a planned radio fault or a radio."""
     word = {"message": "Word", "key": "talk/*/word", "fields": {"said": "number"}}
     agents = {"talk": {"class": "talkers:Talker", "declared": [word]}}
     radio = {"kind": "radio", "target": "main", "range_m": 5}
@@ -70,7 +70,7 @@ def test_where_agents_talk_without_a_radio_a_fault_of_it_is_refused_while_flying
         assert is_taken or has_terms(answer.error, "kind", "radio")
 
 
-def test_a_fault_of_a_sensor_that_the_drone_does_not_have_is_refused():
+def test_a_fault_of_a_sensor_that_the_drone_lacks_is_refused():
     sensors = {"d1": {"range": {}}, "d2": {}}
     document = yaml.safe_load(SCENARIO)
     for drone in document["drones"]:
@@ -81,7 +81,7 @@ def test_a_fault_of_a_sensor_that_the_drone_does_not_have_is_refused():
     assert has_terms(answer.error, "target", "'d2'", "range", "d1", "range_stuck")
 
 
-def test_what_the_scenario_plans_is_published_at_the_start_begun_and_ended():
+def test_planned_faults_are_published_at_the_start_begun_and_ended():
     kill = "{kind: process_kill, target: estimator.d1, at_s: 0.02}"  # it has no end
     made = world(
         f"[{{kind: gps_dropout, target: d1, at_s: 0.04, for_s: 0.06}}, {{kind: mag_stuck, target: d2}}, {kill}]"
@@ -92,7 +92,7 @@ def test_what_the_scenario_plans_is_published_at_the_start_begun_and_ended():
     assert events(made) == [(0, "fault", 2), (1, "fault", 3), (2, "fault", 1), (5, "fault_end", 1)]
 
 
-def test_an_event_says_all_of_a_fault():
+def test_an_event_describes_a_fault_completely():
     made = world()
     go(made, 3)
     add(made, "baro_bias", value_m=2, for_s=1)
@@ -104,7 +104,7 @@ def test_an_event_says_all_of_a_fault():
     assert event.data == {**what, "from_ns": 2 * GATE_NS, "until_ns": 52 * GATE_NS, "source": "tester.one"}
 
 
-def test_a_requested_fault_is_published_before_the_gate_that_nobody_has_seen_yet():
+def test_a_requested_fault_is_published_before_the_first_unseen_gate():
     made = world(delay_gates=5)
     go(made, 4)
     made.take_outbox()
@@ -114,7 +114,7 @@ def test_a_requested_fault_is_published_before_the_gate_that_nobody_has_seen_yet
     assert published == [keys.FAULTS, keys.GATE]
 
 
-def test_what_has_ended_stays_on_the_list_while_somebody_may_work_on_its_gates():
+def test_an_ended_fault_stays_listed_while_its_gates_may_be_in_use():
     made = world(delay_gates=3)
     go(made, 1)
     add(made, for_s=0.04)
@@ -125,7 +125,7 @@ def test_what_has_ended_stays_on_the_list_while_somebody_may_work_on_its_gates()
     assert listed(made) == [[]]
 
 
-def test_nothing_is_kept_of_what_has_left_the_list():
+def test_nothing_is_kept_of_a_fault_that_is_no_longer_listed():
     made = world("[{kind: gps_dropout, target: d1, at_s: 0.02, for_s: 0.04}]")
     go(made, 1)
     add(made, "mag_stuck", "d2")
@@ -138,14 +138,14 @@ def test_nothing_is_kept_of_what_has_left_the_list():
 
 
 def joined(made: World, name: str, period_gates: int, fingerprint: str = "x") -> None:
-    """Let a process join, as one of zsim.runtime.runner does, unless it has no fingerprint."""
+    """Let a process join as `zsim.runtime.runner` does or, without a fingerprint, as another program."""
     run_id, period_ns = made.info().run_id, period_gates * GATE_NS
     join = Join(0, 0, run_id, 1, name.partition(".")[0], "here", 1, period_ns, fingerprint=fingerprint)
     made.handle(keys.process(name, "join"), join, 0)
 
 
-def test_what_has_ended_stays_on_the_list_for_who_steps_rarely():
-    """One that steps every fourth gate hands its agent gates of up to four gates, and the delay, ago."""
+def test_an_ended_fault_stays_listed_for_a_process_with_a_long_period():
+    """A process that steps every fourth gate hands its agent gates from up to four gates plus the delay ago."""
     made = world(delay_gates=3)
     joined(made, "slow.one", 4)
     go(made, 1)
@@ -168,7 +168,7 @@ def test_what_has_ended_stays_on_the_list_for_who_steps_rarely():
         ("my.filter", 1, "x", False),
     ],
 )
-def test_no_process_is_killed_that_does_not_read_the_faults(
+def test_a_kill_of_a_process_that_does_not_read_faults_is_refused(
     name: str, period_gates: int, fingerprint: str, refused: bool
 ):
     made = world()
@@ -180,7 +180,7 @@ def test_no_process_is_killed_that_does_not_read_the_faults(
         assert (where, found.partition(",")[0]) == ("target", repr(name))
 
 
-def test_a_planned_kill_of_who_does_not_die_says_so():
+def test_a_planned_kill_without_effect_is_reported():
     made = world("[{kind: process_kill, target: estimator.d1, at_s: 0.04}]")
     joined(made, "estimator.d1", 0)
     go(made, 4)
@@ -189,8 +189,8 @@ def test_a_planned_kill_of_who_does_not_die_says_so():
     assert has_terms(texts[0], "process_kill", "estimator.d1", "no effect")
 
 
-def test_equal_faults_are_numbered_by_who_begins_and_keep_that():
-    """So the same faults planned from the events of their beginning draw the same."""
+def test_equal_faults_are_ranked_by_start_and_keep_their_rank():
+    """Thus the same faults, planned from their start events, draw the same random numbers."""
 
     def ranks() -> dict[int, int]:
         return {fault.id: fault.rank for fault in made.faults.all}
@@ -206,7 +206,7 @@ def test_equal_faults_are_numbered_by_who_begins_and_keep_that():
     assert ranks() == {3: 0, 4: 1}
 
 
-def test_what_links_carry_is_what_acts():
+def test_link_faults_at_a_gate_are_those_that_act_then():
     made = world()
     add(made, "link_cut", "world/controller.main", at_s=0.04, for_s=0.04)
     add(made, "radio", "main", range_m=10)
@@ -219,7 +219,7 @@ def test_what_links_carry_is_what_acts():
         go(made, 1)
 
 
-def test_clearing_ends_what_acts_and_forgets_what_was_planned():
+def test_clearing_ends_active_faults_and_removes_planned_ones():
     made = world()
     go(made, 2)
     add(made, "gps_dropout")
@@ -240,7 +240,7 @@ def test_clearing_ends_what_acts_and_forgets_what_was_planned():
 @pytest.mark.parametrize(
     ("args", "cleared"), [({"id": 2}, [2]), ({"target": "d1"}, [1, 2]), ({"kind": "gps_stuck"}, [2, 3])]
 )
-def test_some_are_cleared(args: dict[str, Any], cleared: list[int]):
+def test_faults_are_cleared_by_id_target_or_kind(args: dict[str, Any], cleared: list[int]):
     made = world()
     go(made, 1)
     for kind, target in (("gps_dropout", "d1"), ("gps_stuck", "d1"), ("gps_stuck", "d2")):
@@ -260,7 +260,7 @@ def test_some_are_cleared(args: dict[str, Any], cleared: list[int]):
         ("fault_clear", {"name": 7}, "name", "not known"),
     ],
 )
-def test_a_refusal_is_a_line_with_the_argument_and_its_value(op: str, args: dict[str, Any], where: str, found: str):
+def test_a_refusal_is_one_line_with_the_argument_and_its_value(op: str, args: dict[str, Any], where: str, found: str):
     made = world()
     go(made, 4)
     add(made)
@@ -270,7 +270,7 @@ def test_a_refusal_is_a_line_with_the_argument_and_its_value(op: str, args: dict
     assert len(answer.error.splitlines()) == 1
 
 
-def test_all_is_as_before_when_all_is_cleared():
+def test_clearing_all_faults_restores_the_original_state():
     made, sound = world(), world()
     faults: tuple[tuple[str, dict[str, Any]], ...] = (
         ("gps_noise", {"factor": 2}),
@@ -299,8 +299,8 @@ def test_all_is_as_before_when_all_is_cleared():
         ("link_cut", "pilot.other", {}, 1),
     ],
 )
-def test_commands_come_late_or_never(kind: str, sender: str, more: dict[str, Any], applied_after: int | None):
-    """The sender is nobody in the lockstep: its command takes effect a gate after its arrival, and the delay."""
+def test_link_faults_delay_or_drop_commands(kind: str, sender: str, more: dict[str, Any], applied_after: int | None):
+    """The sender is not in the lockstep: its command takes effect one gate after its arrival, plus the delay."""
     made = world()
     go(made, 1)
     add(made, kind, f"{sender}/world", **more)
@@ -309,7 +309,7 @@ def test_commands_come_late_or_never(kind: str, sender: str, more: dict[str, Any
     assert applied == ([] if applied_after is None else [(1 + applied_after) * GATE_NS])
 
 
-def test_a_radio_out_of_reach_brings_no_command():
+def test_a_command_from_beyond_radio_range_is_lost():
     made = world()
     go(made, 1)
     add(made, "radio", "main", range_m=10, spread_m=0.1, place={"pilot.me": [100, 0, 0]})
@@ -318,7 +318,7 @@ def test_a_radio_out_of_reach_brings_no_command():
     made.handle(keys.command("d1", "velocity"), Velocity(0, 0, "pilot.near", (0.0, 0.0, 0.0), 0.0), 0)
     go(made, 4)
     refused = [m.source for _, m in made.take_outbox() if isinstance(m, Event) and m.kind == "refused"]
-    assert refused == ["pilot.near"]  # only its command comes, and a drone on the ground refuses it
+    assert refused == ["pilot.near"]  # only its command arrives, and a drone on the ground refuses it
 
 
 def test_the_radio_of_one_formation_loses_no_command_to_another():
@@ -332,4 +332,4 @@ def test_the_radio_of_one_formation_loses_no_command_to_another():
         made.handle(keys.command(drone, "velocity"), Velocity(0, 0, "pilot.me", (0.0, 0.0, 0.0), 0.0), 0)
     go(made, 4)
     refused = [m.subject for _, m in made.take_outbox() if isinstance(m, Event) and m.kind == "refused"]
-    assert refused == ["drone/d3/cmd/velocity"]  # only its command comes, and a drone on the ground refuses it
+    assert refused == ["drone/d3/cmd/velocity"]  # only its command arrives, and a drone on the ground refuses it

@@ -1,4 +1,4 @@
-"""A record as a run that is played: which message comes with which gate, what is played, what is refused."""
+"""Playing a record as a run: which message belongs to which gate, what is played and what is refused."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,7 +53,7 @@ def event(gate: int, kind: str, seq: int = 0) -> KeyedMessage:
 
 
 def drone(gate: int, name: str) -> Iterator[KeyedMessage]:
-    """Yield what the world says of a drone at a gate: an IMU before it, a fix at it, truth, status."""
+    """Yield what the world publishes about a drone at a gate: an IMU sample before it, a fix at it, truth, status."""
     t_ns = gate * GATE_NS
     yield keys.sensor(name, "imu"), Imu(max(0, t_ns - 5_000_000), gate, t_ns, ZEROS, ZEROS)
     yield keys.sensor(name, "gps"), Gps(t_ns, gate, t_ns, 0.0, 0.0, 0.0, (float(gate), 0.0, 0.0), ZEROS, 2.0, 3, 9)
@@ -78,7 +78,7 @@ def write(folder: Path, recorded: list[KeyedMessage]) -> RecordReader:
 
 @pytest.fixture
 def flight(tmp_path: Path) -> Iterator[RecordReader]:
-    """Ten gates; the estimators answer a gate late, the controller two."""
+    """Ten gates; the estimators answer one gate late, the controller two."""
     recorded: list[KeyedMessage] = [(keys.INFO, INFO), event(0, "join"), clock(0, "waiting")]
     join = Join(0, 0, "flown", 1, "estimator", "h", 1, GATE_NS)
     recorded += [(keys.process("estimator.d1", "join"), join)]
@@ -113,7 +113,7 @@ def on(key: str, published: list[tuple[str, bytes]]) -> list[Any]:
     return [messages.decode(name, payload) for name, payload in published if name == key]
 
 
-# Which message comes with which gate
+# Which message belongs to which gate
 
 
 def gates_of(recorded: list[KeyedMessage], tmp_path: Path, delay_gates: int = 1) -> dict[int, list[tuple[str, int]]]:
@@ -124,7 +124,7 @@ def gates_of(recorded: list[KeyedMessage], tmp_path: Path, delay_gates: int = 1)
 
 
 @pytest.mark.parametrize("late", [0, 1, 2, 4])
-def test_an_answer_comes_with_its_gate_however_far_the_world_ran_ahead(late: int, tmp_path: Path):
+def test_an_answer_belongs_to_its_gate_however_far_the_world_ran_ahead(late: int, tmp_path: Path):
     recorded = [clock(0)]
     for number in range(1, 20):
         recorded += [clock(number), *([estimate(number - 1 - late)] if number > late else [])]
@@ -133,32 +133,32 @@ def test_an_answer_comes_with_its_gate_however_far_the_world_ran_ahead(late: int
         assert gates[number] == [(keys.estimate("d1"), number * GATE_NS)]
 
 
-def test_a_stamp_that_means_nothing_does_not_move_a_message(tmp_path: Path):
+def test_a_meaningless_time_stamp_does_not_move_a_message(tmp_path: Path):
     recorded = [message for number in range(10) for message in (clock(number), command(0), command(10**15))]
     gates = gates_of(recorded, tmp_path)
     assert gates[0] == gates[1] == [] or gates[0][0] == (CMD, 0)
-    # written after the clock of gate k, they are played with gate k + 1, but where the stamp 0 may be an answer's
+    # written after the clock of gate k, they are played with gate k + 1, except where stamp 0 may be an answer's
     assert [len(gates[number]) for number in range(4, 10)] == [2] * 6
     assert sum(map(len, gates.values())) == 18  # what follows the last clock belongs to no gate
 
 
-def test_sensors_between_two_gates_belong_to_the_second(tmp_path: Path):
+def test_sensor_data_between_two_gates_belong_to_the_second(tmp_path: Path):
     gates = gates_of([message for number in range(4) for message in gate(number)], tmp_path)
     assert [len(gates[number]) for number in range(4)] == [8] * 4
     assert (keys.sensor("d2", "imu"), 2 * GATE_NS - 5_000_000) in gates[2]
 
 
-def test_the_clocks_of_a_run_that_stands_are_no_gates(tmp_path: Path):
+def test_clocks_of_a_halted_run_are_not_gates(tmp_path: Path):
     recorded = [clock(0, "waiting"), clock(0, "waiting"), *gate(0), clock(0, "paused"), *gate(1), clock(1, "stopped")]
     assert [*gates_of(recorded, tmp_path)] == [0, 1]
 
 
-def test_a_gate_that_is_cut_is_not_played(tmp_path: Path):
+def test_an_incomplete_gate_is_not_played(tmp_path: Path):
     recorded = [*gate(0), *gate(1), *[*drone(2, "d1")]]
     assert [*gates_of(recorded, tmp_path)] == [0, 1]
 
 
-def test_it_reads_a_few_gates_ahead_and_no_more(tmp_path: Path):
+def test_the_record_is_read_only_a_few_gates_ahead(tmp_path: Path):
     with write(tmp_path, [message for number in range(1000) for message in gate(number)]) as reader:
         read: list[Recorded] = []
 
@@ -178,7 +178,7 @@ def test_it_reads_a_few_gates_ahead_and_no_more(tmp_path: Path):
 # What is played
 
 
-def test_all_is_played_but_what_processes_published_of_themselves(flight: RecordReader):
+def test_everything_but_process_messages_and_views_is_played(flight: RecordReader):
     published = played(playback(flight))
     again = ("drone/d1/sensor/imu", "drone/d2/truth", "drone/d1/sensor/status", "drone/d2/estimate", CMD)
     for key in (*again, "cluster/main/state"):
@@ -192,7 +192,7 @@ def test_all_is_played_but_what_processes_published_of_themselves(flight: Record
     assert [e.kind for e in on(keys.EVENT, published)] == ["join"]  # its own end is published by publish_end
 
 
-def test_the_end_names_the_run_that_was_played(flight: RecordReader):
+def test_info_and_end_name_the_played_run(flight: RecordReader):
     made = playback(flight, to_ns=5 * GATE_NS)
     info = made.info()
     assert (info.run_id, info.replay_of, info.mode, info.rate) == ("replay", "flown", "lockstep", 0.0)
@@ -207,7 +207,7 @@ def test_the_end_names_the_run_that_was_played(flight: RecordReader):
     assert has_terms(made.ended or "", "0.1")
 
 
-def test_a_part_is_played(flight: RecordReader):
+def test_a_part_of_a_record_can_be_played(flight: RecordReader):
     made = playback(flight, from_ns=4 * GATE_NS - 1, keys=("drone/*/truth", "drone/d1/sensor/*"), paused=True)
     assert made.clock.next_ns == 4 * GATE_NS
     made.advance(0)
@@ -221,14 +221,14 @@ def test_a_part_is_played(flight: RecordReader):
     ]
 
 
-def test_a_status_counts_what_is_played(flight: RecordReader):
+def test_the_status_counts_the_messages_played(flight: RecordReader):
     whole = on(keys.status("d1"), played(playback(flight)))
     part = on(keys.status("d1"), played(playback(flight, keys=("drone/*/sensor/imu", "drone/*/sensor/status"))))
     assert {status.count for status in whole} == {3}
     assert part == [msgspec.structs.replace(status, count=2) for status in whole]
 
 
-def test_gates_are_as_the_world_makes_them(flight: RecordReader):
+def test_gates_are_bundled_as_by_the_world(flight: RecordReader):
     made = playback(flight)
     made.advance(0)
     made.take_outbox()
@@ -240,7 +240,7 @@ def test_gates_are_as_the_world_makes_them(flight: RecordReader):
     assert [key for key, _ in gate.pairs][3::4] == [keys.status("d1"), keys.status("d2")]
 
 
-def test_views_are_made_of_what_was_played(flight: RecordReader):
+def test_views_show_what_was_played(flight: RecordReader):
     made = playback(flight)
     played(made)
     views = {output.key: output.message for output in made.views(7)}
@@ -260,7 +260,7 @@ def test_views_are_made_of_what_was_played(flight: RecordReader):
         assert messages.decode(key, messages.encode(message)) == message
 
 
-# Who takes part
+# Participants
 
 
 def join(made: Playback, name: str, period_ns: int = GATE_NS, serves: tuple[str, ...] = ()) -> None:
@@ -268,7 +268,7 @@ def join(made: Playback, name: str, period_ns: int = GATE_NS, serves: tuple[str,
     made.handle(keys.process(name, "join"), Join(0, 0, "replay", 5, role, "h", 1, period_ns, serves=serves), 0)
 
 
-def test_who_takes_part_is_waited_for_and_replaces_its_record(flight: RecordReader):
+def test_a_participant_is_waited_for_and_replaces_its_record(flight: RecordReader):
     made = playback(flight)
     made.barrier.expect("estimator.d1")
     assert not made.may_advance()
@@ -287,7 +287,7 @@ def test_who_takes_part_is_waited_for_and_replaces_its_record(flight: RecordRead
     assert "view/estimates/estimator.d1" not in [output.key for output in made.views(0)]
 
 
-def test_who_dies_or_leaves_does_not_end_it(flight: RecordReader):
+def test_a_death_or_departure_does_not_end_the_replay(flight: RecordReader):
     made = playback(flight)
     join(made, "recorder", 0)
     join(made, "estimator.d1")
@@ -297,7 +297,7 @@ def test_who_dies_or_leaves_does_not_end_it(flight: RecordReader):
     assert made.ended == RECORD_OVER
 
 
-def test_nobody_can_be_flown(flight: RecordReader):
+def test_commands_and_control_of_drones_are_refused(flight: RecordReader):
     made = playback(flight)
     made.handle(CMD, Velocity(0, 0, "tester.one", ZEROS, 0.0), 0)
     (_, refused) = made.take_outbox()[-1]
@@ -310,7 +310,7 @@ def test_nobody_can_be_flown(flight: RecordReader):
     assert made.refusal_at("cluster/main/control") is None
 
 
-def test_seek(flight: RecordReader):
+def test_seek_jumps_to_a_gate_and_refuses_invalid_times(flight: RecordReader):
     made = playback(flight)
     made.advance(0)
     assert made.control(ControlRequest("seek", {"t_s": 0.12})).ok
@@ -327,21 +327,21 @@ def test_seek(flight: RecordReader):
 
 
 def faults_message(number: int, *kinds: str) -> KeyedMessage:
-    """Return what the world says of the faults that stand from a gate on."""
+    """Return the world's list of the faults that are active from a gate on."""
     all_ = tuple(Fault(i, kind, "d1", {}, 0, None, "tester.one") for i, kind in enumerate(kinds))
     return keys.FAULTS, Faults(number * GATE_NS, number, all_)
 
 
 @pytest.fixture
 def faulty(tmp_path: Path) -> Iterator[RecordReader]:
-    """Six gates; from the fourth on a fault stands."""
+    """Six gates; a fault is active from the fourth on."""
     recorded: list[KeyedMessage] = [(keys.INFO, INFO), *gate(0), *gate(1), *gate(2), faults_message(3, "gps_dropout")]
     recorded += [message for number in range(3, 6) for message in gate(number)]
     with write(tmp_path, recorded) as reader:
         yield reader
 
 
-def test_a_replay_that_holds_stands_at_its_end_and_goes_back(flight: RecordReader):
+def test_a_holding_replay_pauses_at_its_end_and_can_seek_back(flight: RecordReader):
     held = Playback(flight, SCENARIO, INFO, PlaybackRange(holds=True))
     for _ in range(1000):
         if held.clock.is_halted:
@@ -358,7 +358,7 @@ def test_a_replay_that_holds_stands_at_its_end_and_goes_back(flight: RecordReade
     assert held.now_ns < end_ns
 
 
-def test_the_views_of_any_part_of_the_record_are_answered_wherever_the_replay_is(flight: RecordReader):
+def test_views_of_any_part_are_answered_wherever_the_replay_is(flight: RecordReader):
     made = playback(flight)
     played(made)
     args = {"from_s": 0.04, "to_s": 0.16, "every_s": 0.04}
@@ -371,7 +371,7 @@ def test_the_views_of_any_part_of_the_record_are_answered_wherever_the_replay_is
     clusters = [messages.decode(key, payload) for key, payload in answer.result if key == keys.cluster_view("main")]
     assert [view.t_ns // GATE_NS for view in clusters] == [2, 4, 6, 8]
     assert len([key for key, _ in answer.result if key == keys.estimates_view("estimator.d2")]) == 4
-    assert (made.requests, len(made.take_outbox())) == before  # no event: it is asked for again and again
+    assert (made.requests, len(made.take_outbox())) == before  # no event, since views are requested again and again
 
 
 @pytest.mark.parametrize(
@@ -384,18 +384,18 @@ def test_the_views_of_any_part_of_the_record_are_answered_wherever_the_replay_is
         ({"from_s": 0.0, "to_s": 50.0, "every_s": 1e-6}, ("every_s", "1e-06")),
     ],
 )
-def test_views_of_no_part_of_a_record_are_refused(flight: RecordReader, args: dict[str, Any], found: tuple[str, str]):
+def test_views_of_an_invalid_range_are_refused(flight: RecordReader, args: dict[str, Any], found: tuple[str, str]):
     answer = playback(flight).control(ControlRequest("views", args))
     assert not answer.ok
     assert parts(answer.error) == found
 
 
-def test_of_a_part_that_the_record_lacks_there_are_no_views(flight: RecordReader):
+def test_there_are_no_views_beyond_the_record(flight: RecordReader):
     answer = playback(flight).control(ControlRequest("views", {"from_s": 0.1, "to_s": 30.0, "every_s": 0.1}))
     assert {messages.decode(key, payload).t_ns for key, payload in answer.result} <= {100_000_000, 200_000_000}
 
 
-def test_a_timeline_has_the_ends_of_the_record_and_some_of_its_events(tmp_path: Path):
+def test_a_timeline_has_both_ends_of_the_record_and_selected_events(tmp_path: Path):
     many = [event(1, "death"), event(1, "command", 1), *(event(k // 10, "control", k) for k in range(20, 1000))]
     with write(tmp_path, [*gate(0), *many, *gate(99)]) as reader:
         answer = Playback(reader, SCENARIO, INFO).control(ControlRequest("timeline"))
@@ -408,7 +408,7 @@ def test_a_timeline_has_the_ends_of_the_record_and_some_of_its_events(tmp_path: 
     assert marks[-1]["t_s"] > 0.9 * 99 * GATE_NS / 1e9
 
 
-def test_a_seek_that_is_refused_changes_nothing(faulty: RecordReader):
+def test_a_refused_seek_changes_nothing(faulty: RecordReader):
     made = playback(faulty)
     made.advance(0)
     assert parts(made.control(ControlRequest("seek", {"t_s": 5})).error) == ("t_s", "5")
@@ -417,7 +417,7 @@ def test_a_seek_that_is_refused_changes_nothing(faulty: RecordReader):
     assert keys.FAULTS not in [key for key, _ in made.take_outbox()]
 
 
-def test_after_a_seek_back_nothing_of_the_future_is_left(faulty: RecordReader):
+def test_a_seek_back_leaves_nothing_of_the_future(faulty: RecordReader):
     made = playback(faulty)
     for _ in range(5):
         made.advance(0)
@@ -430,8 +430,8 @@ def test_after_a_seek_back_nothing_of_the_future_is_left(faulty: RecordReader):
     assert [(listed.t_ns, listed.faults) for listed in faults] == [(GATE_NS, ())]
 
 
-def test_a_replay_measures_what_it_plays(flight: RecordReader):
-    """From gate 6 to gate 8, then gates 1 to 3, a gate per 10 ms."""
+def test_the_result_measures_what_was_played(flight: RecordReader):
+    """Gates 6 to 8, then 1 to 3, one every 10 ms."""
     made = playback(flight, from_ns=6 * GATE_NS)
     for number in range(6):
         if number == 3:
@@ -443,13 +443,13 @@ def test_a_replay_measures_what_it_plays(flight: RecordReader):
 
 
 @pytest.mark.parametrize(("from_ns", "to_ns"), [(GATE_NS + 1, GATE_NS + 2), (0, -1), (7_000_000_000, None)])
-def test_what_holds_no_gate_is_not_played(flight: RecordReader, from_ns: int, to_ns: int | None):
+def test_a_range_without_gates_is_refused(flight: RecordReader, from_ns: int, to_ns: int | None):
     until = [] if to_ns is None else [f"{to_ns / 1e9:.12g}"]
     with refused(RecordError, "run.mcap", "gate", f"{from_ns / 1e9:.12g}", *until):
         playback(flight, from_ns=from_ns, to_ns=to_ns)
 
 
-def test_faults_that_act_are_published_before_the_first_gate(tmp_path: Path):
+def test_active_faults_are_published_before_the_first_gate(tmp_path: Path):
     recorded: list[KeyedMessage] = [(keys.INFO, INFO), faults_message(0), *gate(0), *gate(1)]
     recorded += [faults_message(1, "gps_dropout"), *gate(2), *gate(3)]
     with write(tmp_path, recorded) as reader:
@@ -459,8 +459,8 @@ def test_faults_that_act_are_published_before_the_first_gate(tmp_path: Path):
     assert [key for key, _ in late].index(keys.FAULTS) == 0
 
 
-def test_a_kill_on_record_kills_nobody_who_takes_part(tmp_path: Path):
-    """What is left of the list is as it was; a list without a kill is the same to the byte."""
+def test_a_recorded_kill_does_not_kill_a_participant(tmp_path: Path):
+    """The other faults in the list stay as recorded; a list without a kill is identical to the byte."""
     cut = Fault(1, "gps_dropout", "d1", {}, 0, None, "tester.one")
     kill = Fault(2, "process_kill", "estimator.d1", {}, GATE_NS, None, "tester.one")
     recorded: list[KeyedMessage] = [(keys.INFO, INFO)]
@@ -481,7 +481,7 @@ FRONT, FRONT_INFO, DETECTIONS = keys.camera("d1", "front"), keys.camera_info("d1
 
 @pytest.fixture
 def filmed(tmp_path: Path) -> Iterator[RecordReader]:
-    """Six gates with a picture, and what was seen in it, each; how the camera sees was said once, at the start."""
+    """Six gates, each with a picture and its detections; the camera info was published once, at the start."""
     recorded: list[KeyedMessage] = [(keys.INFO, INFO), (FRONT_INFO, info(0))]
     for number in range(6):
         t_ns = number * GATE_NS
@@ -503,7 +503,7 @@ def test_pictures_are_played_as_recorded_each_with_its_gate(filmed: RecordReader
     assert on(DETECTIONS, published) == [sightings(number * GATE_NS, number) for number in range(6)]
 
 
-def test_how_a_camera_sees_is_said_also_when_a_replay_begins_later(filmed: RecordReader):
+def test_camera_info_is_published_even_if_the_replay_starts_later(filmed: RecordReader):
     assert on(FRONT_INFO, played(playback(filmed))) == [info(0)]
     assert on(FRONT_INFO, played(playback(filmed, from_ns=3 * GATE_NS))) == [info(0)]
     published = played(playback(filmed, from_ns=3 * GATE_NS, keys=("drone/*/truth",)))
@@ -511,17 +511,17 @@ def test_how_a_camera_sees_is_said_also_when_a_replay_begins_later(filmed: Recor
     assert len(on(keys.truth("d1"), published)) == 3
 
 
-def test_a_camera_that_takes_part_renders_in_place_of_the_record(filmed: RecordReader):
+def test_a_participating_camera_replaces_the_recorded_pictures(filmed: RecordReader):
     made = playback(filmed)
     join(made, "camera.d1", 0)
     published = played(made)
     assert (on(FRONT, published), on(FRONT_INFO, published)) == ([], [])
-    assert len(on(DETECTIONS, published)) == 6  # its detector's does not
+    assert len(on(DETECTIONS, published)) == 6  # the recorded detections are kept
 
 
 @pytest.fixture
 def filmed_by_one(tmp_path: Path) -> Iterator[RecordReader]:
-    """A gate, pictures of both drones, and what was seen in them, by one camera and one detector for both."""
+    """One gate with pictures and detections of both drones, from one camera and one detector for both."""
     recorded: list[KeyedMessage] = [(keys.INFO, INFO), *gate(0)]
     for name in ("d1", "d2"):
         recorded += [(keys.camera_info(name, "front"), info(0, source="camera.main"))]
@@ -531,7 +531,7 @@ def filmed_by_one(tmp_path: Path) -> Iterator[RecordReader]:
         yield reader
 
 
-# name: (process, what it declares to do, the drones whose pictures are played, those whose sightings are)
+# name: (process, processes it declares to serve, drones whose pictures are played, drones whose detections are)
 ANEW = {
     "one of them": ("camera.d2", (), ["d1"], ["d1", "d2"]),
     "one of them, in the name of both": ("camera.main", ("camera.d2",), ["d1"], ["d1", "d2"]),
@@ -543,7 +543,7 @@ ANEW = {
 
 
 @pytest.mark.parametrize("name", ANEW)
-def test_a_camera_replaces_the_record_of_the_drones_that_it_draws(filmed_by_one: RecordReader, name: str):
+def test_a_camera_replaces_the_recorded_pictures_of_its_drones(filmed_by_one: RecordReader, name: str):
     process, serves, pictures, seen = ANEW[name]
     made = playback(filmed_by_one)
     join(made, process, 0, serves)
@@ -553,7 +553,7 @@ def test_a_camera_replaces_the_record_of_the_drones_that_it_draws(filmed_by_one:
     assert [d for d in ("d1", "d2") if keys.detections(d) in published] == seen
 
 
-def test_a_camera_that_the_scenario_does_not_have_is_not_replaced(tmp_path: Path):
+def test_recorded_cameras_missing_from_the_scenario_are_not_replaced(tmp_path: Path):
     bottom = keys.camera("d1", "bottom")
     first, second = SCENARIO.drones
     sensors = msgspec.structs.replace(first.sensors, front_camera=FrontCamera())

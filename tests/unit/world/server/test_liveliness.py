@@ -1,6 +1,6 @@
-"""Which processes have died, have fallen silent, or take nothing; and whose join counts.
+"""Liveliness: dead, silent and slow processes, and which joins are admitted.
 
-A join that nobody is behind costs nobody his place, and time for a while only.
+A forged join, with no process behind it, takes nobody's place and holds up the run only briefly.
 """
 
 from collections.abc import Callable
@@ -57,12 +57,12 @@ class Case:
         self.world.handle(keys.process(self.name, "join"), join, 0)
 
     def events(self) -> list[str]:
-        """Return the kinds of events about it."""
+        """Return the kinds of the events about the participant."""
         pending = self.world.outbox.pending
         return [message.kind for key, message in pending if key == keys.EVENT and message.subject == self.name]
 
     def passes(self, wall_ns: int) -> None:
-        """Let wall time pass, look by look."""
+        """Let wall time pass in steps, with a check after each."""
         for _ in range(wall_ns // STEP_NS):
             self.wall_ns += STEP_NS
             self.liveliness.check_due()
@@ -70,7 +70,7 @@ class Case:
 
 @pytest.fixture
 def case_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Case]:
-    """Return a function that makes a Case whose wall clock only tests turn."""
+    """Return a function that creates a Case whose wall clock only the test advances."""
 
     def made(*arguments: Any) -> Case:
         case = Case(*arguments)
@@ -87,11 +87,11 @@ def case_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Case]:
         ("recorder", 0, "recorder", True),
         ("console.1", 0, "console.1", True),
         ("recorder", 0, None, False),  # it never published its health
-        ("estimator.d1", GATE_NS, "estimator.d1", False),  # time stands for it
+        ("estimator.d1", GATE_NS, "estimator.d1", False),  # the run waits for it
         ("recorder", 0, "somebody", False),
     ],
 )
-def test_a_reader_that_falls_silent_is_dead(
+def test_a_reader_that_falls_silent_is_declared_dead(
     case_of: Callable[..., Case], name: str, period_ns: int, publisher: str | None, dies: bool
 ) -> None:
     case = case_of(name, period_ns)
@@ -99,7 +99,7 @@ def test_a_reader_that_falls_silent_is_dead(
         case.liveliness.health_received(publisher)
     case.passes(DEAD_NS)
     assert "death" not in case.events()
-    case.wall_ns += 60 * S  # in which the world itself stood still
+    case.wall_ns += 60 * S  # during which the world itself stood still
     case.passes(STEP_NS)
     assert "death" not in case.events()
     case.passes(2 * STEP_NS)
@@ -107,7 +107,7 @@ def test_a_reader_that_falls_silent_is_dead(
     assert (case.world.ended is not None) == (dies and name == "recorder")
 
 
-def test_one_that_publishes_is_not(case_of: Callable[..., Case]) -> None:
+def test_a_reader_that_publishes_its_health_is_not_declared_dead(case_of: Callable[..., Case]) -> None:
     case = case_of("recorder")
     for _ in range(3):
         case.liveliness.health_received("recorder")
@@ -119,9 +119,7 @@ def test_one_that_publishes_is_not(case_of: Callable[..., Case]) -> None:
     ("is_lost", "pid", "kinds"),
     [(True, 8, ["death", "restart"]), (True, 7, ["superseded"]), (False, 8, ["superseded"])],
 )
-def test_who_joins_in_place_of_one_whose_token_went_had_no_need_to_wait_for_its_death(
-    is_lost: bool, pid: int, kinds: list[str]
-) -> None:
+def test_a_join_of_another_process_after_a_lost_token_is_a_restart(is_lost: bool, pid: int, kinds: list[str]) -> None:
     case = Case("estimator.d1", GATE_NS)
     if is_lost:
         case.liveliness.token_lost(case.name)
@@ -129,7 +127,7 @@ def test_who_joins_in_place_of_one_whose_token_went_had_no_need_to_wait_for_its_
     assert case.events()[1:] == kinds
 
 
-def test_a_join_that_arrives_while_a_token_is_checked_settles_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_join_during_the_check_of_a_lost_token_settles_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("zsim_world.server.liveliness.BYE_NS", 0)
     case = Case("estimator.d1", GATE_NS)
     case.take_in = lambda: case.join(incarnation=2, pid=8)
@@ -139,7 +137,7 @@ def test_a_join_that_arrives_while_a_token_is_checked_settles_it(monkeypatch: py
 
 
 class Watched:
-    """A watch, and what it reports."""
+    """A health watch and its reports."""
 
     def __init__(self) -> None:
         self.reports: list[tuple[str, int | None]] = []
@@ -150,7 +148,7 @@ class Watched:
             self.watch.look(wall_ns)
 
 
-def test_a_stopped_process_is_reported_once_within_two_seconds_and_when_it_is_back():
+def test_silence_is_reported_once_within_two_seconds_and_so_is_its_end():
     case = Watched()
     case.watch.look(10 * S)
     case.watch.received(ME, 10 * S)
@@ -163,12 +161,12 @@ def test_a_stopped_process_is_reported_once_within_two_seconds_and_when_it_is_ba
     assert case.reports[1:] == [(ME, None)]
 
 
-def test_what_the_world_did_not_read_while_it_was_held_up_is_nobody_s_silence():
+def test_silence_while_the_world_was_held_up_is_not_reported():
     case = Watched()
     case.watch.look(10 * S)
     case.watch.received(ME, 10 * S)
     case.watch.look(15 * S)
-    case.watch.forget(ME)  # nothing is expected of one that has left
+    case.watch.forget(ME)  # nothing is expected of a process that has left
     case.looks(15 * S, 20 * S)
     assert case.reports == []
 
@@ -179,7 +177,7 @@ STRANGER = ClosedLink("127.0.0.1:4000", "pid 7 (python reader.py)", (), 70_000, 
 
 @pytest.fixture
 def readers() -> SlowReaders:
-    """Those of a run in which console.1 has published its health."""
+    """The slow readers of a run in which console.1 has published its health."""
     link = FakeLink()
     health = Health(0, 0, "console", "desk", 9, {}, 0, 0, 0, 0, reads=("view/**", "world/event"))
     run = Run(small_world(), HealthMeter(WORLD))
@@ -200,7 +198,7 @@ def reported(readers: SlowReaders, closed: ClosedLink) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("closed", "host", "reads"), [(CONSOLE, "192.0.2.7", ["view/**", "world/event"]), (STRANGER, "laptop", [])]
 )
-def test_a_reader_is_named_by_what_is_known_of_it(
+def test_a_slow_reader_is_reported_with_what_is_known_of_it(
     readers: SlowReaders, closed: ClosedLink, host: str, reads: list[str]
 ) -> None:
     data = reported(readers, closed)
@@ -208,7 +206,7 @@ def test_a_reader_is_named_by_what_is_known_of_it(
     assert found == (host, closed.process, closed.names, reads, closed.times)
 
 
-def test_ever_new_sessions_are_so_many_events_only(readers: SlowReaders) -> None:
+def test_the_number_of_events_about_unknown_sessions_is_limited(readers: SlowReaders) -> None:
     readers.watch.closed.extend(STRANGER._replace(address=f"127.0.0.1:{port}") for port in range(3 * STRANGERS_MAX))
     readers.report()
     events = [message for key, message in readers._run.world.take_outbox() if key == keys.EVENT]
@@ -216,7 +214,7 @@ def test_ever_new_sessions_are_so_many_events_only(readers: SlowReaders) -> None
 
 
 class Door:
-    """A world, who holds which token, and a wall clock that a test turns."""
+    """A world, the tokens that processes hold, and a wall clock that a test advances."""
 
     def __init__(self, trusts: bool = False, mode: str = "lockstep") -> None:
         self.link = FakeLink()
@@ -234,7 +232,7 @@ class Door:
         self.admission.take(name, join, self.wall_ns)
 
     def show(self, name: str, session: str = "", alive: bool = True) -> None:
-        """Let a token of a process appear, or go, and that of its session unless it is a program of somebody's own."""
+        """Show or remove the token of a process, and that of its session, which a user's own program lacks."""
         self.link.show(keys.token(name), alive)
         if session:
             self.link.show(keys.session_token(name, session), alive)
@@ -246,7 +244,7 @@ class Door:
         self.world.handle(keys.process(name, "done"), done, self.wall_ns)
 
     def passes(self, wall_ns: int) -> None:
-        """Let wall time pass, look by look."""
+        """Let wall time pass in steps, with a check after each."""
         for _ in range(wall_ns // LOOK_NS + 1):
             self.wall_ns += LOOK_NS
             self.admission.check_due(self.wall_ns)
@@ -268,7 +266,7 @@ class Door:
             self.world.advance(self.wall_ns)
 
     def fly(self) -> None:
-        """Go on for a few gates, as far as others than ME allow it."""
+        """Advance a few gates, as far as participants other than ME allow."""
         for _ in range(3):
             self.done(ME, self.world.now_ns, incarnation=1)
             self.advance()
@@ -297,14 +295,14 @@ def case() -> Door:
 
 
 @pytest.mark.parametrize("forged", [{"pid": 8}, {"pid": 7, "host": "elsewhere"}, {"pid": 7, "period_ns": 0}])
-def test_a_join_that_nobody_is_behind_takes_nobody_s_place(case: Door, forged: dict[str, int]) -> None:
+def test_a_forged_join_takes_nobody_s_place(case: Door, forged: dict[str, int]) -> None:
     case.join(ME, incarnation=2, **forged)  # type: ignore[arg-type]
     case.flies_for(SHOWN_NS)
     assert case.kinds() == ["join", "no_show"]
     assert (case.incarnation(), case.world.barrier.participants[ME].gating) == (1, True)
 
 
-def test_one_that_is_repeated_is_named_as_soon(case: Door) -> None:
+def test_a_repeated_forged_join_is_reported_just_as_soon(case: Door) -> None:
     for incarnation in range(2, 2 + SHOWN_NS // LOOK_NS):
         case.join(ME, pid=8, incarnation=incarnation)
         case.flies_for(0)
@@ -312,18 +310,18 @@ def test_one_that_is_repeated_is_named_as_soon(case: Door) -> None:
     assert case.kinds() == ["join", "no_show"]
 
 
-def test_one_with_a_token_of_its_own_session_takes_over_at_once(case: Door) -> None:
+def test_a_join_with_its_own_session_token_takes_over_at_once(case: Door) -> None:
     case.show(ME, "b")
     case.join(ME, pid=8, incarnation=2)
     assert case.kinds() == ["join", "superseded"]
-    case.join(ME, pid=9, incarnation=3)  # of nobody, while both tokens are there
+    case.join(ME, pid=9, incarnation=3)  # forged, while both tokens are there
     case.show(ME, "a", alive=False)
     case.show(ME)
     case.flies_for(TOKEN_NS, incarnation=2)
     assert case.incarnation() == 2
 
 
-def test_one_whose_token_comes_late_over_a_router_takes_over_then(case: Door) -> None:
+def test_a_join_whose_token_arrives_late_takes_over_then(case: Door) -> None:
     case.join(ME, pid=8, incarnation=2)
     case.flies_for(TOKEN_NS // 2)
     case.show(ME, "b")
@@ -331,7 +329,7 @@ def test_one_whose_token_comes_late_over_a_router_takes_over_then(case: Door) ->
     assert case.kinds() == ["join", "superseded"]
 
 
-def test_a_program_without_such_a_token_takes_over_with_its_first_done(case: Door) -> None:
+def test_a_join_without_a_session_token_takes_over_with_its_first_done(case: Door) -> None:
     case.join(ME, pid=8, incarnation=2)
     case.flies_for(TOKEN_NS)
     case.done(ME, case.world.now_ns, incarnation=2)
@@ -340,7 +338,7 @@ def test_a_program_without_such_a_token_takes_over_with_its_first_done(case: Doo
 
 
 @pytest.mark.parametrize("how", ["held_up", "silent"])
-def test_or_as_soon_as_the_one_that_lives_is_not_there(case: Door, how: str) -> None:
+def test_a_join_without_a_token_takes_over_from_an_unresponsive_process(case: Door, how: str) -> None:
     case.join(ME, pid=8, incarnation=2)
     if how == "silent":
         case.world.silence_changed(ME, case.wall_ns)
@@ -351,13 +349,13 @@ def test_or_as_soon_as_the_one_that_lives_is_not_there(case: Door, how: str) -> 
     assert case.kinds() == ["join", "superseded"]
 
 
-def test_the_same_process_rejoins_without_another_token(case: Door) -> None:
+def test_the_same_process_rejoins_without_a_new_token(case: Door) -> None:
     case.join(ME, pid=7, incarnation=2)
     assert case.kinds() == ["join", "superseded"]
 
 
 @pytest.mark.parametrize("session", ["b", ""])
-def test_nobody_restarts_the_dead_without_a_token(case: Door, session: str) -> None:
+def test_a_dead_process_is_restarted_only_with_a_token(case: Door, session: str) -> None:
     case.world.died(ME, case.wall_ns)
     case.show(ME, "a", alive=False)
     case.join(ME, pid=8, incarnation=2)
@@ -368,7 +366,7 @@ def test_nobody_restarts_the_dead_without_a_token(case: Door, session: str) -> N
     assert case.kinds()[-1] == "restart"
 
 
-def test_access_control_is_trusted() -> None:
+def test_joins_need_no_token_under_access_control() -> None:
     case = Door(trusts=True)
     case.join(ME, pid=7, incarnation=1)
     case.join(ME, pid=8, incarnation=2)
@@ -377,7 +375,7 @@ def test_access_control_is_trusted() -> None:
 
 
 @pytest.mark.parametrize("name", [VISITOR, "recorder"])
-def test_who_joins_without_a_token_is_not_waited_for(case: Door, name: str) -> None:
+def test_a_process_that_joins_without_a_token_is_not_waited_for(case: Door, name: str) -> None:
     case.join(name, pid=9, incarnation=1)
     case.done(name, 0, incarnation=1)
     case.flies_for(TOKEN_NS)
@@ -395,7 +393,7 @@ def test_a_visitor_joins_as_soon_as_its_token_is_there(case: Door) -> None:
     assert case.world.barrier.participants[VISITOR].from_ns > 0
 
 
-def test_strangers_under_fresh_names_stop_no_time_and_fill_no_memory(case: Door) -> None:
+def test_strangers_with_new_names_neither_stop_time_nor_fill_memory(case: Door) -> None:
     for number in range(3 * WITHHELD_MAX):
         case.join(f"x.{number}", pid=9, incarnation=1)
     before_ns = case.world.now_ns
@@ -406,13 +404,13 @@ def test_strangers_under_fresh_names_stop_no_time_and_fill_no_memory(case: Door)
     assert case.world.outbox.refusals.count >= 3 * WITHHELD_MAX - STRANGERS_MAX
 
 
-def test_one_that_does_not_fit_the_run_is_refused_at_once_token_or_not(case: Door) -> None:
+def test_an_unsuitable_join_is_refused_at_once_even_without_a_token(case: Door) -> None:
     case.join(VISITOR, 2, 2, period_ns=GATE_NS + 1)
     case.passes(TOKEN_NS)
     assert [(e.kind, e.subject) for e in case.events()[1:]] == [("refused", keys.process(VISITOR, "join"))]
 
 
-def test_one_that_does_not_gate_joins_at_once(case: Door) -> None:
+def test_a_process_that_does_not_gate_joins_at_once(case: Door) -> None:
     case.join(VISITOR, pid=9, incarnation=1, period_ns=0)
     assert case.kinds(VISITOR) == ["join"]
     case.flies_for(TOKEN_NS)
@@ -420,10 +418,8 @@ def test_one_that_does_not_gate_joins_at_once(case: Door) -> None:
 
 
 @pytest.mark.parametrize("keeps_up", [True, False])
-def test_who_never_publishes_a_done_is_dropped_but_not_while_time_stands_for_another_too(
-    case: Door, keeps_up: bool
-) -> None:
-    """Where ME does not keep up, that may be why the visitor has published nothing."""
+def test_a_visitor_without_a_done_is_dropped_unless_another_is_late_too(case: Door, keeps_up: bool) -> None:
+    """If ME does not keep up, that may be why the visitor has published nothing."""
     case.show(VISITOR, "v")
     case.join(VISITOR, pid=9, incarnation=1)
     case.fly() if keeps_up else case.advance()
@@ -433,7 +429,7 @@ def test_who_never_publishes_a_done_is_dropped_but_not_while_time_stands_for_ano
     assert case.kinds(VISITOR) == ["join", *(["no_show", "drop"] if keeps_up else [])]
 
 
-def test_nor_one_of_the_scenario_however_long_its_first_step_takes() -> None:
+def test_an_expected_process_may_take_any_time_for_its_first_step() -> None:
     case = Door()
     case.show(ME, "a")
     case.join(ME, pid=7, incarnation=1)
@@ -442,7 +438,7 @@ def test_nor_one_of_the_scenario_however_long_its_first_step_takes() -> None:
     assert case.kinds() == ["join"]
 
 
-def test_a_successor_that_publishes_nothing_is_dead(case: Door) -> None:
+def test_a_successor_that_publishes_nothing_is_declared_dead(case: Door) -> None:
     case.show(ME, "b")
     case.join(ME, pid=8, incarnation=2)
     case.advance()
@@ -451,10 +447,10 @@ def test_a_successor_that_publishes_nothing_is_dead(case: Door) -> None:
     assert [waiting.name for waiting in case.world.waiting_for(case.wall_ns)] == [ME]
 
 
-def test_before_the_start_the_scenario_s_process_is_waited_for_again() -> None:
+def test_an_expected_process_is_waited_for_again_after_a_forged_join() -> None:
     case = Door()
     case.world.barrier.expect("recorder")
-    case.join(ME, pid=8, incarnation=2)  # by nobody
+    case.join(ME, pid=8, incarnation=2)  # forged
     case.passes(TOKEN_NS)
     assert case.kinds() == ["join", "no_show", "drop"]
     assert set(case.world.barrier.absent()) == {ME, "recorder"}
@@ -473,7 +469,7 @@ def realtime() -> Door:
 
 
 @pytest.mark.parametrize("publishes", [True, False])
-def test_in_realtime_a_successor_that_publishes_nothing_is_dead_too(realtime: Door, publishes: bool) -> None:
+def test_a_silent_successor_is_declared_dead_in_realtime_too(realtime: Door, publishes: bool) -> None:
     realtime.show(ME, "b")
     realtime.join(ME, pid=8, incarnation=2)
     realtime.gates(1)
@@ -487,7 +483,7 @@ def test_in_realtime_a_successor_that_publishes_nothing_is_dead_too(realtime: Do
     assert realtime.kinds() == ["join", "superseded", *([] if publishes else ["no_show", "death"])]
 
 
-def test_in_realtime_no_done_is_due_while_the_run_is_paused_or_before_a_period_is_over(realtime: Door) -> None:
+def test_no_done_is_due_in_realtime_when_paused_or_within_a_period(realtime: Door) -> None:
     realtime.show(VISITOR, "v")
     realtime.join(VISITOR, pid=9, incarnation=1, period_ns=100 * GATE_NS)
     realtime.gates(3)

@@ -1,4 +1,4 @@
-"""The world as a process: what strangers send, lost outputs, a state that is no longer finite, and when gates are delayed."""
+"""The world process: messages from strangers, lost outputs, a diverged state, the end of a run and delayed gates."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -46,7 +46,7 @@ def events(link: FakeLink, kind: str) -> list[Event]:
     return [event for event in link.published_on(keys.EVENT) if event.kind == kind]
 
 
-# What strangers send
+# Messages from strangers
 
 
 @pytest.mark.parametrize("key", [ESTIMATE, STATE, VELOCITY, keys.process(ME, "done"), keys.process(ME, "health")])
@@ -60,7 +60,7 @@ def test_no_payload_ends_the_run(key: str, payload: bytes):
     assert [event.subject for event in events(link, "refused")] == [key]
 
 
-def test_an_estimate_of_the_future_is_refused():
+def test_an_estimate_from_the_future_is_refused():
     made, link = world(), FakeLink()
     link.deliver(ESTIMATE, estimate(10**6))
     run(made, link)
@@ -70,7 +70,7 @@ def test_an_estimate_of_the_future_is_refused():
 
 
 @pytest.mark.parametrize("source", ["\x1b[2J", "Über", "a b", "x" * 49, ""])
-def test_a_sender_without_a_name_is_refused(source: str):
+def test_a_command_with_an_invalid_source_is_refused(source: str):
     made, link = world(), FakeLink()
     link.deliver(VELOCITY, Velocity(0, 0, source, ZEROS, 0.0))
     run(made, link)
@@ -80,7 +80,7 @@ def test_a_sender_without_a_name_is_refused(source: str):
     assert events(link, "commander") == []
 
 
-def test_a_request_of_somebody_without_a_name_is_refused():
+def test_a_request_with_an_invalid_source_is_refused():
     made = world()
     answer = made.control(ControlRequest("stop", {}, "\x1b[2J"))
     assert parts(answer.error) == ("source", "'\\x1b[2J'")
@@ -88,7 +88,7 @@ def test_a_request_of_somebody_without_a_name_is_refused():
     assert made.control(ControlRequest("stop", {}, "")).ok
 
 
-def test_states_and_healths_are_shown_with_the_name_of_their_cluster_or_process():
+def test_states_and_healths_are_shown_with_their_cluster_or_process():
     made, link, shown = world(), FakeLink(), []
     health = Health(0, 0, "estimator", "h", 1, {}, 0, 0, 0, 0, received=7)
     link.deliver(STATE, state(0))
@@ -103,10 +103,10 @@ def test_states_and_healths_are_shown_with_the_name_of_their_cluster_or_process(
     assert healths[-1][0].received == 2
 
 
-# What cameras say
+# Messages from cameras
 
 
-def test_how_a_camera_sees_is_kept_and_handed_on_and_its_pictures_are_not():
+def test_camera_info_is_kept_and_passed_on_but_pictures_are_not():
     made, link = world(), FakeLink()
     for key, message in ((FRONT_INFO, info()), (FRONT, image(0)), (DETECTIONS, sightings(0))):
         link.deliver(key, message)
@@ -126,10 +126,10 @@ def test_how_a_camera_sees_is_kept_and_handed_on_and_its_pictures_are_not():
         (FRONT_INFO, image(0)),
         (DETECTIONS, info()),
         (FRONT_INFO, info(10**12)),
-        (keys.sensor("d1", keys.SIGHTINGS), sightings(0)),  # the world's own
+        (keys.sensor("d1", keys.SIGHTINGS), sightings(0)),  # a key of the world's own
     ],
 )
-def test_what_a_camera_cannot_say_changes_nothing(key: str, message: Message):
+def test_an_invalid_camera_message_is_refused_and_changes_nothing(key: str, message: Message):
     made, link = world(), FakeLink()
     link.deliver(key, message)
     process = run(made, link)
@@ -138,8 +138,8 @@ def test_what_a_camera_cannot_say_changes_nothing(key: str, message: Message):
     assert process._history.last(key) == []
 
 
-def test_pictures_of_a_replay_are_on_their_key_alone():
-    """A recorder reads pictures on their keys: in the batches too they would be on record twice."""
+def test_replayed_pictures_are_published_only_on_their_own_key():
+    """A recorder reads pictures on their keys; in batches as well, they would be recorded twice."""
     made, link = world(), FakeLink()
     made.outbox.put(FRONT, msgspec.Raw(messages.encode(image(0))))
     made.outbox.put(FRONT_INFO, msgspec.Raw(messages.encode(info())))
@@ -150,7 +150,7 @@ def test_pictures_of_a_replay_are_on_their_key_alone():
     assert process._history.last(FRONT) == []
 
 
-# Outputs that got lost
+# Lost outputs
 
 
 def estimate(gate: int) -> Estimate:
@@ -162,11 +162,11 @@ def state(gate: int) -> ClusterState:
 
 
 class Lossy(FakeLink):
-    """A link to one participant that says two outputs and a done per gate, and loses some outputs on the way.
+    """A link that loses some outputs of its only participant, which publishes two outputs and a done per gate.
 
     Args:
-        loses: (key, gate).
-        keeps: whether it still has them when it is asked.
+        loses: key and gate of each lost output.
+        keeps: whether the participant still has them when they are requested.
     """
 
     def __init__(self, loses: set[tuple[str, int]], keeps: bool = True, incarnation: int = 1) -> None:
@@ -201,13 +201,13 @@ class Lossy(FakeLink):
         return ControlAnswer(True, result=self._kept[-6:])
 
     def recorded(self, key: str) -> list[int]:
-        """Return the gates of the messages on a key in the order in which the recorder hears of them."""
+        """Return the gates of the messages on a key in the order in which the recorder receives them."""
         passed = [pair for name, payload in self.published if name == keys.BATCH for pair in decode_batch(payload)]
         return [messages.decode(name, payload).t_ns // GATE_NS for name, payload in passed if name == key]
 
 
-def test_every_loss_is_found_and_nothing_comes_twice():
-    """A loss in each of two gates in a row, then one alone: each is asked for once, none hides another."""
+def test_every_lost_output_is_recovered_and_nothing_is_duplicated():
+    """Losses in two consecutive gates and a single later one: each is requested once, and none hides another."""
     link = Lossy({(ESTIMATE, 2), (STATE, 3), (ESTIMATE, 7)})
     run(world(ME), link)
     assert len(link.requests) == 3
@@ -216,8 +216,8 @@ def test_every_loss_is_found_and_nothing_comes_twice():
 
 
 @pytest.mark.parametrize(("incarnation", "missing"), [(1, [1]), (2, [])])
-def test_who_has_just_come_back_is_asked_until_it_answers(incarnation: int, missing: list[int]):
-    """Behind a new router it cannot be asked at once; of anybody else silence is an answer."""
+def test_a_participant_that_just_rejoined_is_queried_until_it_answers(incarnation: int, missing: list[int]):
+    """Behind a new router it cannot be reached at once; from any other participant, silence is an answer."""
     link = Lossy({(ESTIMATE, 2)}, incarnation=incarnation)
     silent = iter(range(3))
     link.on_request = lambda key, args: link._outputs(key, args) if next(silent, None) is None else UNANSWERED
@@ -225,7 +225,7 @@ def test_who_has_just_come_back_is_asked_until_it_answers(incarnation: int, miss
     assert [event.data["missing"] for event in events(link, "outputs_missing")] == missing
 
 
-def test_an_old_output_does_not_stand_in_for_the_one_that_is_missing():
+def test_an_old_output_does_not_replace_a_missing_one():
     link = Lossy({(ESTIMATE, 4)}, keeps=False)
     run(world(ME), link)
     assert [event.data["missing"] for event in events(link, "outputs_missing")] == [1]
@@ -249,7 +249,7 @@ BAD_ANSWERS: dict[str, Callable[[str, dict[str, Any]], ControlAnswer]] = {
 
 
 @pytest.mark.parametrize("name", BAD_ANSWERS)
-def test_an_answer_that_is_none_changes_nothing(name: str):
+def test_an_invalid_answer_changes_nothing(name: str):
     link = Lossy({(ESTIMATE, 4)})
     link.on_request = BAD_ANSWERS[name]
     made = world(ME)
@@ -258,7 +258,7 @@ def test_an_answer_that_is_none_changes_nothing(name: str):
     assert made.ended == DURATION_OVER
 
 
-def test_the_age_of_a_command_is_that_of_its_first_coming():
+def test_the_age_of_a_command_is_measured_at_its_first_arrival():
     made = world()
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "h", 1, GATE_NS), 0)
     made.advance(0)
@@ -268,7 +268,7 @@ def test_the_age_of_a_command_is_that_of_its_first_coming():
     assert made.result()["command_age_ms"]["max"] == pytest.approx(1.0)
 
 
-# A state that is no longer finite
+# A diverged state
 
 
 def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyPatch):
@@ -297,8 +297,8 @@ def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(("action", "waits"), [("restart", True), ("wait", True), ("end", False), ("drop", False)])
-def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str, waits: bool):
-    """It has the last gates to write; others have nothing to do any more."""
+def test_the_end_waits_for_a_dead_recorder_only_if_it_may_return(action: str, waits: bool):
+    """It has the last gates to write; others have nothing left to do."""
     made = small_world(processes={"on_death": {"recorder": action}})
     join = Join(0, 0, "run1", 1, "recorder", "here", 1, 0, slack_ns=GATE_NS)
     made.handle(keys.process("recorder", "join"), join, 0)
@@ -314,7 +314,7 @@ def test_the_end_waits_for_a_recorder_that_died_where_it_comes_back(action: str,
     assert not made.waiting_to_leave()
 
 
-def test_the_end_names_whom_it_waits_for():
+def test_the_stopped_clock_names_the_processes_waited_for():
     made, link = world("recorder"), FakeLink()
     link.deliver(keys.process("recorder", "join"), Join(0, 0, "run1", 1, "recorder", "here", 1, 0, slack_ns=10**12))
     run(made, link)
@@ -324,7 +324,7 @@ def test_the_end_names_whom_it_waits_for():
 
 
 class Lagging:
-    """A world of one agent that is through with `done` gates; the delay is five gates."""
+    """A world with one agent, which has completed `done` gates; the delay is five gates by default."""
 
     def __init__(self, delay: int = 5, mode: str = "lockstep", rate: float = 0.0) -> None:
         self.gate_ns, self.ahead_ns = GATE_NS, delay * GATE_NS
@@ -346,7 +346,7 @@ def pipelining_of(world: Lagging) -> Pipelining:
 
 
 def advance(world: Lagging, pipelining: Pipelining, wall_ns: int = 0) -> int:
-    """Go on as the process does; return how many gates that were."""
+    """Advance as the process does; return the number of gates."""
     gates = 0
     while world.may_advance() and not pipelining.delays(wall_ns):
         world.now += 1
@@ -355,7 +355,7 @@ def advance(world: Lagging, pipelining: Pipelining, wall_ns: int = 0) -> int:
     return gates
 
 
-def test_once_it_must_wait_it_goes_on_when_the_agent_has_nearly_caught_up() -> None:
+def test_after_a_wait_the_world_resumes_once_the_agent_nearly_caught_up() -> None:
     world = Lagging()
     pipelining = pipelining_of(world)
     assert advance(world, pipelining) == 6  # the first five need nothing
@@ -368,7 +368,7 @@ def test_once_it_must_wait_it_goes_on_when_the_agent_has_nearly_caught_up() -> N
     assert world.now - world.done <= 5 + 1
 
 
-def test_whoever_is_slow_gets_all_the_gates_that_it_may_have() -> None:
+def test_a_delay_for_a_slow_agent_is_limited_in_time() -> None:
     world = Lagging()
     pipelining = pipelining_of(world)
     advance(world, pipelining)
@@ -381,7 +381,7 @@ def test_whoever_is_slow_gets_all_the_gates_that_it_may_have() -> None:
 @pytest.mark.parametrize(
     "world", [Lagging(mode="realtime"), Lagging(rate=1.0), Lagging(delay=1), Lagging(delay=LAG_GATES)]
 )
-def test_a_paced_world_and_one_without_slack_hold_nothing_back(world: Lagging) -> None:
+def test_a_world_that_is_paced_or_has_no_slack_delays_no_gate(world: Lagging) -> None:
     pipelining = pipelining_of(world)
     advance(world, pipelining)
     for _ in range(10):
@@ -390,7 +390,7 @@ def test_a_paced_world_and_one_without_slack_hold_nothing_back(world: Lagging) -
         assert not pipelining.continues()
 
 
-def test_messages_are_sent_every_few_gates_and_when_the_next_may_not_come() -> None:
+def test_messages_are_sent_every_few_gates_and_before_a_wait() -> None:
     world = Lagging(delay=9)
     pipelining = pipelining_of(world)
     sent = []
@@ -404,21 +404,21 @@ TICK_MS = 100
 
 
 def looks(watch: TurnWatch, at_ms: Iterable[int], turn_ms: int) -> list[tuple[int, float]]:
-    """Return when something was named, and for how long it had lasted."""
+    """Return when a stuck turn was reported, and how long it had lasted."""
     found = [(ms, watch.stuck_s(ms * 1_000_000, turn_ms * 1_000_000)) for ms in at_ms]
     return [(ms, stuck_s) for ms, stuck_s in found if stuck_s is not None]
 
 
-def test_a_turn_that_does_not_end_is_named_every_two_seconds() -> None:
+def test_a_stuck_turn_is_reported_every_two_seconds() -> None:
     named = looks(TurnWatch(0), range(TICK_MS, 5_000, TICK_MS), turn_ms=100)
     assert named == [(2_200, 2.1), (4_300, 4.2)]
 
 
-def test_no_turn_is_not_stuck() -> None:
+def test_nothing_is_reported_while_no_turn_is_running() -> None:
     assert looks(TurnWatch(0), range(TICK_MS, 5_000, TICK_MS), turn_ms=0) == []
 
 
-def test_a_process_that_stood_was_not_stuck() -> None:
+def test_a_suspended_process_does_not_count_as_stuck() -> None:
     watch = TurnWatch(0)
     assert looks(watch, [100, 12_100, 12_200], turn_ms=50) == []
     assert looks(watch, range(12_300, 14_300, TICK_MS), turn_ms=50) == [(14_200, 2.1)]

@@ -1,4 +1,4 @@
-"""The firmware in flight: modes, loops and watchdogs, on noisy sensors; eight boards in one step."""
+"""The firmware in flight: modes, control loops and watchdogs with noisy sensors; eight boards in one step."""
 
 import math
 from typing import Any
@@ -48,7 +48,7 @@ def states(flight):
 
 
 def airborne(*args, climb_to=None, **kwargs):
-    """Return a fleet that hovers at 1 m, or higher."""
+    """Return a fleet that hovers at 1 m, or that has climbed higher."""
     flight = fleet(*args, **kwargs)
     for i in range(flight.count):
         assert flight.takeoff(i) is None
@@ -75,7 +75,7 @@ def in_heading_frame(truth, i=0):
 
 
 @each_preset
-def test_every_preset_takes_off_flies_a_pattern_at_15_m_and_lands(sensors):
+def test_drones_of_every_preset_take_off_fly_a_pattern_at_15_m_and_land(sensors):
     flight = fleet(3, sensors)
     for i in range(3):
         assert flight.takeoff(i) is None
@@ -103,7 +103,7 @@ def test_every_preset_takes_off_flies_a_pattern_at_15_m_and_lands(sensors):
     assert not flight.truth().rotor_rad_s.any() or flight.truth().rotor_rad_s.max() < 1e-3
 
 
-def test_takeoff_rises_evenly_and_landing_is_gentle():
+def test_takeoff_is_smooth_and_landing_is_gentle():
     flight = fleet(gust=0.0)
     flight.takeoff(0)
     track = run(flight, 8.0)
@@ -118,9 +118,9 @@ def test_takeoff_rises_evenly_and_landing_is_gentle():
     assert states(flight) == ["landed"]
 
 
-def test_hover_in_gusts_stays_within_the_walk_of_its_own_flow():
-    """Flow of 0.1 m/s at 15 Hz integrates to 0.1 / sqrt(15) sqrt(60 s) = 0.2 m per axis: five of these, and the
-    0.1 m that gusts leave."""
+def test_hover_in_gusts_stays_within_the_random_walk_of_the_flow():
+    """Flow noise of 0.1 m/s at 15 Hz integrates to 0.1 / sqrt(15) sqrt(60 s) = 0.2 m per axis; the limit is five times
+    this, plus the 0.1 m that gusts leave."""
     for seed in (1, 2, 3):
         flight = airborne(seed=seed)
         start = flight.truth().position_m[0]
@@ -139,7 +139,7 @@ def test_hover_holds_against_a_steady_wind():
 
 
 @each_preset
-def test_velocity_step(sensors):
+def test_a_velocity_step_is_followed_quickly_with_little_overshoot(sensors):
     flight = airborne(1, sensors, gust=0.0, climb_to=8.0)
     track = run(flight, 6.0, every(flight, (2.0, 0.0, 0.0)))
     ahead = np.array([in_heading_frame(truth)[0] for truth in track])
@@ -149,7 +149,7 @@ def test_velocity_step(sensors):
     assert abs(ahead[150:].mean() - 2.0) < 0.1
 
 
-def test_yaw_rate_and_world_frame():
+def test_yaw_rates_and_world_frame_velocities_are_followed():
     flight = airborne(gust=0.0)
     track = run(flight, 3.0, every(flight, (0.0, 0.0, 0.0), 1.0))
     rates = np.array([truth.angular_velocity_rad_s[0, 2] for truth in track])
@@ -159,7 +159,7 @@ def test_yaw_rate_and_world_frame():
     np.testing.assert_allclose(track[-1].velocity_m_s[0], (1.0, 0.5, 0.0), atol=0.12)
 
 
-def test_velocity_limits():
+def test_the_velocity_limits_are_kept():
     flight = airborne(limits={"horizontal_speed_m_s": 1.0, "vertical_speed_m_s": 0.3, "yaw_rate_deg_s": 30.0})
     end = run(flight, 6.0, every(flight, (9.0, 9.0, 9.0), 9.0))[-1]
     assert np.hypot(*end.velocity_m_s[0, :2]) == pytest.approx(1.0, abs=0.15)
@@ -167,14 +167,14 @@ def test_velocity_limits():
     assert end.angular_velocity_rad_s[0, 2] == pytest.approx(math.radians(30.0), abs=0.03)
 
 
-def test_altitude_limit():
+def test_the_altitude_limit_is_kept():
     flight = airborne(limits={"altitude_m": 3.0})
     track = run(flight, 8.0, every(flight, (0.0, 0.0, 1.0)))
     assert max(truth.position_m[0, 2] for truth in track) < 3.3
     assert track[-1].position_m[0, 2] == pytest.approx(3.0, abs=0.3)
 
 
-def test_tilt_limit_is_kept_in_a_violent_command():
+def test_the_tilt_limit_is_kept_under_an_aggressive_command():
     flight = airborne(gust=0.0, climb_to=8.0, limits={"tilt_deg": 10.0})
     track = run(flight, 3.0, every(flight, (5.0, 0.0, 0.0)))
     q = np.array([truth.orientation_wxyz[0] for truth in track])
@@ -186,7 +186,7 @@ def test_ardrone_commands_are_tilts():
     flight = airborne(gust=0.0, climb_to=8.0)
     track = run(flight, 1.5, lambda: flight.set_ardrone(0, 0.5, 0.0, 0.0, 0.0, False))
     q = track[-1].orientation_wxyz[0]
-    assert 2 * math.asin(q[2]) == pytest.approx(math.radians(20.0) * 0.5, abs=0.03)  # half of 20 deg: nearly
+    assert 2 * math.asin(q[2]) == pytest.approx(math.radians(20.0) * 0.5, abs=0.03)  # nearly half of 20 deg
     assert in_heading_frame(track[-1])[0] > 1.5
     run(flight, 4.0, lambda: flight.set_ardrone(0, 0.0, 0.0, 0.0, 0.0, True))
     assert states(flight) == ["hovering"]
@@ -198,7 +198,7 @@ def test_ardrone_commands_are_tilts():
     assert track[-1].angular_velocity_rad_s[0, 2] == pytest.approx(math.radians(100.0), abs=0.1)
 
 
-def test_attitude_setpoint():
+def test_an_attitude_setpoint_is_followed():
     flight = airborne(gust=0.0, climb_to=8.0)
     q = quaternion_from_rpy((0.0, 0.15, 1.0)).tolist()
     track = run(flight, 1.0, lambda: flight.set_attitude(0, q, 4.3, 0.0))
@@ -207,7 +207,7 @@ def test_attitude_setpoint():
     np.testing.assert_allclose(z, math.sin(0.15) * np.array([math.cos(1.0), math.sin(1.0)]), atol=0.03)
 
 
-def test_rotor_setpoint_goes_to_the_rotors_within_their_limits():
+def test_a_rotor_setpoint_is_applied_within_the_rotor_limits():
     flight = airborne(gust=0.0, climb_to=4.0)
     run(flight, 0.2, lambda: flight.set_rotors(0, (9999.0, 503.0, 470.0, 470.0)))
     np.testing.assert_allclose(flight.truth().rotor_rad_s[0], (503.0, 503.0, 470.0, 470.0), rtol=2e-3)
@@ -216,7 +216,7 @@ def test_rotor_setpoint_goes_to_the_rotors_within_their_limits():
     np.testing.assert_allclose(flight.truth().rotor_rad_s[0], 126.0, rtol=2e-3)
 
 
-def test_silence_of_the_commander_hovers_then_lands():
+def test_a_drone_whose_commander_is_silent_hovers_and_then_lands():
     flight = airborne()
     assert flight.set_velocity(0, (0.3, 0.0, 0.0), 0.0) is None
     for seconds, state in ((0.46, "flying"), (0.06, "hovering"), (1.92, "hovering"), (0.1, "landing"), (8.0, "landed")):
@@ -224,7 +224,7 @@ def test_silence_of_the_commander_hovers_then_lands():
         assert states(flight) == [state]
 
 
-def test_a_new_setpoint_ends_the_silence_and_a_release_never_lands():
+def test_a_setpoint_ends_the_silence_and_a_release_causes_no_landing():
     flight = airborne()
     flight.set_velocity(0, (0.3, 0.0, 0.0), 0.0)
     run(flight, 1.5)
@@ -267,7 +267,7 @@ def test_a_drone_on_its_back_does_not_take_off():
     assert "upright" in str(flight.takeoff(0))
 
 
-def test_low_battery_lands_and_forbids_a_takeoff_and_an_empty_one_stops_the_rotors():
+def test_a_low_battery_forces_a_landing_and_prevents_takeoff():
     flight = airborne(battery_percent=12.0)
     run(flight, 60.0)
     assert states(flight) == ["landed"]
@@ -279,8 +279,8 @@ def test_low_battery_lands_and_forbids_a_takeoff_and_an_empty_one_stops_the_roto
     assert flight.takeoff(0) is not None
 
 
-def test_it_flies_on_its_flow_and_not_on_truth():
-    """A flow sensor that shows 0.3 m/s too much makes the drone drift by as much the other way."""
+def test_the_firmware_flies_on_measured_flow_and_not_on_truth():
+    """A flow sensor that reads 0.3 m/s too high makes the drone drift equally fast the other way."""
     flight = airborne(gust=0.0)
     flight._w.senses.bias[0, 5, 0] += 0.3
     track = run(flight, 10.0, every(flight, (0.0, 0.0, 0.0)))
@@ -311,7 +311,7 @@ LOSSY = {"preset": "paper", "imu": {"dropout": 0.05}, "flow": {"dropout": 0.3}, 
     ],
     ids=["heavy", "light", "a turned and shifted board", "lost samples"],
 )
-def test_another_aircraft_or_board_flies_too(sensors, aircraft, velocity, atol):
+def test_other_aircraft_boards_and_lossy_sensors_fly_too(sensors, aircraft, velocity, atol):
     flight = airborne(2, sensors, **aircraft)
     track = run(flight, 6.0, every(flight, velocity))
     assert states(flight) == ["flying"] * 2
@@ -324,8 +324,8 @@ def test_another_aircraft_or_board_flies_too(sensors, aircraft, velocity, atol):
 
 
 @each_preset
-def test_belief_agrees_with_truth(sensors):
-    """Tilt within a degree, heading within three, velocity and height as the sensors allow."""
+def test_the_belief_agrees_with_the_truth(sensors):
+    """Tilt within 1.5 degrees, heading within 3 degrees, velocity and height as the sensors allow."""
     flight = airborne(3, sensors, climb_to=12.0)
     run(flight, 30.0, every(flight, (0.3, 0.0, 0.0), 0.1))
     truth = flight.truth()
@@ -334,7 +334,7 @@ def test_belief_agrees_with_truth(sensors):
         q = truth.orientation_wxyz[i]
         own = belief[BELIEF.q_WB : BELIEF.q_WB + 4]
         z, z_own = (np.array([2 * (a[1] * a[3] + a[0] * a[2]), 2 * (a[2] * a[3] - a[0] * a[1])]) for a in (q, own))
-        turn = heading(own) - heading(q)  # tilt is compared in each one's own heading
+        turn = heading(own) - heading(q)  # each tilt is compared in its own heading frame
         rotated = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ z
         assert np.linalg.norm(rotated - z_own) < math.radians(1.5)
         assert abs((turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(3.0)
@@ -343,12 +343,12 @@ def test_belief_agrees_with_truth(sensors):
         assert abs(belief[BELIEF.height] - truth.position_m[i, 2]) < 0.3
 
 
-COUNT = 11  # a whole block and a part of one
-STEP_TICKS = 2  # of 2.5 ms
+COUNT = 11  # a whole block of eight and part of another
+STEP_TICKS = 2  # physics ticks of 2.5 ms
 
 
 def flying():
-    """Return drones of two kinds in the air, each with a setpoint of another kind; one stands."""
+    """Return airborne drones of two kinds with setpoints of every kind; one stands on the ground."""
     heavy: Any = {"mass_kg": 0.6, "arm_m": 0.25, "thrust_n_s2": 1.2e-5, "rotor_time_constant_s": 0.05}
     mount: Any = {"imu": {"mount": {"rpy_deg": [5.0, -3.0, 170.0]}}}
     drones = [
@@ -375,16 +375,16 @@ def flying():
 
 
 def lane(table, i, at, count):
-    """Return what stands in the columns of drone i."""
+    """Return the values in these columns of drone i."""
     return tuple(table[i // LANES].reshape(-1, LANES)[at : at + count, i % LANES].tolist())
 
 
 def rotors_of(table, i, group, count):
-    """Return groups of numbers per rotor of drone i."""
+    """Return per-rotor groups of values of drone i."""
     return PerRotor(np.array(lane(table, i, BOARD_LANES.size + 4 * group, 4 * count)), 0, 1, (0, 1, 2, 3))
 
 
-def test_a_block_turns_and_drives_with_the_bits_of_each_drone():
+def test_a_block_computes_the_same_bits_as_each_drone_alone():
     fleet, driven = flying(), 0
     boards, lanes = fleet.boards, fleet.boards.lanes
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""The record: what goes in comes out, whatever is cut off the file, and other MCAP tools agree."""
+"""The record: what is written is read back even from a truncated file, and other MCAP tools agree."""
 
 import errno
 import os
@@ -28,7 +28,7 @@ from zsim.record.record_reader import record_notes
 from zsim.record.record_writer import CHUNK_BYTES
 
 GATE_NS = 20_000_000
-CHUNK_MESSAGES = 40  # per chunk of the records below
+CHUNK_MESSAGES = 40  # messages per chunk of the records below
 
 
 def imu(t_ns: int, seq: int, rng: random.Random) -> bytes:
@@ -74,7 +74,7 @@ def read(path: Path, **options) -> list[Recorded]:
     )
 )
 @settings(max_examples=60, deadline=None)
-def test_what_is_written_is_read(tmp_path_factory, script):
+def test_messages_are_read_back_as_written(tmp_path_factory, script):
     path = tmp_path_factory.mktemp("record") / "run.mcap"
     written = [Recorded(key, payload, t_ns, i) for i, (key, payload, t_ns, _) in enumerate(script)]
     with RecordWriter(path) as writer:
@@ -95,7 +95,7 @@ def test_what_is_written_is_read(tmp_path_factory, script):
     assert foreign == read(path)
 
 
-def test_messages_of_some_keys_only(tmp_path):
+def test_messages_can_be_read_by_key(tmp_path):
     recorded = flight(500)
     write(tmp_path / "run.mcap", recorded)
     wanted = {recorded[1].key}
@@ -103,7 +103,7 @@ def test_messages_of_some_keys_only(tmp_path):
     assert read(tmp_path / "run.mcap", keys=()) == []
 
 
-def test_messages_of_a_key_are_counted_on_from_chunk_to_chunk(tmp_path):
+def test_message_numbers_continue_from_chunk_to_chunk(tmp_path):
     path, rng = tmp_path / "run.mcap", random.Random(8)
     keys = ["a/x", "b/x", "c/x"]
     with RecordWriter(path) as writer:
@@ -141,7 +141,7 @@ def test_other_tools_find_encoding_schema_and_sequence(tmp_path):
     assert b"waiting_for" in schema.data
 
 
-def test_repair_makes_a_cut_record_one_that_other_tools_seek_in(tmp_path):
+def test_repair_makes_a_truncated_record_seekable_by_other_tools(tmp_path):
     path, cut_path = tmp_path / "run.mcap", tmp_path / "cut.mcap"
     write(path, flight(400))
     data, rng = path.read_bytes(), random.Random(3)
@@ -164,7 +164,7 @@ def test_repair_makes_a_cut_record_one_that_other_tools_seek_in(tmp_path):
 
 
 class Damaged:
-    """A record of so many messages, whose bytes may be changed before it is read."""
+    """A record whose bytes may be changed before it is read."""
 
     def __init__(self, folder: Path, messages: int = 200) -> None:
         self.path, self.recorded = folder / "run.mcap", flight(messages)
@@ -174,13 +174,13 @@ class Damaged:
         self.third = self.sizes[2 * CHUNK_MESSAGES - 1]  # where the third chunk begins
 
     def read(self) -> tuple[list[Recorded], tuple[str, ...], bool]:
-        """Return the messages in the order of the file, the damage, and whether it was closed."""
+        """Return the messages in file order, the damage, and whether the record is complete."""
         self.path.write_bytes(self.data)
         with RecordReader(self.path) as reader:
             return list(reader.messages(by_time=False)), reader.damaged, reader.complete
 
 
-def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path):
+def test_a_damaged_chunk_is_skipped_and_reported(tmp_path):
     record = Damaged(tmp_path)
     record.data[record.sizes[CHUNK_MESSAGES - 1] - 3000] ^= 0xFF  # inside the first chunk's compressed content
     found, (damage,), _ = record.read()
@@ -191,20 +191,20 @@ def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path):
         assert has_terms(record_notes(reader)[0], "damaged", str(record.chunks[0].start))
 
 
-def test_a_chunk_whose_check_sum_was_changed_is_named(tmp_path):
-    """Its content is whole, and so nothing but the sum tells."""
+def test_a_chunk_with_a_changed_checksum_is_reported(tmp_path):
+    """Its content is intact, so only the checksum reveals the damage."""
     record = Damaged(tmp_path)
     second, recorded = record.chunks[1], record.recorded
     crc = second.body + CHUNK_HEAD.size - 8
     assert int.from_bytes(record.data[crc : crc + 4], "little") == chunk_head(bytes(record.data), second).crc
-    for changed in (b"\x01\x02\x03\x04", b"\0\0\0\0"):  # MCAP has 0 for no sum; a record of ours always has one
+    for changed in (b"\x01\x02\x03\x04", b"\0\0\0\0"):  # in MCAP, 0 means no checksum, but our records always have one
         record.data[crc : crc + 4] = changed
         found, (damage,), _ = record.read()
         assert found == recorded[:CHUNK_MESSAGES] + recorded[2 * CHUNK_MESSAGES :]
         assert has_terms(damage, "byte", str(second.start))
 
 
-def test_a_damaged_chunk_before_a_cut_is_counted_before_anything_is_read(tmp_path):
+def test_a_damaged_last_chunk_of_a_truncated_record_is_reported_on_opening(tmp_path):
     record = Damaged(tmp_path, 2 * CHUNK_MESSAGES)
     del record.data[-1:]
     record.data[record.chunks[-1].end - 20] ^= 4
@@ -214,7 +214,7 @@ def test_a_damaged_chunk_before_a_cut_is_counted_before_anything_is_read(tmp_pat
         assert reader.damaged == damage
 
 
-def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_path):
+def test_an_impossible_length_hides_what_follows_and_is_reported(tmp_path):
     record = Damaged(tmp_path)
     assert record.data[record.third] == Opcode.CHUNK
     for length in (0, 3, 2**63):
@@ -224,7 +224,7 @@ def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_pat
 
 
 @pytest.mark.parametrize("bit", [4, 14, 20, 62])
-def test_a_length_that_leads_behind_a_cut_is_not_told_as_the_cut(tmp_path, bit):
+def test_a_length_beyond_the_end_of_a_truncated_file_counts_as_damage(tmp_path, bit):
     record = Damaged(tmp_path, 600)
     del record.data[-1000:]
     after = next(place.start for place in places(bytes(record.data)) if place.start > record.third)
@@ -246,11 +246,11 @@ def test_a_length_that_leads_behind_a_cut_is_not_told_as_the_cut(tmp_path, bit):
     ],
     ids=["part of a head", "head of a message", "unknown opcode", "chunk too short for its head"],
 )
-def test_bytes_after_the_last_record_are_a_cut_one_or_damaged(rest: bytes, cut: bool):
+def test_bytes_after_the_last_record_are_a_truncated_one_or_damage(rest: bytes, cut: bool):
     assert is_cut(b"before" + rest, len(b"before")) is cut
 
 
-def test_only_a_closed_record_is_compared_with_its_sum(tmp_path):
+def test_only_a_closed_record_is_compared_with_its_checksum(tmp_path):
     record = Damaged(tmp_path)
     (end,) = [place for place in places(bytes(record.data)) if place.opcode == Opcode.DATA_END]
     record.data[next(places(bytes(record.data))).end - 1] ^= 1  # the last letter of the writer's name
@@ -260,12 +260,12 @@ def test_only_a_closed_record_is_compared_with_its_sum(tmp_path):
             assert (reader.complete, reader.differs()) == (differs, differs)
 
 
-def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summary(tmp_path):
+def test_a_chunk_with_a_damaged_header_is_skipped_and_not_summarised(tmp_path):
     record = Damaged(tmp_path)
-    name = record.third + HEAD.size + CHUNK_HEAD.size - 4  # length of the chunk's compression
+    name = record.third + HEAD.size + CHUNK_HEAD.size - 4  # length of the name of the chunk's compression
     assert record.data[name : name + 8] == b"\x04\x00\x00\x00zstd"
     record.data[name : name + 4] = b"\x00\xff\xff\x00"
-    record.path.write_bytes(record.data[:-1])  # cut, so that there is something to repair
+    record.path.write_bytes(record.data[:-1])  # truncated, so that there is something to repair
     assert repair(record.path)
     record.data = bytearray(record.path.read_bytes())
     found, damage, _ = record.read()
@@ -276,12 +276,12 @@ def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summar
 
 
 @pytest.mark.parametrize("opcode", [Opcode.SCHEMA, Opcode.CHANNEL])
-def test_a_damaged_schema_or_channel_is_one_line(tmp_path, opcode):
+def test_a_damaged_schema_or_channel_is_reported_in_one_line(tmp_path, opcode):
     record = Damaged(tmp_path, 100)
     place = next(place for place in places(bytes(record.data)) if place.opcode == opcode)
     at = place.body + (2 if opcode == Opcode.SCHEMA else 4)  # the length of its name
     record.data[at : at + 4] = b"\xff\xff\xff\x7f"
-    record.path.write_bytes(record.data[:-1])  # cut, so that there is something to repair
+    record.path.write_bytes(record.data[:-1])  # truncated, so that there is something to repair
     with refused(RecordError, str(opcode.name).lower(), f"byte {place.start}", "damaged"):
         repair(record.path)
 
@@ -289,7 +289,7 @@ def test_a_damaged_schema_or_channel_is_one_line(tmp_path, opcode):
 @given(st.integers(0, 2**32))
 @example(29148)  # the name of a chunk's compression is longer than the chunk
 @settings(max_examples=150, deadline=None)
-def test_whatever_is_overwritten_it_is_read_or_refused(tmp_path_factory, seed):
+def test_a_record_overwritten_anywhere_is_read_or_refused(tmp_path_factory, seed):
     path, rng = tmp_path_factory.mktemp("record") / "run.mcap", random.Random(seed)
     write(path, flight(100))
     data = bytearray(path.read_bytes())
@@ -301,7 +301,7 @@ def test_whatever_is_overwritten_it_is_read_or_refused(tmp_path_factory, seed):
             work(path)
 
 
-def test_what_is_no_record_is_refused_in_one_line(tmp_path):
+def test_a_file_that_is_not_a_record_is_refused_in_one_line(tmp_path):
     path = tmp_path / "run.mcap"
     for read_or_repair in (RecordReader, repair):
         with refused(RecordError, "run.mcap", os.strerror(errno.ENOENT)):
@@ -321,7 +321,7 @@ def test_a_record_is_never_overwritten(tmp_path):
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
-def test_what_another_process_writes_is_not_touched(tmp_path: Path, goes_on: bool):
+def test_a_record_that_another_process_writes_is_not_touched(tmp_path: Path, goes_on: bool):
     path = tmp_path / "run.mcap"
     with RecordWriter(path) as writer:
         writer.add("clock", b"\x80", "", 0, 0)
@@ -354,14 +354,14 @@ def test_a_steady_trickle_reaches_the_disk_without_ticks(tmp_path):
             assert len(read(path)) >= i - 5
 
 
-def test_closing_twice_does_nothing(tmp_path):
+def test_closing_twice_is_harmless(tmp_path):
     writer = RecordWriter(tmp_path / "run.mcap")
     writer.close()
     writer.close()
     assert read(tmp_path / "run.mcap") == []
 
 
-def test_no_more_than_a_chunk_is_held_back(tmp_path):
+def test_at_most_one_chunk_is_held_back(tmp_path):
     path, payload = tmp_path / "run.mcap", random.Random(4).randbytes(1000)
     with RecordWriter(path) as writer:
         for i in range(3000):
@@ -371,7 +371,7 @@ def test_no_more_than_a_chunk_is_held_back(tmp_path):
     assert len(read(path)) == 3000
 
 
-def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypatch):
+def test_times_are_clamped_and_excess_keys_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     path = tmp_path / "run.mcap"
     with RecordWriter(path) as writer:
@@ -384,8 +384,8 @@ def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("wanted", [None, {"clock"}])
-def test_a_message_without_a_time_in_every_chunk_does_not_hold_them_all(tmp_path, wanted):
-    """60 chunks of 50 kB, of 1 s each; read by time, a few of them are held."""
+def test_stray_times_in_every_chunk_do_not_keep_all_chunks_in_memory(tmp_path, wanted):
+    """Of 60 chunks of 50 kB and 1 s each, reading by time holds only a few."""
     path, rng = tmp_path / "run.mcap", random.Random(9)
     with RecordWriter(path) as writer:
         for i in range(3000):
@@ -401,10 +401,10 @@ def test_a_message_without_a_time_in_every_chunk_does_not_hold_them_all(tmp_path
     strays = [0] * 30, [10**15] * 30
     clocks = [i * GATE_NS for i in range(3000)]
     assert times == (clocks if wanted else [*strays[0], *clocks, *strays[1]])
-    assert peak < 600_000  # bytes; the whole is 3 MB
+    assert peak < 600_000  # bytes; the whole record is 3 MB
 
 
-def test_writer_keeps_nothing_of_what_is_on_disk(tmp_path):
+def test_the_writer_keeps_nothing_that_is_on_disk(tmp_path):
     payload, held = random.Random(5).randbytes(150), []
     with RecordWriter(tmp_path / "run.mcap") as writer:
         tracemalloc.start()
@@ -436,7 +436,7 @@ FILL = """
 
 
 @pytest.mark.parametrize("limit", [10, 100, 1_000, 2_900_000, 3_000_000, 3_234_567])
-def test_a_full_disk_is_one_line_and_leaves_a_readable_record(tmp_path, limit):
+def test_a_full_disk_is_reported_and_leaves_a_readable_record(tmp_path, limit):
     path = tmp_path / "run.mcap"
     command = [sys.executable, "-c", textwrap.dedent(FILL), str(path), str(limit)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)

@@ -1,4 +1,4 @@
-"""The in-memory bus: agents get each gate once and whole, the world their outputs and then their dones."""
+"""The in-memory bus: agents receive each gate once and in full; the world receives their outputs, then their dones."""
 
 import math
 import os
@@ -24,7 +24,7 @@ KeyedMessages = list[tuple[str, Any]]
 
 
 class Timing(Struct):
-    """What the bus needs of `world/info`."""
+    """The fields of `world/info` that the bus needs."""
 
     command_delay_ns: int
     gate_ns: int
@@ -33,7 +33,7 @@ class Timing(Struct):
 
 
 class Hub:
-    """A world of two drones that says one IMU sample and a status per gate, and waits for whom it is told to."""
+    """A world of two drones that publishes an IMU sample and a status per gate, and waits for the given processes."""
 
     run_id = "run1"
 
@@ -91,7 +91,7 @@ def _event_end() -> Struct:
 
 
 class Notes(Agent):
-    """Base of the agents here: notes what it is handed."""
+    """Base of the agents in this file: notes what it receives."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -150,7 +150,7 @@ def of(published: KeyedMessages, kind: type) -> list[Any]:
     return [message for _, message in published if type(message) is kind]
 
 
-def test_everybody_joins_with_what_the_contract_asks_for():
+def test_every_agent_joins_with_the_fields_the_contract_requires():
     hub, _ = fly(1, team())
     joins = {keys.thing(key): message for key, message in hub.handled if isinstance(message, Join)}
     assert list(joins) == ["estimator.d1", "estimator.d2", "controller.main"]
@@ -158,7 +158,7 @@ def test_everybody_joins_with_what_the_contract_asks_for():
     assert (join.run_id, join.role, join.pid, join.period_ns) == ("run1", "estimator", os.getpid(), GATE_NS)
 
 
-def test_an_agent_gets_each_gate_whole_and_is_then_asked():
+def test_an_agent_receives_each_gate_in_full_before_it_steps():
     agents = team()
     fly(3, agents)
     assert isinstance(agents[0], Notes)
@@ -197,12 +197,12 @@ def test_a_done_follows_its_outputs_and_counts_them_without_views():
         assert [type(message) for _, message in published[place - 2 : place]] == [Velocity, ClusterState]
 
 
-def test_outputs_that_the_world_only_relays_are_counted_for_it():
+def test_outputs_that_the_world_only_relays_are_counted():
     hub, _ = fly(1, team())
     assert hub.outputs == ["estimator.d1", "estimator.d2", "controller.main"]
 
 
-def test_an_agent_of_a_longer_period_reads_every_gate_and_answers_its_own():
+def test_an_agent_with_a_longer_period_reads_all_gates_and_steps_at_its_own():
     agent = FakeEstimator("d1", 2 * GATE_NS)
     hub, _ = fly(5, [agent])
     assert [t_ns // GATE_NS for what, t_ns in agent.notes if what == "step"] == [0, 2, 4]
@@ -210,7 +210,7 @@ def test_an_agent_of_a_longer_period_reads_every_gate_and_answers_its_own():
     assert [done.done_ns // GATE_NS for done in of(hub.handled, Done)] == [0, 2, 4]
 
 
-def test_the_sink_takes_everything_but_views_in_order():
+def test_the_sink_receives_everything_but_views_in_order():
     _, published = fly(2, team())
     assert not [key for key, _ in published if key.startswith("view/")]
     assert len(of(published, Imu)) == 4
@@ -225,7 +225,7 @@ def test_the_sink_takes_everything_but_views_in_order():
     ]
 
 
-def test_everybody_says_bye_after_the_world_s_last_words():
+def test_every_agent_says_bye_after_the_world_s_end_event():
     hub, published = fly(3, team())
     byes = [(key, message) for key, message in published if isinstance(message, Bye)]
     assert published[-3:] == byes
@@ -234,7 +234,7 @@ def test_everybody_says_bye_after_the_world_s_last_words():
     assert hub.handled[-3:] == byes
 
 
-def test_waiting_for_somebody_who_is_not_there_is_an_error_and_no_endless_loop():
+def test_waiting_for_an_absent_process_is_an_error_not_an_endless_loop():
     bus = Bus(Hub(3, waits_for=["estimator.d9", "console.1"]), team(), lambda: 0)
     with refused(RunError, "waits", "estimator.d9", "console.1"):
         bus.turn()
@@ -244,14 +244,14 @@ def test_waiting_for_somebody_who_is_not_there_is_an_error_and_no_endless_loop()
 
 
 class Chatter(Agent):
-    """Publishes the state of a cluster of its own at every gate, and notes what it hears of all."""
+    """Publishes a cluster state under its own name at every gate, and notes all such states that it receives."""
 
     def __init__(self, name: str, returns: Any = None) -> None:
         super().__init__()
         self.name, self.period_ns = f"talk.{name}", GATE_NS
         self.gate_keys = (keys.status("d1"),)
         self.reads = (keys.status("d1"), keys.cluster_state("*"))
-        self.heard: list[tuple[int, str, int]] = []  # at which gate what was handed over, and its stamp
+        self.heard: list[tuple[int, str, int]] = []  # gate of delivery, key and time stamp
         self._now: list[tuple[str, int]] = []
         self._returns = returns
         self._key = keys.cluster_state(name)
@@ -270,7 +270,7 @@ class Chatter(Agent):
 
 
 class AheadHub(Hub):
-    """A world with a command delay: it goes so many gates ahead of the dones."""
+    """A world with a command delay: it runs that many gates ahead of the dones."""
 
     delay = 1
 
@@ -293,7 +293,7 @@ def talk(names: Sequence[str], delay: int = 1) -> dict[str, list[tuple[int, str,
     return {agent.name: agent.heard for agent in team}
 
 
-def test_what_is_received_does_not_depend_on_the_order_of_agents():
+def test_what_agents_receive_does_not_depend_on_their_order():
     forth, back = talk("abcde"), talk("edcba")
     assert forth == back
     assert len({tuple(heard) for heard in forth.values()}) == 1
@@ -304,7 +304,9 @@ def test_what_is_received_does_not_depend_on_the_order_of_agents():
 
 @pytest.mark.parametrize("delay", [1, 3, 12])
 @pytest.mark.parametrize("gates_max", [1, 2, 10])
-def test_nor_on_how_many_gates_the_bus_takes_at_once(monkeypatch: pytest.MonkeyPatch, delay: int, gates_max: int):
+def test_delivery_does_not_depend_on_how_many_gates_the_bus_takes_at_once(
+    monkeypatch: pytest.MonkeyPatch, delay: int, gates_max: int
+):
     monkeypatch.setattr("zsim.runtime.bus.GATES_MAX", gates_max)
     for heard in talk("abc", delay).values():
         assert {t_ns - stamp for t_ns, _, stamp in heard} == {(delay + 1) * GATE_NS}
@@ -327,7 +329,7 @@ def failed(returns: Any) -> tuple[Hub, KeyedMessages, str]:
     return hub, published, str(raised.value)
 
 
-def test_numbers_and_arrays_of_numpy_are_taken_as_they_would_arrive():
+def test_numpy_values_reach_the_world_as_plain_floats():
     def returns(t_ns: int) -> list[Output]:
         return velocity(t_ns, velocity_m_s=np.array([1.0, 2.0, 3.0]), yaw_rate_rad_s=np.float32(0.5))
 
@@ -352,7 +354,7 @@ def test_numbers_and_arrays_of_numpy_are_taken_as_they_would_arrive():
         (lambda t_ns: 1 / (t_ns - t_ns), ("Chatter", "ZeroDivisionError", "test_bus.py:")),
     ],
 )
-def test_what_cannot_be_sent_ends_its_sender_with_class_gate_key_and_field(returns: Any, terms: tuple[str, ...]):
+def test_an_invalid_output_ends_its_agent_with_the_reason(returns: Any, terms: tuple[str, ...]):
     hub, _, line = failed(lambda t_ns: velocity(t_ns) if t_ns < 2 * GATE_NS else returns(t_ns))
     assert line.startswith("talk.a at 0.04 s: ")
     assert all(term in line for term in terms), line

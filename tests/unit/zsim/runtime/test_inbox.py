@@ -1,6 +1,6 @@
 """The inbox: whatever the order of arrival, an agent gets the same gates with the same inputs in the same order.
 
-The routing table says which reader reads which key.
+The routing table, which assigns keys to readers, is tested here too.
 """
 
 import random
@@ -26,7 +26,7 @@ Sent = tuple[str, Any]
 
 
 def gate_of(drone: str, gate: int) -> list[Sent]:
-    """Return what a drone says in a gate: four IMU samples, now and then a barometer's, and the status."""
+    """Return what a drone publishes in a gate: four IMU samples, a barometer sample in odd gates, and the status."""
     t_ns = gate * GATE_NS
     messages_sent: list[Sent] = []
     if gate:
@@ -84,8 +84,8 @@ def test_any_order_of_arrival_gives_the_canonical_sequence(seed: int, gates: int
 
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 2**32), gates=st.integers(2, GAP_MAX))
-def test_estimates_and_states_may_come_in_any_order(seed: int, gates: int):
-    """A controller reads states and estimates of three drones; nothing of its inputs is counted."""
+def test_estimates_and_states_may_arrive_in_any_order(seed: int, gates: int):
+    """A controller reads the states and estimates of three drones, none of which are counted."""
     drones = ["d1", "d2", "d3"]
     closing = [keys.status(d) for d in drones] + [keys.estimate(d) for d in drones]
     messages_sent = [
@@ -105,7 +105,7 @@ def test_samples_of_the_next_gate_do_not_stand_in_for_missing_ones():
     assert [t_ns for t_ns, _ in feed(inbox, [lost])] == [GATE_NS, 2 * GATE_NS]
 
 
-def test_a_late_joiner_s_first_gate_is_not_counted():
+def test_the_first_gate_of_a_late_joiner_is_not_counted():
     inbox = Inbox([STATUS], ["d1"])
     *_, sample, last = gate_of("d1", 7)
     assert feed(inbox, [sample, last]) == [(7 * GATE_NS, [sample, last])]
@@ -130,7 +130,7 @@ def test_a_warm_start_counts_its_next_gate_in_full():
     assert [t_ns for t_ns, _ in feed(inbox, [lost])] == [8 * GATE_NS]
 
 
-def test_a_replay_fills_the_hole_and_brings_nothing_twice():
+def test_a_replay_fills_a_gap_without_duplicates():
     inbox = Inbox([STATUS], ["d1"])
     messages_sent = flight(["d1"], 6)
     taken = feed(inbox, [*messages_sent[0], *messages_sent[1]])
@@ -142,7 +142,7 @@ def test_a_replay_fills_the_hole_and_brings_nothing_twice():
     assert inbox.duplicates == 2
 
 
-def test_a_gate_of_which_nothing_came_is_known_by_its_gap():
+def test_a_completely_lost_gate_is_detected_as_a_gap():
     inbox = Inbox([STATUS], ["d1"])
     messages_sent = flight(["d1"], 4)
     feed(inbox, messages_sent[0])
@@ -158,7 +158,7 @@ def test_a_gate_of_which_nothing_came_is_known_by_its_gap():
     ]
 
 
-def test_a_gap_that_is_given_up_is_passed_over():
+def test_an_abandoned_gap_is_skipped():
     inbox = Inbox([STATUS], ["d1"])
     messages_sent = flight(["d1"], 4)
     feed(inbox, [*messages_sent[0], *messages_sent[3]])
@@ -166,21 +166,21 @@ def test_a_gap_that_is_given_up_is_passed_over():
     assert inbox.next_gate_ns() == 3 * GATE_NS
 
 
-def test_a_gap_that_no_replay_can_fill_is_a_jump():
+def test_a_gap_too_long_for_a_replay_is_a_jump():
     inbox = Inbox([STATUS])
     feed(inbox, gate_of("d1", 0)[-1:])
     far = GAP_MAX + 2
     assert [t_ns for t_ns, _ in feed(inbox, gate_of("d1", far)[-1:])] == [far * GATE_NS]
 
 
-def test_the_longest_gap_that_a_replay_can_fill_is_known() -> None:
+def test_the_longest_gap_that_a_replay_can_fill_is_detected() -> None:
     inbox = Inbox([STATUS])
     feed(inbox, gate_of("d1", 0)[-1:])
     assert feed(inbox, gate_of("d1", GAP_MAX + 1)[-1:]) == []
     assert inbox.next_gate_ns() == GATE_NS
 
 
-def test_a_gap_is_known_by_the_numbers_of_gates_that_come_whole() -> None:
+def test_a_gap_is_detected_by_the_numbers_of_bundled_gates() -> None:
     inbox = Inbox([STATUS])
     for gate in (0, 2):
         t_ns = gate * GATE_NS
@@ -190,7 +190,7 @@ def test_a_gap_is_known_by_the_numbers_of_gates_that_come_whole() -> None:
     assert inbox.next_gate_ns() == GATE_NS
 
 
-def test_lost_names_only_what_will_not_come():
+def test_lost_returns_only_a_key_that_will_not_arrive():
     estimates = keys.estimate("d1")
     inbox = Inbox([STATUS, estimates])
     inbox.put(STATUS, status(0, 0, 1))
@@ -217,7 +217,7 @@ def test_a_dropped_publisher_is_not_waited_for_until_it_is_back():
     assert inbox.missing(2 * GATE_NS) == other
 
 
-def test_a_dropped_drone_s_samples_are_not_waited_for():
+def test_samples_of_a_dropped_drone_are_not_waited_for():
     inbox = Inbox([STATUS], ["d1"])
     feed(inbox, gate_of("d1", 0))
     _, *rest = gate_of("d1", 1)
@@ -226,7 +226,7 @@ def test_a_dropped_drone_s_samples_are_not_waited_for():
     assert [t_ns for t_ns, _ in ready(inbox)] == [GATE_NS]
 
 
-def test_duplicates_and_latecomers_are_counted_and_refused():
+def test_duplicate_and_late_messages_are_counted_and_refused():
     inbox = Inbox([STATUS], ["d1"])
     messages_sent = gate_of("d1", 0)
     assert inbox.put(*messages_sent[0])
@@ -238,14 +238,14 @@ def test_duplicates_and_latecomers_are_counted_and_refused():
     assert inbox.next_gate_ns() is None
 
 
-def test_another_number_or_time_is_another_message():
+def test_a_different_number_or_time_makes_a_different_message():
     inbox = Inbox([STATUS])
     for t_ns, seq in ((5, 0), (6, 0), (5, 1)):
         assert inbox.put(IMU, imu(t_ns, seq))
     assert [message for _, message in inbox.take(10)] == [imu(5, 0), imu(5, 1), imu(6, 0)]
 
 
-def test_a_long_backlog_is_worked_off_in_order():
+def test_a_long_backlog_is_processed_in_order():
     messages_sent = flight(["d1"], 300)
     inbox = Inbox([STATUS], ["d1"])
     for gate in messages_sent:
@@ -255,7 +255,7 @@ def test_a_long_backlog_is_worked_off_in_order():
     assert ready(inbox) == expected(messages_sent)
 
 
-def test_in_realtime_a_late_message_comes_with_the_next_gate_once():
+def test_a_late_message_comes_once_with_the_next_gate_in_realtime():
     a, b = keys.estimate("d1"), keys.estimate("d2")
     inbox = Inbox([a, b], keep_late=True)
     for gate in (1, 2, 3, 4):
@@ -272,7 +272,7 @@ def test_in_realtime_a_late_message_comes_with_the_next_gate_once():
     assert inbox.late == 4
 
 
-def test_in_lockstep_what_belongs_to_no_gate_comes_with_the_next_if_it_is_late():
+def test_late_messages_outside_gates_come_with_the_next_gate_in_lockstep():
     found = keys.detections("d1")
     inbox = Inbox([STATUS], uncounted=[found])
     for gate in (1, 2, 3):
@@ -284,7 +284,7 @@ def test_in_lockstep_what_belongs_to_no_gate_comes_with_the_next_if_it_is_late()
     assert inbox.take(4 * GATE_NS) == []
 
 
-def test_what_a_replay_brings_of_a_gate_that_came_whole_is_left_out():
+def test_replayed_messages_of_a_bundled_gate_are_dropped():
     singly = gate_of("d1", 1)
     whole = GateMessages.of(GATE_NS, 1, key_table(["d1"]), [(key, messages.encode(each)) for key, each in singly])
     inbox = Inbox((STATUS, keys.estimate("d1")), ("d1",))
@@ -294,7 +294,7 @@ def test_what_a_replay_brings_of_a_gate_that_came_whole_is_left_out():
     assert sorted(key for key, _ in inbox.take(GATE_NS)) == sorted([keys.gate("d1"), keys.estimate("d1")])
 
 
-# Publishers that may skip gates, as drivers of external drones
+# Publishers that may skip gates, such as drivers of external drones
 
 SPARSE = (keys.status("d3"), keys.estimate("d3"))
 CLOSING = (keys.status("d1"), keys.estimate("d1"), *SPARSE)
@@ -306,7 +306,7 @@ def closed_by(drone: str, gate: int, seq: int | None = None) -> list[Sent]:
 
 
 def sparse_inbox(gates: int) -> Inbox:
-    """Return an inbox of a controller of d1 and the external d3, through with so many gates of both."""
+    """Return the inbox of a controller of d1 and the external d3 after this many gates of both."""
     inbox = Inbox(CLOSING, keep_late=True, sparse=SPARSE)
     for gate in range(gates):
         for sent in closed_by("d3", gate) + closed_by("d1", gate):
@@ -321,7 +321,7 @@ def put_all(inbox: Inbox, messages_sent: list[Sent]) -> None:
         inbox.put(*sent)
 
 
-def test_who_comes_at_every_gate_is_waited_for():
+def test_a_sparse_publisher_that_skips_no_gate_is_waited_for():
     inbox = sparse_inbox(3)
     put_all(inbox, closed_by("d1", 3))
     assert inbox.missing(3 * GATE_NS) in SPARSE
@@ -330,16 +330,16 @@ def test_who_comes_at_every_gate_is_waited_for():
     assert inbox.missing(3 * GATE_NS) is None
 
 
-def test_who_has_skipped_a_gate_is_not_waited_for_until_it_has_come_twice():
+def test_a_publisher_that_skipped_is_awaited_after_two_gates_in_a_row():
     inbox = sparse_inbox(3)
     put_all(inbox, closed_by("d1", 3))
-    inbox.take(3 * GATE_NS)  # given up: the next gate is there
+    inbox.take(3 * GATE_NS)  # abandoned, since the next gate has arrived
     for gate in range(4, 8):
         put_all(inbox, closed_by("d1", gate))
         assert inbox.missing(gate * GATE_NS) is None
         inbox.take(gate * GATE_NS)
     waited = []
-    for gate in range(8, 12):  # it is back, each time behind the other one
+    for gate in range(8, 12):  # d3 is back, each time later than d1
         put_all(inbox, closed_by("d1", gate))
         waited.append(inbox.missing(gate * GATE_NS) is not None)
         if not waited[-1]:
@@ -352,7 +352,7 @@ def test_who_has_skipped_a_gate_is_not_waited_for_until_it_has_come_twice():
     assert waited == [False, False, True, True]
 
 
-def test_who_comes_at_every_second_gate_is_never_waited_for_and_what_it_brings_is_handed_out():
+def test_a_publisher_at_every_second_gate_is_delivered_but_not_awaited():
     inbox = sparse_inbox(0)
     brought = []
     for gate in range(12):
@@ -364,7 +364,7 @@ def test_who_comes_at_every_second_gate_is_never_waited_for_and_what_it_brings_i
     assert brought == [gate * GATE_NS for gate in range(0, 11, 2)]
 
 
-def test_a_status_that_begins_anew_leaves_no_gap():
+def test_a_status_that_restarts_its_numbers_leaves_no_gap():
     inbox = Inbox([keys.status("d3")], ["d3"], keep_late=True, sparse=[keys.status("d3")])
     assert inbox.may_skip
     for gate, seq in ((4, 7), (9, 8), (11, 0), (12, 1)):
@@ -374,7 +374,7 @@ def test_a_status_that_begins_anew_leaves_no_gap():
         inbox.take(gate * GATE_NS)
 
 
-def test_the_world_s_messages_of_a_gate_do_not_close_it_for_an_external_drone():
+def test_a_gate_of_the_world_does_not_close_it_for_an_external_drone():
     d1, d3 = keys.status("d1"), keys.status("d3")
     table = key_table(["d1", "d3"])
     inbox = Inbox([d1, d3], ["d1", "d3"], keep_late=True, sparse=[d3])
@@ -389,7 +389,7 @@ def test_the_world_s_messages_of_a_gate_do_not_close_it_for_an_external_drone():
     assert inbox.missing(2 * GATE_NS) is None
 
 
-# Which reader reads which key, and what of a gate's messages goes to whom
+# Which reader reads which key, and which messages of a gate it receives
 
 
 DRONES = ("d1", "d2", "d3")
@@ -399,14 +399,14 @@ EXPRESSIONS = st.lists(st.one_of(CHUNKS, st.sampled_from(["*", "**", "a$*"])), m
 
 
 @given(readers=st.lists(st.lists(EXPRESSIONS, max_size=3), max_size=4), key=KEYS)
-def test_it_says_what_comparing_each_expression_says(readers: list[list[str]], key: str) -> None:
+def test_the_routing_table_agrees_with_matching_each_expression(readers: list[list[str]], key: str) -> None:
     wanted = [place for place, own in enumerate(readers) if any(keys.matches(each, key) for each in own)]
     table = RoutingTable(readers)
     assert list(table.readers(key)) == wanted
     assert table.readers(key) is table.readers(key)
 
 
-def test_readers_of_any_of_some_keys_are_named_once() -> None:
+def test_readers_of_several_keys_are_listed_once() -> None:
     table = RoutingTable([["drone/*/truth"], ["clock"], ["drone/d1/*"], ["**"]])
     assert table.readers_of_any([keys.truth("d1"), keys.truth("d2")]) == (0, 2, 3)
 
@@ -423,14 +423,14 @@ def baro_pair(drone: str, t_ns: int = GATE_NS) -> tuple[str, bytes]:
     return keys.sensor(drone, "baro"), encode(Baro(t_ns, 1, t_ns, 101_325.0, 1.0))
 
 
-def test_each_reader_gets_what_it_reads_of_a_gate_decoded_once() -> None:
+def test_a_gate_is_decoded_once_and_split_among_its_readers() -> None:
     router = GateRouter(RoutingTable([["drone/*/sensor/status"], [keys.status("d2")], []]))
     routed = list(router.split(gate_messages(baro_pair("d1"), status_pair("d1"), baro_pair("d2"), status_pair("d2"))))
     assert [(key, readers) for readers, key, _ in routed] == [(keys.status("d1"), (0,)), (keys.status("d2"), (0, 1))]
     assert routed[0][2].count == 2
 
 
-def test_what_is_no_message_of_its_key_is_left_out() -> None:
+def test_undecodable_messages_of_a_gate_are_left_out() -> None:
     router = GateRouter(RoutingTable([["**"]]))
     assert [key for _, key, _ in router.split(gate_messages((keys.status("d1"), b"\xc1"), status_pair("d2")))] == [
         keys.status("d2")
@@ -438,13 +438,13 @@ def test_what_is_no_message_of_its_key_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("place", [-1, 24, 2**62])
-def test_keys_outside_of_the_table_are_not_followed(place: int) -> None:
+def test_key_indices_outside_the_table_are_ignored(place: int) -> None:
     whole = gate_messages(status_pair("d1"), status_pair("d2"))
     bad = GateMessages(GATE_NS, 1, whole.table, np.full(2, place), whole.stamps, whole.ends, whole.buffer)
     assert list(GateRouter(RoutingTable([["**"]])).split(bad)) == []
 
 
-def test_messages_of_a_gate_come_among_the_others_in_canonical_order() -> None:
+def test_messages_of_a_gate_are_merged_in_canonical_order() -> None:
     other = (keys.estimate("d1"), status(GATE_NS, 1))
     router = GateRouter(RoutingTable([["**"]]))
     inputs = [(keys.GATE, gate_messages(status_pair("d2"), baro_pair("d1"), baro_pair("d3", GATE_NS - 1))), other]

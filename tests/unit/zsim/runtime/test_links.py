@@ -1,4 +1,4 @@
-"""Links: what an agent is handed of the messages of a gate, and when; and both ends of the agents' radio."""
+"""Links: which messages of a gate an agent receives and when, and both ends of the agents' radio."""
 
 import math
 from collections import Counter
@@ -55,39 +55,39 @@ def handed_over(made: Links, t_ns: int, inputs: list[Given]) -> list[Given]:
 
 
 def gates(made: Links, last: int, given: Any = estimate) -> list[tuple[int, int]]:
-    """Hand over a message per gate; return (gate of delivery, gate of the message)."""
+    """Deliver one message per gate; return (gate of delivery, gate of the message) pairs."""
     handed = [(gate, handed_over(made, gate * GATE_NS, [given(gate)])) for gate in range(1, last + 1)]
     return [(gate, message.t_ns // GATE_NS) for gate, some in handed for _, message in some]
 
 
-def test_without_a_fault_everything_passes_as_it_is():
+def test_without_a_fault_messages_pass_unchanged():
     inputs = [estimate(1)]
     assert handed_over(links(), GATE_NS, inputs) is inputs
 
 
-def test_a_cut_acts_in_the_gates_after_its_start_up_to_its_end():
+def test_a_cut_acts_from_the_gate_after_its_start_to_its_end():
     made = links(fault("link_cut", at_s=0.04, for_s=0.06))
     assert gates(made, 8) == [(gate, gate) for gate in (1, 2, 6, 7, 8)]
 
 
 @pytest.mark.parametrize(("delay_ms", "late"), [(1, 1), (20, 1), (21, 2), (60, 3)])
-def test_a_delay_is_in_whole_gates(delay_ms: float, late: int):
+def test_a_delay_is_rounded_up_to_whole_gates(delay_ms: float, late: int):
     made = links(fault("link_delay", delay_ms=delay_ms))
     assert gates(made, 10) == [(gate + late, gate) for gate in range(1, 11 - late)]
 
 
-def test_what_is_on_its_way_when_a_delay_ends_still_comes_and_first():
+def test_messages_still_delayed_when_a_delay_ends_come_first():
     made = links(fault("link_delay", delay_ms=40, for_s=0.06))
     assert gates(made, 6) == [(3, 1), (4, 2), (4, 4), (5, 3), (5, 5), (6, 6)]
 
 
-def test_delays_add_up_and_a_cut_beside_them_wins():
+def test_delays_add_up_and_a_cut_overrides_them():
     late = [fault("link_delay", delay_ms=20), fault("link_delay", number=2, delay_ms=30)]
     assert gates(links(*late), 5) == [(4, 1), (5, 2)]
     assert gates(links(*late, fault("link_cut", number=3)), 5) == []
 
 
-def test_a_loss_loses_its_share_and_never_depends_on_the_order_of_arrival():
+def test_losses_match_their_probability_in_any_order_of_arrival():
     share, count = 0.3, 4000
     kept = {gate for gate, _ in gates(links(fault("link_loss", probability=share)), count)}
     assert len(kept) / count == pytest.approx(1 - share, abs=4 * math.sqrt(share * (1 - share) / count))
@@ -100,52 +100,52 @@ def test_a_loss_loses_its_share_and_never_depends_on_the_order_of_arrival():
     assert len(gates(links(fault("link_loss", probability=0.0)), 50)) == 50
 
 
-def test_two_losses_draw_apart():
+def test_two_losses_draw_independently():
     first, second = fault("link_loss", probability=0.5), fault("link_loss", number=2, probability=0.5)
     count = 2000
     kept = len(gates(links(first, replace(second, rank=1)), count)) / count
     assert kept == pytest.approx(0.25, abs=4 * math.sqrt(0.25 * 0.75 / count))
 
 
-def test_two_jitters_draw_apart():
-    """Two even delays of up to two gates each: their sum is a triangle over four."""
+def test_two_jitters_draw_independently():
+    """The sum of two uniform delays of up to two gates each has a triangular distribution over four gates."""
     first, second = fault("link_jitter", jitter_ms=40), fault("link_jitter", number=2, jitter_ms=40)
     count = 2000
     late = [to - of for to, of in gates(links(first, replace(second, rank=1)), count)]
     shares = [late.count(gate) / len(late) for gate in (1, 2, 3, 4)]
     assert shares == pytest.approx([1 / 8, 3 / 8, 3 / 8, 1 / 8], abs=4 * math.sqrt(0.25 / count))
     late = [to - of for to, of in gates(links(fault("link_jitter", jitter_ms=100)), 3000)]
-    assert set(late) == {1, 2, 3, 4, 5}  # a delay of anything above zero is a gate at least
+    assert set(late) == {1, 2, 3, 4, 5}  # any delay above zero takes at least a gate
     assert sum(late) / len(late) == pytest.approx(3.0, abs=0.1)
 
 
-def test_both_ways_unless_it_is_one_way():
+def test_a_cut_acts_both_ways_unless_it_is_one_way():
     there, back = fault("link_cut", f"{ME}/{OTHER}"), fault("link_cut", f"{ME}/{OTHER}", one_way=True)
     assert gates(links(there), 3) == []
     assert len(gates(links(back), 3)) == 3
     assert gates(links(fault("link_cut", f"{OTHER}/{ME}", one_way=True)), 3) == []
 
 
-def test_other_links_are_not_touched():
+def test_a_cut_does_not_affect_other_links():
     made = links(
         fault("link_cut", "estimator.d2/controller.main"), fault("link_cut", f"{OTHER}/controller.b", number=2)
     )
     assert len(gates(made, 3)) == 3
-    assert len(gates(links(fault("link_cut")), 3, status)) == 3  # a status is the world's
+    assert len(gates(links(fault("link_cut")), 3, status)) == 3  # a status is sent by the world
     assert gates(links(fault("link_cut", f"world/{ME}")), 3, status) == []
 
 
-def test_who_sends():
+def test_the_senders_of_a_message():
     assert senders(ESTIMATE, estimate(1)[1]) == (OTHER,)
     assert senders(ESTIMATE, estimate(1, source="controller.main")[1]) == (OTHER,)  # they share a process
     assert senders(ESTIMATE, estimate(1, source="my.filter")[1]) == (OTHER, "my.filter")
     assert senders(STATUS, status(1)[1]) == ("world",)
-    told = AgentMessage(t_ns=0, seq=0, source="pilot.d7")  # of a process that it shares with others
+    told = AgentMessage(t_ns=0, seq=0, source="pilot.d7")  # from a process that serves several drones
     assert senders("swarm/d1/place", told, {"swarm/*/place": "pilot"}) == ("pilot.d1",)
     assert senders(keys.command("d1", "mode"), Mode(0, 0, "console.1", "land")) == ("console.1",)
 
 
-def test_an_older_list_says_nothing_and_a_newer_one_counts():
+def test_only_a_newer_fault_list_replaces_the_current_one():
     made = links(fault("link_cut"))
     made.update(Faults(0, 0, ()))
     assert gates(made, 1) == []
@@ -154,7 +154,7 @@ def test_an_older_list_says_nothing_and_a_newer_one_counts():
 
 
 class Both(Agent):
-    """Estimators of two drones that read whole gates, and note what they receive."""
+    """The estimators of two drones in one agent, which reads whole gates and notes what it receives."""
 
     name, serves, takes_gates = "estimator.d1", ("estimator.d2",), True
     reads = tuple(keys.sensors(drone) for drone in ("d1", "d2"))
@@ -173,7 +173,7 @@ class Both(Agent):
         return []
 
 
-def test_an_estimator_of_several_drones_has_the_link_of_each():
+def test_an_estimator_of_several_drones_has_a_link_for_each():
     pairs = [(keys.sensor(drone, "imu"), encode(Imu(GATE_NS, 1, GATE_NS, ZEROS, ZEROS))) for drone in ("d1", "d2")]
     gate = GateMessages.of(GATE_NS, 1, key_table(["d1", "d2"]), pairs)
     made, inputs = Both(), [(keys.GATE, gate)]
@@ -192,14 +192,14 @@ def radio(**place: Any) -> Fault:
 
 
 @pytest.mark.parametrize("distance_m", [30.0, 45.0, 50.0, 55.0, 70.0])
-def test_a_radio_loses_more_the_farther_it_reaches(distance_m: float):
+def test_a_radio_loses_more_at_greater_distance(distance_m: float):
     count = 2000
     kept = len(gates(links(radio()), count, lambda gate: estimate(gate, (distance_m, 0.0, 0.0))))
     expected = 1 / (1 + math.exp((distance_m - 50) / 5))
     assert kept / count == pytest.approx(expected, abs=4 * math.sqrt(0.25 / count))
 
 
-def test_a_radio_is_where_its_process_is():
+def test_a_radio_is_located_at_its_process():
     far = (1000.0, 0.0, 0.0)
     assert gates(links(radio()), 5, lambda gate: estimate(gate, far)) == []
     assert len(gates(links(radio(controller_main=[990, 0, 0])), 5, lambda gate: estimate(gate, far))) == 5
@@ -212,18 +212,18 @@ def test_a_radio_is_where_its_process_is():
     assert [[message.position_m for _, message in handed] for handed in apart] == [[ZEROS], [ZEROS]]
 
 
-def test_a_radio_is_not_between_a_drone_and_its_own_estimator():
+def test_there_is_no_radio_between_a_drone_and_its_own_estimator():
     made = links(fault("radio", "world", range_m=1, spread_m=0.1), names=(OTHER,))
     assert len(gates(made, 5, lambda gate: estimate(gate, (1000.0, 0.0, 0.0)))) == 5
 
 
-def test_an_unknown_place_loses_nothing():
-    assert len(gates(links(radio()), 5, status)) == 5  # no estimate has come yet
+def test_a_radio_at_an_unknown_place_loses_nothing():
+    assert len(gates(links(radio()), 5, status)) == 5  # no estimate has arrived yet
     assert place_of("controller.main", {"controller.main": "d9"}, ("d1",), {}.get) is None
 
 
 @pytest.mark.parametrize("process", ["estimator.d2", "reference.d2", "pilot.d2"])
-def test_a_radio_is_on_the_drone_after_which_a_process_is_named(process: str) -> None:
+def test_a_process_named_after_a_drone_has_its_radio_on_that_drone(process: str) -> None:
     """d1 is 1000 m from the origin and beside d2; d2 hears itself wherever it is."""
     far, place = (1000.0, 0.0, 0.0), {"d2": (1000.0, 1.0, 0.0)}.get
     assert place_of(process, {}, ("d1", "d2"), place) == (1000.0, 1.0, 0.0)
@@ -238,7 +238,7 @@ def test_a_radio_is_on_the_drone_after_which_a_process_is_named(process: str) ->
 
 
 @pytest.mark.parametrize("process", ["controller.d2", "camera.d2", "console.1", "pilot.nobody"])
-def test_what_is_on_no_board_is_at_the_origin(process: str) -> None:
+def test_a_process_that_is_on_no_drone_is_at_the_origin(process: str) -> None:
     assert place_of(process, {}, ("d1", "d2"), {"d2": (1000.0, 1.0, 0.0)}.get) == ZEROS
 
 
@@ -264,8 +264,8 @@ def test_a_controller_keeps_the_newest_state_of_a_drone():
     assert made._states == ["landing", "landed"]
 
 
-def test_a_controller_takes_so_many_requests_between_two_gates():
-    """As in a run that is paused; at the next gate it says what it took, and takes others."""
+def test_a_controller_takes_a_limited_number_of_requests_per_gate():
+    """A paused run needs this limit; at the next gate the controller publishes the requests it took, and takes others."""
     made, (key,) = controller(), controller().control_keys()
     answers = [made.control(key, ControlRequest("sing", {}, "op.1")) for _ in range(REQUESTS_MAX + 1)]
     assert [answer.error for answer in answers if has_terms(answer.error, str(REQUESTS_MAX), "requests")] == [
@@ -276,7 +276,7 @@ def test_a_controller_takes_so_many_requests_between_two_gates():
     assert "wait for" not in made.control(key, ControlRequest("sing", {}, "op.1")).error
 
 
-def test_one_that_is_restored_hands_over_the_same_at_the_same_gates():
+def test_restored_links_deliver_the_same_messages_at_the_same_gates():
     acting = fault("link_delay", delay_ms=100), fault("link_loss", number=2, probability=0.3)
     made, again = links(*acting), Links(RUN, (ME,))
     gates(made, 20)
@@ -311,15 +311,15 @@ def heard(gate: int, *hears: tuple[int, ...], reception: tuple[tuple[float, ...]
     return RadioLinks(gate * GATE_NS, gate, hears, reception)
 
 
-def test_the_links_at_the_time_of_sending_count() -> None:
+def test_the_links_at_the_time_of_sending_decide() -> None:
     made = receiver()
-    assert made.delay_ns(*said(0)) is None  # no links known
+    assert made.delay_ns(*said(0)) is None  # no links are known yet
     made.take(heard(1, (), (0,)))
     made.take(heard(2, (), ()))
     assert [made.delay_ns(*said(gate)) for gate in (0, 1, 2, 3)] == [None, 0, None, None]
 
 
-def test_what_comes_from_the_same_drone_or_a_wired_station_passes_no_radio() -> None:
+def test_messages_from_the_same_drone_or_a_wired_station_use_no_radio() -> None:
     made = receiver(loss=1.0)
     made.take(heard(0, (), ()))
     assert made.delay_ns(*said(0, "d2")) == 0
@@ -338,7 +338,7 @@ def test_loss_and_reception_multiply() -> None:
     assert received / 4000 == pytest.approx(0.4, abs=4 * math.sqrt(0.24 / 4000))
 
 
-def test_draws_are_of_each_receiver_and_message() -> None:
+def test_draws_depend_on_the_receiver_and_the_message() -> None:
     one, other = receiver(loss=0.5), receiver("watch.d2", loss=0.5)
     for made in (one, other):
         made.take(heard(0, (), (0,)))
@@ -356,7 +356,7 @@ def test_delay_and_jitter_add_up() -> None:
 
 
 def test_bandwidth_spreads_messages_over_gates() -> None:
-    """16 + 16 bytes at 6.4 kbit/s take 40 ms: one at every second gate; beyond two waiting, the oldest is lost."""
+    """16 + 16 bytes at 6.4 kbit/s take 40 ms, so one is sent every second gate; beyond two waiting, the oldest is lost."""
     made = Transmitter(Radio(bandwidth_kbit_s=6.4, queue_max=2), GATE_NS)
     assert made.size_bytes(said(0, text="x" * 13)[1]) == 32  # 1 for the list, 1 and 14 for its values
     sent = {gate: made.send(gate * GATE_NS, [said(gate, text="x" * 13)]) for gate in range(9)}
@@ -366,14 +366,14 @@ def test_bandwidth_spreads_messages_over_gates() -> None:
     assert all(message.t_ns == gate * GATE_NS for gate, each in sent.items() for _, message in each)
 
 
-def test_what_is_no_message_waits_for_none() -> None:
+def test_outputs_that_are_not_agent_messages_do_not_wait() -> None:
     made = Transmitter(Radio(bandwidth_kbit_s=0.1), GATE_NS)
     command = ("drone/d1/cmd/mode", object())
     assert made.send(0, [said(0), command]) == [command, said(0)]
     assert made.send(GATE_NS, [said(1), command]) == [command]
 
 
-def test_a_snapshot_has_what_is_known_and_what_waits() -> None:
+def test_a_snapshot_holds_known_links_and_waiting_messages() -> None:
     radio: dict[str, Any] = {"loss": 0.5, "bandwidth_kbit_s": 6.4}
     one, sends = receiver(**radio), Transmitter(Radio(**radio), GATE_NS)
     one.take(heard(0, (), (0,)))

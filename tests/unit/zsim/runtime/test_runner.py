@@ -1,4 +1,4 @@
-"""The runner: whose estimates a gate waits for, events that are no events, and a world that does not answer at once."""
+"""The runner: the estimates that a gate waits for, invalid events, restarts, and a world that answers late."""
 
 import os
 from collections.abc import Callable
@@ -34,13 +34,13 @@ from zsim.runtime.agent import Agent, Output
 from zsim.runtime.runner import Runner
 
 DRONES = "d1", "d2", "d3"
-END = 6  # last gate of the runs here
+END = 6  # last gate of the test runs
 ME = "judge.main"
 REPLAY = keys.replay(ME)
 
 
 class Judge(Agent):
-    """Closes a gate with the status and the estimate of one drone, and says nothing."""
+    """Closes a gate on the status and the estimate of one drone, and publishes nothing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -72,10 +72,10 @@ def event(kind: str, subject: str, **data: Any) -> Event:
 
 
 class World(FakeLink):
-    """Says a status per gate, the next one when the judge is done with the last, and the end.
+    """Publishes a status per gate, each when the judge is done with the one before, and the end of the run.
 
     Args:
-        at: what happens just before the status of a gate, by gate.
+        at: actions taken just before the status of a gate, by gate.
     """
 
     def __init__(self, at: dict[int, Callable[["World"], None]]) -> None:
@@ -126,7 +126,7 @@ def tells(*said: Event | Estimate) -> Callable[[World], None]:
 
 @pytest.mark.parametrize("kind", ["drop", "leave"])
 @pytest.mark.parametrize("source", ["my.d1", "estimator.d1", ""])
-def test_whose_estimates_are_waited_for_no_longer_follows_from_their_source(kind: str, source: str):
+def test_estimates_of_a_lost_source_are_no_longer_waited_for(kind: str, source: str):
     world = World({**estimates(range(2), source), 2: tells(event(kind, source or "estimator.d1"))})
     run(world)
     assert world.gates_done() == list(range(END + 1))
@@ -141,7 +141,7 @@ def test_the_loss_of_another_process_changes_nothing(subject: str):
 
 
 @pytest.mark.parametrize("successor", ["my.d1", "estimator.d1"])
-def test_who_joins_in_its_place_is_waited_for_from_its_own_first_gate(successor: str):
+def test_a_successor_is_waited_for_from_its_own_first_gate(successor: str):
     joins = event("join", successor, incarnation=1, host="x", pid=1, from_ns=4 * GATE_NS)
     world = World({**estimates(range(2)), 2: tells(event("drop", "my.d1")), 3: tells(joins)})
     ticks = iter(range(10))
@@ -160,7 +160,7 @@ GARBAGE = [
 ]
 
 
-def test_events_that_nobody_can_mean_are_refused_and_change_nothing():
+def test_invalid_events_are_refused_and_change_nothing():
     world = World({**estimates(range(END + 1)), 2: tells(*GARBAGE, estimate(2))})
     runner = Runner(world, info(), Judge())  # type: ignore[arg-type]
     assert runner.run() == RUN_ENDED
@@ -168,7 +168,7 @@ def test_events_that_nobody_can_mean_are_refused_and_change_nothing():
     assert runner.health.refused == len(GARBAGE)
 
 
-def test_who_is_superseded_ends():
+def test_a_superseded_process_ends():
     entry = {"incarnation": 1, "host": "other", "pid": os.getpid() + 1, "from_ns": 0, "former_pid": os.getpid()}
     world = World({**estimates(range(3)), 2: tells(event("superseded", ME, **entry))})
     with refused(SupersededError, ME, "other", f"pid {os.getpid() + 1}"):
@@ -189,13 +189,13 @@ class Swarm(Judge):
 
 
 def bundle_of(t_ns: int, seq: int, entries: list[tuple[str, Any]]) -> GateMessages:
-    """Return messages on drones d1 to d3 as the world bundles them."""
+    """Return messages about drones d1 to d3, bundled as by the world."""
     table = key_table(DRONES)
     return GateMessages.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in entries])
 
 
 class InOne(World):
-    """Says all of a gate in one message."""
+    """Publishes all of a gate in one message."""
 
     def _gate(self, gate: int) -> None:
         t_ns, still = gate * GATE_NS, (0.0, 0.0, 0.0)
@@ -209,12 +209,12 @@ class InOne(World):
         self.deliver(keys.GATE, bundle_of(t_ns, gate, entries).pack())
 
 
-def test_who_reads_several_drones_gets_a_gate_in_one_message():
+def test_a_reader_of_several_drones_receives_a_gate_in_one_message():
     swarm, world = Swarm(), InOne({3: lambda world: world.deliver(keys.estimate("d3"), estimate(3))})
     Runner(world, info(), swarm).run()  # type: ignore[arg-type]
     assert world.gates_done() == list(range(END + 1))
     assert swarm.received[:3] == [("mag", 0), ("status", 0), ("status", 0)]
-    assert len([leaf for leaf, _ in swarm.received if leaf == "status"]) == 2 * (END + 1)  # d3's are not asked for
+    assert len([leaf for leaf, _ in swarm.received if leaf == "status"]) == 2 * (END + 1)  # those of d3 are not read
     assert ("estimate", 3) in swarm.received
 
 
@@ -224,17 +224,17 @@ def test_garbage_in_place_of_a_gate_is_refused_and_changes_nothing():
     assert runner.health.refused == 1
 
 
-# A world that does not answer at once
+# A world that answers late
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let what is owed be tried at every tick."""
+    """Retry pending requests at every tick."""
     monkeypatch.setattr(participant, "RETRY_S", 0.0)
 
 
 def answers(*given: ControlAnswer) -> Callable[[str, dict[str, Any]], ControlAnswer]:
-    """Answer requests in turn."""
+    """Return a handler that gives these answers in turn."""
     left = iter(given)
     return lambda key, args: next(left)
 
@@ -247,8 +247,8 @@ def replayed(*gates: int) -> ControlAnswer:
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("before", [[], [UNANSWERED], [UNANSWERED, ControlAnswer(True, result=7), replayed()]])
-def test_a_gate_that_was_lost_is_asked_for_until_it_is_there(before: list[ControlAnswer]):
-    """The estimate of gate 2 is lost; that of gate 3 shows it; then nothing comes any more but answers."""
+def test_a_lost_gate_is_requested_until_it_arrives(before: list[ControlAnswer]):
+    """The estimate of gate 2 is lost, which that of gate 3 reveals; from then on only answers arrive."""
 
     def loses(world: World) -> None:
         world.deliver(keys.estimate("d1"), estimate(3))
@@ -263,8 +263,8 @@ def test_a_gate_that_was_lost_is_asked_for_until_it_is_there(before: list[Contro
 
 
 @pytest.mark.usefixtures("quick")
-def test_what_nobody_keeps_any_more_ends_it():
-    """Estimate 2 is lost, and the world, which went on without this process, has it no more."""
+def test_a_process_ends_if_a_lost_message_is_no_longer_kept():
+    """Estimate 2 is lost, and the world, which went on without this process, no longer has it."""
     rest = {gate: each for gate, each in estimates(range(END + 1)).items() if gate not in (2, 3)}
     world = World({**rest, 2: tells(estimate(3))})
     world.on_request = lambda key, args: replayed()
@@ -274,7 +274,7 @@ def test_what_nobody_keeps_any_more_ends_it():
 
 
 @pytest.mark.parametrize("deserted", [False, True])
-def test_who_lost_its_launcher_dies_and_does_not_leave(deserted: bool):
+def test_a_process_that_lost_its_launcher_ends_without_a_bye(deserted: bool):
     world = World(estimates(range(END + 1)))
     reason = Runner(world, info(), Judge(), lambda: True, deserted=lambda: deserted).run()  # type: ignore[arg-type]
     assert reason == "stopped"
@@ -283,10 +283,10 @@ def test_who_lost_its_launcher_dies_and_does_not_leave(deserted: bool):
 
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("hears", [True, False])
-def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
-    """The link goes and comes at gate 2, which is lost with it; the world takes its time to answer.
+def test_a_process_rejoins_after_a_lost_link_once_the_world_answers(hears: bool):
+    """The link drops and recovers at gate 2, which is lost; the world answers late.
 
-    A process that does not hear that it was taken in again says so several times.
+    A process that does not hear of its readmission repeats its join several times.
     """
     asked = iter(range(3))
 
@@ -329,7 +329,7 @@ def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
 
 
 @pytest.mark.usefixtures("quick")
-def test_after_a_lost_link_another_run_is_none_of_its_business():
+def test_a_process_does_not_rejoin_another_run_after_a_lost_link():
     def cut(world: World) -> None:
         world.last = {keys.INFO: messages.encode(info("run2"))}
         world.cut(False)
@@ -339,7 +339,7 @@ def test_after_a_lost_link_another_run_is_none_of_its_business():
         run(World({**estimates(range(END + 1)), 2: cut}))
 
 
-# A process that a fault kills dies once, however late it steps and in whatever order the lists come.
+# A process killed by a fault dies once, however late it steps and in whatever order the fault lists arrive.
 
 KILL = Fault(1, "process_kill", ME, {}, 2 * GATE_NS, 3 * GATE_NS, "tester.one")
 
@@ -349,7 +349,7 @@ def entries(gate: int, seq: int, *faults: Fault) -> Faults:
 
 
 def last_gate(before_gate: int, *lists: Faults) -> int:
-    """Return the last gate of a judge to whom some lists are said at once, before a gate."""
+    """Return the last gate of a judge that receives these fault lists together, before a gate."""
 
     def tell(world: World) -> None:
         for each in lists:
@@ -375,20 +375,20 @@ def last_gate(before_gate: int, *lists: Faults) -> int:
         pytest.param(1, [entries(1, 1, KILL), entries(0, 0)], 3, id="an older list comes later"),
     ],
 )
-def test_a_process_dies_of_a_kill_in_the_gate_in_which_it_acts(before_gate: int, lists: list[Faults], last: int):
+def test_a_kill_ends_a_process_at_the_gate_at_which_it_acts(before_gate: int, lists: list[Faults], last: int):
     assert last_gate(before_gate, *lists) == last
 
 
 class Second(Judge):
-    """A judge that takes over the estimate that the world has for it."""
+    """A judge that starts from the estimate that the world holds for it."""
 
     def warm_start_keys(self) -> tuple[str, ...]:
         return (keys.estimate("d1"),)
 
 
 @pytest.mark.parametrize(("former_gate", "killed"), [(2, True), (3, False), (4, False)])
-def test_who_is_started_again_after_its_kill_lives(former_gate: int, killed: bool):
-    """The former process of its name got as far as a gate; the kill is of gate 3."""
+def test_a_process_restarted_after_its_kill_is_not_killed_again(former_gate: int, killed: bool):
+    """Its predecessor got as far as the given gate; the kill acts at gate 3."""
     world = World(estimates(range(END + 1)))
     world.last[keys.estimate("d1")] = encode(estimate(former_gate))
     world.last[keys.FAULTS] = encode(entries(0, 0, KILL))
@@ -398,18 +398,18 @@ def test_who_is_started_again_after_its_kill_lives(former_gate: int, killed: boo
     assert world.gates_done()[-1] == (3 if killed else END)
 
 
-# A process that goes on from the snapshot of a former one of its name
+# A process that continues from the snapshot of its predecessor
 
 
 class Counter(Judge):
-    """A judge that publishes, as its estimate of d2, how many gates it and its former incarnations have stepped."""
+    """A judge that publishes, as its estimate of d2, how many gates it and its predecessors have stepped."""
 
     repeats = (keys.cluster_request("main"),)
 
     def __init__(self) -> None:
         super().__init__()
         self.count = 0
-        self.repeated: list[tuple[int, int]] = []  # count at that time, gate of the request
+        self.repeated: list[tuple[int, int]] = []  # count at the time of the request, gate of the request
 
     def step(self, t_ns: int) -> list[Output]:
         self.count += 1
@@ -432,14 +432,14 @@ class Counter(Judge):
 
 
 def snapshot_of(gate: int, version: int = VERSION, **checkpoint: Any) -> Snapshot:
-    """Return what a Counter that has stepped a gate publishes."""
+    """Return the snapshot of a Counter that has just stepped this gate."""
     seq = {keys.estimate("d2"): gate + 1, "done": gate + 1}
     state = {"own": {"count": gate + 1}, "seq": seq, "links": None} | checkpoint
     return Snapshot(gate * GATE_NS, 0, ME, version, pack(state))
 
 
 class Restarting(World):
-    """A world whose judge died when it had published what it has of the gates up to DIED; it has all in its history."""
+    """A world whose judge died after publishing its results up to gate DIED; its history starts at a given gate."""
 
     DIED = 3
 
@@ -473,12 +473,12 @@ class Restarting(World):
 
 
 def counts(world: World) -> list[tuple[int, float, int]]:
-    """Return gate, count and number of what a Counter has published."""
+    """Return the gate, count and sequence number of each estimate that a Counter has published."""
     return [(each.t_ns // GATE_NS, each.yaw_rad, each.seq) for each in world.published_on(keys.estimate("d2"))]
 
 
 @pytest.mark.parametrize("gate", [0, 1, 3])
-def test_it_steps_again_what_came_since_its_snapshot_and_publishes_what_the_former_one_has_not(gate: int):
+def test_a_restart_redoes_gates_since_its_snapshot_and_publishes_new_ones(gate: int):
     world, judge = Restarting(snapshot_of(gate)), Counter()
     Runner(world, info(), judge).run()  # type: ignore[arg-type]
     assert counts(world) == [(g, g + 1.0, g) for g in range(4, END + 1)]
@@ -500,7 +500,7 @@ def test_it_steps_again_what_came_since_its_snapshot_and_publishes_what_the_form
     ],
     ids=["other version", "other state", "half of it", "of the future", "garbage", "old"],
 )
-def test_without_a_snapshot_of_use_it_starts_from_its_last_output(useless: Snapshot):
+def test_without_a_usable_snapshot_a_process_starts_from_its_last_output(useless: Snapshot):
     world, judge = Restarting(useless), Counter()
     said: list[str] = []
     Runner(world, info(), judge, say=said.append).run()  # type: ignore[arg-type]
@@ -509,12 +509,12 @@ def test_without_a_snapshot_of_use_it_starts_from_its_last_output(useless: Snaps
     assert any(has_terms(line, ME, "snapshot") for line in said)
 
 
-def test_a_world_that_has_forgotten_what_came_since_ends_it():
+def test_a_process_ends_if_the_gates_since_its_snapshot_are_forgotten():
     with refused(BehindError, ME, "snapshot", "0.00"):
         Runner(Restarting(snapshot_of(0), first_kept=3), info(), Counter()).run()  # type: ignore[arg-type]
 
 
-def test_it_publishes_a_snapshot_after_a_gate_at_intervals():
+def test_snapshots_are_published_at_intervals_after_the_done():
     world = World(estimates(range(END + 1)))
     Runner(world, info(), Counter(), snapshot_ns=3 * GATE_NS).run()  # type: ignore[arg-type]
     taken: list[Snapshot] = world.published_on(keys.process(ME, "snapshot"))
@@ -526,7 +526,7 @@ def test_it_publishes_a_snapshot_after_a_gate_at_intervals():
 
 
 class Opaque(Counter):
-    """A counter of which the state is none of plain values."""
+    """A counter whose state does not consist of plain values."""
 
     def __init__(self, state: Any) -> None:
         super().__init__()
@@ -547,7 +547,7 @@ class Opaque(Counter):
         ([1, 2], ("[1, 2]",)),
     ],
 )
-def test_a_state_of_a_user_s_that_is_not_plain_ends_it_with_class_field_and_gate(state: Any, terms: Any) -> None:
+def test_an_unsupported_user_state_is_reported_with_class_field_and_time(state: Any, terms: Any) -> None:
     world = World(estimates(range(END + 1)))
     with pytest.raises(UserCodeError) as raised:
         Runner(world, info(), Opaque(state), snapshot_ns=3 * GATE_NS).run()  # type: ignore[arg-type]
@@ -564,7 +564,7 @@ class Failing(Judge):
         return [] if t_ns < 3 * GATE_NS else [1 / 0]  # type: ignore[list-item]
 
 
-def test_one_of_a_user_s_own_that_raises_tells_the_world_and_its_caller_where():
+def test_an_exception_in_user_code_is_reported_to_world_and_caller():
     world = World(estimates(range(END + 1)))
     with pytest.raises(UserCodeError) as raised:
         Runner(world, info(), Failing(), lambda: False).run()  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Scenario files: what is right is the same everywhere, and what is wrong is told all at once, a line each."""
+"""Scenario files: valid ones resolve reproducibly; all faults of an invalid one are reported at once, a line each."""
 
 import errno
 import hashlib
@@ -32,7 +32,7 @@ DURATION = ("duration_s", "missing", "finite", ">", "0", "<=", "1e+06")
 
 
 def assert_faults(lines: list[str], *expected: tuple[str, ...]) -> None:
-    """Check that there is a line for each expected field, and no other, and that it holds the terms after it."""
+    """Check that exactly the expected fields are reported, each in one line that holds the terms after it."""
     assert sorted(line.split()[1] for line in lines) == sorted(terms[0] for terms in expected)
     for terms in expected:
         assert any(has_terms(line, "step.yaml", *terms) for line in lines), terms
@@ -87,11 +87,11 @@ def only(lines: list[str]) -> str:
     return line
 
 
-# The files that come with it
+# The shipped scenarios
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_the_resolved_text_is_the_same_scenario(path: Path):
+def test_the_resolved_text_gives_the_same_scenario(path: Path):
     scenario = scenario_file.load(path)
     text = scenario_file.to_text(scenario)
     again = scenario_file.from_text(text)
@@ -101,7 +101,7 @@ def test_the_resolved_text_is_the_same_scenario(path: Path):
     assert scenario_file.sha256(text) == hashlib.sha256(text.encode()).hexdigest()
 
 
-# What resolving gives
+# Resolving
 
 
 def test_defaults_are_the_ardrone_in_buenos_aires():
@@ -114,7 +114,7 @@ def test_defaults_are_the_ardrone_in_buenos_aires():
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_a_preset_gives_all_its_figures(preset: str):
+def test_a_preset_sets_all_its_values(preset: str):
     sensors = scenario_file.resolve(document(sensors={"preset": preset})).drones[0].sensors
     plain = msgspec.to_builtins(sensors)
     for sensor, figures in PRESETS[preset].items():
@@ -123,7 +123,7 @@ def test_a_preset_gives_all_its_figures(preset: str):
             assert found == ({**found, **value} if isinstance(value, dict) else value)
 
 
-def test_the_drone_s_sensors_win_over_the_scenario_s_and_those_over_the_preset():
+def test_drone_sensors_override_scenario_sensors_which_override_the_preset():
     drones = [drone("a"), drone("b", 2.0, sensors={"gps": {"position_m": {"noise": 0.5}}})]
     shared = {"preset": "paper", "gps": {"position_m": {"noise": 1.0, "bias": 0.1}}}
     first, second = scenario_file.resolve(document(drones=drones, sensors=shared)).drones
@@ -138,7 +138,7 @@ def test_the_drone_s_sensors_win_over_the_scenario_s_and_those_over_the_preset()
     assert second.sensors.imu.accel_m_s2.noise == PRESETS["ardrone2"]["imu"]["accel_m_s2"]["noise"]
 
 
-def test_resolving_leaves_the_document_as_it_was():
+def test_resolving_does_not_change_the_document():
     raw = document(sensors={"preset": "paper"})
     before = msgspec.json.encode(raw)
     scenario_file.resolve(raw)
@@ -149,7 +149,7 @@ def named(scenario: Scenario) -> str:
     return scenario_file.sha256(scenario_file.to_text(scenario))
 
 
-def test_a_body_is_external_where_it_is_given_and_its_faults_are_refused():
+def test_a_drone_is_external_only_if_declared_and_takes_no_faults():
     plain = scenario_file.resolve(document())
     assert ("body" in scenario_file.to_text(plain), plain.external()) == (False, [])
     fault = {"kind": "gps_noise", "target": "b", "factor": 2.0}
@@ -169,7 +169,7 @@ def test_a_body_is_external_where_it_is_given_and_its_faults_are_refused():
         ("duration_s=330.0", False),
     ],
 )
-def test_a_change_and_no_other_way_to_write_it_is_another_hash(override: str, is_other: bool):
+def test_only_a_changed_value_changes_the_hash(override: str, is_other: bool):
     assert (named(scenario_file.load(STEP, [override])) != named(scenario_file.load(STEP))) == is_other
 
 
@@ -182,8 +182,8 @@ texts = st.text(st.characters(codec="utf-8"), max_size=30) | st.sampled_from([*L
     expressions=st.dictionaries(texts, texts, min_size=1, max_size=3),
     numbers=st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4),
 )
-def test_any_text_and_number_survives_world_info(expressions: dict[str, str], numbers: list[float]):
-    """Texts that look like numbers stay texts, numbers keep their last bit."""
+def test_any_text_and_number_survives_a_round_trip(expressions: dict[str, str], numbers: list[float]):
+    """Texts that look like numbers stay texts; numbers keep their last bit."""
     plan = {"trajectory": {"expressions": expressions, "constants": {"f": numbers[0]}}}
     wind = {"steady_m_s": numbers[1:]}
     clusters = [{"name": "main", "drones": ["drone1", "drone2"], "plan": plan}]
@@ -199,7 +199,7 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path):
     assert scenario_file.load(path) == scenario_file.load(STEP)
 
 
-def test_values_replace_the_file_s_and_none_does_not():
+def test_keyword_values_override_the_file_unless_none():
     scenario = scenario_file.load(STEP, seed=7, duration_s=None, federation="other")
     assert (scenario.seed, scenario.duration_s, scenario.federation) == (7, 330.0, "other")
 
@@ -211,18 +211,18 @@ def test_values_replace_the_file_s_and_none_does_not():
     "path",
     ["drones.drone2.mass_kg", "drones.1.mass_kg", "drones[1].mass_kg", "drones[drone2].mass_kg", "drones[1][mass_kg]"],
 )
-def test_an_entry_is_named_by_place_or_by_name(path: str):
+def test_a_list_entry_is_addressed_by_index_or_name(path: str):
     scenario = scenario_file.load(STEP, [f"{path}=0.5"])
     assert [d.mass_kg for d in scenario.drones] == [0.429, 0.5, 0.429]
 
 
-def test_sections_that_are_not_in_the_file_begin_with_their_first_override():
+def test_an_override_creates_a_missing_section():
     scenario = scenario_file.load(STEP, ["drones.drone1.limits.tilt_deg=10", "silence.hover_s=1.5"])
     assert scenario.drone("drone1").limits.tilt_deg == 10.0
     assert scenario.silence.hover_s == 1.5
 
 
-def test_a_section_that_is_left_empty_is_as_one_that_is_not_there(tmp_path: Path):
+def test_an_empty_section_counts_as_missing(tmp_path: Path):
     path = tmp_path / "own.yaml"
     path.write_text("name: own\nduration_s: 1\nsilence:\ndrones: [{name: a, position_m: [0, 0, 0]}]\n")
     assert scenario_file.load(path, ["silence.hover_s=1.5"]).silence.hover_s == 1.5
@@ -247,7 +247,7 @@ def test_overrides_apply_in_order():
         ("nothing.here", "nothing.here"),
     ],
 )
-def test_the_name_of_a_section_may_be_left_out(path: str, whole: str):
+def test_section_names_may_be_omitted(path: str, whole: str):
     assert whole_path(path) == whole
 
 
@@ -260,11 +260,11 @@ def test_the_name_of_a_section_may_be_left_out(path: str, whole: str):
         ("seeds", ["main"], "seeds"),
     ],
 )
-def test_the_name_of_a_list_with_one_entry_may_be_left_out(path: str, entries: list[str], whole: str) -> None:
+def test_the_only_entry_of_a_list_need_not_be_named(path: str, entries: list[str], whole: str) -> None:
     assert whole_path(path, {"clusters": [{"name": name} for name in entries]}) == whole
 
 
-def test_a_field_of_several_entries_is_refused_with_the_path_of_one() -> None:
+def test_a_field_of_several_entries_is_refused_with_an_example_path() -> None:
     with pytest.raises(ValueError, match=r"2 clusters.*clusters\.left\.gains\.proportional_1_s"):
         whole_path("gains.proportional_1_s", {"clusters": [{"name": "left"}, {"name": "right"}]})
     assert scenario_file.load(STEP, ["gains.proportional_1_s=0.4"]).clusters[0].gains.proportional_1_s == 0.4
@@ -281,13 +281,13 @@ def test_a_field_of_several_entries_is_refused_with_the_path_of_one() -> None:
         ("faults=[{kind: gps_dropout, target: drone1, fro_s: 3}]", "for_s"),
     ],
 )
-def test_what_is_not_known_hints_at_what_is_like_it(override: str, meant: str) -> None:
+def test_an_unknown_name_is_reported_with_a_similar_one(override: str, meant: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         scenario_file.load(STEP, [override])
     assert any(has_terms(line, "mean", meant, "allowed") for line in caught.value.faults)
 
 
-def test_values_are_yaml():
+def test_override_values_are_yaml():
     overrides = [
         "drones.drone1.position_m=[0, 9.5, 0]",
         "report={window_s: [1, 2]}",
@@ -299,7 +299,7 @@ def test_values_are_yaml():
     assert scenario.cluster("main").plan.takeoff_s is None
 
 
-def test_a_drone_named_by_a_number_or_with_dots_is_found_by_its_name():
+def test_a_drone_whose_name_is_a_number_or_has_dots_is_found():
     drones = [drone("2"), drone("1", 2.0)]
     for name, path in (("0", "drones.0.mass_kg"), ("uav.2", "drones[uav.2].mass_kg")):
         raw = document(drones=[*drones[:2], drone(name, 4.0)])
@@ -336,7 +336,7 @@ SYNTAX = ("a.b.c=value",)
     ],
     ids=lambda text: text[:24],
 )
-def test_an_override_that_cannot_be_is_told(override: str, terms: tuple[str, ...]):
+def test_an_invalid_override_is_reported(override: str, terms: tuple[str, ...]):
     line = only(faults_in(STEP, override))
     assert line.startswith("--set ")
     assert has_terms(line, *terms)
@@ -353,11 +353,11 @@ def test_an_override_that_cannot_be_is_told(override: str, terms: tuple[str, ...
         ("drones.drone1=5", ("step.yaml", "drones[0]", "5", "map")),
     ],
 )
-def test_an_override_that_makes_a_fault_is_told_as_the_file_s(override: str, terms: tuple[str, ...]):
+def test_a_fault_caused_by_an_override_is_reported_as_one_of_the_file(override: str, terms: tuple[str, ...]):
     assert has_terms(faults_in(STEP, override)[0], *terms)
 
 
-def test_faults_of_overrides_and_of_the_file_are_told_together():
+def test_faults_of_overrides_and_of_the_file_are_reported_together():
     lines = faults_in(STEP, "seed", "drones.9.mass_kg=1", "drones.drone3.mass_kg=-1.4", seed=-1)
     assert len(lines) == 4
     assert [line.split(":")[0] for line in lines] == ["--set seed", "--set drones.9.mass_kg=1"] + ["step.yaml"] * 2
@@ -365,7 +365,7 @@ def test_faults_of_overrides_and_of_the_file_are_told_together():
 
 @settings(max_examples=100, deadline=None)
 @given(text=st.text(max_size=30) | st.from_regex(r"[a-d.\[\]0-9]{1,12}=[\[\]{}a*&!1:,-]{0,8}", fullmatch=True))
-def test_any_override_is_applied_or_told(text: str):
+def test_any_override_is_applied_or_refused(text: str):
     try:
         scenario_file.load(STEP, [text])
     except ScenarioError as error:
@@ -375,7 +375,7 @@ def test_any_override_is_applied_or_told(text: str):
 # Faults of one field
 
 
-def test_the_fault_of_a_cluster_in_full():
+def test_the_full_text_of_a_cluster_fault():
     line = only(faults_in(STEP, "clusters.main.gains.proportional_1_s=3"))
     said = "clusters[0].gains.proportional_1_s is 3; must be > 0 and <= 2 (cluster 'main')"
     assert line == f"step.yaml: {said}"
@@ -400,7 +400,7 @@ def test_limits_are_quoted(path: str, value: str, allowed: str):
 
 
 @pytest.mark.parametrize("value", ["Step", "a/b", "x" * 33, '"a\\n"', "''"])
-def test_names_are_of_the_contract(value: str):
+def test_names_must_match_the_contract(value: str):
     for field in ("name", "federation"):
         assert has_terms(only(faults_in(STEP, f"{field}={value}")), field, "[a-z0-9_.-]{1,32}")
 
@@ -429,15 +429,15 @@ def test_names_are_of_the_contract(value: str):
         ({7: 1}, ("step.yaml", "7", "known", "clusters")),
     ],
 )
-def test_a_wrong_shape_is_told(fields: dict[Any, Any], terms: tuple[str, ...]):
+def test_a_wrong_structure_is_reported(fields: dict[Any, Any], terms: tuple[str, ...]):
     assert has_terms(only(faults_of(document(clusters=[]) | fields)), *terms)
 
 
-def test_a_scenario_without_anything_says_all_that_is_missing():
+def test_an_empty_scenario_reports_every_missing_field():
     assert_faults(faults_of({}), ("name", "missing", "text"), DURATION, ("drones", "missing", "list"))
 
 
-def test_a_fault_that_all_drones_share_is_told_once():
+def test_a_fault_shared_by_all_drones_is_reported_once():
     line = only(faults_of(document(sensors={"imu": {"rate_hz": -5}})))
     assert has_terms(line, "step.yaml", "sensors.imu.rate_hz", "-5", ">=", "0.01", "<=", "1000")
 
@@ -454,22 +454,22 @@ def test_a_fault_that_all_drones_share_is_told_once():
         ({"drones": [drone("a", mass_kg=2)]}, ("drones[0].mass_kg", "2", "<", "0.747")),
         ({"drones": [drone("a", rotor_min_rad_s=600)]}, ("drones[0].rotor_min_rad_s", "600", "<", "rotor_max_rad_s", "503")),
         ({"drones": [drone("a", rotor_min_rad_s=400)]}, ("drones[0].rotor_min_rad_s", "400", "<", "361.5", "hover")),
-        ({"drones": [drone("a", torque_nm_s2=0.016)]}, ("drones[0].torque_nm_s2", "0.016", "3.36e+06 W", "1.29", "4.29e+03 W", "thrust_n_s2")),  # metres of torque per thrust, as RotorS has it
+        ({"drones": [drone("a", torque_nm_s2=0.016)]}, ("drones[0].torque_nm_s2", "0.016", "3.36e+06 W", "1.29", "4.29e+03 W", "thrust_n_s2")),  # torque per thrust in metres, as in RotorS
         ({"drones": [drone("a", torque_nm_s2=1e-15)]}, ("drones[0].torque_nm_s2", "1e-15", "W", "N m s^2")),
         ({"drones": [drone("a", inertia_kg_m2=[2, 2, 4])]}, ("drones[0].inertia_kg_m2", "[2, 2, 4]", "0.137", "kg m^2")),
-        ({"drones": [drone("a", thrust_n_s2=0.01)]}, ("drones[0].thrust_n_s2", "0.01", "0.042 %", "0.5", "90 %", "N s^2")),  # per (rev/s)^2 instead of (rad/s)^2, and more
-        ({"drones": [drone("a", rotor_max_rad_s=4803)]}, ("drones[0].rotor_max_rad_s", "4803", "480 m/s", "3403", "sound", "rad/s", "rpm")),  # revolutions per minute
+        ({"drones": [drone("a", thrust_n_s2=0.01)]}, ("drones[0].thrust_n_s2", "0.01", "0.042 %", "0.5", "90 %", "N s^2")),  # per (rev/s)^2 instead of (rad/s)^2, and larger still
+        ({"drones": [drone("a", rotor_max_rad_s=4803)]}, ("drones[0].rotor_max_rad_s", "4803", "480 m/s", "3403", "sound", "rad/s", "rpm")),  # given in revolutions per minute
         ({"drones": [drone("a", model="crazyflie2", rotor_max_rad_s=21706)]}, ("drones[0].rotor_max_rad_s", "21706", "501 m/s", "14732")),
         ({"drones": [drone("a", drag_n_s_m=24.9)]}, ("drones[0].drag_n_s_m", "24.9", "2 m/s", "49.8 N", "4.21 N", "2.1", "N s/m")),  # a hundred times the AR.Drone's
         ({"drones": [drone("a", aerodynamics={"quadratic_drag_n_s2_m2": [0.1, 0.1, 5]})]}, ("drones[0].aerodynamics.quadratic_drag_n_s2_m2", "[0.1, 0.1, 5]", "20 N", "1.05", "N s^2/m^2")),
         (
-            {"drones": [drone("a", aerodynamics={"rotor_drag_n_s2_m": 0.0119})]},  # for 1.19e-4
+            {"drones": [drone("a", aerodynamics={"rotor_drag_n_s2_m": 0.0119})]},  # instead of 1.19e-4
             ("drones[0].aerodynamics.rotor_drag_n_s2_m", "0.0119", "N s^2/m"),
         ),
-        ({"drones": [drone("a", battery_mah=1)]}, ("drones[0].battery_mah", "0.72 s", "10", "86400 s", "mAh")),  # ampere-hours
+        ({"drones": [drone("a", battery_mah=1)]}, ("drones[0].battery_mah", "0.72 s", "10", "86400 s", "mAh")),  # given in ampere-hours
         ({"drones": [drone("a", battery_mah=1e6)]}, ("drones[0].battery_mah", "7.2e+05 s", "86400 s")),
         ({"drones": [drone("a", limits={"tilt_deg": 58})]}, ("drones[0].limits.tilt_deg", "58", "<=", "55.0", "weight")),
-        ({"drones": [drone("a", mass_kg=0.72, limits={"tilt_deg": 45})]}, ("drones[0].limits.tilt_deg", "45", "<=", "30.0", "weight")),  # its rotors carry it up to 15.4 deg, but 30 deg are allowed to all
+        ({"drones": [drone("a", mass_kg=0.72, limits={"tilt_deg": 45})]}, ("drones[0].limits.tilt_deg", "45", "<=", "30.0", "weight")),  # its rotors carry its weight up to 15.4 deg, but 30 deg are allowed for every drone
         ({"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]}, ("drones[0].sensors.imu.rate_hz", "500", "<=", "200")),
         ({"sensors": {"sonar": {"min_m": 7}}, "drones": [drone("a")]}, ("drones[0].sensors.sonar.min_m", "7", "<", "max_m", "6")),
         ({"sensors": {"as_printed": True}, "drones": [drone("a")]}, ("drones[0].sensors.as_printed", "true", "false")),
@@ -501,11 +501,11 @@ def test_a_fault_that_all_drones_share_is_told_once():
         (clustered(space="ring"), ("clusters[0].space", "'ring'", "triad", "template", "package.module:Class", "'c'")),
     ],
 )  # fmt: skip
-def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], terms: tuple[str, ...]):
+def test_inconsistent_fields_are_reported(fields: dict[str, Any], terms: tuple[str, ...]):
     assert has_terms(only(faults_of(document(**fields))), *terms)
 
 
-def test_faults_of_groups_are_told_together_and_those_between_faulty_fields_left_out():
+def test_group_faults_are_reported_together_except_between_faulty_fields():
     groups = [{"name": "a", "size": 1}, {"name": "b", "size": 4, "template_m": [[0, 0]] * 4}, {"name": "b", "size": 3}]
     assert_faults(
         faults_of(document(**clustered(groups=groups))),
@@ -515,7 +515,7 @@ def test_faults_of_groups_are_told_together_and_those_between_faulty_fields_left
     )
 
 
-def test_waypoints_go_forward_in_time():
+def test_waypoints_must_go_forward_in_time():
     waypoints = [{"at_s": at, "values": {"x_c": 1}} for at in (0, 5, 5, 4, 9)]
     clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {"waypoints": waypoints}}}]
     lines = faults_of(document(clusters=clusters))
@@ -524,8 +524,8 @@ def test_waypoints_go_forward_in_time():
     assert has_terms(lines[1], "clusters[0].plan.trajectory.waypoints[3].at_s", "4", ">", "5")
 
 
-def test_all_faults_at_once_those_between_fields_too():
-    """Every kind together; a check whose fields are themselves faulty is left out, and no other."""
+def test_faults_in_and_between_fields_are_reported_together():
+    """Only checks whose own fields are faulty are left out."""
     drones = [
         drone("a", yaw_deg=math.inf),
         drone("a", 2.0, mass_kg=-1.4),
@@ -558,13 +558,13 @@ def test_all_faults_at_once_those_between_fields_too():
     )
 
 
-def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
+def test_cluster_drones_are_not_checked_while_a_drone_has_no_name():
     clusters = [{"name": "c", "drones": ["drone1", "drone9"]}]
     lines = faults_of(document(drones=[drone("drone1"), {"position_m": [2, 0, 0]}], clusters=clusters))
     assert has_terms(only(lines), "step.yaml", "drones[1].name", "missing")
 
 
-# Files that are none
+# Files that are not scenarios
 
 
 @pytest.mark.parametrize(
@@ -587,33 +587,35 @@ def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
     ],
     ids=lambda text: repr(text[:12]),
 )
-def test_a_file_that_is_no_scenario_is_one_line(tmp_path: Path, text: str | bytes, terms: tuple[str, ...]):
+def test_a_file_that_is_not_a_scenario_is_reported_in_one_line(
+    tmp_path: Path, text: str | bytes, terms: tuple[str, ...]
+):
     line = only(faults_of_text(tmp_path, text))
     assert "own.yaml" in line
     assert has_terms(line, *terms)
 
 
-def test_a_path_that_cannot_be_read_is_one_line(tmp_path: Path):
+def test_an_unreadable_path_is_reported_in_one_line(tmp_path: Path):
     assert has_terms(only(faults_in(tmp_path / "none.yaml")), "read", os.strerror(errno.ENOENT))
     assert has_terms(only(faults_in(tmp_path)), "read", os.strerror(errno.EISDIR))
     assert has_terms(only(faults_in("a\0b")), "path")
     assert has_terms(only(faults_in("/dev/zero")), "larger", str(FILE_SIZE_MAX))
 
 
-def test_a_million_drones_are_refused_at_once():
+def test_a_million_drones_are_refused_quickly():
     start_s = time.process_time()
     raw = document(drones=[drone("a")] * 1_000_000)
     assert has_terms(only(faults_of(raw)), "step.yaml", "drones", "1000000", "1", "1000")
     assert time.process_time() - start_s < 2.0
 
 
-def test_a_fault_in_each_of_many_places_is_told_a_hundred_times():
+def test_the_number_of_reported_faults_is_limited():
     lines = faults_of(document(**{f"k{i}": i for i in range(5000)}))
     assert len(lines) == FAULTS_MAX + 1
     assert has_terms(lines[-1], "4900")
 
 
-def test_a_thousand_drones_are_a_scenario():
+def test_a_thousand_drones_are_accepted():
     drones = [drone(f"d{i}", position_m=[2 * (i % 32), 2 * (i // 32), 0]) for i in range(DRONES_MAX)]
     assert len(scenario_file.resolve(document(drones=drones)).drones) == DRONES_MAX
 
@@ -633,7 +635,7 @@ places = st.lists(
 @example(changes=[(["sensors"], {"\U000101fe": None, 7: {"module": "x"}})])
 @settings(max_examples=100, deadline=None)
 @given(changes=st.lists(st.tuples(places, values), min_size=1, max_size=3))
-def test_any_document_is_a_scenario_or_told(changes: list[tuple[list[Any], Any]]):
+def test_any_document_resolves_or_is_refused(changes: list[tuple[list[Any], Any]]):
     clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"takeoff_s": 1}}]
     raw: Any = document(clusters=clusters, sensors={"preset": "paper"})
     for path, value in changes:
@@ -653,10 +655,10 @@ def test_any_document_is_a_scenario_or_told(changes: list[tuple[list[Any], Any]]
         assert scenario_file.from_text(scenario_file.to_text(scenario)) == scenario
 
 
-# What all drones share of their vehicle
+# The shared vehicle
 
 
-def test_a_shared_vehicle_is_what_every_drone_says_itself():
+def test_a_shared_vehicle_equals_the_same_fields_in_every_drone():
     file = SCENARIOS / "crazyflie.yaml"
     written = yaml.safe_load(file.read_text())
     drones = [{name: value for name, value in each.items() if name != "model"} for each in written["drones"]]
@@ -664,7 +666,7 @@ def test_a_shared_vehicle_is_what_every_drone_says_itself():
     assert scenario_file.to_text(scenario_file.resolve(shared)) == scenario_file.to_text(scenario_file.load(file))
 
 
-def test_a_drone_s_own_field_wins_over_the_shared_vehicle_s():
+def test_a_drone_s_own_field_overrides_the_shared_vehicle():
     scenario = scenario_file.load(STEP, ["vehicle.mass_kg=0.5"])
     assert [each.mass_kg for each in scenario.drones] == [0.5] * 3
     vehicle = {"mass_kg": 0.5, "battery_mah": 1500, "limits": {"tilt_deg": 12, "altitude_m": 30}}
@@ -674,7 +676,7 @@ def test_a_drone_s_own_field_wins_over_the_shared_vehicle_s():
     assert [(each.limits.tilt_deg, each.limits.altitude_m) for each in (a, b)] == [(12, 30), (9, 30)]
 
 
-def test_aerodynamics_are_taken_one_by_one_and_left_out_where_there_are_none():
+def test_aerodynamics_merge_field_by_field_and_are_omitted_if_absent():
     vehicle = {"aerodynamics": {"rotor_drag_n_s2_m": 1e-4, "rotor_lift_n_s2_m2": 1e-3}}
     drones = [drone("a"), drone("b", 2.0, aerodynamics={"rotor_drag_n_s2_m": 2e-4}), drone("c", 4.0, model="iris")]
     a, b, c = scenario_file.resolve(document(drones=drones, vehicle=vehicle)).drones
@@ -695,7 +697,7 @@ def test_aerodynamics_are_taken_one_by_one_and_left_out_where_there_are_none():
         ([1], "vehicle"),
     ],
 )
-def test_a_fault_of_the_shared_vehicle_is_told_once_by_its_path(vehicle: Any, path: str):
+def test_a_fault_of_the_shared_vehicle_is_reported_once_with_its_path(vehicle: Any, path: str):
     with pytest.raises(ScenarioError) as raised:
         scenario_file.resolve(document(vehicle=vehicle))
     assert [line.split()[1] for line in raised.value.faults] == [path]
@@ -714,7 +716,7 @@ def test_a_fault_of_the_shared_vehicle_is_told_once_by_its_path(vehicle: Any, pa
         ({}, 5, ()),
     ],
 )  # fmt: skip
-def test_what_of_a_plan_begins_after_the_end_of_the_run_is_named(plan: Any, duration_s: float, terms: tuple[str, ...]):
+def test_plan_parts_after_the_end_of_the_run_are_reported(plan: Any, duration_s: float, terms: tuple[str, ...]):
     cluster = {"name": "c", "drones": ["drone1", "drone2"], "plan": plan}
     scenario = scenario_file.resolve(document(clusters=[cluster], duration_s=duration_s), "step.yaml")
     lines = unflown_plans(scenario)

@@ -1,4 +1,4 @@
-"""Cluster spaces: what every kind has to fulfil, then names, measures and singular shapes of each."""
+"""Cluster spaces: properties that every kind must have, then names, measures and singular shapes of each kind."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from zsim_agents.formation.spaces.template_cluster import TemplateCluster, centr
 
 TRIADS = (2, 3, 4, 5, 8)
 TEMPLATES = (3, 5, 10, 30)
-TRIANGLE = np.array([(0.0, 1.5, 1.0), (-1.5, -1.5, 1.0), (1.5, -1.5, 1.0)])  # where the drones take off
+TRIANGLE = np.array([(0.0, 1.5, 1.0), (-1.5, -1.5, 1.0), (1.5, -1.5, 1.0)])  # take-off positions, m
 RING = np.array([(6 * math.cos(k * math.pi / 5), 6 * math.sin(k * math.pi / 5), 0.0) for k in range(10)])
 SQUARE = np.array([(2.0, 2.0, 0.0), (-2.0, 2.0, 0.0), (-2.0, -2.0, 0.0), (2.0, -2.0, 0.0)])
 PENTAGON = 8.0 * np.array([(math.cos(k * 0.4 * math.pi), math.sin(k * 0.4 * math.pi), 0.0) for k in range(5)])
@@ -39,7 +39,7 @@ def triads() -> NestedCluster:
 
 
 def mixed() -> NestedCluster:
-    """A pair, a triad, a square on a template, and three triads, on a parent of four."""
+    """Return a pair, a triad, a square template and three triads, nested in a parent of four."""
     groups = [cluster_space(2), cluster_space(3), TemplateCluster(SQUARE), triads()]
     return NestedCluster(cluster_space(4), list(zip("abcd", groups, strict=True)))
 
@@ -57,7 +57,7 @@ SPACES: dict[str, Callable[[], ClusterSpace]] = {
 
 
 def random_robots(space: ClusterSpace, rng: np.random.Generator, margin_min_m: float = 0.3):
-    """Return positions and headings of robots that are turned anyhow and not nearly singular."""
+    """Return positions and headings of a formation with a random orientation that is not nearly singular."""
     while True:
         if isinstance(space, TemplateCluster):
             angles = rng.uniform(-math.pi, math.pi, 2 + space.n)
@@ -75,7 +75,7 @@ def random_robots(space: ClusterSpace, rng: np.random.Generator, margin_min_m: f
 
 
 @pytest.mark.parametrize("kind", SPACES)
-def test_forward_and_inverse_undo_each_other(kind):
+def test_forward_and_inverse_are_inverse_to_each_other(kind):
     space, rng = SPACES[kind](), np.random.default_rng(1)
     assert space.size == 4 * space.n == len(set(space.names))
     assert [space.index(name) for name in space.names] == list(range(space.size))
@@ -90,7 +90,7 @@ def test_forward_and_inverse_undo_each_other(kind):
 
 @settings(deadline=None, max_examples=300, derandomize=True)
 @given(st.data(), st.sampled_from(TRIADS))
-def test_inverse_then_forward_returns_any_cluster(data, n):
+def test_forward_of_inverse_returns_any_cluster(data, n):
     space = cluster_space(n)
     low, high = np.array(space.bounds).T
     lower = np.where(np.isfinite(low), low + 0.05, -100.0)
@@ -99,7 +99,7 @@ def test_inverse_then_forward_returns_any_cluster(data, n):
     lower[space.angular], upper[space.angular] = -math.pi, math.pi
     c = np.array([data.draw(st.floats(a, b)) for a, b in zip(lower, upper, strict=True)])
     back = space.forward(*space.inverse(c))
-    # the shape is ill-conditioned where lengths differ by 1000 and beta is small
+    # the shape is ill-conditioned if lengths differ by a factor of 1000 and beta is small
     assert np.abs(space.difference(back, c)).max() < 1e-6
 
 
@@ -123,7 +123,7 @@ def test_jacobians_are_inverse_to_each_other_and_agree_with_finite_differences(k
 
 @pytest.mark.parametrize("kind", [kind for kind in SPACES if "nested" not in kind])  # those have another origin
 def test_the_cluster_moves_and_turns_as_one_body(kind):
-    """Translation and a turn about z change x_c, y_c, z_c and yaw alone."""
+    """Translation and rotation about z change only x_c, y_c, z_c and yaw."""
     space = SPACES[kind]()
     p_W, yaw = random_robots(space, np.random.default_rng(3))
     turn, shift = 0.7, np.array([3.0, -4.0, 5.0])
@@ -136,7 +136,7 @@ def test_the_cluster_moves_and_turns_as_one_body(kind):
 
 
 @pytest.mark.parametrize("kind", SPACES)
-def test_a_specimen_is_a_formation_with_room(kind):
+def test_the_specimen_keeps_the_distance_between_robots(kind):
     space = SPACES[kind]()
     p_W, _ = space.inverse(space.specimen(2.0))
     assert closest_pair(p_W)[0] > 2.0 - 1e-9
@@ -151,7 +151,7 @@ def test_robots_without_a_frame_are_refused(kind, value):
     for method in (space.forward, space.jacobian):
         with pytest.raises(SingularClusterError):
             method(p_W, yaw)
-    if kind == "nested triads":  # in any group
+    if kind == "nested triads":  # a singular group suffices
         p_W, yaw = random_robots(space, np.random.default_rng(5))
         p_W[3:6] = p_W[3]
         with pytest.raises(SingularClusterError):
@@ -169,7 +169,7 @@ def test_robots_without_a_frame_are_refused(kind, value):
         (TemplateCluster(RING), "forward", (np.outer(np.arange(10.0), (1, 1, 1)), np.zeros(10)), ("no frame",)),
     ],
 )
-def test_singular_formations_are_refused_by_name(space, method, arguments, terms):
+def test_singular_formations_are_refused_with_the_reason(space, method, arguments, terms):
     with refused(SingularClusterError, *terms):
         getattr(space, method)(*arguments)
 
@@ -190,10 +190,10 @@ def test_impossible_spaces_and_names_are_refused(make, finding):
         make()
 
 
-# Names and what they mean
+# Names and their meaning
 
 
-def test_three_robots_have_the_variables_of_the_paper_in_its_order():
+def test_small_clusters_have_the_variables_of_the_paper_in_order():
     names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
     assert list(cluster_space(3).names) == names
     wrapping = [name for name, wraps in zip(names, cluster_space(3).angular, strict=True) if wraps]
@@ -202,7 +202,7 @@ def test_three_robots_have_the_variables_of_the_paper_in_its_order():
     assert cluster_space(2).names == ("x_c", "y_c", "z_c", "pitch", "yaw", "phi_1", "phi_2", "p")
 
 
-def test_a_template_has_headings_and_departures():
+def test_a_template_has_headings_and_deformations():
     space = TemplateCluster(RING)
     assert space.names[:8] == ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2")
     assert (*space.names[16:18], space.names[-1]) == ("w_1", "w_2", "w_24")
@@ -211,7 +211,7 @@ def test_a_template_has_headings_and_departures():
     assert [space.names[k] for k in space.tilts] == ["roll", "pitch"]
 
 
-def test_nested_names_are_those_of_the_parent_then_those_of_the_groups():
+def test_nested_names_are_of_the_parent_then_of_the_groups():
     space, plain = triads(), cluster_space(3)
     own = ("roll", "pitch", "phi_1", "phi_2", "phi_3", "p", "q", "beta")
     assert space.names == (*plain.names, *(f"{name}.{each}" for name in ("lead", "left", "right") for each in own))
@@ -243,7 +243,7 @@ def test_robot_2_is_left_roll_lowers_the_right_and_pitch_lowers_robot_1():
     assert z[0] < z[1] == pytest.approx(z[2])
 
 
-def test_the_template_itself_has_no_departures_and_w_1_is_its_growth():
+def test_the_template_has_zero_deformation_and_w_1_scales_it():
     space = TemplateCluster(RING + np.array([7.0, -3.0, 2.0]))
     c = space.forward(RING + np.array([1.0, 2.0, 3.0]), np.zeros(10))
     expected = np.zeros(40)
@@ -254,18 +254,18 @@ def test_the_template_itself_has_no_departures_and_w_1_is_its_growth():
 
 
 @pytest.mark.parametrize("n", TEMPLATES)
-def test_modes_neither_move_nor_turn_the_template_and_are_orthogonal(n):
+def test_shape_modes_are_orthogonal_to_rigid_motions_and_each_other(n):
     t = centred(np.random.default_rng(n).normal(size=(n, 3)))
     N = shape_modes(t).reshape(3 * n, -1)
     assert np.abs(N.T @ N - n * np.eye(3 * n - 6)).max() < 1e-12
     assert np.abs(turns(t).reshape(3, -1) @ N).max() < 1e-12
     assert np.abs(N.reshape(n, 3, -1).sum(axis=0)).max() < 1e-12
-    for axis in np.eye(3) if n > 3 else ():  # each stretch of an axis is made of the first three modes
+    for axis in np.eye(3) if n > 3 else ():  # stretching along an axis is a combination of the first three modes
         assert np.abs(N.T[3:] @ (t * axis).ravel()).max() < 1e-11
 
 
 def test_no_robot_of_a_template_is_privileged():
-    """Renumbering robots and template alike changes none of where the formation is and how it is turned."""
+    """Renumbering robots and template alike changes neither position nor orientation of the formation."""
     rng = np.random.default_rng(5)
     places = rng.normal(scale=4.0, size=(10, 3))
     p_W, order = places + rng.normal(scale=0.5, size=(10, 3)), rng.permutation(10)
@@ -274,11 +274,11 @@ def test_no_robot_of_a_template_is_privileged():
     assert np.abs(c[:6] - other[:6]).max() < 1e-13
     assert np.linalg.norm(c[16:]) == pytest.approx(np.linalg.norm(other[16:]))
     t = centred(places)
-    _, R = fitted_rotation(t.T @ (t * (1.0, 1.0, -1.0)))  # a reflection is not answered by a reflection
+    _, R = fitted_rotation(t.T @ (t * (1.0, 1.0, -1.0)))  # a reflection is fitted by a rotation, not by a reflection
     assert np.linalg.det(R) == pytest.approx(1.0)
 
 
-def test_the_parent_has_the_groups_centroids_and_headings():
+def test_the_parent_is_formed_by_the_groups_centroids_and_headings():
     space, rng = triads(), np.random.default_rng(4)
     p_W, yaw = random_robots(space, rng)
     c = space.forward(p_W, yaw)
@@ -289,7 +289,7 @@ def test_the_parent_has_the_groups_centroids_and_headings():
     assert c[space.index("right.p")] == np.linalg.norm(p_W[7] - p_W[6])
 
 
-def test_a_heading_of_a_group_turns_the_group_and_nothing_else():
+def test_the_heading_of_a_group_turns_only_that_group():
     space = triads()
     c, c_dot = space.specimen(2.0), np.zeros(space.size)
     c_dot[space.index("phi_2")] = 0.3
@@ -301,11 +301,11 @@ def test_a_heading_of_a_group_turns_the_group_and_nothing_else():
     assert np.abs(r_dot[3:6] - turning).max() < 1e-12
 
 
-def test_differences_of_wrapping_angles_go_the_short_way():
+def test_differences_of_wrapping_angles_are_the_shortest():
     space = cluster_space(3)
     a, b = np.zeros(12), np.zeros(12)
     a[5], b[5] = 3.0, -3.0  # yaw
-    a[0], b[0] = 30.0, -30.0  # x_c is no angle
+    a[0], b[0] = 30.0, -30.0  # x_c is not an angle
     difference = space.difference(a, b)
     assert difference[[0, 5]] == pytest.approx([60.0, 6.0 - 2 * math.pi])
     assert space.wrapped(np.full(12, 7.0))[5] == pytest.approx(7.0 - 2 * math.pi)
@@ -316,7 +316,7 @@ def test_differences_of_wrapping_angles_go_the_short_way():
 # Measures of singularity
 
 
-def test_the_margin_falls_to_zero_at_each_singularity():
+def test_the_margin_is_zero_at_each_singularity():
     space = cluster_space(3)
     good = np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 4.0, 4.0, math.pi / 2])
     assert space.margin(good) == pytest.approx(4.0)
@@ -328,7 +328,7 @@ def test_the_margin_falls_to_zero_at_each_singularity():
     assert cluster_space(4).margin(c) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_neither_size_nor_number_of_robots_make_the_condition_worse():
+def test_the_condition_depends_on_neither_size_nor_number_of_robots():
     space = cluster_space(3)
     c = [np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, length, length, math.pi / 4]) for length in (4.0, 40.0)]
     assert space.condition(c[0]) == pytest.approx(space.condition(c[1]))
@@ -340,7 +340,7 @@ def test_neither_size_nor_number_of_robots_make_the_condition_worse():
 
 
 @pytest.mark.parametrize("n", TEMPLATES)
-def test_the_condition_of_a_template_is_that_of_the_whole_matrix_in_its_measure(n):
+def test_the_condition_of_a_template_is_that_of_the_weighted_matrix(n):
     rng, judged = np.random.default_rng(30 + n), 0
     for _ in range(10):
         space = TemplateCluster(rng.normal(scale=1.0, size=(n, 3)))
@@ -354,15 +354,15 @@ def test_the_condition_of_a_template_is_that_of_the_whole_matrix_in_its_measure(
     assert judged
 
 
-def test_the_spread_falls_to_zero_where_the_robots_come_into_line():
+def test_the_spread_falls_to_zero_as_the_robots_approach_a_line():
     places = np.array([(3.0, 0, 0), (-3, 0, 0), (0, 2, 0), (0, -2, 0), (1, 0, 0), (-1, 0, 0)])
     space, widths = TemplateCluster(places), (1.0, 0.5, 0.1, 1e-3)
     spreads = [space.spread(space.forward(places * (1.0, width, 1.0), np.zeros(6))) / width for width in widths]
     assert spreads == pytest.approx([math.sqrt(8 / 6)] * 4, rel=1e-9)
 
 
-def test_where_a_template_is_singular_so_are_its_jacobians():
-    """Towards a line the smallest singular value of J^-1 is the margin, counted over all robots: sqrt(n) margin."""
+def test_the_jacobian_is_singular_where_the_template_is():
+    """As the robots approach a line, the smallest singular value of J^-1 approaches sqrt(n) margin."""
     space = TemplateCluster(RING)
     flat = space.forward(RING * (1.0, 1e-4, 1.0), np.zeros(10))
     assert space.margin(flat) == pytest.approx(1e-4 * 6 / math.sqrt(2), rel=1e-6)
@@ -374,7 +374,7 @@ def test_where_a_template_is_singular_so_are_its_jacobians():
     assert np.linalg.svd(space.inverse_jacobian(upright), compute_uv=False)[-1] < 1e-12
 
 
-def test_the_least_of_parent_and_groups_is_the_measure():
+def test_a_nested_measure_is_the_least_of_parent_and_groups():
     space = triads()
     c = space.specimen(2.0)
     wide = space.spread(c)
@@ -393,10 +393,10 @@ def test_the_least_of_parent_and_groups_is_the_measure():
 
 
 @pytest.mark.parametrize("n", TRIADS)
-def test_the_closest_pair_is_the_first_of_the_least_distances_that_are_finite(n):
+def test_the_closest_pair_is_the_first_with_the_least_finite_distance(n):
     rng = np.random.default_rng(n)
     for _ in range(100):
-        p_W = rng.integers(-2, 3, size=(n, 3)).astype(float)  # many pairs are equally near
+        p_W = rng.integers(-2, 3, size=(n, 3)).astype(float)  # many pairs are equally close
         p_W[rng.integers(n), 0] = rng.choice([0.0, math.nan, math.inf, 1e6])
         pairs = [(math.sqrt(((p_W[i] - p_W[j]) ** 2).sum()), i, j) for i in range(n) for j in range(i + 1, n)]
         assert closest_pair(p_W) == min((pair for pair in pairs if math.isfinite(pair[0])), default=(math.inf, 0, 1))

@@ -1,4 +1,4 @@
-"""The compiled mathematics of the controller: the numbers of plain Python, and nothing left to compile in flight."""
+"""The compiled mathematics of the controller: the results of plain Python, and no compilation in flight."""
 
 import importlib
 import math
@@ -33,7 +33,7 @@ def package() -> SimpleNamespace:
 
 @pytest.fixture(scope="module")
 def both() -> tuple[SimpleNamespace, SimpleNamespace]:
-    """Return the modules as they are, and a copy of them imported where numba is missing."""
+    """Return the modules as they are, and a copy imported without numba."""
     compiled = package()
     with patch.dict(sys.modules, {"numba": None}):
         for name in [*sys.modules]:
@@ -43,7 +43,7 @@ def both() -> tuple[SimpleNamespace, SimpleNamespace]:
 
 
 def space_of(way: SimpleNamespace, kind: int | str):
-    """Return a cluster space of these modules; `cluster_space` would import the classes anew, compiled."""
+    """Return a cluster space of these modules; `cluster_space` would import the compiled classes."""
     triad = way.triad_cluster.TriadCluster
     if isinstance(kind, str):
         return way.scenario_space.NestedCluster(triad(3), [(name, triad(3)) for name in kind])
@@ -61,7 +61,7 @@ def robots(n: int, rng: np.random.Generator, scale_m: float = 4.0) -> tuple[np.n
     return rng.normal(scale=scale_m, size=(n, 3)), rng.uniform(-4.0, 4.0, n)
 
 
-def test_one_way_is_compiled_and_the_other_is_not(both):
+def test_only_one_set_of_modules_is_compiled(both):
     compiled, plain = both
     for module, name in (("triad_cluster", "triad_forward"), ("control_law", "limited"), ("trajectory", "put_ramped")):
         assert hasattr(getattr(getattr(compiled, module), name), "py_func")
@@ -70,7 +70,7 @@ def test_one_way_is_compiled_and_the_other_is_not(both):
 
 @pytest.mark.parametrize("scale_m", [1.0, 4.0], ids=["crowded", "apart"])
 @pytest.mark.parametrize("kind", [*SIZES, 10, 30, "abc"])
-def test_kinematics_and_law_are_the_same_with_saturation_guard_and_integral(both, kind, scale_m):
+def test_kinematics_and_law_are_identical_when_compiled(both, kind, scale_m):
     spaces = [space_of(way, kind) for way in both]
     laws = [way.control_law.ProportionalLaw(space) for way, space in zip(both, spaces, strict=True)]
     n, is_small, seen = spaces[0].n, kind in SIZES, set()
@@ -89,7 +89,7 @@ def test_kinematics_and_law_are_the_same_with_saturation_guard_and_integral(both
         assert same(*(space.wrapped(c * 3.0) for space in spaces), most=most)
         for one, other in zip(*(space.inverse(c) for space in spaces), strict=True):
             assert same(one, other, most)
-        assert [type(space.margin(c)) for space in spaces] == [float, float]  # it goes into a message
+        assert [type(space.margin(c)) for space in spaces] == [float, float]  # it is part of a message
         assert same(*(way.cluster_space.closest_pair(p_W) for way in both))
         v_W, c_des = rng.normal(size=(n, 3)), c + rng.normal(scale=rng.choice([0.01, 1.0]), size=4 * n)
         a, b = (law.command(c, p_W, v_W, c_des, np.zeros(4 * n), DT_S) for law in laws)
@@ -102,7 +102,7 @@ def test_kinematics_and_law_are_the_same_with_saturation_guard_and_integral(both
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_ramps_are_the_same(both, n):
+def test_ramps_are_identical_when_compiled(both, n):
     rng = np.random.default_rng(20 + n)
     offsets = [rng.normal(size=4 * n) for _ in range(4)]
     for s in np.linspace(0.0, 1.0, 11).tolist():
@@ -115,7 +115,7 @@ def test_ramps_are_the_same(both, n):
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_places_are_judged_the_same_at_once_and_in_words(both, n):
+def test_faults_of_places_are_identical_when_compiled(both, n):
     space, plain = (space_of(way, n) for way in both)
     rng, found = np.random.default_rng(40 + n), set()
     gains, limits = both[0].control_law.FormationGains(), both[0].flight_check.ShapeLimits()
@@ -134,7 +134,7 @@ def test_places_are_judged_the_same_at_once_and_in_words(both, n):
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_bounds_in_flight_are_those_of_the_judgement_in_words(both, n):
+def test_bounds_in_flight_agree_with_the_reported_faults(both, n):
     check, space = both[0].flight_check, space_of(both[0], n)
     limits = both[0].flight_check.ShapeLimits(spread_min_m=0.0, condition_max=math.inf)
     bounds, rng, found = check.bounds_of(space, limits), np.random.default_rng(50 + n), set()
@@ -154,7 +154,7 @@ BAD = (math.nan, math.inf, -math.inf, 1e7, 0.0, 1.7)
 
 
 @pytest.mark.parametrize("n", SIZES)
-def test_judgements_are_the_same(both, n):
+def test_checks_of_estimates_are_identical_when_compiled(both, n):
     rng = np.random.default_rng(30 + n)
     bounds = space_of(both[0], n).bounds
     found = set()
@@ -226,7 +226,7 @@ print(output.phase, before, compiled())
 @pytest.mark.parametrize(
     "kind", ["3", "nested", *(pytest.param(each, marks=pytest.mark.soak) for each in ("2", "5", "template"))]
 )
-def test_after_the_rehearsal_nothing_is_compiled_in_flight(kind):
+def test_nothing_is_compiled_in_flight_after_the_rehearsal(kind):
     run = [sys.executable, "-c", FLIGHT, kind]
     phase, before, after = subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()
     assert phase == "engaged"
