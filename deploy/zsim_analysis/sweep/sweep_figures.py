@@ -76,7 +76,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
         more = f" The first {POINTS_MAX} points are shown; the tables have all."
     beside = ", compared with the paper" if results.paper_std else ""
     for name, title, what, panels in (
-        ("metrics", "The user's own figures", f"What {results.metrics_function} returned for each run.", own),
+        ("metrics", "Your own metrics", f"What {results.metrics_function} returned for each run.", own),
         ("true_rms", "How well the formation was flown", f"RMS of truth − desired within the window{window}.", rms),
         (
             "est_std",

@@ -41,7 +41,7 @@ from zsim_analysis.sweep.sweep_summary import (
 POINTS_MAX = 200  # maximum number of points in a table on the page; sweep.parquet has them all
 DETAILED_MAX = 24  # maximum number of points with a table of their own
 OVERVIEW = ("runs", "ended well", "as planned", "engaged", "no collision", "separation (m)", "least (m)")
-OWN = "figures of your own"
+OWN = "your own metrics"
 BLOCK_COLUMNS = 6  # maximum number of columns that fit the page, including those of the grid's fields
 QUANTILES = "true RMS, 5 to 95 %"
 
@@ -332,7 +332,7 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     cluster = cluster if errors else None
     of = f" of {cluster}" if cluster else ""
     title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
-    title_own = "Figures of your own, means over the runs as planned"
+    title_own = "Your own metrics, means over the runs as planned"
     title_pairs = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
     caption_pairs = f"means ± half of the {level} interval, of n pairs; if pairs are few, each difference is listed\n"
     title_ends = f"{summary.scenario}: {summary.finished} of {summary.runs} runs"

@@ -158,7 +158,7 @@ def test_a_name_is_found_without_running_its_module(beside: Path, name: str, mon
     ("name", "terms"),
     [
         ("plugin_nowhere:Good", ("'plugin_nowhere:Good'", "ModuleNotFoundError")),
-        ("plugin_meter.inner:Good", ("'plugin_meter.inner:Good'", "no package")),
+        ("plugin_meter.inner:Good", ("'plugin_meter.inner:Good'", "plugin_meter is not a package")),
         ("plugin_meter:Bad", ("'plugin_meter:Bad'", "Good, Half")),
         ("plugin_unread:Good", ("'plugin_unread:Good'", "SyntaxError")),
     ],
