@@ -75,7 +75,7 @@ def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    os.environ.pop("COLUMNS", None)  # of the terminal that starts the tests, which must not depend on its width
+    os.environ.pop("COLUMNS", None)  # set by the terminal that starts the tests; no test depends on its width
     worker = getattr(config, "workerinput", None)
     if worker and sys.platform == "linux" and worker["workerid"] == quiet_one(worker["workercount"]):
         os.setsid()

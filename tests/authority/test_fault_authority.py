@@ -17,7 +17,7 @@ DRAG_1_S = 0.249 / MASS_KG
 
 
 def hovering(**wind: Any) -> Fleet:
-    """Return a drone that has climbed to 6 m and hovers, without noise."""
+    """Return a drone that has climbed to 5 m and hovers, whose firmware has noiseless sensors."""
     quiet = {name: {field: {"noise": 0, "bias": 0, "quantum": 0}} for name, field in (
         ("mag", "field_ut"), ("baro", "altitude_m"), ("sonar", "range_m"), ("flow", "velocity_m_s"))}  # fmt: skip
     quiet["imu"] = {"accel_m_s2": {"noise": 0}, "gyro_deg_s": {"noise": 0}}

@@ -69,7 +69,7 @@ def test_processes_with_killed_pilots_and_a_rerun_give_the_same_bits(tmp_path: P
     assert alone.truth.position_m[1] == pytest.approx(places[-1], abs=0.15)
     truth = run.truth("d2")
     way = truth.loc[asked["from_s"] :, AXES].to_numpy()
-    assert np.linalg.norm(way - places[0], axis=1).min() < 0.45  # past the first place, within its radius
+    assert np.linalg.norm(way - places[0], axis=1).min() < 0.45  # the radius plus tracking error
     assert np.hypot(truth.velocity_m_s_x, truth.velocity_m_s_y).max() < 0.75
     said: list[str] = []
     assert rerun_record(tmp_path / "many", False, said.append, said.append) == ""

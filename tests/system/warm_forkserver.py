@@ -1,10 +1,11 @@
-"""The fork server of `zsim run`, for tests: a run that it forks has a fork server that is forked too.
+"""The fork server of `zsim run`, for tests: runs forked by it fork their own fork server as well.
 
-python warm_forkserver.py     standard input and the rest as of zsim_deploy.cli.forkserver
+python warm_forkserver.py     standard input and arguments as for zsim_deploy.cli.forkserver
 
-What a run's fork server would import and load, it has already: that is half of the processor time of a short run.
-A world that stands publishes its clock more often than the contract wants, since tests wait for it. What a test has
-started ends with the process that runs the test, even if that is killed; what a run under test has started does not.
+It has already imported and loaded what a run's fork server needs, which is half of the processor time of a short run.
+A world whose time stands still publishes its clock more often than the contract requires, since tests wait for it.
+Processes started by a test end with the process that runs the test, even if that is killed; processes started by a
+run under test do not.
 """
 
 import ctypes
@@ -17,18 +18,18 @@ from contextlib import suppress
 from typing import NoReturn
 
 import zsim_bridges.console.console_server
-import zsim_bridges.gateway.gateway_server  # noqa: F401  (what bridges import, too)
+import zsim_bridges.gateway.gateway_server  # noqa: F401  (modules that the bridges import)
 from zsim_deploy.cli import forkserver
 from zsim_deploy.launch import role_launcher
 from zsim_world.server import world_process
 
-STANDING_NS = 100_000_000  # instead of a second
-FILES_MAX = 256  # more than a launcher has open before it starts a role
+STANDING_NS = 100_000_000  # ns, instead of 1 s
+FILES_MAX = 256  # more files than a launcher has open before it starts a role
 RENEW_STREAMS, RUN_ROLE = forkserver.renew_streams, forkserver._run_role
 
 
 class ForkedServer:
-    """A fork server that this process has forked, as of `subprocess.Popen`."""
+    """A fork server forked by this process, with the interface of `subprocess.Popen`."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -43,7 +44,7 @@ class ForkedServer:
 
 
 def start(self: role_launcher.RoleLauncher) -> None:
-    """Do what `RoleLauncher._start_forkserver` does, without a new program."""
+    """Do what `RoleLauncher._start_forkserver` does, by a fork instead of a new program."""
     self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with other:
         pid = os.fork()
@@ -54,7 +55,7 @@ def start(self: role_launcher.RoleLauncher) -> None:
 
 
 def serve(line: int, run: str) -> NoReturn:
-    """Be a fork server, or a role that it has forked, to the end of this process."""
+    """Run a fork server, or a role that it has forked, until this process ends."""
     code: object = 1
     try:
         os.setsid()
@@ -63,24 +64,24 @@ def serve(line: int, run: str) -> NoReturn:
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
         os.closerange(3, FILES_MAX)
         sys.argv = ["forkserver", run]
-        forkserver._prepare = lambda: None  # it is
+        forkserver._prepare = lambda: None  # it is prepared already
         forkserver.renew_streams = RENEW_STREAMS
         forkserver.main()
         code = None
     except BaseException:
         traceback.print_exc()
     finally:
-        forkserver.finish(code)  # without the frames of the launcher that this process was forked in
+        forkserver.finish(code)  # without returning to the launcher that was forked
 
 
 def end_with_parent() -> None:
-    """Begin a role that is killed when the process ends that runs the test."""
+    """Start a role that is killed when the process that runs the test ends."""
     ctypes.CDLL(None).prctl(forkserver.PR_SET_PDEATHSIG, signal.SIGKILL)
     RENEW_STREAMS()
 
 
 def run_role(arguments: list[str], files: list[int]) -> NoReturn:
-    """Run a role with the variables that stand before its arguments, NAME=VALUE each; PWD is where it runs."""
+    """Run a role with the variables NAME=VALUE that precede its arguments; PWD is its working folder."""
     while "=" in arguments[0]:
         name, _, value = arguments.pop(0).partition("=")
         os.environ[name] = value

@@ -1,8 +1,8 @@
-"""A program beside zsim: zenoh and msgpack alone, by docs/protocol.md.
+"""A foreign program that uses only zenoh and msgpack, according to docs/protocol.md.
 
 with Client(endpoint) as client:
     clock = client.subscribe("clock")
-    clock.until(lambda m: m["t_ns"] >= 2e9)          waits for a message, never for a time
+    clock.until(lambda m: m["t_ns"] >= 2e9)          waits for a message, never for a fixed time
     me = client.join("tester.one", period_ns=20_000_000)
 """
 
@@ -17,12 +17,12 @@ import msgpack
 import pytest
 import zenoh
 
-PATIENCE_S = 120.0  # how long anything may take on a loaded machine before the test gives up
-SHOWN = 6  # messages told when a wait was in vain
+PATIENCE_S = 120.0  # longest wait for anything, on a loaded machine
+SHOWN = 6  # number of messages reported when a wait fails
 
 
 class Received(NamedTuple):
-    """One message as it came: wall time (monotonic), key without the federation, content."""
+    """One message as received: wall time (monotonic), key without the federation, content."""
 
     wall_s: float
     key: str
@@ -33,7 +33,7 @@ Wanted = Callable[[dict[str, Any]], Any]
 
 
 class Subscription:
-    """What comes on one expression, in order."""
+    """The messages received on one key expression, in order."""
 
     def __init__(self) -> None:
         self._queue: queue.SimpleQueue[Received] = queue.SimpleQueue()
@@ -45,7 +45,7 @@ class Subscription:
         self._queue.put(Received(time.monotonic(), key, read(sample.payload.to_bytes())))
 
     def until(self, wanted: Wanted, within_s: float = PATIENCE_S) -> Received:
-        """Return the next message that is wanted; fail when none comes."""
+        """Return the next message that is wanted; fail if none arrives."""
         until_s = time.monotonic() + within_s
         while (left_s := until_s - time.monotonic()) > 0:
             try:
@@ -66,7 +66,7 @@ class Subscription:
 
 
 class Client:
-    """A session of a foreign program."""
+    """The Zenoh session of a foreign program."""
 
     def __init__(self, endpoint: str, federation: str = "zsim") -> None:
         self.endpoint = endpoint
@@ -88,9 +88,9 @@ class Client:
         self.session.close()
 
     def subscribe(self, expression: str) -> Subscription:
-        """Listen on an expression; what arrived before a message of another subscription is there before it.
+        """Subscribe to a key expression; messages are available in order of arrival, across all subscriptions.
 
-        Called back indirectly, each subscription would have a thread of its own, of which one may lag behind another.
+        With indirect callbacks, each subscription would have its own thread, and one could lag behind another.
         """
         subscription = Subscription()
 
@@ -102,17 +102,17 @@ class Client:
         return subscription
 
     def get(self, expression: str, payload: bytes | None = None) -> dict[str, Any]:
-        """Return the last values that are answered on an expression, by key."""
+        """Query a key expression and return the answered values by key."""
         replies = self.session.get(self._prefix + expression, payload=payload, timeout=PATIENCE_S)
         good = [reply.ok for reply in replies if reply.ok is not None]
         return {str(ok.key_expr).removeprefix(self._prefix): read(ok.payload.to_bytes()) for ok in good}
 
     def info(self) -> dict[str, Any]:
-        """Return `world/info`, of a world that may still be on its way up."""
+        """Return `world/info` of a world that may still be starting."""
         clock = self.subscribe("clock")
         found = self.get("world/info")
         if not found:
-            clock.until(lambda _: True)  # a world that stands tells its clock once a second
+            clock.until(lambda _: True)  # a world whose time stands still publishes its clock once per second
             found = self.get("world/info")
         return found["world/info"]
 
@@ -122,7 +122,7 @@ class Client:
         return self.get(key, payload=request)[key]
 
     def put(self, key: str, **fields: Any) -> None:
-        """Publish a message; `seq` is counted here."""
+        """Publish a message with the next `seq` of its key."""
         seq = self._seq.get(key, 0)
         self._seq[key] = seq + 1
         self.put_raw(key, self.pack({"seq": seq, **fields}))
@@ -132,7 +132,7 @@ class Client:
         self.session.put(self._prefix + key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def answer(self, key: str, answer: dict[str, Any]) -> list[bytes]:
-        """Answer every get on a key; return the list that its payloads are put into."""
+        """Answer every query on a key; return the list to which payloads of queries are appended."""
         payloads: list[bytes] = []
 
         def reply(query: zenoh.Query) -> None:
@@ -144,24 +144,24 @@ class Client:
 
     @staticmethod
     def pack(fields: dict[str, Any]) -> bytes:
-        """Return a message as it goes on the wire."""
+        """Return an encoded message."""
         return bytes(msgpack.packb(fields) or b"")
 
     def token(self, name: str) -> Any:
-        """Declare the liveliness token of a process; `undeclare` it to play its death."""
+        """Declare the liveliness token of a process; `undeclare` it to simulate its death."""
         return self.session.liveliness().declare_token(f"{self._prefix}process/{name}")
 
     def join(
         self, name: str, info: dict[str, Any], period_ns: int, serves: tuple[str, ...] = (), **others: Any
     ) -> "Participant":
-        """Take part in the run under a name, and do the work of others beside."""
+        """Join the run under a name, and serve other processes as well."""
         participant = Participant(self, name, {**info, **others}, period_ns)
         participant.join(serves)
         return participant
 
 
 class Participant:
-    """A process of the run, as docs/protocol.md says a program of any language can be one."""
+    """A process of the run, which a program in any language can be according to docs/protocol.md."""
 
     _incarnations = itertools.count(int.from_bytes(os.urandom(5), "big"))
 
@@ -180,7 +180,7 @@ class Participant:
         self.client.put(f"process/{self.name}/join", **{"t_ns": 0, **self.run, **about})
 
     def done(self, t_ns: int, sent: int | None = None) -> None:
-        """Say done for a gate; `sent` is counted by who publishes, unless given."""
+        """Publish done for a gate; unless given, `sent` is the count that the caller keeps in `self.sent`."""
         sent, self.sent, self.done_ns = self.sent if sent is None else sent, 0, t_ns
         self.client.put(f"process/{self.name}/done", t_ns=t_ns, **self.run, done_ns=t_ns, sent=sent)
 
@@ -188,12 +188,12 @@ class Participant:
         self.client.put(f"process/{self.name}/bye", t_ns=t_ns, **self.run, reason=reason)
 
     def die(self) -> None:
-        """Let the token go without a bye, as a process does that is killed."""
+        """Undeclare the token without a bye, as if the process were killed."""
         self.token.undeclare()
 
 
 def read(payload: bytes) -> dict[str, Any]:
-    """Return what a payload says; what says nothing is told as such."""
+    """Return the decoded payload, or mark it as unreadable."""
     try:
         return msgpack.unpackb(payload)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Which agents share a process, by names and patterns."""
+"""Hosting of agents: selection by names and patterns, shared processes, and checks before a run."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,11 +29,11 @@ ESTIMATORS = ["estimator.drone1", "estimator.drone2", "estimator.drone3"]
         (["estimator.drone[12]"], ESTIMATORS[:2]),
     ],
 )
-def test_names_and_patterns(patterns: list[str], wanted: list[str]):
+def test_agents_are_selected_by_names_and_patterns(patterns: list[str], wanted: list[str]):
     assert agents_of(STEP, patterns) == wanted
 
 
-def test_a_pattern_that_matches_nobody_is_refused_with_ten_names():
+def test_a_pattern_without_a_match_is_refused_with_ten_names():
     pattern = r"estimator: drone is 'dorne\*'; must match one of drone1, drone2, drone3$"
     with pytest.raises(RunError, match=pattern):
         chosen("estimator: drone", ["drone1", "dorne*"], ["drone1", "drone2", "drone3"])
@@ -41,20 +41,20 @@ def test_a_pattern_that_matches_nobody_is_refused_with_ten_names():
         chosen("estimator: drone", ["x"], [f"d{i}" for i in range(100)])
 
 
-def test_estimators_share_one_kernel_and_a_controller_comes_after_them(tmp_path: Path):
+def test_hosted_agents_form_one_group_with_the_controller_last(tmp_path: Path):
     group = hosted(World(STEP).info(), STEP, ["*"])
     assert isinstance(group, AgentGroup)
     assert (group.name, group.serves) == ("controller.main", tuple(ESTIMATORS))
     assert group.gate_keys == tuple(f"drone/drone{i}/sensor/status" for i in (1, 2, 3))
-    with refused(RunError, "controller.main", "certificate", "estimator.drone1"):  # which is for one process
+    with refused(RunError, "controller.main", "certificate", "estimator.drone1"):  # a certificate is for one process
         roles.check_certificate(group, Identity(tls=tmp_path))
     roles.check_certificate(group, Identity())
     made = roles.agent_of("estimator", ["drone*"])(World(STEP).info(), STEP)
     assert (made.name, made.serves) == ("estimator.drone1", ("estimator.drone2", "estimator.drone3"))
 
 
-def test_a_role_is_a_row_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Its names, its agents, its extra and its rights follow from the row."""
+def test_a_role_is_defined_by_its_row_in_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The names, agents, extra and rights of a role follow from the row."""
     (tmp_path / "altimeter_of_mine.py").write_text(ALTIMETER)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(AGENTS, "altimeter", Role("agents", "drop", "drone", "altimeter_of_mine:Altimeter"))
@@ -85,7 +85,7 @@ class Altimeter(Agent):
 """
 
 
-def test_every_class_that_a_scenario_names_is_loaded_before_it_flies():
+def test_all_classes_named_in_a_scenario_are_checked_before_a_run():
     names = ["no.estimator:A", "no.space:B", "no.law:C"]
     paths = ("estimation.algorithm", "clusters.main.space", "clusters.main.law")
     overrides = [f"{path}={name}" for path, name in zip(paths, names, strict=True)]
@@ -103,7 +103,7 @@ UNFLYABLE = {
 
 
 @pytest.mark.parametrize("assignment", UNFLYABLE)
-def test_a_plan_that_a_controller_refuses_is_refused_in_the_same_words(assignment: str):
+def test_a_plan_is_refused_with_the_text_of_the_controller(assignment: str):
     name, _, text = assignment.partition("=")
     path = f"clusters.main.plan.trajectory.expressions.{name}={text}"
     scenario = scenario_file.load(TRAJECTORY, [path])
@@ -126,14 +126,14 @@ def test_a_plan_that_a_controller_refuses_is_refused_in_the_same_words(assignmen
         ("plan.land_s=5", "plan.land_s"),
     ],
 )
-def test_a_plan_that_cannot_be_flown_is_refused_with_its_path_in_the_scenario(override: str, path: str):
+def test_an_infeasible_plan_is_refused_with_its_path_in_the_scenario(override: str, path: str):
     scenario = scenario_file.load(TRAJECTORY, [f"clusters.main.{override}"])
     with pytest.raises(ScenarioError) as raised:
         check_plans(scenario, "trajectory.yaml")
     assert [line.split(" ")[1] for line in raised.value.faults] == [f"clusters[0].{path}"]
 
 
-def test_a_number_stands_for_an_expression_and_an_expression_for_a_number():
+def test_numbers_and_expressions_are_interchangeable():
     overrides = ["clusters.main.plan.trajectory.expressions.z_c=6", "clusters.main.plan.target={yaw: pi/2}"]
     scenario = scenario_file.load(TRAJECTORY, overrides)
     check_plans(scenario, "trajectory.yaml")

@@ -1,4 +1,4 @@
-"""Fixtures of the tests of reports."""
+"""Fixtures for the tests of reports."""
 
 import pytest
 
@@ -8,7 +8,7 @@ PNG = b"\x89PNG"
 
 
 def axes_png(figure: ReportFigure) -> bytes:
-    """Judge the content of a figure's axes in place of its picture, which takes a second to render."""
+    """Check the content of a figure's axes instead of rendering its picture, which takes a second."""
     visible = [axes for axes in figure.drawing.axes if axes.get_visible()]
     assert visible
     assert any(axes.has_data() or axes.texts for axes in visible)
@@ -17,7 +17,7 @@ def axes_png(figure: ReportFigure) -> bytes:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make reports, comparisons and those of sweeps with one figure, which is empty."""
+    """Give reports of runs, sweeps and comparisons a single, empty figure."""
     figure = ReportFigure("one.png", "", "", new_figure(COLUMN_IN, 1.0))
     for module in ("report.make_report.", "sweep.sweep_report.", "report.comparison.comparison_"):
         monkeypatch.setattr(f"zsim_analysis.{module}figures", lambda *_: iter([figure]))
@@ -25,6 +25,6 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def unrendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw figures, but render none of them."""
+    """Draw figures without rendering them."""
     monkeypatch.setattr(ReportFigure, "png", axes_png)
     monkeypatch.setattr(ReportFigure, "vector", lambda figure, _: axes_png(figure))

@@ -1,4 +1,4 @@
-"""A run flown again: joins on record, and where truth and outputs differ."""
+"""Rerun of a recorded run: repeated joins, and differences of truth and outputs."""
 
 import math
 from typing import Any
@@ -43,7 +43,7 @@ OTHER = recorded(keys.EVENT, Event(0, 0, "join", VISITOR, VISITOR, "", {"incarna
         ([[], [JOIN], [OTHER]], [False, False, False]),
     ],
 )
-def test_a_join_is_repeated_when_it_was_let_in(gates: list[list[Recorded]], taking_part: list[bool]) -> None:
+def test_a_join_is_repeated_at_the_gate_of_its_admission(gates: list[list[Recorded]], taking_part: list[bool]) -> None:
     world = World(SCENARIO, run_id="run1")
     bus = RerunBus(world, ALONE, world.info(), SCENARIO)
     found: list[bool] = []
@@ -65,7 +65,7 @@ def encoded(**changes: Any) -> bytes:
     return messages.encode(msgspec.structs.replace(truth(3, "d1")[1], **changes))
 
 
-def test_how_far_two_states_are_apart():
+def test_the_difference_of_two_states_is_computed():
     c, s = math.cos(0.05), math.sin(0.05)
     other = encoded(
         position_m=(3.0, 4.0, 1.0),
@@ -99,7 +99,7 @@ def command(gate: int, mode: Any = "land", seq: int | None = None) -> Mode:
     return Mode(gate * GATE_NS, gate if seq is None else seq, "controller.main", mode)
 
 
-def test_outputs_that_are_the_same_in_any_order_are_no_difference():
+def test_equal_outputs_in_another_order_are_not_a_difference():
     outputs = OutputComparison(2 * GATE_NS)
     for gate in range(10):
         outputs.add("a", command(gate))
@@ -109,7 +109,7 @@ def test_outputs_that_are_the_same_in_any_order_are_no_difference():
     assert outputs.first == ""
 
 
-def test_the_earliest_answer_that_differs_or_is_missing_is_told():
+def test_the_earliest_different_or_missing_output_is_reported():
     outputs = OutputComparison(2 * GATE_NS)
     outputs.add("missing", command(3))
     for mode in ("land", "takeoff"):

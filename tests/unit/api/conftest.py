@@ -1,4 +1,4 @@
-"""Fixtures of the tests of zsim in Python."""
+"""Fixtures for the tests of zsim's Python interface."""
 
 from near_worker import near
 

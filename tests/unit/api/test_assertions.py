@@ -1,4 +1,4 @@
-"""What tests assert of a run, and what they are told."""
+"""The assertions that users' tests make about a run, and their messages."""
 
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ class Recorded(Assertions):
 
 
 class Together(zsim.Agent):
-    """Lets two drones fly into each other."""
+    """An agent that makes two drones collide."""
 
     def receive(self, key: str, message: Any) -> None: ...
 
@@ -49,7 +49,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     return Recorded(zsim.run(PAIR, out=tmp_path_factory.mktemp("flown") / "run", progress=False))
 
 
-def test_errors(flown: Recorded) -> None:
+def test_formation_errors_are_asserted_within_the_window(flown: Recorded) -> None:
     formation = flown.run().judged_formation()
     rms = formation.errors((8, 10))["p"].true_rms
     assert rms is not None
@@ -66,7 +66,7 @@ def test_errors(flown: Recorded) -> None:
         flown.assert_errors(length=1)
 
 
-def test_collisions(flown: Recorded, tmp_path: Path) -> None:
+def test_the_absence_of_collisions_is_asserted(flown: Recorded, tmp_path: Path) -> None:
     flown.assert_no_collision()
     alone = {**PAIR, "clusters": [], "processes": {"expect": []}}
     met = zsim.run(alone, agents=[Together()], out=tmp_path / "met", progress=False)
@@ -74,7 +74,7 @@ def test_collisions(flown: Recorded, tmp_path: Path) -> None:
         Recorded(met).assert_no_collision()
 
 
-def test_same_bits(flown: Recorded, tmp_path: Path) -> None:
+def test_bitwise_identity_of_runs_is_asserted(flown: Recorded, tmp_path: Path) -> None:
     def other(name: str, **change: Any) -> Run:
         return zsim.run(PAIR, out=tmp_path / name, progress=False, **change)
 

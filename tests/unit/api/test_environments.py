@@ -1,4 +1,4 @@
-"""Environments before their outside judges, with the bits of the flights that their policies fly."""
+"""Environments: the checkers of PettingZoo and Gymnasium, and identity with flights of the same policy."""
 
 import pickle
 from collections.abc import Mapping
@@ -29,18 +29,18 @@ def made(**settings: Any) -> Any:
 
 @pytest.mark.filterwarnings("ignore:.*observation space.*")
 @pytest.mark.parametrize(("observe", "action"), FLOWN)
-def test_it_passes_pettingzoos_tests(observe: str, action: str) -> None:
+def test_the_environment_passes_pettingzoo_s_tests(observe: str, action: str) -> None:
     parallel_api_test(made(observe=observe, action=action, terminated=zsim.far_away(20.0)), num_cycles=60)
     parallel_seed_test(lambda: made(observe=observe, action=action), num_cycles=15)
 
 
 @pytest.mark.parametrize(("observe", "action"), FLOWN)
-def test_it_passes_gymnasiums_test(observe: str, action: str) -> None:
+def test_the_environment_passes_gymnasium_s_checker(observe: str, action: str) -> None:
     check_env(zsim.gym_env(PAIR, reward=stays, step_s=0.1, observe=observe, action=action), skip_render_check=True)
 
 
 def push(agent: str, seen: np.ndarray) -> np.ndarray:
-    """Return some action that depends on all that is seen."""
+    """Return an action that depends on the whole observation."""
     return np.tanh(np.resize(seen, 8 if agent == "main" else 4)) * 0.3
 
 
@@ -52,7 +52,9 @@ class Pushed(zsim.PolicyAgent):
 
 
 @pytest.mark.parametrize(("observe", "action"), FLOWN)
-def test_its_policy_flies_the_same_bits_as_an_agent(observe: Any, action: Any, tmp_path: Path) -> None:
+def test_a_policy_flies_identically_in_an_environment_and_as_an_agent(
+    observe: Any, action: Any, tmp_path: Path
+) -> None:
     env = made(observe=observe, action=action)
     seen, _ = env.reset(seed=5)
     while env.agents:
@@ -108,7 +110,7 @@ def test_episodes_are_drawn_from_the_seed() -> None:
 
 
 @pytest.mark.parametrize("processes", [False, True])
-def test_several_fly_as_one_here_and_in_processes(processes: bool) -> None:
+def test_vectorised_environments_equal_a_single_one(processes: bool) -> None:
     envs: Any = zsim.vector_env(PAIR, 2, processes=processes, reward=stays, step_s=0.1)
     first, _ = envs.reset(seed=[1, 2])
     assert first.shape == (2, 2 * (13 + 6))
@@ -122,7 +124,7 @@ def test_several_fly_as_one_here_and_in_processes(processes: bool) -> None:
     envs.close()
 
 
-def test_settings_that_do_not_fit_are_refused() -> None:
+def test_invalid_settings_are_refused() -> None:
     with refused(RunError, "reward", "missing"):
         zsim.parallel_env(PAIR)
     with refused(RunError, "actoin", "action,"):
@@ -148,13 +150,13 @@ class NotANumber(Pushed):
 
 
 @pytest.mark.parametrize(("kind", "terms"), [(Wrong, ("(3,);", "(4,)")), (NotANumber, ("nan,", "finite"))])
-def test_what_a_policy_returns_amiss_names_class_agent_and_shapes(kind: type, terms: Any, tmp_path: Path) -> None:
+def test_an_invalid_action_is_reported_with_class_agent_and_shapes(kind: type, terms: Any, tmp_path: Path) -> None:
     scenario = made().scenario
     with refused(UserCodeError, f"{kind.__module__}:{kind.__qualname__}.policy", "d1", *terms):
         zsim.run(scenario, agents=[kind], out=tmp_path / "run", progress=False)
 
 
-def test_an_action_is_held_within_its_bounds() -> None:
+def test_an_action_is_clamped_to_its_bounds() -> None:
     env = made()
     env.reset(seed=1)
     space = env.action_space("d1")

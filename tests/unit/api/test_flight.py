@@ -1,4 +1,4 @@
-"""`zsim.run`: classes from anywhere, the bits of the command, and how what goes wrong is told."""
+"""`zsim.run`: agents and laws of the caller, replaced fields, and the report of errors."""
 
 import functools
 import signal
@@ -21,7 +21,7 @@ STATUS = "drone/*/sensor/status"
 
 
 class Lander(zsim.Agent):
-    """Lands d2 at 5 s, and counts its gates."""
+    """An agent that lands d2 at 5 s by default and counts its gates."""
 
     name = "lander.main"
     reads = (STATUS,)
@@ -31,7 +31,7 @@ class Lander(zsim.Agent):
         self.gates = 0
 
     def receive(self, key: str, message: Any) -> None:
-        """Take nothing."""
+        """Ignore the message."""
 
     def step(self, t_ns: int) -> list[zsim.Output]:
         self.gates += 1
@@ -58,7 +58,7 @@ class TwoRates(ControlLaw):
         return c[:2]
 
 
-def test_an_agent_flies_beside_the_stock_ones(tmp_path: Path) -> None:
+def test_a_user_s_agent_runs_beside_the_built_in_ones(tmp_path: Path) -> None:
     lander = Lander()
     run = zsim.run(PAIR, agents=[lander], out=tmp_path / "run", progress=False)
     assert lander.gates == 301
@@ -80,7 +80,7 @@ def test_the_end_of_a_flight_is_shown() -> None:
     assert (shown[-1]["t_s"], shown[-1]["state"], shown[-1]["phase"]) == (6.0, "stopped", "engaged")
 
 
-def test_fields_are_replaced_by_path_by_name_and_by_class(tmp_path: Path) -> None:
+def test_fields_are_replaced_by_path_and_by_keyword(tmp_path: Path) -> None:
     scenario = zsim.Scenario(**PAIR).with_({"environment.wind.gust_m_s": 1.0}, duration_s=1)
     run = zsim.run(scenario, seed=9, out=tmp_path / "run", progress=False, set={"drones.d1.mass_kg": 0.5})
     flown = run.scenario.resolved
@@ -92,7 +92,7 @@ def test_fields_are_replaced_by_path_by_name_and_by_class(tmp_path: Path) -> Non
         zsim.run(scenario, options=["--hosted"])
 
 
-def test_what_a_class_raises_is_raised_after_a_line_that_says_where(
+def test_an_error_in_an_agent_is_raised_and_its_place_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(KeyError) as caught:
@@ -106,7 +106,7 @@ def test_what_a_class_raises_is_raised_after_a_line_that_says_where(
 
 
 @pytest.mark.parametrize(("law", "terms"), [(Nan, ("nan", "d1")), (TwoRates, ("(2,);", "(8,),"))])
-def test_what_a_law_returns_amiss_names_class_field_and_shapes(
+def test_an_invalid_result_of_a_law_is_reported_with_class_and_shapes(
     law: type, terms: tuple[str, ...], tmp_path: Path
 ) -> None:
     with refused(UserCodeError, f"{law.__module__}:{law.__qualname__}.rates", *terms):
@@ -116,10 +116,10 @@ def test_what_a_law_returns_amiss_names_class_field_and_shapes(
 SLOW = functools.partial(Nan, gains=None)
 
 
-def test_a_law_that_fails_in_its_rehearsal_leaves_no_folder(tmp_path: Path) -> None:
+def test_a_law_that_fails_its_rehearsal_leaves_no_folder(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.mkdir()
-    made = type("Made", (Nan,), {})  # flown by a module in the folder
+    made = type("Made", (Nan,), {})  # loaded from a module in the folder
     for out in (tmp_path / "run", mine):
         with pytest.raises(UserCodeError):
             zsim.run(PAIR, law=made, out=out, progress=False)
@@ -158,7 +158,7 @@ MISGIVEN: dict[str, tuple[dict[str, Any], type[ZsimError], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", MISGIVEN)
-def test_what_is_given_for_a_class_or_an_agent_is_named_with_what_is_allowed(case: str) -> None:
+def test_an_invalid_class_or_agent_is_refused_with_what_is_allowed(case: str) -> None:
     given, kind, terms = MISGIVEN[case]
     with refused(kind, *terms):
         zsim.run(PAIR, progress=False, **given)
@@ -167,7 +167,7 @@ def test_what_is_given_for_a_class_or_an_agent_is_named_with_what_is_allowed(cas
             zsim.Simulation(PAIR, **given)
 
 
-def test_a_partial_makes_an_agent(tmp_path: Path) -> None:
+def test_an_agent_can_be_created_by_a_partial(tmp_path: Path) -> None:
     agents = [functools.partial(Lander, at_s=1.0)]
     run = zsim.run(PAIR, agents=agents, duration_s=2, out=tmp_path / "run", progress=False)
     assert "lander.main" in run.commands("d2", "mode").source.tolist()
@@ -188,7 +188,7 @@ run = zsim.run({scenario!r}, duration_s=1e5, agents=[Lander], out={out!r}, progr
 """
 
 
-def test_ctrl_c_ends_a_flight_with_its_record_whole(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_flight_with_a_complete_record(tmp_path: Path) -> None:
     script = SCRIPT.format(scenario=PAIR, out=str(tmp_path / "run"))
     with subprocess.Popen(
         [sys.executable, "-c", script],

@@ -1,4 +1,4 @@
-"""Classes, functions and instances of notebooks and scripts get names under which other processes find them."""
+"""Naming of classes, functions and instances of notebooks and scripts, so that other processes can load them."""
 
 import importlib
 import linecache
@@ -44,7 +44,7 @@ CELL_PATH = "/tmp/ipykernel_4711/2983123.py"
 
 @pytest.fixture
 def searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that is searched for modules."""
+    """Return a folder that is searched for modules."""
     monkeypatch.setenv(plugin.FOLDERS, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
     plugin.search(tmp_path)
@@ -52,7 +52,7 @@ def searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def cell(text: str, path: str = CELL_PATH) -> dict[str, Any]:
-    """Run a cell of a notebook, as a kernel does it; return its names."""
+    """Run a cell of a notebook as a kernel does, and return its namespace."""
     names: dict[str, Any] = {"__name__": "__main__", "__builtins__": __builtins__}
     linecache.cache[path] = (len(text), None, text.splitlines(keepends=True), path)
     exec(compile(text, path, "exec"), names)
@@ -60,13 +60,13 @@ def cell(text: str, path: str = CELL_PATH) -> dict[str, Any]:
 
 
 def printed(folder: Path, code: str) -> str:
-    """Return what another process prints that searches the folder for modules."""
+    """Return the output of another process that searches the folder for modules."""
     code = f"import sys; sys.path.append({str(folder)!r}); {code}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     return done.stdout.strip() or done.stderr
 
 
-def test_a_class_of_a_cell_is_named_and_is_itself_here(searched: Path) -> None:
+def test_the_name_of_a_cell_s_class_gives_the_same_class_here(searched: Path) -> None:
     law = cell(CELL)["Law"]
     name = name_of(law, searched)
     module, _, attribute = name.partition(":")
@@ -76,12 +76,12 @@ def test_a_class_of_a_cell_is_named_and_is_itself_here(searched: Path) -> None:
     assert "#     '''Of a cell.'''\n#     factor = math.tau\n" in text
 
 
-def test_another_process_makes_the_class_from_the_file_with_all_that_it_uses(searched: Path) -> None:
+def test_another_process_loads_the_class_with_its_dependencies(searched: Path) -> None:
     module, _, _ = name_of(cell(CELL)["Law"], searched).partition(":")
     assert printed(searched, f"from {module} import Law; print(Law.scaled(Law))") == "12.566370614359172"
 
 
-def test_the_same_class_gets_the_same_name_in_another_kernel_too(searched: Path) -> None:
+def test_the_same_class_has_the_same_name_in_every_kernel(searched: Path) -> None:
     first = name_of(cell(CELL)["Law"], searched)
     assert name_of(cell(CELL, CELL_PATH.replace("4711", "12"))["Law"], searched) == first
     assert len(list(searched.iterdir())) == 1
@@ -91,7 +91,7 @@ def test_the_same_class_gets_the_same_name_in_another_kernel_too(searched: Path)
     assert name_of(cell(CELL.replace("0.5", "0.6"))["Law"], searched) != first
 
 
-def test_of_other_hash_seeds_too(tmp_path: Path) -> None:
+def test_a_name_does_not_depend_on_the_hash_seed(tmp_path: Path) -> None:
     code = f"class Law:\n    a, b, c = 'x', 'y', 'z'\nfrom zsim_api.own_code import name_of\nfrom pathlib import Path\nprint(name_of(Law, Path({str(tmp_path)!r})))"
     names = {
         subprocess.run(
@@ -102,12 +102,12 @@ def test_of_other_hash_seeds_too(tmp_path: Path) -> None:
     assert len(names) == 1
 
 
-def test_what_can_be_imported_is_named_by_its_own_module(searched: Path) -> None:
+def test_an_importable_object_is_named_by_its_own_module(searched: Path) -> None:
     assert name_of(formations_of, searched) == "zsim_analysis.reading.formation:formations_of"
     assert list(searched.iterdir()) == []
 
 
-def test_a_module_beside_the_script_is_to_be_searched_there(searched: Path) -> None:
+def test_the_folder_of_a_module_beside_the_script_is_searched(searched: Path) -> None:
     (searched / "beside_the_script.py").write_text("class Law: pass\n")
     sys.path.append(str(searched))
     module = importlib.import_module("beside_the_script")
@@ -119,7 +119,7 @@ def test_a_module_beside_the_script_is_to_be_searched_there(searched: Path) -> N
     del sys.modules["beside_the_script"]
 
 
-def test_a_module_that_is_no_file_goes_by_value(searched: Path) -> None:
+def test_a_class_of_a_module_without_a_file_is_stored_by_value(searched: Path) -> None:
     made = ModuleType("made_by_a_test_runner")
     sys.modules[made.__name__] = made
     exec("class Base: number = 7\nclass Law(Base): pass", made.__dict__)
@@ -128,7 +128,7 @@ def test_a_module_that_is_no_file_goes_by_value(searched: Path) -> None:
     assert printed(searched, f"from {module} import Law; print(Law.number)") == "7"
 
 
-def test_functions_and_instances(searched: Path) -> None:
+def test_functions_and_instances_are_named(searched: Path) -> None:
     class Agent:
         def __init__(self, number: int) -> None:
             self.number = number
@@ -154,14 +154,14 @@ UNPICKLABLE = {
 
 
 @pytest.mark.parametrize(("text", "path"), [*zip(UNPICKLABLE.values(), ("log", "log of rates", "log"), strict=True)])
-def test_what_cannot_be_pickled_is_named(text: str, path: str, searched: Path) -> None:
+def test_an_object_that_cannot_be_pickled_is_reported_by_name(text: str, path: str, searched: Path) -> None:
     with pytest.raises(RunError) as raised:
         name_of(cell(text)["Law"], searched)
     assert str(raised.value).startswith(f"{path} of __main__:Law ")
     assert "\n" not in str(raised.value)
 
 
-def test_what_a_cell_raises_is_told_with_its_line() -> None:
+def test_an_error_in_a_cell_is_reported_with_its_line() -> None:
     line = CELL.splitlines().index("        return 1 / 0  # here") + 1
     for path, shown in ((CELL_PATH, "of the notebook"), ("<ipython-input-3-0123456789ab>", "In[3]")):
         with pytest.raises(ZeroDivisionError) as raised:
@@ -173,13 +173,13 @@ def test_what_a_cell_raises_is_told_with_its_line() -> None:
         )
 
 
-def test_so_in_another_process(searched: Path) -> None:
+def test_code_in_another_process_refers_to_the_cell(searched: Path) -> None:
     module, _, _ = name_of(cell(CELL)["Law"], searched).partition(":")
     code = f"from {module} import Law; print(Law.fails.__code__.co_filename, Law.fails.__globals__['__name__'])"
     assert printed(searched, code) == f"{CELL_PATH} __main__"
 
 
-def test_a_record_of_others_is_looked_at_without_importing(searched: Path) -> None:
+def test_untrusted_code_is_not_imported(searched: Path) -> None:
     name = name_of(cell(CELL)["Law"], searched)
     del sys.modules[name.partition(":")[0]]
     with plugin.names_only() as skipped:
@@ -189,7 +189,7 @@ def test_a_record_of_others_is_looked_at_without_importing(searched: Path) -> No
     assert plugin.load(name, "law", object).__doc__ == "Of a cell."
 
 
-def test_a_function_may_use_an_array(searched: Path) -> None:
+def test_a_function_can_use_an_array(searched: Path) -> None:
     text = "import numpy as np\nTIMES = np.arange({})\ndef last(flight):\n    return int(TIMES[-1])\n"
     one, same, other = (name_of(cell(text.format(count))["last"], searched) for count in (4, 4, 5))
     assert one == same != other

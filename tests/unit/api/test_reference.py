@@ -1,4 +1,4 @@
-"""The reference of zsim in Python has every public name, and its docstring, as it builds without a warning."""
+"""The reference of zsim's Python interface has every public name with its docstring and builds without warnings."""
 
 import importlib.util
 import re
@@ -17,7 +17,7 @@ DOCS = Path(__file__).parents[3] / "docs/api"
 pytestmark = pytest.mark.skipif(not importlib.util.find_spec("furo"), reason="the extra `docs` is not installed")
 
 
-def test_it_builds_without_warnings_and_has_every_name(tmp_path: Path) -> None:
+def test_the_reference_builds_without_warnings_and_has_every_name(tmp_path: Path) -> None:
     command = [sys.executable, "-P", "-m", "sphinx", "-W", "--keep-going", "-q", str(DOCS), str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -25,13 +25,11 @@ def test_it_builds_without_warnings_and_has_every_name(tmp_path: Path) -> None:
     documented = re.findall(r'<dt [^>]*id="zsim\.(\w+)"', pages)
     assert sorted(documented) == sorted(zsim_api.__all__)
     assert {"zsim.Run.truth", "zsim.Simulation.step"} <= {*re.findall(r'<dt [^>]*id="([\w.]+)"', pages)}
-    assert "(" not in "".join(
-        re.findall(r"<strong>(.*?)</strong>", pages)
-    )  # names of arguments that were not taken apart
+    assert "(" not in "".join(re.findall(r"<strong>(.*?)</strong>", pages))  # all names of arguments were parsed
 
 
 class Silence:
-    """Keeps warnings."""
+    """A logger that keeps warnings."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -42,7 +40,7 @@ class Silence:
 
 @pytest.fixture
 def conf(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Sphinx's configuration, whose warnings are kept."""
+    """Return Sphinx's configuration module, with a logger that keeps warnings."""
     spec = importlib.util.spec_from_file_location("reference_conf", DOCS / "conf.py")
     assert spec is not None
     assert spec.loader is not None
@@ -57,7 +55,7 @@ def fresh(number: int) -> int:
 
 
 class Fresh:
-    """Has a method that says nothing."""
+    """A class with a method without a docstring."""
 
     def step(self) -> None:
         pass
@@ -66,7 +64,7 @@ class Fresh:
         pass
 
 
-def test_a_new_name_is_on_a_page_and_must_have_a_docstring(conf: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_name_is_documented_and_must_have_a_docstring(conf: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zsim_api, "_WHERE", {**zsim_api._WHERE, "zsim_api.brand_new": ("fresh", "Fresh")})
     monkeypatch.setattr(zsim_api, "_MODULES", {**zsim_api._MODULES, "fresh": __name__, "Fresh": __name__})
     for made in (fresh, Fresh):

@@ -1,4 +1,4 @@
-"""Into which folders a run flies."""
+"""The folders into which a run may write."""
 
 from collections.abc import Iterable
 from contextlib import nullcontext
@@ -25,7 +25,7 @@ def test_a_folder_with_other_files_is_refused_unless_forced(tmp_path: Path) -> N
     assert (tmp_path / "thesis.tex").read_text() == "mine"
 
 
-def test_what_a_run_leaves_that_never_flew_is_in_nobodys_way(tmp_path: Path) -> None:
+def test_remains_of_a_run_that_never_flew_are_not_in_the_way(tmp_path: Path) -> None:
     flown(tmp_path, ("scenario.yaml", "run.log", "up.log", "logs/world.log"))
     (tmp_path / "logs" / "world.log").write_text("")
     assert make_directory(tmp_path, STEP) == tmp_path
@@ -71,7 +71,7 @@ def test_force_removes_a_run_that_left_no_record(tmp_path: Path, left: tuple[str
     assert files(tmp_path) == set()
 
 
-def test_force_removes_nothing_of_a_folder_that_is_no_run(tmp_path: Path) -> None:
+def test_force_removes_nothing_from_a_folder_that_is_not_a_run(tmp_path: Path) -> None:
     mine = {"scenario.yaml", "logs/training.log", "figures/plot.png", "journal/monday", "summary.json"}
     flown(tmp_path, mine)
     make_directory(tmp_path, STEP, force=True)
@@ -79,7 +79,7 @@ def test_force_removes_nothing_of_a_folder_that_is_no_run(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("is_under_way", [False, True])
-def test_force_removes_no_record_of_another_tool_and_no_run_under_way(tmp_path: Path, is_under_way: bool) -> None:
+def test_force_removes_neither_foreign_records_nor_runs_in_progress(tmp_path: Path, is_under_way: bool) -> None:
     flown(tmp_path, ["logs/world.log", "scenario.yaml", *([] if is_under_way else ["run.mcap"])])
     with RecordWriter(tmp_path / "run.mcap") if is_under_way else nullcontext():
         with refused(RunError, str(tmp_path if is_under_way else tmp_path / "run.mcap"), "--out"):
@@ -88,17 +88,15 @@ def test_force_removes_no_record_of_another_tool_and_no_run_under_way(tmp_path: 
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_a_folder_is_one_runs_until_it_is_over(tmp_path: Path, force: bool) -> None:
+def test_a_folder_is_locked_until_its_run_is_over(tmp_path: Path, force: bool) -> None:
     with run_directory(tmp_path, STEP) as folder, refused(RunError, str(tmp_path), "--out"):
         make_directory(folder, STEP, force)
     assert make_directory(tmp_path, STEP, force) == tmp_path
 
 
-def test_runs_that_start_in_one_second_have_folders_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runs_started_in_the_same_second_have_separate_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("zsim_api.run_folder.time.strftime", lambda _: "now")
-    monkeypatch.setattr(Path, "exists", lambda _: False)  # as it was when they looked
+    monkeypatch.setattr(Path, "exists", lambda _: False)  # as if all runs checked at the same time
     names = [make_directory(None, STEP).name for _ in range(3)]
     assert names == ["step-now", "step-now-2", "step-now-3"]

@@ -1,4 +1,4 @@
-"""A scenario in Python: refused with the lines of its YAML, not changed in place, completed by editors."""
+"""A scenario in Python: reported faults, immutability, equivalence to YAML, and completion in editors."""
 
 import inspect
 from pathlib import Path
@@ -22,7 +22,7 @@ WRONG: dict[str, Any] = {
 RIGHT: dict[str, Any] = {"name": "right", "duration_s": 5, "drones": [{"name": "d1", "position_m": [0, 0, 0]}]}
 
 
-def test_it_is_refused_with_the_lines_of_its_yaml(tmp_path: Path) -> None:
+def test_a_scenario_is_refused_with_the_same_faults_as_its_yaml(tmp_path: Path) -> None:
     (tmp_path / "scenario").write_text(yaml.safe_dump(WRONG))
     with pytest.raises(ScenarioError) as of_yaml:
         scenario_file.load(tmp_path / "scenario")
@@ -32,7 +32,7 @@ def test_it_is_refused_with_the_lines_of_its_yaml(tmp_path: Path) -> None:
     assert len(of_python.value.faults) >= 5
 
 
-def test_it_is_not_changed_in_place() -> None:
+def test_a_scenario_is_not_changed_in_place() -> None:
     first = zsim.Scenario(**RIGHT)
     other = first.with_({"drones.d1.mass_kg": 0.5}, seed=7)
     assert (first["drones.d1.mass_kg"], first["seed"]) != (0.5, 7)
@@ -42,7 +42,7 @@ def test_it_is_not_changed_in_place() -> None:
     RIGHT["drones"][0]["position_m"][0] = 0
 
 
-def test_it_is_the_same_document_as_its_yaml(tmp_path: Path) -> None:
+def test_a_scenario_is_the_same_document_as_its_yaml(tmp_path: Path) -> None:
     made = zsim.Scenario(**RIGHT).with_({"environment.wind.gust_m_s": 1.0})
     made.save(tmp_path / "right.yaml")
     loaded = zsim.Scenario.load(tmp_path / "right.yaml")

@@ -1,4 +1,4 @@
-"""Another commit beside this one: its checkout, its environment, and the ratios of the two."""
+"""Comparison with another commit: its checkout, its environment, and the ratios to this one."""
 
 import subprocess
 import sys
@@ -33,20 +33,20 @@ def rows(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
 
 
-def test_above_one_this_tree_is_better() -> None:
+def test_a_ratio_above_one_means_that_this_tree_is_better() -> None:
     _, _, factor, cpu, peak = rows(against.page(sheet()))
     assert factor[1:] == ["70 (60 to 80)", "40 (40 to 40)", "1.75 (1.5 to 2)"]
     assert cpu[1:] == ["1.5 (1 to 2)", "4 (4 to 4)", "3 (2 to 4)"]
     assert peak[1:] == ["300 (300 to 300)", "200 (200 to 200)", "0.667 (0.667 to 0.667)"]
 
 
-def test_a_revision_that_does_not_fly_is_a_row_that_says_why() -> None:
+def test_a_revision_that_fails_has_a_row_with_the_reason() -> None:
     made = sheet()
     for key in against.QUANTITIES:
         del made.values[f"there.in_process.{key}"]
     made.refuse("there.in_process", 3, "exit code 2", [])
     assert {row[2] for row in rows(against.page(made))[2:]} == {"exit code 2"}
-    assert "| x |" in table.replaced(table.PAGE.read_text(), "c-against", "| x |")  # the page has a place for it
+    assert "| x |" in table.replaced(table.PAGE.read_text(), "c-against", "| x |")  # the page has a section for it
 
 
 @needs_git
@@ -64,12 +64,12 @@ def test_a_revision_is_checked_out_with_the_packages_of_this_one(tmp_path: Path)
 
 
 @needs_git
-def test_a_revision_that_git_does_not_know_is_refused(tmp_path: Path) -> None:
+def test_a_revision_unknown_to_git_is_refused(tmp_path: Path) -> None:
     with refused(RefusedError, "git", "no-such-revision"), against.checked_out("no-such-revision", tmp_path):
         pass
 
 
-def test_what_a_process_and_its_children_spend_is_counted_and_one_that_fails_is_refused() -> None:
+def test_cpu_time_includes_children_and_a_failed_process_is_refused() -> None:
     burns = "import time\nwhile time.process_time() < 0.2: pass"
     parent = f"import subprocess, sys\nsubprocess.run([sys.executable, '-c', {burns!r}])\n{burns}"
     assert 0.4 <= spent([sys.executable, "-c", parent], against.ROOT).cpu_s < 4.0

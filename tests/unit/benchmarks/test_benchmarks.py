@@ -1,4 +1,4 @@
-"""The frame of the benchmarks: statistics, tables, the page, contenders that are asked or fail, and a tiny exchange."""
+"""The benchmark framework: statistics, tables, the page, requests to contenders, failures, and a short exchange."""
 
 import json
 import sys
@@ -35,10 +35,10 @@ def sheet() -> Sheet:
 
 
 def test_a_ratio_compares_each_repeat_with_the_same_repeat(tmp_path: Path) -> None:
-    """One that failed is left out with its partner."""
+    """A failed repeat is omitted together with its partner."""
     made = sheet()
     assert made.spread("zsim", 1) == Spread(40.0, 30.0, 50.0)
-    assert made.ratio("zsim", "other", 1) == Spread(4.0, 1.5, 5.0)  # 4, 1.5, 5: not 40 / 10 of the medians' spread
+    assert made.ratio("zsim", "other", 1) == Spread(4.0, 1.5, 5.0)  # of 4, 1.5 and 5, not 40 / 10
     assert made.ratio("zsim", "other", 10) is None
     assert made.best(["zsim", "other"], 1) == "zsim"
     assert made.best(["other"], 10) is None
@@ -53,18 +53,18 @@ def test_a_ratio_compares_each_repeat_with_the_same_repeat(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("power", [0.0, 1.0, 1.7])
-def test_the_exponent_of_a_power_is_found(power: float) -> None:
+def test_the_exponent_of_a_power_law_is_found(power: float) -> None:
     assert exponent({size: 3.0 * size**power for size in (1, 3, 10, 100)}) == pytest.approx(power)
 
 
 @pytest.mark.parametrize(
     ("value", "shown"), [(0.0, "0"), (0.08512, "0.0851"), (2.0, "2"), (845.6, "846"), (12345.0, "12 300")]
 )
-def test_three_digits_are_shown(value: float, shown: str) -> None:
+def test_figures_have_three_significant_digits(value: float, shown: str) -> None:
     assert figure(value) == shown
 
 
-def test_who_has_no_figure_is_a_row_that_says_why() -> None:
+def test_a_contender_without_a_figure_has_a_row_with_the_reason() -> None:
     labels = {"zsim": "zsim", "other": "the other", "absent": "the absent"}
     lines = ratios(sheet(), labels, "zsim").splitlines()
     rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
@@ -87,14 +87,14 @@ def test_only_the_measured_section_of_the_page_is_replaced() -> None:
         table.replaced(text, "b", "new")
 
 
-def test_a_contender_that_fails_is_refused_with_its_last_words() -> None:
+def test_a_failed_contender_is_reported_with_its_error() -> None:
     with refused(RefusedError, "code 1", "ValueError: no"):
         result([sys.executable, "-c", "raise ValueError('no')"], 30.0)
     with refused(RefusedError, "0.2 s"):
         result([sys.executable, "-c", "input() if False else __import__('time').sleep(60)"], 0.2)
 
 
-def test_a_contender_is_asked_and_may_refuse() -> None:
+def test_a_contender_answers_or_refuses_requests() -> None:
     server = Server([sys.executable, "-c", ECHO])
     try:
         assert server.ask({"drones": 4}, 30.0) == {"twice": 8}
@@ -104,7 +104,7 @@ def test_a_contender_is_asked_and_may_refuse() -> None:
         server.close()
 
 
-def test_a_peer_that_is_not_installed_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_peer_that_is_not_installed_has_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peers, "STATE", tmp_path / "peers.json")
     assert has_terms(peers.missing("helics") or "", "make bench")
     peers.STATE.write_text(json.dumps({"helics": "pip: ERROR: none", "mosaik": None}))
@@ -112,17 +112,17 @@ def test_a_peer_that_is_not_installed_has_its_reason(tmp_path: Path, monkeypatch
     assert peers.missing("mosaik") is None
 
 
-def test_a_lap_counts_what_comes_after_the_warm_up() -> None:
+def test_a_lap_counts_steps_after_the_warm_up() -> None:
     lap = Lap(seconds=0.02, warm_s=0.0)
     calls = 1
     while lap.more():
         calls += 1
-    assert lap.steps == calls - 2  # the first call begins the warm-up, the second the count
+    assert lap.steps == calls - 2  # the first call begins the warm-up, the second begins counting
     assert 0.0 < lap.steps_per_s <= lap.steps / 0.02
 
 
 @pytest.mark.parametrize(("count", "clusters"), [(1, 0), (3, 1), (10, 3), (50, 16)])
-def test_drones_stand_apart_in_clusters_of_three(count: int, clusters: int) -> None:
+def test_drones_are_on_a_grid_in_clusters_of_three(count: int, clusters: int) -> None:
     made = grid.scenario(count, duration_s=1.0)
     assert (len(made.drones), len(made.clusters)) == (count, clusters)
     places = {drone.position_m for drone in made.drones}
@@ -131,7 +131,7 @@ def test_drones_stand_apart_in_clusters_of_three(count: int, clusters: int) -> N
     at = {drone.name: drone.position_m for drone in made.drones}
     for cluster in made.clusters:
         (ax, ay, _), (bx, by, _), (cx, cy, _) = (at[name] for name in cluster.drones)
-        assert (bx - ax) * (cy - ay) - (cx - ax) * (by - ay) == grid.SPACING_M**2  # a triangle: else it stays landed
+        assert (bx - ax) * (cy - ay) - (cx - ax) * (by - ay) == grid.SPACING_M**2  # else it stays landed
 
 
 @pytest.mark.parametrize("name", ["zsim", "zsim_lookahead", "zenoh_queue", "raw_tcp"])
@@ -148,7 +148,7 @@ def test_a_world_and_one_agent_exchange_steps(name: str) -> None:
         (None, "forkserver"),
     ],
 )
-def test_a_role_is_known_by_the_command_line_that_the_launcher_gives_it(arguments: list[str] | None, role: str) -> None:
+def test_a_role_is_recognised_by_its_command_line(arguments: list[str] | None, role: str) -> None:
     command = (
         [*role_launcher.COMMAND, *arguments]
         if arguments

@@ -1,4 +1,4 @@
-"""Runs per hour: the ways that peers follow, processes that are asked for flights, and the table."""
+"""Runs per hour: the paths that peers follow, workers that answer requests for flights, and the table."""
 
 import sys
 from pathlib import Path
@@ -44,7 +44,7 @@ def sheet() -> Sheet:
     return made
 
 
-def test_a_way_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_a_path_is_read_as_written(tmp_path: Path) -> None:
     made = way(51)
     write(made, tmp_path / "way.npz")
     found = read(tmp_path / "way.npz")
@@ -53,7 +53,7 @@ def test_a_way_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert [found.at(t_s) for t_s in (0.0, 0.019, 0.02, 0.06, 0.99, 5.0)] == [0, 0, 1, 3, 49, 50]
 
 
-def test_a_worker_answers_with_what_was_flown_and_refuses_what_was_not(tmp_path: Path) -> None:
+def test_a_worker_reports_its_flights_and_refuses_failed_ones(tmp_path: Path) -> None:
     write(way(51), tmp_path / "way.npz")
     server = Server([sys.executable, "-c", FLYER, str(tmp_path / "way.npz"), "1", "--flights", "2"])
     try:
@@ -69,7 +69,7 @@ def test_a_worker_answers_with_what_was_flown_and_refuses_what_was_not(tmp_path:
         server.close()
 
 
-def test_the_table_compares_the_same_repeats_and_says_who_was_not_measured() -> None:
+def test_the_table_compares_equal_repeats_and_names_missing_peers() -> None:
     page = runs_per_hour.page(sheet())
     assert has_terms(page, "zsim sweep", "1 000 (800 to 1 200)", "4.5 (4.5 to 4.5)", "–", "2.47", "12 runs")
     assert has_terms(page, "crazyflow", "2 000 (1 200 to 2 400)", "2 (1 to 3)", "0.15 (0.15 to 0.15)")
@@ -80,10 +80,10 @@ def test_the_table_compares_the_same_repeats_and_says_who_was_not_measured() -> 
 
 
 @pytest.mark.soak
-def test_the_world_alone_follows_the_way_of_a_flight(tmp_path: Path) -> None:
+def test_the_world_alone_follows_the_path_of_a_flight(tmp_path: Path) -> None:
     flown = zsim_sweep.flown_way(duration_s=40.0)
     assert flown.span_s == pytest.approx(40.0)
-    assert flown.p_W[-1, :, 2].min() > 3.0  # they are in the air
+    assert flown.p_W[-1, :, 2].min() > 3.0  # they have taken off
     assert np.allclose(np.diff(flown.p_W, axis=0), 0.02 * flown.v_W[1:], atol=2e-3)
     write(flown, tmp_path / "way.npz")
     command = [sys.executable, "-m", "benchmarks.monte_carlo.zsim_fleet", str(tmp_path / "way.npz"), "0"]
@@ -101,4 +101,4 @@ def test_a_sweep_is_timed_with_the_cpu_time_of_its_workers() -> None:
     found = zsim_sweep.fly(runs=1, workers=1, duration_s=1.0)
     assert found["wall_s"] > 0.1
     assert found["cpu_s"] > 0.1
-    assert found["closest_m"] == pytest.approx(3.0, abs=0.05)  # as they stand
+    assert found["closest_m"] == pytest.approx(3.0, abs=0.05)  # their distance on the ground

@@ -111,7 +111,7 @@ def test_each_method_sends_the_request_that_the_gateway_expects() -> None:
     assert isinstance(rest[0]["value"]["t_ns"], int)
 
 
-def test_requests_to_the_world_and_to_a_cluster() -> None:
+def test_requests_reach_the_world_and_a_cluster() -> None:
     code = """
     c.pause(); c.advance(3); c.resume(); c.rate(2); c.stop('done');
     c.clusterTarget('main', struct('z_c', 10), 20); c.clusterHold('main'); c.clusterRejoin('main');
@@ -162,7 +162,7 @@ def test_lines_are_read_however_they_are_split() -> None:
 
 
 def test_missing_values_and_news_are_empty() -> None:
-    """They are no errors."""
+    """They are not errors."""
 
     def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         return [{"op": "latest", "values": []}]

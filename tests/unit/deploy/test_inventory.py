@@ -26,7 +26,7 @@ ROLES: dict[str, Any] = {"world": "lab", "controller.*": "lab", "estimator.*": [
 
 @pytest.fixture
 def step() -> Scenario:
-    """Three drones in one cluster."""
+    """Return a scenario of three drones in one cluster."""
     return scenario_file.load(ROOT / "scenarios/step.yaml")
 
 
@@ -75,8 +75,8 @@ def test_the_example_is_secure_and_places_every_process_of_the_step_scenario(ste
             "lab",
         ),  # a longer pattern takes precedence, too
         ({**ROLES, "recorder": "two"}, "one two one", "two"),
-        ({**ROLES, "world": ["one", "two"]}, "one two one", "one"),  # the recorder is on the world's host, …
-        ({**ROLES, "*": ["one", "two"]}, "one two one", "one"),  # … which does not advance the list of another pattern
+        ({**ROLES, "world": ["one", "two"]}, "one two one", "one"),  # by default, the recorder runs on the world's host
+        ({**ROLES, "*": ["one", "two"]}, "one two one", "one"),  # the recorder takes the first host of its own pattern
         ({**ROLES, "world": "*", "*": ["one", "two"]}, "one two one", "two"),
     ],
 )
@@ -233,7 +233,7 @@ def test_two_processes_cannot_listen_on_one_port(tmp_path: Path, step: Scenario)
         ("hosts: {a: {address: x}, a: {address: y}}\nroles: {}", ("given", "twice")),
     ],
 )
-def test_a_file_that_is_no_inventory_is_reported_in_one_line(
+def test_a_file_that_is_not_an_inventory_is_reported_in_one_line(
     tmp_path: Path, content: str | None, terms: tuple[str, ...]
 ) -> None:
     path = tmp_path / "own.yaml"
@@ -261,7 +261,7 @@ LONG = {
 
 
 @pytest.mark.parametrize("name", LONG)
-def test_a_megabyte_that_is_no_inventory_is_refused_quickly(tmp_path: Path, name: str) -> None:
+def test_a_megabyte_that_is_not_an_inventory_is_refused_quickly(tmp_path: Path, name: str) -> None:
     text, where = LONG[name]
     start_s = time.process_time()
     lines = faults(tmp_path, text)

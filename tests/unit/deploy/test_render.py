@@ -131,9 +131,7 @@ def option(words: list[str], name: str) -> str | None:
 
 @ALL
 @pytest.mark.parametrize("insecure", [False, True])
-def test_every_process_runs_once_on_its_host_with_endpoints_and_certificates(
-    target: str, insecure: bool, tmp_path: Path
-) -> None:
+def test_every_process_runs_once_on_its_host_with_what_it_needs(target: str, insecure: bool, tmp_path: Path) -> None:
     """Every process gets its certificate with TLS, listening processes their access control, and the world the rate."""
     hosts = placed(tmp_path, HOSTS + "security: {insecure: true}" if insecure else HOSTS)
     texts = TARGETS[target](hosts, scenario_file.load(STEP, ["federation=lab.2"]), ("--realtime", "--rate", "2.0"))

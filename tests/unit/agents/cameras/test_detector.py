@@ -1,4 +1,4 @@
-"""The detector on pictures of which the truth is known: bearing, range, and whether its sigmas are honest."""
+"""The detector on pictures with known truth: bearing, range, and consistency of the stated sigmas."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from zsim_agents.cameras.detector import HatDetector, decoded
 from zsim_agents.cameras.foreground import AMBIENT, ball_images
 from zsim_agents.cameras.scene import View
 
-ASSOCIATED_RAD = 0.03  # rad, within which a sighting is that of the hat
+ASSOCIATED_RAD = 0.03  # rad, largest error of direction with which a sighting is associated with the hat
 
 
 def detector(camera: Camera = FRONT) -> HatDetector:
@@ -23,8 +23,8 @@ def detector(camera: Camera = FRONT) -> HatDetector:
 
 
 def errors(camera: Camera, count: int, seed: int, light: float = 1.0, **of_looks: Any) -> np.ndarray:
-    """Return, of each hat that was seen, the apparent diameter [px], the normalised errors of the direction in its two
-    axes and of the range, and the relative error of the range, (M, 5); and refuse any sighting of anything else."""
+    """Return for each sighted hat its apparent diameter [px], the normalised errors of both axes of its direction and
+    of its range, and the relative error of its range, (M, 5); assert that nothing else is sighted."""
     drawn, found = renderer(camera, scene(light=light)), detector(camera)
     rows = []
     for number, look in enumerate(looks(count, seed, **of_looks)):
@@ -43,7 +43,7 @@ def errors(camera: Camera, count: int, seed: int, light: float = 1.0, **of_looks
     return np.array(rows)
 
 
-def test_range_and_bearing_are_right_and_their_sigmas_are_honest() -> None:
+def test_range_and_bearing_are_consistent_with_their_sigmas() -> None:
     of_all = errors(FRONT, 220, seed=3)
     assert len(of_all) > 205
     assert 0.7 < np.sqrt((of_all[:, 1:3] ** 2).mean()) < 1.3
@@ -53,7 +53,7 @@ def test_range_and_bearing_are_right_and_their_sigmas_are_honest() -> None:
 @pytest.mark.parametrize(
     ("ranges_m", "rms"), [((1.2, 2.5), 0.02), ((2.5, 5.0), 0.04), ((5.0, 8.0), 0.06), ((8.0, 12.0), 0.15)]
 )
-def test_the_range_errs_by_no_more_than_so_much_at_any_range(ranges_m: Any, rms: float) -> None:
+def test_the_relative_error_of_the_range_is_bounded(ranges_m: Any, rms: float) -> None:
     of_all = errors(FRONT, 60, seed=4, ranges_m=ranges_m)
     assert len(of_all) > 50
     assert np.sqrt((of_all[:, 4] ** 2).mean()) < rms
@@ -67,7 +67,7 @@ def test_the_range_errs_by_no_more_than_so_much_at_any_range(ranges_m: Any, rms:
         (FrontCamera(distortion=(-0.28, 0.09, 0.0, 0.0, 0.0)), {}),
     ],
 )
-def test_sigmas_hold_at_dusk_when_the_body_turns_and_behind_a_lens_that_distorts(camera: Camera, fields: Any) -> None:
+def test_sigmas_hold_at_dusk_in_rotation_and_with_distortion(camera: Camera, fields: Any) -> None:
     of_all = errors(camera, 120, seed=5, ranges_m=(1.5, 6.0), **fields)
     assert len(of_all) > 100
     assert np.sqrt((of_all[:, 1:3] ** 2).mean()) < 1.4
@@ -75,11 +75,11 @@ def test_sigmas_hold_at_dusk_when_the_body_turns_and_behind_a_lens_that_distorts
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.8, 0.0), (-0.78, 0.38)])
-def test_a_ball_anywhere_in_the_picture_has_its_range_and_direction(place: Any) -> None:
+def test_a_ball_anywhere_in_the_picture_is_measured_correctly(place: Any) -> None:
     lens, distance = lens_of(FRONT), 2.0
     direction_K = np.array([*place, 1.0]) / np.linalg.norm([*place, 1.0])
     picture = np.full((lens.height, lens.width, 3), 90, np.uint8)
-    colour = np.array([134.0, 0.0, 226.0]) / AMBIENT  # in the shade everywhere, so that nothing but geometry counts
+    colour = np.array([134.0, 0.0, 226.0]) / AMBIENT  # uniform shade, so that only geometry matters
     centres, radius_m = (direction_K * distance)[None], HATS.diameter_m / 2
     ball_images(View(lens), centres, np.zeros((1, 3)), radius_m, colour, direction_K)[0].draw(picture)
     (seen,) = detector().seen(picture)
@@ -95,7 +95,7 @@ def test_the_bottom_camera_sees_drones_below() -> None:
     assert found_K == pytest.approx(hat_K(BOTTOM, where), abs=4 * seen.sigma_range_m)
 
 
-def test_all_hats_of_a_formation_are_seen_and_nothing_else() -> None:
+def test_exactly_the_hats_of_a_formation_are_seen() -> None:
     where = bodies([(0, 0, 6), (4, 1.5, 5.5), (6, -2, 5.0), (5, 0, 4.0)])
     seen = detector().seen(renderer(FRONT, scene(4)).picture(0, 1.0, where))
     R_KB = camera_pose(FRONT).R_BK.T
@@ -107,21 +107,21 @@ def test_all_hats_of_a_formation_are_seen_and_nothing_else() -> None:
     assert max(off) < 2e-3
 
 
-def test_nothing_is_seen_where_no_hat_is() -> None:
+def test_nothing_is_seen_without_a_hat() -> None:
     drawn = renderer(FRONT, scene(1))
     for yaw in np.linspace(-3, 3, 12):
         assert detector().seen(drawn.picture(0, 1.0, bodies([(2, 3, 4)], [(0.1, -0.1, yaw)]))) == ()
 
 
-def test_a_hat_that_the_edge_of_the_picture_cuts_or_too_small_for_an_honest_range_is_left_out() -> None:
-    drawn, edge = renderer(replace(FRONT, noise=0.0)), 320 / lens_of(FRONT).fx  # tangent of the angle to it
+def test_a_hat_cut_by_the_edge_or_too_small_is_omitted() -> None:
+    drawn, edge = renderer(replace(FRONT, noise=0.0)), 320 / lens_of(FRONT).fx  # tangent of the angle to the edge
     assert detector().seen(drawn.picture(0, 1.0, bodies([(0, 0, 5), (2.16, 2 * edge, 4.8)]))) == ()
     seen = [detector().seen(drawn.picture(0, 1.0, bodies([(0, 0, 5), (away, 0, 4.5)]))) for away in (8, 18)]
     assert [*map(len, seen)] == [1, 0]
 
 
 @pytest.mark.parametrize("kind", ["noise", "magenta", "black", "stripes"])
-def test_any_picture_is_taken(kind: str) -> None:
+def test_any_picture_is_processed(kind: str) -> None:
     shape = FRONT.height_px, FRONT.width_px, 3
     picture = np.zeros(shape, np.uint8)
     if kind == "noise":
@@ -134,14 +134,14 @@ def test_any_picture_is_taken(kind: str) -> None:
         assert np.isfinite([*seen.direction_B, seen.range_m, seen.sigma_range_m, seen.sigma_direction_rad]).all()
 
 
-def test_orange_red_and_purple_balls_are_no_hats() -> None:
+def test_balls_of_other_colours_are_not_hats() -> None:
     picture = np.full((360, 640, 3), 120, np.uint8)
     for i, colour in enumerate([(24, 108, 240), (20, 20, 220), (30, 200, 220), (220, 60, 40), (60, 180, 60)]):
         cv2.circle(picture, (80 + 100 * i, 180), 12, colour, cv2.FILLED, cv2.LINE_AA)
     assert detector().seen(picture) == ()
 
 
-# JPEG of strangers
+# Foreign JPEG data
 
 PICTURE = np.random.default_rng(1).integers(0, 255, (48, 64, 3), dtype=np.uint8)
 
@@ -174,12 +174,12 @@ def test_the_size_of_any_jpeg_is_read(options: tuple[int, ...]) -> None:
         jpeg()[:20],
     ],
 )
-def test_what_is_no_jpeg_is_refused(data: bytes) -> None:
+def test_invalid_jpeg_data_is_refused(data: bytes) -> None:
     with pytest.raises(PictureError):
         decoded(data, 64, 48)
 
 
-def test_every_cut_and_any_noise_is_taken_or_refused_in_a_line() -> None:
+def test_truncated_and_corrupt_jpegs_are_decoded_or_refused_in_one_line() -> None:
     data, rng = jpeg(), np.random.default_rng(2)
     pictures = [data[:end] for end in range(0, len(data), 37)]
     for _ in range(100):
@@ -196,7 +196,7 @@ def test_every_cut_and_any_noise_is_taken_or_refused_in_a_line() -> None:
     assert not [refusal for refusal in refusals if "\n" in refusal]
 
 
-def test_a_header_of_an_absurd_size_is_refused_before_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_absurd_size_in_a_header_is_refused_before_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
     data = bytearray(jpeg())
     at = data.index(b"\xff\xc0") + 5

@@ -1,4 +1,4 @@
-"""Madgwick's filter against closed forms and scipy's rotations; the growth of dead reckoning's errors."""
+"""Madgwick's filter against closed forms and scipy's rotations; the growth of errors of dead reckoning."""
 
 import math
 import os
@@ -33,7 +33,7 @@ def as_rotation(q: Quaternion) -> Rotation:
 
 
 def tilt(q: Quaternion) -> float:
-    """Angle between the body's z axis and the vertical [rad]."""
+    """Return the angle between the body's z axis and the vertical [rad]."""
     return math.acos(min(1.0, as_rotation(q).as_matrix()[2, 2]))
 
 
@@ -43,7 +43,7 @@ def triple(values) -> Vector:
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.36, 0.48, 0.8)])
-def test_a_constant_rate_turns_about_the_body_s_axis_by_rate_times_time(axis):
+def test_a_constant_rate_turns_about_the_body_axis_by_rate_times_time(axis):
     rate, steps = 3.0, 400  # rad/s; 2 s
     start = Rotation.from_euler("ZYX", [100.0, 20.0, -30.0], degrees=True)
     q = quaternion(start)
@@ -69,7 +69,7 @@ def test_the_gradient_is_the_derivative_of_the_objective():
         assert strapdown.gravity_gradient(tuple(q), tuple(f)) == pytest.approx(numeric, abs=1e-8)
 
 
-def test_the_accelerometer_levels_by_two_beta_and_keeps_the_heading():
+def test_the_accelerometer_levels_at_twice_beta_and_keeps_the_heading():
     beta, steps = 0.1, 100
     true = Rotation.from_euler("ZYX", [40.0, 0.0, 0.0], degrees=True)
     start = Rotation.from_rotvec([0.2, 0.1, 0.0]) * true
@@ -77,11 +77,11 @@ def test_the_accelerometer_levels_by_two_beta_and_keeps_the_heading():
     for _ in range(steps):
         q = madgwick_step(q, ZERO, triple(true.inv().apply([0.0, 0.0, G])), beta, DT)
     lost = tilt(quaternion(start)) - tilt(q)
-    assert lost == pytest.approx(2.0 * beta * steps * DT, rel=0.02)  # a little of the step is along q itself
+    assert lost == pytest.approx(2.0 * beta * steps * DT, rel=0.02)  # a small part of the step is along q itself
     assert heading(q) == pytest.approx(start.as_euler("ZYX")[0], abs=0.005)
 
 
-def test_under_noise_the_tilt_decays_with_the_levelling_time():
+def test_the_tilt_decays_with_the_levelling_time_under_noise():
     sigma, levelling = 0.35 / G, 2.0  # rad, s
     beta = strapdown.beta_for(levelling, sigma)
     assert strapdown.levelling_time_s(beta, sigma) == pytest.approx(levelling)
@@ -95,7 +95,7 @@ def test_under_noise_the_tilt_decays_with_the_levelling_time():
     assert np.mean(left) == pytest.approx(0.02 * math.exp(-1.0), rel=0.15)
 
 
-def test_without_gain_or_force_only_the_gyroscope_counts_and_the_length_stays_one():
+def test_only_the_gyroscope_counts_without_gain_or_specific_force():
     q = quaternion(Rotation.from_rotvec([0.3, 0.0, 0.0]))
     by_gyro = madgwick_step(q, (0.0, 0.0, 1.0), ZERO, 0.5, DT)
     assert madgwick_step(q, (0.0, 0.0, 1.0), (1.0, 2.0, 9.0), 0.0, DT) == by_gyro
@@ -118,7 +118,7 @@ print([x.hex() for part in state for x in part])
 """
 
 
-def test_compiled_and_plain_python_give_the_same_bits():
+def test_compiled_and_plain_python_give_identical_results():
     pytest.importorskip("numba")
     outputs = set()
     for disabled in ("0", "1"):
@@ -129,14 +129,14 @@ def test_compiled_and_plain_python_give_the_same_bits():
     assert "0x" in outputs.pop()
 
 
-# The growth of errors
+# Growth of errors
 
 
 def test_the_transition_is_the_derivative_of_dead_reckoning():
     dt, f_B = 0.005, (0.5, -0.3, 10.5)  # s, m/s^2
 
     def reckoned(error) -> Reckoning:
-        """One step of a drone whose state and biases are off by `error`."""
+        """Return one step of a drone whose state and biases differ by `error`."""
         w, x, y, z = (Rotation.from_rotvec(error[6:9]) * ATTITUDE).as_quat(scalar_first=True).tolist()
         gyro_bias, accel_bias = triple(error[9:12]), triple(error[12:15])
         rate, force = subtract(RATE, gyro_bias), subtract(f_B, accel_bias)
@@ -156,24 +156,24 @@ def test_the_transition_is_the_derivative_of_dead_reckoning():
     F = np.eye(15)
     R = matrix(nominal[2])
     strapdown.write_transition(F, triple(ATTITUDE.apply(f_B)), R, math.inf, True, dt)
-    # The velocity's dependence on the gyroscope's bias is of second order in dt and left out.
+    # The dependence of velocity on gyroscope bias is of second order in dt and neglected.
     assert F[:9] == pytest.approx(numeric, abs=2e-4)
     assert F[6:9, 9:12] == pytest.approx(numeric[6:9, 9:12], abs=1e-5)
     assert F[9:] == pytest.approx(np.eye(15)[9:])
-    F = np.eye(12)  # Madgwick's pull shortens errors of the tilt, but not of the heading
+    F = np.eye(12)  # Madgwick's correction reduces errors of the tilt, but not of the heading
     strapdown.write_transition(F, (0.0, 0.0, G), matrix(LEVEL), 2.0, False, 0.02)
     assert np.diag(F)[6:9] == pytest.approx([math.exp(-0.01), math.exp(-0.01), 1.0], abs=1e-4)
 
 
-def test_white_acceleration_becomes_a_random_walk_of_velocity_and_biases_gain_theirs():
-    accel_variance, tilt_variance = 0.35**2 * 4 * 0.005**2, 1e-9  # over a gate: m^2/s^2 of four samples, rad^2
+def test_white_acceleration_noise_becomes_a_random_walk_of_velocity():
+    accel_variance, tilt_variance = 0.35**2 * 4 * 0.005**2, 1e-9  # per gate: m^2/s^2 from four samples, rad^2
     rest = (ZERO, ZERO, LEVEL, ZERO, ZERO, (0.0, 0.0, G))
     P, variances = np.zeros((12, 12)), (accel_variance, tilt_variance, tilt_variance)
     for _ in range(500):
         F, Q = np.eye(12), np.zeros((12, 12))
         strapdown.write_prediction(F, Q, np.zeros(12), rest, ZERO, G, 60.0, False, variances, GATE_S)
         P = predicted_covariance(P, F, Q)
-    density = 0.35**2 * 0.005  # m^2/s^3, of white noise at 200 Hz
+    density = 0.35**2 * 0.005  # m^2/s^3, density of white noise sampled at 200 Hz
     assert P[5, 5] == pytest.approx(density * 10.0, rel=1e-6)
     assert P[2, 2] == pytest.approx(density * 10.0**3 / 3.0, rel=1e-3)
     assert density * 10.0 < P[3, 3] < density * 10.0 + tilt_variance / GATE_S * G**2 * 10.0**3 / 3.0

@@ -1,4 +1,4 @@
-"""The estimator as an agent: of external drones it publishes only what their drivers bring; it needs no numba."""
+"""The estimator as an agent: external drones are estimated only while their driver reports; numba is optional."""
 
 import json
 import subprocess
@@ -59,7 +59,7 @@ def step(estimator: Estimator, gate: int, *drones: str) -> dict[str, Estimate]:
     return {keys.thing(key): estimate for key, estimate in estimator.step(gate * GATE_NS)}  # type: ignore[misc]
 
 
-def test_it_estimates_one_only_where_its_driver_has_brought_a_status(estimator: Estimator):
+def test_an_external_drone_is_estimated_only_if_its_driver_reports(estimator: Estimator):
     estimates: dict[str, Estimate] = {}
     for gate in range(100):
         coming = ("d0", "d1") if gate < 30 or gate > 60 else ("d0",)
@@ -70,7 +70,7 @@ def test_it_estimates_one_only_where_its_driver_has_brought_a_status(estimator: 
         assert tuple(each.name for each in shown.estimates) == coming  # type: ignore[attr-defined]
     last = estimates["d1"]
     assert last.seq == 68  # counted without gaps
-    estimator.deliver(100 * GATE_NS, brought("d0", 100) + brought("d1", 100)[:-1])  # without its status
+    estimator.deliver(100 * GATE_NS, brought("d0", 100) + brought("d1", 100)[:-1])  # without d1's status
     assert [key for key, _ in estimator.step(100 * GATE_NS)] == [keys.estimate("d0")]
     np.testing.assert_allclose(last.position_m, (4.0, 0.0, 0.0), atol=0.3)
 
@@ -124,7 +124,7 @@ def fly(*how: str) -> tuple[bool, np.ndarray]:
     return found["compiles"], np.array(found["said"])
 
 
-def test_the_estimator_needs_no_numba():
+def test_the_estimator_works_without_numba():
     compiles, wanted = fly()
     plain, found = fly("without")
     assert (compiles, plain) == (True, False)

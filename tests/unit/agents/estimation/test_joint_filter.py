@@ -1,4 +1,4 @@
-"""The joint filter of a cluster: without sightings as every drone by itself, with them whose hat was seen is found out."""
+"""The joint filter of a cluster: independence of the drones without sightings, and association of sighted hats."""
 
 import math
 from pathlib import Path
@@ -22,13 +22,13 @@ GATE_S, GATE_NS = 0.02, 20_000_000
 PLACES = np.array([(0.0, 4.0, 5.0), (-1.5, 0.0, 5.0), (1.5, 0.0, 5.0)])  # drone 1 is north of drones 2 and 3
 NORTH = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 CAMERA_B, HAT_B = np.array([0.162, 0.0, 0.012]), np.array([-0.03, 0.0, 0.11])
-FIELD_B = np.array([17.8, 2.8, 14.0])  # of the scenario, seen by who looks north
+FIELD_B = np.array([17.8, 2.8, 14.0])  # uT, field of the scenario in the frame of a drone that faces north
 
 
 def still(
     bank: EstimatorBank | ClusterBanks, gate: int, rng: np.random.Generator, baro_off_m: tuple[float, ...] = (0, 0, 0)
 ) -> None:
-    """Hand over what drones sense that stand still in the air, looking north; by how much their barometers lie."""
+    """Deliver the readings of drones that hover facing north, whose barometers are off by `baro_off_m`."""
     t_ns = gate * GATE_NS
     for i, place in enumerate(PLACES):
         for k in (3, 2, 1, 0) if gate else ():
@@ -46,7 +46,7 @@ def still(
 
 
 def sighted(observer: int, target: NDArray[np.float64], t_ns: int, source: str = "") -> Sightings:
-    """Return what an observer sees of a hat at a place, without error."""
+    """Return the error-free sighting by an observer of the hat of a drone at a place."""
     R = np.array(matrix(NORTH))
     to_B = R.T @ (target + R @ HAT_B - PLACES[observer]) - CAMERA_B
     away = float(np.linalg.norm(to_B))
@@ -61,9 +61,9 @@ def bank_of(kind: type[EstimatorBank] = JointBank) -> EstimatorBank:
 def flown(
     bank: EstimatorBank, gates: int, seen: dict[int, NDArray[np.float64]] | None = None, lies_m: float = 0.0
 ) -> list[StateEstimate]:
-    """Return the estimates after so many gates; each observer sees a hat there in every third.
+    """Return the estimates after some gates, in every third of which each observer sees a hat at its place in `seen`.
 
-    From gate 700 on the barometer of drone 1 is off by `lies_m`.
+    After gate 700, the barometer of drone 1 is off by `lies_m`.
     """
     rng = np.random.default_rng(3)
     estimates: list[StateEstimate] = []
@@ -75,14 +75,14 @@ def flown(
     return estimates
 
 
-def test_without_sightings_every_drone_is_as_by_itself():
+def test_drones_are_estimated_independently_without_sightings():
     alone, together = flown(bank_of(EstimatorBank), 300), flown(bank_of(), 300)
     for one, other in zip(alone, together, strict=True):
         assert np.array(other.position_m) == pytest.approx(np.array(one.position_m), abs=1e-9)
         assert np.array(other.covariance) == pytest.approx(np.array(one.covariance), abs=1e-9)
 
 
-def test_with_sightings_the_drones_are_where_they_are_to_each_other():
+def test_sightings_improve_relative_positions():
     alone = flown(bank_of(), 1500)
     together = flown(bank_of(), 1500, {1: PLACES[0], 2: PLACES[0]})
 
@@ -96,10 +96,10 @@ def test_with_sightings_the_drones_are_where_they_are_to_each_other():
 
 
 @pytest.mark.parametrize(("seen", "height_off_m"), [({1: PLACES[0], 2: PLACES[0]}, 0.0), ({}, 5.0)])
-def test_a_barometer_that_lies_is_not_trusted_while_others_whom_the_drone_sees_know_better(
+def test_a_wrong_barometer_is_refused_while_sightings_contradict_it(
     seen: dict[int, NDArray[np.float64]], height_off_m: float
 ):
-    """A drone that nobody sees trusts its barometer again, when that has been refused for long."""
+    """An unseen drone accepts its barometer again after refusing it for a long time."""
     estimates = flown(bank_of(), 1500, seen, lies_m=5.0)
     assert estimates[0].position_m[2] == pytest.approx(PLACES[0, 2] + height_off_m, abs=0.3)
     assert (estimates[0].sensors["baro"][1] > 300) == bool(seen)
@@ -107,7 +107,7 @@ def test_a_barometer_that_lies_is_not_trusted_while_others_whom_the_drone_sees_k
 
 @pytest.mark.parametrize("late_gates", [0, 2])
 @pytest.mark.parametrize("slower_first", [False, True])
-def test_what_two_detectors_find_in_one_picture_of_drone_2_counts_once(slower_first: bool, late_gates: int):
+def test_sightings_by_two_detectors_in_one_picture_count_once(slower_first: bool, late_gates: int):
     bank, rng, estimates = bank_of(), np.random.default_rng(3), []
     for gate in range(900):
         still(bank, gate, rng)
@@ -120,7 +120,7 @@ def test_what_two_detectors_find_in_one_picture_of_drone_2_counts_once(slower_fi
     assert estimates[1].sensors["sightings"][0] > 100
 
 
-def test_a_camera_that_the_drone_does_not_have_moves_nobody():
+def test_sightings_of_an_unknown_camera_have_no_effect():
     bank, calm = (bank_of() for _ in range(2))
     rngs = np.random.default_rng(3), np.random.default_rng(3)
     for gate in range(900):
@@ -131,18 +131,18 @@ def test_a_camera_that_the_drone_does_not_have_moves_nobody():
         assert bank.estimate(gate * GATE_S) == calm.estimate(gate * GATE_S)
 
 
-def test_a_hat_where_nobody_is_or_that_might_be_of_two_moves_nobody():
+def test_sightings_of_no_drone_or_ambiguous_ones_have_no_effect():
     lying = flown(bank_of(), 900, {1: np.array([3.0, 9.0, 0.0])})
     alone = flown(bank_of(), 900)
     for one, other in zip(alone, lying, strict=True):
         assert np.array(other.position_m) == pytest.approx(np.array(one.position_m), abs=1e-12)
     used, refused = lying[1].sensors["sightings"]
     assert (used, refused) == (0, 300)
-    early = flown(bank_of(), 4, {1: PLACES[0]})  # before GPS has told them apart, within a metre or two
+    early = flown(bank_of(), 4, {1: PLACES[0]})  # before GPS has resolved their positions to a metre or two
     assert early[1].sensors["sightings"] == (0, 2)
 
 
-def test_the_jacobian_is_that_of_what_is_expected():
+def test_the_jacobian_is_the_derivative_of_the_prediction():
     zero = (0.0, 0.0, 0.0)
     a: Moment = (0.0, (1.0, 2.0, 3.0), zero, normalised((0.9, 0.1, -0.2, 0.3)), zero, zero, zero)
     b: Moment = (0.0, (4.0, -1.0, 3.5), zero, normalised((0.8, -0.1, 0.2, 0.5)), zero, zero, zero)
@@ -171,7 +171,7 @@ def test_the_jacobian_is_that_of_what_is_expected():
             assert H[:, drone * n + state] == pytest.approx(np.array(axes) @ slope, abs=1e-5)
 
 
-def test_it_goes_on_from_a_snapshot_to_the_same_bits():
+def test_a_restored_filter_continues_bit_for_bit():
     def banks() -> ClusterBanks:
         return ClusterBanks(EYES, ["drone2"], GATE_S)
 

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from zsim_agents.estimation.filter_setup import innovation_limits
 from zsim_agents.estimation.kalman_update import predicted_covariance, stacked_update
 
-LIMITS = np.full(7, 1e9)  # gates that nothing misses
+LIMITS = np.full(7, 1e9)  # gates that accept every innovation
 GATE_PROBABILITY = 0.9999
 
 
@@ -23,7 +23,7 @@ def problem(seed: int, n: int, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 @pytest.mark.parametrize(("n", "m"), [(12, 1), (12, 3), (12, 11), (15, 6), (15, 17)])
 @pytest.mark.parametrize("seed", range(5))
-def test_it_is_filterpys_update(seed: int, n: int, m: int):
+def test_the_update_equals_that_of_filterpy(seed: int, n: int, m: int):
     P, H, variance, y = problem(seed, n, m)
     reference = ExtendedKalmanFilter(n, m)
     reference.x, reference.P = np.zeros(n), P.copy()
@@ -38,7 +38,7 @@ def test_it_is_filterpys_update(seed: int, n: int, m: int):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_it_is_filterpys_prediction(seed: int):
+def test_the_prediction_equals_that_of_filterpy(seed: int):
     P, _, _, _ = problem(seed, 12, 3)
     rng = np.random.default_rng(seed)
     F = np.eye(12) + 0.02 * rng.normal(size=(12, 12)) * (rng.random((12, 12)) < 0.2)
@@ -49,7 +49,7 @@ def test_it_is_filterpys_prediction(seed: int):
     assert predicted_covariance(P, F, Q) == pytest.approx(reference.P, rel=1e-12, abs=1e-12)
 
 
-def test_an_innovation_outside_of_its_gate_changes_nothing():
+def test_an_innovation_outside_its_gate_changes_nothing():
     P, H, variance, y = problem(1, 12, 4)
     before = P.copy()
     y[2] = 1e3
@@ -64,7 +64,7 @@ def test_an_innovation_outside_of_its_gate_changes_nothing():
 
 
 @pytest.mark.parametrize(("size", "inside"), [(1, True), (1, False), (3, True), (3, False), (6, True), (6, False)])
-def test_a_gate_is_the_quantile_of_chi_square(size: int, inside: bool):
+def test_a_gate_is_the_chi_square_quantile(size: int, inside: bool):
     P, H, variance = np.eye(12), np.eye(size, 12), np.full(size, 0.25)
     limit = math.sqrt(chi2.ppf(GATE_PROBABILITY, size) * 1.25 / size)  # per row
     y, blocks = np.full(size, limit * (0.999 if inside else 1.001)), np.array([(0, size)])
@@ -75,7 +75,7 @@ def test_a_gate_is_the_quantile_of_chi_square(size: int, inside: bool):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e300])
-def test_what_is_not_a_number_is_refused(bad: float):
+def test_a_value_that_is_not_finite_or_absurd_is_refused(bad: float):
     P, H = np.eye(12), np.eye(1, 12)
     blocks, limits = np.array([(0, 1)]), innovation_limits(GATE_PROBABILITY)
     with np.errstate(over="ignore", invalid="ignore"):

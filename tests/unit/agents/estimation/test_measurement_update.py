@@ -1,4 +1,4 @@
-"""Measurement models against geometry and finite differences; the update of a gate against filterpy."""
+"""Measurement models against geometry and finite differences; the update at a gate against filterpy."""
 
 from collections.abc import Callable
 
@@ -63,7 +63,7 @@ def flow(H, p, v, R):
 def test_jacobians_are_the_derivatives_of_the_predictions(model: Callable):
     def predicted(error) -> np.ndarray:
         v = V_W + error[3:6]
-        p = P_W + error[0:3] - LAG * error[3:6]  # the past position whose error `lag` maps
+        p = P_W + error[0:3] - LAG * error[3:6]  # the past position, whose error depends on the lag
         turned = Rotation.from_rotvec(error[6:9]) * ATTITUDE
         return np.array(model(np.zeros((8, 12)), triple(p), triple(v), flat(turned)))
 
@@ -77,7 +77,7 @@ def test_jacobians_are_the_derivatives_of_the_predictions(model: Callable):
     assert not H[:, 9:].any()
 
 
-def test_predictions_are_what_the_geometry_says():
+def test_predictions_agree_with_the_geometry():
     H = np.zeros((8, 12))
     R = ATTITUDE.as_matrix()
     p, v = P_W + R @ ARM, V_W + R @ np.cross(W, ARM)
@@ -92,21 +92,21 @@ def test_predictions_are_what_the_geometry_says():
     assert (p + distance * ray)[2] == pytest.approx(0.4)  # the floor
 
 
-def test_a_sonar_that_looks_up_says_nothing():
+def test_a_sonar_pointing_upwards_gives_no_information():
     H = np.zeros((1, 12))
     up = (0.0, 0.0, 1.0)
     assert write_sonar(H, 0, (0.0, 0.0, 3.0), matrix(LEVEL), ZERO, up, 0.0, 0.0) == 0.0
     assert not H.any()
 
 
-# A gate
+# The update at a gate
 
 
 def copy_of(rows: Rows) -> Rows:
     return Rows._make(array.copy() for array in rows)
 
 
-def test_a_refused_measurement_leaves_no_trace_on_those_beside_it():
+def test_a_refused_measurement_does_not_affect_the_others():
     rows = estimator(scenario()).bank.rows
     alone, both, P = copy_of(rows), copy_of(rows), np.eye(12)
     H, z, variance = np.zeros((4, 12)), np.array([50.0, 0.1, 0.2, 0.3]), np.full(4, 0.01)
@@ -118,8 +118,8 @@ def test_a_refused_measurement_leaves_no_trace_on_those_beside_it():
     assert P_both == pytest.approx(P_alone)
 
 
-def test_a_gate_in_flight_is_filterpys_update():
-    """A twin has the same past and the gate's IMU alone: what it lacks is what the other sensors gave."""
+def test_the_update_at_a_gate_equals_that_of_filterpy():
+    """A twin has the same past and only the gate's IMU readings: it lacks the update by the other sensors."""
     of = scenario(estimation={"gate_probability": 1 - 1e-12})
     core, twin, gates = estimator(of), estimator(of), 0
     coming = [r for r in readings(Flight(3, start_s=0.5), of, 3, 8.0) if r.sensor in ("imu", *MODELS)]
@@ -157,7 +157,7 @@ MODELS = {"gps": (_gps, [2.0] * 3 + [0.43] * 3), "mag": (_mag, [0.94] * 3), "bar
 
 
 def compare(rows: Rows, before: Rows, aiding) -> None:
-    """Take the step from `before` by filterpy, and compare the covariance and the corrected state."""
+    """Update `before` by filterpy, and compare the covariance and the corrected state."""
     n = before.covariance.shape[1]
     p, v, q, _, w, _ = state = reckoning(before.nominal[0])
     H, z, expected, sigma = np.zeros((32, n)), [], [], []

@@ -1,4 +1,4 @@
-"""The paper's estimator on flights of known truth, and what stands around an estimator of one drone."""
+"""The paper's estimator on flights with known truth, and the set of single-drone estimators."""
 
 import math
 from typing import Any
@@ -35,29 +35,29 @@ def paper(of: Scenario) -> PaperEstimator:
 
 
 def errors(flight: Flight, estimates: list[tuple[float, StateEstimate]]) -> np.ndarray:
-    """Return the error of position and velocity at each gate, (T, 6)."""
+    """Return the errors of position and velocity at each gate, (T, 6)."""
     t = np.array([t for t, _ in estimates])
     truth = np.hstack([flight.position(t), flight.velocity(t)])
     return np.array([np.concatenate([e.position_m, e.velocity_m_s]) for _, e in estimates]) - truth
 
 
-def test_flights_are_followed_and_the_covariance_of_the_position_is_of_the_right_size():
+def test_flights_are_followed_with_a_consistent_position_covariance():
     nees = []
     for seed in range(4):
         flight = Flight(seed)
-        of = scenario(yaw_deg=math.degrees(flight.yaw_start))  # as the drone was set down
+        of = scenario(yaw_deg=math.degrees(flight.yaw_start))  # the initial heading is known
         estimates = fly(paper(of), readings(flight, of, seed, 40.0), 40.0)
         error = errors(flight, estimates)[round(20.0 / GATE_S) :]
         assert np.sqrt(np.mean(error[:, :3] ** 2, axis=0)).max() < 0.5  # m
-        assert np.sqrt(np.mean(error[:, 3:] ** 2, axis=0)).max() < 0.2  # m/s: of each sample of the aircraft's own
+        assert np.sqrt(np.mean(error[:, 3:] ** 2, axis=0)).max() < 0.2  # m/s, from single samples of velocity
         e, P = errors(flight, estimates)[-1, :3], np.reshape(estimates[-1][1].covariance, (6, 6))[:3, :3]
         nees.append(e @ np.linalg.solve(P, e))
     low, high = chi2.ppf([0.001, 0.999], 3 * len(nees)) / len(nees)
     assert low < np.mean(nees) < high
 
 
-def test_fixes_of_a_moving_drone_tell_the_heading():
-    """Set down 0.1 rad, two sigma, off what the scenario says; 2 m/s for a minute are worth more than that."""
+def test_fixes_of_a_moving_drone_reveal_the_heading():
+    """The initial heading is 0.1 rad, two sigma, off; 2 m/s for a minute determine it more precisely."""
     of, speed = scenario(yaw_deg=0.0), 2.0
     core, rng = paper(of), np.random.default_rng(3)
     estimate = core.estimate(0.0)
@@ -73,7 +73,7 @@ def test_fixes_of_a_moving_drone_tell_the_heading():
     assert estimate.yaw_sigma_rad < 0.02
 
 
-def test_without_a_velocity_or_a_fix_it_grows_uncertain():
+def test_uncertainty_grows_without_a_velocity_or_a_fix():
     core = paper(scenario())
     core.receive("flow", message(Reading(0.0, "flow", 0.0, ((1.0, 0.0, 0.0), 0.0))))
     core.receive("gps", message(Reading(0.0, "gps", 0.0, ((5.0, 0.0, 0.0), (0.0, 0.0, 0.0), 2.0, 0))))
@@ -83,7 +83,7 @@ def test_without_a_velocity_or_a_fix_it_grows_uncertain():
 
 
 class Constant:
-    """An estimator that gives back what it was given."""
+    """An estimator that returns a constant estimate."""
 
     given: Any = StateEstimate(np.zeros(3), [0, 0, 0], (1.0, 0.0, 0.0, 0.0), 0.0, np.eye(6), 1)
 
@@ -114,20 +114,20 @@ def test_numbers_of_any_kind_are_published_as_floats():
 @pytest.mark.parametrize(
     ("field", "value"), [("position_m", (0.0, math.nan, 0.0)), ("covariance", np.eye(3)), ("yaw_rad", math.inf)]
 )
-def test_what_is_no_estimate_is_refused_in_a_line(field: str, value: Any):
+def test_an_invalid_estimate_is_refused_with_class_and_field(field: str, value: Any):
     wrong = type("Wrong", (Constant,), {"given": Constant.given._replace(**{field: value})})
     with refused(UserCodeError, f"{__name__}:Wrong.estimate", "drone1", field, "finite"):
         set_of(wrong).estimate(0.02)
 
 
-def test_the_last_estimate_is_handed_over_to_who_can_use_it():
+def test_the_last_estimate_is_passed_to_estimators_that_can_use_it():
     both = set_of(Constant)
     both.warm_start(0, Constant.given)
     assert both._estimators[0].last is Constant.given  # type: ignore[attr-defined]
     set_of(PaperEstimator).warm_start(0, Constant.given)
 
 
-def test_the_stock_ones_have_names_and_a_scenario_that_chooses_none_resolves_as_before():
+def test_built_in_estimators_have_names_and_the_default_is_not_written():
     assert estimator_class(ESTIMATORS[0]) is None
     assert estimator_class("paper") is PaperEstimator
     with pytest.raises(DocumentError, match="algorithm"):

@@ -1,4 +1,4 @@
-"""The control law: its formula, saturation and integral, and the guard of the distance between robots."""
+"""The control law: formula, saturation and integral, and the guard of the distance between robots."""
 
 import dataclasses
 import math
@@ -36,7 +36,7 @@ def offset(**changes):
     return c
 
 
-def test_the_cluster_rests_at_the_reference_and_moves_by_feed_forward_and_gain():
+def test_the_cluster_rate_is_feed_forward_plus_gain_times_error():
     command = command_at(GOAL, GOAL)
     assert np.abs(command.v_W).max() < 1e-12
     assert (command.factor, command.guarded, command.alarmed) == (1.0, (), ())
@@ -70,7 +70,7 @@ def test_saturation_keeps_the_limits_and_the_direction_in_cluster_space(errors):
         ({"phi_2": 10.0}, lambda c: c.yaw_rate[1] / GAINS.yaw_rate_max_rad_s),
     ],
 )
-def test_each_limit_is_reached_and_not_passed(rate, limited):
+def test_each_limit_is_reached_and_not_exceeded(rate, limited):
     rates = np.zeros(12)
     for name, value in rate.items():
         rates[SPACE.index(name)] = value
@@ -88,7 +88,7 @@ def test_the_integral_grows_with_the_error_up_to_its_clamp():
         command_at(c, GOAL, law=law)
     assert law.integral[[0, 5]] == pytest.approx([GAINS.integral_max_m_s, GAINS.integral_max_rad_s])
     law.reset()
-    near = offset(p=-1.5, q=-1.5)  # robots 2 and 3 at 1.9 m: saturated or guarded, it stands still
+    near = offset(p=-1.5, q=-1.5)  # robots 2 and 3 at 1.9 m: the integral is frozen while saturated or guarded
     assert command_at(offset(x_c=-50.0), GOAL, law=law).factor < 1.0
     assert command_at(near, near - 0.01, law=law).guarded
     assert not law.integral.any()
@@ -107,21 +107,21 @@ def pair(distance, v_1=(0, 0, 0), v_2=(0, 0, 0)):
     ("distance", "v_1", "v_2"),
     [(20.0, (2, 0, 0), (-2, 0, 0)), (2.5, (-1, 0, 0), (1, 0, 0)), (2.5, (0, 2, 0), (0, 2, 0))],
 )
-def test_the_guard_leaves_robots_alone_that_are_far_or_part(distance, v_1, v_2):
+def test_the_guard_ignores_robots_that_are_distant_or_separating(distance, v_1, v_2):
     v_W, guarded, alarmed = pair(distance, v_1, v_2)
     assert v_W.tolist() == [list(v_1), list(v_2)]
     assert (guarded, alarmed) == ((), ())
 
 
-def test_the_guard_lets_robots_come_to_the_minimum_and_no_nearer():
+def test_the_guard_lets_robots_approach_to_the_minimum_distance():
     v_W, guarded, _ = pair(3.0, (2, 0.5, 0), (-2, 0, 0.3))
     assert guarded == ((0, 1),)
     assert v_W[1, 0] - v_W[0, 0] == pytest.approx(-(3.0 - GAINS.separation_min_m) / GAINS.guard_horizon_s)
-    assert v_W[0, 1:].tolist() == [0.5, 0.0]  # what is across the line stays
+    assert v_W[0, 1:].tolist() == [0.5, 0.0]  # components perpendicular to the line are unchanged
     assert v_W[1, 1:].tolist() == [0.0, 0.3]
 
 
-def test_the_guard_drives_robots_apart_that_are_too_near():
+def test_the_guard_separates_robots_that_are_too_close():
     v_W, guarded, alarmed = pair(1.4)
     assert (guarded, alarmed) == (((0, 1),), ((0, 1),))
     assert v_W[1, 0] - v_W[0, 0] == pytest.approx(0.6)
@@ -131,7 +131,7 @@ def test_the_guard_drives_robots_apart_that_are_too_near():
     assert v_W[1, 0] - v_W[0, 0] == pytest.approx(GAINS.separation_min_m)
 
 
-def test_the_guard_allows_for_the_way_that_robots_still_go():
+def test_the_guard_allows_for_the_stopping_distance():
     p_W = np.array([(0.0, 0, 5), (2.5, 0, 5)])
     towards = np.array([(1.0, 0, 0), (-1.0, 0, 0)])
     v_W, guarded, _ = guard(p_W, towards, np.zeros((2, 3)), GAINS.limits)
@@ -141,7 +141,7 @@ def test_the_guard_allows_for_the_way_that_robots_still_go():
 
 @settings(deadline=None, max_examples=100, derandomize=True)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6))
-def test_guarded_robots_never_meet_whatever_is_commanded(seed, n):
+def test_guarded_robots_never_collide_whatever_is_commanded(seed, n):
     """Robots with a velocity lag of 0.3 s are driven at random towards each other for 20 s."""
     rng = np.random.default_rng(seed)
     p_W = np.zeros((n, 3))
@@ -160,7 +160,7 @@ def test_guarded_robots_never_meet_whatever_is_commanded(seed, n):
 
 
 @pytest.mark.parametrize("n", [2, 3, 10])
-def test_near_pairs_are_all_that_are_not_far_by_the_second_and_then_the_first(n):
+def test_near_pairs_are_complete_and_ordered(n):
     rng = np.random.default_rng(n)
     for _ in range(100):
         p_W = rng.integers(-2, 3, size=(n, 3)).astype(float)

@@ -1,4 +1,4 @@
-"""What the controller reads of the estimates at a gate: numbers in their places, the unknown as such."""
+"""The controller's input at a gate: values of the estimates, extrapolation of old ones, and missing ones."""
 
 import math
 
@@ -27,7 +27,7 @@ def controller() -> Controller:
 
 
 def estimate(t_ns: int, drone: int) -> flight_messages.Estimate:
-    """Return an estimate of which each number tells drone and place."""
+    """Return an estimate in which each number identifies the drone and the element."""
     first = 100.0 * drone
     covariance = tuple((first + i) ** 2 for i in range(36))
     p, v = (first + 1, first + 2, first + 3), (first + 4, first + 5, first + 6)
@@ -36,7 +36,7 @@ def estimate(t_ns: int, drone: int) -> flight_messages.Estimate:
     )
 
 
-def test_each_number_is_where_it_belongs(controller):
+def test_each_value_of_an_estimate_has_its_place_in_the_input(controller):
     for drone, name in enumerate(DRONES):
         controller.receive(f"drone/{name}/estimate", estimate(GATE_NS, drone))
     gate = controller._gate(GATE_NS)
@@ -48,7 +48,7 @@ def test_each_number_is_where_it_belongs(controller):
     assert gate.age_s.tolist() == [0.0, 0.0, 0.0]
 
 
-def test_an_old_estimate_is_led_on_and_an_unknown_one_is_not_finite(controller):
+def test_an_old_estimate_is_extrapolated_and_a_missing_one_not_finite(controller):
     controller.receive("drone/d1/estimate", estimate(GATE_NS, 0))
     controller.receive("drone/d2/estimate", estimate(3 * GATE_NS, 1))
     gate = controller._gate(3 * GATE_NS)

@@ -207,7 +207,7 @@ def test_the_reference_starts_at_the_estimate_when_engaged():
     assert not output.desired_rate.any()
 
 
-def test_the_start_of_a_trajectory_is_reached_before_it_begins():
+def test_the_start_of_a_trajectory_is_reached_before_its_start_time():
     fleet = engaged_fleet()
     start_s = fleet.t_s + 60.0
     assert fleet.engagement.request(Follow(PAPER_4, {"f": 0.01}, start_s=start_s)) is None
@@ -300,7 +300,7 @@ def test_take_off_is_refused_from_a_bad_initial_state(spoil, terms):
     assert fleet.engagement.request(Order.TAKE_OFF) is None
 
 
-def test_a_lost_take_off_is_repeated_and_engagement_is_refused_too_low():
+def test_a_lost_take_off_is_repeated_and_engaging_too_low_is_refused():
     fleet = rising_fleet()
     fleet.spoil = {"states": ("landed",) * 3}
     fleet.fly(2.5)

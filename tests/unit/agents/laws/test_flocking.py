@@ -1,4 +1,4 @@
-"""The flocking laws, integrated alone, against what their papers promise."""
+"""The flocking laws, integrated without a simulator, against the claims of their papers."""
 
 import math
 
@@ -18,10 +18,10 @@ from zsim_agents.laws.olfati_saber import (
 from zsim_agents.laws.pilot import Heard
 from zsim_agents.laws.vasarhelyi import braking, friction, repelled
 
-D, R = 7.0, 8.4  # m: spacing and range of the paper
+D, R = 7.0, 8.4  # m, spacing and range in the paper
 
 
-def test_the_lattices_force_is_that_of_the_paper() -> None:
+def test_the_lattice_force_is_that_of_the_paper() -> None:
     assert sigma_norm(D) == pytest.approx(14.2899, abs=1e-4)
     assert sigma_norm(R) == pytest.approx(18.3831, abs=1e-4)
     assert phi_alpha(sigma_norm(D), D, R) == 0.0
@@ -32,8 +32,8 @@ def test_the_lattices_force_is_that_of_the_paper() -> None:
     assert phi_beta(sigma_norm(4.2), 4.2) == 0.0
 
 
-def test_a_flock_becomes_a_lattice_of_one_velocity() -> None:
-    """Energy falls, all fly as the aim does, and the sides of neighbours come to d: it starts within reach."""
+def test_a_flock_forms_a_lattice_with_a_common_velocity() -> None:
+    """All drones start within range; energy falls, velocities become the aim's and distances of neighbours become d."""
     rng, h, c1, c1_g = np.random.default_rng(2), 0.02, 1.0, 0.1
     p, v = rng.uniform(-8, 8, (7, 2)), rng.normal(0, 0.5, (7, 2))
     v_r = np.array([0.5, 0.0])
@@ -54,7 +54,7 @@ def test_a_flock_becomes_a_lattice_of_one_velocity() -> None:
     assert math.sqrt(energy) < 0.01 * D < math.sqrt(first)
 
 
-def test_an_obstacle_only_takes_what_flies_into_it() -> None:
+def test_an_obstacle_brakes_only_motion_towards_it() -> None:
     along, away = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     assert beta_force(along, [(2.0, away)], 3.0, 1.0)[0] == 0.0
     towards = beta_force(-away, [(1.5, away)], 3.0, 1.0)
@@ -77,7 +77,7 @@ def test_a_drone_at_the_braking_speed_stops_within_the_distance() -> None:
     assert steepest == pytest.approx(a, rel=1e-3)
 
 
-def test_friction_takes_from_a_difference_of_velocities() -> None:
+def test_friction_reduces_a_difference_of_velocities() -> None:
     v_i, v_j = np.array([1.0, 0.0]), np.array([-1.0, 0.5])
     before = np.linalg.norm(v_j - v_i)
     after = np.linalg.norm(v_j - (v_i + friction(v_j - v_i, 0.5, 0.3)))

@@ -1,4 +1,4 @@
-"""What a pilot of a formation law takes of what comes late, and of the obstacles and surfaces about it."""
+"""The pilot of a formation law: late messages, obstacles and surfaces."""
 
 import math
 from typing import Any
@@ -30,8 +30,8 @@ def estimate(t_ns: int, y_m: float = 0.0, z_m: float = 2.0) -> Estimate:
     return Estimate(t_ns, 0, (t_ns, y_m, z_m), three, four, 0.0, (0.0,) * 36, 0.0, three, {})
 
 
-def test_an_older_message_that_comes_later_changes_nothing() -> None:
-    """Jitter of a link lets one message overtake another."""
+def test_a_message_overtaken_by_a_newer_one_is_ignored() -> None:
+    """With jitter, one message can overtake another."""
     first = pilot()
     for t_ns in (1, 3, 2):
         first.receive(Motion.of("d2"), motion(t_ns))
@@ -47,13 +47,13 @@ def test_an_older_message_that_comes_later_changes_nothing() -> None:
 
 
 def sheet(name: str, *corners: tuple[float, float, float]) -> dict[str, Any]:
-    """Return the surface of a quadrangle."""
+    """Return the surface of a quadrilateral."""
     a, b, c, d = corners
     return {"name": name, "triangles": packed(np.array([[*a, *b, *c], [*a, *c, *d]]))}
 
 
-def test_a_wall_of_triangles_is_heeded_as_a_wall_that_is_solid() -> None:
-    """Along y = 5; once as a box 2 m thick, once as the sheet of its face."""
+def test_a_wall_of_triangles_is_avoided_like_a_solid_wall() -> None:
+    """The wall is along y = 5, as a box 2 m thick and as a sheet at the box's face."""
     solid = pilot(obstacles=[{"name": "wall", "shape": "box", "position_m": [0, 6, 0], "size_m": [40, 2, 8]}])
     face = pilot(surfaces=[sheet("wall", (-20, 5, 0), (20, 5, 0), (20, 5, 8), (-20, 5, 8))])
     for x, y in ((0, 4.2), (1, 3.6), (2, 3.4), (21, 4.5)):
@@ -65,7 +65,7 @@ def test_a_wall_of_triangles_is_heeded_as_a_wall_that_is_solid() -> None:
         assert (felt[1][1] < 0) == (y > 3.5), (x, y)  # within avoid_m
 
 
-def test_a_slope_is_as_far_as_a_level_flight_to_it_and_level_ground_is_not_heeded() -> None:
+def test_slopes_count_at_their_level_distance_and_flat_ground_is_ignored() -> None:
     rise = math.tan(math.radians(30))
     slope = sheet("slope", (4, -30, 0), (34, -30, 30 * rise), (34, 30, 30 * rise), (4, 30, 0))
     flown = pilot(surfaces=[slope, sheet("floor", (-30, -30, 1), (4, -30, 1), (4, 30, 1), (-30, 30, 1))])

@@ -1,4 +1,4 @@
-"""A drone that is sent to places, at any moment to another one: neither place nor velocity of its way jumps."""
+"""A drone sent to places, to another one at any time: its course has no jumps in position or velocity."""
 
 import math
 
@@ -15,7 +15,7 @@ GATE_S = 0.02
 
 
 class Follower:
-    """A drone that does at once what it is told, and its course."""
+    """A drone that follows velocity commands immediately, and its course."""
 
     def __init__(self) -> None:
         self.course = Course(LIMITS, LAW)
@@ -37,7 +37,7 @@ class Follower:
         return np.array(flown)
 
 
-def test_it_holds_its_cruise_speed_and_arrives_when_the_way_does() -> None:
+def test_a_drone_holds_its_cruise_speed_and_arrives_on_time() -> None:
     drone = Follower()
     drone.send(20.0, 0.0, 0.0, math.pi / 2, speeds=Cruise(2.0))
     flown = drone.fly(20 / 2 + 2 / (SHARE * 2.5))
@@ -46,7 +46,7 @@ def test_it_holds_its_cruise_speed_and_arrives_when_the_way_does() -> None:
     assert drone.here == pytest.approx([20, 0, 0, math.pi / 2], abs=0.05)
 
 
-def test_sent_elsewhere_on_its_way_it_turns_within_its_acceleration() -> None:
+def test_a_drone_sent_elsewhere_turns_within_its_acceleration() -> None:
     drone = Follower()
     drone.send(20.0, 0.0, 0.0, None)
     before = drone.fly(3.0)
@@ -59,18 +59,18 @@ def test_sent_elsewhere_on_its_way_it_turns_within_its_acceleration() -> None:
     assert not after[:, 3].any()
 
 
-def test_it_is_sent_anew_from_where_something_has_driven_it() -> None:
+def test_a_displaced_drone_replans_from_where_it_is() -> None:
     drone = Follower()
     drone.send(0.0, 20.0, 0.0, None)
     drone.fly(3.0)
     drone.here[0] += LOST_M + 0.1
     flown = drone.fly(0.5)
-    assert abs(flown[0, 0]) < 0.2  # it does not hurry back to the way that it was driven off
+    assert abs(flown[0, 0]) < 0.2  # it does not hurry back to its former course
     drone.fly(12.0)
     assert drone.here[:2] == pytest.approx([0, 20], abs=0.02)
 
 
-def test_axes_without_a_place_fly_at_their_rate_and_those_with_both_follow_somebody_else() -> None:
+def test_axes_follow_a_rate_or_a_moving_place() -> None:
     drone = Follower()
     drone.course.send((None, 4.0, None, None), 0.0, [0.0] * 4, [0.0] * 4, rate=(0.5, 0.0, 0.0, 0.3))
     flown = drone.fly(6.0)
@@ -84,7 +84,7 @@ def test_axes_without_a_place_fly_at_their_rate_and_those_with_both_follow_someb
     )
 
 
-def test_where_it_stops_is_where_it_can() -> None:
+def test_a_drone_stops_after_its_braking_distance() -> None:
     course = Course(LIMITS, LAW)
     place = course.stop(0.0, (1.0, 2.0, 3.0, 0.0), (3.0, 4.0, 0.0, 0.0))
     brake_m = 25 / (2 * SHARE * 2.5)
@@ -94,7 +94,7 @@ def test_where_it_stops_is_where_it_can() -> None:
 @pytest.mark.parametrize(
     ("goal", "least"), [((99.0, 99.0, 99.0, 3.0), (1.0, 0.4)), ((-99.0, 0.0, -99.0, -3.0), (1.0, 0.4))]
 )
-def test_the_law_keeps_to_its_limits(goal: Axes, least: tuple[float, float]) -> None:
+def test_the_law_keeps_within_its_limits(goal: Axes, least: tuple[float, float]) -> None:
     place = [float(each or 0.0) for each in goal]
     (x, y, z), turn = velocity_towards(place, (0.0,) * 4, (0.0,) * 4, LIMITS, LAW, down_m_s=0.4)
     assert math.hypot(x, y) == pytest.approx(5.0)

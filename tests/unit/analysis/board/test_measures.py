@@ -1,4 +1,4 @@
-"""The measures of a board on motions of which they are known."""
+"""The measures of a board on motions with known results."""
 
 import math
 from typing import Any
@@ -31,16 +31,18 @@ def error(p: NDArray[Any], *invariances: str) -> float:
     [
         (C + MOVED, (), 5.0),
         (C + MOVED, ("translation",), 0.0),
-        (turned(C, 60), ("translation",), 3.0),  # each at the end of a chord of its circle
+        (turned(C, 60), ("translation",), 3.0),  # each moves by a chord of its circle
         (turned(C, 60) + 7, ("translation", "rotation"), 0.0),
         (1.5 * C - 2, ("translation",), 1.5),
         (1.5 * C - 2, ("translation", "rotation"), 1.5),
         (1.5 * C - 2, ("translation", "scale"), 0.0),
-        (-C, ("translation", "scale"), 3.0),  # turned inside out: no growth makes it of that
-        (C * [1, -1], ("translation", "rotation"), 3.0 * math.sqrt(2)),  # a mirrored figure is another one
+        (-C, ("translation", "scale"), 3.0),  # point reflection, which no positive scale undoes
+        (C * [1, -1], ("translation", "rotation"), 3.0 * math.sqrt(2)),  # a mirrored figure differs
     ],
 )  # fmt: skip
-def test_a_figure_errs_by_what_its_law_does_not_leave_open(p: Any, invariances: tuple[str, ...], wanted: float) -> None:
+def test_the_shape_error_ignores_the_invariances_of_the_law(
+    p: Any, invariances: tuple[str, ...], wanted: float
+) -> None:
     assert error(p, *invariances) == pytest.approx(wanted, abs=1e-9)
 
 
@@ -52,7 +54,7 @@ def test_drones_on_the_ground_do_not_count() -> None:
     assert math.isnan(error(lost, "translation"))
 
 
-def test_a_lattice_errs_by_the_sides_within_reach() -> None:
+def test_the_lattice_error_counts_only_sides_within_range() -> None:
     triangle = np.array([[[0.0, 0], [3.5, 0], [1.75, 3.5 * math.sqrt(0.75)], [1.75, 20]]])
     assert lattice_errors(triangle, 3.5, 4.2)[0] == pytest.approx(0.0, abs=1e-12)
     assert lattice_errors(triangle, 3.0, 4.2)[0] == pytest.approx(0.5)

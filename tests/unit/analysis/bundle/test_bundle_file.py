@@ -1,4 +1,4 @@
-"""The file of a bundle: the same bytes for the same content, and refused when it is not as it was written."""
+"""The file of a bundle: identical bytes for identical content, and refusal of modified files."""
 
 import stat
 import zipfile
@@ -42,7 +42,7 @@ def bundle(tmp_path: Path) -> Path:
 
 
 def rewritten(path: Path, change: "Change") -> Path:
-    """Write an archive anew, with members changed or (None) left out."""
+    """Rewrite an archive with members changed or, if None, omitted."""
     other = path.with_name("other.zsim")
     with zipfile.ZipFile(path) as source, zipfile.ZipFile(other, "w") as target:
         for entry in source.infolist():
@@ -60,7 +60,7 @@ def added(path: Path, *names: str, mode: int) -> Path:
     return path
 
 
-def test_a_bundle_is_the_same_bytes_and_holds_what_was_given(bundle: Path, tmp_path: Path) -> None:
+def test_a_bundle_is_reproducible_and_contains_its_members(bundle: Path, tmp_path: Path) -> None:
     again = write_bundle(tmp_path / "again.zsim", BLANK, dict(reversed(MEMBERS.items())), force=False)
     assert again.path.read_bytes() == bundle.read_bytes()
     assert zipfile.ZipFile(bundle).testzip() is None
@@ -128,7 +128,7 @@ MANY = bundle_file.MEMBERS_MAX + 1
         ([f"m{number}" for number in range(MANY)], stat.S_IFREG, ("members", str(bundle_file.MEMBERS_MAX))),
     ],
 )
-def test_a_further_member_is_refused_and_written_nowhere(
+def test_an_additional_member_is_refused_and_not_extracted(
     bundle: Path, tmp_path: Path, names: list[str], mode: int, terms: tuple[str, ...]
 ) -> None:
     with refused(RunError, *terms), opened(added(bundle, *names, mode=mode | 0o644)):
@@ -137,13 +137,13 @@ def test_a_further_member_is_refused_and_written_nowhere(
 
 
 @pytest.mark.parametrize("cut", [0, 10, 500, -30, -1])
-def test_a_file_that_is_cut_or_none_is_refused(bundle: Path, cut: int) -> None:
+def test_a_truncated_or_empty_file_is_refused(bundle: Path, cut: int) -> None:
     bundle.write_bytes(bundle.read_bytes()[:cut])
     with refused(RunError, "one.zsim", "bundle"), opened(bundle):
         pass
 
 
-def test_any_changed_byte_is_refused_in_a_line(bundle: Path) -> None:
+def test_any_changed_byte_of_content_is_refused_in_one_line(bundle: Path) -> None:
     whole = bundle.read_bytes()
     accepted, lines = list[int](), list[str]()
     for place in range(0, len(whole), 7):
@@ -152,7 +152,7 @@ def test_any_changed_byte_is_refused_in_a_line(bundle: Path) -> None:
             with opened(bundle) as (manifest, folder):
                 held = {name: (folder / name).read_bytes() for name in manifest.files}
             accepted.append(place)
-            assert held == MEMBERS, place  # a date, or another field of the archive that says nothing of the content
+            assert held == MEMBERS, place  # a date or another archive field that does not affect the content
         except RunError as error:
             lines.append(str(error))
     assert len(accepted) < len(lines) / 4
@@ -162,7 +162,7 @@ def test_any_changed_byte_is_refused_in_a_line(bundle: Path) -> None:
 @pytest.mark.parametrize(
     "line", ["--index-url=x", "numpy", "numpy>=2", "numpy @ file:///x", "-e .", "numpy==2 ; x", "../x==1"]
 )
-def test_a_lock_with_anything_but_versions_is_refused(line: str) -> None:
+def test_a_lock_with_anything_but_pinned_versions_is_refused(line: str) -> None:
     assert pins_of("# of 2026\nnumpy==2.4.6\n\ntyping-extensions==4.1\n", "lock") == [
         "numpy==2.4.6",
         "typing-extensions==4.1",

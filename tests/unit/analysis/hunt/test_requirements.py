@@ -1,4 +1,4 @@
-"""What must hold of a flight, and by how much it does."""
+"""The requirements on a flight and their margins."""
 
 import math
 from typing import Any
@@ -40,7 +40,7 @@ FIGURES: dict[str, Any] = {
         ("not (errors.q.true_rms < 1)", False, None, BROKEN),
     ],
 )
-def test_a_margin(text: str, holds: bool, value: float | None, share: float) -> None:
+def test_the_margin_of_a_requirement_is_computed(text: str, holds: bool, value: float | None, share: float) -> None:
     margin = Requirement(text).margin(FIGURES)
     assert margin.holds is holds
     assert margin.value == (None if value is None else pytest.approx(value))
@@ -48,7 +48,7 @@ def test_a_margin(text: str, holds: bool, value: float | None, share: float) -> 
 
 
 @given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.sampled_from(["<", "<=", ">", ">=", "==", "!="]))
-def test_a_comparison_holds_as_python_s_does_and_its_margin_has_that_sign(a: float, b: float, op: str) -> None:
+def test_a_comparison_agrees_with_python_and_the_sign_of_its_margin(a: float, b: float, op: str) -> None:
     margin = Requirement(f"a {op} b").margin({"a": a, "b": b})
     assert margin.holds is eval(f"{a} {op} {b}")
     assert margin.value is not None
@@ -77,18 +77,18 @@ def test_a_comparison_holds_as_python_s_does_and_its_margin_has_that_sign(a: flo
         ("(" * 500, ("must",)),
     ],
 )
-def test_what_is_no_requirement_is_refused_with_its_place(text: str, terms: tuple[str, ...]) -> None:
+def test_an_invalid_requirement_is_refused_with_the_reason(text: str, terms: tuple[str, ...]) -> None:
     with pytest.raises(ScenarioError) as error:
         Requirement(text).margin(FIGURES)
     assert has_terms(error.value.faults[0], "--require", *terms)
 
 
-def test_all_unknown_names_are_told_at_once() -> None:
+def test_all_unknown_names_are_reported_at_once() -> None:
     lines = Requirement("colisions == 0 and crashd").faults(FIGURES)
     assert has_terms(lines[0], "collisions?")
     assert has_terms(lines[1], "crashed?")
 
 
-def test_figures_of_a_summary_are_its_numbers_texts_and_gaps_by_path() -> None:
+def test_figures_of_a_summary_are_its_scalar_values_by_path() -> None:
     summary = {"a": {"b": 1.5, "c": None}, "d": "text", "e": [1, 2], "f": True}
     assert dict(figures_of(summary)) == {"a.b": 1.5, "a.c": None, "d": "text", "f": True}

@@ -1,4 +1,4 @@
-"""Estimates, commands and references of drones against their truth: known errors give their closed form."""
+"""Estimates, commands and references of drones against the truth: known errors match their closed form."""
 
 import math
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ EVE = "eve"
 
 
 def traffic(flown: Flown) -> Iterator[tuple[str, Any, int]]:
-    """Yield a flight whose estimates are off by constants, flown by `controller.main`, to which eve sends as well."""
+    """Yield a flight with constant estimate errors, flown by `controller.main`, while eve sends commands as well."""
     for key, message, wall_ns in synthetic_record.traffic(flown):
         if isinstance(message, Status):
             message = msgspec.structs.replace(message, commander="controller.main")
@@ -69,7 +69,7 @@ def flight() -> RecordedFlight:
     return synthetic_record.flight(traffic(Flown(duration_s=3.0)), answers=True)
 
 
-def test_errors_of_estimates_and_what_is_stated_of_them(flight: RecordedFlight) -> None:
+def test_errors_of_estimates_and_their_stated_sigmas_are_found(flight: RecordedFlight) -> None:
     errors = estimate_errors(flight)
     assert list(errors) == ["drone1", "drone2", "drone3"]
     for each in errors.values():
@@ -81,18 +81,18 @@ def test_errors_of_estimates_and_what_is_stated_of_them(flight: RecordedFlight) 
         assert each.share_inside(np.ones(151, bool)).tolist() == [1.0, 0.0, 1.0, 0.0]
 
 
-def test_of_very_many_estimates_the_same_instants_of_all_drones_count(
+def test_too_many_estimates_are_thinned_to_the_same_instants(
     flight: RecordedFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = estimate_errors(flight)
-    monkeypatch.setattr(drone_errors, "ESTIMATES_MAX", 200)  # of 3 x 151
+    monkeypatch.setattr(drone_errors, "ESTIMATES_MAX", 200)  # fewer than the 3 x 151 of the flight
     some = estimate_errors(flight)
     for name, each in some.items():
         assert each.t_s == pytest.approx(whole[name].t_s[::3])
         assert each.error == pytest.approx(whole[name].error[::3])
 
 
-def test_nees_of_its_own_noise_is_six_and_not_known_of_a_covariance_that_is_none() -> None:
+def test_nees_of_consistent_errors_is_six_and_nan_if_singular() -> None:
     error = np.ones((3, 6))
     covariance = np.stack([np.eye(6), np.zeros((6, 6)), np.diag([1.0, 1, 1, 1, 1, -1])])
     assert nees(error, covariance)[0] == pytest.approx(6.0)
@@ -103,16 +103,16 @@ def test_nees_of_its_own_noise_is_six_and_not_known_of_a_covariance_that_is_none
     assert nees(error, np.tile(root @ root.T, (20_000, 1, 1))).mean() == pytest.approx(6, abs=0.1)
 
 
-def test_velocities_are_those_of_the_commander_by_the_heading(flight: RecordedFlight) -> None:
+def test_velocities_are_the_commander_s_in_the_heading_frame(flight: RecordedFlight) -> None:
     (first, *_) = velocity_responses(flight).values()
     assert first.commanded == pytest.approx(np.tile([0.3, 0.1, 0.2, 0.4], (len(first.t_s), 1)), abs=1e-6)
     yaw = flight.tracks[0].yaw[0]
-    x, y, z = 0.1, 0.2, 0.3  # of the synthetic truth
+    x, y, z = 0.1, 0.2, 0.3  # velocity of the synthetic truth
     flown = (x * math.cos(yaw) + y * math.sin(yaw), y * math.cos(yaw) - x * math.sin(yaw), z, 0.6)
     assert first.flown[0] == pytest.approx(flown, abs=1e-9)
 
 
-def test_what_is_read_of_a_record_is_what_was_flown(flight: RecordedFlight, tmp_path: Path) -> None:
+def test_a_flight_read_from_a_record_equals_the_original(flight: RecordedFlight, tmp_path: Path) -> None:
     synthetic_record.record(tmp_path / "run.mcap", traffic(Flown(duration_s=3.0)))
     read = read_flight(tmp_path / "run.mcap", answers=True)
     assert np.array_equal(read.estimates["drone2"].p_W, flight.estimates["drone2"].p_W)
@@ -123,7 +123,7 @@ def test_what_is_read_of_a_record_is_what_was_flown(flight: RecordedFlight, tmp_
     assert [(track.t_ns // 10**9).tolist() for track in still.tracks] == 3 * [[0, 1, 2, 3]]
 
 
-def test_distances_of_the_paper_s_triangle(flight: RecordedFlight) -> None:
+def test_distances_match_the_paper_s_triangle(flight: RecordedFlight) -> None:
     apart = distances(flight, pairs_max=6)
     assert apart is not None
     base = 8 * math.sin(math.pi / 8)  # 2 p sin(beta / 2), p = q = 4 m
@@ -137,7 +137,7 @@ def test_distances_of_the_paper_s_triangle(flight: RecordedFlight) -> None:
     assert separations(flight) == (2.0, 1.5, pytest.approx(0.52))
 
 
-def test_errors_against_the_goal_have_the_climb() -> None:
+def test_errors_from_the_goal_include_the_climb() -> None:
     flight = synthetic_record.flight(synthetic_record.traffic(Flown(duration_s=6.0, climb_s=4.0)))
     (formation,) = formations_of(flight)
     goal = goal_errors(formation, flight.scenario)
@@ -158,17 +158,17 @@ def test_errors_against_the_goal_have_the_climb() -> None:
 # References
 
 Phases = dict[float, ReferencePhase]
-SECONDS, GATES = 30, 10  # ten gates a second
+SECONDS, GATES = 30, 10  # 30 s with ten gates per second
 
 
 def referenced(off_m: float, off_s: tuple[float, float], phases: Phases) -> RecordedFlight:
-    """Return a flight whose drone is 3 m east and 4 m north times a share of its reference, for some time."""
+    """Return a flight whose drone is `off_m` away from its reference, to the north-east, during `off_s`."""
     reader = FlightReader()
     for gate in range(SECONDS * GATES + 1):
         t_ns, t_s = gate * 10**9 // GATES, gate / GATES
         phase: ReferencePhase = next(each for from_s, each in reversed(phases.items()) if from_s <= t_s)
         share = off_m / 5.0 if off_s[0] <= t_s < off_s[1] else 0.0
-        half = math.pi / 4 if share else 0.0  # a quarter turn off in heading, too
+        half = math.pi / 4 if share else 0.0  # the heading is off by a quarter turn, too
         attitude = math.cos(half), 0.0, 0.0, math.sin(half)
         truth = Truth(t_ns, gate, (t_s + 3 * share, 4 * share, 2), (1, 0, 0), attitude, (0, 0, 0), (0, 0, 0), (0,) * 4)
         reference = Reference(t_ns, gate, phase, (t_s, 0, 2), (1, 0, 0), math.tau, 0, None, "reference.d1")
@@ -181,7 +181,7 @@ def referenced(off_m: float, off_s: tuple[float, float], phases: Phases) -> Reco
 PHASES: Phases = {0: "waiting", 2: "approaching", 5: "path", 20: "holding", 28: "over"}
 
 
-def test_errors_are_those_in_the_air_and_of_the_path_apart() -> None:
+def test_errors_cover_the_time_in_flight_and_separately_the_path() -> None:
     flown = referenced(1.0, (10, 15), PHASES)
     errors = reference_errors(flown)["d1"]
     assert (errors.t_s[0], errors.t_s[-1]) == (2.0, 27.9)
@@ -199,14 +199,14 @@ def test_errors_are_those_in_the_air_and_of_the_path_apart() -> None:
 @pytest.mark.parametrize(
     ("off_m", "off_s", "strayed"), [(6, (10, 15), True), (6, (10, 11.5), False), (4, (10, 20), False)]
 )
-def test_a_drone_that_is_far_from_its_reference_for_long_has_strayed(
+def test_a_drone_far_from_its_reference_for_long_has_strayed(
     off_m: float, off_s: tuple[float, float], strayed: bool
 ) -> None:
     lines = [line for line in shortfalls(referenced(off_m, off_s, PHASES), (0, 30)) if line.kind == "strayed"]
     assert [(line.subject, line.t_s, line.fails) for line in lines] == [("d1", 10.0, True)] * strayed
 
 
-def test_a_drone_that_never_takes_off_has_not_flown_as_planned() -> None:
+def test_a_drone_that_never_takes_off_falls_short_of_its_plan() -> None:
     (line,) = [line for line in shortfalls(referenced(0, (0, 0), {0: "waiting"}), (0, 30)) if line.kind == "reference"]
     assert (line.subject, line.fails) == ("d1", True)
     assert np.isclose(line.t_s, 0.0)

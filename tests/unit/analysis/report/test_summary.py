@@ -1,4 +1,4 @@
-"""Table I stands beside a flight of Test 1 alone: its drones, sensors, plan and window, flown to the end and engaged."""
+"""Table I of the paper is shown only for complete, engaged flights of Test 1, with its drones, sensors and plan."""
 
 from dataclasses import replace
 
@@ -39,14 +39,14 @@ def stands(*overrides: str, scenario: str = "step") -> bool:
     return bool(paper_table(scenario_file.load(SCENARIOS / f"{scenario}.yaml", overrides), "main"))
 
 
-def test_it_stands_beside_test_1_whatever_its_name_and_not_beside_test_2() -> None:
+def test_table_1_is_shown_for_test_1_of_any_name_but_not_for_test_2() -> None:
     for overrides in ((), ("name=mine", "seed=7"), ("sensors.as_printed=true",), ("duration_s=400",)):
         assert stands(*overrides)
     assert not stands(scenario="trajectory")
 
 
 @pytest.mark.parametrize("override", UNLIKE)
-def test_it_does_not_stand_beside_another_scenario(override: str) -> None:
+def test_table_1_is_not_shown_for_another_scenario(override: str) -> None:
     assert not stands(override)
 
 
@@ -56,14 +56,14 @@ def flies(*overrides: str, scenario: str) -> bool:
 
 
 @pytest.mark.parametrize("scenario", ["step", "trajectory"])
-def test_figures_are_the_paper_s_of_both_its_tests_whatever_the_window(scenario: str) -> None:
+def test_figures_are_the_paper_s_for_both_tests_and_any_window(scenario: str) -> None:
     assert flies(scenario=scenario)
     assert flies("report.window_s=[20, 30]", "name=mine", scenario=scenario)
     for other in ("environment.wind.gust_m_s=2", "sensors.preset=ardrone2", "drones.drone1.mass_kg=0.6"):
         assert not flies(other, scenario=scenario)
 
 
-def test_test_2_is_equation_4_however_it_is_written() -> None:
+def test_test_2_is_recognised_by_equation_4_in_any_notation() -> None:
     expressions = "clusters.main.plan.trajectory.expressions"
     assert flies(f"{expressions}.p=2*2", f"{expressions}.x_c='5*sin(2*pi*f*t + pi/2)'", scenario="trajectory")
     assert not flies(f"{expressions}.p=5", scenario="trajectory")
@@ -72,13 +72,13 @@ def test_test_2_is_equation_4_however_it_is_written() -> None:
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[RecordedFlight, Formation]:
-    """Return a flight whose record says that it is Test 1, and a formation that is engaged within its window."""
+    """Return a flight recorded as Test 1, and a formation that is engaged within its window."""
     flight = synthetic_record.flight(synthetic_record.traffic(Flown(duration_s=1.0)))
     (formation,) = formations_of(flight)
     return flight, replace(formation, t_s=np.linspace(*WINDOW_S, len(formation.t_s)))
 
 
-def test_it_stands_beside_a_flight_that_flew_all_of_it_and_not_a_part(flown: tuple[RecordedFlight, Formation]) -> None:
+def test_table_1_is_shown_only_for_a_complete_engaged_flight(flown: tuple[RecordedFlight, Formation]) -> None:
     assert paper_table_of(*flown, WINDOW_S) == PAPER_TABLE_1
     flight, formation = flown
     cut = replace(flight, completeness=msgspec.structs.replace(flight.completeness, closed=False))
@@ -99,7 +99,7 @@ def test_it_stands_beside_a_flight_that_flew_all_of_it_and_not_a_part(flown: tup
         ("sensors.gps.position_m.noise=uniform(1,2)", False),
     ],
 )
-def test_it_stands_beside_a_sweep_of_which_every_run_flies_test_1(vary: str, there: bool) -> None:
+def test_table_1_is_shown_for_a_sweep_only_if_all_runs_are_test_1(vary: str, there: bool) -> None:
     document, faults = read_document(SCENARIOS / "step.yaml", [])
     plan = make_plan("step.yaml", document, [vary], 2, False, lambda run, of: None, faults)
     assert bool(SweepResults(SweepDesign(plan), []).paper_std) is there

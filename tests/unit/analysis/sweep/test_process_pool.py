@@ -1,4 +1,4 @@
-"""Many runs of a sweep, flown by workers that may die."""
+"""The pool that flies the runs of a sweep in workers that may die."""
 
 import multiprocessing
 import os
@@ -22,10 +22,10 @@ def task(run: int) -> Task:
 
 
 class FakeWorker:
-    """A worker without a process: flies at once, and dies of what it is told to."""
+    """A worker without a process, which completes a run at once or dies of it according to `dies_of`."""
 
-    dies_of: dict[int, int]  # by run: how many workers still will
-    stillborn = 0  # how many of the next will not get ready
+    dies_of: dict[int, int]  # by run: number of workers that it will still kill
+    stillborn = 0  # number of next workers that will not become ready
     answer: Any = None
     flown: list[int]
     alive: set["FakeWorker"]
@@ -101,7 +101,7 @@ def test_the_run_of_a_dead_worker_is_flown_again() -> None:
         assert has_terms(line, f"run {run}", "died", "SIGKILL")
 
 
-def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
+def test_a_run_that_kills_every_worker_is_a_row_with_the_failure() -> None:
     lines: list[str] = []
     FakeWorker.dies_of = {2: 99}
     found = {row["run"]: row["failure"] for row in rows(5, lines)}
@@ -109,7 +109,7 @@ def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
     assert found == dict.fromkeys((0, 1, 3, 4))
 
 
-def test_workers_that_cannot_start_end_the_sweep_as_does_what_no_run_survives() -> None:
+def test_workers_that_cannot_start_or_fail_fatally_end_the_sweep() -> None:
     FakeWorker.stillborn = 2  # these are replaced
     assert len(rows(5, [])) == 5
     FakeWorker.stillborn = 99
@@ -120,17 +120,17 @@ def test_workers_that_cannot_start_end_the_sweep_as_does_what_no_run_survives() 
         rows(5, [])
 
 
-def test_a_sweep_that_is_closed_leaves_no_worker() -> None:
+def test_a_closed_sweep_leaves_no_worker() -> None:
     flying = process_pool.ProcessPool(2, lambda _: None).rows(task(run=run) for run in range(50))
     next(flying)
     flying.close()
     assert FakeWorker.alive == set()
 
 
-def test_a_worker_imports_nothing_from_the_working_folder_first(
+def test_a_worker_does_not_import_from_the_working_folder_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A spawned interpreter begins with `-c`, for which that folder comes before the standard library."""
+    """A spawned interpreter starts with `-c`, which puts that folder before the standard library."""
     (tmp_path / "signal.py").write_text("open('executed', 'w').close()\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)

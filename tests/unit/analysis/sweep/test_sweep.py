@@ -1,4 +1,4 @@
-"""A whole sweep: what is kept of it in its folder, and its screen."""
+"""A sweep as a whole: its folder, journal and table, and its screen."""
 
 import errno
 import io
@@ -29,7 +29,7 @@ from zsim_analysis.sweep.sweep import (
 )
 
 
-def test_a_journal_keeps_what_was_finished_and_drops_a_cut_line(tmp_path: Path) -> None:
+def test_a_journal_keeps_finished_runs_and_drops_a_truncated_line(tmp_path: Path) -> None:
     with refused(RunError, "nowhere/journal.jsonl", os.strerror(errno.ENOENT)):
         Journal(tmp_path / "nowhere/journal.jsonl")
     of, path = plan("seed", runs=5), tmp_path / "journal.jsonl"
@@ -46,7 +46,7 @@ def test_a_journal_keeps_what_was_finished_and_drops_a_cut_line(tmp_path: Path) 
     assert read_journal(path) == [well(of, 0), well(of, 4)]
 
 
-def test_the_table_has_a_typed_column_for_all_that_is_known(tmp_path: Path) -> None:
+def test_the_table_has_a_typed_column_for_every_quantity(tmp_path: Path) -> None:
     presets = "sensors.preset=paper,ardrone2"
     of = plan("seed", "duration_s=1,2.5", presets, "a=[1,2],[3]", "b=uniform(0,1)", "c=true,false", runs=32)
     rows = [made(of, 0, failure="diverged"), *(well(of, run) for run in range(1, 32))]
@@ -72,7 +72,7 @@ def test_the_table_has_a_typed_column_for_all_that_is_known(tmp_path: Path) -> N
         read_table(path)
 
 
-def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path) -> None:
+def test_a_folder_continues_its_own_plan_and_refuses_any_other(tmp_path: Path) -> None:
     of, out = plan("seed", runs=4), tmp_path / "sweep"
     assert not is_sweep(out)
     with locked(out, of) as folder:
@@ -108,12 +108,12 @@ def test_a_folder_with_other_files_is_refused_unless_forced(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == [stranger]
     with locked(tmp_path, of, force=True):
         pass
-    with locked(tmp_path, of):  # a sweep by now, which goes on
+    with locked(tmp_path, of):  # it is now the folder of a sweep, which continues
         pass
     assert stranger.read_text() == "mine"
 
 
-def test_a_sweep_of_which_nothing_is_finished_claims_no_folder(tmp_path: Path) -> None:
+def test_a_sweep_without_finished_runs_does_not_claim_its_folder(tmp_path: Path) -> None:
     with locked(tmp_path, plan("seed", runs=1_000_000)) as folder:
         folder.compact()
     with locked(tmp_path, plan("seed", "duration_s=1,2", runs=4)) as folder, folder.journal() as book:
@@ -121,10 +121,10 @@ def test_a_sweep_of_which_nothing_is_finished_claims_no_folder(tmp_path: Path) -
     with pytest.raises(RunError, match=f"^{tmp_path}: .*--out"), locked(tmp_path, plan("seed", runs=4)):
         pass
     with pytest.raises(RunError, match=r"plan\.json: .*'\\udcfc'"), locked(tmp_path / "b", plan("name=a\udcfc")):
-        pass  # a plan that is no text
+        pass  # a plan that cannot be encoded as text
 
 
-def test_a_crash_between_table_and_journal_doubles_nothing(tmp_path: Path) -> None:
+def test_a_crash_between_table_and_journal_duplicates_no_run(tmp_path: Path) -> None:
     of = plan("seed", runs=2)
     folder = SweepFolder(tmp_path, of)
     with folder.journal() as book:
@@ -136,7 +136,7 @@ def test_a_crash_between_table_and_journal_doubles_nothing(tmp_path: Path) -> No
     assert [each["run"] for each in folder.rows()] == [1]
 
 
-def test_the_screen_tells_runs_per_hour_and_the_time_to_go() -> None:
+def test_the_screen_shows_runs_per_hour_and_the_remaining_time() -> None:
     now_s = [100.0]
     clock: Callable[[], float] = lambda: now_s[0]  # noqa: E731
     screen = SweepScreen(100, 40, Console(file=io.StringIO()), clock)

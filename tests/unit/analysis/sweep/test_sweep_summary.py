@@ -1,4 +1,4 @@
-"""What a sweep came to: confidence intervals, distributions, and the names of its columns and fields."""
+"""The summary of a sweep: confidence intervals, distributions, and names of columns and fields."""
 
 import math
 
@@ -23,7 +23,7 @@ from zsim_analysis.sweep.sweep_summary import (
 
 
 @pytest.mark.parametrize("n", [RUNS_MIN, 10, 200])
-def test_the_interval_of_a_mean_is_student_s(n: int) -> None:
+def test_the_interval_of_a_mean_is_student_s_t_interval(n: int) -> None:
     samples = stream(n, "samples").normal(3.0, 2.0, n)
     found = mean_interval(samples)
     wanted = scipy.stats.t.interval(LEVEL, n - 1, samples.mean(), scipy.stats.sem(samples))
@@ -32,8 +32,8 @@ def test_the_interval_of_a_mean_is_student_s(n: int) -> None:
 
 
 @pytest.mark.parametrize("n", range(1, RUNS_MIN))
-def test_few_samples_have_a_mean_and_no_interval(n: int) -> None:
-    """Two runs, 0.044 and 0.190 m, would give 0.117 ± 0.935 m."""
+def test_few_samples_have_a_mean_but_no_interval(n: int) -> None:
+    """For example, two runs with 0.044 m and 0.190 m would give 0.117 ± 0.935 m."""
     found = mean_interval(np.full(n, 4.0))
     assert found.value == 4.0
     assert math.isnan(found.low)
@@ -41,7 +41,7 @@ def test_few_samples_have_a_mean_and_no_interval(n: int) -> None:
 
 
 @pytest.mark.parametrize(("count", "of"), [(0, 1), (1, 1), (0, 30), (30, 30), (1, 30), (17, 30), (999, 1000)])
-def test_the_interval_of_a_share_is_the_exact_one(count: int, of: int) -> None:
+def test_the_interval_of_a_share_is_the_exact_binomial_one(count: int, of: int) -> None:
     found = share_interval(count, of)
     wanted = scipy.stats.binomtest(count, of).proportion_ci(LEVEL, "exact")
     assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), rel=1e-9)
@@ -49,7 +49,7 @@ def test_the_interval_of_a_share_is_the_exact_one(count: int, of: int) -> None:
         assert found.high == pytest.approx(1 - ((1 - LEVEL) / 2) ** (1 / of), rel=1e-12)
 
 
-def test_a_spread() -> None:
+def test_a_distribution_ignores_values_that_are_not_finite() -> None:
     found = distribution(np.array([1.0, 2.0, 3.0, 4.0, np.nan, np.inf]))
     assert found is not None
     assert (found.runs, found.median, found.least, found.greatest) == (4, 2.5, 1.0, 4.0)
@@ -61,7 +61,7 @@ def test_a_spread() -> None:
     assert distribution(np.array([np.nan])) is None
 
 
-def test_parameters_are_found_in_the_names_of_columns() -> None:
+def test_formation_parameters_are_found_in_names_of_columns() -> None:
     columns = ["errors.x_c.est_std", "errors.x_c.true_rms", "errors.left.p.true_rms"]
     columns.append("clusters.a.b.errors.yaw.true_rms")
     found = parameters(columns, ["main", "a.b"])
@@ -76,7 +76,7 @@ def test_parameters_are_found_in_the_names_of_columns() -> None:
     assert [each.labelled("x_c (m)") for each in hostile.values()] == ["errors: x_c (m)"]
 
 
-def test_columns_of_a_failed_run_are_no_samples() -> None:
+def test_values_of_a_failed_run_are_not_samples() -> None:
     of = plan("seed", runs=3)
     results = SweepResults(SweepDesign(of), [well(of, 0), made(of, 1, failure="x", min_separation_m=0.1), well(of, 2)])
     assert results.values("min_separation_m").tolist() == [2.0, 2.2]
@@ -84,8 +84,8 @@ def test_columns_of_a_failed_run_are_no_samples() -> None:
     assert results.without_collision(0) == (2, 2)
 
 
-def test_differences_are_of_runs_with_the_same_seed() -> None:
-    """What a seed does to both runs of a pair is not in their difference; a pair of which one failed or left its plan is none."""
+def test_differences_are_between_runs_with_the_same_seed() -> None:
+    """Effects of the seed on both runs cancel; pairs with a failed or unplanned run are omitted."""
     of = plan("seed=paired", "a.b=0,1,2", runs=18)
     of_seed = stream(3, "seed").normal(0.0, 5.0, 6)
     rows = [well(of, run) | {"metrics.m": of_seed[run // 3] + 0.25 * (run % 3)} for run in range(18)]
@@ -140,7 +140,7 @@ def test_differences_are_of_runs_with_the_same_seed() -> None:
         ("metrics.overshoot_m", "overshoot (m)"),
     ],
 )
-def test_a_path_has_words_and_a_unit(path: str, name: str) -> None:
+def test_a_field_has_a_readable_name_with_a_unit(path: str, name: str) -> None:
     assert str(field_name(path)) == name
     words, _, unit = name.partition(" (")
     assert field_name(path).at("1.5") == f"{words} 1.5 {unit.removesuffix(')')}".rstrip()

@@ -1,4 +1,4 @@
-"""An AR.Drone is set up, flown by velocities and landed; nothing is sent that was not demanded."""
+"""The session of an AR.Drone: configuration, flight by velocities, landing, and no command without a demand."""
 
 import math
 
@@ -15,7 +15,7 @@ S = 1_000_000_000
 
 
 class Loop:
-    """A session and its aircraft; what the one sends reaches the other after a delay."""
+    """A session and its aircraft, which receives the session's datagrams after a delay."""
 
     def __init__(self, delay_s: float = 0.0, yaw: float = 1.0, ultrasound: int = 8) -> None:
         self.aircraft = FakeAircraft(yaw)
@@ -51,7 +51,7 @@ class Loop:
         pytest.fail(f"it is {self.session.state.state} after {within_s} s; must be {state}")
 
 
-def test_it_is_set_up_entry_by_entry():
+def test_the_aircraft_is_configured_entry_by_entry():
     loop = Loop(ultrasound=7)
     loop.run(5)
     assert loop.aircraft.config["pic:ultrasound_freq"] == "7"
@@ -61,10 +61,10 @@ def test_it_is_set_up_entry_by_entry():
         "control:euler_angle_max"
     )
     assert len(loop.aircraft.config) == 8
-    assert set(loop.aircraft.names) == {"Config", "Control", "ResetWatchdog"}  # nothing that moves it
+    assert set(loop.aircraft.names) == {"Config", "Control", "ResetWatchdog"}  # no command that moves it
 
 
-def test_it_is_set_up_again_when_it_was_switched_on_again():
+def test_the_aircraft_is_configured_again_after_a_restart():
     loop = Loop()
     loop.run(5)
     loop.until("hovering", Demand("take_off"))
@@ -77,7 +77,7 @@ def test_it_is_set_up_again_when_it_was_switched_on_again():
 
 
 @pytest.mark.parametrize("yaw", [1.0, -2.5])
-def test_a_flight_from_the_ground_to_the_ground(yaw: float):
+def test_a_flight_from_take_off_to_landing_follows_its_demands(yaw: float):
     loop = Loop(delay_s=0.1, yaw=yaw)
     loop.run(5)
     assert (loop.session.state.state, loop.session.state.battery_percent) == ("landed", 66)
@@ -100,7 +100,7 @@ def test_a_flight_from_the_ground_to_the_ground(yaw: float):
     loop.until("landed", Demand("land"), 30)
 
 
-def test_the_velocity_answers_without_overshoot_to_speak_of():
+def test_the_velocity_responds_with_little_overshoot():
     loop = Loop(delay_s=0.15)
     loop.run(5)
     loop.until("hovering", Demand("take_off"))
@@ -112,7 +112,7 @@ def test_the_velocity_answers_without_overshoot_to_speak_of():
     assert loop.aircraft.velocity[0] == pytest.approx(1.0, abs=0.03)
 
 
-def test_kill_stops_the_motors_and_a_reset_leaves_the_emergency():
+def test_kill_stops_the_motors_and_reset_ends_the_emergency():
     loop = Loop()
     loop.run(5)
     loop.until("hovering", Demand("take_off"))
@@ -125,7 +125,7 @@ def test_kill_stops_the_motors_and_a_reset_leaves_the_emergency():
     loop.until("hovering", Demand("take_off"))
 
 
-def test_a_kill_is_not_taken_back_by_its_repetition_where_the_link_is_slow():
+def test_a_repeated_kill_does_not_undo_itself_on_a_slow_link():
     loop = Loop(delay_s=0.2)
     loop.run(8)
     loop.until("hovering", Demand("take_off"))
@@ -135,7 +135,7 @@ def test_a_kill_is_not_taken_back_by_its_repetition_where_the_link_is_slow():
         assert loop.session.state.state == "emergency"
 
 
-def test_readings_have_our_units_and_axes():
+def test_readings_have_zsim_s_units_and_axes():
     loop = Loop(yaw=0.0)
     loop.run(6)
     newest = {reading.sensor: reading.values for reading in loop.session.readings.take()}
@@ -149,7 +149,7 @@ def test_readings_have_our_units_and_axes():
     assert loop.session.readings.take() == []
 
 
-def test_a_slow_sensor_is_read_when_it_measures_and_not_with_each_packet():
+def test_a_slow_sensor_is_read_only_when_its_value_changes():
     loop = Loop()
     loop.run(10)
     count = {"imu": 0, "gps": 0, "mag": 0}
@@ -157,10 +157,10 @@ def test_a_slow_sensor_is_read_when_it_measures_and_not_with_each_packet():
         if reading.sensor in count:
             count[reading.sensor] += 1
     assert count["imu"] > 1500
-    assert count["gps"] == count["mag"] == 1  # it stands still: nothing changes
+    assert count["gps"] == count["mag"] == 1  # the aircraft stands still: nothing changes
 
 
-def test_loss_is_measured_and_garbage_counted():
+def test_loss_is_measured_and_garbage_is_counted():
     loop = Loop()
     loop.run(5)
     draw = np.random.default_rng(4)

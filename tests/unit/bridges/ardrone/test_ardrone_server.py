@@ -1,4 +1,4 @@
-"""The server of a run's drones: what it asks the run for, what it prints; addresses, and who is let in on its ports."""
+"""The AR.Drone server: subscriptions to pictures, printed reasons, addresses, and hosts allowed on its ports."""
 
 import asyncio
 import contextlib
@@ -28,12 +28,12 @@ from zsim_bridges.ardrone.ardrone_server import (
 )
 
 HOME = "127.0.0.1"
-ELSEWHERE = AllowedHosts("192.0.2.1", frozenset({"192.0.2.9"}))  # as on an address that other hosts reach
+ELSEWHERE = AllowedHosts("192.0.2.1", frozenset({"192.0.2.9"}))  # as for an address that other hosts can reach
 HERE = AllowedHosts("127.0.0.2", frozenset())
 NAMES = ["drone1", "drone2"]
 
 
-def test_addresses_follow_the_first_or_are_given_by_name():
+def test_addresses_follow_the_first_one_or_are_given_by_name():
     addresses = {"drone1": "127.0.0.254", "drone2": "127.0.0.255", "drone3": "127.0.1.0"}
     assert drone_addresses("127.0.0.254", [*NAMES, "drone3"]) == addresses
     assert drone_addresses("drone2=192.168.1.5", NAMES) == {"drone2": "192.168.1.5"}
@@ -50,7 +50,7 @@ def test_addresses_follow_the_first_or_are_given_by_name():
         ("drone1=::1", ("'::1'", "IPv4")),
     ],
 )
-def test_addresses_that_are_none(text: str, terms: tuple[str, ...]):
+def test_invalid_addresses_are_refused(text: str, terms: tuple[str, ...]):
     with refused(RunError, *terms):
         drone_addresses(text, NAMES)
 
@@ -61,7 +61,7 @@ def test_peers_are_names_or_addresses():
         peer_addresses(["no.such.host.invalid"])
 
 
-def test_on_loopback_everybody_of_this_host_is_obeyed_elsewhere_those_that_were_named_alone():
+def test_loopback_allows_this_host_and_other_addresses_only_peers():
     assert HERE.allow(HOME)
     assert ELSEWHERE.allow("192.0.2.9")
     assert not ELSEWHERE.allow("192.0.2.10")
@@ -71,7 +71,7 @@ def test_on_loopback_everybody_of_this_host_is_obeyed_elsewhere_those_that_were_
 
 
 class Refusals(list[str]):
-    """Reasons, and a way to wait for one."""
+    """A list of reasons, with an event for its first one."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -157,7 +157,7 @@ DRONES = (DroneInfo("drone1", "ardrone2"),)
 
 
 def offered() -> tuple[ArdroneServer, list[str]]:
-    """Return the server of one drone, and the lines that it prints."""
+    """Return the server of one drone and a list of the lines that it prints."""
     link: Any = FakeLink()
     origin, lines = Origin(0.0, 0.0, 0.0), []
     info = Info(0, 0, 1, "r", "zsim", "lockstep", 1.0, 1, 1, 1, 1, origin, DRONES, (), SCENARIO, "", "", "")
@@ -166,7 +166,7 @@ def offered() -> tuple[ArdroneServer, list[str]]:
 
 
 @pytest.mark.parametrize("is_installed", [True, False])
-def test_pictures_are_asked_for_where_they_can_be_encoded_else_the_extra_is_named_once(
+def test_pictures_are_subscribed_to_if_encodable_else_the_extra_is_named(
     monkeypatch: pytest.MonkeyPatch, is_installed: bool
 ):
     monkeypatch.setattr(ardrone_server, "find_spec", lambda _: object() if is_installed else None)
@@ -181,8 +181,8 @@ def test_pictures_are_asked_for_where_they_can_be_encoded_else_the_extra_is_name
     assert server.observer.health.refused == 0
 
 
-def test_a_reason_is_printed_once_whatever_its_figures_and_all_are_counted():
-    """A flood of datagrams has every length; each drone and each program that sends has a line of its own."""
+def test_reasons_that_differ_in_numbers_are_printed_once_and_counted():
+    """A flood of datagrams may have all lengths; each drone and each sending host gets its own line."""
     server, lines = offered()
     for size in range(40):
         for drone in ("drone1", "drone2"):

@@ -1,4 +1,4 @@
-"""Navdata: a packet of a real aircraft, the sizes of its headers, and what another program reads of ours."""
+"""Navdata: a packet of a real aircraft, sizes of the SDK's structures, and parsing by other programs."""
 
 import random
 import struct
@@ -9,20 +9,20 @@ from ardrone_readers import pyardrone_reads
 from zsim_bridges.ardrone import navdata
 from zsim_bridges.ardrone.navdata import FULL_TAGS, GPS_TAG, LAYOUTS, NavdataError, NavdataTemplate, StateBit
 
-BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from an aircraft
+BOOTSTRAP = bytes.fromhex("88776655100c804f0100000000000000ffff0800a6020000")  # captured from a real aircraft
 _SIZES = "148 8 52 46 16 12 88 16 24 76 56 16 44 92 108 364 328 8 40 65 12 18 75 56 72 32 8 216 6 32"
 SIZES = {tag: int(size) for tag, size in enumerate(_SIZES.split())} | {navdata.CHECKSUM_TAG: 8}
-"""Bytes, of the structures of the SDK."""
+"""Sizes of the structures of the SDK by tag, bytes."""
 OPTIONS = tuple(tag for tag in LAYOUTS if tag != navdata.CHECKSUM_TAG)
 
 
 def counted(tag: int):
-    """Return an option whose numbers differ, as far as a byte can hold them."""
+    """Return an option with mostly different numbers, each of which fits a byte."""
     layout = LAYOUTS[tag]
     return layout.option(tuple((7 * tag + k) % 100 for k in range(len(layout.codec.unpack(bytes(layout.codec.size))))))
 
 
-def test_the_packet_of_a_real_aircraft():
+def test_the_packet_of_a_real_aircraft_is_packed_and_unpacked():
     assert navdata.pack(0x4F800C10, 1, 0) == BOOTSTRAP
     packet = navdata.unpack(BOOTSTRAP)
     assert packet.bootstrap
@@ -33,7 +33,7 @@ def test_the_packet_of_a_real_aircraft():
     assert packet.state == modes | threads | StateBit.PIC_VERSION_OK
 
 
-def test_sizes():
+def test_structures_and_packets_have_the_sizes_of_the_sdk():
     assert {tag: layout.size for tag, layout in LAYOUTS.items()} == SIZES
     assert len(NavdataTemplate((0, 16)).packet(0, 1, 0)) == 500
     assert len(NavdataTemplate(FULL_TAGS).packet(0, 1, 0)) == 1904
@@ -41,31 +41,31 @@ def test_sizes():
 
 
 @pytest.mark.parametrize("tag", OPTIONS)
-def test_what_is_packed_is_unpacked(tag: int):
+def test_a_packed_option_is_unpacked_unchanged(tag: int):
     option = counted(tag)
     packet = navdata.unpack(navdata.pack(3, 9, 1, [(tag, option)]))
     assert packet == (StateBit.FLYING | StateBit.VIDEO, 9, 1, {tag: option}, {})
 
 
-def test_a_template_is_the_packet():
+def test_a_template_gives_the_same_packet_as_packing():
     template = NavdataTemplate(FULL_TAGS)
     for tag in FULL_TAGS:
         template.filler(tag)(*LAYOUTS[tag].flat(counted(tag)))
     template.filler(26)(77)
-    template.filler(GPS_TAG)(1, 2, 3)  # is not in it
+    template.filler(GPS_TAG)(1, 2, 3)  # GPS is not in the template
     expected = [(tag, counted(tag) if tag != 26 else (77,)) for tag in FULL_TAGS]
     assert template.packet(5, 6, 0) == navdata.pack(5, 6, 0, expected)
 
 
 @pytest.mark.parametrize("magic", navdata.MAGICS)
-def test_both_magics_are_read(magic: int):
+def test_both_magic_numbers_are_accepted(magic: int):
     packet = bytearray(BOOTSTRAP)
     packet[:4] = struct.pack("<I", magic)
     packet[-4:] = struct.pack("<I", sum(packet[:-8]))
     assert navdata.unpack(bytes(packet)).sequence == 1
 
 
-def test_an_option_of_another_size_is_kept_as_it_came():
+def test_an_option_of_unexpected_size_is_kept_unparsed():
     body = struct.pack("<IIII", navdata.MAGIC, 0, 1, 0) + struct.pack("<HHif", GPS_TAG, 12, 5, 0.5)
     packet = navdata.unpack(body + struct.pack("<HHI", 0xFFFF, 8, sum(body)))
     assert packet.options == {}
@@ -83,12 +83,12 @@ def test_an_option_of_another_size_is_kept_as_it_came():
         (BOOTSTRAP[:16] + struct.pack("<HHI", 26, 8, 0), "has no checksum"),
     ],
 )
-def test_what_is_no_packet_is_refused_with_a_reason(datagram: bytes, reason: str):
+def test_an_invalid_packet_is_refused_with_a_reason(datagram: bytes, reason: str):
     with pytest.raises(NavdataError, match=reason):
         navdata.unpack(datagram)
 
 
-def test_nothing_that_anybody_sends_raises_anything_else():
+def test_corrupt_packets_raise_no_other_error():
     chance = random.Random(2)
     good = NavdataTemplate(FULL_TAGS).packet(0, 1, 0)
     refused = 0
@@ -110,15 +110,15 @@ def test_pyardrone_reads_every_number_of_every_option():
     read = pyardrone_reads("navdata", template.packet(int(StateBit.FLYING), 12, 1))
     assert read.pop("metadata") == [navdata.MAGIC, 1, 12, 1]
     assert len(read.pop("cks")) == 1
-    names = {"euler_angles": "eular_angles"}  # as it is written there
+    names = {"euler_angles": "eular_angles"}  # as misspelt there
     expected = {LAYOUTS[tag].name: list(LAYOUTS[tag].flat(counted(tag))) for tag in FULL_TAGS}
     assert read == {names.get(name, name): values for name, values in expected.items()}
 
 
 class TestArdroneSdk:
-    """What the unmodified parser of ardrone-sdk reads of our packets."""
+    """Parsing of zsim's packets by the unmodified parser of ardrone-sdk."""
 
-    def test_it_reads_a_demo(self):
+    def test_ardrone_sdk_reads_a_demo_packet(self):
         parser = pytest.importorskip("ardrone.navdata")
         demo = LAYOUTS[0].zeros()._replace(ctrl_state=4 << 16, battery_percent=77, theta_mdeg=2500.0, altitude_mm=1000)
         read = parser.decode(navdata.pack(StateBit.FLYING | StateBit.COMMAND_ACK, 3, 0, [(0, demo)]))

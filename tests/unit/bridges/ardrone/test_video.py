@@ -1,4 +1,4 @@
-"""The live video: frames that can be decoded from an IDR frame on, behind PaVE headers."""
+"""The live video: frames with PaVE headers that can be decoded from any IDR frame."""
 
 import asyncio
 import struct
@@ -27,7 +27,7 @@ HOME = "127.0.0.1"
 HEADER = pave_header(VideoFrame(bytes(1234), True, 14, 6), 7, 1500, (5 << 32) + 9)
 
 
-def test_offsets_of_the_sdk_s_structure():
+def test_the_header_has_the_offsets_of_the_sdk_s_structure():
     assert len(HEADER) == 64
     assert HEADER[:4] == b"PaVE"
     assert struct.unpack_from("<HI4HII", HEADER, 6) == (64, 1234, 640, 368, 640, 360, 7, 1500)
@@ -59,7 +59,7 @@ def picture(shade: int, t_ms: int = 0, data: bytes | None = None) -> CameraImage
 
 
 def shades(frames: list[bytes]) -> list[float]:
-    """Return the mean brightness of each frame, as another decoder of H.264 has it."""
+    """Return the mean brightness of each frame as decoded by an independent H.264 decoder."""
     decoder = av.CodecContext.create("h264", "r")
     decoder.thread_count = 1
     decoded = [frame for data in (*frames, None) for frame in decoder.decode(av.Packet(data) if data else None)]
@@ -67,7 +67,7 @@ def shades(frames: list[bytes]) -> list[float]:
     return [float(frame.to_ndarray(format="gray").mean()) for frame in decoded]
 
 
-def test_pictures_are_what_was_encoded():
+def test_decoded_frames_have_the_brightness_of_the_pictures():
     encoder = VideoEncoder()
     frames = [encoder.encode(jpeg(shade), begins=False) for shade in (40, 120, 200)]
     assert [frame.is_idr for frame in frames if frame] == [True, False, False]
@@ -75,7 +75,7 @@ def test_pictures_are_what_was_encoded():
     assert brightness[0] < brightness[1] < brightness[2]
 
 
-def test_an_idr_frame_has_sps_and_pps_and_comes_every_second_and_when_it_is_asked_for():
+def test_idr_frames_have_sps_and_pps_and_are_periodic_or_on_request():
     encoder = VideoEncoder()
     frames = [encoder.encode(jpeg(100), begins=k == 5) for k in range(IDR_EVERY + 6)]
     begins = [k for k, frame in enumerate(frames) if frame and frame.is_idr]
@@ -87,13 +87,13 @@ def test_an_idr_frame_has_sps_and_pps_and_comes_every_second_and_when_it_is_aske
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"\xff\xd8\xff" + bytes(500)])
-def test_what_is_no_picture_is_refused(data: bytes):
+def test_an_unreadable_picture_is_refused(data: bytes):
     with pytest.raises(VideoError, match="readable JPEG"):
         VideoEncoder().encode(data, begins=False)
 
 
 class Header(NamedTuple):
-    """What a test reads of a header."""
+    """The fields of a header that the tests read."""
 
     frame_number: int
     timestamp_ms: int
@@ -114,7 +114,7 @@ class Stream:
 
 
 class Served:
-    """A video server on a port of loopback."""
+    """A video server on a loopback port."""
 
     def __init__(self) -> None:
         self.refusals: list[str] = []

@@ -365,7 +365,7 @@ def test_suggested_waypoints_begin_at_the_formation_in_display_units(bench: Benc
 
 def test_suggested_waypoints_follow_the_formation_until_edited(bench: Bench):
     form, text, shown = bench.formation(), bench.gui.at[WAYPOINTS], []
-    for x_c in (-1.43, 5.0, 5.05, 5.05):  # noise of the estimate leaves them; a formation at rest updates them
+    for x_c in (-1.43, 5.0, 5.05, 5.05):  # unmoved by the noise of an estimate, but exact once the formation rests
         form.refresh(bench.view(x_c=x_c), LATER_S)
         shown.append(text.value)
     assert has_terms(shown[1], "x_c = 5")
@@ -416,7 +416,7 @@ def test_a_common_fault_has_the_labelled_target_and_magnitude(
     assert has_terms(told, label, struck)
     assert has_terms(
         told, "Messages lost", "processes", "world", "no radio"
-    )  # a link between processes is no radio link
+    )  # a link between processes is not a radio link
     assert magnitude is None or has_terms(told, label, f"{magnitude[1]:g}")
 
 
@@ -447,7 +447,7 @@ def test_any_fault_can_be_typed_with_the_syntax_of_the_command_line(bench: Bench
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_choosing_a_kind_suggests_a_valid_target_and_the_required_parameters(bench: Bench, kind: str):
+def test_choosing_a_kind_suggests_a_valid_target_and_its_parameters(bench: Bench, kind: str):
     bench.faults()
     bench.gui.at["kind"].put(kind)
     target, text = bench.gui.at["target"].value, bench.gui.at["parameters"].value
@@ -476,7 +476,7 @@ def test_choosing_a_kind_suggests_a_valid_target_and_the_required_parameters(ben
         ),
     ],
 )
-def test_invalid_parameters_are_refused_without_a_fault(
+def test_invalid_parameters_are_refused_and_inject_no_fault(
     bench: Bench, kind: str | None, text: str, terms: tuple[str, ...]
 ):
     bench.faults()

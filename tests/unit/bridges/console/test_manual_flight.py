@@ -307,8 +307,7 @@ def test_a_drone_flies_to_a_place_until_the_stick_is_used(flown: Cockpit):
         flown.after(0.4)
     flown.control.steer(PAGE, None)
     last = flown.after(PERIOD_S)[0]
-    # From rest, the velocity of the path one lead of the law ahead. The drone does not move, so the command then
-    # catches up, to the cruise.
+    # From rest, the path's velocity one lead of the law ahead; as the drone does not move, it rises to the cruise.
     assert first == pytest.approx((ACCEL_M_S2 * LAW.lead_s, 0.0, 0.0), abs=0.05)
     assert last == pytest.approx((1.5, 0.0, 0.0), abs=0.02)
     flown.control.steer(PAGE, None)  # the page is alive but its dead-man key is not held

@@ -305,7 +305,7 @@ def test_a_hovering_formation_moves_no_camera(followed: Pages):
     assert page.camera.position.tolist() == before.tolist()
 
 
-def test_a_zoomed_page_keeps_its_distance_and_an_unfollowing_one_its_place(followed: Pages):
+def test_a_zoomed_page_keeps_its_distance_and_a_fixed_one_its_place(followed: Pages):
     zoomed, still = followed.come(Page(1)), followed.come(Page(2))
     followed.cameras.follow(TRIANGLE)
     zoomed.camera.position = zoomed.camera.look_at + np.array((0.0, -2.0, 0.0))

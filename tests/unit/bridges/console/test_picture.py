@@ -291,7 +291,11 @@ def test_trails_are_the_recent_part_of_each_path():
         poses = pic.drone_poses(ViewDrones(x * 10**9, 0, (drone_view("drone1", float(x)),), ()), names)
         trails.add(float(x), poses.p_W)
     way, nothing = trails.lines(3.0, poses.p_W)
-    assert way == [[0.0, 2.0, 0.0], [1.0, 2.0, 1.0], [2.0, 2.0, 2.0]]  # the page continues it to the current position
+    assert way == [
+        [0.0, 2.0, 0.0],
+        [1.0, 2.0, 1.0],
+        [2.0, 2.0, 2.0],
+    ]  # where segments begin; the last one ends at the drone
     assert nothing == []
 
 

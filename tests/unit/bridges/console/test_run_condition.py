@@ -152,7 +152,7 @@ def test_foreign_commanders_are_those_other_than_the_controller(
     assert run_condition.foreign_commanders("controller.main", MEMBERS, of_drones, roles) == found
 
 
-def test_a_formation_off_its_reference_or_with_a_foreign_commander_alarms():
+def test_a_foreign_commander_or_a_large_deviation_raises_an_alarm():
     view = ViewCluster(0, 0, "engaged", ("p", "yaw"), (11.6, 3.0), (4.0, 0.0), "")
     foreign = {"main": {"drone2": "console.run"}}
     found = run_condition.formation_alarms({"main": ("engaged", "")}, foreign, {"main": view})

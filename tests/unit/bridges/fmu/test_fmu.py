@@ -235,7 +235,7 @@ def test_a_bad_mapping_or_option_is_refused_in_one_line(
     assert "\n" not in str(raised.value)
 
 
-def test_a_file_that_is_no_usable_fmu_is_refused(tmp_path: Path, waypoint: Path) -> None:
+def test_a_file_that_is_not_a_usable_fmu_is_refused(tmp_path: Path, waypoint: Path) -> None:
     def refuses(path: Path, *terms: str) -> None:
         with refused(RunError, path.name, *terms):
             FmuModel(path)

@@ -100,7 +100,7 @@ def test_payloads_of_unknown_keys_are_shown_as_far_as_json_allows(payload: bytes
 
 
 @pytest.mark.parametrize("payload", [b"\xc0", msgspec.msgpack.encode({"t_ns": 1}), b"\xc1 no msgpack", b""])
-def test_a_payload_that_is_no_message_of_its_key_is_not_shown(payload: bytes):
+def test_a_payload_that_is_not_a_message_of_its_key_is_not_shown(payload: bytes):
     assert not is_sound(VELOCITY, payload)
     with pytest.raises(DecodeError):
         payload_to_json(VELOCITY, payload)
@@ -316,9 +316,7 @@ def test_an_internal_error_is_answered_and_reported():
 
 
 @pytest.mark.parametrize(("droppable", "left", "cuts"), [(True, [b"lost 3\n", b"abc3", b"abc4"], 0), (False, None, 1)])
-def test_a_full_outbox_drops_old_values_but_cuts_off_rather_than_lose_answers(
-    droppable: bool, left: list[bytes] | None, cuts: int
-):
+def test_a_full_outbox_drops_the_oldest_values_but_no_answers(droppable: bool, left: list[bytes] | None, cuts: int):
     cut: list[str] = []
 
     async def fill() -> list[bytes]:
@@ -371,7 +369,7 @@ class LockstepLines(LockstepSession):
         (["**"], "eye.one", (), (*(f"drone/drone{k}/{what}" for k in (1, 2) for what in ("sensor/status", "truth")),)),
     ],
 )
-def test_the_gate_keys_of_a_session_come_every_gate_from_other_processes(
+def test_the_gate_keys_of_a_session_come_from_others_at_every_gate(
     reads: list[str], name: str, required: Any, gates: tuple[str, ...]
 ):
     assert sorted(gate_keys_of(info(), reads, name, required)) == sorted(gates)

@@ -133,7 +133,7 @@ def test_a_landing_commanded_elsewhere_is_not_overridden(autopilot: int, landed:
 
 
 @AUTOPILOTS
-def test_a_demanded_landing_is_no_take_over(autopilot: int):
+def test_a_demanded_landing_is_not_a_take_over(autopilot: int):
     loop = Loop(autopilot)
     loop.until("hovering", Demand("take_off"))
     loop.run(2, Demand("hold"))
@@ -143,7 +143,7 @@ def test_a_demanded_landing_is_no_take_over(autopilot: int):
     assert not any("control" in text for text in loop.session.texts)
 
 
-def test_an_autopilot_that_fell_back_to_hold_is_switched_back_to_offboard():
+def test_an_autopilot_that_fell_back_to_hold_returns_to_offboard():
     loop = Loop(PX4)
     loop.until("hovering", Demand("take_off"))
     loop.run(2, Demand("hold"))

@@ -258,7 +258,7 @@ def test_a_mission_flies_straight_legs_at_its_speed_and_turns_smoothly() -> None
         flown.append(drone._velocity)
     steps = [math.dist(one[:2], other[:2]) for one, other in itertools.pairwise(flown)]
     accel_m_s2 = SHARE * 9.80665 * math.tan(math.radians(20.0))
-    lead_s, period_s = Piloted().lead_s, 0.04  # of the control law, which anticipates a new acceleration
+    lead_s, period_s = Piloted().lead_s, 0.04  # of the control law, which anticipates by its lead
     assert max(steps[25:]) < accel_m_s2 * (lead_s + period_s)
     assert drone.position[:2] == pytest.approx([0.0, 0.0], abs=0.6)
     assert drone.position[2] == pytest.approx(5.0, abs=0.1)

@@ -568,7 +568,7 @@ def test_an_invalid_master_uri_is_refused(uri):
         own_address(uri)
 
 
-def test_the_own_address_follows_the_ros_variables_or_the_route_to_the_master():
+def test_own_address_follows_ros_variables_or_the_route_to_the_master():
     assert own_address("http://127.0.0.1:11311", {}) == "127.0.0.1"
     assert own_address("http://127.0.0.1", {"ROS_IP": "10.0.0.7"}) == "10.0.0.7"
     both = {"ROS_IP": "10.0.0.7", "ROS_HOSTNAME": "lab"}

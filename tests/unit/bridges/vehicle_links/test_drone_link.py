@@ -41,7 +41,7 @@ def status(t_ns: int) -> flight_messages.Status:
     return flight_messages.Status(t_ns, 0, "flying", 90.0, False, None, 1)
 
 
-def test_the_own_velocity_is_integrated_along_the_heading():
+def test_the_measured_velocity_is_integrated_along_the_heading():
     own = OnboardState()
     own.update(estimate(0, (0.0, 0.0, 0.0), yaw_rad=math.pi / 2))  # the nose points north
     for n in range(11):

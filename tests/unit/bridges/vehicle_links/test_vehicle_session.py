@@ -109,7 +109,7 @@ def test_the_heading_frame_is_turned_by_the_yaw_of_the_aircraft():
     assert flight.failsafe.demand(flight.now_ns, flight.vehicle).velocity_m_s == pytest.approx((0, 1, 0.2))
 
 
-def test_a_silent_commander_holds_and_then_lands():
+def test_a_drone_with_a_silent_commander_holds_and_then_lands():
     flight = Flight().takes_off()
     flight.fly(1, 0, 0)
     assert flight.after(0.4) == "fly"

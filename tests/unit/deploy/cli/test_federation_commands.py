@@ -32,7 +32,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("text", ["10s", "500ms", "2min", "3", "1.5 s", None])
-def test_durations_with_a_unit_are_accepted(text: str | None):
+def test_valid_durations_are_accepted(text: str | None):
     assert duration(text) == text
 
 

@@ -63,7 +63,7 @@ def test_an_unknown_role_is_refused_with_the_known_ones() -> None:
         ps(["controller.*"], federation="zsim")
 
 
-def test_a_log_is_printed_and_an_empty_one_is_no_error(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_is_printed_and_an_empty_one_is_not_an_error(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     logs("estimator.d1", federation="zsim")
     logs("world", federation="zsim")
     silent, world = capsys.readouterr().err.splitlines()

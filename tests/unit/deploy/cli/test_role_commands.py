@@ -31,7 +31,7 @@ def test_the_ros_package_has_the_message_types_of_the_bridge(
     assert "<name>zsim_msgs</name>" in (package / "package.xml").read_text()
 
 
-def test_ros2_needs_a_router_with_tls_and_a_writable_folder_for_its_package(tmp_path: Path) -> None:
+def test_ros2_needs_a_router_with_tls_and_a_writable_package_folder(tmp_path: Path) -> None:
     with refused(typer.BadParameter, "--tls", "--router"):
         ros2(tls=tmp_path)
     (tmp_path / "zsim_msgs").write_text("a file is there")

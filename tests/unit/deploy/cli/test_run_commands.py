@@ -41,7 +41,7 @@ def raising(error: BaseException) -> Any:
 
 
 @pytest.mark.parametrize("where", ["before", "flight", "report"])
-def test_after_ctrl_c_the_exit_code_is_130_and_the_record_is_named(
+def test_ctrl_c_exits_with_130_and_names_a_record(
     recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, where: str
 ):
     record = recorded / "run.mcap"

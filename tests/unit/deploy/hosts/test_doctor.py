@@ -131,7 +131,7 @@ def test_a_port_that_cannot_be_opened_is_not_called_unreachable(found, terms):
 
 def checked_up(folder: Path) -> CheckResult:
     """Check a host that does not answer, with an inventory in the given folder."""
-    host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux, which no machine runs
+    host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux, on which nothing listens
     return check_hosts(InventoryFile(Inventory(hosts={"h1": host}, roles={"world": "h1"}), folder, "lab.yaml"), None)
 
 
@@ -338,7 +338,7 @@ def test_leftover_records_and_keys_are_reported_in_a_line_each(tmp_path: Path) -
 
 
 @pytest.mark.skipif(shutil.which("ps") is None, reason="needs ps (apt-get install procps)")
-def test_files_of_a_current_run_are_no_leftovers(tmp_path: Path) -> None:
+def test_files_of_a_current_run_are_not_leftovers(tmp_path: Path) -> None:
     run_of(tmp_path, "abcdef", "run.mcap", "identity/world/key.pem")
     words = [sys.executable, "-c", WAITS, "world", "--launched", "abcdef", "--host", "h1"]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:

@@ -70,7 +70,7 @@ def test_a_plan_lists_processes_hosts_and_ports(plan: HostPlan) -> None:
     assert has_terms(remark, "my.drone1", "h2")
 
 
-def test_a_process_has_its_endpoint_identity_and_options_on_its_command_line(plan: HostPlan) -> None:
+def test_a_command_line_has_the_endpoint_identity_and_options(plan: HostPlan) -> None:
     reach = ["--connect", "tls/127.0.0.1:7447", "--federation", "zsim", "--host", "h1"]
     tls = ["--tls", "/z/runs/abc/identity/estimator.-d2"]
     assert plan.arguments("estimator.-d2") == ["estimator", "--launched", "abc", *reach, *tls, "--", "-d2"]

@@ -274,7 +274,7 @@ def test_an_unknown_host_or_extra_is_refused_with_the_known_ones(
 
 
 def test_every_failed_host_is_reported_in_a_line(tmp_path: Path) -> None:
-    closed = Host(address="127.0.0.1", port=1)  # tcpmux, which no machine runs
+    closed = Host(address="127.0.0.1", port=1)  # tcpmux, on which nothing listens
     steps: list[tuple[str, ...]] = []
     with pytest.raises(HostsError) as caught:
         pushed(tmp_path, [], [], lambda *step: steps.append(step), a=closed, b=closed, c=Host(address="h", python="/p"))

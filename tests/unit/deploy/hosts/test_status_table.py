@@ -61,7 +61,7 @@ def test_a_row_shows_the_host_and_figures_of_a_process(board, now):
 
 
 @pytest.mark.parametrize(("more", "terms"), [({}, ("waited for", "3 s")), ({"held_by": ["planner.d1"]}, ("waits for planner.d1",))])  # fmt: skip
-def test_a_row_tells_a_process_waited_for_from_one_that_waits(board, more, terms):
+def test_a_row_distinguishes_being_waited_for_from_waiting(board, more, terms):
     waiting = {"name": "estimator.d1", "host": "h1", "since_wall_s": 3.2, **more}
     board.clock(clock(1.0, waiting_for=[waiting]))
     assert has_terms(board.rows()[0]["state"], *terms)

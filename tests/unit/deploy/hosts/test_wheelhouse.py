@@ -197,7 +197,7 @@ def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give pip an index that refuses connections and no folder."""
     monkeypatch.delenv("PIP_NO_INDEX", raising=False)
     monkeypatch.delenv("PIP_FIND_LINKS")
-    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")  # tcpmux, which no machine runs
+    monkeypatch.setenv("PIP_INDEX_URL", "http://127.0.0.1:1/simple")  # tcpmux, on which nothing listens
 
 
 @pytest.mark.soak

@@ -231,7 +231,7 @@ def test_ctrl_c_while_loading_leaves_no_fork_server(monkeypatch: pytest.MonkeyPa
     assert role_launcher._forkserver.poll() is not None
 
 
-def test_an_exit_code_collected_elsewhere_is_no_error() -> None:
+def test_an_exit_code_collected_elsewhere_is_not_an_error() -> None:
     with subprocess.Popen([sys.executable, "-c", "pass"], stdin=subprocess.PIPE, text=True) as child:
         child.wait()
         assert child.stdin is not None

@@ -128,7 +128,7 @@ def test_a_process_that_outlives_the_run_is_left_to_the_caller():
 
 
 @pytest.mark.parametrize("name", ["recorder", "world"])
-def test_a_failure_after_the_end_is_the_reason_why_the_run_failed(name: str):
+def test_a_failure_after_the_end_is_the_reason_of_the_failed_run(name: str):
     team = Team(world=(143 if name == "world" else 0,))
     if name == "recorder":
         team.recorder = team.watch.members[1] = Member("recorder", 143, lives_for=21)
@@ -260,7 +260,7 @@ def test_an_overdue_process_is_dropped_or_ends_the_run(action: str, fails: bool)
     assert team.others[0].killed is not fails
 
 
-def test_deaths_far_apart_do_not_count_together(monkeypatch):
+def test_deaths_far_apart_do_not_accumulate(monkeypatch):
     now = iter(range(0, 100_000, 100))
     monkeypatch.setattr("zsim_deploy.launch.supervisor.time.monotonic", lambda: float(next(now)))
     team = Team(Member("estimator.d1", *[1] * 8, None), looks=12)
@@ -387,7 +387,7 @@ def test_a_run_interrupted_before_its_start_starts_no_process():
 
 
 @pytest.mark.parametrize("text", ["1234\n", "[1]\n", "null\n", "Welcome\n"])
-def test_lines_that_are_no_progress_are_ignored(text):
+def test_lines_that_are_not_progress_are_ignored(text):
     team = Team()
     team.watch.handle_line(text)
     assert team.show.lines == []

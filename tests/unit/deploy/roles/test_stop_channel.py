@@ -83,7 +83,7 @@ def test_a_key_sent_for_a_successor_is_kept(key: Path) -> None:
     old.release()
 
 
-def test_the_own_key_of_a_host_is_not_treated_as_lent(key: Path) -> None:
+def test_a_key_that_belongs_to_the_host_is_not_treated_as_lent(key: Path) -> None:
     certs = Path("certs/h1/estimator.d1")
     for tls, launched in ((None, "run1"), (key.parent, None), (key.parent, "run2"), (certs, "run1")):
         assert key_lease(Identity(tls=tls), launched) is None
@@ -143,14 +143,14 @@ def test_a_closed_terminal_ends_a_process_in_an_orderly_way(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_raises_an_interrupt(number: signal.Signals) -> None:
+def test_a_signal_raises_keyboard_interrupt(number: signal.Signals) -> None:
     former = signal.getsignal(number)
     with pytest.raises(KeyboardInterrupt), interruptible():
         signal.raise_signal(number)
     assert signal.getsignal(number) is former
 
 
-def test_an_interrupt_that_a_library_turns_into_an_error_stays_an_interrupt() -> None:
+def test_an_interrupt_that_a_library_turns_into_an_error_is_restored() -> None:
     def fail(number: int = 0) -> None:
         with suppress(KeyboardInterrupt):
             signal.raise_signal(number) if number else None

@@ -1,4 +1,4 @@
-"""External drones in a fleet: put where their drivers say, moved on for a while, judged by the state that these publish."""
+"""External drones in a fleet: they follow the poses and states of their drivers, extrapolated for a while."""
 
 import math
 from typing import Any
@@ -49,7 +49,7 @@ def advance(fleet: Fleet, drones: ExternalDrones, gates: int = 1) -> None:
         fleet.advance()
 
 
-def test_before_the_first_pose_it_stands_where_the_scenario_puts_it(fleet: Fleet, drones: ExternalDrones):
+def test_before_its_first_pose_a_drone_stands_where_the_scenario_puts_it(fleet: Fleet, drones: ExternalDrones):
     standing = fleet.truth().position_m[1].copy()
     np.testing.assert_allclose(standing[:2], START[:2])
     advance(fleet, drones, 50)
@@ -57,7 +57,7 @@ def test_before_the_first_pose_it_stands_where_the_scenario_puts_it(fleet: Fleet
     assert drones.status(1) is None
 
 
-def test_it_is_where_its_driver_says_and_goes_on_with_its_velocity(fleet: Fleet, drones: ExternalDrones):
+def test_a_drone_follows_its_driver_and_moves_on_at_the_last_velocity(fleet: Fleet, drones: ExternalDrones):
     advance(fleet, drones, 10)
     assert drones.take("d1", truth(200_000_000, q=HALF_TURN), fleet.t_ns) is None
     for gate in range(1, 20):
@@ -70,7 +70,7 @@ def test_it_is_where_its_driver_says_and_goes_on_with_its_velocity(fleet: Fleet,
         np.testing.assert_array_equal(now.rotor_rad_s[1], [300.0] * 4)
 
 
-def test_a_pose_is_moved_on_for_half_a_second_and_then_held(fleet: Fleet, drones: ExternalDrones):
+def test_a_pose_is_extrapolated_for_half_a_second_and_then_held(fleet: Fleet, drones: ExternalDrones):
     drones.take("d1", truth(0), 0)
     advance(fleet, drones, 60)
     held = np.array((4.0, 1.0, 2.0)) + POSE_AGE_MAX_NS * 1e-9 * np.array((1.0, -0.5, 0.25))
@@ -78,8 +78,8 @@ def test_a_pose_is_moved_on_for_half_a_second_and_then_held(fleet: Fleet, drones
     np.testing.assert_array_equal(fleet.truth().velocity_m_s[1], (0.0, 0.0, 0.0))
 
 
-def test_the_others_fly_to_the_same_bits_beside_it():
-    """Far away nothing acts: the simulated drones are those of a fleet without external ones."""
+def test_simulated_drones_fly_bit_identically_beside_an_external_one():
+    """Far away, external drones have no effect: the simulated drones fly as in a fleet without them."""
     plain, mixed = fleet_of("simulated", "simulated"), fleet_of("simulated", "external")
     led = ExternalDrones(mixed)
     for fleet in (plain, mixed):
@@ -92,7 +92,7 @@ def test_the_others_fly_to_the_same_bits_beside_it():
     assert [s for s in samples_of(plain) if s.drone == 0] == samples_of(mixed)
 
 
-def test_the_world_publishes_nothing_of_it():
+def test_the_world_publishes_nothing_about_external_drones():
     for bodies in (("simulated", "external"), ("external", "simulated", "external", "simulated")):
         fleet = fleet_of(*bodies)
         publication, simulated = GatePublication(fleet), {f"d{i}" for i, b in enumerate(bodies) if b == "simulated"}
@@ -105,7 +105,7 @@ def test_the_world_publishes_nothing_of_it():
             assert {key for key, _ in gate.decoded() if key.endswith("status")} == {keys.status(d) for d in simulated}
 
 
-def test_a_fleet_of_external_drones_alone_goes_on():
+def test_a_fleet_of_external_drones_alone_advances():
     fleet = fleet_of("external", "external")
     drones = ExternalDrones(fleet)
     GatePublication(fleet)
@@ -144,7 +144,7 @@ def test_stale_and_future_poses_are_refused(drones: ExternalDrones):
     assert drones.status(1) == status(now_ns)
 
 
-def test_rotors_are_taken_up_to_what_the_model_has(fleet: Fleet, drones: ExternalDrones):
+def test_rotor_speeds_are_clipped_to_the_limits_of_the_model(fleet: Fleet, drones: ExternalDrones):
     drones.take("d1", truth(0, rotors=(-5.0, 100.0, 503.0, 2000.0)), 0)
     advance(fleet, drones)
     np.testing.assert_array_equal(fleet.truth().rotor_rad_s[1], (0.0, 100.0, 503.0, 503.0))
@@ -173,19 +173,19 @@ KINDS = ("takeoff", "land", "reset", "velocity", "ardrone", "attitude", "rotors"
 
 
 @pytest.mark.parametrize("state", ALLOWED)
-def test_the_state_that_its_driver_publishes_decides_what_it_takes(drones: ExternalDrones, state: str):
+def test_the_state_the_driver_publishes_decides_which_commands_are_accepted(drones: ExternalDrones, state: str):
     drones.take("d1", status(0, state), 0)
     assert {kind for kind in KINDS if command_refusal(drones, kind) is None} == ALLOWED[state]
     assert command_refusal(drones, "emergency") is None
 
 
-def test_without_a_state_nothing_but_a_stop_is_handed_on(drones: ExternalDrones):
+def test_without_a_state_only_an_emergency_stop_is_accepted(drones: ExternalDrones):
     for kind in KINDS:
         assert has_terms(command_refusal(drones, kind) or "", "d1", "driver.d1")
     assert command_refusal(drones, "emergency") is None
 
 
-def test_a_setpoint_that_does_not_fit_is_refused(drones: ExternalDrones):
+def test_a_setpoint_that_does_not_fit_the_drone_is_refused(drones: ExternalDrones):
     drones.take("d1", status(0), 0)
     six = RotorSpeeds(0, 0, "x", (300.0,) * 6)
     none = Attitude(0, 0, "x", (0.0, 0.0, 0.0, 0.0), 4.0, 0.0)
@@ -193,7 +193,7 @@ def test_a_setpoint_that_does_not_fit_is_refused(drones: ExternalDrones):
     assert has_terms(drones.command_refusal(1, "attitude", none) or "", "quaternion")
 
 
-def test_another_takes_over_what_the_drivers_have_published(fleet: Fleet, drones: ExternalDrones):
+def test_a_restored_fleet_keeps_what_the_drivers_published(fleet: Fleet, drones: ExternalDrones):
     drones.take("d1", truth(0), 0)
     drones.take("d1", status(0), 0)
     advance(fleet, drones, 3)

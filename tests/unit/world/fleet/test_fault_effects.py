@@ -1,4 +1,4 @@
-"""What each fault does to sensors, rotors and air is what it says: measured on a fleet beside its sound twin."""
+"""Effects of each fault on sensors, rotors and air, measured on a fleet against a twin without faults."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ SENSORS = {
     "sonar": {"range_m": {"noise": 0.002, "bias": 0.001}, "min_m": 0.0, "max_m": 20.0},
     "flow": {"velocity_m_s": WHITE},
 }
-# kind's first word: sensor, the values of a sample that it is about, its bias and what that is in the values' unit
+# first word of the kind: (sensor, affected values of a sample, parameters of a bias, bias in the unit of the values)
 CHANNELS: dict[str, tuple[str, slice, dict[str, Any], Any]] = {
     "accel": ("imu", slice(0, 3), {"value_m_s2": [0.1, -0.2, 0.3]}, [0.1, -0.2, 0.3]),
     "gyro": ("imu", slice(3, 6), {"value_deg_s": [1, 2, -3]}, np.radians([1, 2, -3])),
@@ -60,7 +60,7 @@ def values(flying: Fleet, name: str, gates: int, drone: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("word", CHANNELS)
-def test_a_bias_is_added_and_taken_away_again(word: str):
+def test_a_bias_is_added_and_removed_again(word: str):
     name, which, given, bias = CHANNELS[word]
     sound, faulty = fleet(), fleet()
     faulty.impairment.strike([fault(f"{word}_bias", **given)])
@@ -72,7 +72,7 @@ def test_a_bias_is_added_and_taken_away_again(word: str):
 
 @pytest.mark.parametrize("word", CHANNELS)
 def test_noise_grows_by_its_factor(word: str):
-    """The difference between three and five times the noise is that between once and three times, sample by sample."""
+    """From three to five times the noise, each sample changes by as much as from one to three times."""
     name, which, _, _ = CHANNELS[word]
     thrice, five, sound = fleet(), fleet(), fleet()
     thrice.impairment.strike([fault(f"{word}_noise", factor=3)])
@@ -85,7 +85,7 @@ def test_noise_grows_by_its_factor(word: str):
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_a_stuck_sensor_gives_the_first_sample_after_the_start_again(name: str):
+def test_a_stuck_sensor_repeats_its_first_sample_after_the_start(name: str):
     flying = fleet()
     before = values(flying, name, 60)
     assert len(np.unique(before, axis=0)) > 1
@@ -99,7 +99,7 @@ def test_a_stuck_sensor_gives_the_first_sample_after_the_start_again(name: str):
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_the_other_drone_and_what_comes_after_are_as_without(name: str):
+def test_a_fault_changes_neither_the_other_drone_nor_later_samples(name: str):
     sound, faulty = fleet(), fleet()
     faulty.impairment.strike([fault(f"{name}_stuck"), fault(f"{name}_dropout", number=2, probability=0.5)])
     for drone in (1, 1):
@@ -109,7 +109,7 @@ def test_the_other_drone_and_what_comes_after_are_as_without(name: str):
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_a_dropout_loses_its_share_of_samples(name: str):
+def test_a_dropout_loses_samples_at_its_probability(name: str):
     flying, gates = fleet(), 3000
     expected = len(samples(flying, name, gates))
     flying.impairment.strike([fault(f"{name}_dropout", probability=0.3)])
@@ -122,7 +122,7 @@ def test_a_dropout_loses_its_share_of_samples(name: str):
     assert len(samples(flying, name, gates)) == expected
 
 
-def test_dropouts_compose_with_each_other_and_with_the_scenario_s():
+def test_dropouts_combine_with_each_other_and_with_the_scenario_s():
     flying = fleet(sensors={"preset": "paper", "baro": {"dropout": 0.2}})
     rate = 25 * 0.02
     both = [fault("baro_dropout", probability=0.5), fault("baro_dropout", number=2, probability=0.5)]
@@ -141,19 +141,19 @@ def hovering() -> Fleet:
 
 
 @pytest.mark.parametrize("rotor", range(4))
-def test_a_weak_rotor_gives_its_share_of_the_thrust(rotor: int):
-    """A rotor's thrust is as its speed squared: of a commanded speed, the rotor has the root of the share."""
+def test_a_weak_rotor_produces_its_share_of_the_thrust(rotor: int):
+    """Thrust grows with the square of the speed, so the rotor runs at the commanded speed times the root of the share."""
     flying, share = hovering(), 0.6
     flying.impairment.strike([fault("rotor_efficiency", rotor=ROTORS[rotor], value=share)])
     assert flying.set_rotors(0, (300.0,) * 4) is None
-    for _ in range(10):  # a fifth of a second: before the firmware finds itself overturned, and cuts the motors
+    for _ in range(10):  # 0.2 s, before the firmware detects that the drone has overturned and cuts the motors
         flying.advance()
     speeds = flying.truth().rotor_rad_s[0]
     assert speeds[rotor] ** 2 / 300.0**2 == pytest.approx(share, rel=0.01)
     assert np.delete(speeds, rotor) == pytest.approx([300.0] * 3, rel=0.01)
 
 
-def test_weak_rotors_compose():
+def test_efficiencies_of_a_rotor_multiply():
     flying = hovering()
     weak = [
         fault("rotor_efficiency", rotor="all", value=0.9),
@@ -165,7 +165,7 @@ def test_weak_rotors_compose():
     assert flying.boards.actuator[0, 1:5] ** 2 == pytest.approx([0.9] * 4)
 
 
-def test_a_stuck_rotor_turns_as_told_or_on_as_it_turned_when_the_fault_began():
+def test_a_stuck_rotor_keeps_the_given_speed_or_that_at_the_start():
     flying = hovering()
     flying.impairment.strike([fault("rotor_stuck", rotor="front_left", speed_rad_s=150.0)])
     for _ in range(10):
@@ -178,7 +178,7 @@ def test_a_stuck_rotor_turns_as_told_or_on_as_it_turned_when_the_fault_began():
     flying.set_rotors(0, (400.0,) * 4)
     for _ in range(10):
         flying.advance()
-    flying.impairment.strike([stuck, fault("mag_stuck", number=2)])  # another one begins meanwhile
+    flying.impairment.strike([stuck, fault("mag_stuck", number=2)])  # another fault begins in the meantime
     for _ in range(10):
         flying.advance()
     speeds = flying.truth().rotor_rad_s[0]
@@ -186,7 +186,7 @@ def test_a_stuck_rotor_turns_as_told_or_on_as_it_turned_when_the_fault_began():
     assert speeds[:3] == pytest.approx([400.0] * 3, rel=1e-3)
 
 
-def test_a_gust_is_one_minus_cosine_upon_the_steady_wind():
+def test_a_gust_adds_a_one_minus_cosine_profile_to_the_steady_wind():
     flying = fleet()
     blow = planned({"kind": "gust", "target": "world", "for_s": 2.0, "velocity_m_s": [0, 4, 0]}, 1, "t", 0, GATE_NS)
     flying.impairment.strike([blow])

@@ -1,4 +1,4 @@
-"""Requests, commands and joins that repeat without end: counted to the last, published up to a bound, never done unpublished."""
+"""Floods of requests, commands and joins: all are counted, but events are limited, and no change goes unpublished."""
 
 from collections import Counter
 
@@ -15,7 +15,7 @@ from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest, Done,
 from zsim_world.run.outbox import CHANGES_MAX, EVENTS_MAX, REASONS_MAX, REFUSED_MAX, STRANGERS_MAX, UNJOINED, RefusalLog
 from zsim_world.run.world import World
 
-FLOOD = 5000  # requests, several times what is published
+FLOOD = 5000  # number of requests, several times what is published
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def kinds(world: World) -> dict[str, int]:
     return Counter(event.kind for event in events(world))
 
 
-def test_refused_requests_are_events_as_often_as_other_refusals(world: World) -> None:
+def test_refused_requests_are_limited_like_other_refusals(world: World) -> None:
     for _ in range(FLOOD):
         assert not ask(world, "resume").ok
     assert len(events(world)) == EVENTS_MAX
@@ -59,14 +59,14 @@ def test_refused_requests_are_events_as_often_as_other_refusals(world: World) ->
     assert [event.subject for event in events(world)] == ["release"]
 
 
-def test_requests_about_time_are_done_when_they_are_events_no_more(world: World) -> None:
+def test_clock_requests_are_carried_out_beyond_the_limit_of_events(world: World) -> None:
     for number in range(FLOOD):
         assert ask(world, "rate", value=number % 7).ok
     assert len(events(world)) == CHANGES_MAX
     assert world.clock.rate == (FLOOD - 1) % 7
 
 
-def test_what_changes_the_flight_is_an_event_or_is_refused_and_every_gate_allows_one_more(world: World) -> None:
+def test_flight_changes_beyond_the_limit_are_refused_with_one_more_per_gate(world: World) -> None:
     answers = [ask(world, op, drone="d1") for _ in range(FLOOD // 2) for op in ("acquire", "release")]
     done = [event for event in events(world) if event.data["ok"]]
     assert sum(answer.ok for answer in answers) == len(done) == CHANGES_MAX
@@ -79,7 +79,7 @@ def test_what_changes_the_flight_is_an_event_or_is_refused_and_every_gate_allows
 
 
 @pytest.mark.parametrize("period_ns", [0, GATE_NS])
-def test_a_process_joins_and_leaves_so_often_only(world: World, period_ns: int) -> None:
+def test_joins_and_leaves_of_a_process_are_limited(world: World, period_ns: int) -> None:
     for number in range(FLOOD):
         join(world, "console.x", period_ns, incarnation=number)
         leave(world, "console.x", number)
@@ -87,7 +87,7 @@ def test_a_process_joins_and_leaves_so_often_only(world: World, period_ns: int) 
     assert world.result()["refused"] == FLOOD - CHANGES_MAX
 
 
-def test_a_process_takes_its_own_place_so_often_only_unless_time_stands_for_it(world: World) -> None:
+def test_a_process_may_supersede_itself_only_so_often_unless_it_is_dead(world: World) -> None:
     first = Join(0, 0, "run1", 1, "estimator", "here", 1, GATE_NS)
     for number in range(FLOOD):
         world.handle(keys.process("estimator.d1", "join"), replace(first, incarnation=1 + number), 0)
@@ -97,7 +97,7 @@ def test_a_process_takes_its_own_place_so_often_only_unless_time_stands_for_it(w
     assert kinds(world) == {"death": 1, "restart": 1}
 
 
-def test_modes_of_who_gates_are_events_up_to_a_bound_and_all_of_them_are_done(world: World) -> None:
+def test_mode_commands_of_a_gating_process_are_all_carried_out(world: World) -> None:
     join(world, "me.x", GATE_NS)
     events(world)
     for number in range(FLOOD):
@@ -111,7 +111,7 @@ def test_modes_of_who_gates_are_events_up_to_a_bound_and_all_of_them_are_done(wo
     assert world.fleet.status(0)[0] == "emergency"
 
 
-def test_outputs_that_a_process_counts_and_never_publishes_are_events_up_to_a_bound(world: World) -> None:
+def test_events_about_outputs_never_published_are_limited(world: World) -> None:
     join(world, "me.x", GATE_NS)
     events(world)
     for number in range(2 * CHANGES_MAX):
@@ -121,7 +121,7 @@ def test_outputs_that_a_process_counts_and_never_publishes_are_events_up_to_a_bo
     assert world.result()["events_left_out"] == CHANGES_MAX
 
 
-def test_a_command_of_who_does_not_gate_is_an_event_or_is_refused(world: World) -> None:
+def test_a_command_of_a_process_that_does_not_gate_is_an_event_or_refused(world: World) -> None:
     for seq in range(FLOOD):
         command(world, "me.x", seq)
     assert kinds(world) == {"command": CHANGES_MAX, "refused": EVENTS_MAX}
@@ -134,7 +134,7 @@ def test_a_command_of_who_does_not_gate_is_an_event_or_is_refused(world: World) 
     assert kinds(world) == {"command": 1}
 
 
-def test_other_names_allow_those_who_have_not_joined_so_many_commands_only(world: World) -> None:
+def test_commands_under_new_names_that_have_not_joined_are_limited(world: World) -> None:
     join(world, "me.x")
     events(world)
     for number in range(4 * UNJOINED * CHANGES_MAX):
@@ -145,7 +145,7 @@ def test_other_names_allow_those_who_have_not_joined_so_many_commands_only(world
 
 
 @pytest.mark.parametrize("period_ns", [0, GATE_NS])
-def test_newcomers_join_so_often_only_all_names_together(world: World, period_ns: int) -> None:
+def test_joins_of_newcomers_are_limited_over_all_names(world: World, period_ns: int) -> None:
     for number in range(FLOOD):
         join(world, f"console.{number}", run_id="another")
         join(world, f"console.{number}", period_ns)
@@ -159,7 +159,7 @@ def test_newcomers_join_so_often_only_all_names_together(world: World, period_ns
     assert kinds(world) == {"join": 3, "leave": 1}
 
 
-def test_every_second_allows_one_newcomer_more_and_a_continued_run_has_spent_as_much(world: World) -> None:
+def test_each_second_allows_one_more_newcomer_and_a_continued_run_agrees(world: World) -> None:
     for number in range(FLOOD):
         join(world, f"console.{number}")
     events(world)
@@ -175,7 +175,7 @@ def test_every_second_allows_one_newcomer_more_and_a_continued_run_has_spent_as_
     assert kinds(world) == {"join": 1, "refused": 1}
 
 
-def test_refusals_of_all_sources_together_and_joins_that_nobody_is_behind_are_so_many_events(world: World) -> None:
+def test_refusals_and_forged_joins_are_limited_over_all_sources(world: World) -> None:
     for number in range(FLOOD):
         world.falsely_joined(f"x.{number}", Join(0, 0, "run1", 1, "x", "here", 1, GATE_NS), "no token")
     assert kinds(world) == {"no_show": STRANGERS_MAX}
@@ -194,7 +194,7 @@ def refusals() -> RefusalLog:
     return RefusalLog(lambda: 0)
 
 
-def test_the_first_of_each_are_events_and_all_are_counted(refusals: RefusalLog):
+def test_the_first_refusals_of_a_source_are_events_and_all_are_counted(refusals: RefusalLog):
     texts = [refusals.add("a.one", MODE, "too late") for _ in range(EVENTS_MAX + 5)]
     assert texts[0] == f"{MODE}: too late"
     assert has_terms(texts[EVENTS_MAX - 1] or "", MODE, "too late", "counted")
@@ -203,13 +203,13 @@ def test_the_first_of_each_are_events_and_all_are_counted(refusals: RefusalLog):
     assert refusals.count == EVENTS_MAX + 6
 
 
-def test_a_new_reason_is_an_event_after_many_of_another(refusals: RefusalLog):
+def test_a_new_reason_is_an_event_even_after_many_of_another(refusals: RefusalLog):
     ages = [refusals.add("a.one", MODE, f"age is {500.5 + age} ms; must be <= 500 ms") for age in range(2 * EVENTS_MAX)]
     assert len([text for text in ages if text]) == EVENTS_MAX
     assert refusals.add("a.one", MODE, "landed") == f"{MODE}: landed"
 
 
-def test_ever_new_reasons_do_not_make_events_for_ever(refusals: RefusalLog):
+def test_events_about_ever_new_reasons_are_limited(refusals: RefusalLog):
     texts = [refusals.add("a.one", MODE, "x" * length) for length in range(1, 1 + 100 * EVENTS_MAX)]
     assert len([text for text in texts if text]) == REASONS_MAX + EVENTS_MAX
     assert refusals.count == 100 * EVENTS_MAX

@@ -1,4 +1,4 @@
-"""Scans of a fleet against closed forms: directions, errors, other drones, instants, and what is lost."""
+"""Scans of a fleet against closed forms: directions, errors, other drones, sample times and losses."""
 
 import math
 from typing import Any
@@ -22,7 +22,7 @@ EXACT = {"noise_m": 0, "noise_share": 0, "noise_1_m": 0, "bias_m": 0}
 
 
 def fleet(*places: tuple[float, ...], obstacles: Any = (WALL,), **sensors: Any) -> Fleet:
-    """Return drones that stand, or fall, at these places; scanners are exact unless told otherwise."""
+    """Return drones that stand at, or fall from, these places; scanners are exact unless configured otherwise."""
     scanners = {name: EXACT | each if name in SCANNERS else each for name, each in sensors.items()}
     document: dict[str, Any] = {
         "name": "scans",
@@ -37,22 +37,22 @@ def fleet(*places: tuple[float, ...], obstacles: Any = (WALL,), **sensors: Any) 
 
 
 def taken(fleet: Fleet, kind: Any, drone: int = 0) -> Any:
-    """Return the message of a kind of the last gate, as readers get it."""
+    """Return the last gate's message of a kind, as readers receive it."""
     (scan,) = (each for each in fleet.seen.values() if each.drone == drone and isinstance(each.message(0), kind))
     key = f"drone/d{drone}/sensor/{scan.sensor}"
     return messages.decode(key, messages.encode(scan.message(0)))
 
 
-def test_beams_of_a_turned_drone():
-    """Its front is to the left of W, so the wall is to its right; the beam up meets nothing."""
+def test_beams_of_a_turned_drone_find_the_wall():
+    """The drone faces north, so the wall in the east is to its right; the upward beam meets nothing."""
     made = fleet((0, 0, 0, 90.0), range={"max_m": 8, "mount": {"position_m": [0, 0, 0.3]}})
     message = taken(made, Range)
     assert message.beams == ("back", "front", "left", "right", "up")
     np.testing.assert_allclose(message.ranges_m, [0, 0, 0, 5.0, 0], atol=1e-6)
 
 
-def test_a_beam_begins_at_its_mount_and_a_cone_finds_what_is_beside_its_axis():
-    """A post of 1 cm, 0.2 m beside the axis 4 m ahead, is 2.86 deg off."""
+def test_a_beam_starts_at_its_mount_and_a_cone_covers_its_surroundings():
+    """The post has a radius of 1 cm and stands 4 m ahead, 0.2 m beside the axis."""
     post = {"name": "post", "shape": "cylinder", "position_m": [4, 0.2, 0], "radius_m": 0.01, "height_m": 3}
     ahead = {"beams": {"ahead": {"position_m": [1, 0, 0.5]}}, "max_m": 8}
     (far,) = taken(fleet((0, 0, 0), obstacles=[post, WALL], range=ahead), Range).ranges_m
@@ -62,7 +62,7 @@ def test_a_beam_begins_at_its_mount_and_a_cone_finds_what_is_beside_its_axis():
     assert near == pytest.approx(math.hypot(3.0, 0.2) - 0.01, abs=1e-4)
 
 
-def test_a_lidar_is_what_its_message_says_and_its_wall_is_flat():
+def test_a_lidar_shows_a_flat_wall_in_the_directions_of_its_message():
     settings = {"channels": 3, "columns": 90, "elevation_deg": [-10, 10], "azimuth_deg": [-45, 45], "max_m": 30}
     made = fleet((0, 0, 1), lidar=settings)
     message, truth = taken(made, Lidar), made.truth()
@@ -73,13 +73,13 @@ def test_a_lidar_is_what_its_message_says_and_its_wall_is_flat():
     assert message.azimuth_rad == pytest.approx((-math.pi / 4, math.radians(1.0)))
 
 
-def test_a_depth_image_is_flat_where_the_wall_is_and_its_pixels_are_the_camera_s():
+def test_a_depth_image_of_a_wall_is_flat_and_has_the_camera_s_geometry():
     camera = {"mount": {"position_m": [0, 0, 3]}}
     made = fleet((0, 0, 0), front_camera=camera, depth={"columns": 16, "rows": 9, "max_m": 8})
     message = taken(made, Depth)
-    np.testing.assert_allclose(message.depths()[:5], 5.0, atol=1e-5)  # its upper half: depth, not distance
+    np.testing.assert_allclose(message.depths()[:5], 5.0, atol=1e-5)  # upper half: depth, not distance
     assert message.centre_px == pytest.approx((7.5, 4.0))
-    # tan of half the diagonal of 92 deg, over 16 x 9 pixels
+    # from half of the 92 deg across the diagonal of 16 x 9 pixels
     assert message.focal_px == pytest.approx(2 * (math.hypot(16, 9) / 2 / math.tan(math.radians(46)),))
 
 
@@ -90,7 +90,7 @@ def test_drones_see_each_other_and_not_themselves():
     assert nothing == 0.0
 
 
-def test_nothing_comes_back_from_beyond_or_below_the_range():
+def test_nothing_is_measured_outside_the_range_limits():
     for limits in ({"max_m": 4.99}, {"min_m": 5.01, "max_m": 8}):
         assert taken(fleet((0, 0, 0), range={"beams": {"a": {}}} | limits), Range).ranges_m == (0.0,)
 
@@ -98,8 +98,8 @@ def test_nothing_comes_back_from_beyond_or_below_the_range():
 @pytest.mark.parametrize(
     ("errors", "sigma"), [({"noise_m": 0.05}, 0.05), ({"noise_share": 0.02}, 0.1), ({"noise_1_m": 0.004}, 0.1)]
 )
-def test_noise_is_that_of_the_settings(errors: dict[str, float], sigma: float):
-    """Of 4000 beams at 5 m: sigma within 4 standard errors, no mean."""
+def test_noise_has_the_configured_sigma(errors: dict[str, float], sigma: float):
+    """For 4000 beams at 5 m, sigma and mean are within 4 standard errors."""
     rate = {"beams": {f"b{i}": {"position_m": [0, 0, 1]} for i in range(50)}, "max_m": 8, "rate_hz": 50}
     made, seen = fleet((0, 0, 0), range=rate | errors), []
     for _ in range(80):
@@ -109,7 +109,7 @@ def test_noise_is_that_of_the_settings(errors: dict[str, float], sigma: float):
     assert np.mean(seen) == pytest.approx(5.0, abs=4 * sigma / math.sqrt(len(seen)))
 
 
-def test_a_bias_is_of_the_sensor_and_a_quantum_of_each_reading():
+def test_a_bias_is_common_to_the_beams_and_a_quantum_rounds_each_reading():
     several = {"beams": {"a": {}, "b": {"position_m": [1, 0, 0]}}, "max_m": 8}
     first, second = taken(fleet((0, 0, 0), range=several | {"bias_m": 0.1}), Range).ranges_m
     assert first - second == pytest.approx(1.0, abs=1e-6)
@@ -118,7 +118,7 @@ def test_a_bias_is_of_the_sensor_and_a_quantum_of_each_reading():
     assert rounded == 5.0
 
 
-def test_rays_and_messages_are_lost_as_often_as_told():
+def test_rays_and_messages_are_lost_at_the_configured_rates():
     beams = {f"b{i}": {} for i in range(40)}
     missed = {"beams": beams, "max_m": 8, "rate_hz": 50, "miss": 0.25}
     made, lost = fleet((0, 0, 0), range=missed), 0
@@ -133,8 +133,8 @@ def test_rays_and_messages_are_lost_as_often_as_told():
     assert kept / 400 == pytest.approx(0.5, abs=4 * math.sqrt(0.25 / 400))
 
 
-def test_a_sample_between_two_gates_is_of_its_instant_and_late_by_its_latency():
-    """A drone that falls from 30 m: the beam down measures the height at t_sample_ns, published 30 ms later."""
+def test_a_sample_is_measured_at_its_instant_and_delayed_by_its_latency():
+    """The drone falls from 30 m; its downward beam measures the height at t_sample_ns, published 30 ms later."""
     down = {"beams": {"down": {"rpy_deg": [0, 90, 0]}}, "max_m": 50, "rate_hz": 1000 / 30, "latency_ms": 30}
     made, heights, seen = fleet((0, 0, 30), obstacles=(), range=down), {}, {}
     for _ in range(20):
@@ -150,7 +150,7 @@ def test_a_sample_between_two_gates_is_of_its_instant_and_late_by_its_latency():
         assert height == pytest.approx(expected, abs=1e-3)
 
 
-def test_a_restored_fleet_scans_on_to_the_same_bits():
+def test_a_restored_fleet_scans_on_bit_identically():
     settings = {"noise_m": 0.1, "miss": 0.1, "latency_ms": 15, "rate_hz": 40}
     made, other = (fleet((0, 0, 1), lidar=settings) for _ in range(2))
     for _ in range(5):
@@ -162,8 +162,8 @@ def test_a_restored_fleet_scans_on_to_the_same_bits():
         assert [each.message(0) for each in other.seen.values()] == [each.message(0) for each in made.seen.values()]
 
 
-def test_a_first_scan_that_is_larger_than_all_other_messages_is_published_whole():
-    """It was written behind the end of the buffer once."""
+def test_a_first_scan_larger_than_all_other_messages_is_published_whole():
+    """The scan must not be written beyond the end of the buffer."""
     made = fleet((0, 0, 1), (3, 0, 1), lidar={"channels": 64, "columns": 360})
     gate = GatePublication(made).gate([None, None])
     sizes = [len(payload) for key, payload in gate.pairs if key.endswith("/lidar")]
@@ -171,7 +171,7 @@ def test_a_first_scan_that_is_larger_than_all_other_messages_is_published_whole(
     assert min(sizes) > 64 * 360 * 4
 
 
-def test_faults_lose_messages_and_shift_distances_of_one_sensor_and_end() -> None:
+def test_dropout_and_bias_faults_affect_one_sensor_and_end() -> None:
     made = fleet((0, 0, 0), (0, 3, 0), range={"beams": {"ahead": {}}, "max_m": 8, "rate_hz": 50})
     made.advance()
 
@@ -192,7 +192,7 @@ def test_faults_lose_messages_and_shift_distances_of_one_sensor_and_end() -> Non
     assert ahead() == pytest.approx([5.0, 5.0], abs=1e-3)
 
 
-def test_a_fault_multiplies_the_noise_of_one_sensor_or_gives_its_first_message_again_and_again() -> None:
+def test_noise_and_stuck_faults_affect_one_sensor_and_end() -> None:
     noisy = {"beams": {"ahead": {}}, "max_m": 8, "rate_hz": 50, "noise_m": 0.01}
     readings = {}
     for kind, values in {"": {}, "range_noise": {"factor": 3.0}, "range_stuck": {}}.items():

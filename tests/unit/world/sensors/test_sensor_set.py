@@ -1,4 +1,4 @@
-"""Each sensor's truth to measurement, with lever arms and turned mounts; sonar and flow over a table or a drone."""
+"""Ideal measurements of each sensor with lever arms and turned mounts; sonar and flow over a table or a drone."""
 
 import math
 from typing import Any
@@ -37,7 +37,7 @@ SITE = Site(9.8, (0.0, 20.0, -10.0))
 
 
 def body(p=NOWHERE, v=STILL, q=STRAIGHT, w=STILL, a=STILL, alpha=STILL):
-    """Return the truth of a drone; whole numbers as floats, as compiled code has them."""
+    """Return the truth of a drone, with whole numbers as floats, which compiled code requires."""
     vectors: Any = [tuple(map(float, each)) for each in (p, v, q, w, a, alpha)]
     return BodyTruth(*vectors)
 
@@ -52,7 +52,7 @@ def turn(roll=0.0, pitch=0.0, yaw=0.0):
 
 LEFT = turn(yaw=math.pi / 2)
 SINE, COSINE = 9.8 * math.sin(0.1), 9.8 * math.cos(0.1)
-# sensor, truth, mount, values worked out by hand
+# name: (sensor, truth, mount, values calculated by hand)
 CASES: dict[str, tuple[Any, BodyTruth, MountedSensor, Any]] = {
     "at rest, gravity is felt upwards": (imu, body(), mounted((0.1, 0.2, 0.3)), ((0, 0, 9.8), STILL)),
     # a real landed packet: theta +2.97 deg, accel x +80 mg
@@ -99,7 +99,7 @@ def test_a_sensor_measures_what_its_mount_is_exposed_to(name: str):
     # ISO 2533, table of the standard atmosphere (geopotential heights)
     [(0, 101325.0), (1000, 89874.6), (2000, 79495.2), (5000, 54019.9), (11000, 22632.0)],
 )
-def test_pressure_of_the_standard_atmosphere(altitude, pascals):
+def test_pressure_follows_the_standard_atmosphere(altitude, pascals):
     assert pressure(altitude) == pytest.approx(pascals, rel=2e-4)
 
 
@@ -130,7 +130,7 @@ HEIGHT_M, SPEED_M_S = 2.5, 1.0
 
 
 def samples(sensor: int, x_m: float, obstacles: Any = (TABLE, BALL), surfaces: Any = (), **sensors: Any) -> np.ndarray:
-    """Return what a sensor says of a drone that is level 2.5 m over x_m and moves east, without noise."""
+    """Return a noise-free sample of a level drone 2.5 m above the ground at x_m that moves east."""
     sections = {"sonar": {"range_m": EXACT}, "flow": {"velocity_m_s": EXACT}}
     document: dict[str, Any] = {
         "name": "over",
@@ -155,21 +155,21 @@ def samples(sensor: int, x_m: float, obstacles: Any = (TABLE, BALL), surfaces: A
     [(0.0, 1.0), (0.9, 1.0), (1.1, 0.0), (5.0, 1.5), (-5.0, 0.0)],
     ids=["middle", "inside", "beside", "ball", "far"],
 )
-def test_a_sonar_measures_to_what_is_below(x_m: float, top_m: float):
-    """Within 3 cm: it falls and moves for at most 40 ms until the sample, 8 mm and 4 cm."""
+def test_a_sonar_measures_the_distance_to_the_surface_below(x_m: float, top_m: float):
+    """Within 3 cm, since the drone falls 8 mm and moves 4 cm in the up to 40 ms until the sample."""
     distance, valid = samples(SONAR, x_m)[:2]
     assert distance == pytest.approx(HEIGHT_M - top_m, abs=0.03)
     assert valid == 1.0
 
 
-def test_a_sonar_hears_a_table_that_is_nearer_than_its_range_though_the_ground_is_not():
+def test_a_sonar_detects_a_table_in_range_above_ground_out_of_range():
     low = samples(SONAR, 0.0, sonar={"max_m": 2.0})[:2]
     assert low[0] == pytest.approx(1.5, abs=0.03)
     assert low[1] == 1.0
     assert samples(SONAR, 3.0, sonar={"max_m": 2.0})[1] == 0.0
 
 
-def test_over_the_bare_ground_the_bits_are_those_without_obstacles():
+def test_obstacles_elsewhere_do_not_change_the_bits_over_bare_ground():
     for sensor in (SONAR, FLOW):
         np.testing.assert_array_equal(samples(sensor, 3.0), samples(sensor, 3.0, obstacles=[]))
 
@@ -179,14 +179,14 @@ def test_over_the_bare_ground_the_bits_are_those_without_obstacles():
     [(0.0, 0.0, 1.0), (0.0, 1.3, 2.5 / 1.5), (1.3, 0.0, 1.5 / 2.5)],
     ids=["both over the table", "sonar beside it", "camera beside it"],
 )
-def test_flow_is_right_where_both_see_one_surface(camera_m: float, sonar_m: float, ratio: float):
+def test_flow_is_right_where_camera_and_sonar_see_the_same_surface(camera_m: float, sonar_m: float, ratio: float):
     mounts = {"flow": {"mount": {"position_m": [camera_m, 0, 0]}}, "sonar": {"mount": {"position_m": [sonar_m, 0, 0]}}}
     ahead = samples(FLOW, 0.0, **mounts)[0]
     level = samples(FLOW, 0.0, obstacles=[], **mounts)[0]
     assert ahead / level == pytest.approx(ratio, rel=0.01)
 
 
-def test_a_sonar_measures_to_a_surface_too():
+def test_a_sonar_detects_a_surface():
     plane = packed(np.array([[-9.0, -9.0, 1.2, 9.0, -9.0, 1.2, 0.0, 9.0, 1.2]]))
     surface = {"name": "deck", "triangles": plane}
     assert samples(SONAR, 3.0, surfaces=[surface])[0] == pytest.approx(HEIGHT_M - 1.2, abs=0.03)
@@ -206,11 +206,11 @@ BELOW = {"sonar": {"range_m": EXACT}, "flow": {"velocity_m_s": EXACT}}
 def over_a_drone(
     sensor: int, height_m: float, aside_m: float = 0.0, speed_m_s: float = 0.0, yaw_deg: float = 0.0, **more: Any
 ) -> np.ndarray:
-    """Return what a level drone that moves east at 1 m/s, 4 m over the ground, says of another that moves east too.
+    """Return a sample of a level drone that moves east at 1 m/s, 4 m above the ground, near another that also moves east.
 
     Args:
-        height_m: of the other, whose speed [m/s] is `speed_m_s` and which is `aside_m` north.
-        yaw_deg: heading of the first.
+        height_m: height of the other drone, which moves at `speed_m_s` and is `aside_m` further north.
+        yaw_deg: heading of the first drone.
     """
     document: dict[str, Any] = {
         "name": "below",
@@ -236,13 +236,13 @@ def over_a_drone(
     [(2.0, 0.0, 2.0 - 0.065), (2.0, 0.24, 2.0 - 0.025), (2.0, 0.28, 4.0), (5.0, 0.0, 4.0)],
     ids=["middle", "near its edge", "beside", "above"],
 )
-def test_a_sonar_hears_the_hull_of_a_drone_below(height_m: float, aside_m: float, range_m: float):
-    """A hull is 0.26 m wide and a quarter as high; both drones fall alike."""
+def test_a_sonar_detects_the_hull_of_a_drone_below(height_m: float, aside_m: float, range_m: float):
+    """A hull has a radius of 0.26 m and a quarter of that as half height; both drones fall alike."""
     assert over_a_drone(SONAR, height_m, aside_m)[0] == pytest.approx(range_m, abs=0.01)
 
 
-def test_flow_is_that_against_a_hull_which_covers_the_picture_and_else_that_of_the_ground():
-    """At 0.6 m a hull covers most of it, at 1.2 m a quarter; the sonar measures to the hull both times."""
+def test_flow_is_relative_to_a_hull_that_fills_the_picture_or_to_the_ground():
+    """At 0.6 m a hull covers most of the picture, at 1.2 m a quarter; the sonar measures to the hull in both cases."""
     alone = over_a_drone(FLOW, 4.0, aside_m=3.0)[0]
     assert over_a_drone(FLOW, 3.4, speed_m_s=0.25)[0] == pytest.approx(alone - 0.25, abs=0.01)
     north = over_a_drone(FLOW, 3.4, speed_m_s=0.25, yaw_deg=90.0)
@@ -251,8 +251,8 @@ def test_flow_is_that_against_a_hull_which_covers_the_picture_and_else_that_of_t
     assert over_a_drone(FLOW, 2.8, speed_m_s=0.25)[0] == pytest.approx(alone * share, abs=0.01)
 
 
-def test_every_drone_that_a_beam_can_meet_has_been_noted_and_those_beside_have_not():
-    """Of 30 drones in a cube of 5 m, tilted by up to 60 deg, moved by less than makes them be looked for again."""
+def test_every_drone_that_has_another_in_its_beam_is_flagged():
+    """30 drones in a cube of 5 m, tilted by up to 60 deg, move by less than triggers a new search for neighbours."""
     rng, names = np.random.default_rng(1), [f"d{i}" for i in range(30)]
     mount = {"mount": {"position_m": [0.3, 0, -0.1]}}
     document: dict[str, Any] = {

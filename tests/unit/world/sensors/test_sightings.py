@@ -1,4 +1,4 @@
-"""Sightings: which hats are in view, when pictures are taken, their errors, and that chance goes on where it was."""
+"""Sightings: which hats are in view, when pictures are taken, their errors, and snapshots of the random state."""
 
 import math
 from pathlib import Path
@@ -42,7 +42,7 @@ def scenario(*fields: str) -> Scenario:
 
 
 def still() -> NDArray[np.float64]:
-    """Return the states of three drones that stand in the air; the first sees the others."""
+    """Return the states of three drones at rest in the air, of which the first sees the others."""
     state = np.zeros((3, 13))
     state[:, :3] = [(0, 0, 5), (4, 0.5, 5), (4, -0.5, 5)]
     state[:, 6] = 1.0
@@ -62,18 +62,18 @@ def of(sightings: list[PictureSightings], drone: int) -> list[PictureSightings]:
     return [sighting for sighting in sightings if sighting.drone == drone]
 
 
-def test_pictures_are_taken_at_the_camera_s_rate_between_gates_and_come_with_its_latency():
+def test_pictures_are_taken_at_the_camera_rate_and_arrive_with_its_latency():
     sightings = of(sampled(made("sensors.front_camera.latency_ms=50", "sensors.sightings.latency_ms=7"), range(51)), 0)
     assert [each.t_sample_ns for each in sightings] == [round(n * 1e9 / 15) for n in range(15)]
     assert {each.t_ns - each.t_sample_ns for each in sightings} == {57_000_000}
 
 
-def test_who_looks_away_sees_nobody_and_says_so():
+def test_a_drone_that_looks_away_publishes_empty_sightings():
     assert [len(each.seen) for each in of(sampled(made(), range(51)), 1)] == [0] * 16
 
 
 def errors(*fields: str) -> NDArray[np.float64]:
-    """Return what is seen of a drone, less what is there, in sigmas: range, direction to the left and up; (M, 3)."""
+    """Return the errors of the sightings of a drone in sigmas: range, direction to the left and upwards; (M, 3)."""
     rows = []
     for each in of(sampled(made(*fields, "environment.hats.covered=[d3]"), range(5000)), 0):
         for seen in each.seen:
@@ -89,19 +89,19 @@ def errors(*fields: str) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("fields", [(), ("environment.light=0.1",)], ids=["day", "dusk"])
-def test_the_errors_are_as_large_as_they_say(fields: tuple[str, ...]):
+def test_the_errors_match_the_reported_sigmas(fields: tuple[str, ...]):
     found = errors(*fields)
     count = len(found)
-    assert np.mean(found, 0) == pytest.approx([0, 0, 0], abs=4 / np.sqrt(count) + 0.15)  # ranges are a little skewed
+    assert np.mean(found, 0) == pytest.approx([0, 0, 0], abs=4 / np.sqrt(count) + 0.15)  # ranges are slightly skewed
     assert np.std(found, 0) == pytest.approx([1, 1, 1], rel=0.1)
 
 
-def test_misses_come_as_often_as_they_should():
+def test_misses_occur_at_the_configured_probability():
     sightings = of(sampled(made("sensors.sightings.miss=0.2"), range(5000)), 0)
     assert np.mean([len(each.seen) for each in sightings]) == pytest.approx(1.6, abs=0.06)
 
 
-def test_false_alarms_come_as_often_as_they_should_and_anywhere():
+def test_false_alarms_occur_at_the_configured_rate_all_over_the_picture():
     sightings = of(sampled(made("sensors.sightings.false_hz=3", "sensors.sightings.miss=1"), range(5000)), 0)
     seen = [each for sighting in sightings for each in sighting.seen]
     assert len(seen) / 100.0 == pytest.approx(3.0, abs=0.6)
@@ -109,7 +109,7 @@ def test_false_alarms_come_as_often_as_they_should_and_anywhere():
     assert y.min() < -0.5 < 0.5 < y.max()
 
 
-def test_what_is_seen_stands_from_left_to_right_whosever_it_is():
+def test_sightings_are_ordered_from_left_to_right_and_not_by_drone():
     swapped = still()
     swapped[[1, 2]] = swapped[[2, 1]]
     for state in (still(), swapped):
@@ -118,7 +118,7 @@ def test_what_is_seen_stands_from_left_to_right_whosever_it_is():
             assert lefts == sorted(lefts, reverse=True)
 
 
-def test_it_goes_on_from_a_snapshot():
+def test_sightings_continue_identically_from_a_snapshot():
     fields = ("sensors.sightings.false_hz=2", "sensors.front_camera.latency_ms=90")
     whole = sampled(made(*fields), range(200))
     first, second = made(*fields), made(*fields)
@@ -129,7 +129,7 @@ def test_it_goes_on_from_a_snapshot():
 
 
 HAT_B, DIAMETER_M, HULL_M = (-0.03, 0.0, 0.11), 0.14, 0.26
-LENS_B = (0.162, 0.0, 0.012)  # of the front camera
+LENS_B = (0.162, 0.0, 0.012)  # position of the lens of the front camera
 
 
 def pose(x: float, y: float, z: float, rpy_deg: tuple[float, float, float] = (0, 0, 0)) -> NDArray[np.float64]:
@@ -145,7 +145,7 @@ def look(
     obstacles: list[Obstacle] | None = None,
     triangles: list[list[tuple[float, float, float]]] | None = None,
 ) -> NDArray[np.float64]:
-    """Return what the front camera of the first drone has in view."""
+    """Return the table of what the front camera of the first drone has in view."""
     at, camera = camera_pose(FrontCamera()), FrontCamera()
     x, y, z = at.p_BK.tolist()
     w, i, j, k = at.q_BK
@@ -174,7 +174,7 @@ def test_a_hat_ahead_is_seen_where_it_is():
 
 @pytest.mark.parametrize(("yaw_deg", "seen"), [(0, 1), (40, 1), (42, 0), (-40, 1), (-42, 0), (180, 0)])
 def test_a_hat_is_seen_within_the_picture_s_width(yaw_deg: float, seen: int):
-    # 92 deg across the diagonal of 640 x 360 are 84.2 deg across the width, less than the hat itself; all level
+    # 92 deg across the diagonal of 640 x 360 are 84.2 deg across the width, less that of the hat itself; all is level
     view = look(
         [
             pose(
@@ -189,19 +189,19 @@ def test_a_hat_is_seen_within_the_picture_s_width(yaw_deg: float, seen: int):
     assert view[1, VIEW.seen] == seen
 
 
-def test_a_covered_hat_is_not_seen_and_a_false_one_is():
+def test_a_covered_hat_is_not_seen_but_a_ball_is():
     view = look([pose(0, 0, 5), pose(4, 0, 5)], balls=[(3.0, 1.0, 5.0)], bare=[True, False])
     assert view[:, VIEW.seen].tolist() == [0.0, 0.0, 1.0]
 
 
 @pytest.mark.parametrize(("height_m", "seen"), [(0.03, 0), (0.1, 0), (0.5, 1), (-0.5, 1)])
-def test_a_hull_in_between_hides_it(height_m: float, seen: int):
-    """The middle one stands in the line of sight, which rises by 0.1 m over 4 m, or over or under it."""
+def test_a_hull_in_between_hides_a_hat(height_m: float, seen: int):
+    """The middle drone is in the line of sight, which rises by 0.1 m over 4 m, or above or below it."""
     view = look([pose(0, 0, 5), pose(4, 0, 5), pose(2, 0, 5 + height_m)], bare=[True, True, False])
     assert view[1, VIEW.seen] == seen
 
 
-def test_its_own_hull_hides_a_hat_from_below():
+def test_a_hat_is_hidden_from_below_by_its_own_hull():
     view = look([pose(0, 0, 5, (0, -30, 0)), pose(0.8, 0, 6.5)])
     assert view[1, VIEW.seen] == 0.0
 
@@ -210,21 +210,21 @@ RIM_M = 1.15 * HULL_M, 0.14 * HULL_M  # radius and height of the rotors' rim
 
 
 @pytest.mark.parametrize("below_deg", [-10.0, 0.0, 4.0, 8.0, 12.0])
-def test_its_own_rotors_hide_a_hat_from_its_lower_edge_on(below_deg: float):
-    """A straight edge hides an arc of its edge, by the height of the rim's near edge over the hat's lower one."""
+def test_a_hat_is_hidden_from_its_lower_edge_upwards_by_its_own_rotors(below_deg: float):
+    """A straight edge hides an arc of the hat, set by the height of the rim's near edge above the hat's lower edge."""
     slope = math.tan(math.radians(below_deg))
     view = look([pose(-LENS_B[0], 0, 5 - LENS_B[2]), pose(4.0 - HAT_B[0], 0, 5 + 4.0 * slope - HAT_B[2])])
     hidden_m = RIM_M[1] + (RIM_M[0] + HAT_B[0]) * slope - (HAT_B[2] - DIAMETER_M / 2)
     cut = min(max(hidden_m / DIAMETER_M, 0.0), 1.0) if below_deg > 0 else 0.0
     arc = 1 - math.acos(1 - 2 * cut) / math.pi
-    beside = 2 / POINTS if cut else 0.0  # the points beside it are left out
+    beside = 2 / POINTS if cut else 0.0  # the points next to the hidden arc are left out
     row = view[1]
     assert row[VIEW.share] == pytest.approx(arc - beside, abs=2 / POINTS)
     assert (row[VIEW.centre] > 1.0, row[VIEW.radius] > 1.0) == (cut > 0, cut > 0)
 
 
-def test_an_edge_that_is_visible_to_a_half_tells_the_circle_as_least_squares_do():
-    """A wall hides the right half; of a circle through 15 points of 32 the errors are those of (A^T A)^-1."""
+def test_the_errors_of_a_half_visible_circle_are_those_of_least_squares():
+    """A wall hides the right half; the errors of a circle through 15 of 32 points are those of (A^T A)^-1."""
     wall = Obstacle(name="wall", shape="box", position_m=(2, -1.0001, 0), size_m=(0.01, 2, 20))
     view = look([pose(0, 0, 5), pose(4, 0, 5)], obstacles=[wall])[1]
     count = round(view[VIEW.share] * POINTS)
@@ -245,25 +245,25 @@ OBSTACLES = [
 
 @pytest.mark.parametrize("obstacle", OBSTACLES, ids=lambda obstacle: obstacle.name)
 @pytest.mark.parametrize(("y", "seen"), [(0.0, 0), (6.0, 1)])
-def test_an_obstacle_in_between_hides_it(obstacle: Obstacle, y: float, seen: int):
+def test_an_obstacle_in_between_hides_a_hat(obstacle: Obstacle, y: float, seen: int):
     """The second pair stands beside the obstacle."""
     view = look([pose(0, y, 5), pose(4, y, 5)], obstacles=[obstacle])
     assert view[1, VIEW.seen] == seen
 
 
 @pytest.mark.parametrize(("below_m", "share"), [(-0.06, 1.0), (0.0, 0.5), (0.06, 0.0)])
-def test_a_hill_in_between_hides_the_part_of_a_hat_that_is_below_its_crest(below_m: float, share: float):
-    """A crest in the middle between lens and hat, its height that of their line and so much above it, of a hat of 14 cm."""
+def test_a_hill_in_between_hides_the_part_of_a_hat_below_its_crest(below_m: float, share: float):
+    """The crest is midway between lens and hat, this far above their line of sight; the hat is 14 cm in diameter."""
     line_m = 0.5 * (5 + LENS_B[2] + 5 + HAT_B[2])
     x, z = 0.5 * (LENS_B[0] + 4 + HAT_B[0]), line_m + below_m
     slopes = [[(x, -9.0, z), (x, 9.0, z), (x + side, 0.0, 0.0)] for side in (-1.0, 1.0)]
     row = look([pose(0, 0, 5), pose(4, 0, 5)], triangles=slopes)[1]
-    beside = 2 / POINTS if share == 0.5 else 0.0  # the points beside what is hidden are left out
+    beside = 2 / POINTS if share == 0.5 else 0.0  # the points next to the hidden part are left out
     assert row[VIEW.share] == pytest.approx(share - beside, abs=1 / POINTS)
     assert row[VIEW.seen] == (share > 0.0)
 
 
-def test_it_moves_over_the_picture_as_the_drones_move_and_turn():
+def test_the_rate_in_the_picture_follows_from_motion_and_rotation():
     watcher, other = pose(0, 0, 5), pose(4, 0, 5)
     away = 4 + HAT_B[0] - LENS_B[0]
     other[STATE.v_WB + 1] = 2.0

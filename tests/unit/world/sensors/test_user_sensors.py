@@ -1,4 +1,4 @@
-"""Users' sensors in the world: equations with lever arms, statistics of the errors, faults, and what else stays as it is."""
+"""Users' sensors in the world: equations with lever arms, error statistics, faults, and no effect on other sensors."""
 
 import importlib
 import math
@@ -47,7 +47,7 @@ def values(flying: Fleet, name: str, gates: int, drone: int = 0) -> np.ndarray:
 
 
 def truth(t_s: float = 0.0, **given: Any) -> SensorTruth:
-    """Return a drone that turns about all axes, with a sensor that is off the centre and turned."""
+    """Return the truth of a sensor that is mounted off centre and turned."""
     still = np.zeros(3)
     fields: dict[str, Any] = {
         "p_WB": still, "v_WB": still, "a_WB": still, "R_WB": np.eye(3), "w_WB_B": still, "alpha_B": still, "air_W": still,
@@ -56,8 +56,8 @@ def truth(t_s: float = 0.0, **given: Any) -> SensorTruth:
     return SensorTruth(t_s=t_s, **(fields | given))
 
 
-def test_the_sensors_motion_is_that_of_its_point():
-    """Turning about a fixed axis: position, velocity and acceleration of the point by differences of its place."""
+def test_a_sensor_moves_as_its_mounting_point_does():
+    """For rotation about a fixed axis, velocity and acceleration match finite differences of the position of the point."""
     rate, speeding = 2.0, 1.5
 
     def at(t: float) -> SensorTruth:
@@ -75,7 +75,7 @@ def test_the_sensors_motion_is_that_of_its_point():
     np.testing.assert_allclose(now.R_WS.T @ now.R_WS, np.eye(3), atol=1e-12)
 
 
-def test_a_standing_drones_range_is_that_of_its_antenna():
+def test_the_range_of_a_standing_drone_is_measured_from_its_antenna():
     flying = Fleet(scenario(my_uwb=EXACT))
     shown = values(flying, "my_uwb", 5)
     state = flying.truth()
@@ -83,8 +83,8 @@ def test_a_standing_drones_range_is_that_of_its_antenna():
     assert shown[-1, 0] == pytest.approx(np.linalg.norm(antenna - (3, 4, 0)), abs=1e-4)
 
 
-def test_airspeed_is_that_of_the_air_against_the_tube():
-    airspeed = importlib.import_module("airspeed")  # found by the fixture
+def test_airspeed_is_measured_along_the_pitot_tube():
+    airspeed = importlib.import_module("airspeed")  # on the path thanks to the fixture
     site = scenario().environment
     wind, spin = np.array([4.0, -3.0, 0.5]), np.array([0.0, 0.0, 2.0])
     mounted = truth(v_WB=np.array([1.0, 0, 0]), w_WB_B=spin, air_W=wind)
@@ -96,7 +96,7 @@ def test_airspeed_is_that_of_the_air_against_the_tube():
     assert airspeed.speed([pascals], None, site) == [pascals, pytest.approx(u)]
 
 
-def test_errors_have_the_statistics_that_the_scenario_asks_for():
+def test_errors_have_the_configured_statistics():
     errors = {"noise": 0.3, "density": 0.02, "quantum": 0.01}
     noisy = values(Fleet(scenario(my_uwb=UWB | {"range_m": errors})), "my_uwb", 1500)[:, 0]
     exact = values(Fleet(scenario(my_uwb=EXACT)), "my_uwb", 1500)[:, 0]
@@ -119,7 +119,7 @@ def test_biases_differ_between_drones_and_seeds():
     assert bias(1, 0) == made[0]
 
 
-def test_a_share_of_samples_is_lost():
+def test_samples_are_lost_at_the_dropout_probability():
     kept = len(values(Fleet(scenario(my_uwb=UWB | {"dropout": 0.3})), "my_uwb", 1000))
     assert kept == pytest.approx(700, abs=4 * math.sqrt(1000 * 0.3 * 0.7))
 
@@ -128,7 +128,7 @@ def fault(kind: str, **parameters: Any) -> Fault:
     return Fault(1, f"my_uwb_{kind}", "d0", parameters, 0)
 
 
-def test_faults_strike_the_drone_that_they_are_meant_for():
+def test_faults_affect_only_their_target_drone():
     exact = values(Fleet(scenario(my_uwb=EXACT)), "my_uwb", 30)[:, 0]
     biased = Fleet(scenario(my_uwb=EXACT))
     biased.impairment.strike([fault("bias", value_m=2.0)])
@@ -139,7 +139,7 @@ def test_faults_strike_the_drone_that_they_are_meant_for():
     assert len(values(lost, "my_uwb", 30, drone=1)) == 30
 
 
-def test_a_stuck_sensor_shows_one_sample_until_it_is_free():
+def test_a_stuck_sensor_repeats_one_sample_until_the_fault_ends():
     flying = Fleet(scenario(my_uwb=UWB))
     flying.impairment.strike([fault("stuck")])
     assert len(set(values(flying, "my_uwb", 20)[:, 0])) == 1
@@ -156,7 +156,7 @@ def test_noise_grows_by_the_factor():
     )
 
 
-def test_no_other_sample_changes_with_a_users_sensor():
+def test_a_user_sensor_changes_no_other_sample():
     without, with_it = Fleet(scenario()), Fleet(scenario(my_uwb=UWB, pitot={"module": "airspeed"}))
     for _ in range(20):
         without.advance()
@@ -165,7 +165,7 @@ def test_no_other_sample_changes_with_a_users_sensor():
         assert stock == samples_of(without)
 
 
-def test_messages_come_in_order_and_are_counted():
+def test_messages_are_published_in_order_and_none_is_lost():
     flying = Fleet(scenario(my_uwb=UWB | {"latency_ms": 30}, pitot={"module": "airspeed"}))
     publication = GatePublication(flying)
     scenario_info = {"my_uwb": 0, "pitot": 0}
@@ -185,7 +185,7 @@ def test_messages_come_in_order_and_are_counted():
     assert scenario_info == {"my_uwb": 2 * 8, "pitot": 2 * 10}
 
 
-def test_what_is_no_reading_ends_the_run_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_invalid_reading_ends_the_run_with_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     text = (EXAMPLES / "uwb_range.py").read_text()
     for name, equation in {"fails": "1 / 0", "long": "[1.0, 2.0]", "infinite": "[np.inf]"}.items():
         line = "return [float(np.linalg.norm(truth.p_WS - settings.anchor_m))]"

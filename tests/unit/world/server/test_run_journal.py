@@ -1,4 +1,4 @@
-"""The journal of a run: what a world finds on disk, and that it publishes what comes next and nothing again."""
+"""The journal of a run: what a world finds on disk, and that it continues without publishing anything twice."""
 
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -29,7 +29,7 @@ def journal(folder: Path, **options: Any) -> RunJournal:
 
 
 def written(folder: Path, checkpoints: int = 0, **options: Any) -> list[Entry]:
-    """Write a journal of two frames before each checkpoint and after the last; return the entries."""
+    """Write a journal with two frames before each checkpoint and after the last; return the entries."""
     entries: list[Entry] = []
     kept = journal(folder, **options)
     assert kept.open() is None
@@ -65,7 +65,7 @@ def test_a_new_journal_starts_a_run(tmp_path: Path):
     kept.close()
 
 
-def test_a_run_goes_on_from_its_start(tmp_path: Path):
+def test_without_a_checkpoint_a_run_continues_from_its_start(tmp_path: Path):
     entries = written(tmp_path)
     again = journal(tmp_path)
     assert again.open() == (None, 0)
@@ -75,7 +75,7 @@ def test_a_run_goes_on_from_its_start(tmp_path: Path):
 
 
 @pytest.mark.parametrize(("checkpoints", "first", "truth"), [(1, 0, b""), (2, 1, b"0"), (5, 4, b"0123")])
-def test_a_run_goes_on_from_the_last_checkpoint_but_one(tmp_path: Path, checkpoints: int, first: int, truth: bytes):
+def test_a_run_continues_from_the_last_checkpoint_but_one(tmp_path: Path, checkpoints: int, first: int, truth: bytes):
     entries = written(tmp_path, checkpoints)
     again = journal(tmp_path)
     found = again.open()
@@ -90,7 +90,7 @@ def test_a_run_goes_on_from_the_last_checkpoint_but_one(tmp_path: Path, checkpoi
 
 
 @pytest.mark.parametrize("cut", [1, 7, 8, 9, 30])
-def test_what_is_torn_at_the_end_was_never_published(tmp_path: Path, cut: int):
+def test_an_incomplete_last_frame_is_dropped(tmp_path: Path, cut: int):
     entries = written(tmp_path)
     place = tmp_path / "0.entries"
     place.write_bytes(place.read_bytes()[:-cut])
@@ -107,7 +107,7 @@ def test_what_is_torn_at_the_end_was_never_published(tmp_path: Path, cut: int):
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut", "bit"])
-def test_a_checkpoint_that_is_not_whole_is_passed_over(tmp_path: Path, damage: str):
+def test_an_incomplete_checkpoint_is_skipped(tmp_path: Path, damage: str):
     entries = written(tmp_path, 3)
     place = tmp_path / "3.checkpoint"
     data = bytearray(place.read_bytes())
@@ -131,7 +131,7 @@ def test_a_journal_of_another_run_is_refused(tmp_path: Path):
     other.close()
 
 
-def test_a_folder_has_one_world(tmp_path: Path):
+def test_a_journal_folder_serves_only_one_world(tmp_path: Path):
     first, second = journal(tmp_path), journal(tmp_path)
     first.open()
     with pytest.raises(RunError, match="another world"):
@@ -140,7 +140,7 @@ def test_a_folder_has_one_world(tmp_path: Path):
     second.close()
 
 
-def test_a_full_disk_ends_the_journal_and_not_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_ends_the_journal_but_not_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     lines: list[str] = []
     kept = journal(tmp_path, say=lines.append)
     kept.open()
@@ -161,7 +161,7 @@ def test_a_full_disk_ends_the_journal_and_not_the_run(tmp_path: Path, monkeypatc
     kept.remove()
 
 
-def test_a_journal_of_nothing_is_quiet():
+def test_a_journal_without_a_folder_does_nothing():
     kept = RunJournal(None)
     assert kept.open() is None
     kept.note(Advanced(1, False))
@@ -171,7 +171,7 @@ def test_a_journal_of_nothing_is_quiet():
     kept.remove()
 
 
-def test_a_run_that_is_over_leaves_no_journal(tmp_path: Path):
+def test_a_finished_run_leaves_no_journal(tmp_path: Path):
     written(tmp_path / "journal", 2)
     kept = journal(tmp_path / "journal")
     kept.open()
@@ -184,7 +184,7 @@ GATES = 600
 
 
 class AtOnce:
-    """An executor, as of `ThreadPoolExecutor`, that does not let a flight overtake the disk."""
+    """An executor like `ThreadPoolExecutor` that works at once, so that no flight overtakes the disk."""
 
     def __init__(self, *_: Any) -> None: ...
 
@@ -199,14 +199,14 @@ class AtOnce:
 
 @pytest.fixture
 def often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let checkpoints come so often that each part of these short flights has some."""
+    """Create checkpoints often enough for each part of these short flights to have some."""
     monkeypatch.setattr(run_journal, "ThreadPoolExecutor", AtOnce)
     monkeypatch.setattr(run_journal, "CHECKPOINT_NS", 1_000_000_000)
     monkeypatch.setattr(run_journal, "CHECKPOINT_WALL_NS", 0)
 
 
 def fly(folder: Path | None, until: int = GATES + 1, drones: int = 1) -> FakeLink:
-    """Run a world until a gate is there; d1 is asked to take off before the first."""
+    """Run a world until a gate; d1 is commanded to take off before the first gate."""
     made, link = small_world(drones=drones, duration_s=GATES * GATE_NS / 1e9), FakeLink()
     link.deliver(keys.command("d1", "mode"), Mode(0, 0, "somebody", "takeoff"))
     journal = RunJournal(folder, "run1", "a" * 64)
@@ -228,7 +228,7 @@ def _drone(link: FakeLink) -> list[tuple[str, bytes]]:
 
 
 @pytest.mark.usefixtures("often")
-def test_a_world_goes_on_where_another_one_ended(tmp_path: Path):
+def test_a_world_continues_where_another_one_ended(tmp_path: Path):
     whole = fly(None)
     parts = [fly(tmp_path / "journal", until) for until in (40, 290, 560, GATES + 1)]
     assert [end(part)["last_ns"] // GATE_NS for part in parts] == [40, 290, 560, GATES]
@@ -239,7 +239,7 @@ def test_a_world_goes_on_where_another_one_ended(tmp_path: Path):
 
 
 @pytest.mark.usefixtures("often")
-def test_a_long_flight_goes_on_from_a_checkpoint(tmp_path: Path):
+def test_a_long_flight_continues_from_a_checkpoint(tmp_path: Path):
     fly(tmp_path, 560)
     again = RunJournal(tmp_path, "run1", "a" * 64)
     checkpoint = again.open()
@@ -256,8 +256,8 @@ def test_a_checkpoint_of_another_fleet_is_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize("is_complete", [True, False])
-def test_what_follows_an_end_is_noted_after_the_last_gate_only(is_complete: bool):
-    """Continuing a run undoes an end before its last gate; its recorder must not read of that end."""
+def test_entries_after_an_end_are_kept_only_after_the_last_gate(is_complete: bool):
+    """Continuing a run undoes an end before its last gate; its recorder must not receive that end."""
     noted: list[Entry] = []
     run = Run(small_world(), HealthMeter(WORLD), noted.append)
     end = run.world.clock.complete if is_complete else run.world.clock.stop

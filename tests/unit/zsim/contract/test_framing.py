@@ -1,4 +1,4 @@
-"""Messages in one payload and messages from rows of numbers: the same bytes as one by one, whatever comes."""
+"""Messages bundled in one payload or written from rows of numbers have the same bytes as when encoded one by one."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ DRONES = ["d1", "d2", "d3"]
 
 @pytest.fixture(scope="module")
 def flown() -> list[GateMessages]:
-    """Two seconds of three drones, one of which is flown by somebody."""
+    """Two seconds of three drones, one of which has a commander."""
     places = [{"name": name, "position_m": [3 * i, 0, 0]} for i, name in enumerate(DRONES)]
     latency = {"gps": {"latency_ms": 35.0}, "baro": {"latency_ms": 12.5}}
     fleet = Fleet(scenario_file.resolve({"name": "gate", "duration_s": 5, "drones": places, "sensors": latency}))
@@ -33,7 +33,7 @@ def flown() -> list[GateMessages]:
     return gates
 
 
-def test_every_message_is_of_the_contract_and_to_the_byte_what_its_encoder_gives(flown: list[GateMessages]) -> None:
+def test_every_message_matches_the_contract_and_its_encoder_to_the_byte(flown: list[GateMessages]) -> None:
     received = set()
     for gate in flown:
         for key, payload in gate.pairs:
@@ -42,7 +42,7 @@ def test_every_message_is_of_the_contract_and_to_the_byte_what_its_encoder_gives
     assert received == set(key_table(DRONES))
 
 
-def test_numbers_count_on_per_key_and_status_counts_what_came(flown: list[GateMessages]) -> None:
+def test_sequence_numbers_continue_per_key_and_the_status_counts_messages(flown: list[GateMessages]) -> None:
     seq = dict.fromkeys(key_table(DRONES), 0)
     for gate in flown:
         of_drone = dict.fromkeys(DRONES, 0)
@@ -56,13 +56,13 @@ def test_numbers_count_on_per_key_and_status_counts_what_came(flown: list[GateMe
             assert gate.t_ns - 20_000_000 < message.t_ns <= gate.t_ns
 
 
-def test_a_commander_is_named(flown: list[GateMessages]) -> None:
+def test_the_status_names_the_commander(flown: list[GateMessages]) -> None:
     statuses = [message for key, message in flown[-1].decoded() if keys.is_status(key)]
     assert [status.commander for status in statuses] == [None, "pilot.one", None]
     assert {status.state for status in statuses} == {"landed"}
 
 
-def test_samples_of_a_drone_come_in_the_order_of_their_stamps_and_none_is_lost(flown: list[GateMessages]) -> None:
+def test_samples_of_a_drone_are_in_time_order_and_none_is_lost(flown: list[GateMessages]) -> None:
     for drone in DRONES:
         samples = [m for gate in flown for key, m in gate.decoded() if key == keys.sensor(drone, "gps")]
         assert [m.t_ns - m.t_sample_ns for m in samples] == [35_000_000] * len(samples)
@@ -71,7 +71,7 @@ def test_samples_of_a_drone_come_in_the_order_of_their_stamps_and_none_is_lost(f
         assert all(stamp == sorted(stamp) for stamp in stamps)
 
 
-def test_a_part_travels_and_comes_out_the_same(flown: list[GateMessages]) -> None:
+def test_a_gate_and_a_part_of_it_survive_packing(flown: list[GateMessages]) -> None:
     for gate in flown[::10]:
         whole = GateMessages.unpack(gate.pack(), gate.table)
         assert (whole.t_ns, whole.seq, whole.pairs) == (gate.t_ns, gate.seq, gate.pairs)
@@ -92,20 +92,20 @@ def test_a_part_travels_and_comes_out_the_same(flown: list[GateMessages]) -> Non
         msgspec.msgpack.encode({"t_ns": 1}),
     ],
 )
-def test_what_is_no_gate_message_is_refused(payload: bytes) -> None:
+def test_an_invalid_gate_payload_is_refused(payload: bytes) -> None:
     with refused(DecodeError, "@gate", "messages", "gate"):
         GateMessages.unpack(payload, key_table(DRONES))
 
 
 @pytest.mark.parametrize("place", [-1000, 24, 2**62])
-def test_keys_that_are_not_there_are_refused(flown: list[GateMessages], place: int) -> None:
+def test_key_indices_outside_the_table_are_refused(flown: list[GateMessages], place: int) -> None:
     b = flown[0]
     bad = GateMessages(b.t_ns, b.seq, b.table, np.full(len(b), place), b.stamps, b.ends, b.buffer)
     with pytest.raises(DecodeError, match="@gate: "):
         GateMessages.unpack(bad.pack(), b.table).check()
 
 
-def test_a_record_of_gates_is_that_of_their_messages(flown: list[GateMessages], tmp_path) -> None:
+def test_a_record_of_gates_equals_that_of_their_messages(flown: list[GateMessages], tmp_path) -> None:
     with RecordWriter(tmp_path / "whole.mcap") as writer:
         for gate in flown:
             copy = GateMessages(gate.t_ns, gate.seq, gate.table, gate.which, gate.stamps, gate.ends,
@@ -120,7 +120,7 @@ def test_a_record_of_gates_is_that_of_their_messages(flown: list[GateMessages], 
     assert len(whole) == sum(map(len, flown))
 
 
-def test_a_record_that_has_no_number_left_for_a_key_takes_the_others(
+def test_a_record_without_free_channels_still_takes_messages_of_known_keys(
     flown: list[GateMessages], tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
@@ -139,7 +139,7 @@ TEXTS = ["landed", "flying", "", "controller.main", "ö" * 15, None]
 
 
 def written(kinds: list[Any], rows: list[tuple[int, list[int], list[float]]]) -> list[bytes]:
-    """Return what is written of (kind, whole numbers, floats), having read again what can be."""
+    """Return the payloads written from (kind, whole numbers, floats), after checking that they can be read again."""
     layouts, texts = Layouts(kinds), words(TEXTS)
     found = []
     for kind, whole, real in rows:
@@ -156,7 +156,7 @@ def padded(values: Any, size: int, dtype: type) -> np.ndarray:
 
 
 def check_reading(layouts: Layouts, kind: int, payload: bytes, ints: np.ndarray, floats: np.ndarray) -> None:
-    """Whatever was written is read again, but for texts and numbers below zero; what is cut off or longer is not."""
+    """Check that all but texts and negative integers is read again, and a truncated or longer payload is not."""
     data, program = np.frombuffer(payload, dtype=np.uint8), layouts.program
     again, bits = ints.copy(), np.zeros(len(floats), dtype=np.uint64)
     for end in range(0, len(data), 41):
@@ -177,14 +177,14 @@ def check_reading(layouts: Layouts, kind: int, payload: bytes, ints: np.ndarray,
 
 
 @pytest.mark.parametrize("whole", EDGES)
-def test_whole_numbers_at_the_edges_give_the_encoders_bytes(whole: int) -> None:
+def test_integers_at_the_limits_match_the_encoder(whole: int) -> None:
     message: Any = messages.Imu(0, 0, whole, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert written([messages.Imu], [(0, [0, 0, whole], [])]) == [messages.encode(message)]
 
 
 @given(st.data())
 @settings(max_examples=10, deadline=None)
-def test_any_numbers_give_the_encoders_bytes(data: st.DataObject) -> None:
+def test_any_values_match_the_encoder(data: st.DataObject) -> None:
     t_ns, seq, count, sample_ns = data.draw(COUNT), data.draw(COUNT), data.draw(COUNT), data.draw(WHOLE)
     real: Any = tuple(data.draw(st.lists(NUMBER, min_size=20, max_size=20)))
     flag, text, name = data.draw(st.booleans()), data.draw(st.integers(0, 1)), data.draw(st.integers(0, len(TEXTS) - 1))
@@ -207,7 +207,7 @@ def test_any_numbers_give_the_encoders_bytes(data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("kind", [messages.Mag, messages.Baro, messages.Flow, flight_messages.Truth])
-def test_every_kind_that_a_world_says_has_a_layout(kind: type) -> None:
+def test_every_message_type_of_the_world_has_a_layout(kind: type) -> None:
     values = [0.5 * k for k in range(20)]
     whole = [7, 300] if kind is flight_messages.Truth else [7, 300, -5]
     laid_out = (kind, 4) if kind is flight_messages.Truth else kind
@@ -217,7 +217,7 @@ def test_every_kind_that_a_world_says_has_a_layout(kind: type) -> None:
     assert messages.encode(message) == payload
 
 
-def test_a_kind_with_a_list_of_any_length_has_none() -> None:
+def test_a_message_type_with_a_list_of_any_length_has_no_layout() -> None:
     class Several(msgspec.Struct):
         values: list[float]
 
@@ -226,14 +226,14 @@ def test_a_kind_with_a_list_of_any_length_has_none() -> None:
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
-def test_what_is_not_finite_is_not_read(bad: float) -> None:
+def test_values_that_are_not_finite_are_not_read(bad: float) -> None:
     layouts = Layouts([messages.Mag])
     payload = messages.encode(messages.Mag(1, 2, 3, (0.0, bad, 1.0)))
     ints, bits = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.uint64)
     assert not read(layouts.program, 0, np.frombuffer(payload, dtype=np.uint8), 0, len(payload), ints, bits)
 
 
-def test_fields_in_another_order_or_of_another_type_are_not_read() -> None:
+def test_fields_of_another_order_or_type_are_not_read() -> None:
     layouts = Layouts([messages.Mag])
     ints, bits = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.uint64)
     for message in ({"seq": 1, "t_ns": 2, "t_sample_ns": 3, "field_ut": [1.0, 2.0, 3.0]},

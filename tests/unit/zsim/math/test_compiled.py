@@ -1,4 +1,4 @@
-"""Compiled mathematics: every source file of a kernel counts for its cache, and a change of one renews it; columns."""
+"""Compiled mathematics: a change in any source file of a kernel renews its cache; columns of rows."""
 
 import importlib
 import os
@@ -23,8 +23,8 @@ def names(module: str) -> set[str]:
     return {path.stem for path in compiled.sources(importlib.import_module(module).__name__)}
 
 
-def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
-    """Where a function is compiled, what it calls and the constants that it names are too, wherever they come from."""
+def test_the_sources_of_a_kernel_are_all_modules_it_imports():
+    """A function is compiled together with what it calls and the constants it names, wherever they are defined."""
     assert {"kalman_update", "strapdown", "compiled"} <= names("zsim_agents.estimation.estimator_bank")
     pytest.importorskip("numba")
     own, of_zsim = {"kernel", "firmware", "rigid_body", "simd", "sensor_set"}, {"rotation", "vehicle", "surroundings"}
@@ -32,7 +32,7 @@ def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
     assert "kernel" not in names("zsim_world.sensors.noise")
 
 
-def test_the_digest_changes_with_the_text_of_each_file_and_not_with_the_folders(tmp_path: Path):
+def test_the_digest_depends_on_file_contents_but_not_on_folders(tmp_path: Path):
     digests = set()
     for case, texts in enumerate((("a", "b"), ("A", "b"), ("a", "B"), ("b", "a"))):
         files = [tmp_path / str(case) / name for name in ("one.py", "two.py")]
@@ -50,8 +50,8 @@ print(place_of(np.ones(20)))
 """
 
 
-def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
-    """`joint_filter.place_of` calls `filter_state.vector`: numba's own cache would go on with the old one."""
+def test_a_change_in_a_called_function_recompiles_the_caller(tmp_path: Path):
+    """`joint_filter.place_of` calls `filter_state.vector`: numba's own cache would continue to use the old one."""
     pytest.importorskip("numba")
     shutil.copytree(
         ROOT / "agents" / "zsim_agents", tmp_path / "zsim_agents", ignore=shutil.ignore_patterns("__pycache__")
@@ -70,7 +70,7 @@ def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
     assert ask() == "(2.0, 1.0, 1.0)"
 
 
-def test_a_kernel_is_known_to_be_kept_once_it_was_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_compiled_kernel_is_reported_as_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     pytest.importorskip("numba")
     from zsim.math.compiled import is_kept, kernel
 
@@ -147,7 +147,7 @@ assert exp.dispatcher.signatures and pickle.loads(pickle.dumps(exp)) is exp
 """
 
 
-def test_a_deferred_kernel_runs_as_python_until_numba_is_imported_to_the_same_bits():
+def test_a_deferred_kernel_gives_the_same_bits_before_numba_is_imported():
     pytest.importorskip("numba")
     subprocess.run([sys.executable, "-c", DEFERRED], check=True)
 
@@ -170,12 +170,12 @@ print(quarter(2.0), halved(2.0), len(compilations.buffer) // 2)
 """
 
 
-def test_kernels_have_their_parts_and_what_python_calls_of_these_is_kept(tmp_path: Path):
+def test_inlined_parts_of_a_kernel_are_cached_when_called_from_python(tmp_path: Path):
     pytest.importorskip("numba")
     (tmp_path / "halving.py").write_text(PART)
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
     run = [sys.executable, "-c", "import halving"]
-    for compilations in ("3", "0"):  # the kernel, its part, and that of Python
+    for compilations in ("3", "0"):  # compilations: the kernel, its part, and the part called from Python
         made = subprocess.run(run, env=environment, capture_output=True, text=True, check=True)
         assert made.stdout.split() == ["0.5", "1.0", compilations]
 
@@ -192,8 +192,8 @@ hold({name}(np.ones(3)))
 """
 
 
-def test_tuples_are_held_after_their_class_was_renamed(tmp_path: Path):
-    """Numba's index of kept code names the classes: one that is no more would make all of it unreadable."""
+def test_tuples_are_held_after_their_class_is_renamed(tmp_path: Path):
+    """Numba's index of cached code names the classes: a class that no longer exists would make the index unreadable."""
     pytest.importorskip("numba")
     cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
     for name in ("Former", "Present"):
@@ -211,7 +211,7 @@ def total(row):
     return row[ROW.energy] + row[ROW.q_WB]
 
 
-def test_fields_stand_one_after_the_other_and_compiled_code_reads_them():
+def test_fields_are_consecutive_columns_that_compiled_code_reads():
     assert (ROW.p_WB, ROW.energy, ROW.q_WB, ROW.size) == (0, 3, 4, 8)
     assert total(np.arange(8.0)) == 7.0
     with pytest.raises(ValueError, match="p_WB"):

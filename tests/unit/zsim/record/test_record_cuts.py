@@ -1,4 +1,4 @@
-"""A record of a real run, cut at any byte and with any bit turned: what is before the cut is read, by everybody."""
+"""A record of a real run, cut at any byte or with any bits flipped: every tool reads what precedes the cut."""
 
 import random
 from collections import defaultdict
@@ -35,11 +35,11 @@ from zsim_analysis.export.columns import MessageSelection
 from zsim_analysis.export.make_export import export
 from zsim_analysis.report.summary import judge
 
-CUTS = 8  # at any byte, besides those that hurt
+CUTS = 8  # at random bytes, in addition to the critical ones
 FLIPS = 15
 
 Content = tuple[bytes, int, int]  # payload, simulated and wall time [ns] of a message
-Made = tuple[int, list[str]]  # rows of what was made from a record, and what was said of it
+Made = tuple[int, list[str]]  # number of rows made from a record, and the notes on it
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(run: Path) -> dict[str, list[Recorded]]:
-    """Return all its messages by key."""
+    """Return all messages of the record by key."""
     return by_key(run)
 
 
@@ -76,7 +76,7 @@ def chunks(data: bytes) -> list[RecordSpan]:
 
 
 def nasty(data: bytes) -> list[int]:
-    """Return places at which a cut hurts: in and around the magic, heads, chunks, indexes, summary and footer."""
+    """Return the critical places for a cut: in and around the magic, heads, chunks, indexes, summary and footer."""
     found = chunks(data)
     middle, last = found[len(found) // 2], found[-1]
     indexes = [place for place in places(data) if place.opcode == Opcode.MESSAGE_INDEX]
@@ -97,8 +97,10 @@ def cuts(data: bytes) -> list[int]:
     return [*(rng.randrange(len(data)) for _ in range(CUTS)), *nasty(data)]
 
 
-def test_whatever_is_cut_off_the_rest_is_read(run: Path, whole: dict[str, list[Recorded]], tmp_path: Path) -> None:
-    """What is read is what was recorded first on each key, and lacks at most the chunk that was cut."""
+def test_a_record_truncated_anywhere_is_read_up_to_the_cut(
+    run: Path, whole: dict[str, list[Recorded]], tmp_path: Path
+) -> None:
+    """For each key, all messages recorded before the cut are read, except those of the chunk that was cut."""
     data, cut = run.read_bytes(), tmp_path / "cut.mcap"
     ends = {place.end: number for number, place in enumerate(chunks(data), start=1)}
     per_chunk = chunk_sizes(run)
@@ -125,10 +127,8 @@ def chunk_sizes(path: Path) -> list[int]:
     return counts
 
 
-def test_whatever_is_cut_off_a_writer_goes_on_behind_the_rest(
-    run: Path, whole: dict[str, list[Recorded]], tmp_path: Path
-) -> None:
-    """A whole record, too: what is added comes behind, on keys that it has and on others."""
+def test_a_writer_continues_after_a_truncated_file(run: Path, whole: dict[str, list[Recorded]], tmp_path: Path) -> None:
+    """This includes a whole record; messages are appended, on keys that it has and on new ones."""
     data, cut = run.read_bytes(), tmp_path / "cut.mcap"
     added = [each._replace(wall_ns=7) for key in whole for each in whole[key][:2]]
     added += [each._replace(key=f"{each.key}/again") for each in added]
@@ -161,7 +161,7 @@ def by_channel(file: IO[bytes]) -> dict[int, list[int]]:
 
 
 @pytest.mark.parametrize("content", [b"something else", b"x"])
-def test_a_writer_does_not_go_on_with_another_file(tmp_path: Path, content: bytes) -> None:
+def test_a_writer_does_not_continue_a_file_that_is_not_a_record(tmp_path: Path, content: bytes) -> None:
     other = tmp_path / "other.mcap"
     other.write_bytes(content)
     with refused(RecordError, "other.mcap", "MCAP"):
@@ -170,10 +170,10 @@ def test_a_writer_does_not_go_on_with_another_file(tmp_path: Path, content: byte
 
 
 @pytest.mark.parametrize("stated", [1000, CHUNK_MAX + 1])
-def test_a_chunk_that_would_grow_without_end_is_damaged(
+def test_a_chunk_that_would_decompress_without_bound_counts_as_damaged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: int
 ) -> None:
-    """Its head states one size, its compressed frame has another; or both are beyond what anybody writes."""
+    """Its head states another size than its compressed frame, or both exceed what any writer produces."""
     path, data = tmp_path / "bomb.mcap", zstandard.compress(bytes(CHUNK_MAX + 1))
     head = CHUNK_HEAD.pack(0, 1, stated, 0, len(ZSTD)) + ZSTD + SIZE.pack(len(data))
     path.write_bytes(opening() + HEAD.pack(Opcode.CHUNK, len(head) + len(data)) + head + data)
@@ -185,7 +185,7 @@ def test_a_chunk_that_would_grow_without_end_is_damaged(
 
 
 def turned(data: bytes, rng: random.Random) -> bytes:
-    """Return data with one to eight bits turned."""
+    """Return data with one to eight bits flipped."""
     changed = bytearray(data)
     for _ in range(rng.randrange(1, 9)):
         changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
@@ -199,7 +199,7 @@ def read_all(path: Path) -> set[Content]:
 
 
 def content(message: Recorded) -> Content:
-    """Return what a check sum guards of a message."""
+    """Return the parts of a message that a checksum protects."""
     return message.payload, message.t_ns, message.wall_ns
 
 
@@ -234,7 +234,7 @@ WORKS: tuple[tuple[Callable[[Path], object], int], ...] = (
 )
 
 
-def test_whatever_bits_are_turned_what_is_read_was_recorded(
+def test_with_any_bits_flipped_only_recorded_messages_are_read(
     run: Path, whole: dict[str, list[Recorded]], tmp_path: Path
 ) -> None:
     data, rng, path = run.read_bytes(), random.Random(12), tmp_path / "run.mcap"
@@ -252,7 +252,7 @@ def test_whatever_bits_are_turned_what_is_read_was_recorded(
 
 
 @pytest.mark.parametrize(("work", "times"), WORKS, ids=[work.__name__ for work, _ in WORKS])
-def test_whatever_bits_are_turned_it_is_read_or_refused_in_one_line(
+def test_with_any_bits_flipped_a_record_is_read_or_refused_in_one_line(
     work: Callable[[Path], object], times: int, run: Path, tmp_path: Path
 ) -> None:
     data, rng, path = run.read_bytes(), random.Random(12), tmp_path / "run.mcap"
@@ -267,7 +267,7 @@ def test_whatever_bits_are_turned_it_is_read_or_refused_in_one_line(
 
 
 @pytest.mark.parametrize("work", [to_summary, to_csv, to_foxglove, to_mat])
-def test_everybody_reads_what_is_before_the_cut(work: Callable[[Path], Made], run: Path, tmp_path: Path) -> None:
+def test_every_tool_reads_a_record_up_to_the_cut(work: Callable[[Path], Made], run: Path, tmp_path: Path) -> None:
     data, path, read = run.read_bytes(), tmp_path / "run.mcap", []
     for at in (len(data) // 3, 2 * len(data) // 3, len(data) - 9):
         path.write_bytes(data[:at])
@@ -277,7 +277,7 @@ def test_everybody_reads_what_is_before_the_cut(work: Callable[[Path], Made], ru
     assert 0 < read[0] <= read[1] <= read[2]
 
 
-def test_the_commands_say_that_a_record_was_cut(run: Path, tmp_path: Path) -> None:
+def test_a_command_reports_that_a_record_was_cut(run: Path, tmp_path: Path) -> None:
     from zsim_deploy.cli.cli import app
 
     data = run.read_bytes()

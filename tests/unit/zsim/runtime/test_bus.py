@@ -202,7 +202,7 @@ def test_outputs_that_the_world_only_relays_are_counted():
     assert hub.outputs == ["estimator.d1", "estimator.d2", "controller.main"]
 
 
-def test_an_agent_with_a_longer_period_reads_all_gates_and_steps_at_its_own():
+def test_an_agent_with_a_longer_period_reads_all_gates_but_steps_rarely():
     agent = FakeEstimator("d1", 2 * GATE_NS)
     hub, _ = fly(5, [agent])
     assert [t_ns // GATE_NS for what, t_ns in agent.notes if what == "step"] == [0, 2, 4]
@@ -304,7 +304,7 @@ def test_what_agents_receive_does_not_depend_on_their_order():
 
 @pytest.mark.parametrize("delay", [1, 3, 12])
 @pytest.mark.parametrize("gates_max", [1, 2, 10])
-def test_delivery_does_not_depend_on_how_many_gates_the_bus_takes_at_once(
+def test_delivery_does_not_depend_on_the_batch_size_of_the_bus(
     monkeypatch: pytest.MonkeyPatch, delay: int, gates_max: int
 ):
     monkeypatch.setattr("zsim.runtime.bus.GATES_MAX", gates_max)

@@ -265,7 +265,7 @@ def test_a_controller_keeps_the_newest_state_of_a_drone():
 
 
 def test_a_controller_takes_a_limited_number_of_requests_per_gate():
-    """A paused run needs this limit; at the next gate the controller publishes the requests it took, and takes others."""
+    """A paused run needs the limit; at the next gate the controller publishes the requests it took and takes others."""
     made, (key,) = controller(), controller().control_keys()
     answers = [made.control(key, ControlRequest("sing", {}, "op.1")) for _ in range(REQUESTS_MAX + 1)]
     assert [answer.error for answer in answers if has_terms(answer.error, str(REQUESTS_MAX), "requests")] == [
@@ -356,7 +356,7 @@ def test_delay_and_jitter_add_up() -> None:
 
 
 def test_bandwidth_spreads_messages_over_gates() -> None:
-    """16 + 16 bytes at 6.4 kbit/s take 40 ms, so one is sent every second gate; beyond two waiting, the oldest is lost."""
+    """16 + 16 bytes at 6.4 kbit/s take 40 ms: one every second gate; with more than two waiting, the oldest is lost."""
     made = Transmitter(Radio(bandwidth_kbit_s=6.4, queue_max=2), GATE_NS)
     assert made.size_bytes(said(0, text="x" * 13)[1]) == 32  # 1 for the list, 1 and 14 for its values
     sent = {gate: made.send(gate * GATE_NS, [said(gate, text="x" * 13)]) for gate in range(9)}

@@ -1,4 +1,4 @@
-"""A process's part in a run: what the world does not answer is asked for again, and who takes its place ends it."""
+"""A process as a participant in a run: unanswered requests are repeated, and a successor ends the process."""
 
 import os
 from typing import Any
@@ -37,7 +37,7 @@ class Wall:
         return self.now_s
 
 
-def test_what_is_not_answered_is_asked_for_again_after_a_while():
+def test_an_unanswered_request_is_repeated_after_a_while():
     link, wall, came = FakeLink(), Wall(), []
     member = AgentParticipant(link, INFO, Quiet(), came.append, lambda text: None, wall)  # type: ignore[arg-type]
     for turns in (1, 2, 3):
@@ -53,7 +53,7 @@ def test_what_is_not_answered_is_asked_for_again_after_a_while():
     assert not member.owes
 
 
-def test_another_gate_is_asked_for_at_once():
+def test_another_gate_is_requested_at_once():
     link = FakeLink()
     member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     for gate in (3, 4):
@@ -62,8 +62,8 @@ def test_another_gate_is_asked_for_at_once():
 
 
 @pytest.mark.parametrize(("mode", "from_gate"), [("lockstep", 0), ("realtime", 2)])
-def test_what_an_inbox_holds_back_is_asked_for_where_there_is_such_a_hold(mode: Any, from_gate: int) -> None:
-    """Delay and a gate before; in realtime nothing is held, and an agent would get what it has had a second time."""
+def test_a_replay_request_includes_gates_held_back_in_lockstep(mode: Any, from_gate: int) -> None:
+    """From the command delay and one gate before; in realtime nothing is held, and the agent would receive duplicates."""
     link, agent = FakeLink(), Quiet()
     agent.reads = (*Quiet.reads, "drone/d2/estimate")
     info = replace(INFO, mode=mode)
@@ -72,7 +72,7 @@ def test_what_an_inbox_holds_back_is_asked_for_where_there_is_such_a_hold(mode: 
     assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [from_gate]
 
 
-def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
+def test_a_process_rejoins_if_its_entry_shows_an_unknown_incarnation():
     link = FakeLink()
     link.last = {keys.INFO: messages.encode(INFO)}
     member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
@@ -88,10 +88,10 @@ def test_who_did_not_join_as_the_news_of_its_own_process_say_joins_again():
     assert member.failure is None
 
 
-# What is not there yet, as while a world is being started again
+# A world that is not available yet, for example while it restarts
 
 
-def test_a_join_is_repeated_until_the_world_has_taken_it_in():
+def test_a_join_is_repeated_until_the_world_admits_the_process():
     link, wall = FakeLink(), Wall()
     link.admits, link.last = False, {keys.INFO: messages.encode(INFO)}
     member = AgentParticipant(link, INFO, Quiet(), lambda sample: None, lambda text: None, wall)  # type: ignore[arg-type]
@@ -109,7 +109,7 @@ def test_a_join_is_repeated_until_the_world_has_taken_it_in():
     assert (member.awaited, len(link.published_on("process/*/join"))) == (False, 4)
 
 
-def test_a_snapshot_is_asked_for_until_a_world_answers(monkeypatch: pytest.MonkeyPatch):
+def test_a_snapshot_is_requested_until_a_world_answers(monkeypatch: pytest.MonkeyPatch):
     link, states = FakeLink(), []
     agent = Quiet()
     monkeypatch.setattr(agent, "snapshot", lambda: {"count": 3})
@@ -124,26 +124,26 @@ def test_a_snapshot_is_asked_for_until_a_world_answers(monkeypatch: pytest.Monke
     }
     monkeypatch.setattr(
         participant.time, "sleep", lambda wall_s: link.last.update(kept)
-    )  # it is there when asked again
+    )  # available at the next request
     member = AgentParticipant(link, INFO, agent, lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
     assert (member.resume(), states) == (GATE_NS, [{"count": 3}])
 
 
-def test_whoever_is_to_end_waits_for_no_world():
+def test_a_process_that_is_to_end_does_not_wait_for_a_world():
     link = FakeLink()
     settings = (lambda sample: None, lambda text: None, Wall(), lambda: True)
     member = AgentParticipant(link, INFO, Quiet(), *settings)  # type: ignore[arg-type]
     assert member.resume() is None
 
 
-# A process that shows, and never gates
+# A process that only displays and never gates
 
 
 ME = "console.1"
 
 
 def console(link: FakeLink) -> Participant:
-    """Return a participant that is admitted, by the answer of the fake link."""
+    """Return a participant that the fake link has admitted."""
     participant = Participant(link, INFO, ME)  # type: ignore[arg-type]
     participant.announce()
     assert participant.admitted
@@ -156,16 +156,16 @@ def tell(link: FakeLink, kind: str, incarnation: int, pid: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["join", "restart", "superseded"])
-def test_another_process_of_its_name_ends_it(kind: str):
+def test_a_process_is_superseded_by_another_of_its_name(kind: str):
     link = FakeLink()
     shown = console(link)
     tell(link, kind, 7, os.getpid() + 1)
     assert shown.superseded
     shown.leave("closed")
-    assert not link.published_on("process/*/bye")  # which would be that of the other one
+    assert not link.published_on("process/*/bye")  # which would count as a bye of the other process
 
 
-def test_who_is_not_admitted_yet_replaces_whoever_was_before():
+def test_a_process_not_yet_admitted_is_not_superseded():
     link = FakeLink()
     link.admits = False
     shown = Participant(link, INFO, ME)  # type: ignore[arg-type]
@@ -174,7 +174,7 @@ def test_who_is_not_admitted_yet_replaces_whoever_was_before():
     assert not shown.superseded
 
 
-def test_a_join_of_its_own_process_that_it_did_not_publish_is_answered_by_a_newer_one():
+def test_a_forged_join_of_its_own_process_is_answered_by_a_newer_one():
     link = FakeLink()
     shown = console(link)
     tell(link, "superseded", 7, os.getpid())
@@ -185,7 +185,7 @@ def test_a_join_of_its_own_process_that_it_did_not_publish_is_answered_by_a_newe
 
 
 @pytest.mark.parametrize("slack_ns", [0, GATE_NS])
-def test_after_a_lost_link_it_joins_anew_and_says_again_what_it_has_done(slack_ns: int):
+def test_after_a_lost_link_a_participant_rejoins_and_repeats_its_done(slack_ns: int):
     link = FakeLink()
     shown = Participant(link, INFO, ME, slack_ns=slack_ns)  # type: ignore[arg-type]
     shown.announce()
@@ -203,7 +203,7 @@ def test_after_a_lost_link_it_joins_anew_and_says_again_what_it_has_done(slack_n
     )
 
 
-def test_it_leaves_once():
+def test_a_participant_leaves_only_once():
     link = FakeLink()
     shown = console(link)
     for _ in range(2):

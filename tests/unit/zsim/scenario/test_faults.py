@@ -1,4 +1,4 @@
-"""What a fault may be: every kind with what it needs, every flaw in a line."""
+"""Kinds of faults: each with its parameters, and each flaw reported in one line."""
 
 import math
 import re
@@ -49,7 +49,7 @@ def sound(kind: str, **more: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_is_taken_with_what_it_needs(kind: str):
+def test_every_kind_is_accepted_with_its_required_parameters(kind: str):
     assert list(flaws(sound(kind), KNOWN)) == []
     for parameter in KINDS[kind].parameters:
         left_out = {name: value for name, value in sound(kind).items() if name != parameter.name}
@@ -58,7 +58,7 @@ def test_every_kind_is_taken_with_what_it_needs(kind: str):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_nobody_simulates_of_an_external_drone_cannot_fail(kind: str):
+def test_faults_of_an_external_drone_are_refused(kind: str):
     known = KNOWN._replace(external=("drone1",))
     found = list(flaws(sound(kind), known))
     if KINDS[kind].strikes != "drone":
@@ -111,14 +111,14 @@ def test_every_parameter_is_checked(kind: str):
         (sound("rotor_stuck", rotor="left"), ('rotor', "'left'", 'front_left', 'front_right', 'rear_right', 'rear_left', 'all', 'rotor_stuck')),
     ],
 )  # fmt: skip
-def test_a_flaw_is_a_line(given: dict[str, Any], terms: tuple[str, ...]):
+def test_a_flaw_is_reported_with_its_parameter_value_and_limits(given: dict[str, Any], terms: tuple[str, ...]):
     (flaw,) = [f"{path} {text}" for path, text in flaws(given, KNOWN)]
     assert has_terms(flaw, *terms)
 
 
 @pytest.mark.parametrize(("others", "allowed"), [((), "out"), (("lidar",), "drone2")])
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].sensor in SCANNERS])
-def test_a_sensor_that_the_drone_does_not_have_cannot_fail(kind: str, others: tuple[str, ...], allowed: str):
+def test_a_fault_of_a_sensor_that_the_drone_lacks_is_refused(kind: str, others: tuple[str, ...], allowed: str):
     sensor = KINDS[kind].sensor
     others = (sensor,) if others else ()
     ((path, text),) = flaws(sound(kind), KNOWN._replace(sensors={"drone1": (), "drone2": others}))
@@ -127,7 +127,7 @@ def test_a_sensor_that_the_drone_does_not_have_cannot_fail(kind: str, others: tu
     assert list(flaws(sound(kind), KNOWN._replace(sensors={"drone1": (sensor,), "drone2": ()}))) == []
 
 
-def test_an_unknown_kind_names_one_that_is_like_it_and_hides_nothing_else():
+def test_an_unknown_kind_is_reported_with_a_similar_one():
     ((path, text),) = flaws({"kind": "gps_dropot"}, KNOWN)
     assert path == "kind"
     assert has_terms(text, "'gps_dropot'", "gps_dropout", f"{len(KNOWN.kinds)}", "zsim fault kinds")
@@ -142,7 +142,7 @@ def test_an_unknown_kind_names_one_that_is_like_it_and_hides_nothing_else():
     "name",
     ["my.filter", "pilot", "estimator2.drone1", "my_estimator.drone1", "controllers.main", "control.main", "contr.x"],
 )
-def test_a_name_of_one_s_own_is_taken_before_it_has_joined(name: str):
+def test_a_user_s_process_name_is_accepted_before_it_has_joined(name: str):
     assert list(flaws(sound("radio", place={name: "drone1"}), KNOWN)) == []
     for target in (f"{name}/world", f"world/{name}"):
         assert list(flaws(sound("link_cut", target=target, one_way=True), KNOWN)) == []
@@ -154,22 +154,22 @@ def test_a_name_of_one_s_own_is_taken_before_it_has_joined(name: str):
         *(sound("link_cut", target=f"{a}/world", one_way=one_way) for a in ("console.1", "recorder") for one_way in (True, False)),
         *(sound("link_cut", target=target) for target in ("my.filter/controller.main", "estimator.drone1/estimator.drone2")),
         sound("process_kill", target="my.filter"),
-        sound("link_cut", target="world/controler.main"),  # it looks mistyped, and takes part
+        sound("link_cut", target="world/controler.main"),  # it looks mistyped, but such a process takes part
     ],
     ids=lambda given: given["target"],
 )  # fmt: skip
-def test_links_and_processes_that_can_be_are_taken(given: dict[str, Any]):
+def test_valid_links_and_processes_are_accepted(given: dict[str, Any]):
     assert list(flaws(given, KNOWN._replace(processes=("my.filter", "controler.main")))) == []
 
 
-def test_a_kill_of_who_would_not_hear_of_it_is_a_flaw():
+def test_a_kill_of_a_process_that_does_not_read_faults_is_a_flaw():
     known = Known(("drone1",), (), ("recorder",))
     ((path, text),) = flaws(sound("process_kill", target="recorder"), known)
     assert path == "target"
     assert has_terms(text, "'recorder'", "estimator.d…")
 
 
-def test_times_are_whole_gates():
+def test_times_are_rounded_to_whole_gates():
     fault = planned(sound("baro_bias", at_s=1.009, for_s=0.031), 3, "me", 0, GATE_NS)
     assert (fault.id, fault.source, fault.from_ns, fault.until_ns) == (3, "me", 50 * GATE_NS, 52 * GATE_NS)
     assert [gate for gate in range(48, 56) if acts(fault, gate * GATE_NS)] == [51, 52]
@@ -182,7 +182,7 @@ def test_times_are_whole_gates():
     assert (kill.from_ns, kill.until_ns) == (50 * GATE_NS, 51 * GATE_NS)
 
 
-def test_every_parameter_is_told():
+def test_a_planned_fault_has_every_parameter():
     assert planned(sound("link_cut"), 1, "me", 0, GATE_NS).parameters == {"one_way": False}
     paths = planned(sound("radio", place={"controller.main": [1, 2, 3]}), 1, "me", 0, GATE_NS).parameters
     assert paths == {"range_m": 30.0, "spread_m": 5.0, "place": {"controller.main": [1.0, 2.0, 3.0]}}
@@ -195,7 +195,7 @@ def document(*given: Any) -> dict[str, Any]:
     return {"name": "t", "duration_s": 1, "drones": drones, "clusters": clusters, "faults": list(given)}
 
 
-def test_a_scenario_tells_every_flaw_at_once():
+def test_a_scenario_reports_every_flaw_at_once():
     with pytest.raises(ScenarioError) as paths:
         resolve(document(sound("gps_dropout"), sound("link_loss", probability=1.4), {"kind": "x"}, 3), "step.yaml")
     lines = str(paths.value).splitlines()
@@ -204,7 +204,7 @@ def test_a_scenario_tells_every_flaw_at_once():
     assert len(lines) == 3
 
 
-def test_a_scenario_takes_every_kind_and_comes_back_from_its_text():
+def test_a_scenario_with_every_kind_survives_a_round_trip():
     everything = [sound(kind, at_s=1.5) for kind in KINDS]
     seeing = {"range": {}, "lidar": {}, "front_camera": {}, "depth": {}}
     scenario = resolve({**document(*everything), "sensors": seeing})
@@ -212,7 +212,7 @@ def test_a_scenario_takes_every_kind_and_comes_back_from_its_text():
     assert scenario_file.from_text(text).faults == scenario.faults == everything
 
 
-def test_the_table_of_kinds_in_the_documentation_says_what_the_code_says():
+def test_the_table_of_kinds_in_the_documentation_matches_the_code():
     text = (Path(__file__).parents[4] / "docs/faults.md").read_text()
     table = re.search(r"<!-- kinds -->\n\n((?:\|.*\n)+)", text)
     assert table

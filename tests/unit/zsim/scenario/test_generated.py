@@ -1,4 +1,4 @@
-"""Forests, corridors, meshes, height maps and clouds: what becomes of them, and what is refused."""
+"""Forests, corridors, meshes, height maps and point clouds: the obstacles they generate, and what is refused."""
 
 import struct
 from itertools import combinations, pairwise
@@ -31,7 +31,7 @@ def obstacles(**given: Any) -> Any:
     return resolve(document(**given)).environment.obstacles
 
 
-def test_trunks_are_clear_of_each_other_and_of_the_starts():
+def test_trees_are_clear_of_each_other_and_of_the_starts():
     trees = obstacles(forest=FOREST)
     assert len({tree.name for tree in trees}) == 60
     places = np.array([tree.position_m[:2] for tree in trees])
@@ -43,22 +43,22 @@ def test_trunks_are_clear_of_each_other_and_of_the_starts():
 
 
 @pytest.mark.parametrize("part", [{"forest": FOREST}, {"corridor": CORRIDOR}])
-def test_the_seed_decides_and_may_be_its_own(part: dict[str, Any]):
+def test_the_seed_of_the_scenario_or_section_determines_the_obstacles(part: dict[str, Any]):
     ((name, settings),) = part.items()
     assert obstacles(seed=1, **part) == obstacles(seed=1, **part) != obstacles(seed=2, **part)
     fixed = {name: settings | {"seed": 5}}
     assert obstacles(seed=1, **fixed) == obstacles(seed=2, **fixed)
 
 
-def test_the_resolved_text_has_each_of_them_beside_those_that_are_given():
+def test_the_resolved_text_lists_generated_and_given_obstacles():
     ball = {"name": "ball", "shape": "sphere", "position_m": [0, 0, 9], "radius_m": 1}
     made = resolve(document(forest=FOREST, corridor=CORRIDOR | {"start_m": [30, 0]}, obstacles=[ball]))
     assert len(made.environment.obstacles) == 1 + 60 + 16
     assert scenario_file.from_text(scenario_file.to_text(made)) == made
 
 
-def test_a_corridor_is_as_wide_as_told_and_closed_at_its_bends():
-    """Along its middle the nearest wall is half of the width away; along the inner faces none is missing."""
+def test_a_corridor_has_its_width_and_is_closed_at_its_bends():
+    """Opposite walls are one width apart; consecutive walls overlap, so that there is no gap."""
     walls = list(obstacles(corridor=CORRIDOR))
     rows = [row_of(wall) for wall in walls]
     lefts, rights = ([wall for wall in walls if wall.name.endswith(side)] for side in ("left", "right"))
@@ -67,7 +67,7 @@ def test_a_corridor_is_as_wide_as_told_and_closed_at_its_bends():
         across = np.array([-np.sin(yaw), np.cos(yaw)])
         apart = np.subtract(left.position_m, right.position_m)[:2] @ across
         assert apart == pytest.approx(3.0 + 0.2, abs=5e-3)
-    for first, second in pairwise(lefts):  # the ends of two walls are within one another
+    for first, second in pairwise(lefts):  # each wall ends within the next
         yaw = np.radians(first.yaw_deg)
         end = np.array(first.position_m[:2]) + 0.5 * (first.size_m[0] - 0.2) * np.array([np.cos(yaw), np.sin(yaw)])
         assert nearest(rows[walls.index(second)], float(end[0]), float(end[1]), 1.0)[0] < 0.0
@@ -76,19 +76,19 @@ def test_a_corridor_is_as_wide_as_told_and_closed_at_its_bends():
 @pytest.mark.parametrize(
     ("section", "change", "field"),
     [
-        ("forest", {"trees": 900}, "trees"),  # do not fit
+        ("forest", {"trees": 900}, "trees"),  # too many to fit
         ("forest", {"area_m": [5, 0, -5, 1]}, "area_m"),
         ("forest", {"radius_m": [0.3, 0.2]}, "radius_m"),
         ("forest", {"colour": 1}, "colour"),
         ("corridor", {"seed": 0.5}, "seed"),
     ],
 )
-def test_what_is_refused(section: str, change: dict[str, Any], field: str):
+def test_invalid_forests_and_corridors_are_refused(section: str, change: dict[str, Any], field: str):
     changed: Any = {section: {"forest": FOREST, "corridor": CORRIDOR}[section] | change}
     assert faulty_fields(document(**changed), "environment.") == [f"{section}.{field}"]
 
 
-def test_together_they_are_no_more_than_a_world_takes():
+def test_more_obstacles_in_total_than_a_world_takes_are_refused():
     big: Any = {"forest": FOREST | {"trees": 999, "area_m": [-300, -300, 300, 300]}, "corridor": CORRIDOR}
     assert faulty_fields(document(**big), "environment.") == ["obstacles"]
 
@@ -98,7 +98,7 @@ CORNERS = np.array([[[0, -1, 0], [0, 1, 0], [0, 0, 2]], [[2, -1, 0], [2, 1, 0], 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write the same two triangles in every format; height maps and clouds of other shapes."""
+    """Write the same two triangles in every mesh format, and height maps and clouds of other shapes."""
     monkeypatch.setenv(plugin.FOLDERS, "")
     plugin.search(tmp_path)
     facets = b"".join(struct.pack("<12fH", 0, 0, 0, *each.ravel(), 0) for each in CORNERS)
@@ -144,16 +144,16 @@ def seen(made: Any, o: Any, d: Any) -> float:
 
 
 @pytest.mark.parametrize("file", ["binary.stl", "text.stl", "mesh.obj"])
-def test_a_mesh_is_seen_where_it_is_placed(file: str):
+def test_a_ray_hits_a_mesh_where_it_is_placed(file: str):
     pytest.importorskip("trimesh")
     made = resolved(surfaces=[{"name": "m", "file": file, "position_m": [5, 3, 0], "yaw_deg": 90, "scale": 2}])
-    assert seen(made, (5.0, -4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(7.0, abs=1e-6)  # turned: y = 3
-    assert seen(made, (5.0, 4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(3.0, abs=1e-6)  # and y = 3 + 2 * 2
+    assert seen(made, (5.0, -4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(7.0, abs=1e-6)  # after the turn, at y = 3
+    assert seen(made, (5.0, 4.0, 1.0), (0.0, 1.0, 0.0)) == pytest.approx(3.0, abs=1e-6)  # and at y = 3 + 2 * 2
     assert seen(made, (5.0, -4.0, 4.1), (0.0, 1.0, 0.0)) == 50.0  # above its top
 
 
 @pytest.mark.parametrize("file", ["hill.csv", "hill.npy"])
-def test_a_height_map_is_flat_between_its_heights(file: str):
+def test_a_height_map_is_linear_between_its_heights(file: str):
     made = resolved(surfaces=[{"name": "hill", "file": file, "cell_m": 4}])
     for x, y, height in ((0.0, 0.0, 3.0), (2.0, 0.0, 1.5), (0.0, -1.0, 2.25), (3.9, 3.9, 0.075)):
         assert seen(made, (x, y, 9.0), (0.0, 0.0, -1.0)) == pytest.approx(9.0 - height, abs=1e-5)
@@ -167,8 +167,8 @@ def test_the_resolved_text_needs_no_file(folder: Path):
 
 
 @pytest.mark.parametrize("file", ["points.csv", "points.pcd", "points.ply"])
-def test_a_cloud_becomes_boxes_of_its_occupied_cells(file: str):
-    """Cells of 0.5 m: two above each other make one box, the third is apart."""
+def test_a_point_cloud_becomes_boxes_of_its_occupied_cells(file: str):
+    """Of the occupied cells of 0.5 m, two on top of each other form one box, and the third is separate."""
     if not file.endswith("csv"):
         pytest.importorskip("trimesh")
         pytest.importorskip("pypcd4")
@@ -199,7 +199,7 @@ def test_a_cloud_becomes_boxes_of_its_occupied_cells(file: str):
         ({"cloud": {"file": "hill.npy", "cell_m": 1}}, "cloud.file"),
     ],
 )
-def test_files_and_texts_that_cannot_be_are_refused(environment: dict[str, Any], field: str):
+def test_invalid_files_and_triangles_are_refused(environment: dict[str, Any], field: str):
     found = faulty_fields(with_files(**environment), "environment.")
     assert field in found
     assert {each.partition(".")[0] for each in found} == {field.partition(".")[0]}
@@ -212,7 +212,7 @@ def test_more_triangles_than_a_scenario_can_carry_are_refused(folder: Path):
 
 
 def test_a_bad_binary_stl_is_refused_with_its_size_or_triangle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One is cut short, the second triangle of another has a NaN."""
+    """One file is truncated, and in another the second triangle has a NaN."""
     triangle = np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0], "<f4")
     bad = triangle.copy()
     bad[4] = np.nan
@@ -229,7 +229,7 @@ def test_a_bad_binary_stl_is_refused_with_its_size_or_triangle(tmp_path: Path, m
         assert has_terms(raised.value.faults[0], "environment.surfaces[0].file", "'rock.stl'", finding)
 
 
-def test_a_height_that_is_not_finite_is_named_by_row_and_column(tmp_path: Path) -> None:
+def test_a_height_that_is_not_finite_is_reported_with_row_and_column(tmp_path: Path) -> None:
     heights = np.zeros((4, 5))
     heights[2, 3] = np.nan
     np.save(tmp_path / "hill.npy", heights)

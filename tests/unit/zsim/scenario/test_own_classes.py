@@ -1,4 +1,4 @@
-"""Agents of users' classes in a scenario: what is filled in, and what is refused where."""
+"""Users' agent and law classes in a scenario: what is filled in, and which faults are reported where."""
 
 from pathlib import Path
 from typing import Any
@@ -114,7 +114,7 @@ def resolve(**agents: Any) -> Any:
     return scenario_file.resolve({**BASE, "agents": agents})
 
 
-def test_parameters_and_messages_are_filled_in_and_kept_by_whoever_imports_nothing() -> None:
+def test_resolved_parameters_and_messages_are_read_without_the_module() -> None:
     scenario = resolve(pilot=PILOT, watch={"class": "flyers:Watch", "per": "run"})
     pilot, watch = scenario.own_agents["pilot"], scenario.own_agents["watch"]
     assert pilot.parameters == {"push_1_s": 0.4, "height_m": 2.0}
@@ -130,14 +130,14 @@ def test_parameters_and_messages_are_filled_in_and_kept_by_whoever_imports_nothi
     assert yaml.safe_load(text)["agents"]["pilot"]["class"] == "flyers:Pilot"
 
 
-def test_they_are_processes_like_the_stock_ones() -> None:
+def test_user_agents_are_processes_like_the_stock_ones() -> None:
     scenario = resolve(pilot=PILOT, watch={"class": "flyers:Watch", "per": "run"})
     own = ["pilot.d1", "pilot.d2", "watch.main"]
     assert agent_names(scenario) == expected_processes(scenario) == ["estimator.d1", "estimator.d2", *own]
     assert scenario.own_code() == ["flyers:Pilot", "flyers:Watch"]
 
 
-def test_of_a_drone_they_may_command_it_and_publish_for_it_only_and_read_all_but_the_truth() -> None:
+def test_user_agents_write_only_for_their_drone_and_read_all_but_the_truth() -> None:
     scenario = resolve(pilot=PILOT, watch={"class": "flyers:Watch", "per": "run"})
     pilot, watch = rights_for("pilot.d1", scenario), rights_for("watch.main", scenario)
     assert permits(pilot.writes, "swarm/d1/offset")
@@ -184,12 +184,12 @@ def test_of_a_drone_they_may_command_it_and_publish_for_it_only_and_read_all_but
         ({"a": PILOT, "b": {"class": "flyers:OtherPilot"}}, ("agents.b.class", "swarm/*/offset", "agents.a")),
     ],
 )
-def test_what_is_wrong_is_told_at_its_place(agents: dict[str, Any], terms: tuple[str, ...]) -> None:
+def test_invalid_agents_are_reported_with_their_path(agents: dict[str, Any], terms: tuple[str, ...]) -> None:
     (line,) = faults_of({**BASE, "agents": agents})
     assert has_terms(line, *terms), line
 
 
-def test_an_unresolved_agent_is_not_taken_from_world_info() -> None:
+def test_an_unresolved_agent_in_world_info_is_refused() -> None:
     with pytest.raises(ScenarioError) as raised:
         scenario_file.from_text(yaml.safe_dump({**BASE, "agents": {"pilot": PILOT}}))
     assert has_terms(str(raised.value), "agents.pilot.declared")
@@ -199,7 +199,7 @@ def of_law(**cluster: Any) -> Any:
     return scenario_file.resolve({**BASE, "clusters": [{"name": "main", "drones": ["d1", "d2"], **cluster}]})
 
 
-def test_parameters_of_a_law_are_filled_in_overridden_and_there_when_it_is_made(tmp_path: Path) -> None:
+def test_law_parameters_are_filled_in_overridden_and_passed_to_the_law(tmp_path: Path) -> None:
     scenario = of_law(law="flyers:Law")
     assert scenario.cluster("main").law_parameters == {"push_1_s": 0.4}
     (tmp_path / "s.yaml").write_text(yaml.safe_dump({**BASE, "clusters": [{"name": "main", "drones": ["d1", "d2"]}]}))
@@ -225,7 +225,7 @@ def test_parameters_of_a_law_are_filled_in_overridden_and_there_when_it_is_made(
         ({"law": "flyers:Plain", "law_parameters": {"push": 1}}, ("clusters[0].law_parameters", "Plain", "Parameters")),
     ],
 )
-def test_those_of_a_law_are_checked_with_the_scenario(cluster: dict[str, Any], terms: tuple[str, ...]) -> None:
+def test_invalid_law_parameters_are_reported_with_the_scenario(cluster: dict[str, Any], terms: tuple[str, ...]) -> None:
     with pytest.raises(ScenarioError) as raised:
         of_law(**cluster)
     assert has_terms(str(raised.value), *terms), str(raised.value)

@@ -1,4 +1,4 @@
-"""Obstacles in closed form and triangles against brute force: distances, nearest points, rims, paths that cross one."""
+"""Obstacles in closed form and triangles against brute force: distances, nearest points, rims and crossing paths."""
 
 import math
 from types import SimpleNamespace
@@ -30,7 +30,7 @@ from zsim_world.run.world import World
 
 
 def rough(rows: int = 30, seed: int = 0) -> Any:
-    """Return an environment with a turned height map of random heights, in cells of half a metre."""
+    """Return an environment with a rotated height map of random heights in cells of half a metre, scaled by 1.5."""
     height = np.random.default_rng(seed).uniform(0.0, 3.0, (rows, rows))
     x = np.arange(rows, dtype=float) * 0.5
     p = np.stack([*np.meshgrid(x, x), height], axis=2)
@@ -41,7 +41,7 @@ def rough(rows: int = 30, seed: int = 0) -> Any:
 
 
 def brute_force(corners: np.ndarray, p: np.ndarray) -> float:
-    """Return the least distance of a point from triangles (T, 3, 3): of the plane's foot within it, or of an edge."""
+    """Return the least distance of a point from triangles (T, 3, 3): to its foot point within one, or to an edge."""
     a, b, c = np.moveaxis(corners, 1, 0)
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
@@ -57,7 +57,7 @@ def brute_force(corners: np.ndarray, p: np.ndarray) -> float:
     return min(least, np.abs(height[inside]).min(initial=np.inf))
 
 
-def test_the_nearest_point_is_that_of_brute_force():
+def test_the_nearest_point_matches_brute_force():
     environment, rng = rough(), np.random.default_rng(1)
     sheet = sheet_of(environment)
     corners = corners_of(sheet.triangle)
@@ -66,11 +66,11 @@ def test_the_nearest_point_is_that_of_brute_force():
     expected = np.array([brute_force(corners, p) for p in points])
     np.testing.assert_allclose(distance, expected, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(points - found, axis=1), expected, atol=1e-12)
-    far = 0.7 * expected + 0.3 * np.median(expected)  # nothing is found beyond it
+    far = 0.7 * expected + 0.3 * np.median(expected)  # search radius: nothing is found beyond it
     np.testing.assert_allclose(nearest_points(hold(sheet), points, far)[0], np.minimum(far, expected), atol=1e-12)
 
 
-def test_the_nearest_point_is_that_of_trimesh():
+def test_the_nearest_point_matches_trimesh():
     trimesh = pytest.importorskip("trimesh")
     sheet = sheet_of(rough(12, seed=3))
     mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners_of(sheet.triangle)))
@@ -90,13 +90,13 @@ def test_the_rim_of_a_height_map_is_its_outline():
     assert not sheet.rim[inner].any()
 
 
-def test_a_way_crosses_what_a_plane_says_and_does_not_slip_between_two():
-    """Of a plane in cells: a way crosses it if and only if its ends are on both sides, on its edges and corners too."""
+def test_a_path_crosses_a_plane_also_on_the_edges_of_its_triangles():
+    """A path crosses a gridded plane if and only if its ends are on either side, even through edges and corners."""
     sheet = sheet_of(SimpleNamespace(obstacles=[], surfaces=[flat()]))
     rng = np.random.default_rng(4)
     starts = rng.uniform(-3.5, 3.5, (600, 3))
     ends = starts + rng.normal(0.0, 1.0, (600, 3))
-    starts[:300, :2] = ends[:300, :2] = np.rint(2.0 * starts[:300, :2]) / 2.0  # upright, through corners
+    starts[:300, :2] = ends[:300, :2] = np.rint(2.0 * starts[:300, :2]) / 2.0  # vertical, through corners
     ends = np.clip(ends, -3.9, 3.9)
     for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
         assert crosses(sheet, tuple(start), tuple(end)) == ((start[2] >= 0.0) != (end[2] >= 0.0))
@@ -111,7 +111,7 @@ def flat() -> Surface:
     return Surface(name="flat", triangles=packed(triangles))
 
 
-def test_distances_are_those_from_the_nearest_of_obstacles_and_surfaces():
+def test_distances_are_to_the_nearest_of_obstacles_and_surfaces():
     post = Obstacle(name="post", shape="cylinder", position_m=(0, 0, 0), radius_m=1, height_m=4)
     both = Surroundings(Environment(obstacles=[post], surfaces=[flat()]))
     points = [(0, 0, 2), (1.5, 0, 2), (2, 0, 0.25), (0, 0, -0.5), (9, 0, 0)]
@@ -131,7 +131,7 @@ def row(shape: str, **given: Any) -> list[float]:
 
 
 R2 = math.sqrt(0.5)
-BOX_ROW = row("box", position_m=(1, 2, 0), size_m=(2, 4, 6), yaw_deg=90)  # 4 along x, 2 along y
+BOX_ROW = row("box", position_m=(1, 2, 0), size_m=(2, 4, 6), yaw_deg=90)  # extends 4 m along x, 2 m along y
 ROUND = row("cylinder", position_m=(0, 0, 1), radius_m=1, height_m=2)
 
 
@@ -152,7 +152,7 @@ ROUND = row("cylinder", position_m=(0, 0, 1), radius_m=1, height_m=2)
         (row("sphere", position_m=(0, 0, 2), radius_m=1), (0, 0, 1.5), -0.5, (0, 0, -1)),
     ],
 )
-def test_distance_and_direction(solid: list[float], point: Any, distance: float, away: Any):
+def test_distance_and_direction_to_a_solid(solid: list[float], point: Any, distance: float, away: Any):
     found = nearest(solid, *point)
     assert found[0] == pytest.approx(distance, abs=1e-9)
     assert found[1:] == pytest.approx(away, abs=1e-9)
@@ -161,7 +161,7 @@ def test_distance_and_direction(solid: list[float], point: Any, distance: float,
 @pytest.mark.parametrize(
     "solid", [BOX_ROW, ROUND, row("sphere", position_m=(0, 0, 2), radius_m=1)], ids=["box", "cylinder", "sphere"]
 )
-def test_the_direction_is_the_slope_of_the_distance(solid: list[float]):
+def test_the_direction_is_the_gradient_of_the_distance(solid: list[float]):
     rng = np.random.default_rng(1)
     for p in rng.uniform(-5, 6, (300, 3)):
         d, *away = nearest(solid, *p)
@@ -177,7 +177,7 @@ def scenario(*obstacles: Any, **more: Any) -> Scenario:
 
 
 @pytest.mark.parametrize("given", [BOX, PILLAR, BALL], ids=lambda o: o["shape"])
-def test_a_drone_that_flies_into_an_obstacle_does_not_get_through(given: dict[str, Any]):
+def test_a_drone_does_not_fly_through_an_obstacle(given: dict[str, Any]):
     flown = scenario(given)
     fleet, solid = Fleet(flown), row_of(flown.environment.obstacles[0])
     assert fleet.takeoff(0) is None
@@ -189,14 +189,14 @@ def test_a_drone_that_flies_into_an_obstacle_does_not_get_through(given: dict[st
         began += fleet.bumps()
         depths.append(ARDRONE2.airframe.hull_radius_m - nearest(solid, *fleet.truth().position_m[0])[0])
     assert began[0] == (0, 0)
-    # of the hull's 0.26 m; a ball turns the flat hull, which comes to lie on it
+    # compared with the hull's 0.26 m; a ball turns the flat hull, which comes to lie on it
     assert 0.0 < max(depths) < (0.25 if given is BALL else 0.1)
     assert not fleet.touching[1]
     if given is BOX:
         assert fleet.truth().position_m[0, 0] < 3.5
 
 
-def test_the_world_says_who_runs_into_what():
+def test_the_world_reports_a_collision_with_drone_and_obstacle():
     world = World(scenario(BOX), run_id="r")
     for gate in range(600):
         if gate == 1:
@@ -228,14 +228,14 @@ def test_an_obstacle_out_of_reach_changes_nothing():
         ({**BOX, "shape": "cone"}, ('environment.obstacles[0].shape', "'cone'", 'box', 'cylinder', 'sphere')),
     ],
 )  # fmt: skip
-def test_what_an_obstacle_cannot_be(given: dict[str, Any], terms: tuple[str, ...]):
+def test_an_invalid_obstacle_is_refused(given: dict[str, Any], terms: tuple[str, ...]):
     with pytest.raises(ScenarioError) as raised:
         scenario(given)
     (fault,) = raised.value.faults
     assert has_terms(fault, *terms)
 
 
-def test_a_drone_may_start_on_a_roof_and_takes_off_from_it():
+def test_a_drone_may_start_and_take_off_from_a_roof():
     roof = {"name": "roof", "shape": "box", "position_m": [0, 0, 0], "size_m": [3, 3, 2.5]}
     drones = [{"name": "d1", "position_m": [0.5, 0.2, 2.5]}]
     document = {"name": "t", "duration_s": 30, "drones": drones, "environment": {"obstacles": [roof]}}
@@ -251,7 +251,7 @@ def test_a_drone_may_start_on_a_roof_and_takes_off_from_it():
     assert fleet.truth().position_m[0, 2] == pytest.approx(2.5 + ARDRONE2.takeoff_height_m, abs=0.15)
 
 
-def test_least_distances_are_those_of_nearest_in_blocks_too(monkeypatch: pytest.MonkeyPatch):
+def test_least_distances_match_nearest_even_when_computed_in_blocks(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(surroundings, "PAIRS_MAX", 7)
     solids = [
         Obstacle(name="box", shape="box", position_m=(1, 2, 0), size_m=(2, 1, 3), yaw_deg=30),

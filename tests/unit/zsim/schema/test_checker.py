@@ -1,4 +1,4 @@
-"""Faults of a document against its types: every one, with its path, and what is sound of the rest."""
+"""Faults of a document against its types: each with its path, and the sound part of the rest."""
 
 import math
 from typing import Annotated, Any, Literal
@@ -83,7 +83,7 @@ def test_a_sound_document_has_no_faults():
         ({7: 1}, ("7", "known", "count", "free")),
     ],
 )  # fmt: skip
-def test_a_fault_says_where_what_and_what_is_allowed(changes: dict[str, Any], terms: tuple[str, ...]):
+def test_a_fault_gives_the_path_the_value_and_what_is_allowed(changes: dict[str, Any], terms: tuple[str, ...]):
     (only,) = [f"{path} {text}" for path, text in faults({**GOOD, **changes}, Whole)]
     assert has_terms(only, *terms)
     assert first_fault({**GOOD, **changes}, Whole) is not None
@@ -97,17 +97,17 @@ def test_every_fault_is_found():
 
 
 @pytest.mark.parametrize("document", [None, [], "x", 3, [{}]])
-def test_a_document_that_is_no_map_is_one_fault(document: Any):
+def test_a_document_that_is_not_a_map_is_one_fault(document: Any):
     ((path, text),) = faults(document, Whole)
     assert path == ""
     assert has_terms(text, "map")
 
 
-def test_unknown_fields_are_faults_only_where_the_type_says_so():
+def test_unknown_fields_are_faults_only_if_the_type_forbids_them():
     assert list(faults({"x": 1, "y": 2}, Loose)) == []
 
 
-def test_a_path_begins_where_it_is_told():
+def test_a_path_begins_with_the_given_prefix():
     assert [path for path, _ in faults({"name": 1}, Part, "drones[3]")] == ["drones[3].name"]
 
 
@@ -123,7 +123,7 @@ def test_limits_of_the_representation_are_not_shown():
     assert not any(limit in text for text in texts for limit in ("e+308", "<="))
 
 
-# Agreement with msgspec, which decides in the end
+# Agreement with msgspec, which has the final say
 
 plain = st.recursive(
     st.none() | st.booleans() | st.integers(-5, 5) | st.floats(-3, 3) | st.sampled_from(["a", "big", "x" * 9]),
@@ -148,10 +148,10 @@ def test_faults_are_found_exactly_where_msgspec_refuses(changes: dict[str, Any])
     assert accepted == (found(**changes) == [])
 
 
-# What is sound
+# The sound part
 
 
-def test_what_is_sound_keeps_its_place_and_the_rest_is_none():
+def test_sound_values_keep_their_place_and_faulty_ones_become_none():
     document = {
         "count": "x",
         "parts": [{"name": "a", "mass_kg": -1, "place": [1, 2]}, 5, {"name": "B", "kind": "small"}],
@@ -168,17 +168,17 @@ def test_what_is_sound_keeps_its_place_and_the_rest_is_none():
 
 
 @pytest.mark.parametrize("document", [None, 5, [], "x"])
-def test_nothing_is_sound_of_what_is_no_map(document: Any):
+def test_a_document_that_is_not_a_map_has_no_sound_part(document: Any):
     assert sound(document, Whole) is None
 
 
-def test_a_list_beyond_its_limit_is_not_gone_through():
+def test_a_list_beyond_its_limit_is_not_examined():
     assert sound({**GOOD, "parts": [{"name": "a"}] * 4}, Whole).parts is None
 
 
 @settings(max_examples=300, deadline=None)
 @given(changes=st.dictionaries(fields, plain, max_size=4))
-def test_any_document_has_a_sound_part(changes: dict[str, Any]):
+def test_any_map_has_a_sound_part(changes: dict[str, Any]):
     document = {**GOOD, **changes}
     whole = sound(document, Whole)
     assert whole.on in (True, False, None)
@@ -186,12 +186,12 @@ def test_any_document_has_a_sound_part(changes: dict[str, Any]):
         assert msgspec.to_builtins(msgspec.convert(document, Whole))["count"] == whole.count
 
 
-# One line
+# Values shown in one line
 
 
 @settings(max_examples=300, deadline=None)
 @given(value=st.recursive(st.none() | st.integers() | st.floats() | st.text() | st.binary(), st.lists, max_leaves=9))
-def test_what_was_found_fits_into_a_line(value: Any):
+def test_a_value_is_shown_in_one_short_line(value: Any):
     said = show(value)
     assert 0 < len(said) <= 60
     assert said.isprintable()
@@ -210,29 +210,29 @@ def test_what_was_found_fits_into_a_line(value: Any):
         ({1: b"x"}, "{1: b'x'}"),
     ],
 )
-def test_what_was_found_is_shown_as_it_would_stand_in_a_file(value: Any, shown: str):
+def test_a_value_is_shown_as_it_would_be_written_in_a_file(value: Any, shown: str):
     assert show(value) == shown
 
 
-def test_what_is_long_is_shown_by_its_kind_and_length():
+def test_a_long_value_is_shown_by_its_type_and_length():
     assert has_terms(show(list(range(100))), "list", "100")
     assert has_terms(show(dict.fromkeys(range(100))), "map", "100")
 
 
-def test_a_number_of_any_size_is_shown_in_a_line():
+def test_a_number_of_any_size_is_shown_in_one_line():
     assert has_terms(show(10**5000), "4300")
     ((_, text),) = faults({**GOOD, "count": 10**5000}, Whole)
     assert has_terms(text, "4300")
 
 
-def test_nesting_without_end_is_shown_in_a_line():
+def test_deep_nesting_is_shown_in_one_line():
     nested: list[Any] = []
     for _ in range(5000):
         nested = [nested]
     assert len(show(nested)) <= 60
 
 
-def test_a_long_or_broken_key_fits_into_a_line():
+def test_a_long_or_multi_line_key_is_shown_in_one_line():
     ((path, _),) = faults({**GOOD, "k\n" * 500: 1}, Whole)
     assert len(path) <= 60
     assert path.isprintable()

@@ -1,4 +1,4 @@
-"""Sensors by declaration: stock ones, users' modules, and error models in the units of data sheets and of Kalibr."""
+"""Declared sensors: stock ones, users' modules, and error models in the units of data sheets and of Kalibr."""
 
 import math
 from pathlib import Path
@@ -42,13 +42,13 @@ def scenario(
 
 
 def paths(**given: Any) -> list[str]:
-    """Return where the faults of a scenario are."""
+    """Return the paths of the faults of a scenario."""
     with pytest.raises(ScenarioError) as refused:
         scenario(**given)
     return [line.removeprefix("scenario: ").split(" ")[0] for line in refused.value.faults]
 
 
-def test_the_stock_sensors_are_those_of_a_scenario():
+def test_the_stock_sensors_match_those_of_a_scenario():
     assert tuple(STOCK) == FIELDS[2 : 2 + len(STOCK)] == keys.SENSORS
     assert FIELDS[2 + len(STOCK) :] == ("front_camera", "bottom_camera", keys.SIGHTINGS, *SCANNERS)
     for name, kind in STOCK.items():
@@ -57,7 +57,7 @@ def test_the_stock_sensors_are_those_of_a_scenario():
         assert kind.presets.keys() == PRESETS.keys()
 
 
-def test_a_section_is_resolved_with_the_defaults_of_its_module():
+def test_a_section_is_completed_with_the_defaults_of_its_module():
     made = scenario(my_uwb=UWB, second={"my_uwb": {"rate_hz": 5, "range_m": {"bias": 0.3}}})
     first: Any
     second: Any
@@ -79,7 +79,7 @@ def test_the_resolved_text_is_read_without_the_module(monkeypatch: pytest.Monkey
     assert list(declarations(again.drones)) == ["my_uwb", "pitot"]
 
 
-def test_a_module_that_declares_another_message_than_the_scenario_is_refused():
+def test_a_module_whose_message_differs_from_the_scenario_is_refused():
     text = scenario_file.to_text(scenario(my_uwb=UWB)).replace("range_m: number", "distance_m: number")
     read = scenario_file.from_text(text)
     with pytest.raises(DocumentError, match=r"sensors\.my_uwb\.declared"):
@@ -102,11 +102,11 @@ def test_a_module_that_declares_another_message_than_the_scenario_is_refused():
         ({"a": UWB | {"colour": 1}}, "sensors.a.colour"),
     ],
 )
-def test_a_faulty_section_is_named_once(sensors: dict[str, Any], where: str):
+def test_a_faulty_section_is_reported_once(sensors: dict[str, Any], where: str):
     assert paths(**sensors) == [where]
 
 
-def test_faults_of_sensors_that_are_not_imported_are_passed_over_and_no_others():
+def test_only_faults_of_sensors_that_are_not_imported_are_skipped():
     def fault(kind: str) -> dict[str, Any]:
         return {"kind": kind, "target": "d1", "at_s": 0.1}
 
@@ -120,7 +120,7 @@ def test_faults_of_sensors_that_are_not_imported_are_passed_over_and_no_others()
 
 
 def module(path: Path, name: str, text: str) -> dict[str, str]:
-    """Write a module with a sensor of one number; return its section."""
+    """Write a module with a sensor that measures one number; return its section."""
     head = """
 from zsim.schema.message import Number
 from zsim.sensors.sensor import Channel, ErrorModel, LatencyMs, RateHz, Sample, Sensor, SensorType
@@ -140,7 +140,7 @@ CONFIG = (
 MINE = "class Mine(Sample, frozen=True):\n    {}: Number\n"
 
 
-def test_one_name_is_one_kind_of_message_and_has_the_same_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_sensor_name_stands_for_one_message_type_with_fixed_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     one, other = (module(tmp_path, f"named_{x}", MINE.format(x) + CONFIG) for x in "ab")
     assert scenario(p=one, q=one).drones[0].sensors is not None
@@ -149,7 +149,7 @@ def test_one_name_is_one_kind_of_message_and_has_the_same_fields(tmp_path: Path,
 
 
 @pytest.mark.parametrize(("field", "is_sound"), [("latency_ms: LatencyMs", True), ("latency_ms: float", False)])
-def test_settings_that_all_sensors_share_keep_their_limits(
+def test_settings_common_to_all_sensors_keep_their_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: str, is_sound: bool
 ):
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -173,7 +173,7 @@ def test_faults_of_a_users_sensor_have_its_unit():
     assert paths(faults=[{**sound, "value_m": "far"}], my_uwb=UWB) == ["faults[0].value_m"]
 
 
-def test_messages_are_known_wherever_the_info_of_the_run_is():
+def test_message_types_are_known_once_the_run_info_registers_them():
     fields: dict[str, Any] = {"range_m": "number", "place_m": "number[3]", "hits": "whole", "line_of_sight": "flag"}
     key = keys.sensor("d1", "test_ranger")
     assert messages.type_of(key) is None
@@ -192,7 +192,7 @@ def test_messages_are_known_wherever_the_info_of_the_run_is():
 
 
 @pytest.mark.parametrize("numbers", [[], [1.0], [1.0, 2.0, 3.0, 4.0, 5.0]])
-def test_a_reading_of_another_length_makes_no_message(numbers: list[float]):
+def test_a_reading_of_the_wrong_length_is_refused(numbers: list[float]):
     with pytest.raises(ValueError, match="place_m"):
         as_fields(numbers, {"range_m": "number", "place_m": "number[3]"})
 
@@ -220,13 +220,13 @@ def resolved(**sensors: Any):
         ("gyro_deg_s", {"bias_instability_deg_h": 36, "correlation_s": 9}, "bias_instability", 0.01),
     ],
 )
-def test_a_figure_of_a_data_sheet_is_read_in_its_unit(channel: str, given: dict[str, float], field: str, value: float):
+def test_a_value_from_a_data_sheet_is_read_in_its_unit(channel: str, given: dict[str, float], field: str, value: float):
     of = resolved(imu={channel: given})
     assert getattr(getattr(of.drones[0].sensors.imu, channel), field) == pytest.approx(value)
     assert from_text(to_text(of)) == of
 
 
-def test_kalibrs_file_is_read_as_it_is():
+def test_a_kalibr_file_is_read_unchanged():
     keys = {"accelerometer_noise_density": 0.0017, "accelerometer_random_walk": 3e-4, "update_rate": 100}
     imu = resolved(imu={**keys, "gyroscope_noise_density": 2e-4, "gyroscope_random_walk": 2e-5}).drones[0].sensors.imu
     assert (imu.rate_hz, imu.accel_m_s2.density, imu.accel_m_s2.bias_walk) == (100, 0.0017, 3e-4)
@@ -234,18 +234,18 @@ def test_kalibrs_file_is_read_as_it_is():
     assert imu.gyro_deg_s.bias_walk == pytest.approx(math.degrees(2e-5))
 
 
-def test_what_a_drone_says_wins_over_what_all_share():
+def test_the_settings_of_a_drone_override_the_shared_ones():
     drone = {"name": "a", "position_m": [0, 0, 0], "sensors": {"mag": {"field_ut": {"density_nt_sqrt_hz": 50}}}}
     shared = {"preset": "paper", "mag": {"field_ut": {"density": 0.2}}}
     of = resolve({"name": "t", "duration_s": 1, "sensors": shared, "drones": [drone]})
     assert of.drones[0].sensors.mag.field_ut.density == pytest.approx(0.05)
 
 
-def test_a_scenario_without_them_has_none_of_the_fields():
+def test_unused_error_fields_are_not_in_the_resolved_text():
     assert not [name for name in ("correlation_s", "bias_instability", "sigma_max") if name in to_text(resolved())]
 
 
-def test_every_unit_is_of_a_field_and_every_channel_has_units():
+def test_every_unit_belongs_to_a_field_and_every_channel_has_units():
     assert {unit.field for units in BY_UNIT.values() for unit in units.values()} <= set(ErrorModel.__struct_fields__)
     assert {channel.unit for kind in STOCK.values() for channel in kind.channels} == set(BY_UNIT)
 
@@ -265,7 +265,7 @@ def test_every_unit_is_of_a_field_and_every_channel_has_units():
         ({"gps": {"position_m": {"density_ug_sqrt_hz": 1}}}, ("gps.position_m.density_ug_sqrt_hz", "not", "known")),
     ],
 )
-def test_what_is_wrong_is_a_line(sensors: dict[str, Any], terms: tuple[str, ...]):
+def test_invalid_error_settings_are_reported(sensors: dict[str, Any], terms: tuple[str, ...]):
     with pytest.raises(ScenarioError) as refused:
         resolved(**sensors)
     assert any(all(term in line for term in terms) for line in refused.value.faults), refused.value.faults

@@ -1,4 +1,4 @@
-"""Who loses its link: a reader that takes nothing and that nobody waits for; never anybody else."""
+"""The link watch closes the link of a stalled reader that no process waits for, and no other."""
 
 import os
 import socket
@@ -30,7 +30,7 @@ FAR_ENDS = {READER: FarEnd("r", False), RECORDER: FarEnd("rec", False), ROUTER: 
 
 
 class Sockets:
-    """Connections that hold back what a test says."""
+    """Connections that hold back as many bytes as a test sets."""
 
     def __init__(self) -> None:
         self.held: dict[str, int] = {}
@@ -50,7 +50,7 @@ class Sockets:
 
 
 class Case:
-    """A hub with a reader, the recorder, which is waited for, and a router."""
+    """A hub linked to a reader, to the recorder, which is waited for, and to a router."""
 
     def __init__(self) -> None:
         self.link, self.sockets, self.wall_s = FakeLink(), Sockets(), 100.0
@@ -62,14 +62,14 @@ class Case:
         self.watch = LinkWatch(self.link, tokens, lambda: self.awaited, self.sockets, lambda: self.wall_s)  # type: ignore[arg-type]
 
     def passes(self, wall_s: float, taken: int = 0) -> None:
-        """Let time pass look by look; each far end takes so many bytes in each."""
+        """Let time pass in steps, with a check after each; each far end takes `taken` bytes per step."""
         for _ in range(round(wall_s / LOOK_S)):
             self.wall_s += LOOK_S
             self.sockets.taken = {each: self.sockets.taken.get(each, 0) + taken for each in FAR_ENDS}
             self.watch.look()
 
 
-def test_who_takes_nothing_is_closed_and_named_and_who_is_waited_for_is_not():
+def test_a_stalled_reader_is_closed_but_an_awaited_process_is_only_reported():
     case = Case()
     case.sockets.held = {READER: STALL_BYTES, RECORDER: 100 * HELD_BYTES, ROUTER: 100 * HELD_BYTES}
     case.passes(STALL_S + 2 * LOOK_S)
@@ -79,27 +79,27 @@ def test_who_takes_nothing_is_closed_and_named_and_who_is_waited_for_is_not():
     assert case.watch.stuck() == [f"recorder at {RECORDER}", f"a router at {ROUTER}"]
 
 
-def test_of_two_who_are_waited_for_only_the_one_that_takes_nothing_is_stuck():
-    """As after a host has vanished: the others have much to take at that moment, too, and take it."""
+def test_of_two_awaited_processes_only_the_stalled_one_is_stuck():
+    """After a host has vanished, for example, the others have much to read at that moment too, and read it."""
     case = Case()
     case.awaited.append(Awaited(("estimator.d1",), 8))
     case.link.ends[ESTIMATOR] = FarEnd("e", False)
     case.link.show(keys.session_token("estimator.d1", "e"))
     case.sockets.held = {RECORDER: 10 * HELD_BYTES, ESTIMATOR: HELD_BYTES}
-    case.passes(2.0, taken=1)  # of the links that the case began with
+    case.passes(2.0, taken=1)  # by the links that the case began with
     assert case.watch.stuck() == [f"estimator.d1 at {ESTIMATOR}"]
     assert case.sockets.closed == []
 
 
 @pytest.mark.parametrize(("held_bytes", "closed"), [(STALL_BYTES, []), (HELD_BYTES, [READER])])
-def test_who_takes_something_is_closed_only_if_it_never_catches_up(held_bytes: int, closed: list[str]):
+def test_a_slow_reader_is_closed_only_if_it_never_catches_up(held_bytes: int, closed: list[str]):
     case = Case()
     case.sockets.held = {READER: held_bytes}
     case.passes(10.0, taken=1)
     assert case.sockets.closed == closed
 
 
-def test_a_long_way_is_given_its_time():
+def test_a_long_round_trip_is_allowed_for():
     case = Case()
     case.sockets.round_trip_s = 0.6
     case.sockets.held = {READER: STALL_BYTES}
@@ -109,9 +109,9 @@ def test_a_long_way_is_given_its_time():
     assert case.sockets.closed == [READER]
 
 
-def test_nobody_is_closed_while_one_that_is_waited_for_may_be_behind_any_link():
+def test_no_link_is_closed_while_an_awaited_process_may_be_behind_any():
     case = Case()
-    case.awaited.append(Awaited(("estimator.d1",), 8))  # by its own program: it does not show which session it has
+    case.awaited.append(Awaited(("estimator.d1",), 8))  # a user's own program, which does not show its session
     case.sockets.held = {READER: HELD_BYTES}
     case.passes(2.0)
     assert case.sockets.closed == []
@@ -120,7 +120,7 @@ def test_nobody_is_closed_while_one_that_is_waited_for_may_be_behind_any_link():
     assert case.sockets.closed == [READER]
 
 
-def test_one_that_others_wait_for_is_told_from_a_reader_by_its_pid_on_this_machine():
+def test_a_local_awaited_process_is_identified_by_its_pid():
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as reader:
         case, here = Case(), "{}:{}".format(*reader.getsockname())
         case.awaited.append(Awaited(("estimator.d1",), os.getpid()))
@@ -134,7 +134,7 @@ def test_one_that_others_wait_for_is_told_from_a_reader_by_its_pid_on_this_machi
         assert case.watch.closed[0].process.startswith(f"pid {os.getpid()} ")
 
 
-def test_who_comes_back_to_do_it_again_is_kept_out_for_a_while():
+def test_a_reader_that_stalls_repeatedly_is_kept_out_for_a_while():
     case = Case()
     for _ in range(SPARED):
         case.sockets.held = {READER: HELD_BYTES}
@@ -149,7 +149,7 @@ def test_who_comes_back_to_do_it_again_is_kept_out_for_a_while():
     assert len(case.sockets.closed) == SPARED + 1
 
 
-def test_who_is_kept_out_loses_its_other_links_in_the_same_look():
+def test_a_reader_that_is_kept_out_loses_its_other_links_at_once():
     case, other = Case(), "192.168.1.2:41999"
     case.link.ends[other] = case.link.ends[READER]
     for number in range(SPARED):
@@ -159,7 +159,7 @@ def test_who_is_kept_out_loses_its_other_links_in_the_same_look():
     assert case.sockets.closed == [READER] * SPARED + [other]
 
 
-def test_of_a_session_one_closed_link_is_reported_in_a_while_with_their_number():
+def test_closed_links_of_a_session_are_reported_at_intervals_with_a_count():
     case = Case()
     for _ in range(SPARED - 1):
         case.sockets.held = {READER: HELD_BYTES}
@@ -171,7 +171,7 @@ def test_of_a_session_one_closed_link_is_reported_in_a_while_with_their_number()
     assert [closed.times for closed in case.watch.closed] == [1, SPARED]
 
 
-def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_something_back():
+def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_data_back():
     case = Case()
     for _ in range(SPARED):
         case.sockets.held = {READER: HELD_BYTES}
@@ -184,15 +184,15 @@ def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_something_back(
     assert list(case.watch.closed) == []
 
 
-# Connections of this process, as the kernel has them
+# Connections of this process as the kernel lists them
 
 
-LINGER = struct.Struct("ii")  # socket(7): whether, and for how many seconds
+LINGER = struct.Struct("ii")  # socket(7): whether to linger, and for how many seconds
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows a process its connections")
-def test_a_connection_that_was_seen_does_not_linger_when_it_is_closed() -> None:
-    """Whoever closes one that lingers, does nothing else for so long while the far end takes nothing."""
+def test_an_observed_connection_does_not_linger_when_closed() -> None:
+    """Closing a connection that lingers blocks for that long while the far end reads nothing."""
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as near:
         near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER.pack(1, 10))
         host, port = near.getpeername()

@@ -136,7 +136,7 @@ def test_the_cluster_moves_and_turns_as_one_body(kind):
 
 
 @pytest.mark.parametrize("kind", SPACES)
-def test_the_specimen_keeps_the_distance_between_robots(kind):
+def test_the_specimen_keeps_the_minimum_distance(kind):
     space = SPACES[kind]()
     p_W, _ = space.inverse(space.specimen(2.0))
     assert closest_pair(p_W)[0] > 2.0 - 1e-9
@@ -231,7 +231,7 @@ def test_units_follow_from_names_in_any_space():
     assert {unit(name) for name in angles} == {"rad"}
 
 
-def test_robot_2_is_left_roll_lowers_the_right_and_pitch_lowers_robot_1():
+def test_roll_lowers_the_right_side_and_pitch_lowers_robot_1():
     space = cluster_space(3)
     assert space.forward(TRIANGLE, np.zeros(3))[3:6] == pytest.approx([0.0, 0.0, math.pi / 2])
     assert abs(space.forward(TRIANGLE[[0, 2, 1]], np.zeros(3))[3]) == pytest.approx(math.pi)

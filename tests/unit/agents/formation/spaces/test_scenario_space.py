@@ -1,4 +1,4 @@
-"""Which cluster space a scenario asks for."""
+"""The cluster space that a scenario selects."""
 
 from typing import Any
 
@@ -40,13 +40,13 @@ def space(n: int, **cluster: Any) -> ClusterSpace:
         (3, {"template_m": [[0, 0, 0], [3, 0, 0], [0, 3, 0]]}, TemplateCluster),
     ],
 )
-def test_the_default_is_a_triad_up_to_four_and_a_template_from_five_on(n: int, cluster: Any, kind: type[ClusterSpace]):
+def test_the_default_is_a_triad_up_to_four_robots_and_a_template_above(n: int, cluster: Any, kind: type[ClusterSpace]):
     assert type(space(n, **cluster)) is kind
     assert space(n, **cluster).n == n
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -30.0])
-def test_the_template_is_where_the_drones_start_seen_along_the_first_one_s_heading(yaw_deg: float):
+def test_the_template_is_the_start_seen_along_the_first_heading(yaw_deg: float):
     made = space(5, yaw_deg=yaw_deg)
     starts = np.array([(x, y, 0.0) for x, y in STARTS[:5]])
     c = made.forward(starts, np.full(5, np.radians(yaw_deg)))
@@ -55,14 +55,14 @@ def test_the_template_is_where_the_drones_start_seen_along_the_first_one_s_headi
     assert np.abs(c - expected).max() < 1e-12
 
 
-def test_a_template_that_is_given_is_in_the_formation_s_axes():
+def test_a_given_template_is_in_the_axes_of_the_formation():
     places = [[4, 0, 0], [0, 3, 0], [0, -3, 0], [-4, 3, 0], [-4, -3, 1]]
     made = space(5, template_m=places)
     assert isinstance(made, TemplateCluster)
     assert np.abs(made.t_C - (np.array(places) - np.mean(places, axis=0))).max() < 1e-15
 
 
-def test_groups_are_the_next_drones_each_and_the_robots_of_a_template_of_groups_their_centroids():
+def test_groups_are_successive_drones_and_parents_use_their_centroids():
     starts = np.array([(x, y, 0.0) for x, y in STARTS])
     made = space(8, groups=[{"name": "a", "size": 3}, {"name": "b", "size": 5}])
     assert isinstance(made, NestedCluster)
@@ -80,7 +80,7 @@ def test_groups_are_the_next_drones_each_and_the_robots_of_a_template_of_groups_
     assert np.abs(made.parent.t_C - seen).max() < 1e-12
 
 
-def test_a_variable_of_a_plan_that_the_space_does_not_have_is_told_with_those_it_has():
+def test_an_unknown_variable_in_a_plan_is_refused_with_the_known_ones():
     made = scenario(8, plan={"takeoff_s": 1, "target": {"rho_4": 3.0}})
     with refused(RunError, "clusters[0].plan.target", "'rho_4'", "unknown", "x_c", "w_18", "32", "'c'"):
         engagement_of(made, made.clusters[0])
