@@ -371,7 +371,7 @@ def test_the_end_of_a_run_missed_while_the_link_was_lost_is_requested(
     assert completed(path).complete
 
 
-def test_missed_realtime_messages_are_requested_even_if_no_clock_is(tmp_path: Path):
+def test_missed_realtime_messages_are_requested_without_a_missing_clock(tmp_path: Path):
     """A restarted world has published events, and the recorder reconnects when only clocks follow."""
     path, info = tmp_path / "run.mcap", replace(INFO, mode="realtime")
     missed = [pair(keys.EVENT, Event(0, number, "superseded", "x.y", "x.y", "")) for number in (0, 1)]

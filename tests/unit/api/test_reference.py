@@ -25,7 +25,7 @@ def test_the_reference_builds_without_warnings_and_has_every_name(tmp_path: Path
     documented = re.findall(r'<dt [^>]*id="zsim\.(\w+)"', pages)
     assert sorted(documented) == sorted(zsim_api.__all__)
     assert {"zsim.Run.truth", "zsim.Simulation.step"} <= {*re.findall(r'<dt [^>]*id="([\w.]+)"', pages)}
-    assert "(" not in "".join(re.findall(r"<strong>(.*?)</strong>", pages))  # names of arguments were parsed
+    assert "(" not in "".join(re.findall(r"<strong>(.*?)</strong>", pages))  # all names of arguments were parsed
 
 
 class Silence:

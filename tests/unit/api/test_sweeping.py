@@ -49,7 +49,7 @@ def climb_m(run: "zsim.Run") -> dict[str, float]:
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_a_metric_gets_the_run_or_if_its_parameter_is_flight_the_arrays(near: None, tmp_path: Path, keep: bool) -> None:
+def test_a_metric_gets_the_run_or_the_arrays_by_its_parameter_s_name(near: None, tmp_path: Path, keep: bool) -> None:
     frame: Any = zsim.sweep(
         DOCUMENT, {"seed": [4, 6]}, metrics=[climb_m, counts], out=tmp_path, keep_records=keep, progress=False
     )

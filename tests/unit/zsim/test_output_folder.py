@@ -44,7 +44,7 @@ def test_a_lock_excludes_others_where_locks_are_supported(tmp_path: Path) -> Non
 def test_without_locks_everything_works_with_a_warning(
     tmp_path: Path, reason: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    warning = f"{tmp_path}: cannot be locked ({reason}); do not let two commands write there at a time"
+    warning = f"{tmp_path}: cannot be locked ({reason}); do not let two commands write there at the same time"
     assert no_locks(tmp_path) == warning
     journal = RunJournal(tmp_path / "journal", "run", "sha", print)
     assert journal.open() is None

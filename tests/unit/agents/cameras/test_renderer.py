@@ -116,13 +116,13 @@ def test_the_ground_is_blurred_by_the_speed_over_it() -> None:
         ({"shape": "sphere", "position_m": (2.0, 0.27, 4.8), "radius_m": 0.8}, True),
     ],
 )
-def test_an_obstacle_hides_a_hat_only_from_in_front_of_it(obstacle: Any, hides: bool) -> None:
+def test_an_obstacle_hides_only_hats_behind_it(obstacle: Any, hides: bool) -> None:
     row = tuple(row_of(Obstacle(name="wall", **obstacle)))
     assert has_magenta(draw(of=scene(obstacles=(row,)))) is not hides
 
 
 @pytest.mark.parametrize("lens", [{}, {"distortion": (-0.2, 0.05, 0, 0, 0)}], ids=["flat", "bent"])
-def test_a_surface_of_either_side_hides_a_hat_only_from_in_front_of_it(lens: dict[str, Any]) -> None:
+def test_a_surface_seen_from_either_side_hides_only_hats_behind_it(lens: dict[str, Any]) -> None:
     for x, hides in ((2.0, True), (7.0, False)):
         a, b, c = (x, -9.0, 0.0), (x, 9.0, 0.0), (x, 0.0, 20.0)
         for corners in ((a, b, c), (a, c, b)):

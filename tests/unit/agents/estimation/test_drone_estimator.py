@@ -209,7 +209,7 @@ def test_the_heading_converges_from_any_start(yaw_deg: float):
     assert off[-1] < min(0.03, 4.0 * estimates[-1][1].yaw_sigma_rad)
 
 
-def test_the_heading_without_a_magnetometer_starts_at_the_scenario_s():
+def test_the_scenario_gives_the_heading_without_a_magnetometer():
     flight = Flight(9, start_s=100.0)
     flight.yaw_start = math.radians(-100.0)
     of = scenario(yaw_deg=-100.0, estimation={"magnetometer": False})

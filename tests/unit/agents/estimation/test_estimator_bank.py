@@ -75,7 +75,7 @@ def nees(flight: Flight, t_s: float, estimate: StateEstimate) -> float:
 
 
 def three(preset: str = "paper", **sections: Any) -> Scenario:
-    """Return a scenario of three drones with error states of different sizes; on the last, every sensor is offset."""
+    """Return a scenario of three drones with error states of different sizes; the last has its sensors off-centre."""
     biased = {"gps": "position_m", "baro": "altitude_m", "flow": "velocity_m_s"}
     aside = {kind: ASIDE | ({biased[kind]: BIASED} if kind in biased else {}) for kind in KINDS}
     drones = [

@@ -33,7 +33,7 @@ def test_the_lattice_force_is_that_of_the_paper() -> None:
 
 
 def test_a_flock_forms_a_lattice_with_a_common_velocity() -> None:
-    """All drones start within range; the energy falls, velocities approach the aim's, and distances of neighbours d."""
+    """All drones start within range; energy falls, velocities become the aim's and distances of neighbours become d."""
     rng, h, c1, c1_g = np.random.default_rng(2), 0.02, 1.0, 0.1
     p, v = rng.uniform(-8, 8, (7, 2)), rng.normal(0, 0.5, (7, 2))
     v_r = np.array([0.5, 0.0])

@@ -65,7 +65,7 @@ def test_a_wall_of_triangles_is_avoided_like_a_solid_wall() -> None:
         assert (felt[1][1] < 0) == (y > 3.5), (x, y)  # within avoid_m
 
 
-def test_a_slope_is_as_far_as_level_flight_and_level_ground_is_ignored() -> None:
+def test_slopes_count_at_their_level_distance_and_flat_ground_is_ignored() -> None:
     rise = math.tan(math.radians(30))
     slope = sheet("slope", (4, -30, 0), (34, -30, 30 * rise), (34, 30, 30 * rise), (4, 30, 0))
     flown = pilot(surfaces=[slope, sheet("floor", (-30, -30, 1), (4, -30, 1), (4, 30, 1), (-30, 30, 1))])

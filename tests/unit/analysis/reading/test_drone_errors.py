@@ -85,7 +85,7 @@ def test_too_many_estimates_are_thinned_to_the_same_instants(
     flight: RecordedFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = estimate_errors(flight)
-    monkeypatch.setattr(drone_errors, "ESTIMATES_MAX", 200)  # of 3 x 151
+    monkeypatch.setattr(drone_errors, "ESTIMATES_MAX", 200)  # fewer than the 3 x 151 of the flight
     some = estimate_errors(flight)
     for name, each in some.items():
         assert each.t_s == pytest.approx(whole[name].t_s[::3])
@@ -199,7 +199,7 @@ def test_errors_cover_the_time_in_flight_and_separately_the_path() -> None:
 @pytest.mark.parametrize(
     ("off_m", "off_s", "strayed"), [(6, (10, 15), True), (6, (10, 11.5), False), (4, (10, 20), False)]
 )
-def test_a_drone_long_far_from_its_reference_has_strayed(
+def test_a_drone_far_from_its_reference_for_long_has_strayed(
     off_m: float, off_s: tuple[float, float], strayed: bool
 ) -> None:
     lines = [line for line in shortfalls(referenced(off_m, off_s, PHASES), (0, 30)) if line.kind == "strayed"]

@@ -115,7 +115,7 @@ TIMED = (*SOON, "clusters.main.plan.target_over_s=4")
 
 
 def along(from_s: float, to_s: float = 30.0) -> State:
-    """Return the states of a formation that follows `WAY` in this interval, and is refused it before."""
+    """Return the states of a formation that follows `WAY` in this interval and is refused its trajectory before."""
     space = cluster_space(3)
     at_target = np.array([5, -5, 15, 0, 0, np.pi / 2, 0, 0, 0, 4, 4, np.pi / 4])
     way = WaypointTrajectory(space, WAY, at_target)

@@ -162,7 +162,7 @@ def test_figures_of_drones_fit_a_page(count: int) -> None:
         assert sum(len(axes.lines) for axes in figure.axes) < 100
 
 
-def test_drones_have_their_colours_and_flown_covers_commanded() -> None:
+def test_drones_have_their_colours_and_flown_curves_are_on_top() -> None:
     drawn = draw_velocities(responses(3), colours(3), MARKS)
     assert [axes.lines[0].get_color() for axes in drawn.axes[:3]] == list(colours(3).values())
     for axes in drawn.axes:

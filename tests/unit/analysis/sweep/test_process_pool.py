@@ -22,9 +22,9 @@ def task(run: int) -> Task:
 
 
 class FakeWorker:
-    """A worker without a process that completes runs at once, or dies from those in `dies_of`."""
+    """A worker without a process, which completes a run at once or dies of it according to `dies_of`."""
 
-    dies_of: dict[int, int]  # number of workers that a run will still kill
+    dies_of: dict[int, int]  # by run: number of workers that it will still kill
     stillborn = 0  # number of next workers that will not become ready
     answer: Any = None
     flown: list[int]

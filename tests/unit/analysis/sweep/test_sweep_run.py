@@ -153,7 +153,7 @@ def test_a_run_that_raises_an_error_is_a_row_with_the_failure(tmp_path: Path, mo
     assert [path.name for path in tmp_path.iterdir()] == ["000007"]  # the record is kept
 
 
-def test_a_full_disk_ends_the_sweep_rather_than_fail_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_ends_the_sweep_instead_of_failing_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The incomplete record keeps the name that the error gives."""
 
     calls, write = itertools.count(), mcap_layout.write_all

@@ -160,7 +160,7 @@ def test_a_class_is_found_by_name_without_running_its_module(
     ("name", "terms"),
     [
         ("plugin_nowhere:Good", ("'plugin_nowhere:Good'", "ModuleNotFoundError")),
-        ("plugin_meter.inner:Good", ("'plugin_meter.inner:Good'", "no package")),
+        ("plugin_meter.inner:Good", ("'plugin_meter.inner:Good'", "plugin_meter is not a package")),
         ("plugin_meter:Bad", ("'plugin_meter:Bad'", "Good, Half")),
         ("plugin_unread:Good", ("'plugin_unread:Good'", "SyntaxError")),
     ],

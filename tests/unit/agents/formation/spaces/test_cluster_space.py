@@ -136,7 +136,7 @@ def test_the_cluster_moves_and_turns_as_one_body(kind):
 
 
 @pytest.mark.parametrize("kind", SPACES)
-def test_the_specimen_keeps_the_distance_between_robots(kind):
+def test_the_specimen_keeps_the_minimum_distance(kind):
     space = SPACES[kind]()
     p_W, _ = space.inverse(space.specimen(2.0))
     assert closest_pair(p_W)[0] > 2.0 - 1e-9
@@ -178,9 +178,9 @@ def test_singular_formations_are_refused_with_the_reason(space, method, argument
     ("make", "finding"),
     [
         *[(lambda n=n: cluster_space(n), "2 to 64") for n in (0, 1, ROBOTS_MAX + 1)],
-        (lambda: TemplateCluster(RING[:2]), "2 places; allowed: 3"),
-        (lambda: TemplateCluster(np.outer(range(6), (1, 2, 0))), "one line"),
-        (lambda: TemplateCluster(np.ones((5, 3))), "one line"),
+        (lambda: TemplateCluster(RING[:2]), "template: 2 "),
+        (lambda: TemplateCluster(np.outer(range(6), (1, 2, 0))), "template: .*collinear"),
+        (lambda: TemplateCluster(np.ones((5, 3))), "template: .*collinear"),
         (lambda: NestedCluster(cluster_space(3), [(name, cluster_space(3)) for name in "ab"]), "2; allowed: 3"),
         (lambda: cluster_space(3).index("gamma"), r"'gamma'.*x_c, y_c"),
     ],
@@ -231,7 +231,7 @@ def test_units_follow_from_names_in_any_space():
     assert {unit(name) for name in angles} == {"rad"}
 
 
-def test_robot_2_is_left_roll_lowers_the_right_and_pitch_lowers_robot_1():
+def test_roll_lowers_the_right_side_and_pitch_lowers_robot_1():
     space = cluster_space(3)
     assert space.forward(TRIANGLE, np.zeros(3))[3:6] == pytest.approx([0.0, 0.0, math.pi / 2])
     assert abs(space.forward(TRIANGLE[[0, 2, 1]], np.zeros(3))[3]) == pytest.approx(math.pi)

@@ -20,7 +20,7 @@ MODULES = (
     "formation.spaces.triad_cluster",
 )
 SIZES = (2, 3, 5)
-SAME = 0.0  # to the bit
+SAME = 0.0  # relative tolerance: identical to the bit
 DT_S = 0.02
 
 pytest.importorskip("numba")
