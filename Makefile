@@ -8,6 +8,7 @@ AGAINST ?=
 WORKERS ?= 4
 FLIGHT := python
 CONSTRAINTS ?= constraints.txt
+KERNELS := $(shell grep -rlF --include=*.py zsim.math.compiled zsim world agents)
 # Constraints are set in the environment, so that the build of zsim has them too; empty: the newest versions of all packages.
 HELD = PIP_CONSTRAINT=$(CONSTRAINTS) PIP_BUILD_CONSTRAINT=$(CONSTRAINTS)
 PIP = $(HELD) $(BIN)/pip install --disable-pip-version-check --no-compile
@@ -82,9 +83,10 @@ $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(VENV)/bin/python
 	@touch $@ $(VENV)/.all $(VENV)/.run
 
 # A target of its own, so that it runs in parallel with what needs no kernel. Two processes compile; a function that one
-# has compiled is found by the other.
-$(VENV)/.compiled: pyproject.toml
-	@echo "compiling the kernels, once on this machine; takes about a minute"
+# has compiled is found by the other. Kernels that have changed are compiled here, since otherwise every process of a
+# flight would compile them.
+$(VENV)/.compiled: pyproject.toml $(KERNELS)
+	@echo "compiling the kernels, which takes about a minute; once on this machine, and after changes of their files"
 	@$(BIN)/python -P -m zsim_deploy.roles.warm_up agents & agents=$$!; \
 		$(BIN)/python -P -m zsim_deploy.roles.warm_up world; world=$$?; wait $$agents && exit $$world
 	@touch $@

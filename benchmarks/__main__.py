@@ -65,23 +65,23 @@ PARTS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {' '.join(PARTS)}; all if none is given")
-    parser.add_argument("--repeats", type=int, default=5, help="of every measurement; medians are told (5)")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"one of {' '.join(PARTS)}; all if none is given")
+    parser.add_argument("--repeats", type=int, default=5, help="of every measurement; medians are reported (5)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--page", action="store_true", help="measure nothing; write the page from the JSON files")
     parser.add_argument("--no-page", action="store_true", help="leave benchmarks/README.md and its pictures alone")
-    parser.add_argument("--against", metavar="REV", help="with part c alone: fly this tree beside a commit, in turn")
+    parser.add_argument("--against", metavar="REV", help="with only part c: measure this tree and a commit in turn")
     parser.add_argument(
-        "--of", nargs="+", choices=against.FLIGHTS, default=list(against.FLIGHTS), help="with --against: what is flown"
+        "--of", nargs="+", choices=against.FLIGHTS, default=list(against.FLIGHTS), help="with --against: its flights"
     )
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are terminated too
     if unknown := set(given.parts) - set(PARTS):
-        parser.error(f"part is {', '.join(sorted(unknown))}; must be of {' '.join(PARTS)}")
+        parser.error(f"part is {', '.join(sorted(unknown))}; must be one of {' '.join(PARTS)}")
     chosen = {name: PARTS[name] for name in given.parts or PARTS}
     if given.against is not None:
         if list(chosen) != ["c"]:
-            parser.error(f"--against: part is {', '.join(chosen)}; must be c alone: say c --against {given.against}")
+            parser.error(f"--against: part is {', '.join(chosen)}; must be only c: use c --against {given.against}")
         chosen = {"c-against": Part(partial(against.measure, revision=given.against, names=given.of), against.page)}
     if not given.page and BESIDE & set(chosen):
         peers.ensure(_say)

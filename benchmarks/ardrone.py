@@ -138,7 +138,7 @@ def _await_navdata(pilots: Pilots) -> None:
     until_s = time.monotonic() + READY_S
     while len(pilots.states) < len(pilots.addresses):
         if time.monotonic() > until_s:
-            raise SystemExit("no navdata came")
+            raise SystemExit("no navdata arrived")
         pilots.begin()
         pilots.read(time.monotonic() + 0.3)
 

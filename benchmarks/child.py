@@ -31,7 +31,7 @@ def result(command: Sequence[str], timeout_s: float) -> dict[str, Any]:
         try:
             printed, _ = process.communicate(timeout=timeout_s)
         except subprocess.TimeoutExpired:
-            raise RefusedError(f"not through after {timeout_s:g} s") from None
+            raise RefusedError(f"not finished after {timeout_s:g} s") from None
         finally:
             _end(process)
         lines = [text for text in printed.splitlines() if text.startswith("{")]

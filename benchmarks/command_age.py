@@ -22,7 +22,7 @@ ZSIM: dict[str, tuple[str, ...]] = {"hosted": ("--hosted",), "zsim": ()}
 QUANTILES = ("p50", "p99", "max")
 LABELS = {
     "trip": "bare Zenoh, there and back",
-    "command": "bare Zenoh, the way of a command",
+    "command": "bare Zenoh, the path of a command",
     "hosted": "zsim, estimators and controller in one process (`--hosted`)",
     "zsim": "zsim, a process for each",
 }
@@ -76,7 +76,7 @@ def page(sheet: Sheet) -> str:
                 cells.append(f"refused: {refused}")
             rows.append([str(size), label, *cells])
         compared = [spread(sheet.ratio(f"zsim_{quantile}", f"command_{quantile}", size)) for quantile in QUANTILES]
-        rows.append([str(size), "zsim / bare Zenoh, the way of a command", *compared])
+        rows.append([str(size), "zsim / bare Zenoh, the path of a command", *compared])
     head = [f"deadline misses in {SECONDS:g} s", *(f"N = {size}" for size in SIZES)]
     misses = [
         [LABELS[name], *(spread(sheet.spread(f"{name}_deadline_misses", size)) for size in SIZES)] for name in ZSIM

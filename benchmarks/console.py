@@ -118,7 +118,7 @@ def _await(condition: Callable[[], bool], what: str) -> None:
     until_s = time.monotonic() + TIMEOUT_S
     while not condition():
         if time.monotonic() > until_s:
-            raise RefusedError(f"{what} did not come within {TIMEOUT_S:g} s")
+            raise RefusedError(f"{what} did not appear within {TIMEOUT_S:g} s")
         time.sleep(LOOK_S)
 
 
@@ -240,8 +240,8 @@ def measure(repeats: int) -> Sheet:
 
 def page(sheet: Sheet) -> str:
     rows = [
-        ["nobody looks [% of a core]", *_cells(sheet, "alone")],
-        ["one page, read whole [% of a core]", *_cells(sheet, "read")],
+        ["no page open [% of a core]", *_cells(sheet, "alone")],
+        ["one page open [% of a core]", *_cells(sheet, "read")],
         ["goal for one page [% of a core]", *(f"≤ {figure(GOALS[count])}" for count in SIZES)],
         ["sent to a page [kB/s]", *_cells(sheet, "rate")],
         ["as fast as it goes, without [× real time]", *_cells(sheet, "without")],

@@ -121,5 +121,5 @@ def page(sheet: Sheet) -> str:
         cells = [spread(sheet.ratio(f"{ours}_{field}", f"{theirs}_{field}", SIZE)) for field in fields]
         rows.append([f"ratio: {LABELS[ours]} / {LABELS[theirs]}", *cells])
     added = [spread(sheet.spread(f"added_{quantile}", SIZE)) for quantile in QUANTILES]
-    rows.append(["added by the gateway between Zenoh and a client of lines [ms]", "", *added])
+    rows.append(["added by the gateway between Zenoh and a lines client [ms]", "", *added])
     return table(["", "per second", "p50 [ms]", "p99 [ms]"], rows)

@@ -12,7 +12,7 @@ from benchmarks.table import PICTURES, figure, lines, spread, table
 SIZES = {1: 10.0, 3: 10.0, 10: 6.0, 30: 3.0, 100: 1.5}  # number of drones: simulated duration [s]
 TIMEOUT_S = 300.0
 CPU = "CPU ms per drone-second"
-ONBOARD = {"plain": "extra `agents`, numba taken out", "numba": "extra `agents`"}
+ONBOARD = {"plain": "extra `agents`, without numba", "numba": "extra `agents`"}
 
 
 def measure(repeats: int) -> Sheet:
@@ -104,7 +104,7 @@ def _growth(sheet: Sheet) -> str:
     if len(memory) > 1:
         first, last = min(memory), max(memory)
         slope = (memory[last] - memory[first]) / (last - first)
-        words.append(f"Memory: {figure(slope)} MB for each drone more (N = {first} to {last}).")
+        words.append(f"Memory: {figure(slope)} MB for each additional drone (N = {first} to {last}).")
     return f"{told}\n\n{' '.join(words)}"
 
 
@@ -115,7 +115,7 @@ def _starts(sheet: Sheet) -> str:
     ]
     if "start_up" in sheet.refused:
         rows.append(["not measured", sheet.refused["start_up"], ""])
-    return table(["", "s until ready", "resident then, MB"], rows)
+    return table(["", "s until ready", "resident when ready, MB"], rows)
 
 
 def _onboards(sheet: Sheet) -> str:

@@ -87,7 +87,7 @@ def _watched(estimator: subprocess.Popen[bytes]) -> tuple[float, float]:
     until_s = time.monotonic() + TIMEOUT_S
     while estimator.poll() is None:
         if time.monotonic() > until_s:
-            raise RefusedError(f"estimator: not through after {TIMEOUT_S:g} s")
+            raise RefusedError(f"estimator: not finished after {TIMEOUT_S:g} s")
         try:
             resident = max(resident, seen.memory_info().rss / 1e6)
             times = seen.cpu_times()

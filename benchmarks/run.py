@@ -70,7 +70,7 @@ def spent(command: Sequence[str], folder: Path) -> Spent:
                 time.sleep(WAIT_S)
                 ended, status, usage = os.wait4(process.pid, os.WNOHANG)
                 if not ended and time.monotonic() > until_s:
-                    raise RefusedError(f"not through after {TIMEOUT_S:g} s")
+                    raise RefusedError(f"not finished after {TIMEOUT_S:g} s")
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)

@@ -52,9 +52,9 @@ CONTENDERS = {
     "rotorpy": Contender(
         "RotorPy, `Environment`, SE(3) controller, wind EKF", "rotorpy", "rotorpy_flights", ("--seconds", "3"),
         "3 s of a flight, scaled up",
-        "GPS, compass, sonar, estimator of position, cluster controller, contacts"),
+        "GPS, compass, sonar, position estimator, cluster controller, contacts"),
 }  # fmt: skip
-NOT_FLOWN = {"MuJoCo": "it has no controller of a multirotor; its bodies alone are in (b)"}
+NOT_FLOWN = {"MuJoCo": "it has no multirotor controller; its bodies alone are in (b)"}
 
 
 def measure(repeats: int) -> Sheet:
@@ -124,7 +124,7 @@ def page(sheet: Sheet) -> str:
     rows += [_row(sheet, name, contender.label, contender.flown) for name, contender in CONTENDERS.items()]
     lacks = [[contender.label, contender.lacks] for contender in CONTENDERS.values()]
     lacks += [[name, f"not flown: {why}"] for name, why in NOT_FLOWN.items()]
-    head = ["", "runs per hour", "× `zsim sweep`", "CPU s per run", "off its way, m", "closest pair, m", "measured"]
+    head = ["", "runs per hour", "× `zsim sweep`", "CPU s per run", "off its path, m", "closest pair, m", "measured"]
     return "\n\n".join([table(head, rows), table(["", "leaves out"], lacks), _ratios(sheet)])
 
 

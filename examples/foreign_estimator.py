@@ -109,7 +109,7 @@ class Participant:
         try:
             return self._inbox.get(timeout=SILENCE_S)
         except Empty:
-            text = f"the world on {ENDPOINT} is silent for {SILENCE_S:g} s; answered {gates} gates until then"
+            text = f"the world on {ENDPOINT} has been silent for {SILENCE_S:g} s; {gates} gates were answered before"
             raise SystemExit(f"{ME}: {text}") from None
 
     def _answer(self, t_ns: int, state: State) -> None:

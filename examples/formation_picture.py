@@ -62,7 +62,9 @@ def recorded(record: Path, t_ns: int | None) -> Instant:
             come = (message for message in reader.messages(wanted, from_ns=t_ns) if message.t_ns >= t_ns)
             payloads = {message.key: message.payload for message in islice(come, len(names))}  # one per drone and gate
     if payloads.keys() != set(wanted):
-        raise SystemExit(f"{record}: ends before that instant; look at an earlier one, or leave it out for the last")
+        raise SystemExit(
+            f"{record}: ends before that instant; give an earlier one, or leave out SECONDS for the last instant"
+        )
     truths = [msgspec.msgpack.decode(payloads[key], type=Truth) for key in wanted]
     return Instant(names, scene_of(info, scenario_file.from_text(info.scenario)), states(truths))
 

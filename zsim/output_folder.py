@@ -54,7 +54,7 @@ def no_locks(folder: Path) -> str | None:
         with TemporaryFile(dir=folder) as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        return f"{folder}: cannot be locked ({error.strerror}); do not let two commands write there at a time"
+        return f"{folder}: cannot be locked ({error.strerror}); do not let two commands write there at the same time"
     return None
 
 

@@ -17,7 +17,9 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--receive", choices=("queue", "drain"), default="drain", help="how the world takes answers")
     options.add_argument("--express", action="store_true", help="send every message at once")
-    options.add_argument("--low-latency", action="store_true", help="the transport without priorities and fragments")
+    options.add_argument(
+        "--low-latency", action="store_true", help="use the transport without priorities and fragmentation"
+    )
     given = options.parse_args()
     if given.agent is None:
         world(given.agents, given.seconds, given.receive, given.express, given.low_latency)

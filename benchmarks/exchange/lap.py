@@ -55,9 +55,9 @@ def parser(text: str | None) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=(text or "").splitlines()[0])
     made.add_argument("--agents", type=int, default=1, help="number of agent processes")
     made.add_argument("--seconds", type=float, default=1.0, help="wall time counted")
-    made.add_argument("--lookahead", action="store_true", help="begin a step while the answers to the last are out")
-    made.add_argument("--agent", type=int, help="be this agent (said to the children)")
-    made.add_argument("--at", help="where the world is (said to the children)")
+    made.add_argument("--lookahead", action="store_true", help="begin a step while answers to the last are outstanding")
+    made.add_argument("--agent", type=int, help="act as this agent (passed to child processes)")
+    made.add_argument("--at", help="address of the world (passed to child processes)")
     return made
 
 

@@ -60,7 +60,7 @@ clock = time.perf_counter
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--agents", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=1.0, help="about so long")
+    parser.add_argument("--seconds", type=float, default=1.0, help="approximate wall time counted")
     given = parser.parse_args()
     steps = WARM_STEPS + max(20, int(given.seconds * STEPS_S / (1 + given.agents)))
     run(given.agents, steps)

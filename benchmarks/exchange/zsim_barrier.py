@@ -31,7 +31,9 @@ GATE_NS = 20_000_000
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--low-latency", action="store_true", help="the transport without priorities and fragments")
+    options.add_argument(
+        "--low-latency", action="store_true", help="use the transport without priorities and fragmentation"
+    )
     given = options.parse_args()
     with _transport(given.low_latency):
         if given.agent is None:

@@ -30,7 +30,7 @@ def serve(build: Callable[[Way, argparse.Namespace], Fly], **options: Any) -> No
     """Answer each {"seed": n} with a `Flown` and its CPU time; `options` maps command-line options to defaults."""
     parser = argparse.ArgumentParser()
     parser.add_argument("way", type=Path)
-    parser.add_argument("worker", type=int, help="0 or 1: of which core")
+    parser.add_argument("worker", type=int, help="0 or 1: number of this process and its core")
     for name, default in options.items():
         if isinstance(default, bool):
             parser.add_argument(f"--{name}", action="store_true")

@@ -82,7 +82,7 @@ def rerun_record(
         if recorded_by != __version__:
             note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not promised")
         if commands_only or agents.why_not:
-            why = "as asked" if commands_only else agents.why_not
+            why = "as requested" if commands_only else agents.why_not
             say(f"agents are not run again: {why}; the world alone, with all recorded commands")
             return _judge(record.reader, agents.truth_sha256, _fly(record, no_agents), say)
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
@@ -164,7 +164,7 @@ def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say:
         return ""
     condition = "is damaged" if reader.damaged else "does not hold the whole run" if reader.complete else "was cut"
     lacks = f"{recorded} cannot be verified" if recorded else "has no truth_sha256"
-    reason = f"{until}, for it {condition}" if until else f"the record {condition} and {lacks}"
+    reason = f"{until}, as it {condition}" if until else f"the record {condition} and {lacks}"
     say(f"{reason}; truth is the same at all {compared.instants} instants before, to the bit")
     return "" if recorded is None and not until and not reader.damaged else reason
 

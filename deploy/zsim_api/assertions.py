@@ -65,7 +65,7 @@ class Assertions(ABC):
                 row = int(np.nanargmax(errors))
                 most = f"the largest error is {errors[row]:.3g}, at {formation.t_s[row]:.2f} s"
                 faults.append(
-                    f"{where}: true RMS of {name} is {error:.3g} {unit(name)}; allowed are {allowed:g}; {most}"
+                    f"{where}: true RMS of {name} is {error:.3g} {unit(name)}; must be at most {allowed:g}; {most}"
                 )
         if faults:
             raise AssertionError("\n".join([*faults, f"the record is {run.record}"]))

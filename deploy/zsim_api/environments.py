@@ -274,7 +274,7 @@ def vector_env(
 def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
     known = [*signature(_Episodes).parameters][1:]  # without the scenario
     if unknown := [name for name in settings if name not in known]:
-        raise RunError(f"settings: unknown {', '.join(unknown)}; must be of {', '.join(known)}")
+        raise RunError(f"settings: unknown {', '.join(unknown)}; must be one of {', '.join(known)}")
     if "reward" not in settings:
         raise RunError("settings: reward is missing; must be a function of the zsim.Simulation and an agent's name")
     return dict(settings)

@@ -390,12 +390,12 @@ class Federation(Assertions):
                 before = f" (last {len(shown)} of {len(lines)} lines)" if len(shown) < len(lines) else ""
                 parts.append("\n".join([f"--- {name}.log{before}", *shown]))
             elif shown:
-                parts.append(f"--- {name}.log, the last of {len(lines)}: {shown[0]}")
+                parts.append(f"--- {name}.log, last of {len(lines)} lines: {shown[0]}")
         return "\n".join(parts)
 
     def _progress(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
-            return "no clock of a world was received"
+            return "no clock message of a world was received"
         lines = [f"  {each}" for each in holding_up(clock.state, waiting) or waiting]
         if not self._watch.left and self._watch.wanted is None:
             lines.append(f"  {PROCESS}, this test, which is not waiting for anything at the moment")

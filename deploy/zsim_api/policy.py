@@ -185,7 +185,7 @@ class Interface:
         commands: dict[str, Command] = {}
         for agent, given in actions.items():
             if agent not in self._bounds:
-                raise UserCodeError(f"{by}: action is of {agent!r}; must be of {', '.join(self.agents)}")
+                raise UserCodeError(f"{by}: action is for {agent!r}; must be for one of {', '.join(self.agents)}")
             low, high = self._bounds[agent]
             action = np.asarray(given, np.float32)
             if action.shape != low.shape:

@@ -493,7 +493,7 @@ def _checked(window: Window) -> Window:
             return start_s, end_s
     except (TypeError, ValueError):
         pass
-    raise RunError(f"window is {window!r}; must be start and end [s], as (20, 40)")
+    raise RunError(f"window is {window!r}; must be start and end [s], such as (20, 40)")
 
 
 def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...]]:

@@ -56,7 +56,7 @@ def rerun_in_environment(
 
 def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: Callable[[str], None]) -> Path:
     """Return the folder of an environment with the packages of a lock file; create it if missing."""
-    version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is not a Python")
+    version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is not a Python interpreter")
     name, origin = str(checkout() or ""), ""
     if not name:
         name, separator, rest = requirement(distribution(PROJECT)).partition(" @ ")

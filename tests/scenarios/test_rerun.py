@@ -60,7 +60,7 @@ def test_a_run_of_processes_is_rerun_to_the_same_bits(federation: Federation, pa
     role.line("run again: world, estimator.drone1, estimator.drone2, controller.main")
     same(role, pair_sha256)
     alone = rerun(federation, "--commands-only", of=federation.out / "run.mcap")
-    alone.line("agents are not run again: as asked; the world alone, with all recorded commands")
+    alone.line("agents are not run again: as requested; the world alone, with all recorded commands")
     same(alone, pair_sha256)
 
 
@@ -209,7 +209,7 @@ def test_a_realtime_run_is_rerun_by_the_world_alone(federation: Federation) -> N
     """
     federation.run(PAIR, "--realtime", "--rate", "4").ends(with_code=0)
     role = rerun(federation)
-    role.line("agents are not run again: in realtime it is not in the scenario when they answered")
+    role.line("agents are not run again: in realtime, the times of their answers do not follow from the scenario")
     same(role, federation.record().sha256())
 
 
@@ -255,7 +255,7 @@ def test_a_damaged_record_is_reported_as_damaged(federation: Federation) -> None
     for name, part, cut, text in (
         ("last", 1.0, 0, "the record is damaged and has no truth_sha256"),
         ("last and cut", 1.0, 9, "the record is damaged and has no truth_sha256"),
-        ("middle", 0.5, 0, r"the record has nothing of \d+\.\d+ s, for it is damaged"),
+        ("middle", 0.5, 0, r"the record has nothing of \d+\.\d+ s, as it is damaged"),
     ):
         printed = rerun(federation, code=1, of=damaged(federation.out, federation.folder / name, part, cut))
         match = re.search(text + alike, printed)

@@ -6,7 +6,8 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from xmlrpc.client import ServerProxy
 
@@ -149,6 +150,13 @@ class RosGraph:
     def watch(self, topic: str) -> Tool:
         """Start `rostopic echo -p`, which prints each message as a line of numbers, its time first."""
         return self.start("rostopic", "echo", "-p", topic)
+
+    @contextmanager
+    def published(self, topic: str, *message: str) -> Iterator[None]:
+        """Publish a message, latched, while the block runs: `rostopic pub -1` leaves after 3 s, connected or not."""
+        tool = self.start("rostopic", "pub", topic, *message)
+        yield
+        tool.end()
 
     def generate(self, package: str, name: str, definition: str) -> None:
         """Generate a message type for the tools with ROS's own generator, as a build of its package would."""

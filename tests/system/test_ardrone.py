@@ -276,6 +276,6 @@ def test_a_second_server_on_the_same_addresses_is_refused(fleet: Fleet) -> None:
     role = Role(["ardrone", "serve", "--connect", endpoint, *where])
     try:
         role.ends(with_code=2)
-        role.line("UDP port 5554 of .* cannot be had: another program has it")
+        role.line("UDP port 5554 of .* cannot be opened: another program uses it")
     finally:
         role.close()

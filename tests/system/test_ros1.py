@@ -170,8 +170,8 @@ def test_rostopic_and_roscpp_fly_and_track_a_drone(graph: RosGraph):
     asked = graph.run("rosnode", "info", "/zsim")  # answered by the node itself
     assert re.search(r"topic: /drone1/ground_truth/state\n    \* to: /rostopic\S+\n    \* direction: outbound", asked)
     graph.run("rosservice", "call", "/drone1/ardrone/flattrim")
-    graph.start("rostopic", "pub", "-1", "/drone1/ardrone/takeoff", "std_msgs/Empty")
-    truth.until(lambda line: (at := numbers(line)) and at[3] > 0.9)
+    with graph.published("/drone1/ardrone/takeoff", "std_msgs/Empty"):
+        truth.until(lambda line: (at := numbers(line)) and at[3] > 0.9)
     assert "landed" in graph.refused("rosservice", "call", "/drone1/ardrone/flattrim")
     _, x, y, _ = numbers(truth.until(numbers))
     north = graph.start("rostopic", "pub", "-r", "10", "/drone1/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.15}}")
@@ -184,8 +184,8 @@ def test_rostopic_and_roscpp_fly_and_track_a_drone(graph: RosGraph):
     copy.until(lambda line: (at := numbers(line)) and at[1] < x - 1.5)  # left of north
     copy.end()
     west.end()
-    graph.start("rostopic", "pub", "-1", "/drone1/ardrone/land", "std_msgs/Empty")
-    truth.until(lambda line: (at := numbers(line)) and at[3] < 0.1)
+    with graph.published("/drone1/ardrone/land", "std_msgs/Empty"):
+        truth.until(lambda line: (at := numbers(line)) and at[3] < 0.1)
     truth.end()
 
 
@@ -204,13 +204,13 @@ def test_a_rospy_node_for_ardrone_autonomy_flies_unchanged(graph: RosGraph):
 
 
 def test_a_velocity_that_is_not_a_number_is_refused_and_reported(flight: Flight):
-    flight.graph.start("rostopic", "pub", "-1", "/drone1/cmd_vel", "geometry_msgs/Twist", "{linear: {x: .nan}}")
-    flight.bridge.line("/drone1/cmd_vel: .*/rostopic_.*finite")
+    with flight.graph.published("/drone1/cmd_vel", "geometry_msgs/Twist", "{linear: {x: .nan}}"):
+        flight.bridge.line("/drone1/cmd_vel: .*/rostopic_.*finite")
 
 
 def test_a_refusal_of_the_world_is_reported(flight: Flight):
-    flight.graph.start("rostopic", "pub", "-1", "/drone1/ardrone/land", "std_msgs/Empty")
-    flight.bridge.line("ros1.main: drone/drone1/cmd/mode: drone1 is landed")
+    with flight.graph.published("/drone1/ardrone/land", "std_msgs/Empty"):
+        flight.bridge.line("ros1.main: drone/drone1/cmd/mode: drone1 is landed")
 
 
 @pytest.mark.soak  # test_node.py covers this without ROS's own master

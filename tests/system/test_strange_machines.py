@@ -276,7 +276,7 @@ def test_runs_and_sweeps_work_without_file_locks(tmp_path: Path) -> None:
         done = run_here(command, str(scenario), *options, "--out", str(out))
         assert done.code == 0, done.stderr
         assert [line for line in done.stderr.splitlines() if reason in line] == [
-            f"{out}: cannot be locked ({reason}); do not let two commands write there at a time"
+            f"{out}: cannot be locked ({reason}); do not let two commands write there at the same time"
         ]
     record = (tmp_path / "runs" / "run.mcap").read_bytes()
     assert record

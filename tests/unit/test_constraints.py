@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
 LINES = [line for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines() if not line.startswith("#")]
-LEFT_OUT = {"soak"}  # extras
+LEFT_OUT = {"soak"}  # extras without constraints
 PLATFORMS = {"linux": ("Linux", "posix"), "darwin": ("Darwin", "posix"), "win32": ("Windows", "nt")}
 
 
@@ -27,7 +27,7 @@ def needed() -> Iterator[Requirement]:
             yield Requirement(line)
 
 
-def test_a_line_is_a_version_of_a_package_and_no_address() -> None:
+def test_every_line_pins_a_version_and_none_has_an_address() -> None:
     found = [Requirement(line) for line in LINES]
     assert len(found) > 100
     for each in found:
@@ -38,7 +38,7 @@ def test_a_line_is_a_version_of_a_package_and_no_address() -> None:
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 @pytest.mark.parametrize("minor", [11, 12, 13, 14])
-def test_each_package_has_one_version_that_zsim_takes(minor: int, platform: str) -> None:
+def test_each_package_has_one_version_that_zsim_accepts(minor: int, platform: str) -> None:
     system, os_name = PLATFORMS[platform]
     here = {"python_version": f"3.{minor}", "python_full_version": f"3.{minor}.7", "sys_platform": platform}
     here |= {"platform_system": system, "os_name": os_name, "implementation_version": f"3.{minor}.7"}

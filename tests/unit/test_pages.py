@@ -1,4 +1,4 @@
-"""Words of our own are defined on the pages, and in what a run prints, where they are first read."""
+"""Terms of our own are defined where they first appear, on the pages and in the output of a run."""
 
 import re
 from pathlib import Path
@@ -11,12 +11,12 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/walkthrough.md"])
-def test_a_gate_is_defined_where_it_is_first_read(page: str) -> None:
+def test_the_term_gate_is_defined_at_its_first_occurrence(page: str) -> None:
     first = re.search(r"\*?\bgates?\b\*?", (ROOT / page).read_text())
     assert first is not None
     assert first[0] == "*gate*"
 
 
-def test_a_run_that_counts_gates_says_what_one_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_counts_gates_explains_the_term(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_commands._fault_of(True, "complete: 10 gates", []) == ""
     assert "gate: a time step" in capsys.readouterr().out

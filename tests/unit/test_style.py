@@ -1,4 +1,4 @@
-"""Tests judge errors by class, field and value: none of them compares a sentence."""
+"""Tests judge errors by class, field and value, and never compare whole sentences."""
 
 import ast
 import re
@@ -52,7 +52,7 @@ def test_no_test_judges_a_sentence(folder: str) -> None:
         'refused(E, "the mass must be positive")',
     ],
 )
-def test_a_sentence_is_found(judgement: str) -> None:
+def test_a_sentence_is_detected(judgement: str) -> None:
     assert len(sentences(judgement)) == 1
 
 
@@ -64,5 +64,5 @@ def test_a_sentence_is_found(judgement: str) -> None:
         "said = 'the mass must be positive'",
     ],
 )
-def test_terms_and_inputs_are_no_sentences(judgement: str) -> None:
+def test_terms_and_inputs_are_not_sentences(judgement: str) -> None:
     assert sentences(judgement) == []

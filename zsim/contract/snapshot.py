@@ -45,7 +45,7 @@ def unpack(payload: bytes) -> State:
     try:
         return _DECODER.decode(payload)
     except REFUSALS as error:
-        raise DecodeError(f"state: {error}; must be as this version of zsim packs it") from error
+        raise DecodeError(f"state: {error}; must have been packed by this version of zsim") from error
 
 
 def checked(state: Any, owner: type) -> State | None:

@@ -94,7 +94,7 @@ class Completeness(Struct, frozen=True):
         if self.damaged:
             faults.append(f"damaged: {shown(self.damaged)}")
         if not self.closed:
-            faults.append("it was cut: its writer did not close it")
+            faults.append("it was cut off: its writer did not close it")
         return faults
 
     def __str__(self) -> str:

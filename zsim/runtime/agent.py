@@ -170,7 +170,7 @@ class Agent(ABC):
         if frame is None:
             return ""
         agent = frame.f_locals["self"]
-        return f"; {agent.name} has not returned at {agent._answered_ns / 1e9:.2f} s{line}"
+        return f"; {agent.name} has not returned from its step at {agent._answered_ns / 1e9:.2f} s{line}"
 
     def failure(self, error: BaseException, t_ns: int) -> UserCodeError | None:
         """Return an error raised by user code, with the agent's name and the gate; None for other errors."""
@@ -189,7 +189,7 @@ class Agent(ABC):
             if isinstance(output, AgentMessage):
                 output = self.message(t_ns, output)
             if not (isinstance(output, tuple) and len(output) == 2 and isinstance(output[0], str)):
-                allowed = "must be of self.command, self.message or zsim.Output"
+                allowed = "must be the result of self.command or self.message, or a zsim.Output"
                 raise DecodeError(f"{show(output)}: is not an output; {allowed}")
             key, message = output
             if isinstance(message, AgentMessage) and type(message) not in self.messages:
@@ -494,4 +494,4 @@ def _in_order(members: Sequence[Agent]) -> tuple[Agent, ...]:
     except CycleError as error:
         names = ", ".join(members[place].name for place in sorted(set(error.args[1])))
         found = f"gate_keys of a group's members {names} are outputs of each other"
-        raise RunError(f"{found}; must not wait for each other: leave one of them to `reads` alone") from None
+        raise RunError(f"{found}; must not wait for each other: list one of them only in `reads`") from None

@@ -294,7 +294,7 @@ class AgentParticipant(Participant):
             self._fail_behind(f"the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are")
 
     def _fail_behind(self, what: str) -> None:
-        self.failure = BehindError(f"{self.name}: {what} no longer kept; this one ends, start it again")
+        self.failure = BehindError(f"{self.name}: {what} no longer kept; this process ends; start it again")
 
     # Taking part
 

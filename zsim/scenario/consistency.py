@@ -112,7 +112,7 @@ def unflown_plans(scenario: Scenario) -> list[str]:
         planned = {step: at_s for step, at_s in times.items() if at_s is not None}
         late = [f"its {step} at {at_s:g} s" for step, at_s in planned.items() if at_s >= scenario.duration_s]
         if late:
-            what = "nothing of it is flown" if "take-off" in late[0] or len(late) == len(planned) else "not flown"
+            what = "none of it is flown" if "take-off" in late[0] or len(late) == len(planned) else "not flown"
             line = f"the run ends at {scenario.duration_s:g} s, before {' and '.join(late)}: {what}"
             lines.append(f"clusters[{index}].plan: {line} (cluster {cluster.name!r})")
     for name, flown in scenario.piloted().items():
@@ -202,7 +202,7 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
     for index, obstacle in obstacles:
         path = f"environment.obstacles[{index}]"
         if obstacle.name in names:
-            yield f"{path}.name", f"is {obstacle.name!r}, as a drone; must be another"
+            yield f"{path}.name", f"is {obstacle.name!r}, as a drone; must be unique"
         wanted = _SIZES.get(obstacle.shape)
         if wanted is None:
             continue
@@ -236,7 +236,7 @@ def _surface_faults(
     for index, surface in surfaces:
         if surface.name in names or surface.name in obstacles:
             other = "a drone" if surface.name in names else "an obstacle"
-            yield f"environment.surfaces[{index}].name", f"is {surface.name!r}, as {other}; must be another"
+            yield f"environment.surfaces[{index}].name", f"is {surface.name!r}, as {other}; must be unique"
     placed = _placed(drones)
     for _, surface in surfaces:
         is_read = isinstance(surface.triangles, str) and _known(surface.position_m, surface.yaw_deg, surface.scale)
@@ -390,7 +390,7 @@ def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
             message = section[DECLARED]["message"]
             path = f"drones[{index}].sensors.{name}.{DECLARED}.message"
             if message in taken:
-                yield path, f"is {show(message)}, which is a message of the contract; must be another"
+                yield path, f"is {show(message)}, a message of the contract; must be a different name"
             elif fields_of.setdefault(message, section[DECLARED]["fields"]) != section[DECLARED]["fields"]:
                 yield path, f"is {show(message)}, which another sensor declares with other fields; must be unique"
             other, module = first.setdefault(name, (index, section[MODULE]))
@@ -450,13 +450,13 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
         path = "space" if spec.space else "template_m"
         yield path, f"asks for a template of {robots} robots; must be {TEMPLATE_ROBOTS_MIN} or more"
     elif template and len(template) != robots:
-        yield "template_m", f"has {len(template)} places; must have {robots}, one for each robot"
+        yield "template_m", f"has {len(template)} positions; must have {robots}, one for each robot"
     elif space != "template":
         return  # a user's class checks its own template
     elif template and _known(*template) and _in_line(template):
-        yield "template_m", f"is in one line, within {TEMPLATE_WIDTH_MIN_M:g} m; must span a plane or space"
+        yield "template_m", f"is on one line, within {TEMPLATE_WIDTH_MIN_M:g} m; must span a plane or space"
     elif not template and len(starts) == robots and _known(*starts) and _in_line(starts):
-        yield "template_m", "is missing, and the robots start in one line; must be given, or space must be triad"
+        yield "template_m", "is missing, and the robots start on one line; must be given, or space must be triad"
 
 
 def _in_line(places: list[Any]) -> bool:
@@ -480,7 +480,7 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 def _order_faults(path: str, points: list[Any] | None) -> Iterator[Fault]:
     for (_, before), (index, after) in pairwise(_entries(points)):
         if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
-            yield f"{path}[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+            yield f"{path}[{index}].at_s", f"is {after.at_s:g}; must be > {before.at_s:g}, the time before it"
 
 
 def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
@@ -512,7 +512,7 @@ def _reference_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> It
             at = f"{path}.stages[{number}]"
             if _known(stage.places_m, exchange.drones) and len(stage.places_m) != len(exchange.drones):
                 count = len(exchange.drones)
-                yield f"{at}.places_m", f"has {len(stage.places_m)} places; must have {count}, one for each drone"
+                yield f"{at}.places_m", f"has {len(stage.places_m)} positions; must have {count}, one for each drone"
             if _known(stage.start_s, before_s) and stage.start_s < before_s:
                 yield f"{at}.start_s", f"is {stage.start_s:g}; must be >= {before_s:g}, the end of the stage before"
             if _known(stage.start_s, stage.over_s):
@@ -524,7 +524,7 @@ def _path_faults(reference: Any) -> Iterator[Fault]:
     """Yield conflicts between the fields of one drone's reference."""
     given = [name for name in PATHS if getattr(reference, name)]
     if len(given) > 1:
-        yield given[1], f"is given beside {given[0]}; must be one of {', '.join(PATHS)}"
+        yield given[1], f"is given together with {given[0]}; must be only one of {', '.join(PATHS)}"
     if given and reference.start_s is None:
         yield "start_s", f"is missing; must say when {given[0]} begins"
     if not given and reference.start_s is not None:
@@ -569,7 +569,7 @@ def _process_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iter
         kind, entries = things.get(role, ("", []))
         known = _names(entries)
         if kind and thing not in known and len(known) == len(entries):
-            named = listed(known) or f"a {kind}, and there is none"
+            named = listed(known) or f"a {kind} (the scenario has none)"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 
@@ -577,7 +577,7 @@ def _process_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iter
 def _program_faults(programs: Mapping[str, Any], roles: Sequence[str]) -> Iterator[Fault]:
     for name, program in programs.items():
         if (role := str(name).partition(".")[0]) in roles:
-            allowed = f"must begin with another word than {', '.join(roles)}"
+            allowed = f"must not begin with {', '.join(roles)}"
             yield f"programs.{name}", f"is named like a process of the role {role}; {allowed}"
         if program and program.command and not program.command[0]:
             yield f"programs.{name}.command[0]", "is empty; must be a program"
@@ -657,7 +657,7 @@ def _camera_faults(sensors: Any) -> Iterator[Fault]:
         if None not in of_lens and None not in camera.distortion and folds(lens_of(camera)):
             least = LEAST_K1 / el.tan(math.radians(camera.diagonal_deg) / 2) ** 2
             given = f"is {list(camera.distortion)}, which folds a picture of {camera.diagonal_deg:g} deg"
-            needed = f"must give every pixel a ray of its own, k1 alone more than {least:.3f}"
+            needed = f"must give every pixel its own ray: if only k1 is set, k1 > {least:.3f}"
             yield f"{path}.distortion", f"{given}; {needed}"
         if None not in (camera.exposure_ms, camera.rate_hz) and camera.exposure_ms * camera.rate_hz > 1e3:
             most = f"{1e3 / camera.rate_hz:.4g} ms at rate_hz {camera.rate_hz:g}"
@@ -685,7 +685,7 @@ def _scanner_faults(sensors: Any) -> Iterator[Fault]:
         rows = {"lidar": "channels", "depth": "rows"}.get(name)
         if rows and _known(getattr(own, rows), own.columns) and getattr(own, rows) * own.columns > RAYS_MAX:
             most = f"must be <= {RAYS_MAX // getattr(own, rows)} with {rows} {getattr(own, rows)}"
-            yield f"{name}.columns", f"is {own.columns}; {most}: {RAYS_MAX} rays a message"
+            yield f"{name}.columns", f"is {own.columns}; {most}: {RAYS_MAX} rays per message"
     azimuth = sensors.lidar and sensors.lidar.azimuth_deg
     if azimuth and None not in azimuth and not 0 < azimuth[1] - azimuth[0] <= 360:
         yield "lidar.azimuth_deg", f"is {show(list(azimuth))}; must be [first, last], rising by at most 360"

@@ -70,7 +70,7 @@ def _number(
 
 _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
 _FACTOR = _number("factor", "by which the standard deviation grows", "", 1.0, 1e6, above=True, mildest=1.0)
-ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))  # a vehicle may name its own rotors
+ROTOR = FaultParameter("rotor", "choice", "which rotor", choices=(*ROTORS, "all"))  # a vehicle may name its own rotors
 _ONE_WAY = FaultParameter("one_way", "flag", "from the first to the second only", default=False, required=False)
 
 _RADIO = (
@@ -113,7 +113,7 @@ def _sensor_kinds(sensors: Mapping[str, SensorType | Declaration]) -> dict[str, 
         dropouts[f"{name}_dropout"] = FaultKind(
             "drone", f"samples of the {label} are lost", (_PROBABILITY,), sensor=name
         )
-        stuck[f"{name}_stuck"] = FaultKind("drone", f"the {label} shows one sample again and again", sensor=name)
+        stuck[f"{name}_stuck"] = FaultKind("drone", f"the {label} keeps repeating one sample", sensor=name)
     for name, part in sensor_parts(sensors).items():
         channel = part.channel
         unit = "" if channel.unit == "1" else re.sub(r"[^a-z0-9]+", "_", channel.unit.lower().replace("^", ""))
@@ -135,14 +135,14 @@ KINDS: dict[str, FaultKind] = {
     "rotor_efficiency": FaultKind(
         "drone",
         "a rotor has lost thrust",
-        (ROTOR, _number("value", "share of the thrust that is left", "", 0.0, 1.0, mildest=1.0)),
+        (ROTOR, _number("value", "remaining share of the thrust", "", 0.0, 1.0, mildest=1.0)),
     ),
     "rotor_stuck": FaultKind(
         "drone",
         "a rotor turns at a constant speed, whatever its command",
         (
             ROTOR,
-            _number("speed_rad_s", "if left out, that at the fault's start", "rad/s", 0.0, 1e4, required=False),
+            _number("speed_rad_s", "if omitted, the speed at the fault's start", "rad/s", 0.0, 1e4, required=False),
         ),
     ),
     "gust": FaultKind(
@@ -153,20 +153,25 @@ KINDS: dict[str, FaultKind] = {
     ),
     "link_delay": FaultKind(
         "link",
-        "messages come later",
-        (_number("delay_ms", "after it, a message comes at the next gate", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
+        "messages arrive later",
+        (
+            _number(
+                "delay_ms", "after this delay, a message arrives at the next gate", "ms", 0.0, 60_000.0, above=True
+            ),
+            _ONE_WAY,
+        ),
     ),
     "link_jitter": FaultKind(
         "link",
-        "messages come later, each by another time",
-        (_number("jitter_ms", "most of it, evenly spread from 0", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
+        "messages arrive later, each by a different delay",
+        (_number("jitter_ms", "maximum, uniformly distributed from 0", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
     ),
     "link_loss": FaultKind(
         "link", "messages are lost", (_number("probability", "of each message", "", 0.0, 1.0), _ONE_WAY)
     ),
-    "link_cut": FaultKind("link", "no message comes", (_ONE_WAY,)),
+    "link_cut": FaultKind("link", "no message arrives", (_ONE_WAY,)),
     "radio": FaultKind("radio", "messages between a drone and others are lost with distance", _RADIO),
-    PROCESS_KILL: FaultKind("process", "the process dies as by kill -9", lasts="once"),
+    PROCESS_KILL: FaultKind("process", "the process dies as if by kill -9", lasts="once"),
 }
 
 
@@ -306,11 +311,11 @@ def _target_flaws(fault: Mapping[str, Any], kind: FaultKind, known: Known) -> It
         yield from _link_flaws(actual, target, fault.get("one_way") is True, known)
     elif kind.strikes == "process":
         if not isinstance(target, str) or not known.takes_part(target):
-            yield "target", f"{actual}; must be a process that takes part, as {known.example()}"
+            yield "target", f"{actual}; must be a process that takes part, such as {known.example()}"
         elif target.partition(".")[0] in UNGATED:
             yield (
                 "target",
-                f"{actual}, outside of the lockstep; must be a process that takes part, as {known.example()}",
+                f"{actual}, outside the lockstep; must be a process that takes part, such as {known.example()}",
             )
     else:
         allowed = {"drone": known.drones, "world": ("world",), "radio": ("world", *known.clusters)}[kind.strikes]
@@ -327,17 +332,17 @@ def _target_flaws(fault: Mapping[str, Any], kind: FaultKind, known: Known) -> It
 def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterator[Flaw]:
     names = target.split("/") if isinstance(target, str) else []
     if len(names) != 2 or names[0] == names[1]:
-        yield "target", f"{actual}; must be two processes, as world/{known.example()}"
+        yield "target", f"{actual}; must be two processes, such as world/{known.example()}"
         return
     for name in names:
         allowed = _allowed_instead(name, known)
         if allowed:
             yield "target", f"{actual}; {name[:48]!r} must be {allowed}"
-    receiver = f"the world or a process that takes part, as {known.example()}"
+    receiver = f"the world or a process that takes part, such as {known.example()}"
     if not any(name == "world" or known.takes_part(name) for name in names):
         yield "target", f"{actual}; one of them must be {receiver}"
     elif one_way and names[1] != "world" and names[1].partition(".")[0] in UNGATED:
-        yield "target", f"{actual}, one way, and {names[1]!r} is outside of the lockstep; the second must be {receiver}"
+        yield "target", f"{actual}, one way, and {names[1]!r} is outside the lockstep; the second must be {receiver}"
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:

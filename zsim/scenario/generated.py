@@ -183,7 +183,12 @@ def _read_surfaces(given: list[Any]) -> tuple[list[Any], list[Fault]]:
         file, text = entry.get("file"), entry.get("triangles")
         try:
             if ("file" in entry) == ("triangles" in entry):
-                wrong.append((f"{where}.file", f"is {'given beside triangles' if file else 'missing'}; must be given"))
+                wrong.append(
+                    (
+                        f"{where}.file",
+                        f"is {'given with triangles' if file else 'missing'}; give either it or triangles",
+                    )
+                )
             elif isinstance(file, str) and file:
                 cell_m = entry.get("cell_m")
                 cell_m = float(cell_m) if isinstance(cell_m, int | float) and cell_m > 0 else None
@@ -268,7 +273,7 @@ def _text_grid(path: Path) -> Array:
 def _read(path: Path, where: str, read: Callable[[Path], Any]) -> Any:
     try:
         if path.stat().st_size > BYTES_MAX:
-            _refuse(path, where, f"has more than {BYTES_MAX} bytes", "must have less")
+            _refuse(path, where, f"has more than {BYTES_MAX} bytes", "must have at most that many")
         return read(path)
     except DocumentError:
         raise

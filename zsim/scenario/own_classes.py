@@ -42,7 +42,7 @@ def with_agents(section: Any, imports: bool) -> tuple[Any, list[Fault]]:
             continue
         where = f"agents.{role}"
         if not imports:
-            wrong.append((f"{where}.declared", "is missing; must be there in a resolved scenario"))
+            wrong.append((f"{where}.declared", "is missing; must be present in a resolved scenario"))
             continue
         try:
             filled[role] = {**entry, **_declared(entry, where)}
@@ -106,7 +106,7 @@ def law_faults(cluster: Any, drones: Mapping[str, Any], unread: Collection[str])
     """
     given = [name for name in ("law_sensors", "law_map") if getattr(cluster, name)]
     if given and cluster.law in (UNSET, "proportional"):
-        yield from ((name, "is given, and the stock law reads none; must be left out") for name in given)
+        yield from ((name, "is given, but the stock law uses none; must be left out") for name in given)
         return
     has = [drones[name].sensors for name in cluster.drones or () if name in drones]
     if not has or None in has:
@@ -131,7 +131,7 @@ def messages_of(kind: Any, where: str) -> tuple[type[AgentMessage], ...]:
     try:
         for each in classes:
             if not (isinstance(each, type) and issubclass(each, AgentMessage)):
-                raise TypeError(f"{each!r:.60} is no subclass of zsim.AgentMessage")
+                raise TypeError(f"{each!r:.60} is not a subclass of zsim.AgentMessage")
             message_info(each)
     except (TypeError, ValueError) as error:
         raise DocumentError([f"{where} is {kind.__name__}, whose messages cannot be used: {error}"]) from error
@@ -149,9 +149,9 @@ def agent_faults(agents: Any, roles: Any, clusters: bool) -> Iterator[Fault]:
     writers: dict[str, str] = {}
     for role, agent in (agents or {}).items():
         if role in roles:
-            yield f"agents.{role}", f"is a role of zsim; must be another name than {', '.join(roles)}"
+            yield f"agents.{role}", f"is a role of zsim; must be a name other than {', '.join(roles)}"
         if agent.per == "cluster" and not clusters:
-            yield f"agents.{role}.per", "is 'cluster', and there are none; must be drone or run"
+            yield f"agents.{role}.per", "is 'cluster', and the scenario has none; must be drone or run"
         for info in agent.declared or ():
             first = writers.setdefault(info.key, role)
             if first != role:

@@ -154,7 +154,7 @@ def driver_lines(scenario: Scenario, endpoint: str) -> list[str]:
     drivers, awaited_names = drivers_of(scenario), expected_processes(scenario)
     awaited, others = (listed([d for d in drivers if (d in awaited_names) is wanted]) for wanted in (True, False))
     waits = [f"the run waits for {awaited}"] if awaited else []
-    waits += [f"{others} may come at any time"] if others else []
+    waits += [f"{others} may join at any time"] if others else []
     return [f"external drones: {', and '.join(waits)}; start drivers with --connect {endpoint}"] if drivers else []
 
 

@@ -206,7 +206,7 @@ def _with_pieces(reference: Any, where: str, unsound: list[Fault]) -> Any:
     if not isinstance(name, str):
         return reference
     if "pieces" in reference:
-        unsound.append((f"{where}.file", "is given beside pieces; must be one of them"))
+        unsound.append((f"{where}.file", "is given together with pieces; must be only one of them"))
         return reference
     try:
         pieces = pieces_of(plugin.beside(name), f"{where}.file")
@@ -391,7 +391,7 @@ def pieces_of(path: Path, where: str) -> list[dict[str, Any]]:
     header = tuple(cell.lower().replace(" ", "") for cell in rows[0]) if rows else ()
     if header != HEADER:
         needed = f"must begin with the header duration, x^0 to x^7, y^0, …, yaw^7: {len(HEADER)} columns"
-        raise DocumentError([f"{where} is {show(str(path))}, which does not; {needed}"])
+        raise DocumentError([f"{where} is {show(str(path))}, whose header differs; {needed}"])
     pieces, wrong = [], []
     for number, row in enumerate(rows[1:], start=2):
         if not row:

@@ -136,7 +136,7 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
             and (info.le is None or value <= info.le)
         ):
             wide = whole and not -(2**63) <= value < 2**63
-            allowed = "a signed whole number of 64 bits" if wide else _limits(info)
+            allowed = "a signed 64-bit whole number" if wide else _limits(info)
     elif isinstance(info, types.LiteralType):
         allowed = _expected(info) if value not in info.values else None
     elif isinstance(info, types.BoolType | types.BytesType | types.StrType):

@@ -40,7 +40,7 @@ def parameters_type(kind: Callable[..., Any], filled: tuple[str, ...] = ()) -> t
     declared = getattr(kind, "Parameters", None)
     if declared is not None:
         if not (isinstance(declared, type) and issubclass(declared, Parameters)):
-            raise TypeError(f"{kind.__name__}.Parameters is no subclass of zsim.Parameters")
+            raise TypeError(f"{kind.__name__}.Parameters is not a subclass of zsim.Parameters")
         return declared
     return msgspec.defstruct("Arguments", list(_arguments(kind, filled)), bases=(Parameters,), kw_only=True)
 

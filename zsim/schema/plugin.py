@@ -250,7 +250,7 @@ def _attribute(name: str, where: str, kind: str, is_kind: Callable[[Any], bool])
     found = getattr(module, attribute, None)
     if not is_kind(found):
         if module_name.startswith(MADE):  # the user passed an object in Python, not a name
-            raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name module:{kind}"])
+            raise DocumentError([f"{where} is {show(found)}; must be a {kind.lower()}, or a name, e.g. module:{kind}"])
         is_one = isfunction if kind == "function" else isclass
         own = [each for each in vars(module).values() if is_one(each) and each.__module__ == module.__name__]
         names = sorted(each.__name__ for each in own if not each.__name__.startswith("_"))
@@ -291,7 +291,7 @@ def located(name: str, what: str) -> ModuleSpec:
     for part in accumulate(name.split("."), "{}.{}".format):
         where = spec.submodule_search_locations if spec else None
         if spec and where is None:
-            raise DocumentError([f"{what}, and {spec.name} is no package; {WHERE}"])
+            raise DocumentError([f"{what}, and {spec.name} is not a package; {WHERE}"])
         if where is not None:
             spec = PathFinder.find_spec(part, list(where))
         else:
@@ -316,7 +316,7 @@ def _find(name: str, what: str, attribute: str) -> None:
         raise DocumentError([f"{what}, which cannot be imported ({reason_of(error)})"]) from error
     if attribute not in bound and "*" not in bound:
         own = sorted(bound - _imported_names(tree)) or ["it defines nothing"]
-        raise DocumentError([f"{what}; must be of {name}: {', '.join(own)}"])
+        raise DocumentError([f"{what}; must be one that {name} defines: {', '.join(own)}"])
 
 
 def _bound(body: ast.AST) -> set[str]:

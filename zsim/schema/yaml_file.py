@@ -34,7 +34,7 @@ def read(path: Path, example: str, refuse: type[DocumentError]) -> dict[str, Any
     except UnicodeDecodeError as error:
         raise refuse([f"{path}: is not text (byte {error.start}); must be YAML in UTF-8"]) from error
     except ValueError as error:
-        raise refuse([f"{show(str(path))}: is no path ({error}); give that of a YAML file"]) from error
+        raise refuse([f"{show(str(path))}: is not a path ({error}); give that of a YAML file"]) from error
     if len(content) > FILE_SIZE_MAX:
         raise refuse([f"{path}: is larger than {FILE_SIZE_MAX} bytes; must be at most that"])
     return parse(text, path.name, example, refuse)

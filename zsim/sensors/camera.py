@@ -128,4 +128,4 @@ def frame_of(data: bytes) -> Frame:
             at += 1
         else:
             at += 2 if marker in STANDALONE else 2 + max(2, length)  # always advances, so that reading ends
-    raise PictureError(f"data ({len(data)} bytes, {data[:4].hex(' ') or 'none'} …) has no frame of a JPEG; must be one")
+    raise PictureError(f"data ({len(data)} bytes, {data[:4].hex(' ') or 'none'} …) has no frame header; must be a JPEG")

@@ -42,7 +42,7 @@ class Range(Sample, frozen=True):
     def fault(self) -> str | None:
         if len(self.beams) == len(self.ranges_m):
             return None
-        return f"ranges_m has {len(self.ranges_m)} entries; must have {len(self.beams)}, as beams"
+        return f"ranges_m has {len(self.ranges_m)} entries; must have {len(self.beams)}, one for each beam"
 
 
 class Lidar(Sample, frozen=True):

@@ -165,7 +165,7 @@ def separate(
             wrong.append((field_path("", name), f"is not known; {suggestion(name, FIELDS)}{allowed}"))
             continue
         if not isinstance(name, str) or not re.fullmatch(NAME, name) or name in RESERVED:
-            wrong.append((field_path("", name), f"is no name of a sensor; must be {NAME_ALLOWED}"))
+            wrong.append((field_path("", name), f"is not a valid sensor name; must be {NAME_ALLOWED}"))
             continue
         section_faults = [*_section_faults(name, value, imports)]
         wrong += section_faults
@@ -219,7 +219,7 @@ def _section_faults(name: str, section: dict[str, Any], imports: bool) -> Iterat
         yield from faults(section[DECLARED], Declaration, f"{name}.{DECLARED}")
         return
     if not imports:
-        yield f"{name}.{DECLARED}", "is missing; must be there in a resolved scenario"
+        yield f"{name}.{DECLARED}", "is missing; must be present in a resolved scenario"
         return
     module = section[MODULE]
     if not isinstance(module, str) or not re.fullmatch(plugin.MODULE_NAME, module):
@@ -307,7 +307,7 @@ def _of_kalibr(section: dict[str, Any], where: str, wrong: list[Fault]) -> dict[
         found = [*faults(section[key], RateHz if len(place) == 1 else NonNegative, f"{where}.{key}")]
         inside = read if len(place) == 1 else read.get(place[0], {})
         if isinstance(inside, dict) and place[-1] in inside:
-            found.append((f"{where}.{key}", f"is given beside {'.'.join(place)}; must be one of them"))
+            found.append((f"{where}.{key}", f"is given together with {'.'.join(place)}; must be only one of them"))
         wrong += found
         if found or not isinstance(inside, dict):
             continue
@@ -324,7 +324,7 @@ def _in_unit(model: dict[str, Any], units: dict[str, Unit], where: str, wrong: l
         if key in model:
             found = [*faults(model[key], NonNegative, f"{where}.{key}")]
             if unit.field in read:
-                text = f"is given beside another field for {unit.field}; must be the only one"
+                text = f"is given together with another field for {unit.field}; must be the only one"
                 found.append((f"{where}.{key}", text))
             wrong += found
             if not found:

@@ -437,7 +437,7 @@ class Session:
             if reply.kind != "ERROR":
                 return messages.decode_as(ControlAnswer, reply.payload, key)
         late = time.monotonic() - start_s >= timeout_s
-        what = f"no answer came within {timeout_s:g} s" if late else "nobody answers there"
+        what = f"no answer came within {timeout_s:g} s" if late else "no process answers there"
         return Unanswered(ok=False, error=f"{key}: {what}; is it running?")
 
     def declare_queryable(self, expression: str, callback: Callable[[Query], None], complete: bool = False) -> None:

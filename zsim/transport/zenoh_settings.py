@@ -143,7 +143,7 @@ def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Setti
 def refusal(path: str, value: str, identity: Identity) -> str:
     """Return the error for a setting that Zenoh refuses: only endpoints and access control come from the user."""
     if path == ACCESS:
-        return f"{identity.access}: is not an access control of Zenoh; must be an access.json of zsim certs init"
+        return f"{identity.access}: is not a Zenoh access control file; must be an access.json of zsim certs init"
     endpoints = ", ".join(map(repr, json.loads(value)))
     return f"endpoint is {endpoints}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447"
 
@@ -190,7 +190,7 @@ def require_files(needed: int, what: str) -> None:
     """
     allowed = allow_files(needed)
     if allowed is not None and allowed < needed:
-        raise SessionError(f"open files are {allowed} at most; must be {needed} for {what}: `ulimit -n {needed}`")
+        raise SessionError(f"the limit of open files is {allowed}; must be {needed} for {what}: `ulimit -n {needed}`")
 
 
 def allow_files(wanted: int) -> int | None:

@@ -184,16 +184,16 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError(f"rotors has the names {', '.join(names)}; must be distinct")
         farthest = max(el.hypot(rotor.x_m, rotor.y_m) for rotor in self.rotors)
         if not math.isclose(self.arm_m, farthest, rel_tol=ARM_MISS_MAX):
-            what = f"arm_m is {self.arm_m:g}, but the farthest of rotors is {farthest:.4g} m from the centre"
+            what = f"arm_m is {self.arm_m:g}, but the farthest of the rotors is {farthest:.4g} m from the centre"
             raise ValueError(f"{what}; must be the same: give both, and airframe and rotor_radius_m that fit")
         strengths = linear.singular_values(np.vstack([np.ones(count), allocation(self)]))
         if strengths[-1] < RANK_MIN * strengths[0]:
             raise ValueError(
-                "rotors cannot give thrust, roll, pitch and yaw apart from each other; place them about the centre"
+                "rotors cannot give thrust, roll, pitch and yaw independently; place them about the centre"
             )
         shares = lift_shares(self)
         if shares.min() < LIFT_MIN:
-            weakest = f"{names[int(shares.argmin())]} of rotors bears {shares.min():.2f} of the mean thrust in a hover"
+            weakest = f"rotors: {names[int(shares.argmin())]} bears {shares.min():.2f} of the mean thrust in a hover"
             raise ValueError(f"{weakest}; must be >= {LIFT_MIN:g}: place them about the centre of mass, turns balanced")
 
 

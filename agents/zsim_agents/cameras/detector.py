@@ -82,7 +82,7 @@ def decoded(data: bytes, width: int, height: int) -> Picture:
     _, found_width, found_height = frame_of(data)
     if (found_width, found_height) != (width, height):
         found = f"{found_width} x {found_height}"
-        raise PictureError(f"data is a JPEG of {found}; must be {width} x {height}, as the camera's info")
+        raise PictureError(f"data is a JPEG of {found}; must be {width} x {height}, as in the camera's info")
     if width * height > PIXELS_MAX:
         raise PictureError(f"picture has {width * height} pixels; must have at most {PIXELS_MAX}")
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION

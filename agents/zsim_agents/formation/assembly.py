@@ -131,8 +131,8 @@ def planned_assembly(
     start_W = p_W[order]
     least_m, distance = apart * gains.separation_min_m, straight_separation(start_W, goal_W)
     if distance < least_m - ROUNDING_M:
-        near = f"on the ways to their places two drones come within {distance:.2f} m"
-        sure = f"sure where starts, and places, are {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
+        near = f"on the paths to their positions two drones come within {distance:.2f} m"
+        sure = f"certain if starts and goals are each {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
         raise RefusalError(f"{near}; allowed: {least_m:g} m or more, {sure}")
     return Assembly(start_W, goal_W, c, _least_s(start_W, goal_W, gains), gains), order
 
@@ -149,7 +149,7 @@ def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
     if starts.ndim != 2 or starts.shape != goals.shape or starts.shape[1] not in (2, 3):
         raise ValueError(f"found starts {starts.shape} and goals {goals.shape}; must both be (n, 3)")
     if not (np.isfinite(starts).all() and np.isfinite(goals).all()):
-        raise ValueError("a place is not finite; must be")
+        raise ValueError("a position is not finite; all must be")
     return linear_sum_assignment(((starts[:, None] - goals[None]) ** 2).sum(axis=2))[1]
 
 

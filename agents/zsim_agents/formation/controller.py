@@ -154,7 +154,7 @@ class Controller(Agent):
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
         if len(self._answered) >= REQUESTS_MAX:
-            error = f"{key}: {REQUESTS_MAX} requests already wait for the next gate; ask again after it"
+            error = f"{key}: {REQUESTS_MAX} requests are already waiting for the next gate; repeat the request after it"
             return ControlAnswer(ok=False, error=error)
         try:
             refusal = self._engagement.request(read_request(request.op, request.args))

@@ -291,7 +291,9 @@ class Engagement:
         if self._assembly is None or self._assembly.arrived(gate.p_W):
             return None
         i, away_m = self._assembly.farthest(gate.p_W)
-        return f"{self.drones[i]} is {away_m:.1f} m from its place, {self._assembly.left_s:.1f} s of the ways are left"
+        return (
+            f"{self.drones[i]} is {away_m:.1f} m from its position, {self._assembly.left_s:.1f} s of the paths are left"
+        )
 
     def _places_at(self, p_W: Array) -> Places:
         return Places(p_W, self.gains, self._held_limits, SHAPE.share)
@@ -365,7 +367,7 @@ class Engagement:
             self._places = None
             return None
         i, away_m = self._places.farthest(gate.p_W)
-        place = f"{self.drones[i]} is {away_m:.1f} m from its place; allowed: {IN_PLACE_M:g} m"
+        place = f"{self.drones[i]} is {away_m:.1f} m from its position; allowed: {IN_PLACE_M:g} m"
         return f"{REJOINING}: {place}" if away_m > IN_PLACE_M else None
 
     def _fly(self, gate: GateInput) -> GateOutput:
@@ -411,7 +413,7 @@ class Engagement:
     ) -> GateOutput:
         """Return the output of a gate; without a reference, the desired value is the estimate."""
         if command and command.alarmed:
-            near = f"nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
+            near = f"closer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
             reason = f"{TOO_NEAR}, {near}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note

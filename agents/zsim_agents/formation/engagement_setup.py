@@ -303,7 +303,7 @@ class _Rehearsal:
         ramp = self._planner.fastest((start, np.zeros_like(start)), Shifted(trajectory, start_s), ready_s)
         there_s = ready_s + ramp.over_s
         if end_s < math.inf and there_s > ready_s + WAY_ROOM * (end_s - ready_s):
-            reason = f"the way to it takes the formation until {there_s:.0f} s"
+            reason = f"the formation does not reach it before {there_s:.0f} s"
             raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
 
     def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:

@@ -169,9 +169,9 @@ class RampPlanner:
                     raise TrajectoryError(f"over_s is {over_s:g} s; {allowed}")
             fault = self.reference_fault(ramp, start_s, start_s + ramp.over_s)
         except SingularClusterError as error:
-            raise TrajectoryError(f"the way is singular: {error}") from None
+            raise TrajectoryError(f"the path is singular: {error}") from None
         if fault:
-            raise TrajectoryError(f"the way is not allowed: {fault}")
+            raise TrajectoryError(f"the path is not allowed: {fault}")
         return ramp
 
     def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:

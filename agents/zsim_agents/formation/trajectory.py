@@ -325,7 +325,7 @@ def _refuse_twice(space: Variables, variable: Variable, given: set[int], place: 
     """Raise TrajectoryError for a variable given twice, in two units; otherwise record it."""
     if variable.entry in given:
         name = space.names[variable.entry]
-        raise TrajectoryError(f"is given beside the same variable; allowed: {name} or {name}{DEGREES}", *place)
+        raise TrajectoryError(f"is the same variable in a second unit; allowed: {name} or {name}{DEGREES}", *place)
     given.add(variable.entry)
 
 

@@ -77,7 +77,7 @@ class ShapePilot(Pilot):
         yield from super().flaws(parameters, scenario)
         drones, places = [drone.name for drone in scenario.drones], parameters["places_m"]
         if places and len(places) != len(drones):
-            yield "places_m", f"has {len(places)} places; must have {len(drones)}, one for each drone"
+            yield "places_m", f"has {len(places)} positions; must have {len(drones)}, one for each drone"
         for name in parameters["informed"] or ():
             if name not in drones:
-                yield "informed", f"names {name!r}; must be of {', '.join(drones)}"
+                yield "informed", f"names {name!r}; must be one of {', '.join(drones)}"

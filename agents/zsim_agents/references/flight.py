@@ -175,7 +175,7 @@ def flight_of(scenario: Scenario, drone: str) -> Flight:
     from_s, least_s = flown.start_s - (way.duration_s or 0.0), flown.takeoff_s + READY_S
     if from_s < least_s:
         needed = f"must be >= {least_s + (way.duration_s or 0.0):.2f}: it takes off at {flown.takeoff_s:g} s, then the"
-        raise FlightError("start_s", f"is {flown.start_s:g}; {needed} way to the path takes {way.duration_s:.2f} s")
+        raise FlightError("start_s", f"is {flown.start_s:g}; {needed} approach takes {way.duration_s:.2f} s")
     return Flight(hover, (Leg(from_s, way, "approaching"), Leg(flown.start_s, path, "path")))
 
 
@@ -296,7 +296,7 @@ def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, now: str) -> str:
     what, unit = QUANTITIES[worst]
     found = f"needs a {what} of {peaks[worst]:.3g} {unit} at {peaks.at_s[worst]:.2f} s"
     allowed = f"must be at most {SHARE * limits[worst]:.3g}, {SHARE:g} of the drone's limit"
-    return f"{found}; {allowed}: fly it {round_up(factor):g} times as slowly ({now}), or set fit: true"
+    return f"{found}; {allowed}: slow it down by a factor of {round_up(factor):g} ({now}), or set fit: true"
 
 
 def _check_heights(path: Reference, altitude_max_m: float) -> None:
@@ -346,7 +346,7 @@ def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight
         over_s = stage.over_s
         if least_s > over_s * ROUNDING:
             if not exchange.fit:
-                needed = f"must be >= {round_up(least_s):g} for the longest way, or set fit: true"
+                needed = f"must be >= {round_up(least_s):g} for the longest distance, or set fit: true"
                 raise FlightError(f"{at}.over_s", f"is {over_s:g}; {needed}")
             over_s = round_up(least_s)
         coefficients = (rise / [el.power(over_s, float(k)) for k in range(len(rise))])[:, None] * ways[:, None, :]
@@ -418,7 +418,7 @@ def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
     pair = f"{names[found.first]} and {names[found.second]}"
     least = float(clearance[found.first] + clearance[found.second])
     near = f"{pair} are {found.distance_m:.2f} m apart at {found.t_s:.2f} s"
-    return f"have references by which {near}; must be >= {least:g} m"
+    return f"have references on which {near}; must be >= {least:g} m"
 
 
 def checked_flight(scenario: Scenario, drone: str) -> Flight:
@@ -524,7 +524,7 @@ def _meetings(
         met = [(each, name) for each, name in zip(found, flights, strict=True) if each is not None]
         if met:
             (t_s, distance_m, robot), name = min(met)
-            near = f"leads robot {robot + 1} within {distance_m:.2f} m of {name}, by its reference, at {t_s:.1f} s"
+            near = f"brings robot {robot + 1} within {distance_m:.2f} m of {name}, on its reference, at {t_s:.1f} s"
             least = own_m + clearance[name]
             yield f"clusters[{index}].{planned.path}", f"{near}; must be >= {least:g} m (cluster {cluster.name!r})"
 

@@ -252,7 +252,7 @@ def move(
         if path.peaks().factor(limits) <= 1.0:
             return path
         length_s *= GROWTH
-    raise TrajectoryError("is faster at an end than the limits of the way there")
+    raise TrajectoryError("is faster at one end than the limits of the approach allow")
 
 
 def round_up(factor: float) -> float:

@@ -156,7 +156,7 @@ class ReferencePilot(Agent):
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
         """Handle a request, which takes effect at the next gate."""
         if len(self._answered) >= REQUESTS_MAX:
-            error = f"{key}: {REQUESTS_MAX} requests already wait for the next gate; ask again after it"
+            error = f"{key}: {REQUESTS_MAX} requests are already waiting for the next gate; repeat the request after it"
             return ControlAnswer(ok=False, error=error)
         try:
             result, error = self._take(request), ""
@@ -179,7 +179,7 @@ class ReferencePilot(Agent):
             return None
         if asked == "takeoff":
             if self._state != "landed" or self._estimate is None:
-                raise DroneRequestError(f"{self._drone} is {self._state}; must be landed, and estimated")
+                raise DroneRequestError(f"{self._drone} is {self._state}; must be landed and have an estimate")
             x, y, z = self._estimate.position_m
             hover = [x, y, z + self._spec.takeoff_height_m, self._estimate.yaw_rad]
             self._asked, self._flight = (t_s, "takeoff", {}, hover, [0.0] * 4), Flight(np.array(hover))
@@ -188,7 +188,7 @@ class ReferencePilot(Agent):
             return None
         if self._state not in AIRBORNE or self._is_over or t_s >= self._land_s:
             state = "landed, or about to" if self._state in AIRBORNE else self._state
-            raise DroneRequestError(f"{self._drone} is {state}; must fly its reference: ask for takeoff first")
+            raise DroneRequestError(f"{self._drone} is {state}; must be flying its reference: request takeoff first")
         place, rate = self._flight.value(t_s)
         flight = requested_flight(asked, t_s, place, rate, self._spec, self._limits)
         self._flight, self._asked = flight, (t_s, request.op, request.args, place.tolist(), rate.tolist())
@@ -296,7 +296,7 @@ def read_request(op: str, args: Mapping[str, Any]) -> Asked:
             raise DroneRequestError(f"position_m {found} places_m; must have one of them")
         if asked.over_s and (asked.places_m or asked.speed_m_s):
             other = "places_m" if asked.places_m else "speed_m_s"
-            raise DroneRequestError(f"over_s is {asked.over_s:g} beside {other}; must be left out, or {other}")
+            raise DroneRequestError(f"over_s is {asked.over_s:g} beside {other}; one of them must be left out")
     return asked
 
 

@@ -55,7 +55,7 @@ IN_THE_AIR = ("taking_off", *AIRBORNE)
 NO_ALTITUDE_LIMIT_MM = 100_000  # value of altitude_max that stands for no limit (ARDroneLib)
 CLIMB_1_S = 1.5  # maximum climb rate per metre below the maximum height [1/s], as in zsim's firmware
 CALIBRATION_YAW_RAD_S = 1.0  # yaw rate of a calibration: a full turn takes 6 s, as on the real aircraft
-FIGURES = "figures are not flown here; the aircraft's flips are its firmware's"
+FIGURES = "flight animations are not simulated; on a real aircraft the firmware performs them"
 
 
 class Outlets(NamedTuple):
@@ -157,7 +157,7 @@ class Aircraft:
                 self._command_ns, self._is_lost = self._now_ns, False
                 self._obey(command)
             else:
-                self._refuse("AT commands come with sequence numbers that are not above the last one")
+                self._refuse("AT commands have sequence numbers that do not exceed the last one")
 
     def _obey(self, command: Command) -> None:
         ids, self._ids = self._ids, None
@@ -191,7 +191,7 @@ class Aircraft:
         key = config.key.lower()
         is_foreign = ids and not self.configuration.is_current(ids.session, ids.user, ids.application)
         if is_foreign and not key.startswith("custom:"):
-            self._refuse(f"CONFIG {key[:60]} is not obeyed: its identifiers are not those in force")
+            self._refuse(f"CONFIG {key[:60]} is not obeyed: its identifiers are not the current ones")
             return
         if key == "control:flight_anim":
             self._refuse(f"CONFIG {key} is not obeyed: {FIGURES}")

@@ -106,7 +106,7 @@ class ArdroneServer(PictureServer):
                     yield keys.camera(name, drone.aircraft.camera)
                 else:
                     advice = install_command(["video"])
-                    self.say_once(f"video: av is not installed, no pictures are streamed; {advice}")
+                    self.say_once(f"video: av is not installed, so no pictures are streamed; {advice}")
 
     def forward(self, key: str, payload: bytes) -> None:
         kind, thing, leaf = keys.parts(key)
@@ -175,15 +175,15 @@ class DroneServer:
                 await opened.open(self.address, port)
             except OSError as error:
                 why = {
-                    errno.EADDRINUSE: "another program has it; end that, or give other --addresses",
-                    errno.EADDRNOTAVAIL: "the address is not this host's; give one that is, as --addresses",
+                    errno.EADDRINUSE: "another program uses it; end that program, or give other --addresses",
+                    errno.EADDRNOTAVAIL: "the address is not this host's; give one of this host's as --addresses",
                 }.get(error.errno or 0, error.strerror or str(error))
-                raise RunError(f"{self._name}: {kind} port {port} of {self.address} cannot be had: {why}") from error
+                raise RunError(f"{self._name}: {kind} port {port} of {self.address} cannot be opened: {why}") from error
         try:  # optional, since few programs use this port and opening it needs a privilege
             await self._files.open(self.address, FILES_PORT)
         except OSError as error:
             why = "needs a privilege" if error.errno in NOT_PERMITTED else error.strerror
-            return [f"{self._name}: TCP port {FILES_PORT} is left out ({why}); ps_drone looks there"]
+            return [f"{self._name}: TCP port {FILES_PORT} is not served ({why}); ps_drone uses it"]
         return []
 
     async def close(self) -> None:
@@ -329,7 +329,7 @@ class FileServer:
             _reply(writer, "550 no such file")
         else:
             listing = "".join(f"{each}\r\n" for each in self._files).encode("ascii")
-            _reply(writer, "150 it comes")
+            _reply(writer, "150 sending data")
             waiting.put_nowait(self._files[name] if verb == "RETR" else listing)
             await asyncio.wait_for(waiting.join(), DATA_WITHIN_S)
             _reply(writer, "226 done")
@@ -448,8 +448,8 @@ class AllowedHosts:
         self._named = named
         if not self._is_loopback and not named:
             raise RunError(
-                f"{address} is reached by every host of its network, and an AR.Drone has no password; "
-                "give --peer HOST, the host that is obeyed, or an address 127.x.y.z"
+                f"{address} can be reached by every host on its network, and an AR.Drone has no password; "
+                "give --peer HOST, the host to obey, or an address 127.x.y.z"
             )
 
     def allow(self, host: str) -> bool:
@@ -480,7 +480,7 @@ def drone_addresses(text: str, drones: Sequence[str]) -> dict[str, str]:
         try:
             addresses = {drone: str(first + i) for i, drone in enumerate(drones)}
         except ipaddress.AddressValueError:
-            raise RunError(f"--addresses begins with {first}; there are not enough addresses behind it") from None
+            raise RunError(f"--addresses begins with {first}; there are not enough addresses after it") from None
     if len(set(addresses.values())) < len(addresses):
         raise RunError(f"--addresses is {text!r}; must give each drone an address of its own")
     return addresses

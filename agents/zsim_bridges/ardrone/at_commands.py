@@ -488,17 +488,17 @@ class Configuration:
             identifier = value[1:]
             deleted = [each for each in self._kept[level] if each != DEFAULT_ID and identifier in ("all", each)]
             if not deleted and identifier != "all":
-                raise ConfigurationError(f"there is no configuration {identifier[:40]!r} of the level {level}")
+                raise ConfigurationError(f"there is no configuration {identifier[:40]!r} at the level {level}")
             for each in deleted:
                 del self._kept[level][each], self._described[level][each]
             if self._current[level] not in self._kept[level]:
                 self._current[level] = DEFAULT_ID
         else:
             if not _ID.fullmatch(value):
-                raise ConfigurationError(f"the identifier {value[:40]!r} must be letters and digits, at most 32")
+                raise ConfigurationError(f"the identifier {value[:40]!r} must consist of at most 32 letters and digits")
             if value not in self._kept[level]:
                 if len(self._kept[level]) >= KEPT_MAX:
-                    raise ConfigurationError(f"there are {KEPT_MAX} configurations of the level {level}; delete some")
+                    raise ConfigurationError(f"there are {KEPT_MAX} configurations at the level {level}; delete some")
                 self._kept[level][value], self._described[level][value] = {}, ""
             self._current[level] = value
 
@@ -506,7 +506,7 @@ class Configuration:
 def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
     """Return a value in its stored form, a number clipped to its range."""
     if entry.kind == "fixed":
-        raise ConfigurationError(f"{key} is read only")
+        raise ConfigurationError(f"{key} is read-only")
     if entry.kind == "text":
         return _checked_text(key, value)
     if entry.kind == "flag":
@@ -526,7 +526,7 @@ def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
 
 def _checked_text(key: str, value: str) -> str:
     if len(value) > TEXT_MAX or not value.isprintable():
-        raise ConfigurationError(f"{key} is set to {value[:40]!r}; must be printable, at most {TEXT_MAX} characters")
+        raise ConfigurationError(f"{key} is set to {value[:40]!r}; must be at most {TEXT_MAX} printable characters")
     return value
 
 

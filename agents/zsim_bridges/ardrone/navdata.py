@@ -342,7 +342,7 @@ class NavdataSender:
                 self._content.fill_gate(self._put, tags)
             self._content.fill_packet(self._put, self._ctrl_state(), t_ns)
         except (struct.error, ArithmeticError, ValueError) as error:
-            self._refuse(f"navdata has a value beyond what its field can hold ({error})")
+            self._refuse(f"navdata has a value out of range for its field ({error})")
         self._sequence += 1
         bits = self._state_bits()
         if self.is_bootstrap:

@@ -39,7 +39,7 @@ PANEL_PX = 350
 ROWS_SHOWN = 60  # maximum number of events shown
 SWITCHES = {
     "ghosts": "Ghosts: the desired formation",
-    "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
+    "estimates": "Estimates: 2σ ellipsoids (contain 74 % in 3-D)",
     "trails": "Trails",
 }
 MANY = 12  # number of drones that fit on a page; if there are more, the worst come first by default

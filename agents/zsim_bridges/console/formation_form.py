@@ -464,7 +464,7 @@ def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] =
         elif name in names:
             by_variable[name] = value
         else:
-            constants[name] = _number(value, f"line {number}: {name}, a constant since it is no variable,")
+            constants[name] = _number(value, f"line {number}: {name}, a constant, since it is not a variable,")
     if not by_variable:
         raise InputError("trajectory is empty; must have at least one line VARIABLE = EXPRESSION")
     for name in constants:

@@ -312,7 +312,7 @@ def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Arra
             assert isinstance(request, Follow)
             reference = request.trajectory(space, base)
             span_s = reference.duration_s or ENDLESS_S
-            length = f"{span_s:g} s{'' if reference.duration_s else ' of it'}"
+            length = f"{span_s:g} s{'' if reference.duration_s else ' shown'}"
             flown = np.array([reference.value(t_s)[0] for t_s in np.linspace(0.0, span_s, POINTS)])
             lead = _ramp(space, base, flown[0], round(POINTS * TRANSIT_SHARE))
         paths_W = np.array([space.inverse(c)[0] for c in (*lead, *flown)]).transpose(1, 0, 2)

@@ -470,7 +470,7 @@ def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
         rejoin = f"{cluster} is {'rejoining' if fault else 'not held by a fault'}"
     elif grounded:
         state = run.drones.get(grounded[0]) or "not seen"
-        rejoin = f"{grounded[0]} is {_words(state)}; take it off first"
+        rejoin = f"{grounded[0]} is {_words(state)}; let it take off first"
     else:
         rejoin = ""
     return {
@@ -559,7 +559,7 @@ def page_head(
         title, detail = f"run over at {t_s:.1f} s", run.ended
     elif run.level == "silent":
         title = f"no answer from the world for {run.silent_s:.0f} s"
-        detail = f"the display is as of {t_s:.1f} s and may be outdated"
+        detail = f"the display shows the state at {t_s:.1f} s and may be outdated"
     else:
         state = "waiting" if run.clock == "running" and is_waiting else run.clock or "no clock yet"
         pace = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""

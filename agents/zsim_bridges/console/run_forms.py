@@ -181,7 +181,7 @@ class FaultForm:
             "Motor weak": ("rotor_efficiency", drone, {"rotor": rotor, "value": thrust / 100}, weak),
             "Gust": ("gust", "world", {"velocity_m_s": [gust, 0.0, 0.0]}, f"all drones: {gust:g} m/s to the east"),
             "Messages lost": ("link_loss", link, {"probability": messages / 100}, lost),
-            "Kill estimator": (PROCESS_KILL, f"estimator.{drone}", {}, f"process estimator.{drone}, as by kill -9"),
+            "Kill estimator": (PROCESS_KILL, f"estimator.{drone}", {}, f"process estimator.{drone}, as with kill -9"),
         }
 
     def _describe(self) -> None:

@@ -147,7 +147,7 @@ def _check_once(found: FmuMapping) -> None:
             target = (place.key, place.field, index)
             if target in mapped:
                 raise RunError(
-                    f"--map {variable.name}={place.text}: {mapped[target]} is mapped there already; must be one"
+                    f"--map {variable.name}={place.text}: {mapped[target]} is already mapped there; must be unique"
                 )
             mapped[target] = variable.name
     inputs: set[str] = set()

@@ -242,7 +242,7 @@ def _pack(key: str, value: Any) -> bytes:
     try:
         return msgspec.msgpack.encode(value)
     except REFUSALS as error:
-        raise DecodeError(f"{key:.80}: {error}; must be JSON with numbers of 64 bits") from error
+        raise DecodeError(f"{key:.80}: {error}; must be JSON with 64-bit numbers") from error
 
 
 def _with_integers(value: Any) -> Any:

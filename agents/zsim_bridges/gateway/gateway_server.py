@@ -465,7 +465,7 @@ class Client:
         if request.key not in self._subscriptions:
             if len(self._subscriptions) >= SUBSCRIPTIONS_MAX:
                 raise TooManyError(
-                    f"subscribe: there are {SUBSCRIPTIONS_MAX} already; unsubscribe some, or use wildcards"
+                    f"subscribe: has {SUBSCRIPTIONS_MAX} subscriptions already; end some, or use wildcards"
                 )
             self._subscriptions[request.key] = self._gateway.subscriptions.subscribe(request.key, self._on_value)
         self.send({"op": "subscribe", "key": request.key}, request)

@@ -239,7 +239,7 @@ class KeyTrees:
         expression, accepted = _key_of(request, "/"), _first_accepted(request)
         if any(part.startswith("@") for part in expression.split("/")):  # wildcards match no such parts
             raise ForbiddenError(
-                f"{expression[:80]}: Zenoh's own keys are not shown; must be keys without @, as zsim/**"
+                f"{expression[:80]}: Zenoh's own keys are not shown; must be keys without @, such as zsim/**"
             )
         if accepted == EVENT_STREAM:
             return await stream_events(request, self.full_subscriptions, expression, _sample_event)

@@ -199,7 +199,7 @@ class AutopilotSession(VehicleSession):
             self._refused += 1
             if address not in self._strangers and len(self._strangers) < STRANGERS_MAX:
                 self._strangers.add(address)
-                self.texts.append(f"messages of system {address[0]}, component {address[1]}, are not read")
+                self.texts.append(f"messages from system {address[0]}, component {address[1]}, are ignored")
         return False
 
     def _take(self, message: Any, now_ns: int) -> None:
@@ -220,7 +220,7 @@ class AutopilotSession(VehicleSession):
                 taken_over = self._autopilot.is_taken_over(self._action == "land")
                 if taken_over != self._taken_over:
                     self._taken_over = taken_over
-                    what = "another program or pilot has control" if taken_over else "it is given back"
+                    what = "another program or pilot has control" if taken_over else "control has been given back"
                     self.texts.append(f"{what} (mode {self._autopilot.custom_mode:#x})")
 
     # To the vehicle

@@ -44,7 +44,7 @@ SILENT_S = 30.0  # wall time after which a silent program is forgotten
 REASONS = {
     "bad_crc": "a frame with a wrong checksum",
     "unknown": "a message that is not in the dialect",
-    "incompatible": "a frame with flags that are not known",
+    "incompatible": "a frame with unknown flags",
     "truncated": "a truncated frame",
     "unsigned": "a frame without a signature",
     "bad_signature": "a frame with a wrong signature",

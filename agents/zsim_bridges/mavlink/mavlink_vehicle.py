@@ -314,7 +314,7 @@ class MavlinkVehicle:
         elif is_px4:  # PX4's altitude is above sea level
             altitude_m -= state.to_global(state.home_or_here_m)[2]
         if not 0.0 < altitude_m <= 10_000.0:
-            return f"take-off to {altitude_m:.1f} m over home"
+            return f"take-off to {altitude_m:.1f} m above home"
         return self.flight.take_off(altitude_m)
 
     def _reposition(self, request: Request) -> str | None:
@@ -418,7 +418,7 @@ def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) 
     if frame == MavFrame.LOCAL_NED:
         return _target(message, ned(place), False, state)
     if frame not in FROM_HERE:
-        return f"frame {frame} of a local setpoint is not flown"
+        return f"unsupported frame {frame} of a local setpoint"
     along_heading = frame in ALONG_HEADING
     x, y, z = turned_about_up(dialect.frd(place), state.yaw_rad) if along_heading else ned(place)
     own_x, own_y, own_z = state.position_m
@@ -427,7 +427,7 @@ def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) 
 
 def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState) -> Setpoint | str:
     if message.coordinate_frame not in (*ABSOLUTE, *RELATIVE):
-        return f"frame {message.coordinate_frame} of a global setpoint is not flown"
+        return f"unsupported frame {message.coordinate_frame} of a global setpoint"
     own = state.to_global(state.position_m)
     height_m = message.alt
     if message.coordinate_frame in RELATIVE:
@@ -454,7 +454,7 @@ def _target(
     given = (message.vx, message.vy, message.vz)
     known = [not mask & bit and math.isfinite(v) for v, bit in zip(given, bits, strict=True)]
     if position == NOWHERE and not any(known):
-        return "a setpoint without position and velocity is not flown"
+        return "a setpoint has neither position nor velocity"
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
     if any(known):
         vx, vy, vz = (v if is_known else 0.0 for v, is_known in zip(given, known, strict=True))
@@ -483,7 +483,7 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
     mask = AttitudeMask(message.type_mask & 0xFF)
     values = (*message.q, message.thrust, message.body_yaw_rate)
     if mask & AttitudeMask.ATTITUDE:
-        return "body rates alone are not flown; give an attitude"
+        return "body rates need an attitude too"
     length = el.length(message.q)
     if not all(map(math.isfinite, values)) or not 0.5 < length < 2.0:
         return "the attitude of a setpoint is not a quaternion"

@@ -98,7 +98,7 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
     except ValueError:
         scheme, host, port = "", None, 0
     if host is None or scheme != "http":
-        raise RunError(f"ROS master is {master_uri!r}; must be such as {DEFAULT_MASTER}")
+        raise RunError(f"ROS master is {master_uri!r}; must be a URI such as {DEFAULT_MASTER}")
     configured = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP")
     if configured:
         return configured
@@ -108,7 +108,7 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
             return probe.getsockname()[0]
     except OSError as error:
         raise RunError(
-            f"ROS master {master_uri}: no way to {host} ({error}); correct --master or give --ros-host"
+            f"ROS master {master_uri}: no route to {host} ({error}); correct --master or give --ros-host"
         ) from error
 
 

@@ -385,7 +385,7 @@ class SubscribedTopic:
     def _report_once(self, uri: str, reason: str) -> None:
         if uri not in self._reported:
             self._reported.add(uri)
-            self._say(f"{self.topic_type.name}: what {self.connected.get(uri, uri)} sends is refused: {reason}")
+            self._say(f"{self.topic_type.name}: messages from {self.connected.get(uri, uri)} are refused: {reason}")
 
 
 class TopicType(NamedTuple):
@@ -552,7 +552,7 @@ def serialize(kind: str, message: Any) -> bytes:
     try:
         return bytes(_store.serialize_ros1(message, _full_name(kind)))
     except Exception as error:  # the generated writer may raise any exception for invalid values
-        raise ValueError(f"is no {kind}: {error}") from error
+        raise ValueError(f"is not a {kind}: {error}") from error
 
 
 def deserialize(kind: str, data: bytes) -> Any:
@@ -564,7 +564,7 @@ def deserialize(kind: str, data: bytes) -> Any:
     try:
         return _store.deserialize_ros1(data, _full_name(kind))
     except Exception as error:  # the generated reader may raise any exception for invalid bytes
-        raise ValueError(f"{len(data)} bytes are no {kind}") from error
+        raise ValueError(f"{len(data)} bytes are not a {kind}") from error
 
 
 def _full_name(kind: str) -> str:

@@ -387,7 +387,7 @@ def decode(payload: bytes, name: str) -> Any:
         return _store.deserialize_cdr(payload, _stored(name))
     except (SerdeError, ValueError, IndexError, MemoryError, OverflowError) as error:
         why = str(error) or type(error).__name__
-        raise ValueError(f"{len(payload)} bytes are no CDR of {name} ({why})") from error
+        raise ValueError(f"{len(payload)} bytes are not a CDR encoding of {name} ({why})") from error
 
 
 @cache

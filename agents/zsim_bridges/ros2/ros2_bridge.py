@@ -182,7 +182,7 @@ class Ros2Bridge:
         context.on_subscription(lambda token, alive: self._queue.add_task(partial(self._on_subscription, token, alive)))
         for own, name in {**names, **self.names.clusters}.items():
             if own != name:
-                self.report_once(own, f"{own} is {name} in ROS, which takes no such name")
+                self.report_once(own, f"{own} is called {name} in ROS, which does not allow this name")
 
     def _advertise(self, node: Ros2Node, run_topics: Iterator[Topic]) -> None:
         for topic in run_topics:
@@ -196,7 +196,7 @@ class Ros2Bridge:
             return
         if rmw_zenoh.data_key(self._domain, *endpoint[1:]) != publication.publisher.key:
             kind = publication.topic.kind
-            self.report_once(token, f"{endpoint.name}: somebody subscribes to {endpoint.type_name}; it is {kind}")
+            self.report_once(token, f"{endpoint.name}: a subscriber expects {endpoint.type_name}; it is {kind}")
             return
         readers, had_readers = publication.readers, bool(publication.readers)
         readers.add(token) if alive else readers.discard(token)

@@ -227,8 +227,8 @@ class DriverProcess:
         """Print possible causes if nothing has been received from the aircraft."""
         if self._session.state.received_ns is None:
             channel, refused = self._session.channels[0], self._session.figures().refused
-            silence = self._sockets[0].fault.lower() or "nothing comes"
-            what = f"{refused} messages of other senders arrived" if refused else silence
+            silence = self._sockets[0].fault.lower() or "nothing arrives"
+            what = f"{refused} messages from other senders arrived" if refused else silence
             advice = "check its address, that it is switched on, and over MAVLink its system id and key"
             self._say(f"no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
 
@@ -394,7 +394,7 @@ class AircraftSocket(asyncio.DatagramProtocol):
                 why = error.strerror or str(error)
                 if error.errno in (errno.EADDRINUSE, errno.EACCES):
                     advice = "give another --local-port, or end the program that uses it"
-                    raise RunError(f"UDP port {channel.local_port} here cannot be had: {why}; {advice}") from error
+                    raise RunError(f"UDP port {channel.local_port} cannot be opened: {why}; {advice}") from error
                 advice = "give the address of the aircraft"
                 raise RunError(f"{channel.host}:{channel.port} cannot be reached: {why}; {advice}") from error
 
@@ -478,7 +478,7 @@ def check_run(info: Info, process: str, drone: str) -> None:
     if drone not in bodies:
         raise RunError(f"{process}: drone is {drone!r}; must be one of {', '.join(bodies)}")
     if bodies[drone] != "external":
-        raise RunError(f"{process}: {drone} is simulated; a driver needs `body: external` of it in the scenario")
+        raise RunError(f"{process}: {drone} is simulated; a driver needs `body: external` for it in the scenario")
     if info.mode != "realtime":
         raise RunError(f"{process}: the run is in lockstep; a driver needs one that is started with --realtime")
     if process != f"{DRIVER}.{drone}":

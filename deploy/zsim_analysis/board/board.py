@@ -250,7 +250,7 @@ def chosen(given: str | None, known: Sequence[str], option: str, open_to_classes
         ScenarioError: the list is empty or has unknown names; one line per name.
     """
     names = [*dict.fromkeys(name.strip() for name in given.split(",") if name.strip())] if given else [*known]
-    allowed = f"must be of {', '.join(known)}{', or package.module:Class' if open_to_classes else ''}"
+    allowed = f"must be one of {', '.join(known)}{', or package.module:Class' if open_to_classes else ''}"
     unknown = [name for name in names if name not in known and not (open_to_classes and ":" in name)]
     if not names:
         raise ScenarioError([f"{option} is {given!r}; {allowed}"])

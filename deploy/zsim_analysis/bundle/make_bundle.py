@@ -189,7 +189,7 @@ class _Expected:
             for drone, payload in gate.truth.items():
                 self.digests.add(keys.truth(drone), gate.t_ns, payload)
         if scenario.own_programs or scenario.gates("camera"):
-            senders.add("what programs or cameras did")
+            senders.add("outputs of programs or cameras")
         ended_ns = until_ns + info.gate_ns + info.command_delay_ns
         if ended_ns + info.gate_ns <= scenario.duration_s * 1e9:
             senders.add(f"an early end, after {ended_ns / 1e9:g} of {scenario.duration_s:g} s")
@@ -439,7 +439,7 @@ WHAT = {
     names.RESULTS: "errors of the formation, separations, and deviations of the flight from its plan",
     names.FIGURES: "the figures of the report, each with its curves as a table",
     names.MODULES: "the scenario's own Python modules, which run when it is flown again",
-    names.MANIFEST: "the contents of this file, with the SHA-256 of each part, and what flying it again must give",
+    names.MANIFEST: "this file's contents, with the SHA-256 of each part, and the results that a rerun must reproduce",
 }
 
 

@@ -204,7 +204,7 @@ def _requirements(texts: Sequence[str]) -> list[Requirement]:
         except ScenarioError as error:
             faults += error.faults
     if faults or not requirements:
-        raise ScenarioError(faults or ["--require is missing; must be a condition, as 'min_separation_m > 1.5'"])
+        raise ScenarioError(faults or ["--require is missing; must be a condition, such as 'min_separation_m > 1.5'"])
     return requirements
 
 

@@ -248,7 +248,7 @@ def _why_not(
 ) -> str:
     """Return why the agents cannot be run again; empty if they can."""
     if info.mode == "realtime":
-        return "in realtime it is not in the scenario when they answered"
+        return "in realtime, the times of their answers do not follow from the scenario"
     if not names:
         return "none of zsim's took part"
     if any(fault.get("kind") == PROCESS_KILL for fault in scenario.faults):
@@ -266,7 +266,7 @@ def _why_not(
         is_fault = event.kind == "control" and event.data.get("ok") and event.subject == "fault_add"
         fault = event.data.get("args") if is_fault else None
         if isinstance(fault, dict) and fault.get("kind") == PROCESS_KILL:
-            return f"a {PROCESS_KILL} was asked for {at}"
+            return f"a {PROCESS_KILL} was requested {at}"
     return ""
 
 

@@ -113,7 +113,7 @@ def window(wanted_s: tuple[float, float] | None, length_s: float) -> tuple[tuple
         return (start, length_s), f"The run ended at {length_s:.2f} s, inside the window {span_text(wanted_s)}."
     return default, (
         f"The run ended at {length_s:.2f} s, before the window {span_text(wanted_s)}; "
-        "the last two thirds of what there is are used."
+        "the last two thirds of the run are used."
     )
 
 
@@ -361,7 +361,7 @@ def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[f
     if requests and takeoff_s is not None:
         first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in requests[:3])
         more = f" and {len(requests) - 3} more" if len(requests) > 3 else ""
-        yield _line(states, "request", requests[0].t_ns / 1e9, f"asked {first}{more}")
+        yield _line(states, "request", requests[0].t_ns / 1e9, f"requested: {first}{more}")
     if flight.scenario and cluster and plan and takeoff_s is not None:
         for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
             if due_s is not None and due_s >= end_s:
@@ -530,7 +530,7 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
         return
     of = f"{seconds_text(due_s)} s"
     if not on.any():
-        text = f"nothing of the {of} of its trajectory was flown"
+        text = f"none of the {of} of its trajectory was flown"
     else:
         stretches = np.split(at_s[on], np.flatnonzero(np.diff(at_s[on]) > 2 * SAMPLE_NS / 1e9) + 1)
         longest = max(stretches, key=len)

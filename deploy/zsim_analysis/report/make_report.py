@@ -193,7 +193,7 @@ def _of_cluster(
         partial(draw_errors, formation, window_s, marks, goal),
     )
     for file, number, what, names in parameter_groups(formation.names):
-        shown = ", ".join(names) if len(names) <= ROWS_MAX else f"values of the most moving of {len(names)} variables"
+        shown = ", ".join(names) if len(names) <= ROWS_MAX else f"those of {len(names)} variables that move most"
         yield PlannedFigure(
             f"{file}{suffix}.png",
             f"{what}{numbered(number, paper)}",

@@ -203,4 +203,4 @@ class ProcessPool:
         else:
             from zsim_analysis.sweep.sweep_run import failed_row
 
-            yield failed_row(worker.task, f"{DEATHS_MAX} workers died in it, the last one {worker.cause()}")
+            yield failed_row(worker.task, f"{DEATHS_MAX} workers died while flying it (the last one: {worker.cause()})")

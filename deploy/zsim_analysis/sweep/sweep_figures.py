@@ -74,9 +74,9 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     more = ""
     if results.design.points > POINTS_MAX and not GridAxis(results.design).field:
         more = f" The first {POINTS_MAX} points are shown; the tables have all."
-    beside = ", beside the paper" if results.paper_std else ""
+    beside = ", compared with the paper" if results.paper_std else ""
     for name, title, what, panels in (
-        ("metrics", "Figures of the user's own", f"What {results.metrics_function} returned for each run.", own),
+        ("metrics", "Your own metrics", f"What {results.metrics_function} returned for each run.", own),
         ("true_rms", "How well the formation was flown", f"RMS of truth − desired within the window{window}.", rms),
         (
             "est_std",
@@ -90,7 +90,7 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
     yield style.ReportFigure(
         "safety.png",
         "How the runs ended, and how close the drones came to each other",
-        "(a) Share of runs that ended well, and of those flown as planned and without a collision, "
+        "(a) Share of runs that ended well and, of these, shares flown as planned and without a collision, "
         f"with exact intervals. (b) Minimum true distance between two drones in the air.{more}",
         _draw_safety(results),
     )

@@ -41,7 +41,7 @@ from zsim_analysis.sweep.sweep_summary import (
 POINTS_MAX = 200  # maximum number of points in a table on the page; sweep.parquet has them all
 DETAILED_MAX = 24  # maximum number of points with a table of their own
 OVERVIEW = ("runs", "ended well", "as planned", "engaged", "no collision", "separation (m)", "least (m)")
-OWN = "figures of your own"
+OWN = "your own metrics"
 BLOCK_COLUMNS = 6  # maximum number of columns that fit the page, including those of the grid's fields
 QUANTILES = "true RMS, 5 to 95 %"
 
@@ -190,7 +190,7 @@ def notes(summary: SweepSummary) -> list[str]:
     lines += marks_of(summary)
     if summary.not_engaged:
         lines.append(
-            f"In {summary.not_engaged} runs that ended well a cluster was never engaged within the judged window; "
+            f"In {summary.not_engaged} runs that ended well, a cluster was never engaged within the judged window; "
             "its errors are left out."
         )
     lines += [f"{count} of {summary.finished} runs have no {OWN}: {why}" for why, count in summary.unmeasured.items()]
@@ -209,7 +209,7 @@ def without_data(summary: SweepSummary) -> str:
         names = [name for name, column in columns.items() if column not in known]
         if names:
             parts.append(what if len(names) == len(columns) else f"{what} of {', '.join(names)}")
-    return f"No run has {', nor '.join(parts)}; they are in no table and no figure." if parts else ""
+    return f"No run has {' or '.join(parts)}; these appear in no table or figure." if parts else ""
 
 
 def details(point: GridPoint, names: dict[str, FormationParameter], paper_std: dict[str, float]) -> list[list[str]]:
@@ -332,9 +332,9 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     cluster = cluster if errors else None
     of = f" of {cluster}" if cluster else ""
     title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
-    title_own = "Figures of your own, means over the runs as planned"
+    title_own = "Your own metrics, means over the runs as planned"
     title_pairs = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
-    caption_pairs = f"means ± half of the {level} interval, of n pairs; few pairs are listed\n"
+    caption_pairs = f"means ± half of the {level} interval, of n pairs; if pairs are few, each difference is listed\n"
     title_ends = f"{summary.scenario}: {summary.finished} of {summary.runs} runs"
     caption_ends = f"means over the runs as planned; minima over all runs; {level} intervals are in the report\n"
     ends = [overview(point, brief=True) for point in points]

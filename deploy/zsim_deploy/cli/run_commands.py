@@ -573,7 +573,7 @@ def hunt(
         note(f"interrupted; what was found so far is in {request.out}")
         sys.exit(INTERRUPTED)
     if summary.violation:
-        raise failed(f"{summary.violation.requirement}: broken; the flight is {request.out / 'violation'}")
+        raise failed(f"{summary.violation.requirement}: broken; the flight is in {request.out / 'violation'}")
 
 
 @app.command(rich_help_panel=opt.RUN)

@@ -207,7 +207,7 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
             warnings.append(f"{name}: {load}; lockstep runs at the pace of the slowest host")
         if slow := set(facts["governors"]) - PERFORMANCE:
             governors = f"the CPU governor is {', '.join(sorted(slow))}"
-            warnings.append(f"{name}: {governors}; performance is steadier (cpupower frequency-set)")
+            warnings.append(f"{name}: {governors}; the governor performance is steadier (cpupower frequency-set)")
         if facts["free_bytes"] < FREE_MIN_BYTES:
             free = f"{facts['free_bytes'] / 1e9:.1f} GB are free on its disk"
             warnings.append(f"{name}: {free}; a record of an hour takes about 1 GB")

@@ -80,7 +80,7 @@ async def _push_to(
     name: str, host: Host, base: Path, wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
 ) -> bool:
     if host.python:
-        progress(name, f"has its own zsim, of {host.python}")
+        progress(name, f"uses its own zsim, that of {host.python}")
         return False
     link = HostLink(name, host, base)
     try:

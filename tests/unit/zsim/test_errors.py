@@ -1,4 +1,4 @@
-"""Extras can be installed as they are written: from a checkout, since no index has the distribution."""
+"""Extras are documented as installed from a checkout, since no index has the distribution."""
 
 import re
 import tomllib
@@ -18,11 +18,11 @@ def texts() -> dict[str, str]:
     return {str(path.relative_to(ROOT)): path.read_text(errors="replace") for path in sorted(files)}
 
 
-def test_nothing_is_to_be_installed_from_an_index() -> None:
+def test_no_text_installs_zsim_from_an_index() -> None:
     assert [place for place, text in texts().items() if OF_AN_INDEX.search(text)] == []
 
 
-def test_what_the_pages_install_is_an_extra() -> None:
+def test_every_extra_that_a_text_installs_exists() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = [name for text in texts().values() for names in OF_A_CHECKOUT.findall(text) for name in names.split(",")]
     assert "notebook" in named

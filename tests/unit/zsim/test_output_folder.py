@@ -1,4 +1,4 @@
-"""Locks of the folders that commands write into, where there are any, and temporary folders."""
+"""Locks of the folders that commands write into, file systems without locks, and temporary folders."""
 
 import errno
 import fcntl
@@ -16,12 +16,12 @@ from zsim.record.record_writer import is_being_written
 from zsim_deploy.hosts import control_socket, on_host
 from zsim_world.server.run_journal import RunJournal
 
-LOCKLESS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # as Lustre, FUSE and some of NFS answer
+LOCKLESS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # errors of Lustre, FUSE and some NFS file systems
 
 
 @pytest.fixture(params=LOCKLESS)
 def reason(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Why nothing can be locked."""
+    """Make locking fail; return the reason."""
 
     def flock(*_: Any) -> None:
         raise OSError(request.param, os.strerror(request.param))
@@ -30,7 +30,7 @@ def reason(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return os.strerror(request.param)
 
 
-def test_another_is_kept_away_where_there_are_locks(tmp_path: Path) -> None:
+def test_a_lock_excludes_others_where_locks_are_supported(tmp_path: Path) -> None:
     with open(tmp_path / "file", "w") as one, open(tmp_path / "file") as other:
         assert take_lock(one)
         assert not take_lock(other)
@@ -41,10 +41,10 @@ def test_another_is_kept_away_where_there_are_locks(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_without_locks_everything_goes_on_with_a_warning(
+def test_without_locks_everything_works_with_a_warning(
     tmp_path: Path, reason: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    warning = f"{tmp_path}: cannot be locked ({reason}); do not let two commands write there at a time"
+    warning = f"{tmp_path}: cannot be locked ({reason}); do not let two commands write there at the same time"
     assert no_locks(tmp_path) == warning
     journal = RunJournal(tmp_path / "journal", "run", "sha", print)
     assert journal.open() is None
@@ -57,7 +57,7 @@ def test_without_locks_everything_goes_on_with_a_warning(
     tmp_path.chmod(0o700)
     for federation in ("one", "one@1"):
         control_socket.ControlSocket(federation, {}).close()
-    assert capfd.readouterr().err.splitlines() == [warning]  # a run's own was given by the run
+    assert capfd.readouterr().err.splitlines() == [warning]  # the warning about a run's own folder is given by the run
 
 
 HOLDER = """
@@ -85,7 +85,7 @@ fcntl.flock = flock
 
 
 def holding(folder: Path, script: str = HOLDER) -> tuple[subprocess.Popen[str], Path]:
-    """Start a process that has a temporary folder, and had a child with one; return the folder, too."""
+    """Start a process that holds a temporary folder and had a child with one; return the process and its folder."""
     (folder / "holder.py").write_text(script)
     environment = {**os.environ, "TMPDIR": str(folder / "tmp")}
     words, pipe = [sys.executable, "holder.py"], subprocess.PIPE
@@ -98,9 +98,7 @@ def holding(folder: Path, script: str = HOLDER) -> tuple[subprocess.Popen[str], 
 
 
 @pytest.mark.parametrize("script", [HOLDER, LOCKLESS_HOLDER], ids=["locks", "no locks"])
-def test_a_temporary_folder_goes_with_its_process_or_if_that_is_killed_with_the_next_one(
-    tmp_path: Path, script: str
-) -> None:
+def test_a_temporary_folder_is_removed_with_its_process_or_by_the_next_one(tmp_path: Path, script: str) -> None:
     (tmp_path / "tmp").mkdir()
     (killed, left), (alive, held) = holding(tmp_path), holding(tmp_path)
     killed.kill()
@@ -108,7 +106,7 @@ def test_a_temporary_folder_goes_with_its_process_or_if_that_is_killed_with_the_
     assert left.is_dir()
     another, _ = holding(tmp_path, script)
     assert held.is_dir()
-    assert left.exists() == (script == LOCKLESS_HOLDER)  # where nothing can be locked, nobody knows
+    assert left.exists() == (script == LOCKLESS_HOLDER)  # without locks, the next one cannot tell whether it is in use
     for process in (another, alive):
         process.communicate()
         assert process.returncode == 0

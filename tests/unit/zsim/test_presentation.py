@@ -1,4 +1,4 @@
-"""Tables in terminals of any width break no name, unit or figure; the colours of drones are distinct for everybody."""
+"""Tables keep names, units and figures whole at any width; colours of drones are distinct for any colour vision."""
 
 import ast
 import io
@@ -40,7 +40,7 @@ def test_figures_and_headers_are_whole_or_left_out(width: int) -> None:
         assert sum(figure in line for line in text) == (len(ROWS) if is_shown else 0)
 
 
-def test_what_is_worth_least_goes_first() -> None:
+def test_the_least_important_columns_are_dropped_first() -> None:
     table = FittedTable(COLUMNS, ROWS)
     left = [tuple(table.left_out(width)) for width in (120, 55, 45)]
     assert left == [(), ("round trip",), ("lag", "round trip")]
@@ -53,13 +53,13 @@ def test_names_keep_their_ends(width: int) -> None:
     assert all(row[0].endswith(name.removeprefix("…")) for name, row in zip(names, ROWS, strict=True))
 
 
-def test_a_row_of_one_line_is_cut_at_its_end() -> None:
+def test_a_one_line_row_is_truncated_at_its_end() -> None:
     text = lines(FittedTable(COLUMNS, ROWS, one_line=True), 60)
     assert len(text) == 1 + len(ROWS)
     assert all("…" in line for line in text[-len(ROWS) :])
 
 
-def test_codes_of_a_terminal_are_written_out() -> None:
+def test_terminal_control_codes_are_escaped() -> None:
     table = FittedTable([Column("\x1b[2J", "name"), Column("b", "text")], [("\x1b[2J", "\x07")], "\x1b", "\x9b")
     assert not {"\x1b", "\x07", "\x9b"} & set("".join(lines(table, 80)))
 
@@ -92,24 +92,24 @@ def linear(text: str) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [2, 3, 6])
 @pytest.mark.parametrize("seen", [np.eye(3), *DICHROMATS])
-def test_few_drones_are_distinct_with_every_colour_vision(count: int, seen: np.ndarray) -> None:
+def test_few_drones_are_distinct_for_every_colour_vision(count: int, seen: np.ndarray) -> None:
     looks = [lab(seen @ linear(each)) for each in drone_colours(count)]
     assert min(np.linalg.norm(a - b) for a, b in combinations(looks, 2)) > DISTINCT
 
 
 @pytest.mark.parametrize("count", [7, 30, 100])
 @pytest.mark.parametrize("seen", [np.eye(3), *DICHROMATS])
-def test_many_drones_go_from_dark_to_light(count: int, seen: np.ndarray) -> None:
+def test_colours_of_many_drones_run_from_dark_to_light(count: int, seen: np.ndarray) -> None:
     colours = drone_colours(count)
     assert len(set(colours)) == count
     assert all(re.fullmatch("#[0-9a-f]{6}", each) for each in colours)
     lightness = [lab(seen @ linear(each))[0] for each in colours]
     assert all(a < b for a, b in pairwise(lightness))
-    assert lightness[-1] < 80  # of white 100: it is seen on paper
+    assert lightness[-1] < 80  # white is 100, so that the colour is visible on paper
 
 
 @pytest.mark.parametrize("place", DRAWN_IN)
-def test_all_that_draws_drones_takes_this_palette(place: str) -> None:
+def test_every_module_that_draws_drones_uses_this_palette(place: str) -> None:
     tree = ast.parse((HOME / place).read_text())
     taken = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     assert "zsim.presentation" in taken

@@ -1,4 +1,4 @@
-"""The version says of which commit the code is: in a checkout, a worktree, a wheel, and an archive made by git."""
+"""The version gives the commit of the code in a checkout, a worktree, a wheel, and an archive made by git."""
 
 import re
 import subprocess
@@ -35,7 +35,7 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path / "checkout"
 
 
-def test_a_checkout_and_a_worktree_have_the_commits_of_their_branches_which_may_be_packed_or_none(checkout: Path):
+def test_a_checkout_or_worktree_has_the_commit_of_its_branch_or_head(checkout: Path):
     first = head(checkout)
     assert zsim.commit(checkout / "zsim") == first
     git(checkout, "commit", "-q", "--allow-empty", "-m", "second")
@@ -44,7 +44,7 @@ def test_a_checkout_and_a_worktree_have_the_commits_of_their_branches_which_may_
     git(checkout, "worktree", "add", "-q", "-b", "other", str(worktree))
     git(worktree, "commit", "-q", "--allow-empty", "-m", "third")
     assert zsim.commit(worktree / "zsim") == head(worktree) != head(checkout)
-    git(checkout, "branch", "n/main")  # ends as the other one does
+    git(checkout, "branch", "n/main")  # its name ends like that of the other branch
     git(checkout, "pack-refs", "--all")
     assert not (checkout / ".git" / "refs" / "heads" / "main").exists()
     assert zsim.commit(checkout / "zsim") == head(checkout)
@@ -52,7 +52,7 @@ def test_a_checkout_and_a_worktree_have_the_commits_of_their_branches_which_may_
     assert zsim.commit(checkout / "zsim") == head(checkout)
 
 
-def test_what_was_built_has_the_commit_of_the_build_and_else_the_release_alone(tmp_path: Path) -> None:
+def test_a_build_has_its_commit_or_without_one_only_the_release(tmp_path: Path) -> None:
     (tmp_path / zsim.COMMIT_FILE).write_text(f"{OTHER}\n")
     assert zsim.commit(tmp_path) == OTHER
     (tmp_path / zsim.COMMIT_FILE).write_bytes((ROOT / "zsim" / zsim.COMMIT_FILE).read_bytes())

@@ -158,7 +158,7 @@ class Coordinator(ABC):
         """Stop waiting for a participant's lost outputs."""
         missing = self.barrier.participants[name].reset_counts()
         if missing:
-            text = f"{name}: {missing} of its outputs did not come"
+            text = f"{name}: {missing} of its outputs did not arrive"
             self.outbox.notice("outputs_missing", name, text, {"missing": missing})
 
     def join(self, name: str, message: Join, wall_ns: int) -> None:
@@ -197,7 +197,7 @@ class Coordinator(ABC):
         found, own = joined.join.fingerprint, fingerprint()
         if found and found != own:
             who = f"{name} on {joined.join.host}"
-            text = f"{who} computes with other code (fingerprint); the same bits are not promised"
+            text = f"{who} runs different code (fingerprint); the same bits are not guaranteed"
             outbox.event("fingerprint", name, text, {"found": found, "expected": own})
         for other, both in barrier.duplicates(name).items():
             text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"

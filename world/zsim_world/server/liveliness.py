@@ -211,7 +211,7 @@ class SlowReaders:
     def stuck(self) -> str:
         """Return a text that names the blocked link."""
         named = self.watch.stuck()
-        return f"the link takes nothing of {named[0]}" if named else "no link is known to be full"
+        return f"the link to {named[0]} takes no data" if named else "no link is known to be full"
 
 
 @dataclass

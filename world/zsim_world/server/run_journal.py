@@ -192,7 +192,7 @@ class RunJournal:
                 self._number = numbers[-1]
                 whole = [number for number in numbers if number == 0 or self._checkpoint(number)]
                 if not whole:
-                    raise RunError(f"{self._folder}: no checkpoint is whole; the run cannot be continued")
+                    raise RunError(f"{self._folder}: no checkpoint is complete; the run cannot be continued")
                 self._first = whole[-2] if len(whole) > 1 else whole[0]
                 found = self._checkpoint(self._first) if self._first else Checkpoint(None, 0)
             self._file = self._open_entries(self._number)
@@ -241,7 +241,7 @@ class RunJournal:
                 except REFUSALS as error:
                     raise RunError(f"{place}: is not the journal of a run ({error}); name another folder") from error
                 if head != self._head:
-                    raise RunError(f"{place}: is of {head}; must be of {self._head}; name another folder")
+                    raise RunError(f"{place}: belongs to {head}; must belong to {self._head}; name another folder")
             whole = end
         if whole < len(data):
             os.truncate(place, whole)

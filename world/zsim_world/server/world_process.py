@@ -365,7 +365,7 @@ class WorldProcess:
             self._inputs.wake()
             stuck_s = watch.stuck_s(time.monotonic_ns(), self._turn_wall_ns)
             if stuck_s is not None:
-                text = f"nothing can be published for {stuck_s:.1f} s: {self._readers.stuck()}"
+                text = f"nothing could be published for {stuck_s:.1f} s: {self._readers.stuck()}"
                 event = run_messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
                 self._run.progress("event", event, self._run.phase)
 

@@ -123,7 +123,7 @@ class NestedCluster(ClusterSpace):
             self._groups.append(_Group(space, slice(robots, after), rows, body, rest, own, at))
             names += [f"{name}.{space.names[i]}" for i in rest]
             robots = after
-        super().__init__(robots, names, "least measure of the parent and its groups")
+        super().__init__(robots, names, "minimum of the spreads of the parent and its groups")
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
         c, bodies = np.empty(self.size), np.empty((self.parent.n, 4))

@@ -38,7 +38,7 @@ from zsim_agents.formation.spaces.cluster_space import (
 
 INDEPENDENT_MIN = 1e-6  # minimum share of a direction outside the previous ones; rounding leaves 1e-15
 PLANES = ((0, 1), (0, 2), (1, 2))
-NO_FRAME = "the robots are in one line or one place, or too far from the template: the formation has no frame"
+NO_FRAME = "the robots are collinear or coincide, or are too far from the template: the formation has no frame"
 HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # indices in the 7 x 7 matrix of `condition`
 
 
@@ -60,7 +60,7 @@ class TemplateCluster(ClusterSpace):
         self.t_C = centred(places_m)
         n = len(self.t_C)
         if n < 3:
-            raise ValueError(f"template: {n} places; allowed: 3 or more")
+            raise ValueError(f"template: {n} positions; allowed: 3 or more")
         self.modes_C = shape_modes(self.t_C)
         self._modes = self.modes_C.reshape(3 * n, 3 * n - 6)
         self._gathered = np.ascontiguousarray(self._modes.T) / n  # N^T / n, the inverse of N on its span
@@ -246,7 +246,7 @@ def shape_modes(t: Array) -> Array:
     n = len(t)
     rigid = _orthonormal([*np.repeat(np.eye(3)[:, None], n, axis=1), *turns(t)], [])
     if len(rigid) < 6:
-        raise ValueError("template: all places are in one line; allowed: places that span a plane or space")
+        raise ValueError("template: all positions are collinear; allowed: positions that span a plane or space")
     single = np.eye(3 * n).reshape(3 * n, n, 3)
     stretches = [t * axis for axis in np.eye(3)]
     shears = [np.zeros_like(t) for _ in PLANES]

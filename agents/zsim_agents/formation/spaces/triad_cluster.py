@@ -42,7 +42,7 @@ from zsim_agents.formation.spaces.cluster_space import (
     wrap_angle,
 )
 
-NO_FRAME = "robots 1, 2 and 3 are in line or in one place: the formation has no frame"
+NO_FRAME = "robots 1, 2 and 3 are collinear or coincide: the formation has no frame"
 
 
 class TriadCluster(ClusterSpace):
@@ -54,7 +54,7 @@ class TriadCluster(ClusterSpace):
     def __init__(self, n: int) -> None:
         others = [name for k in range(4, n + 1) for name in (f"rho_{k}", f"azimuth_{k}", f"elevation_{k}")]
         names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
-        spread_text = "sin(beta) min(p, q)" if n == 3 else "least of sin(beta) min(p, q) and rho_k cos(elevation_k)"
+        spread_text = "sin(beta) min(p, q)" if n == 3 else "minimum of sin(beta) min(p, q) and rho_k cos(elevation_k)"
         super().__init__(n, [*names, "p", "q", "beta", *others], spread_text)
         self._shape = 6 + n  # index of p in c
 
@@ -335,7 +335,7 @@ class PairCluster(ClusterSpace):
         c = np.empty(8)
         pair_forward(p_W, yaw, c)
         if not c[7] > LENGTH_MIN_M:  # also true for NaN
-            raise SingularClusterError("robots 1 and 2 are in one place: the formation has no direction")
+            raise SingularClusterError("robots 1 and 2 coincide: the formation has no direction")
         return c
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
@@ -346,7 +346,7 @@ class PairCluster(ClusterSpace):
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         _, _, _, pitch, psi, _, _, p = self.forward(p_W, yaw).tolist()
         if el.cos(pitch) < LENGTH_MIN_M:
-            raise SingularClusterError("the two robots are above each other: the formation has no yaw")
+            raise SingularClusterError("one robot is directly above the other: the formation has no yaw")
         x, y, z = np.array(matrix_from_rpy(0.0, pitch, psi)).T
         J = np.zeros((8, 2, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / 2

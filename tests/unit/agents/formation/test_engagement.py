@@ -284,7 +284,7 @@ def test_requests_that_do_not_fit_the_phase_are_refused():
         ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "finite")),
         ({"states": ("landed", "landed", "emergency")}, ("drone3", "emergency")),
         ({"p_W": GROUND[[0, 2, 1]]}, ("roll", "180.0")),
-        ({"p_W": GROUND * (1.0, 0.0, 1.0)}, ("in line",)),
+        ({"p_W": GROUND * (1.0, 0.0, 1.0)}, ("robots 1, 2 and 3", "frame")),
         ({"p_W": GROUND * 0.6}, ("1.80", "apart")),
         ({"p_W": GROUND * (0.2, 1.0, 1.0)}, ("sin(beta)", "min(p, q)", "0.60", "above", "1")),
     ],
@@ -323,7 +323,7 @@ def test_a_lost_take_off_is_repeated_and_engaging_too_low_is_refused():
         ({"sigma_m": np.full((3, 3), 2.5)}, ("drone1", "sigma", "2.50")),
         ({"yaw_sigma": np.radians([5.0, 5.0, 31.0])}, ("heading", "drone3", "sigma", "31.0 deg", "30 deg")),
         ({"states": ("flying", "emergency", "flying")}, ("drone2", "emergency")),
-        ({"p_W": GROUND * (1.0, 0.0, 1.0) + (0, 0, 5.0)}, ("in line",)),
+        ({"p_W": GROUND * (1.0, 0.0, 1.0) + (0, 0, 5.0)}, ("robots 1, 2 and 3", "frame")),
         ({"p_W": GROUND * (0.2, 1.0, 1.0) + (0, 0, 5.0)}, ("sin(beta)", "min(p, q)", "0.60")),
     ],
     ids=["old", "nan", "inf", "sigma", "heading", "emergency", "line", "narrow"],
@@ -441,7 +441,7 @@ def test_a_drone_far_below_its_formation_hovers_until_rejoin_is_requested(away_m
     assert has_terms(fleet.output.reason, "roll")
     assert fleet.p_W[1, 2] == pytest.approx(0.8, abs=0.1)
     assert fleet.engagement.request(Order.REJOIN) is None
-    assert has_terms(fleet.step().reason, "drone2", "place", "1")
+    assert has_terms(fleet.step().reason, "drone2", "1")
     outputs, low_m = [], fleet.p_W[1, 2]
     place = fleet.engagement.space.inverse(fleet.engagement.guidance.value(fleet.t_s)[0])[0][1]
     while np.linalg.norm(fleet.p_W[1, :2] - place[:2]) > 1.0:  # first horizontally, then straight up

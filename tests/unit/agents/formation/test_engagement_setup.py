@@ -233,7 +233,7 @@ def test_a_step_that_ends_before_it_can_begin_is_refused_with_a_time() -> None:
     far = "{takeoff_s: 2, trajectory: {start_s: 10, waypoints: [{at_s: 0, values: {x_c: 90}}, {at_s: 9, values: {x_c: 92}}]}}"
     assert has_terms(text := refusal(pair(far)), "clusters[0].plan.trajectory", "19 s")
     least_s = 5 + 15 / 8 * 90 / (0.8 * 1.5)
-    assert least_s - 1 < float(re.findall(r"until (\d+) s", text)[0]) < 1.2 * least_s
+    assert least_s - 1 < float(re.findall(r"before (\d+) s", text)[0]) < 1.2 * least_s
     landing = "{takeoff_s: 2, land_s: 15, trajectory: {start_s: 20, expressions: {x_c: 0.1*t}}}"
     assert has_terms(refusal(pair(landing)), "clusters[0].plan.land_s", "15", "20 s")
     assert refusal(pair("{takeoff_s: 2, target: {x_c: 1}, land_s: 3}")).startswith("clusters[0].plan.land_s")

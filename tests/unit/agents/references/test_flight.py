@@ -50,7 +50,7 @@ def test_a_path_that_is_too_fast_is_refused_with_the_factor_or_fitted(path: dict
     assert factor > 1.0
     text = refusal(scenario_of({**path, "start_s": 40}))
     assert has_terms(text, "drones[0].reference", "(drone 'd1')")
-    named = float(text.partition("fly it ")[2].split()[0])
+    named = float(text.partition("by a factor of ")[2].split()[0])
     assert named == pytest.approx(factor, rel=2e-3)
     fitted = scenario_of({**path, "start_s": 40, "fit": True})
     flown = flight_of(fitted, "d1").legs[-1].path

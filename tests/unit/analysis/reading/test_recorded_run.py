@@ -126,7 +126,7 @@ def test_foreign_processes_under_zsim_s_names_are_not_run_again(write: Any, fore
         (event("leave", "estimator.d2"), ("leave", "estimator.d2", "0.10")),
         (event("outputs_missing", "estimator.d2"), ("outputs", "estimator.d2", "0.10")),
         (event("join", "estimator.d2", from_ns=GATE_NS), ("estimator.d2", "joined", "0.10")),
-        (event("control", "fault_add", ok=True, args=KILL), ("process_kill", "asked", "0.10")),
+        (event("control", "fault_add", ok=True, args=KILL), ("process_kill", "0.10")),
     ],
 )
 def test_agents_are_not_run_again_after_a_disturbance(write: Any, entries: RecordedEntry, terms: tuple[str, ...]):

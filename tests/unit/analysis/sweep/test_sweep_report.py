@@ -356,7 +356,7 @@ def test_quantities_without_data_are_neither_in_tables_nor_in_figures(tmp_path: 
     page, _ = report_of(tmp_path, of, rows)
     assert figures_in(tmp_path) == {"safety"}
     assert page.count("<table") == 1
-    assert has_terms(without_tags(page), "formation errors", "figures", "your own", "no figure")
+    assert has_terms(without_tags(page), "formation errors", "your own")
     text = terminal(of, rows, 200)
     assert "overshoot" not in text
     assert without_data(judged(of, rows).summary()) in text

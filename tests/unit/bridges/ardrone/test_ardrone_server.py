@@ -88,7 +88,7 @@ def refusals() -> Refusals:
 
 
 @in_loop
-async def test_a_stranger_s_datagrams_are_counted_and_not_taken(refusals: Refusals) -> None:
+async def test_datagrams_from_other_hosts_are_counted_and_ignored(refusals: Refusals) -> None:
     taken: list[bytes] = []
     port = DatagramPort(ELSEWHERE, lambda data, _: taken.append(data), refusals.add)
     number = await port.open(HOME, 0)
@@ -102,7 +102,7 @@ async def test_a_stranger_s_datagrams_are_counted_and_not_taken(refusals: Refusa
 
 
 @in_loop
-async def test_a_datagram_of_this_host_is_taken_on_loopback(refusals: Refusals) -> None:
+async def test_datagrams_from_this_host_are_accepted_on_loopback(refusals: Refusals) -> None:
     taken: asyncio.Queue[bytes] = asyncio.Queue()
     port = DatagramPort(HERE, lambda data, _: taken.put_nowait(data), refusals.add)
     number = await port.open(HOME, 0)
@@ -114,7 +114,7 @@ async def test_a_datagram_of_this_host_is_taken_on_loopback(refusals: Refusals) 
 
 
 @in_loop
-async def test_a_stranger_s_connection_is_ended_and_counted(refusals: Refusals) -> None:
+async def test_connections_from_other_hosts_are_closed_and_counted(refusals: Refusals) -> None:
     port = StreamPort(ELSEWHERE, read_until_end, refusals.add)
     reader, writer = await asyncio.open_connection(HOME, await port.open(HOME, 0))
     with contextlib.suppress(ConnectionError):
@@ -126,7 +126,7 @@ async def test_a_stranger_s_connection_is_ended_and_counted(refusals: Refusals) 
 
 
 @in_loop
-async def test_there_is_an_end_to_connections(refusals: Refusals) -> None:
+async def test_the_number_of_connections_is_limited(refusals: Refusals) -> None:
     port = StreamPort(HERE, read_until_end, refusals.add)
     number = await port.open(HOME, 0)
     connections = [await asyncio.open_connection(HOME, number) for _ in range(CONNECTIONS_MAX + 1)]
@@ -139,7 +139,7 @@ async def test_there_is_an_end_to_connections(refusals: Refusals) -> None:
 
 
 @in_loop
-async def test_what_is_broadcast_comes_to_all(refusals: Refusals) -> None:
+async def test_a_broadcast_reaches_all_connections(refusals: Refusals) -> None:
     port = StreamPort(HERE, read_until_end, refusals.add)
     number = await port.open(HOME, 0)
     connections = [await asyncio.open_connection(HOME, number) for _ in range(2)]

@@ -93,7 +93,7 @@ def test_the_number_of_identifiers_is_limited(configuration: Configuration):
         ("custom:no_such", "1", "not an entry"),
         ("custom:session_id", "not an id!", "letters and digits"),
         ("custom:session_id", "-dd", "there is no configuration"),
-        ("general:flying_time", "1", "read only"),
+        ("general:flying_time", "1", "general:flying_time is read-only"),
         ("general:ardrone_name", "x" * 129, "at most 128"),
         ("general:ardrone_name", "a\nb", "printable"),
         (TILT, "nan", "must be a number"),

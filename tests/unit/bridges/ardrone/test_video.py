@@ -155,7 +155,7 @@ async def test_a_connection_begins_with_an_idr_frame() -> None:
 
 
 @in_loop
-async def test_nothing_is_encoded_while_nobody_is_connected() -> None:
+async def test_nothing_is_encoded_without_a_connection() -> None:
     async with Served() as served:
         served.server.on_picture(picture(60))
         assert not served.server.is_watched
@@ -166,7 +166,7 @@ async def test_nothing_is_encoded_while_nobody_is_connected() -> None:
 
 
 @in_loop
-async def test_a_picture_that_cannot_be_read_is_counted_and_the_next_one_comes() -> None:
+async def test_an_unreadable_picture_is_counted_and_skipped() -> None:
     async with Served() as served:
         stream = await served.connect()
         served.server.on_picture(picture(0, data=b"\xff\xd8\xff" + bytes(100)))

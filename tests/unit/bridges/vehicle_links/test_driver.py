@@ -187,7 +187,7 @@ async def test_a_gate_is_published_when_the_world_reaches_it() -> None:
 
 
 @in_loop
-async def test_it_flies_when_it_is_armed_and_lands_what_flies_before_it_leaves() -> None:
+async def test_an_armed_driver_flies_and_lands_the_aircraft_before_it_ends() -> None:
     async with Flight(armed=False) as flight:
         await flight.gate()
         flight.take_off()
@@ -208,7 +208,7 @@ async def test_it_flies_when_it_is_armed_and_lands_what_flies_before_it_leaves()
 
 
 @in_loop
-async def test_kill_reaches_the_aircraft_at_once_and_shows() -> None:
+async def test_kill_reaches_the_aircraft_at_once_and_is_shown() -> None:
     async with Flight(armed=True) as flight:
         await flight.fly()
         assert (await flight.answered("kill")).ok
@@ -218,7 +218,7 @@ async def test_kill_reaches_the_aircraft_at_once_and_shows() -> None:
 
 
 @in_loop
-async def test_a_stop_of_the_motors_goes_on_after_the_run_until_they_stand() -> None:
+async def test_a_kill_continues_after_the_run_until_the_motors_stop() -> None:
     async with Flight(armed=True) as flight:
         await flight.fly()
         assert (await flight.answered("kill")).ok
@@ -232,7 +232,7 @@ async def test_a_stop_of_the_motors_goes_on_after_the_run_until_they_stand() -> 
 
 
 @in_loop
-async def test_who_cannot_land_is_left_to_a_person_with_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_aircraft_that_does_not_land_is_left_to_a_person(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver, "LANDING_S", 0.1)
     async with Flight(armed=True) as flight:
         await flight.fly()
@@ -242,7 +242,7 @@ async def test_who_cannot_land_is_left_to_a_person_with_a_line(monkeypatch: pyte
 
 
 @in_loop
-async def test_an_aircraft_that_does_not_show_itself_is_reported_once_with_the_reason(
+async def test_a_silent_aircraft_is_reported_once_with_advice(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(driver, "PATIENCE_S", 0.0)
@@ -256,7 +256,7 @@ async def test_an_aircraft_that_does_not_show_itself_is_reported_once_with_the_r
 
 
 @in_loop
-async def test_the_port_of_a_driver_that_is_replaced_is_awaited() -> None:
+async def test_a_new_driver_waits_for_the_port_of_its_predecessor() -> None:
     loop = asyncio.get_running_loop()
     former, _ = await loop.create_datagram_endpoint(asyncio.DatagramProtocol, local_addr=("0.0.0.0", 0))
     channel = UdpChannel("127.0.0.1", 9, former.get_extra_info("sockname")[1])
@@ -270,7 +270,7 @@ async def test_the_port_of_a_driver_that_is_replaced_is_awaited() -> None:
 
 @pytest.mark.parametrize("taken", [True, False])
 @in_loop
-async def test_a_socket_that_cannot_be_had_is_refused_with_what_to_change(
+async def test_a_socket_that_cannot_be_opened_is_refused_with_advice(
     monkeypatch: pytest.MonkeyPatch, taken: bool
 ) -> None:
     monkeypatch.setattr(driver, "FORMER_S", 0.0)
@@ -288,7 +288,7 @@ async def test_a_socket_that_cannot_be_had_is_refused_with_what_to_change(
 
 
 @in_loop
-async def test_a_driver_whose_place_another_has_taken_does_not_land_the_aircraft() -> None:
+async def test_a_superseded_driver_does_not_land_the_aircraft() -> None:
     async with Flight(armed=True) as flight:
         await flight.fly()
         data = {"incarnation": 7, "host": flight.link.host, "pid": 1, "from_ns": 0}
@@ -302,7 +302,7 @@ BAD = {"an unknown op": ("fly", "arm, disarm, kill"), "no text": (7, "op")}
 
 @pytest.mark.parametrize("name", BAD)
 @in_loop
-async def test_what_is_no_request_is_answered_with_the_reason(name: str) -> None:
+async def test_an_invalid_request_is_answered_with_the_reason(name: str) -> None:
     op, term = BAD[name]
     async with Flight(armed=False) as flight:
         answer = await flight.answered(op)
@@ -344,7 +344,7 @@ def test_addresses_and_positions_are_parsed_or_refused():
 
 
 @in_loop
-async def test_the_link_is_a_message_of_the_contract() -> None:
+async def test_the_link_state_is_a_message_of_the_contract() -> None:
     async with Flight(armed=False) as flight:
         while not flight.links():
             await flight.aircraft.next()

@@ -85,7 +85,7 @@ async def is_cut(stream: Stream) -> bool:
 
 
 @in_loop
-async def test_the_oldest_head_that_does_not_end_makes_room_for_the_next_connection() -> None:
+async def test_the_oldest_incomplete_head_makes_room_for_the_next_connection() -> None:
     async with server() as (connect, url, _):
         halves = []
         for _ in range(STRANGERS + 1):
@@ -99,7 +99,7 @@ async def test_the_oldest_head_that_does_not_end_makes_room_for_the_next_connect
 
 
 @in_loop
-async def test_a_head_that_does_not_end_in_time_ends_its_connection() -> None:
+async def test_a_head_that_is_incomplete_in_time_ends_its_connection() -> None:
     async with server(request_s=0.05) as (connect, _, _):
         half = await connect()
         half[1].write(HALF)
@@ -107,7 +107,7 @@ async def test_a_head_that_does_not_end_in_time_ends_its_connection() -> None:
 
 
 @in_loop
-async def test_who_has_been_answered_makes_no_room_for_strangers() -> None:
+async def test_an_answered_connection_makes_no_room_for_strangers() -> None:
     async with server() as (connect, _, _):
         known, refused = await connect(), await connect()
         assert await status(known, WHOLE) == 200
@@ -119,7 +119,7 @@ async def test_who_has_been_answered_makes_no_room_for_strangers() -> None:
 
 
 @in_loop
-async def test_a_request_under_way_is_answered_however_many_connections_there_are() -> None:
+async def test_a_pending_request_is_answered_whatever_the_number_of_connections() -> None:
     async with server() as (connect, _, app):
         busy = []
         for _ in range(CONNECTIONS):
@@ -143,7 +143,7 @@ def head_of(size: int, path: str = "/") -> bytes:
 
 
 @in_loop
-async def test_a_request_whose_body_does_not_end_is_answered_and_its_connection_closed() -> None:
+async def test_a_request_with_an_incomplete_body_times_out() -> None:
     async with server(request_s=SHORT_S) as (connect, _, _):
         slow, known = await connect(), await connect()
         assert await status(known, WHOLE) == 200
@@ -154,7 +154,7 @@ async def test_a_request_whose_body_does_not_end_is_answered_and_its_connection_
 
 
 @in_loop
-async def test_a_known_connection_does_not_begin_requests_that_never_end() -> None:
+async def test_an_incomplete_request_ends_even_a_known_connection() -> None:
     async with server(request_s=SHORT_S) as (connect, _, _):
         reader, writer = known = await connect()
         assert await status(known, WHOLE) == 200
@@ -163,7 +163,7 @@ async def test_a_known_connection_does_not_begin_requests_that_never_end() -> No
 
 
 @in_loop
-async def test_large_bodies_wait_for_room_and_small_ones_do_not() -> None:
+async def test_large_bodies_wait_for_room_but_small_ones_do_not() -> None:
     size = 2 * SMALL_BYTES
     async with server(body_bytes_max=size) as (connect, _, app):
         first, second, small = await connect(), await connect(), await connect()
@@ -178,7 +178,7 @@ async def test_large_bodies_wait_for_room_and_small_ones_do_not() -> None:
 
 
 @in_loop
-async def test_or_are_refused_when_there_is_none_in_their_time() -> None:
+async def test_large_bodies_are_refused_without_room_in_time() -> None:
     size = 2 * SMALL_BYTES
     async with server(request_s=SHORT_S, body_bytes_max=size) as (connect, _, app):
         first, second = await connect(), await connect()

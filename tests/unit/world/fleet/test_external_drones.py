@@ -173,7 +173,7 @@ KINDS = ("takeoff", "land", "reset", "velocity", "ardrone", "attitude", "rotors"
 
 
 @pytest.mark.parametrize("state", ALLOWED)
-def test_the_state_the_driver_publishes_decides_which_commands_are_accepted(drones: ExternalDrones, state: str):
+def test_the_state_a_driver_publishes_decides_which_commands_are_accepted(drones: ExternalDrones, state: str):
     drones.take("d1", status(0, state), 0)
     assert {kind for kind in KINDS if command_refusal(drones, kind) is None} == ALLOWED[state]
     assert command_refusal(drones, "emergency") is None

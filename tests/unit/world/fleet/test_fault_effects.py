@@ -142,7 +142,7 @@ def hovering() -> Fleet:
 
 @pytest.mark.parametrize("rotor", range(4))
 def test_a_weak_rotor_produces_its_share_of_the_thrust(rotor: int):
-    """Thrust grows with the square of the speed, so the rotor runs at the commanded speed times the root of the share."""
+    """Thrust is proportional to speed squared: the rotor runs at the commanded speed times the root of the share."""
     flying, share = hovering(), 0.6
     flying.impairment.strike([fault("rotor_efficiency", rotor=ROTORS[rotor], value=share)])
     assert flying.set_rotors(0, (300.0,) * 4) is None

@@ -1,4 +1,4 @@
-"""An incident of a drone becomes an event with its figures; a usual flight, with a landing, has none."""
+"""Incidents of drones become events with their data; a normal flight with a landing has none."""
 
 from typing import Any, Literal
 
@@ -37,7 +37,7 @@ def airborne(drone: Any = None, **top: Any) -> Fleet:
     return fleet
 
 
-def test_a_flight_with_a_landing_that_was_asked_for_has_none():
+def test_a_normal_flight_with_a_landing_has_no_incident():
     fleet = airborne()
     for i in range(fleet.count):
         assert fleet.land(i) is None
@@ -45,7 +45,7 @@ def test_a_flight_with_a_landing_that_was_asked_for_has_none():
     assert fleet.status(0)[0] == "landed"
 
 
-def test_a_fall_is_an_impact_at_the_speed_before_it_and_its_bounces_are_none():
+def test_a_fall_is_a_single_impact_at_the_speed_before_it():
     fleet = airborne()
     fleet.emergency(1)
     fastest, found = 0.0, []
@@ -59,8 +59,8 @@ def test_a_fall_is_an_impact_at_the_speed_before_it_and_its_bounces_are_none():
 
 
 @pytest.mark.parametrize("gate_ms", [5, 100, 500])
-def test_an_impact_is_found_whatever_the_length_of_a_gate(gate_ms: int):
-    """A gate of 500 ms holds the fall, the impact and its bounces: its mean acceleration tells none of them."""
+def test_an_impact_is_detected_whatever_the_length_of_a_gate(gate_ms: int):
+    """A gate of 500 ms spans the fall, the impact and its bounces, so the mean acceleration reveals none of them."""
     found = {}
     for gate in (20, gate_ms):
         fleet = airborne(time={"gate_ms": gate})
@@ -72,7 +72,7 @@ def test_an_impact_is_found_whatever_the_length_of_a_gate(gate_ms: int):
 
 
 def descend(fleet: Fleet, seconds: float) -> list[tuple[str, int, dict[str, Any]]]:
-    """Fly drone 0 down at 0.3 m/s, be there ground or not; return the incidents."""
+    """Fly drone 0 down at 0.3 m/s, even onto the ground; return the incidents."""
     found = []
     for _ in range(round(seconds)):
         assert fleet.set_velocity(0, (0.0, 0.0, -0.3)) is None
@@ -80,7 +80,7 @@ def descend(fleet: Fleet, seconds: float) -> list[tuple[str, int, dict[str, Any]
     return found
 
 
-def test_a_drone_that_is_flown_onto_the_ground_touches_it_in_flight_once_until_it_is_in_the_air_again():
+def test_a_touchdown_in_flight_is_reported_once_until_the_drone_takes_off():
     fleet = airborne()
     assert descend(fleet, 6.0) == [("touchdown", 0, {"other": "the ground"})]
     assert fleet.status(0)[0] == "hovering"  # its commander is silent
@@ -94,13 +94,13 @@ def test_a_drone_that_is_flown_onto_the_ground_touches_it_in_flight_once_until_i
 BOX = {"obstacles": [{"name": "box", "shape": "box", "position_m": [10, 0, 0], "size_m": [2, 2, 0.5]}]}
 
 
-def test_a_drone_that_is_flown_onto_an_obstacle_touches_it_in_flight():
+def test_a_touchdown_on_an_obstacle_is_reported():
     fleet = airborne(environment=BOX)
     fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = 10.0, 0.0, 1.5
     assert ("touchdown", 0, {"other": "box"}) in descend(fleet, 8.0)
 
 
-def test_a_hard_hit_on_an_obstacle_names_it():
+def test_an_impact_on_an_obstacle_names_the_obstacle():
     fleet = airborne(environment=BOX)
     fleet.bodies.state[0, STATE.p_WB : STATE.p_WB + 3] = 10.0, 0.0, 2.0
     fleet.emergency(0)
@@ -116,7 +116,7 @@ def test_two_drones_that_hit_each_other_are_both_named():
     assert hits == {0: "d1", 1: "d0"}
 
 
-def test_a_drone_that_is_turned_over_flips_once_and_its_firmware_stops_it():
+def test_an_overturned_drone_is_reported_as_a_flip_and_an_emergency():
     fleet = airborne()
     fleet.bodies.state[0, STATE.w_WB_B] = 20.0  # rad/s, about its x axis
     found = incidents_of(fleet, 0.5)
@@ -126,7 +126,7 @@ def test_a_drone_that_is_turned_over_flips_once_and_its_firmware_stops_it():
     assert emergency["cause"] == "tilt"
 
 
-def test_an_empty_battery_and_the_landing_before_it_are_found():
+def test_an_empty_battery_and_the_landing_before_it_are_reported():
     fleet = airborne()
     fleet.bodies.energy[0] = 1.0  # J, which lasts for a few gates
     found = incidents_of(fleet, 0.2)
@@ -136,14 +136,14 @@ def test_an_empty_battery_and_the_landing_before_it_are_found():
     assert [(kind, drone) for kind, drone, _ in found if kind == "battery"] == [("battery", 0)]
 
 
-def test_a_drone_whose_commander_falls_silent_lands_and_says_why():
+def test_the_landing_after_a_commander_falls_silent_gives_its_cause():
     fleet = airborne()
     fleet.set_velocity(1, (0.0, 0.0, 0.0))
     ((kind, drone, data),) = incidents_of(fleet, 3.0)
     assert (kind, drone, data["cause"]) == ("landing", 1, "silence")
 
 
-def test_the_watch_goes_on_from_its_snapshot():
+def test_the_watch_continues_from_its_snapshot():
     fleet, other = airborne(), Fleet(scenario())
     fleet.emergency(0)
     continue_from(fleet, other)

@@ -1,4 +1,4 @@
-"""Who hears whom: graphs, distance, reception, lines of sight, the nearest."""
+"""Radio links between drones: graphs, distance, reception, lines of sight and nearest neighbours."""
 
 import math
 from collections.abc import Iterable
@@ -53,13 +53,15 @@ def links(faults: Iterable[Fault] = (), **sections: Any) -> RadioLinks:
         ({"radio": {"range_m": 9, "station_m": [12, 0, 0]}}, ((1, 2), (0, 2, 4), (0, 1, 3, 4), (2, 4), (1, 2, 3))),
     ],
 )
-def test_who_hears_whom(sections: dict[str, Any], hears: tuple[tuple[int, ...], ...]) -> None:
+def test_the_topology_and_the_radio_determine_the_links(
+    sections: dict[str, Any], hears: tuple[tuple[int, ...], ...]
+) -> None:
     made = links(**sections)
     assert made.hears == hears
     assert made.reception == ()
 
 
-def test_reception_falls_with_distance_until_nobody_is_a_neighbour() -> None:
+def test_reception_falls_with_distance_until_drones_are_not_neighbours() -> None:
     made = links(radio={"range_m": 7, "spread_m": 1.0})
     assert made.hears == ((1, 2), (0, 2, 3), (0, 1, 3), (1, 2))  # 12 m: .0067; 16 m: 1.2e-4 < RECEPTION_MIN
     at = dict(zip(made.hears[1], made.reception[1], strict=True))
@@ -90,13 +92,13 @@ def hill(crest_m: float) -> dict[str, Any]:
     ],
     ids=["a hill to the line", "a hill below it", "a wall", "a wall beside it"],
 )
-def test_a_surface_blocks_the_lines_that_cross_it(environment: dict[str, Any], is_between: bool) -> None:
+def test_a_surface_blocks_the_lines_of_sight_that_cross_it(environment: dict[str, Any], is_between: bool) -> None:
     """d0 and d1 are on one side, d2 and d3 on the other, all at 2 m; d3 is 9 m from d2 and out of the others' range."""
     hears = ((1,), (0,), (3,), (2,)) if is_between else ((1, 2), (0, 2), (0, 1, 3), (2,))
     assert links(radio={"range_m": 9, "line_of_sight": True}, environment=environment).hears == hears
 
 
-def test_faults_of_kind_radio_lower_the_reception_of_the_drones_of_their_target() -> None:
+def test_radio_faults_lower_the_reception_of_their_target_drones() -> None:
     def fault(number: int, target: str, range_m: float, spread_m: float, kind: str = "radio") -> Fault:
         return Fault(number, kind, target, {"range_m": range_m, "spread_m": spread_m, "place": {}}, 0, None, "test")
 
@@ -111,7 +113,7 @@ def test_faults_of_kind_radio_lower_the_reception_of_the_drones_of_their_target(
     assert made.hears == ((1, 2), (0, 2, 3), (0, 1, 3), (1, 2))  # d0 and d3: 16 m, 2.2e-4 < RECEPTION_MIN
 
 
-def test_an_obstacle_beside_the_line_is_in_nobodys_way() -> None:
+def test_an_obstacle_beside_the_line_of_sight_does_not_block_it() -> None:
     beside = {**WALL, "position_m": [5.5, 1.6, 0]}
     radio = {"range_m": 9, "line_of_sight": True}
     assert links(radio=radio, environment={"obstacles": [beside]}).hears == links(radio={"range_m": 9}).hears
@@ -136,7 +138,7 @@ def test_an_obstacle_beside_the_line_is_in_nobodys_way() -> None:
         ({"radio": {"station_m": [1, 2]}}, "radio.station_m", "[1, 2]"),
     ],
 )
-def test_a_faulty_section_is_refused_at_its_place(sections: dict[str, Any], field: str, value: str) -> None:
+def test_a_faulty_section_is_refused_with_its_path(sections: dict[str, Any], field: str, value: str) -> None:
     with pytest.raises(ScenarioError) as raised:
         scenario(**sections)
     (line,) = raised.value.faults

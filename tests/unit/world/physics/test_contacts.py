@@ -1,4 +1,4 @@
-"""Gusts, hulls that touch, and downwash."""
+"""Gusts, contacts between hulls, and downwash."""
 
 import math
 
@@ -34,7 +34,7 @@ def meet(positions, velocities=None, rotor=0.0):
     return least, met.air, met.push, met.touching, met.touched
 
 
-def test_least_distance_of_all_pairs():
+def test_the_least_distance_of_all_pairs_is_returned():
     least, _, push, touching, _ = meet([(0, 0, 5), (3, 4, 5), (3, 4, 6)])
     assert least == 1.0
     assert not push.any()
@@ -50,14 +50,14 @@ def test_touching_hulls_push_each_other_apart_and_keep_momentum():
     assert touching.sum() == 1
 
 
-def test_hull_resists_closing_and_never_attracts():
+def test_a_hull_resists_closing_and_never_attracts():
     assert hull_force(1000.0, 10.0, 0.02, 1.0) == pytest.approx(1000.0 * 0.02 + 10.0)
     assert hull_force(1000.0, 10.0, 0.01, -5.0) == 0.0
     assert hull_force(1000.0, 10.0, 0.0, 5.0) == 0.0
 
 
-def test_head_on_collision_rebounds_and_loses_energy():
-    """Two free bodies at 3 m/s towards each other; drag and gravity off."""
+def test_a_head_on_collision_rebounds_and_loses_energy():
+    """Two free bodies approach each other at 3 m/s, without drag and gravity."""
     met = bodies_at([(0.0, 0.0, 50.0), (0.6, 0.0, 50.0)])
     met.vehicle[:, VEHICLE.drag] = met.vehicle[:, VEHICLE.gravity] = 0.0
     state, least, step_s = met.state, 9.0, 0.0025
@@ -72,7 +72,7 @@ def test_head_on_collision_rebounds_and_loses_energy():
     assert 2 * RADIUS - 0.06 < least < 2 * RADIUS
 
 
-def test_two_drones_in_one_place_give_no_nan():
+def test_two_drones_at_the_same_place_give_no_nan():
     _, air, push, _, _ = meet([(0, 0, 5), (0, 0, 5), (9, 9, 9)], rotor=360.0)
     assert np.isfinite(push).all()
     assert np.isfinite(air).all()
@@ -80,7 +80,7 @@ def test_two_drones_in_one_place_give_no_nan():
 
 @pytest.mark.parametrize("below", [0.0, 0.5, 3.0])
 def test_downwash_carries_the_thrust(below):
-    """The momentum of the jet, integrated over a plane below, is the thrust at every depth."""
+    """The momentum of the jet, integrated over a plane below, equals the thrust at every depth."""
     radii = np.linspace(0.0, 4.0, 20001)
     speed = np.array([downwash(4.2, 1.225, 0.2, below, r) for r in radii])
     flux = np.trapezoid(1.225 * speed**2 * 2 * np.pi * radii, radii)
@@ -92,7 +92,7 @@ def test_downwash_at_the_disc_is_twice_the_induced_speed():
     assert math.isclose(downwash(4.2, 1.225, 0.2, 0.0, 0.0), 2 * induced, rel_tol=1e-12)
 
 
-def test_downwash_blows_on_the_lower_drone_only():
+def test_downwash_acts_only_on_the_lower_drone():
     _, air, _, _, _ = meet([(0, 0, 6), (0.1, 0, 4), (8, 0, 4)], rotor=361.6)
     assert air[1, 2] < -2.0
     assert air[0, 2] == air[2, 2] == 0.0
@@ -103,7 +103,7 @@ def test_downwash_ends_beside_the_jet():
 
 
 def all_pairs(state):
-    """Return every pair as near, wherever the drones go next."""
+    """Return every pair as a near one, wherever the drones go next."""
     n = len(state)
     pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)], dtype=np.int32)
     above, eye = np.zeros(len(state), dtype=np.int8), np.zeros((len(state), 3))
@@ -113,7 +113,7 @@ def all_pairs(state):
 @pytest.mark.parametrize(
     ("size_m", "speed_m_s"), [((3.0, 3.0, 3.0), 1.0), ((15.0, 15.0, 40.0), 8.0), ((0.5, 9.0, 9.0), 3.0)]
 )
-def test_near_pairs_give_the_bits_of_all_pairs(size_m, speed_m_s):
+def test_near_pairs_give_the_same_bits_as_all_pairs(size_m, speed_m_s):
     """Drones of two sizes in a box, for 3 s: every touch, every jet and the least distance are found."""
     rng = np.random.default_rng(7)
     n, searches = 12, 0
@@ -166,8 +166,8 @@ def test_steady_wind_and_motion_count_as_airspeed():
     assert math.isclose(gust[0], math.exp(-0.5 * 8.0 / 10.0), rel_tol=1e-12)
 
 
-def test_variance_stays_whatever_the_step():
-    """sigma^2 = decay^2 sigma^2 + fresh^2: one normal number of size 1 adds sigma sqrt(1 - decay^2)."""
+def test_the_gust_variance_is_independent_of_the_step():
+    """sigma^2 = decay^2 sigma^2 + fresh^2: a normal number of 1 adds sigma sqrt(1 - decay^2)."""
     for dt in (0.005, 0.1, 20.0):
         gust = np.zeros(3)
         contacts.blow(parameters(gust=0.7, correlation=0.0), CALM, gust, CALM, (1.0, 1.0, 1.0), dt)
@@ -176,6 +176,6 @@ def test_variance_stays_whatever_the_step():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_shared_noise_has_unit_variance_and_the_share_asked(share):
+def test_shared_noise_has_unit_variance_and_the_requested_share(share):
     assert contacts.gust_noise(share, 1.0, 0.0) ** 2 == pytest.approx(share)
     assert contacts.gust_noise(share, 1.0, 0.0) ** 2 + contacts.gust_noise(share, 0.0, 1.0) ** 2 == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Rays against closed forms, and against two casters that share nothing with ours: steps that are free, and numpy."""
+"""Rays against closed forms and against two independent casters, one by steps of free distance, one in numpy."""
 
 import math
 from typing import Any
@@ -62,11 +62,11 @@ NOTHING = scene(np.empty((0, COLUMNS)), np.empty((0, TRIANGLE)))
         ((0, 0, 2), (1, 0, -1), 2.0 * math.sqrt(2.0)),
         ((0, 0, 2), (1, 0, 0), FAR),
         ((0, 0, 2), (0, 0, 1), FAR),
-        ((0, 0, -1), (0, 0, -1), FAR),  # under the ground there is nothing
-        ((0, 0, 2), (1, 0, -0.01), FAR),  # beyond what is asked
+        ((0, 0, -1), (0, 0, -1), FAR),  # there is nothing below the ground
+        ((0, 0, 2), (1, 0, -0.01), FAR),  # beyond the range
     ],
 )
-def test_ground(o, d, expected):
+def test_a_ray_meets_the_ground(o, d, expected):
     assert distance(NOTHING, o, d) == pytest.approx(expected, abs=1e-12)
 
 
@@ -80,8 +80,8 @@ CLOSED_FORMS = [
     (box((5, 0, 0), (2, 4, 6)), (9, 0, 3), (1, 0, 0), FAR),  # behind
     (cylinder((5, 0, 0), 0.5, 3), (0, 0, 1), (1, 0, 0), 4.5),
     (cylinder((5, 0, 0), 0.5, 3), (0, 0.3, 1), (1, 0, 0), 4.6),
-    (cylinder((5, 0, 0), 0.5, 3), (5, 0.2, 7), (0, 0, -1), 4.0),  # its lid
-    (cylinder((5, 0, 1), 0.5, 3), (5, 0.2, 0.5), (0, 0, 1), 0.5),  # its foot, from below
+    (cylinder((5, 0, 0), 0.5, 3), (5, 0.2, 7), (0, 0, -1), 4.0),  # its top
+    (cylinder((5, 0, 1), 0.5, 3), (5, 0.2, 0.5), (0, 0, 1), 0.5),  # its bottom, from below
     (cylinder((5, 0, 0), 0.5, 3), (0, 0, 3.001), (1, 0, 0), FAR),
     (sphere((5, 0, 2), 1), (0, 0, 2), (1, 0, 0), 4.0),
     (sphere((5, 0, 2), 1), (0, 0.6, 2), (1, 0, 0), 4.2),
@@ -90,7 +90,7 @@ CLOSED_FORMS = [
 
 
 @pytest.mark.parametrize(("obstacle", "o", "d", "expected"), CLOSED_FORMS)
-def test_a_solid(obstacle, o, d, expected):
+def test_a_ray_meets_a_solid_as_in_closed_form(obstacle, o, d, expected):
     held = scene(solids(obstacle), np.empty((0, TRIANGLE)))
     assert distance(held, o, d) == pytest.approx(expected, abs=1e-12)
 
@@ -112,7 +112,7 @@ def test_a_hull_is_flat_and_turns_with_its_drone():
 
 
 def stepped(rows, o, d):
-    """Return where a ray meets solids or ground, by steps to the nearest surface: an independent caster."""
+    """Return where a ray meets solids or ground, by steps of the distance to the nearest surface."""
     t = 0.0
     for _ in range(20_000):
         p = [a + t * b for a, b in zip(o, d, strict=True)]
@@ -126,7 +126,7 @@ def stepped(rows, o, d):
 
 
 def moeller_trumbore(corners, o, d):
-    """Return the nearest hit of many triangles (T, 3, 3), by the determinant of a 3 x 3 system: in numpy."""
+    """Return the nearest hit of triangles (T, 3, 3), by solving a 3 x 3 system for each in numpy."""
     a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     system = np.stack([np.broadcast_to(-np.array(d), a.shape), e1, e2], axis=2)
     sound = np.abs(np.linalg.det(system)) > 1e-12
@@ -135,7 +135,7 @@ def moeller_trumbore(corners, o, d):
     return min(hits.min(initial=FAR), FAR)
 
 
-def test_a_forest_agrees_with_independent_casters():
+def test_rays_through_a_forest_agree_with_independent_casters():
     rng = np.random.default_rng(7)
     trunks = [cylinder((x, y, 0), r, h) for x, y, r, h in rng.uniform((-20, -20, 0.05, 1), (20, 20, 0.6, 8), (200, 4))]
     boxes = [
@@ -155,8 +155,8 @@ def test_a_forest_agrees_with_independent_casters():
     assert met > 80
 
 
-def test_a_tree_finds_what_a_list_finds():
-    """The same bits from the tree as from comparing with every part, for as many parts as it has leaves or fewer."""
+def test_a_tree_gives_the_same_bits_as_a_list():
+    """The tree gives the bits of a comparison with every part, also for no more parts than one leaf holds."""
     rng = np.random.default_rng(3)
     for count in (1, 4, 5, 64, 333):
         rows = solids(*(cylinder(vector(rng.uniform((-9, -9, 0), (9, 9, 0))), 0.3, 4) for _ in range(count)))

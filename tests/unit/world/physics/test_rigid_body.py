@@ -36,7 +36,7 @@ def fly(row, state, seconds, command=OFF, air=CALM, push=NOBODY, dt=DT):
     return state
 
 
-def test_free_fall_with_linear_drag(row, state):
+def test_free_fall_with_linear_drag_matches_the_closed_form(row, state):
     tau, g = row[VEHICLE.mass] / row[VEHICLE.drag], row[VEHICLE.gravity]
     state[3] = 4.0
     fly(row, state, 3.0)
@@ -52,7 +52,7 @@ def test_wind_carries_a_falling_body_along(row, state):
     np.testing.assert_allclose(state[3:6], (3.0, -2.0, -terminal), rtol=1e-6)
 
 
-def test_push_of_another_is_a_force(row, state):
+def test_a_push_acts_as_a_force(row, state):
     row[VEHICLE.drag] = 0.0
     fly(row, state, 1.0, push=(0.429, 0.0, 0.0))
     np.testing.assert_allclose(state[3:6], (1.0, 0.0, -row[VEHICLE.gravity]), rtol=1e-9)
@@ -69,7 +69,7 @@ def test_torque_free_motion_keeps_energy_and_angular_momentum(row, state):
     assert math.isclose(inertia @ state[10:13] ** 2, energy, rel_tol=2e-7)
 
 
-def test_symmetric_top_precesses_at_its_rate(row, state):
+def test_a_symmetric_top_precesses_at_the_predicted_rate(row, state):
     ix, iz = 2e-3, 5e-3
     row[VEHICLE.inertia : VEHICLE.inertia + 3] = (ix, ix, iz)
     wz, across, t = 6.0, 1.0, 2.0
@@ -80,7 +80,7 @@ def test_symmetric_top_precesses_at_its_rate(row, state):
     np.testing.assert_allclose(state[10:13], expected, atol=2e-5)
 
 
-def test_step_is_of_fourth_order(row):
+def test_the_integration_step_is_of_fourth_order(row):
     def end(dt):
         state = np.zeros(STATE.size + 4)
         state[2], state[STATE.q_WB] = 100.0, 1.0
@@ -100,7 +100,7 @@ def test_hover_speed_carries_the_weight(row, state):
     np.testing.assert_allclose(state[:3], (0.0, 0.0, 1e4), atol=1e-6)
 
 
-def test_rotor_step_response_is_exact_at_any_step(row, state):
+def test_the_rotor_step_response_is_exact_at_any_step(row, state):
     lag = row[VEHICLE.rotor_lag]
     for dt in (0.0025, 0.02):
         state[13:17] = 200.0

@@ -1,4 +1,4 @@
-"""Eight drones in one step: the bits of each drone's own."""
+"""Eight drones in one step give the same bits as each drone alone."""
 
 from typing import Any
 
@@ -14,15 +14,15 @@ from zsim_world.physics.fleet_arrays import STATE, PerRotor, four, put, vector
 from zsim_world.physics.surfaces import drag_anchors
 
 DT = 0.0025  # s
-COUNT = 11  # a whole block and a part of one
+COUNT = 11  # a whole block of eight and part of another
 
-# what is compiled for these tests alone takes a minute; tests/unit/world/fleet has a drone of a block and one alone
+# compiling for these tests alone takes a minute; tests/unit/world/fleet compares a drone of a block with one alone
 pytestmark = [pytest.mark.xdist_group("simd"), pytest.mark.soak]
 
 
 @inlined
 def each(bodies, dt):
-    """Integrate one drone after the other, the ground always with it."""
+    """Integrate one drone after the other, always with the ground."""
     for i in range(bodies.state.shape[0]):
         row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
         rotors, air, push = (
@@ -36,7 +36,7 @@ def each(bodies, dt):
 
 @inlined
 def accelerate_each(bodies):
-    """Note the accelerations of one drone after the other, the ground always with it."""
+    """Store the accelerations of one drone after the other, always with the ground."""
     for i in range(bodies.state.shape[0]):
         row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
         (p, v, q, w), each = body.pose(state), bodies.each
@@ -52,7 +52,7 @@ def accelerate_each(bodies):
 
 
 def bodies_in_motion(rng, height_m, count=COUNT):
-    """Return drones of two kinds that tumble, some of them through the ground."""
+    """Return tumbling drones of two kinds, some of which pass through the ground."""
     heavy: Any = {"mass_kg": 0.6, "arm_m": 0.25, "thrust_n_s2": 1.2e-5, "rotor_time_constant_s": 0.05}
     drones = [
         {"name": f"d{k}", "position_m": [2.0 * k, 0.0, height_m], **(heavy if k % 3 == 1 else {})} for k in range(count)
@@ -79,7 +79,7 @@ def copied(bodies):
 
 @pytest.mark.parametrize("count", [1, 8, COUNT])
 @pytest.mark.parametrize("height_m", [0.0, 0.3, 0.8, 30.0])
-def test_a_block_gives_the_bits_of_each_drone(height_m, count):
+def test_a_block_gives_the_same_bits_as_each_drone_alone(height_m, count):
     one = bodies_in_motion(np.random.default_rng(3), height_m, count)
     other, least_m = copied(one), np.inf
     simd.line_up(one)

@@ -1,4 +1,4 @@
-"""The history: last values, replays, bounded memory, and outputs of a participant that have not come."""
+"""The history: last values, replays, bounded memory, and missing outputs of a participant."""
 
 import pytest
 from msgspec import Struct
@@ -17,7 +17,7 @@ VELOCITY = keys.command("d1", "velocity")
 
 
 def since(history: MessageHistory, from_ns: int, expressions: list[str]) -> list[tuple[str, bytes]]:
-    """Return all pages of what is stamped later."""
+    """Return all pages of messages with a later time stamp."""
     messages, start = [], 0
     while start is not None:
         passed, start = history.page(from_ns, lambda key: any(keys.matches(e, key) for e in expressions), start)
@@ -29,7 +29,7 @@ def clock(history: MessageHistory, t_ns: int) -> None:
     history.add(keys.CLOCK, b"tick", t_ns)
 
 
-def test_the_last_values_of_an_expression_are_answered_however_old():
+def test_the_last_values_of_an_expression_are_returned_however_old():
     history = MessageHistory()
     for payload in (b"old", b"new"):
         for key in ("drone/d1/truth", "drone/d2/truth", "drone/d1/estimate"):
@@ -41,17 +41,17 @@ def test_the_last_values_of_an_expression_are_answered_however_old():
     assert history.last("drone/d3/truth") == since(history, -1, ["drone/**"]) == []
 
 
-def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
+def test_a_replay_returns_later_messages_in_order_of_arrival():
     history = MessageHistory()
     for t_ns in (1, 3, 2, 4):
         history.add(IMU, b"%d" % t_ns, t_ns)
         history.add("drone/d2/truth", b"other", t_ns)
     assert [payload for _, payload in since(history, 1, ["drone/d1/**"])] == [b"3", b"2", b"4"]
     assert since(history, 4, ["**"]) == since(history, -1, []) == []
-    assert len(since(history, 3, ["drone/**", "**", IMU])) == 2  # each once
+    assert len(since(history, 3, ["drone/**", "**", IMU])) == 2  # each message once
 
 
-def test_what_is_older_than_the_window_is_forgotten():
+def test_messages_older_than_the_window_are_forgotten():
     history = MessageHistory()
     for second in range(20):
         clock(history, second * SECOND_NS)
@@ -60,7 +60,7 @@ def test_what_is_older_than_the_window_is_forgotten():
     assert kept == list(range(19 - KEEP_NS // SECOND_NS, 20))
 
 
-def test_a_sender_s_stamp_pushes_out_no_messages_of_others_and_keeps_none_for_ever():
+def test_a_message_from_the_future_neither_evicts_others_nor_stays_forever():
     history = MessageHistory()
     clock(history, 10 * SECOND_NS)
     history.add(IMU, b"mine", 10 * SECOND_NS)
@@ -78,7 +78,7 @@ def test_memory_is_bounded_while_time_stands_still():
     assert [int(payload) for _, payload in since(history, -1, [IMU])] == list(range(90, 100))
 
 
-def test_strangers_push_nothing_out_and_have_room_again_when_theirs_is_forgotten(monkeypatch: pytest.MonkeyPatch):
+def test_foreign_messages_evict_no_others_and_have_room_of_their_own(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zsim_world.run.inputs.FOREIGN_BYTES", 250)
     history = MessageHistory(keep_bytes=1000)
     history.add(IMU, b"first", 0)
@@ -90,7 +90,7 @@ def test_strangers_push_nothing_out_and_have_room_again_when_theirs_is_forgotten
     assert since(history, -1, ["lab/**"]) == [("lab/camera", b"new")]
 
 
-def test_pages_bring_everything_once_and_in_order():
+def test_pages_return_everything_once_and_in_order():
     history = MessageHistory(page_bytes=10)
     published = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
     published += [(IMU, b"x" * 30), (IMU, b"y")]  # longer than a page
@@ -103,7 +103,7 @@ def test_pages_bring_everything_once_and_in_order():
     assert first == published[: len(first)]
 
 
-def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_meanwhile():
+def test_a_page_continues_the_last_one_even_if_old_messages_are_dropped():
     history = MessageHistory(keep_bytes=20, page_bytes=4)
     for number in range(20):
         history.add(IMU, bytes([number]), number)
@@ -114,7 +114,7 @@ def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_me
     assert [payload[0] for _, payload in (*passed, *history.page(-1, lambda key: True, more)[0])] == [*range(8)]
 
 
-# Outputs that were lost
+# Lost outputs
 
 
 def command(t_ns: int, seq: int, source: str = "a.b", speed: float = 0.0) -> Velocity:
@@ -156,7 +156,7 @@ def test_outputs_that_have_not_arrived_are_found(
     assert history_of(*came).lost_outputs(kept(*has_kept), done_ns) == samples(*lost)
 
 
-def test_only_outputs_that_can_be_read_are_taken():
+def test_only_readable_outputs_are_accepted():
     done = kept(Done(1, 1, "r", 1, 1, 0), key="process/a.b/done")
     assert (
         history_of().lost_outputs([*done, [VELOCITY, b"\xc1"], [keys.estimate("d1"), b"\x80"], ["of/mine", b""]], 1)
@@ -166,8 +166,8 @@ def test_only_outputs_that_can_be_read_are_taken():
 
 @pytest.mark.parametrize("payload", [b"\xc1", messages.encode(Clock(0, 9, "run1", 0, "running", 1.0))])
 @pytest.mark.parametrize("key", [keys.CLOCK, keys.EVENT, keys.INFO, keys.sensor("d1", "status")])
-def test_a_message_that_claims_to_be_the_world_s_is_refused_and_not_replayed(key: str, payload: bytes):
-    """A process that rejoins takes what is replayed for the world's."""
+def test_a_message_posing_as_the_world_s_is_refused_and_not_replayed(key: str, payload: bytes):
+    """A process that rejoins takes replayed messages to be the world's."""
     run = Run(small_world(), HealthMeter("world"))
     run.world.take_outbox()
     run.enter(Taken(0, (key, payload)))

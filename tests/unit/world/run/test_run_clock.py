@@ -1,4 +1,4 @@
-"""Simulated time of a run: its states, the requests that change it, and what a run measures of itself."""
+"""The clock of a run: its states, the requests that change it, and the statistics of a run."""
 
 import math
 from typing import Any
@@ -24,7 +24,7 @@ def request(made: RunClock, op: str, **args: Any) -> Any:
     return made.operations()[op](ControlRequest(op, args, "tester.one"))
 
 
-def test_gates_follow_one_another():
+def test_the_clock_advances_gate_by_gate():
     made = clock("waiting")
     assert (made.now_ns, made.next_ns) == (0, 0)
     made.start(0)
@@ -33,7 +33,7 @@ def test_gates_follow_one_another():
     assert (made.now_ns, made.next_ns) == (GATE_NS, 2 * GATE_NS)
 
 
-def test_a_paused_run_goes_on_for_the_steps_that_are_requested():
+def test_a_paused_run_advances_by_the_requested_steps():
     made = clock()
     assert request(made, "pause") is None
     assert made.is_halted
@@ -53,7 +53,7 @@ def test_a_step_takes_a_whole_number_of_gates(gates: Any):
 
 
 @pytest.mark.parametrize(("op", "state"), [("pause", "paused"), ("resume", "running"), ("step", "waiting")])
-def test_an_operation_is_refused_in_a_state_that_it_does_not_fit(op: str, state: str):
+def test_an_operation_is_refused_in_an_unsuitable_state(op: str, state: str):
     refusal = request(clock(state), op)
     assert isinstance(refusal, Refusal)
     assert refusal[:2] == ("the run", state)
@@ -71,7 +71,7 @@ def test_a_rate_is_set_within_its_limits(mode: str, rate: float, taken: bool):
     assert made.rate == (rate if taken else 1.0)
 
 
-def test_of_several_reasons_to_end_the_first_is_kept():
+def test_only_the_first_of_several_reasons_to_end_is_kept():
     made = clock()
     request(made, "stop", reason="lunch")
     made.stop("later")
@@ -116,7 +116,7 @@ def test_old_ages_are_forgotten(monkeypatch):
     assert ages.summary_ms() == pytest.approx({"p50": 1.5, "p99": 1.99, "max": 2.0})
 
 
-def test_the_rate_is_simulated_per_wall_time_over_the_last_second():
+def test_the_rate_is_simulated_over_wall_time_in_the_last_second():
     rate = RealTimeFactor()
     assert (rate.now(), rate.wall_s) == (0.0, 0.0)
     rate.gate(0, 7_000 * MS)
@@ -133,15 +133,15 @@ def test_the_rate_is_simulated_per_wall_time_over_the_last_second():
 @pytest.mark.parametrize(
     ("wall_ms", "now"), [([0, 5_000, 10_000, 15_000], 0.004), ([5, 5], 0.0)], ids=["rare gates", "a standing clock"]
 )
-def test_any_wall_clock_gives_a_rate(wall_ms: list[int], now: float):
+def test_the_rate_is_defined_for_rare_gates_and_a_stopped_wall_clock(wall_ms: list[int], now: float):
     rate = RealTimeFactor()
     for gate, wall in enumerate(wall_ms):
         rate.gate(gate * GATE_NS, wall * MS)
     assert rate.now() == pytest.approx(now)
 
 
-def test_time_that_jumps_does_not_pass():
-    """From 300 s on, five seconds at twice its pace; then back to 1 s, and five more."""
+def test_a_jump_in_simulated_time_does_not_count_as_elapsed():
+    """Five seconds from 300 s at twice real time, then a jump back to 1 s and four more seconds."""
     rate = RealTimeFactor()
     for number in range(11):
         if number == 6:
@@ -152,7 +152,7 @@ def test_time_that_jumps_does_not_pass():
     assert (rate.sim_ns / 1e9, rate.wall_s) == pytest.approx((9.0, 5.0))
 
 
-def test_simulated_time_passes_from_before_a_stand_to_the_gate_after_it():
+def test_the_wall_time_of_a_standstill_is_excluded_from_the_rate():
     rate = RealTimeFactor()
     rate.gate(0, 0)
     rate.gate(GATE_NS, 20 * MS)
@@ -175,7 +175,7 @@ class Owing:
         return need_ns < self._owes_until_ns
 
 
-def test_the_result_counts_who_was_late_and_how_near_drones_came():
+def test_the_result_has_deadline_misses_rate_and_shortest_distance():
     measured = RunStatistics()
     both: list[Any] = [Owing("late", 2), Owing("quick", 0)]
     for need_ns in (-1, 0, 1, 2):

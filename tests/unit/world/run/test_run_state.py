@@ -1,4 +1,4 @@
-"""The state of a world: a world that takes it over goes on to the same bytes, whatever flies, fails or is on its way."""
+"""The state of a world: a world restored from it continues with the same bytes, whatever flies, fails or is delayed."""
 
 from typing import Any
 
@@ -93,7 +93,7 @@ def _join() -> Join:
 
 @pytest.fixture(scope="module")
 def whole() -> tuple[Flown, dict[int, bytes], dict[int, int]]:
-    """A flight, with its state and how much it had published at some gates."""
+    """A flight, its states at some gates, and the number of messages published up to these."""
     flown, states, sizes = Flown(), {}, {}
     flown.start()
     for k in range(1, GATES):
@@ -103,7 +103,7 @@ def whole() -> tuple[Flown, dict[int, bytes], dict[int, int]]:
     return flown, states, sizes
 
 
-def test_the_flight_has_what_is_to_be_restored(whole: tuple[Flown, dict[int, bytes], dict[int, int]]):
+def test_the_flight_covers_what_has_to_be_restored(whole: tuple[Flown, dict[int, bytes], dict[int, int]]):
     payloads = whole[0].published
     events = [messages.decode(key, payload) for key, payload in payloads if key == keys.EVENT]
     assert {"fault", "fault_end", "commander", "mode", "collision", "refused"} <= {event.kind for event in events}
@@ -111,7 +111,7 @@ def test_the_flight_has_what_is_to_be_restored(whole: tuple[Flown, dict[int, byt
 
 
 @pytest.mark.parametrize("k", RESTORED)
-def test_a_world_goes_on_from_its_state(whole: tuple[Flown, dict[int, bytes], dict[int, int]], k: int):
+def test_a_restored_world_publishes_the_same_bytes(whole: tuple[Flown, dict[int, bytes], dict[int, int]], k: int):
     flown, states, sizes = whole
     again = Flown()
     again.world.take_outbox()
@@ -123,7 +123,7 @@ def test_a_world_goes_on_from_its_state(whole: tuple[Flown, dict[int, bytes], di
     assert again.published == flown.published[sizes[k] :]
 
 
-def test_the_hash_of_truth_goes_on(whole: tuple[Flown, dict[int, bytes], dict[int, int]]):
+def test_the_truth_hash_continues_after_a_restore(whole: tuple[Flown, dict[int, bytes], dict[int, int]]):
     first, second, truth = Flown(), Flown(), bytearray()
     first.world.keep_truth(truth.extend)
     first.start()

@@ -21,7 +21,7 @@ def noise(gates: int) -> NoiseTable:
 
 
 @pytest.mark.parametrize("used", [0, 1, 7])
-def test_a_stream_goes_on_where_it_was_left(used: int):
+def test_a_stream_continues_where_it_was_left(used: int):
     table = noise(gates=2)
     rng = stream(3, "b/imu")
     rng.standard_normal(CHANNELS[IMU])  # the bias at the start
@@ -35,7 +35,7 @@ def test_a_stream_goes_on_where_it_was_left(used: int):
     np.testing.assert_array_equal(table.table[1, : rows * width], expected[used:].ravel())
 
 
-def test_all_drones_share_one_wind():
+def test_all_drones_share_one_wind_stream():
     table = noise(gates=2)
     rng = stream(3, "wind")
     rng.standard_normal(3)  # the gust at the start
@@ -49,7 +49,7 @@ def drawn(out: NDArray, stream: NDArray) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_million_numbers_are_numpys(seed: int):
+def test_a_million_numbers_match_numpy(seed: int):
     """About 270 of them are from the tail, and 12 000 from the layers' edges."""
     rng = np.random.default_rng(seed)
     stream, out = np.array(words(rng), dtype=np.uint64), np.zeros(1_000_000)

@@ -206,7 +206,7 @@ BELOW = {"sonar": {"range_m": EXACT}, "flow": {"velocity_m_s": EXACT}}
 def over_a_drone(
     sensor: int, height_m: float, aside_m: float = 0.0, speed_m_s: float = 0.0, yaw_deg: float = 0.0, **more: Any
 ) -> np.ndarray:
-    """Return a sample of a level drone that moves east at 1 m/s, 4 m above the ground, near another that also moves east.
+    """Return a sample of a level drone that moves east at 1 m/s, 4 m above the ground, near another that moves east.
 
     Args:
         height_m: height of the other drone, which moves at `speed_m_s` and is `aside_m` further north.
@@ -241,7 +241,7 @@ def test_a_sonar_detects_the_hull_of_a_drone_below(height_m: float, aside_m: flo
     assert over_a_drone(SONAR, height_m, aside_m)[0] == pytest.approx(range_m, abs=0.01)
 
 
-def test_flow_is_relative_to_a_hull_that_fills_the_picture_or_to_the_ground():
+def test_flow_is_relative_to_a_hull_filling_the_picture_or_to_the_ground():
     """At 0.6 m a hull covers most of the picture, at 1.2 m a quarter; the sonar measures to the hull in both cases."""
     alone = over_a_drone(FLOW, 4.0, aside_m=3.0)[0]
     assert over_a_drone(FLOW, 3.4, speed_m_s=0.25)[0] == pytest.approx(alone - 0.25, abs=0.01)

@@ -57,7 +57,7 @@ def truth(t_s: float = 0.0, **given: Any) -> SensorTruth:
 
 
 def test_a_sensor_moves_as_its_mounting_point_does():
-    """For rotation about a fixed axis, velocity and acceleration match finite differences of the position of the point."""
+    """For rotation about a fixed axis, velocity and acceleration match finite differences of the point's position."""
     rate, speeding = 2.0, 1.5
 
     def at(t: float) -> SensorTruth:

@@ -1,4 +1,4 @@
-"""The fixed observer gains: steady Kalman filters, stable on their true schedule, for any noise that may be asked."""
+"""The fixed observer gains: steady Kalman filters, stable on their true schedule for any noise of a scenario."""
 
 import itertools
 import math
@@ -26,7 +26,7 @@ def row_of(sensors, **drone):
 
 
 @pytest.mark.parametrize("sensors", PRESETS.values(), ids=PRESETS)
-def test_observer_gains_make_a_stable_filter_over_its_true_schedule(sensors):
+def test_observer_gains_give_a_stable_filter_on_its_true_schedule(sensors):
     """Errors of the horizontal design model shrink over one second of 200 accelerometer and 15 flow samples."""
     row = row_of(sensors)
     c, g = 0.249 / 0.429, 9.80665
@@ -41,16 +41,16 @@ def test_observer_gains_make_a_stable_filter_over_its_true_schedule(sensors):
     assert np.abs(np.linalg.eigvals(second)).max() < 0.999
 
 
-def test_steady_gain_of_a_scalar_filter_is_the_closed_form():
-    """A random walk of q per sqrt(s) seen at 200 Hz with sigma: p = (q' + sqrt(q'^2 + 4 q' r)) / 2."""
+def test_the_steady_gain_of_a_scalar_filter_matches_the_closed_form():
+    """A random walk of q per sqrt(s), measured at 200 Hz with sigma: p = (q' + sqrt(q'^2 + 4 q' r)) / 2."""
     q, r = 0.3**2 / 200, 0.5**2
     p = (q + math.sqrt(q * q + 4 * q * r)) / 2
     gain = observer.steady_gains(np.zeros((1, 1)), np.array([0.3]), [([1.0], 0.5, 200.0)])
     assert gain[0, 0] == pytest.approx(p / (p + r), rel=1e-9)
 
 
-def test_covariance_solves_the_riccati_equation():
-    """Against scipy's solver, where that one works."""
+def test_the_covariance_solves_the_riccati_equation():
+    """Checked against scipy's solver in a case that it can solve."""
     a = np.array([[-0.58, 9.8, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
     walks, dt = np.array([0.0, 6e-4, 2e-5, 0.2]), 0.005
     meters = [([-0.58, 0, 0, 1], 0.35, 200.0), ([1, 0, 0, 0], 0.1, 15.0)]

@@ -1,4 +1,4 @@
-"""The fingerprint of code and contract, the same on every machine; the hash of a flight, written again with `struct`."""
+"""The fingerprint of code and contract, equal on every machine, and the hash of a flight, recomputed with `struct`."""
 
 import hashlib
 import importlib.util
@@ -28,7 +28,7 @@ def _asked_anew():
         asked.cache_clear()
 
 
-def test_another_process_on_another_processor_has_the_same():
+def test_the_fingerprint_is_the_same_in_a_process_on_another_processor():
     command = [sys.executable, "-c", "from zsim.contract.fingerprint import fingerprint; print(fingerprint())"]
     other = {**os.environ, "OPENBLAS_CORETYPE": "Nehalem", "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA"}
     found = subprocess.run(command, capture_output=True, text=True, check=True, env=other).stdout.strip()
@@ -36,7 +36,7 @@ def test_another_process_on_another_processor_has_the_same():
     assert re.fullmatch(r"[0-9a-f]{16}", found)
 
 
-def test_the_sources_count_and_their_line_ends_and_folder_do_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_fingerprint_depends_on_text_but_not_line_ends_or_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def code(folder: str, text: bytes) -> str:
         place = tmp_path / folder
         place.mkdir(exist_ok=True)
@@ -53,7 +53,7 @@ def test_the_sources_count_and_their_line_ends_and_folder_do_not(tmp_path: Path,
 
 
 @pytest.mark.parametrize("part", ["code", "contract"])
-def test_another_part_is_another_fingerprint(part: str, monkeypatch: pytest.MonkeyPatch):
+def test_a_change_in_any_part_changes_the_fingerprint(part: str, monkeypatch: pytest.MonkeyPatch):
     here, known = fingerprint(), parts()
     monkeypatch.setattr(module, "parts", lambda: {**known, part: "other"})
     fingerprint.cache_clear()
@@ -70,9 +70,7 @@ def test_another_part_is_another_fingerprint(part: str, monkeypatch: pytest.Monk
         ("x86_64-linux-gnu/libopenblas.so.0", True),
     ],
 )
-def test_a_blas_that_another_package_brings_is_none_of_the_machine_s(
-    library: str, counts: bool, monkeypatch: pytest.MonkeyPatch
-):
+def test_only_the_blas_of_numpy_scipy_or_the_system_counts(library: str, counts: bool, monkeypatch: pytest.MonkeyPatch):
     here, known = machine()["blas"], threadpoolctl.threadpool_info()
     other = {"user_api": "blas", "internal_api": "openblas", "architecture": "Other", "filepath": f"/usr/lib/{library}"}
     monkeypatch.setattr(threadpoolctl, "threadpool_info", lambda: [*known, other])
@@ -82,14 +80,14 @@ def test_a_blas_that_another_package_brings_is_none_of_the_machine_s(
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="names of cores of x86")
 @pytest.mark.parametrize("core", ["Haswell", "Sandybridge"])
-def test_a_machine_names_the_processor_for_which_blas_computes(core: str):
+def test_the_machine_names_the_core_for_which_blas_computes(core: str):
     command = [sys.executable, "-c", "from zsim.contract.fingerprint import machine; print(machine()['blas'])"]
     chosen = {**os.environ, "OPENBLAS_CORETYPE": core}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=chosen)
     assert done.stdout.strip() == f"openblas-{core}"
 
 
-def test_what_is_not_there_is_left_out_and_the_system_stands_for_an_unknown_c_library(monkeypatch: pytest.MonkeyPatch):
+def test_missing_packages_are_omitted_and_the_system_replaces_unknown_libc(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module.platform, "libc_ver", lambda: ("", ""))
     monkeypatch.setattr(module.platform, "system", lambda: "Darwin")
     monkeypatch.setattr(module, "PACKAGES", ("numpy", "no-such-package"))
@@ -113,9 +111,9 @@ def digest(states: list[tuple[int, list[np.ndarray]]]) -> str:
     return truth.hexdigest()
 
 
-def test_the_bytes_are_the_contract_s():
+def test_the_hashed_bytes_are_those_of_the_contract():
     """Instants in time order, drones in scenario order: t_ns, position, velocity, orientation, angular velocity."""
-    states = instants(100)  # more than are held back
+    states = instants(100)  # more than are buffered
     wanted = hashlib.sha256()
     for t_ns, arrays in states:
         for drone in range(DRONES):
@@ -144,14 +142,14 @@ def test_the_last_bit_of_every_number_counts(array: int, drone: int):
     assert digest(changed) == digest(states)
 
 
-def test_time_and_order_count():
+def test_time_and_order_change_the_hash():
     states = instants(3)
     assert digest(states[::-1]) != digest(states)
     assert digest([(t + 1, arrays) for t, arrays in states]) != digest(states)
     assert digest([(t, [array[::-1] for array in arrays]) for t, arrays in states]) != digest(states)
 
 
-def test_the_hash_may_be_asked_on_the_way():
+def test_the_hash_may_be_read_before_the_end():
     truth = TruthHash(DRONES)
     for t_ns, arrays in instants(4):
         truth.add(t_ns, np.hstack(arrays))

@@ -1,11 +1,11 @@
-"""What displays are sent of an estimate and of a formation."""
+"""Views of estimates and formations that displays receive."""
 
 import numpy as np
 
 from zsim.contract.flight_messages import ClusterState, Estimate, cluster_view, estimate_view
 
 
-def test_an_estimate_is_shown_with_the_upper_triangle_of_its_position():
+def test_an_estimate_view_has_the_upper_triangle_of_its_covariance():
     half = np.random.default_rng(1).normal(size=(6, 6))
     P = half @ half.T
     level = (1.0, 0.0, 0.0, 0.0)
@@ -17,7 +17,7 @@ def test_an_estimate_is_shown_with_the_upper_triangle_of_its_position():
     assert shown.sensors == {"gps": (3, 1)}
 
 
-def test_a_formation_is_shown_with_what_it_is_and_what_it_is_to_be():
+def test_a_formation_view_has_actual_and_desired_values():
     state = ClusterState(20, 1, "held", ("d1",), ("x_c",), (1.0,), (2.0,), (3.0,), None, 0.5, "too near")
     shown = cluster_view(state, 40, 7)
     assert (shown.t_ns, shown.seq, shown.phase, shown.reason) == (40, 7, "held", "too near")

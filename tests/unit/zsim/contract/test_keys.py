@@ -1,4 +1,4 @@
-"""Keys: names, builders, and agreement with Zenoh on what an expression takes."""
+"""Keys: names, builders, and agreement with Zenoh on the keys that an expression matches."""
 
 import time
 
@@ -13,7 +13,7 @@ from zsim.errors import BadNameError
 
 
 @pytest.mark.parametrize("name", ["a", "drone1", "estimator.drone1", "x_y-z.0", "9", "a" * 32, ".", "-"])
-def test_names_of_the_contract_are_taken(name: str):
+def test_valid_names_are_accepted(name: str):
     assert keys.name(name) == name
 
 
@@ -21,7 +21,7 @@ def test_names_of_the_contract_are_taken(name: str):
     "name",
     ["", "a" * 33, "Drone", "a/b", "a b", "drone1\n", "*", "**", "$*", "é", "a\0", "@a", "#", "?", None, 1, b"drone1"],
 )
-def test_other_names_are_refused_with_what_is_allowed(name):
+def test_invalid_names_are_refused_with_what_is_allowed(name):
     with pytest.raises(BadNameError) as caught:
         keys.name(name, "federation")
     error = str(caught.value)
@@ -29,7 +29,7 @@ def test_other_names_are_refused_with_what_is_allowed(name):
     assert "\n" not in error
 
 
-def test_keys_are_the_contract_s():
+def test_keys_are_those_of_the_contract():
     assert keys.sensor("drone1", "imu") == "drone/drone1/sensor/imu"
     assert keys.sensors("drone1") == "drone/drone1/sensor/*"
     assert keys.status("drone1") == "drone/drone1/sensor/status"
@@ -45,7 +45,7 @@ def test_keys_are_the_contract_s():
     assert keys.SENSORS == ("imu", "gps", "mag", "baro", "sonar", "flow")
 
 
-def test_keys_are_taken_apart():
+def test_keys_are_split_into_their_parts():
     assert keys.thing("drone/drone1/sensor/imu") == "drone1"
     assert keys.thing("process/estimator.drone1/done") == "estimator.drone1"
     assert keys.leaf("drone/drone1/sensor/imu") == "imu"
@@ -70,7 +70,7 @@ def test_keys_are_taken_apart():
         ("", "clock", False),
     ],
 )
-def test_what_an_expression_takes(expression: str, key: str, takes: bool):
+def test_an_expression_matches_the_right_keys(expression: str, key: str, takes: bool):
     assert keys.matches(expression, key) is takes
 
 
@@ -102,7 +102,7 @@ def test_matches_agrees_with_zenoh_and_answers_any_text(expression: str, key: st
         ("x" + "$*a" * 40 + "$*b", "x" + "a" * 4000),
     ],
 )
-def test_a_contrived_expression_takes_no_more_than_a_moment(expression: str, key: str):
+def test_a_contrived_expression_is_matched_quickly(expression: str, key: str):
     start_s = time.process_time()
     assert not keys.matches(expression, key)
     assert time.process_time() - start_s < 1.0

@@ -17,14 +17,14 @@ from zsim.errors import DecodeError
     "value",
     [0, -(2**63), 0.1, -0.0, math.inf, math.nan, "text", b"bytes", None, True, [1, [2.5, "x"]], {"a": {"b": 1}}],
 )
-def test_plain_values_come_back_as_they_were(value: Any):
+def test_plain_values_survive_a_round_trip(value: Any):
     assert repr(unpack(pack({"value": value}))) == repr({"value": value})
 
 
 @pytest.mark.parametrize(
     ("value", "plain"), [(np.float64(0.1), 0.1), (np.int64(-3), -3), (np.uint8(7), 7), (np.bool_(True), True)]
 )
-def test_numbers_of_numpy_come_back_as_plain_ones(value: Any, plain: Any):
+def test_numpy_numbers_come_back_as_plain_ones(value: Any, plain: Any):
     assert repr(unpack(pack({"value": value}))["value"]) == repr(plain)
 
 
@@ -38,14 +38,14 @@ def test_numbers_of_numpy_come_back_as_plain_ones(value: Any, plain: Any):
         np.arange(12.0).reshape(3, 4)[:, 1],
     ],
 )
-def test_arrays_come_back_to_the_bit_and_may_be_written(array: np.ndarray):
+def test_arrays_come_back_bit_identical_and_writable(array: np.ndarray):
     again = unpack(pack({"rows": [array]}))["rows"][0]
     assert (again.dtype, again.shape, again.tobytes()) == (array.dtype, array.shape, array.tobytes())
     again[...] = 0
 
 
 @pytest.mark.parametrize("value", [object(), {1, 2}.__iter__(), np.array(["text"]), np.array([1.0], dtype=np.float32)])
-def test_what_is_not_plain_is_refused(value: Any):
+def test_values_of_unsupported_types_are_refused(value: Any):
     with refused(TypeError, "a state", type(value).__name__):
         pack({"value": value})
 
@@ -68,6 +68,6 @@ def array(kind: str, shape: list[int], numbers: bytes) -> bytes:
         array("|V8", [1], bytes(8)),
     ],
 )
-def test_garbage_is_refused_in_a_line(payload: bytes):
+def test_garbage_is_refused_in_one_line(payload: bytes):
     with refused(DecodeError, "state"):
         unpack(payload)

@@ -1,4 +1,4 @@
-"""Geodesy, against the way back and formulas of others, and conversions of attitudes."""
+"""Geodesy against its inverse and independent formulas, and conversions of attitudes."""
 
 import math
 
@@ -26,7 +26,7 @@ angle = st.floats(-math.pi, math.pi)
         ((45.0, 45.0, 0.0), (3194419.145061, 3194419.145061, 4487348.408866)),
     ],
 )
-def test_earth_fixed_coordinates_of_known_places(geodetic, ecef):
+def test_earth_fixed_coordinates_of_known_places_are_correct(geodetic, ecef):
     np.testing.assert_allclose(frames.geodetic_to_ecef(geodetic), ecef, atol=1e-6)
 
 
@@ -41,8 +41,8 @@ def test_euler_angles_agree_with_scipy(roll, pitch, yaw):
     np.testing.assert_allclose(frames.wrap_angle(frames.heading(q) - yaw), 0.0, atol=1e-9)
 
 
-def test_a_matrix_has_the_quaternion_that_it_was_made_from():
-    """Random attitudes, and half turns about each axis, of which one part alone is not zero."""
+def test_a_matrix_converts_back_to_its_quaternion():
+    """Random attitudes, and half turns about each axis, whose quaternions have a single non-zero component."""
     q = np.random.default_rng(4).normal(size=(5, 40, 4))
     q /= np.linalg.norm(q, axis=-1, keepdims=True)
     again = frames.quaternion_from_matrix(frames.rotation_matrix(q))
@@ -52,7 +52,7 @@ def test_a_matrix_has_the_quaternion_that_it_was_made_from():
     np.testing.assert_allclose(turn, frames.rotation_matrix(q[0, 0]), atol=1e-12)
 
 
-def test_principal_axes_make_their_covariance_again():
+def test_principal_axes_reproduce_their_covariance():
     half = np.random.default_rng(3).standard_normal((20, 3, 3))
     covariance = half @ np.swapaxes(half, -1, -2)
     sigma, axes = frames.principal_axes(covariance)
@@ -60,7 +60,7 @@ def test_principal_axes_make_their_covariance_again():
     np.testing.assert_allclose(R * np.square(sigma)[:, None, :] @ np.swapaxes(R, -1, -2), covariance, atol=1e-12)
 
 
-def test_products_and_inverses_over_leading_shapes():
+def test_products_and_inverses_broadcast_over_leading_axes():
     rng = np.random.default_rng(2)
     p, q = rng.normal(size=(2, 4, 4))
     p, q = (x / np.linalg.norm(x, axis=-1, keepdims=True) for x in (p, q))
@@ -76,7 +76,7 @@ def test_heading_is_counter_clockwise_from_east():
     assert math.isclose(float(frames.heading(q)), math.pi / 2)
 
 
-def test_wrap_angle():
+def test_wrap_angle_returns_angles_from_minus_pi_to_below_pi():
     wrapped = frames.wrap_angle([math.pi, -math.pi, 3 * math.pi / 2])
     np.testing.assert_allclose(wrapped, [-math.pi, -math.pi, -math.pi / 2])
 
@@ -91,7 +91,7 @@ def place_of(position, origin=ORIGIN):
 
 @few
 @given(st.floats(-89.9, 89.9), st.floats(-179.9, 180.0), st.floats(-5e3, 1e5), st.tuples(*[st.floats(-1e4, 1e4)] * 3))
-def test_the_way_to_the_tangent_plane_and_back_is_exact(latitude, longitude, height, position):
+def test_conversion_to_the_tangent_plane_and_back_is_exact(latitude, longitude, height, position):
     origin = latitude, longitude, height
     np.testing.assert_allclose(place_of((0.0, 0.0, 0.0), origin), origin, atol=1e-8)
     np.testing.assert_allclose(geodetic_to_enu(place_of(position, origin), origin), position, atol=1e-7)

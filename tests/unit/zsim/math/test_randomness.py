@@ -1,4 +1,4 @@
-"""Random streams: named, reproducible, and ignorant of each other."""
+"""Random streams: named, reproducible and independent of each other."""
 
 import numpy as np
 

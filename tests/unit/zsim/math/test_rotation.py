@@ -1,4 +1,4 @@
-"""Quaternion algebra of the compiled code against scipy; poses between two instants."""
+"""Quaternion algebra of the compiled code against scipy; interpolated poses between two instants."""
 
 import math
 
@@ -28,7 +28,7 @@ def scipy_rotation(q):
 
 @few
 @given(quaternions, vectors)
-def test_rotate_agrees_with_scipy_and_back_undoes_it(q, v):
+def test_rotate_agrees_with_scipy_and_rotate_back_inverts_it(q, v):
     q = unit(q)
     turned = rot.rotate(q, v)
     np.testing.assert_allclose(turned, scipy_rotation(q).apply(v), atol=1e-12)
@@ -37,7 +37,7 @@ def test_rotate_agrees_with_scipy_and_back_undoes_it(q, v):
 
 @few
 @given(quaternions, quaternions, vectors)
-def test_product_turns_first_by_the_right_factor(p, q, v):
+def test_a_product_rotates_by_the_right_factor_first(p, q, v):
     p, q = unit(p), unit(q)
     np.testing.assert_allclose(rot.rotate(rot.multiply(p, q), v), rot.rotate(p, rot.rotate(q, v)), atol=1e-12)
 
@@ -57,14 +57,14 @@ def test_matrices_agree_with_scipy(p, q, v):
 
 @few
 @given(vectors)
-def test_a_matrix_of_euler_angles_turns_by_yaw_last(rpy):
+def test_a_matrix_from_euler_angles_applies_yaw_last(rpy):
     expected = Rotation.from_euler("xyz", rpy).as_matrix()
     np.testing.assert_allclose(rot.matrix_from_rpy(*rpy), expected, atol=1e-12)
 
 
 @few
 @given(vectors)
-def test_rotation_vector_agrees_with_scipy(r):
+def test_a_rotation_vector_agrees_with_scipy(r):
     expected = Rotation.from_rotvec(r).as_matrix()
     got = scipy_rotation(rot.from_rotation_vector(r)).as_matrix()
     np.testing.assert_allclose(got, expected, atol=1e-12)
@@ -74,7 +74,7 @@ def test_rotation_vector_agrees_with_scipy(r):
 
 @few
 @given(quaternions, vectors)
-def test_rate_is_the_derivative_of_the_attitude(q, w):
+def test_the_rate_is_the_derivative_of_the_attitude(q, w):
     q, h = unit(q), 1e-6
     ahead = rot.multiply(q, rot.from_rotation_vector((w[0] * h, w[1] * h, w[2] * h)))
     behind = rot.multiply(q, rot.from_rotation_vector((-w[0] * h, -w[1] * h, -w[2] * h)))
@@ -94,13 +94,13 @@ def test_axes_and_heading_are_those_of_the_matrix(q):
 
 @few
 @given(st.floats(-100.0, 100.0))
-def test_wrapped_is_the_same_angle_in_range(angle):
+def test_wrapped_returns_the_same_angle_in_range(angle):
     wrapped = rot.wrapped(angle)
     assert -math.pi <= wrapped < math.pi
     assert math.remainder(wrapped - angle, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_cross_and_norm():
+def test_vector_functions_give_known_values():
     a, b = (1.0, 2.0, 3.0), (-4.0, 5.0, 0.5)
     np.testing.assert_allclose(rot.cross(a, b), np.cross(a, b))
     assert rot.norm(a) == math.sqrt(14.0)
@@ -111,7 +111,7 @@ def test_cross_and_norm():
 P0, V0 = (1.0, -2.0, 3.0), (0.5, 0.0, -1.0)
 P1, V1 = (1.02, -1.99, 2.97), (0.7, 0.4, -1.2)
 Q0 = multiply(about_z(0.7), from_rotation_vector((0.1, -0.2, 0.0)))
-TURN = (0.3, -0.1, 0.2)  # rad, within the span
+TURN = (0.3, -0.1, 0.2)  # rad, during the span
 Q1 = multiply(Q0, from_rotation_vector(TURN))
 SPAN = 0.02  # s
 
@@ -121,12 +121,12 @@ def between(s: float, q0: Quaternion = Q0, q1: Quaternion = Q1) -> tuple[Vector,
 
 
 @pytest.mark.parametrize(("s", "p", "v", "q"), [(0.0, P0, V0, Q0), (1.0, P1, V1, Q1)])
-def test_the_ends_are_what_was_given(s: float, p: Vector, v: Vector, q: Quaternion) -> None:
+def test_interpolation_reproduces_the_given_ends(s: float, p: Vector, v: Vector, q: Quaternion) -> None:
     for found, end in zip(between(s), (p, v, q), strict=True):
         assert found == pytest.approx(end, abs=1e-9)
 
 
-def test_a_flight_with_constant_jerk_is_exact() -> None:
+def test_interpolation_is_exact_for_constant_jerk() -> None:
     def flight(t: float) -> tuple[Vector, Vector]:
         return (t**3, 2 * t**2, 1 - t), (3 * t**2, 4 * t, -1.0)
 
@@ -143,7 +143,7 @@ def test_the_attitude_turns_at_a_constant_rate(s: float) -> None:
     assert between(s)[2] == pytest.approx(multiply(Q0, from_rotation_vector((s * x, s * y, s * z))), abs=1e-12)
 
 
-def test_the_other_sign_of_a_quaternion_is_the_same_attitude_and_equal_ones_stay() -> None:
+def test_interpolation_handles_opposite_signs_and_equal_quaternions() -> None:
     w, x, y, z = Q1
     assert between(0.3, q1=(-w, -x, -y, -z))[2] == pytest.approx(between(0.3)[2])
     assert between(0.3, q1=Q0)[2] == pytest.approx(Q0, abs=1e-15)

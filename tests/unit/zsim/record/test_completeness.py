@@ -1,4 +1,4 @@
-"""Completeness of a record: by the numbers that the world gives to gates and messages, and by its end."""
+"""Completeness of a record, judged by the numbers of its gates and messages and by its end."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -55,20 +55,20 @@ def judged(
         return completeness(reader)
 
 
-def test_a_record_without_gaps(tmp_path: Path) -> None:
+def test_a_record_without_gaps_is_complete(tmp_path: Path) -> None:
     found = judged(tmp_path / "run.mcap", whole(10), range(40), strange=[b"\xc1", b"\x91" * 5000])
     assert (found.complete, found.gates, found.gaps, found.messages_missing) == (True, 10, (), 0)
     assert str(found) == "complete: 10 gates"
 
 
-def test_what_drivers_publish_is_not_counted(tmp_path: Path) -> None:
-    """A driver begins anew after a death, and what it publishes may be dropped on its way."""
+def test_messages_of_drivers_are_not_counted(tmp_path: Path) -> None:
+    """A driver restarts its numbers after a death, and its messages may be dropped on the way."""
     external = replace(INFO, drones=(DroneInfo("d1", "any", body="external"),))
     assert judged(tmp_path / "external.mcap", whole(5), (0, 1, 7, 0, 1), external).messages_missing == 0
     assert judged(tmp_path / "simulated.mcap", whole(5), (0, 1, 7)).messages_missing == 5
 
 
-def test_gates_that_are_missing(tmp_path: Path) -> None:
+def test_missing_gates_are_reported(tmp_path: Path) -> None:
     on_clock = [clock for clock in whole(20) if clock.step not in (0, 1, 7, 12, 13, 14)]
     found = judged(tmp_path / "run.mcap", on_clock)
     assert found.gaps == (
@@ -84,8 +84,8 @@ def test_gates_that_are_missing(tmp_path: Path) -> None:
     assert has_terms(str(many), "19", "40", "0.10", "16")
 
 
-def test_time_that_stood_and_time_that_was_moved_lack_nothing(tmp_path: Path) -> None:
-    """While time stands its clock is repeated; a replay may begin anywhere, and seeks."""
+def test_pauses_and_seeks_are_not_gaps(tmp_path: Path) -> None:
+    """While time stands still, the clock is repeated; a replay may begin anywhere and may seek."""
     assert judged(tmp_path / "stood.mcap", [*clocks(0, 1, 1, 1, 2), stopped(clocks(2, first_seq=4)[0])]).complete
     replay = replace(INFO, replay_of="other")
     seeks = clocks(50, 51, 10, 11, 90)
@@ -94,22 +94,22 @@ def test_time_that_stood_and_time_that_was_moved_lack_nothing(tmp_path: Path) ->
     assert judged(tmp_path / "gap.mcap", [*seeks, stopped(seeks[-1])], (), replay).gates_missing == 79
 
 
-def test_messages_in_another_order_are_there(tmp_path: Path) -> None:
+def test_messages_out_of_order_are_not_missing(tmp_path: Path) -> None:
     swapped = whole(10)
     swapped[4:6] = swapped[5], swapped[4]
     assert judged(tmp_path / "run.mcap", swapped, [0, 2, 1, 4, 3]).complete
 
 
 @pytest.mark.parametrize(("imus", "missing"), [([0, 1, 3, 4], 1), ([5, 6], 5), ([0, 1, 2, 2, 2, 4], 1)])
-def test_numbers_of_a_key_that_are_missing(tmp_path: Path, imus: list[int], missing: int) -> None:
+def test_missing_numbers_of_a_key_are_reported(tmp_path: Path, imus: list[int], missing: int) -> None:
     found = judged(tmp_path / "run.mcap", whole(3), imus)
     assert (found.complete, found.messages_missing, found.gaps) == (False, missing, ())
     assert has_terms(str(found), "incomplete", str(missing), "messages")
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 2**63 - 1), st.integers(0, 20)), min_size=1))
-def test_numbers_are_read_as_they_are_decoded(fields: list[tuple[int, int, int]]) -> None:
-    """Whatever the length of both integers, and of the map that they begin."""
+def test_sequence_numbers_are_read_as_the_decoder_reads_them(fields: list[tuple[int, int, int]]) -> None:
+    """This holds whatever the length of both integers and of the map that starts with them."""
     payloads = [encode({"t_ns": t_ns, "seq": seq, **{f"f{k}": k for k in range(more)}}) for t_ns, seq, more in fields]
     ends = np.cumsum([len(payload) for payload in payloads])
     starts = np.array([0, *ends[:-1]])
@@ -129,13 +129,13 @@ def test_numbers_are_read_as_they_are_decoded(fields: list[tuple[int, int, int]]
         encode({"t_ns": 1, "seq": 300})[:-1],
     ],
 )
-def test_what_is_written_otherwise_is_left_to_the_decoder(garbage: bytes) -> None:
+def test_payloads_in_another_form_are_left_to_the_decoder(garbage: bytes) -> None:
     none = np.zeros(1, np.int64)
     spans = MessageSpans(garbage, none, none, np.array([len(garbage)]), none)
     assert sequence_numbers(spans).tolist() == [UNREAD]
 
 
-def test_fields_in_another_order_are_numbered(tmp_path: Path) -> None:
+def test_sequence_numbers_are_found_with_fields_in_another_order(tmp_path: Path) -> None:
     with RecordWriter(tmp_path / "run.mcap") as writer:
         writer.add_message(keys.INFO, INFO, 1)
         for seq in (0, 1, 4):
@@ -144,14 +144,14 @@ def test_fields_in_another_order_are_numbered(tmp_path: Path) -> None:
         assert completeness(reader).messages_missing == 2
 
 
-def test_a_record_without_an_end(tmp_path: Path) -> None:
+def test_a_record_without_an_end_is_incomplete(tmp_path: Path) -> None:
     found = judged(tmp_path / "run.mcap", clocks(*range(11)))
     assert (found.complete, found.ended, found.gaps) == (False, False, ())
     assert has_terms(str(found), "incomplete", "end", "0.20")
     assert not judged(tmp_path / "empty.mcap", []).complete
 
 
-def test_what_is_damaged_or_cut_is_incomplete(tmp_path: Path) -> None:
+def test_a_damaged_or_truncated_record_is_incomplete(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     assert judged(path, whole(500)).complete
     data = path.read_bytes()
@@ -167,13 +167,13 @@ def test_what_is_damaged_or_cut_is_incomplete(tmp_path: Path) -> None:
         assert has_terms(str(found), "damaged", "byte", str(place.start))
 
 
-def test_the_name_of_a_key_that_was_changed_is_damage(tmp_path: Path) -> None:
-    """A name stands outside of the chunks and their sums."""
+def test_a_changed_key_name_counts_as_damage(tmp_path: Path) -> None:
+    """Key names are stored outside the chunks and their checksums."""
     path = tmp_path / "run.mcap"
     assert judged(path, whole(9), range(36)).complete
     data = path.read_bytes()
     with open(path, "rb") as file:
-        assert len(list(StreamReader(file, validate_crcs=True).records)) > 0  # as the library computes it
+        assert len(list(StreamReader(file, validate_crcs=True).records)) > 0  # checksums as the library's
     path.write_bytes(data.replace(b"drone/d1/sensor/imu", b"drone/d2/sensor/imu"))
     with RecordReader(path) as reader:
         found = completeness(reader)

@@ -1,4 +1,4 @@
-"""Agents that share a process: what each hears and says is what it would hear and say by itself."""
+"""Agents that share a process: each receives and publishes what it would in a process of its own."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,12 +13,12 @@ from zsim.contract.snapshot import pack, unpack
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, AgentGroup, Output
 
-HOLD_NS = 2 * GATE_NS  # with a command delay of a gate
+HOLD_NS = 2 * GATE_NS  # for a command delay of one gate
 CLUSTER = keys.cluster_control("main")
 
 
 class Member(Agent):
-    """Says one message per gate on a key of its own, and notes what it hears; its messages are not the keys' own."""
+    """Publishes one message per gate on its own key, of a type that is not the key's, and notes what it receives."""
 
     _is_own = False  # type: ignore[assignment]
 
@@ -49,7 +49,7 @@ class Member(Agent):
 
 
 class Overhearing(Member):
-    """One that reads all estimates, and whose gate the drone's status closes."""
+    """A member that reads all estimates, and whose gate is closed by the status of the drone."""
 
     def __init__(self, name: str, writes: str) -> None:
         super().__init__(name, [keys.status("d1")], writes)
@@ -60,7 +60,7 @@ class Overhearing(Member):
 
 
 class Asked(Member):
-    """One that answers requests."""
+    """A member that answers requests."""
 
     def control_keys(self) -> tuple[str, ...]:
         return (CLUSTER,)
@@ -77,7 +77,7 @@ def team() -> tuple[Member, Member, AgentGroup]:
     return first, last, AgentGroup([first, last], HOLD_NS)
 
 
-def test_a_group_reads_what_its_members_do_not_tell_each_other_and_has_the_name_of_the_last():
+def test_a_group_reads_external_inputs_and_has_the_name_of_its_last_member():
     _, _, group = team()
     assert group.reads == group.gate_keys == (keys.status("d1"),)
     assert group.counted == ("d1",)
@@ -86,7 +86,7 @@ def test_a_group_reads_what_its_members_do_not_tell_each_other_and_has_the_name_
     assert group.serves == ("estimator.d1", "estimator.d2")
 
 
-def test_a_member_hears_in_the_same_gate_what_those_before_it_said():
+def test_a_member_receives_outputs_of_earlier_members_in_the_same_gate():
     first, last, group = team()
     group.receive(keys.status("d1"), status(GATE_NS))
     outputs = group.step(GATE_NS)
@@ -101,8 +101,8 @@ def test_a_member_hears_in_the_same_gate_what_those_before_it_said():
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_what_closes_the_gate_of_one_is_held_for_another_who_only_reads_it(resumed: bool):
-    """Also where the group goes on from a snapshot in between."""
+def test_an_input_closing_one_member_s_gate_is_held_for_other_readers(resumed: bool):
+    """This also holds if the group resumes from a snapshot in between."""
 
     def made() -> tuple[Overhearing, AgentGroup]:
         waiting = Member("controller.main", [keys.estimate("d2")], keys.cluster_state("main"))
@@ -128,7 +128,7 @@ def test_what_closes_the_gate_of_one_is_held_for_another_who_only_reads_it(resum
     ]
 
 
-def test_inputs_come_in_the_order_of_time_key_and_number():
+def test_inputs_are_ordered_by_time_key_and_number():
     _, last, group = team()
     for t_ns, seq in ((2 * GATE_NS, 3), (GATE_NS, 2), (GATE_NS, 1)):
         group.receive(keys.status("d1"), status(t_ns, seq))
@@ -137,7 +137,7 @@ def test_inputs_come_in_the_order_of_time_key_and_number():
     assert statuses == [(GATE_NS, 1), (GATE_NS, 2), (2 * GATE_NS, 3)]
 
 
-def test_requests_and_last_values_go_to_whom_they_belong():
+def test_requests_and_last_values_go_to_the_right_member():
     first, last, group = team()
     group.rehearse()
     assert (first.rehearsed, last.rehearsed) == (True, True)
@@ -165,7 +165,7 @@ def test_requests_and_last_values_go_to_whom_they_belong():
     ],
     ids=["nobody", "waiting for each other"],
 )
-def test_what_cannot_be_a_group_is_refused(members: list[Member], terms: tuple[str, ...]):
+def test_an_impossible_group_is_refused(members: list[Member], terms: tuple[str, ...]):
     with refused(RunError, *terms):
         AgentGroup(members, HOLD_NS)
 

@@ -1,4 +1,4 @@
-"""What a process says of itself: once a wall second, with the percentiles of its newest steps."""
+"""The health of a process: due once per second of wall time, with percentiles of its newest steps."""
 
 import os
 import sys
@@ -16,7 +16,7 @@ class WallClock:
         return self.now_s
 
 
-def test_it_is_due_once_a_wall_second():
+def test_health_is_due_once_per_second_of_wall_time():
     clock = WallClock()
     meter = HealthMeter("estimator", clock)
     assert not meter.due()
@@ -30,7 +30,7 @@ def test_it_is_due_once_a_wall_second():
     assert not meter.due()
 
 
-def test_it_says_who_and_how():
+def test_a_health_message_has_identity_and_counts():
     meter = HealthMeter("estimator", WallClock())
     meter.received, meter.refused, meter.dropped, meter.lag_ns = 9, 3, 2, 40
     message = meter.message(7, 1)
@@ -50,7 +50,7 @@ def test_percentiles_are_of_the_newest_steps():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="read from /proc")
-def test_memory_is_that_of_this_process():
+def test_resident_bytes_measures_this_process():
     before = resident_bytes()
     held = bytearray(64 << 20)
     held[::4096] = b"x" * len(held[::4096])

@@ -63,7 +63,7 @@ def test_another_gate_is_requested_at_once():
 
 @pytest.mark.parametrize(("mode", "from_gate"), [("lockstep", 0), ("realtime", 2)])
 def test_a_replay_request_includes_gates_held_back_in_lockstep(mode: Any, from_gate: int) -> None:
-    """From the command delay and one gate before; in realtime nothing is held, and the agent would receive duplicates."""
+    """From the command delay and one gate before; in realtime nothing is held, and the agent would get duplicates."""
     link, agent = FakeLink(), Quiet()
     agent.reads = (*Quiet.reads, "drone/d2/estimate")
     info = replace(INFO, mode=mode)

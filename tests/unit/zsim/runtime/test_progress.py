@@ -1,4 +1,4 @@
-"""The lines that a run shows: a reason that lasts, once."""
+"""The lines that a run shows: lasting reasons, repeated events, control codes and progress."""
 
 import io
 
@@ -24,7 +24,7 @@ def lines_of(reasons: HoldReasons, reason: str, from_ns: int, to_ns: int) -> lis
     return [line for line in lines if line]
 
 
-def test_a_reason_that_lasts_is_told_once():
+def test_a_lasting_reason_is_shown_once():
     reasons = HoldReasons()
     assert lines_of(reasons, WAITS, 0, REASON_NS) == []
     (line,) = lines_of(reasons, WAITS, REASON_NS, 10 * REASON_NS)
@@ -34,20 +34,20 @@ def test_a_reason_that_lasts_is_told_once():
     assert [line and line.split()[2] for line in lines] == ["a,", "b,"]
 
 
-def test_a_reason_that_passes_is_not_told():
+def test_a_passing_reason_is_not_shown():
     reasons = HoldReasons()
     for start_ns in range(0, 10 * REASON_NS, REASON_NS):
         assert lines_of(reasons, WAITS, start_ns, start_ns + REASON_NS // 2) == []
         assert lines_of(reasons, "", start_ns + REASON_NS // 2, start_ns + REASON_NS) == []
 
 
-def test_other_numbers_are_the_same_reason():
+def test_reasons_that_differ_only_in_numbers_are_the_same():
     reasons, times = HoldReasons(), range(0, 2 * REASON_NS, GATE_NS)
     lines = [reasons.line("main", state(t_ns, f"drone2 is at z = {t_ns / 1e12:.3f} m")) for t_ns in times]
     assert len([line for line in lines if line]) == 1
 
 
-def test_equal_events_are_one_line_with_their_count():
+def test_equal_events_are_merged_into_one_line_with_their_count():
     output = io.StringIO()
     with progress.Screen(60.0, Console(file=output, width=200)) as screen:
         for k in range(20):
@@ -59,7 +59,7 @@ def test_equal_events_are_one_line_with_their_count():
     assert all(has_terms(line, "19", "1.00") for line in lines[2:])
 
 
-def test_events_are_counted_anew_after_a_while():
+def test_counting_of_equal_events_restarts_after_a_while():
     events = progress.RepeatedEvents()
     times = (0.0, 1.0, progress.REPEATED_S, progress.REPEATED_S + 1.0)
     shown = [events.lines(t_s, "collision", "a and b") for t_s in times]
@@ -70,7 +70,7 @@ def test_events_are_counted_anew_after_a_while():
 ESCAPES = "\x1b]0;title\x07\x1b[2Ka\x9b1m\r\u202eb"
 
 
-def test_codes_that_a_terminal_acts_on_are_shown_and_not_sent():
+def test_terminal_control_codes_are_escaped():
     output = io.StringIO()
     screen = progress.Screen(10.0, Console(file=output))
     assert printable("one\n\ttwo: Zürich, 東京 ×") == "one\n\ttwo: Zürich, 東京 ×"
@@ -84,7 +84,7 @@ def test_codes_that_a_terminal_acts_on_are_shown_and_not_sent():
 
 
 @pytest.mark.parametrize("is_slow", [True, False])
-def test_a_start_that_takes_long_is_explained(monkeypatch: pytest.MonkeyPatch, is_slow: bool):
+def test_a_slow_start_is_explained(monkeypatch: pytest.MonkeyPatch, is_slow: bool):
     monkeypatch.setattr(progress, "SLOW_S", 0.0 if is_slow else 600.0)
     shown: list[str] = []
     start = progress.SlowStart(shown.append)
@@ -95,7 +95,7 @@ def test_a_start_that_takes_long_is_explained(monkeypatch: pytest.MonkeyPatch, i
     assert shown == [progress.SLOW_NOTICE] * is_slow
 
 
-def test_progress_of_a_part_counts_that_part() -> None:
+def test_progress_of_a_part_is_relative_to_that_part() -> None:
     line = {"t_s": 15.0, "rate": 1.0, "state": "running", "waiting_for": []}
     assert progress.describe(line, 20.0, from_s=10.0).count("█") == 10
     assert progress.describe({**line, "t_s": 10.0}, 20.0, from_s=10.0).count("█") == 0

@@ -1,4 +1,4 @@
-"""The rate limiter: a burst at once, then one more each period, for each subject by itself."""
+"""The rate limiter: a burst at once, then one more each period, separately for each subject."""
 
 import pytest
 
@@ -21,7 +21,7 @@ def spent(limit: RateLimit, subject: str = "", tries: int = 10) -> int:
 @pytest.mark.parametrize(
     ("burst", "periods", "more"), [(1, 0.9, 0), (1, 1, 1), (1, 5, 1), (3, 1, 1), (3, 2.5, 2), (3, 9, 3)]
 )
-def test_what_is_spent_comes_back_one_by_one_up_to_the_burst(burst: int, periods: float, more: int) -> None:
+def test_the_allowance_recovers_one_per_period_up_to_the_burst(burst: int, periods: float, more: int) -> None:
     clock = Clock()
     limit = RateLimit(20, burst, clock)
     assert spent(limit) == burst
@@ -30,14 +30,14 @@ def test_what_is_spent_comes_back_one_by_one_up_to_the_burst(burst: int, periods
     assert spent(limit) == more
 
 
-def test_each_subject_has_its_own() -> None:
+def test_each_subject_has_its_own_allowance() -> None:
     limit = RateLimit(1.0, 2, Clock())
     assert not limit.knows("a")
     assert (spent(limit, "a"), spent(limit, "b")) == (2, 2)
     assert limit.knows("a")
 
 
-def test_how_long_to_wait() -> None:
+def test_wait_returns_the_time_until_the_next_allowance() -> None:
     clock = Clock()
     limit = RateLimit(20, 2, clock)
     assert limit.wait() == 0
@@ -46,7 +46,7 @@ def test_how_long_to_wait() -> None:
     assert limit.wait() == pytest.approx(15)
 
 
-def test_subjects_without_end_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_remembered_subjects_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limit, "SUBJECTS_MAX", 10)
     limit = RateLimit(1.0, 1, Clock())
     for number in range(25):

@@ -1,4 +1,4 @@
-"""Large documents that are no scenario: refused before they have cost much, whatever they are full of."""
+"""Large documents that are not scenarios are refused quickly, whatever fills them."""
 
 import time
 from pathlib import Path
@@ -24,8 +24,8 @@ from zsim.schema import yaml_file
 from zsim.schema.yaml_file import VALUES_MAX
 
 SIZE = 250_000  # bytes
-SIZE_OF_MOST = 1_000_000  # bytes, of a document with more than VALUES_MAX or WAYPOINTS_MAX
-PARSINGS = 20  # of a plain document of its size by libyaml: CPU time within which one is refused. Slow ones took hours
+SIZE_OF_MOST = 1_000_000  # bytes, size of documents that exceed VALUES_MAX or WAYPOINTS_MAX
+PARSINGS = 20  # limit of a refusal's CPU time, as a multiple of libyaml's for a plain document of the same size
 PAIR = """name: pair
 duration_s: 10
 drones:
@@ -41,7 +41,7 @@ CLUSTER = PAIR + "clusters:\n- {name: main, drones: [drone1, drone2], %s}"
 
 @pytest.fixture(scope="module")
 def refused_s() -> float:
-    """CPU time [s] within which this machine refuses each byte of a document: what libyaml needs for plain ones."""
+    """CPU time [s] per byte within which a document must be refused, derived from libyaml's for plain ones."""
     start_s = time.process_time()
     yaml.load(numbered("", "k{}: 1\n"), yaml.CSafeLoader)
     return PARSINGS * (time.process_time() - start_s) / SIZE
@@ -55,7 +55,7 @@ def numbered(head: str, unit: str, tail: str = "", size: int = SIZE) -> str:
     return head + "".join(unit.format(i) for i in range((size - len(head) - len(tail)) // (len(unit) + 4))) + tail
 
 
-# name: the text, what the first line must show
+# name: (text, terms that one line must show)
 TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "almost a number": (filled(PAIR + "seed: ", "1", "x"), ("seed",)),
     "almost a fraction": (PAIR + "seed: " + "1" * (SIZE // 2) + "." + "1" * (SIZE // 2) + "x", ("seed",)),
@@ -99,7 +99,7 @@ TEXTS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("name", TEXTS)
-def test_what_is_no_scenario_is_refused_at_once(tmp_path: Path, refused_s: float, name: str) -> None:
+def test_a_large_invalid_document_is_refused_quickly(tmp_path: Path, refused_s: float, name: str) -> None:
     text, terms = TEXTS[name]
     path = tmp_path / "own.yaml"
     path.write_text(text)
@@ -110,7 +110,7 @@ def test_what_is_no_scenario_is_refused_at_once(tmp_path: Path, refused_s: float
     assert any(has_terms(line, *terms) for line in caught.value.faults), caught.value.faults[0]
 
 
-def test_a_thousand_obstacles_among_a_thousand_drones_are_checked_at_once(tmp_path: Path, refused_s: float) -> None:
+def test_a_thousand_obstacles_and_a_thousand_drones_are_checked_quickly(tmp_path: Path, refused_s: float) -> None:
     spheres = "".join(
         f"{{name: o{i}, shape: sphere, radius_m: 1, position_m: [0, 0, 0]}}," for i in range(OBSTACLES_MAX)
     )
@@ -124,7 +124,7 @@ def test_a_thousand_obstacles_among_a_thousand_drones_are_checked_at_once(tmp_pa
 
 
 @pytest.mark.parametrize("path", ["a" + ".a" * 60_000, "a" + "[a]" * 40_000], ids=["words", "brackets"])
-def test_an_override_of_a_long_path_is_refused_at_once(tmp_path: Path, path: str) -> None:
+def test_an_override_with_a_very_long_path_is_refused(tmp_path: Path, path: str) -> None:
     file = tmp_path / "own.yaml"
     file.write_text(PAIR)
     with pytest.raises(ScenarioError) as caught:
@@ -135,7 +135,7 @@ def test_an_override_of_a_long_path_is_refused_at_once(tmp_path: Path, path: str
 def test_a_resolved_scenario_of_a_thousand_drones_is_read_from_its_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`zsim run` hands it to its world that way; here it is an eighth of it, as are the limits."""
+    """`zsim run` passes it to its world that way; here scenario and limits are an eighth as large."""
     monkeypatch.setattr(yaml_file, "VALUES_MAX", VALUES_MAX // 8)
     monkeypatch.setattr(yaml_file, "FILE_SIZE_MAX", yaml_file.FILE_SIZE_MAX // 8)
     path = tmp_path / "many.yaml"

@@ -1,4 +1,4 @@
-"""References of drones in a scenario: what is read, who flies them, and what is refused where."""
+"""References of drones in a scenario: files, pilots, and faults with their paths."""
 
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ def resolve(reference: Any = None, **more: Any) -> Any:
     return scenario_file.resolve({**document, **more})
 
 
-def test_a_file_is_read_into_pieces_and_needed_by_nobody_else(tmp_path: Path) -> None:
+def test_a_reference_file_is_read_into_pieces_and_not_needed_afterwards(tmp_path: Path) -> None:
     scenario = resolve({"file": "good.csv", "start_s": 10})
     (piece,) = scenario.drones[0].reference.pieces
     assert (piece.duration_s, piece.x, piece.yaw) == (
@@ -52,7 +52,7 @@ def test_a_file_is_read_into_pieces_and_needed_by_nobody_else(tmp_path: Path) ->
     assert scenario_file.from_text(scenario_file.to_text(scenario)) == scenario
 
 
-def test_drones_with_a_reference_have_a_pilot_that_may_fly_them_alone() -> None:
+def test_a_drone_with_a_reference_has_a_pilot_for_it_alone() -> None:
     scenario = resolve({"waypoints": ONE, "start_s": 10})
     assert agent_names(scenario) == ["estimator.d1", "estimator.d2", "reference.d1"]
     rights = rights_for("reference.d1", scenario)
@@ -68,7 +68,7 @@ def test_drones_with_a_reference_have_a_pilot_that_may_fly_them_alone() -> None:
     ]
 
 
-def test_a_scenario_without_any_is_as_it_was() -> None:
+def test_a_scenario_without_references_does_not_mention_them() -> None:
     text = scenario_file.to_text(resolve())
     assert "reference" not in text
     assert "exchanges" not in text
@@ -97,14 +97,16 @@ def test_a_scenario_without_any_is_as_it_was() -> None:
         ({"exprssions": {}}, ("reference.exprssions", "expressions")),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_with_field_and_value(reference: dict[str, Any], terms: tuple[str, ...]) -> None:
+def test_an_invalid_reference_is_refused_with_field_and_value(
+    reference: dict[str, Any], terms: tuple[str, ...]
+) -> None:
     with pytest.raises(ScenarioError) as raised:
         resolve(reference)
     text = str(raised.value).replace("'", "")
     assert any(all(term.rstrip("…") in line for term in terms) for line in text.splitlines()), text
 
 
-def test_only_drones_that_have_a_pilot_are_waited_for_or_lose_it() -> None:
+def test_only_existing_pilots_can_be_expected_or_killed() -> None:
     flown = {"waypoints": ONE, "start_s": 10}
     kill = {"kind": "process_kill", "at_s": 5}
     resolve(flown, faults=[{**kill, "target": "reference.d1"}], processes={"expect": ["reference.d1"]})
@@ -114,14 +116,14 @@ def test_only_drones_that_have_a_pilot_are_waited_for_or_lose_it() -> None:
         resolve(flown, faults=[{**kill, "target": "reference.d2"}])
 
 
-def test_what_begins_after_the_end_of_the_run_is_told() -> None:
+def test_references_after_the_end_of_the_run_are_reported() -> None:
     late = resolve({"waypoints": ONE, "start_s": 30})
     assert [has_terms(line, "drones.d1", "30", "30") for line in unflown_plans(late)] == [True]
     assert unflown_plans(resolve({"waypoints": ONE, "start_s": 29})) == []
     assert len(unflown_plans(resolve(exchanges=[EXCHANGE], duration_s=8))) == 2
 
 
-def test_a_drone_has_one_who_flies_it() -> None:
+def test_a_drone_has_only_one_source_of_setpoints() -> None:
     cluster = [{"name": "main", "drones": ["d1", "d2"]}]
     with refused(ScenarioError, "drones[0].reference", "'main'", "(drone 'd1')"):
         resolve({"waypoints": ONE, "start_s": 10}, clusters=cluster)
@@ -142,6 +144,6 @@ def test_a_drone_has_one_who_flies_it() -> None:
         ({"stages": [*EXCHANGE["stages"], *EXCHANGE["stages"]]}, ("exchanges[0].stages[1].start_s", "8", "16")),
     ],
 )
-def test_an_exchange_that_cannot_be_is_refused(changed: dict[str, Any], terms: tuple[str, ...]) -> None:
+def test_an_invalid_exchange_is_refused(changed: dict[str, Any], terms: tuple[str, ...]) -> None:
     with refused(ScenarioError, *terms):
         resolve(exchanges=[{**EXCHANGE, **changed}])

@@ -706,9 +706,9 @@ def test_a_fault_of_the_shared_vehicle_is_reported_once_with_its_path(vehicle: A
 @pytest.mark.parametrize(
     ("plan", "duration_s", "terms"),
     [
-        ({"takeoff_s": 20}, 20, ("clusters[0].plan", "20 s", "take-off at 20 s", "nothing", "'c'")),
-        ({"takeoff_s": 20, "land_s": 90}, 5, ("5 s", "take-off at 20 s and its landing at 90 s", "nothing")),
-        ({"land_s": 90}, 50, ("landing at 90 s", "nothing")),
+        ({"takeoff_s": 20}, 20, ("clusters[0].plan", "20 s", "take-off at 20 s", "none", "'c'")),
+        ({"takeoff_s": 20, "land_s": 90}, 5, ("5 s", "take-off at 20 s and its landing at 90 s", "none")),
+        ({"land_s": 90}, 50, ("landing at 90 s", "none")),
         ({"takeoff_s": 2, "land_s": 90}, 50, ("before its landing at 90 s: not flown",)),
         ({"takeoff_s": 2, "trajectory": {"start_s": 60, "expressions": {"x_c": "t"}}}, 50, ("before its trajectory at 60 s: not flown",)),
         ({"takeoff_s": 20, "land_s": 90}, 91, ()),

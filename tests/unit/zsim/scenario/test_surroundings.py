@@ -223,7 +223,7 @@ def test_an_obstacle_out_of_reach_changes_nothing():
     [
         ({**BOX, "size_m": None}, ('environment.obstacles[0].size_m', 'missing', 'box')),
         ({**BALL, "height_m": 2}, ('environment.obstacles[0].height_m', 'given', 'sphere')),
-        ({**PILLAR, "name": "d1"}, ('environment.obstacles[0].name', "'d1'", 'another')),
+        ({**PILLAR, "name": "d1"}, ('environment.obstacles[0].name', "'d1'")),
         ({**PILLAR, "position_m": [0.6, 0, 0]}, ('drones[0].position_m', '0.10', "'pillar'", '>=', '0.3', "'d1'")),
         ({**BOX, "shape": "cone"}, ('environment.obstacles[0].shape', "'cone'", 'box', 'cylinder', 'sphere')),
     ],

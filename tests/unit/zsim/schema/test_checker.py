@@ -119,7 +119,7 @@ def test_limits_of_the_representation_are_not_shown():
     ]
     assert has_terms(texts[0], "'x'", "finite")
     assert has_terms(texts[1], "-1", ">=", "0")
-    assert has_terms(texts[2], "18446744073709551615", "whole", "64")
+    assert has_terms(texts[2], "18446744073709551615", "whole")
     assert not any(limit in text for text in texts for limit in ("e+308", "<="))
 
 

@@ -1,4 +1,4 @@
-"""Classes and modules of a user's own package, named in a document."""
+"""Classes, functions and modules of a user's own package, named in a document."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from zsim.schema import plugin
 
 
 class Meter(Protocol):
-    """What a class is to be."""
+    """The protocol that a loaded class must implement."""
 
     def read(self) -> float: ...
     def reset(self) -> None: ...
@@ -41,10 +41,10 @@ number = 3
 
 @pytest.fixture
 def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with modules that is searched; its name holds what separates paths elsewhere."""
+    """A folder with modules that is searched; its name contains characters that separate paths on some systems."""
     monkeypatch.setenv(plugin.FOLDERS, "")
     monkeypatch.setattr(sys, "path", [*sys.path])
-    folder = tmp_path / "12:30 ü;"  # as of a run that is named after its time
+    folder = tmp_path / "12:30 ü;"  # like that of a run named after its time
     folder.mkdir()
     (folder / "plugin_meter.py").write_text(SOURCE)
     (folder / "plugin_broken.py").write_text("1 / 0\n")
@@ -53,17 +53,17 @@ def beside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_a_method_may_take_more_than_it_is_given(beside: Path) -> None:
+def test_a_method_may_have_additional_optional_parameters(beside: Path) -> None:
     assert plugin.load("plugin_meter:Wide", "a.yaml: meter", Meter)().read() == 1.0
 
 
 @pytest.mark.parametrize("returned", [None, "1", ["1"], [None, 1.0], 1j, [[1.0], [1.0, 2.0]], object()])
-def test_what_is_no_real_numbers_is_refused(returned: Any) -> None:
-    with pytest.raises(ValueError):  # noqa: PT011 - whose text is not shown
+def test_values_that_are_not_real_numbers_are_refused(returned: Any) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - its text is never shown
         plugin.numbers(returned)
 
 
-def test_a_class_is_loaded_from_beside_the_document(beside: Path) -> None:
+def test_a_class_is_loaded_from_the_folder_of_the_document(beside: Path) -> None:
     assert plugin.load("plugin_meter:Good", "a.yaml: meter", Meter)().read() == 1.0
 
 
@@ -81,7 +81,7 @@ def test_a_class_is_loaded_from_beside_the_document(beside: Path) -> None:
         (":Good", "package.module:Class"),
     ],
 )
-def test_what_cannot_be_loaded_is_one_line(beside: Path, name: str, wrong: str) -> None:
+def test_a_class_that_cannot_be_loaded_is_reported_in_one_line(beside: Path, name: str, wrong: str) -> None:
     with pytest.raises(DocumentError) as raised:
         plugin.load(name, "a.yaml: meter", Meter)
     (line,) = raised.value.faults
@@ -103,7 +103,7 @@ def test_a_function_is_loaded(beside: Path) -> None:
         ("plugin_meter", "package.module:function"),
     ],
 )
-def test_what_is_no_function_is_one_line(beside: Path, name: str, wrong: str) -> None:
+def test_an_invalid_function_is_reported_in_one_line(beside: Path, name: str, wrong: str) -> None:
     with pytest.raises(DocumentError) as raised:
         plugin.load_function(name, "a.yaml: metrics")
     (line,) = raised.value.faults
@@ -115,12 +115,12 @@ def test_a_module_is_loaded(beside: Path) -> None:
     assert plugin.load_module("plugin_meter", "a.yaml: module").number == 3
 
 
-def test_processes_started_from_here_search_there_too(beside: Path) -> None:
+def test_child_processes_search_the_same_folders(beside: Path) -> None:
     code = "from zsim.schema import plugin; print(plugin.load_module('plugin_meter', '').number)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "3\n"
 
 
-def test_a_folder_is_named_once_and_hides_nothing(beside: Path) -> None:
+def test_a_folder_is_added_once_and_shadows_no_module(beside: Path) -> None:
     (beside / "json.py").write_text("")
     plugin.search(beside)
     assert plugin.load_module("json", "").__file__ != str(beside / "json.py")
@@ -134,7 +134,9 @@ def test_a_folder_is_named_once_and_hides_nothing(beside: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["plugin_meter:Good", "plugin_broken:Any", "plugin_exits:Any", "plugin_package.inner:Inner"]
 )
-def test_a_name_is_found_without_running_its_module(beside: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_class_is_found_by_name_without_running_its_module(
+    beside: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delitem(sys.modules, name.partition(":")[0], raising=False)
     (beside / "plugin_package").mkdir()
     (beside / "plugin_package" / "__init__.py").write_text("1 / 0\n")
@@ -150,7 +152,7 @@ def test_a_name_is_found_without_running_its_module(beside: Path, name: str, mon
         assert not plugin.may_import()
     assert has_terms(raised.value.faults[0], "a.yaml: meter", repr(name), "--trust")
     assert name.partition(":")[0] not in sys.modules
-    assert sys.path == former  # else what zsim imports later, and is not installed, would be found there
+    assert sys.path == former  # otherwise later imports of packages that are not installed would be found there
     assert plugin.may_import()
 
 
@@ -158,12 +160,12 @@ def test_a_name_is_found_without_running_its_module(beside: Path, name: str, mon
     ("name", "terms"),
     [
         ("plugin_nowhere:Good", ("'plugin_nowhere:Good'", "ModuleNotFoundError")),
-        ("plugin_meter.inner:Good", ("'plugin_meter.inner:Good'", "no package")),
+        ("plugin_meter.inner:Good", ("'plugin_meter.inner:Good'", "plugin_meter is not a package")),
         ("plugin_meter:Bad", ("'plugin_meter:Bad'", "Good, Half")),
         ("plugin_unread:Good", ("'plugin_unread:Good'", "SyntaxError")),
     ],
 )
-def test_and_refused_where_it_is_not_there(beside: Path, name: str, terms: tuple[str, ...]) -> None:
+def test_a_missing_name_is_refused_without_running_its_module(beside: Path, name: str, terms: tuple[str, ...]) -> None:
     (beside / "plugin_unread.py").write_text("class\n")
     with plugin.names_only() as skipped:
         with pytest.raises(DocumentError) as raised:
@@ -177,12 +179,12 @@ def test_and_refused_where_it_is_not_there(beside: Path, name: str, terms: tuple
         assert skipped == [name]
 
 
-def test_code_of_zsim_is_imported_whoever_names_it() -> None:
+def test_code_of_zsim_itself_is_always_imported() -> None:
     with plugin.names_only():
         assert plugin.load_module("zsim.errors", "a.yaml: module") is sys.modules["zsim.errors"]
 
 
-def test_processes_that_are_started_import_nothing_either(beside: Path) -> None:
+def test_child_processes_import_no_user_code_either(beside: Path) -> None:
     code = "from zsim.schema import plugin; plugin.load_module('plugin_meter', 'a.yaml: module')"
     with plugin.names_only():
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -21,13 +21,13 @@ DOCUMENTS = st.recursive(
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
-def test_our_files_mean_what_plain_yaml_means(file: Path) -> None:
+def test_our_files_mean_the_same_in_plain_yaml(file: Path) -> None:
     text = file.read_text()
     assert yaml_file.value(text) == yaml.safe_load(text)
 
 
 @given(DOCUMENTS)
-def test_what_was_written_is_read_again(document: object) -> None:
+def test_a_written_document_is_read_back_unchanged(document: object) -> None:
     assert yaml_file.value(yaml_file.dump(document)) == document
 
 
@@ -57,7 +57,7 @@ def test_words_mean_what_yaml_1_2_says(text: str, value: object) -> None:
     assert (type(read), read) == (type(value), value)
 
 
-def test_a_key_that_yaml_1_1_merges_is_a_key() -> None:
+def test_a_merge_key_of_yaml_1_1_is_an_ordinary_key() -> None:
     assert yaml_file.value("<<: {b: 1}\nb: 2") == {"<<": {"b": 1}, "b": 2}
 
 
@@ -72,6 +72,6 @@ def test_a_key_that_yaml_1_1_merges_is_a_key() -> None:
         ("[" * 40 + "1" + "]" * 40 + "]", ("line 1",)),
     ],
 )
-def test_what_is_refused_says_where(text: str, terms: tuple[str, ...]) -> None:
+def test_a_refused_document_is_reported_with_the_reason(text: str, terms: tuple[str, ...]) -> None:
     with refused(ValueError, *terms):
         yaml_file.value(text)

@@ -1,4 +1,4 @@
-"""The lens: rays to pixels and back, lenses that fold a picture, and settings of cameras that cannot be."""
+"""The lens: rays to pixels and back, lenses that fold a picture, and invalid camera settings."""
 
 import math
 from typing import Any
@@ -33,8 +33,8 @@ def camera(diagonal_deg: float, distortion: Any) -> FrontCamera:
 
 
 @pytest.mark.parametrize(("diagonal_deg", "distortion"), SOUND)
-def test_the_ray_of_a_pixel_falls_on_it(diagonal_deg: float, distortion: Any) -> None:
-    """By OpenCV's projection, over the whole picture to its corners."""
+def test_the_ray_of_a_pixel_projects_back_onto_it(diagonal_deg: float, distortion: Any) -> None:
+    """Checked with OpenCV's projection over the whole picture, including its corners."""
     lens = lens_of(camera(diagonal_deg, distortion))
     u, v = (
         each.ravel() for each in np.meshgrid(np.linspace(0, lens.width - 1, 41), np.linspace(0, lens.height - 1, 23))
@@ -47,7 +47,7 @@ def test_the_ray_of_a_pixel_falls_on_it(diagonal_deg: float, distortion: Any) ->
 
 
 @pytest.mark.parametrize(("diagonal_deg", "distortion"), SOUND)
-def test_the_slopes_are_those_of_finite_differences(diagonal_deg: float, distortion: Any) -> None:
+def test_the_distortion_slopes_match_finite_differences(diagonal_deg: float, distortion: Any) -> None:
     lens, h = lens_of(camera(diagonal_deg, distortion)), 1e-6
     for x, y in ((0.3, -0.2), (-0.5, 0.4), (0.0, 0.0)):
         by_x = [(a - b) / (2 * h) for a, b in zip(distorted(lens, x + h, y), distorted(lens, x - h, y), strict=True)]
@@ -57,11 +57,11 @@ def test_the_slopes_are_those_of_finite_differences(diagonal_deg: float, distort
 
 
 @pytest.mark.parametrize(("diagonal_deg", "distortion"), FOLDING)
-def test_a_lens_that_folds_the_picture_is_known(diagonal_deg: float, distortion: Any) -> None:
+def test_a_lens_that_folds_the_picture_is_detected(diagonal_deg: float, distortion: Any) -> None:
     assert folds(lens_of(camera(diagonal_deg, distortion)))
 
 
-def test_k1_alone_folds_from_where_its_cubic_turns_back_before_the_corner() -> None:
+def test_k1_alone_folds_if_its_cubic_turns_back_before_the_corner() -> None:
     least = -4 / 27 / math.tan(math.radians(46)) ** 2
     found = [folds(lens_of(camera(92.0, (k1, 0.0, 0.0, 0.0, 0.0)))) for k1 in (least * 0.99, least * 1.01)]
     assert found == [False, True]
@@ -76,5 +76,5 @@ def test_k1_alone_folds_from_where_its_cubic_turns_back_before_the_corner() -> N
         ({"sightings": {}}, "drones[0].sensors.sightings.cameras[0]"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_where_they_stand(sensors: dict[str, Any], path: str) -> None:
+def test_invalid_settings_are_refused_with_their_path(sensors: dict[str, Any], path: str) -> None:
     assert faulty_fields({"name": "t", "duration_s": 1, "drones": DRONES, "sensors": sensors}) == [path]

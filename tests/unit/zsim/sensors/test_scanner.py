@@ -1,4 +1,4 @@
-"""Settings and messages of sensors that measure along rays: what is refused, and what a reader gets."""
+"""Settings and messages of sensors that measure along rays: what is refused, and what a reader receives."""
 
 import math
 from typing import Any
@@ -37,14 +37,14 @@ LIDAR.update({"elevation_rad": (0.0, 0.1), "azimuth_rad": (0.0, math.pi / 2)})
         ("depth", {}, "cameras[0]"),  # the drone has no front camera
     ],
 )
-def test_what_is_refused(section: str, settings: dict[str, Any], field: str):
+def test_invalid_settings_are_refused(section: str, settings: dict[str, Any], field: str):
     drone = {"name": "d1", "position_m": [0, 0, 0], "sensors": {"bottom_camera": {}, section: settings}}
     assert faulty_fields({"name": "t", "duration_s": 1, "drones": [drone]}, "drones[0].sensors.") == [
         f"{section}.{field}"
     ]
 
 
-def test_a_lidar_is_read_as_an_array_whose_zeros_are_infinite():
+def test_lidar_ranges_are_read_as_an_array_with_zeros_as_infinity():
     message = messages.decode("drone/d1/sensor/lidar", messages.encode(Lidar(**LIDAR)))
     np.testing.assert_array_equal(message.ranges(), [[1.5, math.inf], [2.0, 3.0]])
     np.testing.assert_allclose(message.directions()[0], [[1, 0, 0], [0, 1, 0]], atol=1e-12)
@@ -62,7 +62,7 @@ def test_a_lidar_is_read_as_an_array_whose_zeros_are_infinite():
         ),
     ],
 )
-def test_a_message_of_another_size_than_it_says_is_refused(message: Any, field: str):
+def test_a_message_whose_size_contradicts_its_fields_is_refused(message: Any, field: str):
     with pytest.raises(DecodeError) as refused:
         messages.decode(f"drone/d1/sensor/{type(message).__name__.lower()}", messages.encode(message))
     assert field in str(refused.value).split()

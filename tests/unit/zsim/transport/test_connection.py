@@ -1,4 +1,4 @@
-"""What is said when no world answers: nobody is there, or somebody is who does not let us in."""
+"""Connections: what is reported if no world answers, silent connections, and failures to listen."""
 
 import socket
 import time
@@ -60,7 +60,7 @@ LET_IN = Permissions("world", "operator.eve", {"read": ("zsim/**",)})
     ],
     ids=["not let in", "let in", "without certificates"],
 )
-def test_a_hub_that_answers_nothing_is_told_with_what_may_be_the_reason(
+def test_an_unresponsive_hub_is_reported_with_possible_reasons(
     monkeypatch: pytest.MonkeyPatch,
     endpoint: str,
     identity: Identity | None,
@@ -75,7 +75,7 @@ def test_a_hub_that_answers_nothing_is_told_with_what_may_be_the_reason(
     assert not_told not in text
 
 
-def test_a_port_that_opens_to_who_is_refused_may_be_one_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_open_port_that_refuses_the_session_is_reported_as_possibly_tls(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "connect", nobody)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -85,21 +85,21 @@ def test_a_port_that_opens_to_who_is_refused_may_be_one_with_tls(monkeypatch: py
 
 
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:7447", "tcp/127.0.0.1:70000", "tcp/nowhere", "unixsock-stream/x"])
-def test_an_endpoint_that_cannot_be_tried_is_one_where_nobody_listens(
+def test_an_endpoint_that_cannot_be_probed_counts_as_not_listening(
     monkeypatch: pytest.MonkeyPatch, endpoint: str
 ) -> None:
     monkeypatch.setattr(connection, "connect", nobody)
     assert has_terms(said(endpoint), "zsim world")
 
 
-# Connections that say nothing
+# Silent connections
 
-SILENT_CONNECTIONS = 150  # Zenoh of itself takes 100 at a time
+SILENT_CONNECTIONS = 150  # by default Zenoh accepts 100 at a time
 PATIENCE_S = 120.0
 
 
-def test_connections_that_say_nothing_keep_nobody_out(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(zenoh_settings, "ACCEPT_MS", round(10_000 * PATIENCE_S))  # none is given up meanwhile
+def test_silent_connections_keep_no_client_out(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(zenoh_settings, "ACCEPT_MS", round(10_000 * PATIENCE_S))  # none is dropped in the meantime
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     with connection.listen([endpoint], "zsim", "lockstep"), ExitStack() as left_open:
@@ -109,7 +109,7 @@ def test_connections_that_say_nothing_keep_nobody_out(monkeypatch: pytest.Monkey
             assert link.links() == 1
 
 
-def test_a_port_that_is_taken_is_refused_with_the_option_that_gives_another() -> None:
+def test_a_port_in_use_is_refused_with_the_option_for_another() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -119,7 +119,7 @@ def test_a_port_that_is_taken_is_refused_with_the_option_that_gives_another() ->
     assert has_terms(str(caught.value), endpoint, "--listen")
 
 
-def test_a_port_where_no_process_listens_may_be_tried_again() -> None:
+def test_a_port_without_a_listener_raises_no_listener_error() -> None:
     with pytest.raises(NoListenerError), connection.connect(f"tcp/127.0.0.1:{free_port()}", "zsim"):
         pass
 
@@ -133,7 +133,7 @@ def test_a_port_where_no_process_listens_may_be_tried_again() -> None:
         ("tcp/127.0.0.1:7447#iface=no-such", ("no such network interface",)),
     ],
 )
-def test_every_cause_of_not_listening_has_its_line(endpoint: str, terms: tuple[str, ...]) -> None:
+def test_every_cause_of_a_failure_to_listen_is_reported(endpoint: str, terms: tuple[str, ...]) -> None:
     identity = Identity(insecure=True)
     with (
         refused(SessionError, f"cannot listen on {endpoint}: ", *terms),
@@ -142,7 +142,7 @@ def test_every_cause_of_not_listening_has_its_line(endpoint: str, terms: tuple[s
         pass
 
 
-def test_causes_that_the_system_numbers_are_told_apart() -> None:
+def test_every_known_error_number_has_a_message_of_its_own() -> None:
     texts = {
         number: str(connection.no_listening(["tcp/h:1"], f"no listener: [h:1: some words (os error {number}))"))
         for number in connection._LISTEN_FAULTS
@@ -152,9 +152,9 @@ def test_causes_that_the_system_numbers_are_told_apart() -> None:
     assert "some words" in str(connection.no_listening(["tcp/h:1"], "some words (os error 5)"))
 
 
-def test_a_panic_of_zenoh_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_panic_in_zenoh_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     class PanicException(BaseException):
-        """As of pyo3, which exports none."""
+        """Like that of pyo3, which does not export it."""
 
     def fail(_: Any) -> None:
         raise PanicException("failed to spawn thread: no memory")
@@ -167,7 +167,7 @@ def test_a_panic_of_zenoh_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
-def test_the_hub_adds_nothing_to_a_message_and_has_room_for_the_largest_run() -> None:
+def test_the_hub_adds_no_timestamp_and_has_room_for_the_largest_run() -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     stamps: SimpleQueue[str | None] = SimpleQueue()
     with (
@@ -179,4 +179,4 @@ def test_the_hub_adds_nothing_to_a_message_and_has_room_for_the_largest_run() ->
             time.sleep(0.01)
         hub.put_sample("own", b"1", "")
         assert stamps.get(timeout=PATIENCE_S) is None
-    assert zenoh_settings.SESSIONS_MAX > DRONES_MAX + 100  # estimators, and who else comes
+    assert zenoh_settings.SESSIONS_MAX > DRONES_MAX + 100  # estimators and other participants

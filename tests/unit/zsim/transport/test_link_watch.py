@@ -69,7 +69,7 @@ class Case:
             self.watch.look()
 
 
-def test_a_stalled_reader_is_closed_but_an_awaited_process_is_only_reported():
+def test_a_stalled_reader_is_closed_and_an_awaited_process_only_reported():
     case = Case()
     case.sockets.held = {READER: STALL_BYTES, RECORDER: 100 * HELD_BYTES, ROUTER: 100 * HELD_BYTES}
     case.passes(STALL_S + 2 * LOOK_S)

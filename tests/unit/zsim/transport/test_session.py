@@ -1,4 +1,4 @@
-"""The start and the end of a session."""
+"""Sessions: opening, closing, permissions and the check for subscribers."""
 
 import shutil
 import subprocess
@@ -13,7 +13,7 @@ from zsim.errors import SessionError
 from zsim.transport.session import Session, open_session
 from zsim.transport.tls import Identity, Permissions
 
-ALONE = ("unshare", "--map-root-user", "--mount")  # Linux: mounts that nobody else sees
+ALONE = ("unshare", "--map-root-user", "--mount")  # Linux: a private mount namespace
 WITH_SHM = "mount -t tmpfs -o {options} tmpfs /dev/shm && exec {python} -c '{code}'"
 OPENS = """
 import os
@@ -40,8 +40,8 @@ def test_a_session_needs_no_shared_memory_and_leaves_nothing_in_it(options: str)
     assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
-def test_a_far_end_that_takes_nothing_does_not_fail_who_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Zenoh gives up closing after 10 s; nothing is lost by it that would still be taken."""
+def test_a_stalled_far_end_does_not_make_closing_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zenoh gives up closing after 10 s, which loses nothing that the far end would still have taken."""
     closed: list[None] = []
 
     def close() -> None:
@@ -54,7 +54,7 @@ def test_a_far_end_that_takes_nothing_does_not_fail_who_leaves(monkeypatch: pyte
     assert closed
 
 
-def test_permissions_that_cannot_be_read_are_an_error_of_the_session() -> None:
+def test_unreadable_permissions_raise_a_session_error() -> None:
     session = Session(SimpleNamespace(), "zsim", Identity("here"))  # type: ignore[arg-type]
     session.permissions = Permissions("world", "x", {"publish": ("zsim//clock",)})
     with pytest.raises(SessionError, match="clock"):
@@ -62,7 +62,7 @@ def test_permissions_that_cannot_be_read_are_an_error_of_the_session() -> None:
 
 
 class LatePublisher:
-    """A publisher to which somebody subscribes between Zenoh's answer and its use."""
+    """A publisher that gains a subscriber between Zenoh's answer and its use."""
 
     def declare_matching_listener(self, listener: Any) -> SimpleNamespace:
         self._listener = listener
@@ -77,6 +77,6 @@ class LatePublisher:
         return
 
 
-def test_who_subscribes_while_it_is_asked_whether_anybody_does_is_not_overlooked() -> None:
+def test_a_subscription_during_the_check_for_subscribers_is_noticed() -> None:
     raw: Any = SimpleNamespace(declare_publisher=lambda key, **settings: LatePublisher())
     assert Session(raw, "zsim", Identity("here")).has_subscribers("drone/*/truth")

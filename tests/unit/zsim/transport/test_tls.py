@@ -1,4 +1,4 @@
-"""What is known of an endpoint before anybody connects."""
+"""Endpoints that leave the machine, and the permissions that are reported to a process."""
 
 import pytest
 from refused import has_terms
@@ -14,11 +14,11 @@ OUT = ("tcp/0.0.0.0:7447", "tcp/[::]:7447", "udp/192.0.2.1:7447", "ws/lab-pc:80"
 
 
 @pytest.mark.parametrize("endpoint", [*LOCAL, *OUT])
-def test_a_link_leaves_the_machine_or_stays(endpoint: str):
+def test_only_endpoints_reachable_from_outside_leave_the_machine(endpoint: str):
     assert leaves_machine(endpoint) == (endpoint in OUT)
 
 
-# What a process is told that its certificate permits is what access control permits
+# The permissions reported to a process are those that access control grants
 
 
 ACTS: dict[Act, str] = {"publish": "p", "read": "r", "ask": "g"}
@@ -27,7 +27,7 @@ RULES = access_control(scenario_file.from_text(SCENARIO), ROLES, {"router.site":
 
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("act", ACTS)
-def test_what_a_role_may_do_is_what_the_table_says(role: str, act: Act) -> None:
+def test_the_permissions_of_a_role_match_the_table(role: str, act: Act) -> None:
     answer = messages.encode(permissions_of(RULES, "world", role))
     found = messages.decode_as(Permissions, answer, keys.access(role))
     assert found.refusal() is None
@@ -36,17 +36,17 @@ def test_what_a_role_may_do_is_what_the_table_says(role: str, act: Act) -> None:
 
 
 @pytest.mark.parametrize("name", ["operator.eve", "anyone", "estimator.drone2"])
-def test_who_is_not_named_is_not_let_in(name: str) -> None:
+def test_a_process_that_no_rule_names_is_refused(name: str) -> None:
     refusal = permissions_of(RULES, "world", name).refusal()
     assert has_terms(refusal, name, "world", *ROLES[:4], str(len(ROLES) - 3), "zsim certs init", "world")
 
 
-def test_what_is_like_the_wanted_key_is_named_first() -> None:
+def test_a_denial_names_the_most_similar_key_first() -> None:
     line = permissions_of(RULES, "world", "estimator.drone1").denial("publish", "drone/drone2/estimate", "zsim/")
     assert has_terms(line, "estimator.drone1", "publish", "drone/drone2/estimate", "drone/drone1/estimate", "3")
 
 
-def test_a_rule_that_denies_or_is_about_what_goes_out_allows_nothing() -> None:
+def test_a_deny_or_egress_rule_allows_nothing() -> None:
     rule = {"id": "a", "permission": "deny", "messages": ["put"], "key_exprs": ["zsim/**"]}
     others = {"subjects": [{"id": "s", "cert_common_names": ["x"]}], "policies": [{"subjects": ["s"], "rules": ["a"]}]}
     assert permissions_of({"rules": [rule], **others}, "world", "x").refusal()

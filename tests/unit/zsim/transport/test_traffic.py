@@ -1,4 +1,4 @@
-"""What passes the hub, and its replay: batches taken apart once, and what cannot be read is counted."""
+"""Traffic through the hub and its replay: batches are unpacked once, and unreadable payloads are counted."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ GATE = GateMessages.of(20, 1, key_table(DRONES), [(keys.truth("d1"), b"truth"), 
 
 
 def passed(*payloads: bytes) -> tuple[list[Any], int]:
-    """Return what arrives of some batches, and how often something was refused."""
+    """Return what arrives from these batches, and the number of refusals."""
     refusals: list[None] = []
     link: Any = FakeLink()
     traffic = Traffic(link, key_table(DRONES), lambda: refusals.append(None))
@@ -27,7 +27,7 @@ def passed(*payloads: bytes) -> tuple[list[Any], int]:
     return list(traffic.drain()), len(refusals)
 
 
-def test_messages_and_gates_come_in_the_order_in_which_they_passed() -> None:
+def test_messages_and_gates_arrive_in_the_order_they_were_sent() -> None:
     arrived, refused = passed(encode_batch([("clock", b"1"), (keys.GATE, GATE.pack()), ("my/own", b"2")]))
     assert arrived[0] == ReceivedSample("clock", b"1")
     assert arrived[1].pairs == GATE.pairs
@@ -36,7 +36,7 @@ def test_messages_and_gates_come_in_the_order_in_which_they_passed() -> None:
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\xc1", encode_batch([(keys.GATE, b"\xc1")])])
-def test_what_cannot_be_read_is_counted_and_the_rest_comes(garbage: bytes) -> None:
+def test_unreadable_payloads_are_counted_and_the_rest_arrives(garbage: bytes) -> None:
     arrived, refused = passed(garbage, encode_batch([("clock", b"1")]))
     assert (arrived, refused) == ([ReceivedSample("clock", b"1")], 1)
 
@@ -57,7 +57,7 @@ def pages(link: FakeLink, *answers: ControlAnswer) -> list[tuple[str, bytes]]:
     return list(replay(link, "quiet.one", 7, ["**"], 1.0))  # type: ignore[arg-type]
 
 
-def test_a_replay_goes_on_until_the_last_page():
+def test_a_replay_continues_until_the_last_page():
     link = FakeLink()
     first, second = ControlAnswer(True, result=[["a", b"1"]], more=41), ControlAnswer(True, result=[["b", b"2"]])
     assert pages(link, first, second) == [("a", b"1"), ("b", b"2")]
@@ -70,19 +70,19 @@ NO_PAIRS = [None, 7, "text", [1], [["a"]], [["a", "dGV4dA=="]], [["a", b"1", b"2
 
 
 @pytest.mark.parametrize("result", NO_PAIRS)
-def test_a_result_that_is_no_list_of_pairs_is_none(result: Any):
+def test_a_result_that_is_not_a_list_of_pairs_is_refused(result: Any):
     with refused(DecodeError, "list", "[key, payload]"):
         pairs_of(result)
     with refused(NoWorldError, "replay"):
         pages(FakeLink(), ControlAnswer(True, result=result))
 
 
-def test_no_answer_is_said():
+def test_a_missing_answer_is_reported():
     with pytest.raises(NoWorldError, match="nobody answered"):
         pages(FakeLink(), UNANSWERED)
 
 
 @pytest.mark.parametrize("payload", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1", b""])
-def test_a_batch_that_is_none_is_refused(payload: bytes):
+def test_an_invalid_batch_is_refused(payload: bytes):
     with refused(DecodeError, "@batch", "list"):
         decode_batch(payload)

@@ -1,4 +1,4 @@
-"""The limit of open files: raised where that is allowed, refused with the number needed where it is not."""
+"""The limit of open files: raised where allowed, otherwise refused with the required number."""
 
 import resource
 from collections.abc import Callable
@@ -15,7 +15,7 @@ Limits = Callable[[int, int], list[int]]
 
 @pytest.fixture
 def limits(monkeypatch: pytest.MonkeyPatch) -> Limits:
-    """Return what sets soft and hard limit of a process that is not this one, and returns them."""
+    """Return a function that replaces the limits of this process by fake ones and returns them (soft, hard)."""
 
     def install(soft: int, hard: int) -> list[int]:
         held = [soft, hard]
@@ -26,7 +26,7 @@ def limits(monkeypatch: pytest.MonkeyPatch) -> Limits:
     return install
 
 
-def test_a_soft_limit_is_raised_to_what_is_needed_and_a_hard_one_refuses(limits: Limits) -> None:
+def test_the_soft_limit_is_raised_as_required_up_to_the_hard_one(limits: Limits) -> None:
     held = limits(16, 1024)
     require_files(100, "10 processes")
     assert held == [100, 1024]
@@ -36,7 +36,7 @@ def test_a_soft_limit_is_raised_to_what_is_needed_and_a_hard_one_refuses(limits:
         require_files(2000, "200 processes")
 
 
-def test_what_is_only_wanted_is_raised_as_far_as_it_goes(limits: Limits) -> None:
+def test_an_optional_raise_goes_as_far_as_the_hard_limit(limits: Limits) -> None:
     held = limits(256, 512)
     assert allow_files(2000) == 512
     assert held == [512, 512]
@@ -45,8 +45,8 @@ def test_what_is_only_wanted_is_raised_as_far_as_it_goes(limits: Limits) -> None
 
 
 @pytest.mark.parametrize(("clients", "measured"), [(2, 26), (4, 31), (11, 48), (31, 92)])
-def test_a_hub_needs_what_was_measured_and_room(clients: int, measured: int) -> None:
+def test_the_files_of_a_hub_are_the_measured_number_plus_a_margin(clients: int, measured: int) -> None:
     assert measured < hub_files(clients) < 2 * measured + zenoh_settings.SESSION_FILES
     assert launcher_files(clients + 1, clients) >= hub_files(clients)
-    # a host of many agents: its world waits for all
+    # a host of many agents, for all of which its world waits
     assert launcher_files(roles=3, names=clients) >= hub_files(clients)

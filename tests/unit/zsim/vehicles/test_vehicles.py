@@ -1,4 +1,4 @@
-"""Vehicles as data: stock ones are sound, and what is none is refused with one line."""
+"""Vehicles as data: stock ones are valid, and an invalid one is refused in one line."""
 
 import math
 import re
@@ -32,7 +32,7 @@ def fault_of(**drone: Any) -> str:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_stock_vehicle_gives_a_drone_its_numbers(model: str):
+def test_a_drone_takes_the_values_of_its_stock_vehicle(model: str):
     vehicle = vehicle_of(model)
     drone = scenario_file.resolve(document(model=model)).drones[0]
     assert {name: getattr(drone, name) for name in VEHICLE_NUMBERS} == {
@@ -43,7 +43,7 @@ def test_a_stock_vehicle_gives_a_drone_its_numbers(model: str):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_every_number_of_a_stock_vehicle_has_its_source_or_reason(model: str):
+def test_every_value_of_a_stock_vehicle_has_a_source_or_reason(model: str):
     text = Path(str(STOCK[model].__file__)).read_text()
     numbers = [line for line in text.splitlines() if re.match(r"\s+\w+=\(?-?[\d.]", line)]
     assert len(numbers) > 30
@@ -56,7 +56,7 @@ def test_a_drone_overrides_its_vehicle_field_by_field():
     assert (drone.limits.tilt_deg, drone.limits.horizontal_speed_m_s) == (12.0, 2.0)
 
 
-def test_a_module_of_the_users_is_a_model_that_nobody_imports_who_reads_the_resolved_scenario():
+def test_a_resolved_scenario_is_read_without_the_module_of_its_model():
     hexacopter = scenario_file.resolve(document(model="hexacopter"))
     assert hexacopter.drones[0].thrust_n_s2 == pytest.approx(8.048e-6 * 2 / 3)
     text = scenario_file.to_text(hexacopter)
@@ -64,11 +64,11 @@ def test_a_module_of_the_users_is_a_model_that_nobody_imports_who_reads_the_reso
     assert other.drones[0].model == "not_here.at_all"
 
 
-def test_a_fault_names_a_rotor_that_the_vehicle_has():
+def test_a_rotor_fault_must_name_a_rotor_of_the_vehicle():
     fault = {"kind": "rotor_stuck", "target": "a", "at_s": 1, "rotor": "rotor3"}
     assert scenario_file.resolve(document(model="hexacopter") | {"faults": [fault]}).faults
     resolved = scenario_file.to_text(scenario_file.resolve(document(model="hexacopter") | {"faults": [fault]}))
-    assert scenario_file.from_text(resolved.replace("hexacopter", "not_here.at_all")).faults  # by an agent
+    assert scenario_file.from_text(resolved.replace("hexacopter", "not_here.at_all")).faults  # as read by an agent
     for model, rotor in (("hexacopter", "front_left"), ("ardrone2", "rotor3"), ("crazyflie2", "rotor3")):
         with pytest.raises(ScenarioError) as error:
             scenario_file.resolve(document(model=model) | {"faults": [fault | {"rotor": rotor}]})
@@ -79,7 +79,7 @@ def test_a_fault_names_a_rotor_that_the_vehicle_has():
 
 
 @pytest.mark.parametrize("model", ["ardrone_9", "no_such.module", "3d", "a/b"])
-def test_an_unknown_model_is_a_line_with_drone_value_and_what_is_allowed(model: str):
+def test_an_unknown_model_is_reported_with_drone_value_and_known_models(model: str):
     line = fault_of(model=model)
     for part in ("drones[0].model", repr(model), "ardrone2, crazyflie2", "(drone 'a')"):
         assert part in line
@@ -93,7 +93,7 @@ def test_an_unknown_model_is_a_line_with_drone_value_and_what_is_allowed(model: 
         ({"VEHICLE": replace(ardrone2.VEHICLE, mass_kg=-1.0)}, "VEHICLE.mass_kg is -1.0"),
     ],
 )
-def test_a_module_without_a_sound_vehicle_is_refused(monkeypatch: pytest.MonkeyPatch, contents: Any, found: str):
+def test_a_module_without_a_valid_vehicle_is_refused(monkeypatch: pytest.MonkeyPatch, contents: Any, found: str):
     module = ModuleType("my_plane")
     vars(module).update(contents)
     monkeypatch.setitem(sys.modules, "my_plane", module)
@@ -122,7 +122,7 @@ CROSS = cross_layout(0.2)
     ],
     ids=["three", "one twice", "off the centre", "in a line", "mass almost under the front"],
 )
-def test_rotors_that_cannot_hold_it_level_are_refused(rotors: tuple[Rotor, ...], text: str):
+def test_rotors_that_cannot_hold_a_vehicle_level_are_refused(rotors: tuple[Rotor, ...], text: str):
     with pytest.raises(ValueError, match=text):
         with_rotors(*rotors)
     with pytest.raises(ValueError, match=r"arm_m is 0\.25\b.* 0\.1785 m"):
@@ -135,8 +135,8 @@ def test_mixing_inverts_the_allocation_and_adds_no_thrust():
         np.testing.assert_allclose(mixing(vehicle).sum(axis=0), 0.0, atol=1e-9)
 
 
-def test_the_lift_is_shared_so_that_nothing_turns():
-    """Two arms of one length and two of half of it: the near ones bear twice as much, 4/3 of the mean."""
+def test_the_lift_is_shared_without_a_moment():
+    """Two arms are half as long as the other two: their rotors carry twice as much, 4/3 of the mean."""
     rotors = [replace(each, x_m=each.x_m * (1.0 if each.x_m > 0 else 0.5)) for each in cross_layout(0.2)]
     vehicle = with_rotors(*rotors)
     np.testing.assert_allclose(lift_shares(vehicle), [2 / 3, 2 / 3, 4 / 3, 4 / 3], rtol=1e-9)
