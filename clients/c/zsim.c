@@ -1,6 +1,6 @@
-/* The client of `zsim gateway` for C; zsim.h says how to use it.
+/* C client for `zsim gateway`; zsim.h describes its use.
 
-   From top to bottom: JSON read, JSON written, the socket, lines, requests, the calls of zsim.h. */
+   From top to bottom: JSON reader, JSON writer, socket, lines, requests, and the functions of zsim.h. */
 #ifdef _WIN32
 #define _WIN32_WINNT 0x0600 /* WSAPoll */
 #else
@@ -41,23 +41,23 @@ typedef int socket_type;
 #define close_socket close
 #define WOULD_BLOCK (errno == EAGAIN || errno == EWOULDBLOCK || errno == EINPROGRESS || errno == EINTR)
 #ifdef MSG_NOSIGNAL
-#define SEND_FLAGS MSG_NOSIGNAL /* a gateway that is gone is an error, not the end of this program */
+#define SEND_FLAGS MSG_NOSIGNAL /* report a closed connection as an error, not by SIGPIPE */
 #else
 #define SEND_FLAGS 0
 #endif
 #endif
 
-/* JSON, read where it stands */
+/* Reading JSON in place */
 
 enum {
-    DEPTH_MAX = 64, /* levels; a bit each */
-    NUMBER_MAX = 400, /* bytes; the longest exact double has 767 digits, but nobody sends those */
+    DEPTH_MAX = 64, /* levels, one bit each */
+    NUMBER_MAX = 400, /* bytes; writing a double exactly can take 767 digits, but no known sender does so */
     REPLACEMENT = 0xFFFD
 };
 
-static const double ANSWER_S = 1.0; /* at least, for an answer */
-static const double PATIENCE_S = 3600.0; /* of one poll, whose argument is an int of milliseconds */
-static const double RETURN_S = 1.0; /* for an answer of a gateway that waits for others' answers */
+static const double ANSWER_S = 1.0; /* minimum timeout for an answer */
+static const double PATIENCE_S = 3600.0; /* longest single poll, whose argument is an int of milliseconds */
+static const double RETURN_S = 1.0; /* additional timeout if the gateway itself waits for an answer */
 
 typedef struct {
     const char *at, *end;
@@ -89,7 +89,7 @@ static void skip_space(reader *in)
         in->at++;
 }
 
-/* Tell what comes, 0 at the end. */
+/* Return the next character, 0 at the end. */
 static char peek(const reader *in)
 {
     return in->at < in->end ? *in->at : '\0';
@@ -139,7 +139,7 @@ static int hex_digit(char c)
     return c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
 }
 
-/* Read the four digits of \uXXXX; -1 if they are not there. */
+/* Read the four digits of \uXXXX; return -1 if they are missing. */
 static long read_unit(reader *in)
 {
     long unit = 0;
@@ -154,7 +154,8 @@ static long read_unit(reader *in)
     return unit;
 }
 
-/* Read what stands behind \u, both halves of a pair; what is none, or 0, becomes U+FFFD. -1: no hexadecimal. */
+/* Read the character after \u, including both halves of a surrogate pair; 0 and a lone surrogate become U+FFFD. Return
+   -1 if the digits are not hexadecimal. */
 static long read_escaped(reader *in)
 {
     long first = read_unit(in), second;
@@ -196,10 +197,11 @@ static size_t encode(long point, char out[4])
     return 4;
 }
 
-/* Read a character of a string whose opening quote is behind us: its bytes, 0 at the closing quote, -1 at a fault. */
+/* Read a character of a string after its opening quote; return its number of bytes, 0 at the closing quote, -1 on a
+   syntax error. */
 static int read_char(reader *in, char out[4])
 {
-    static const char escapes[] = "\"\"\\\\//b\bf\fn\nr\rt\t"; /* what is written, what is meant */
+    static const char escapes[] = "\"\"\\\\//b\bf\fn\nr\rt\t"; /* pairs: the escaped and the actual character */
     long point;
     if (in->at == in->end || (unsigned char)*in->at < 0x20)
         return -1;
@@ -265,7 +267,7 @@ static int skip_name(reader *in)
     return skip_char(in, ':');
 }
 
-/* What is open around a value: how many levels, and which of them are maps. */
+/* The open levels around a value: how many there are, and which of them are maps. */
 typedef struct {
     int depth;
     uint64_t maps;
@@ -276,7 +278,7 @@ static int in_map(const levels *open)
     return (int)(open->maps >> (open->depth - 1) & 1);
 }
 
-/* Enter a list or map; 1 if a value follows, 0 if it is closed at once, -1 at a fault. */
+/* Enter a list or map; return 1 if a value follows, 0 if it is empty, -1 on a syntax error. */
 static int enter(reader *in, levels *open)
 {
     int map = *in->at++ == '{';
@@ -290,7 +292,7 @@ static int enter(reader *in, levels *open)
     return map && !skip_name(in) ? -1 : 1;
 }
 
-/* Behind a value: 1 if another follows, 0 if all levels are closed, -1 at a fault. */
+/* Continue after a value; return 1 if another follows, 0 if all levels are closed, -1 on a syntax error. */
 static int leave_value(reader *in, levels *open)
 {
     while (open->depth > 0) {
@@ -304,7 +306,7 @@ static int leave_value(reader *in, levels *open)
     return 0;
 }
 
-/* Go behind a value, without recursion: a line may not decide how much stack is used. */
+/* Skip a value, without recursion, so that the input does not determine how much stack is used. */
 static int skip_value(reader *in)
 {
     levels open = {0, 0};
@@ -372,7 +374,7 @@ int zsim_each(zsim_json value, size_t *at, zsim_json *name, zsim_json *entry)
     return entry->length > 0;
 }
 
-/* Tell whether a JSON text says these bytes. */
+/* Return whether a JSON text, unescaped, equals these bytes. */
 static int says(zsim_json text, const char *wanted, size_t length)
 {
     reader in = reader_of(text);
@@ -389,7 +391,7 @@ static int says(zsim_json text, const char *wanted, size_t length)
     return count == 0 && length == 0;
 }
 
-/* The number that a part of a path is; SIZE_MAX if it is none. */
+/* Return a part of a path as a number; SIZE_MAX if it is not one. */
 static size_t index_of(const char *part, size_t length)
 {
     size_t number = 0;
@@ -425,7 +427,7 @@ zsim_json zsim_get(zsim_json value, const char *path)
     }
 }
 
-/* Read a number with strtod, which wants the locale's decimal point. */
+/* Read a number with strtod, which expects the locale's decimal point. */
 static int to_double(zsim_json text, double *number)
 {
     const char *point = localeconv()->decimal_point;
@@ -478,7 +480,7 @@ int zsim_integer(zsim_json value, const char *path, int64_t *number)
     zsim_json text = zsim_get(value, path);
     reader in = reader_of(text);
     int negative = skip_char(&in, '-');
-    int64_t read = 0; /* negative, since the least number has no positive one */
+    int64_t read = 0; /* accumulated as a negative number, since INT64_MIN has no positive counterpart */
     if (in.at == in.end)
         return 0;
     for (; in.at < in.end; in.at++) {
@@ -526,7 +528,7 @@ int zsim_is_true(zsim_json value, const char *path)
     return found.length == 4 && memcmp(found.text, "true", 4) == 0;
 }
 
-/* JSON, written into a buffer */
+/* Writing JSON into a buffer */
 
 typedef struct {
     char *text;
@@ -573,7 +575,7 @@ static void write_integer(writer *out, int64_t number)
 
 int zsim_format(double number, char text[32])
 {
-    char local[48]; /* at most 24 and the locale's decimal point */
+    char local[48]; /* at most 24 characters, plus the locale's decimal point */
     size_t used = 0;
     if (!isfinite(number))
         return 0;
@@ -582,7 +584,7 @@ int zsim_format(double number, char text[32])
         if (is_digit(*byte) || *byte == '-' || *byte == '+' || *byte == 'e')
             text[used++] = *byte;
         else if (used > 0 && text[used - 1] != '.')
-            text[used++] = '.'; /* however many bytes the point has there */
+            text[used++] = '.'; /* the locale's decimal point may have several bytes */
     }
     text[used] = '\0';
     return 1;
@@ -597,7 +599,7 @@ static int write_number(writer *out, double number)
     return 1;
 }
 
-/* Write a user's JSON as one line; 0 if it is none. */
+/* Write the user's JSON as one line; return 0 if it is invalid. */
 static int write_json(writer *out, const char *json)
 {
     zsim_json value = zsim_parse(json, strlen(json));
@@ -607,30 +609,30 @@ static int write_json(writer *out, const char *json)
     write_bytes(out, value.text, value.length);
     for (; from < out->length; from++)
         if (out->text[from] == '\n' || out->text[from] == '\r')
-            out->text[from] = ' '; /* between values; in texts they are escaped */
+            out->text[from] = ' '; /* only between values: within texts they are escaped */
     return 1;
 }
 
-/* The client's inside */
+/* Internal state of a client */
 
 struct zsim_inside {
     socket_type socket;
     double timeout_s;
     int64_t id; /* of the newest request */
     int64_t done_id; /* of the newest done */
-    int sits; /* has joined */
-    int open; /* a gate waits for its done */
+    int sits; /* has joined the lockstep */
+    int open; /* a gate is not answered yet */
     int in_put; /* between put_begin and put_end */
-    int faulty; /* a field of the put was wrong; `error` says which */
-    size_t mark, fields; /* of the put that is being written */
-    size_t first, last; /* of what was received and not yet taken */
-    zsim_json line; /* taken last */
-    writer out, said; /* a request; the outputs of the gate */
-    char *received, *taken, *gate, *info; /* ZSIM_LINE_MAX each */
-    char key[ZSIM_KEY_MAX]; /* of the put that is being written */
+    int faulty; /* a field of the put was invalid; `error` names it */
+    size_t mark, fields; /* of the put being written: its start, and its number of fields */
+    size_t first, last; /* range of the received bytes that are not taken yet */
+    zsim_json line; /* the one taken last */
+    writer out, said; /* the request; the outputs of the open gate */
+    char *received, *taken, *gate, *info; /* ZSIM_LINE_MAX bytes each */
+    char key[ZSIM_KEY_MAX]; /* of the put being written */
 };
 
-/* Keep a sentence in `error`, in one line; return -1. */
+/* Write a message to `error`, as one line; return -1. */
 static int fail(zsim_client *c, const char *format, ...)
 {
     va_list arguments;
@@ -716,7 +718,7 @@ static int is_ready(socket_type socket, short events, double left_s)
     return poll(&waiting, 1, (int)ceil(1e3 * fmax(0.0, fmin(left_s, PATIENCE_S)))) > 0;
 }
 
-/* Wait until a socket can be read or written; 0 when the time is up. A negative `until_s` is never. */
+/* Wait until a socket can be read or written; return 0 at the deadline. A negative `until_s` means no deadline. */
 static int wait_for(socket_type socket, short events, double until_s)
 {
     double left_s = until_s < 0.0 ? PATIENCE_S : until_s - wall_s();
@@ -728,7 +730,7 @@ static double deadline(double timeout_s)
     return timeout_s < 0.0 ? -1.0 : wall_s() + timeout_s;
 }
 
-/* Open or close a gate: what is written from here on goes elsewhere. */
+/* Open or close a gate. Messages are collected while it is open, and sent directly while none is. */
 static void set_open(struct zsim_inside *in, int open)
 {
     in->open = open;
@@ -753,7 +755,7 @@ static int set_up(socket_type socket)
     return stop_blocking(socket) && setsockopt(socket, IPPROTO_TCP, TCP_NODELAY, (const char *)&on, sizeof on) == 0;
 }
 
-/* Tell whether a connection that was begun has come about. */
+/* Return whether a pending connection has been established. */
 static int is_connected(socket_type socket)
 {
     int error = 1;
@@ -781,7 +783,7 @@ static void pause_before_dialling(void)
 #ifdef _WIN32
     Sleep(100);
 #else
-    poll(NULL, 0, 100); /* ms: a gateway on its way up is there soon enough, and nobody is flooded */
+    poll(NULL, 0, 100); /* ms between two attempts, while a gateway may be starting */
 #endif
 }
 
@@ -838,7 +840,7 @@ static int send_all(zsim_client *c, const char *bytes, size_t count)
     return 1;
 }
 
-/* Lines: what was received, in order; who waits for one takes it out and leaves the others where they are */
+/* Lines: received ones are kept in order; a caller removes the one for which it waits and leaves the others in place */
 
 enum { VALUE = 1, GATE = 2, LEFT = 4, RUN = 8, ERROR_LINE = 16, ANSWER = 32, OTHER = 64 };
 
@@ -871,7 +873,7 @@ static void remove_bytes(struct zsim_inside *in, size_t from, size_t to)
         in->first = in->last = 0;
 }
 
-/* Tell what a line is to a client: a refused done of a seat that is lost is nothing any more. */
+/* Return the kind of a line for this client: the refusal of a done is ignored once the lockstep session has ended. */
 static int kind_here(const zsim_client *c, zsim_json line, int64_t awaited)
 {
     int kind = kind_of(line, awaited);
@@ -881,7 +883,7 @@ static int kind_here(const zsim_client *c, zsim_json line, int64_t awaited)
     return kind;
 }
 
-/* Take what nobody waits for out of the way: notes, and answers that came too late. */
+/* Handle a line for which no caller waits: a notice, or a late answer, which is ignored. */
 static void pass_over(zsim_client *c, zsim_json line)
 {
     int64_t lost = 0;
@@ -903,7 +905,7 @@ static int keep(zsim_client *c, zsim_json line, int kind)
     return kind;
 }
 
-/* Look through what was received from `*from` on; return the kind of the line that is taken, 0 if none is wanted. */
+/* Search the lines received from `*from` on; take the first wanted one and return its kind, 0 if there is none. */
 static int take_received(zsim_client *c, int wanted, int64_t awaited, size_t *from)
 {
     struct zsim_inside *in = c->inside;
@@ -931,7 +933,7 @@ static int take_received(zsim_client *c, int wanted, int64_t awaited, size_t *fr
     return 0;
 }
 
-/* Make room: move what is there to the front; if it is full, the oldest value goes. 0: there is none. */
+/* Move the received bytes to the front; if the buffer is full, drop the oldest value. Return 0 if it stays full. */
 static int make_room(zsim_client *c, size_t *from)
 {
     struct zsim_inside *in = c->inside;
@@ -970,7 +972,7 @@ static int receive(zsim_client *c, size_t *from)
     return count < 0 && WOULD_BLOCK ? 0 : lose(c, "the gateway hung up");
 }
 
-/* Take the first line of a wanted kind; return its kind, 0 when the time is up, -1 if the connection is lost. */
+/* Take the first line of a wanted kind; return its kind, 0 on a timeout, -1 if the connection is lost. */
 static int take(zsim_client *c, int wanted, int64_t awaited, double until_s)
 {
     size_t from = c->inside->first;
@@ -979,7 +981,7 @@ static int take(zsim_client *c, int wanted, int64_t awaited, double until_s)
         if (found != 0)
             return found;
         if (tries > 0 && until_s >= 0.0 && wall_s() > until_s)
-            return 0; /* others' lines may come without end */
+            return 0; /* unwanted lines might otherwise extend the wait without end */
         came = receive(c, &from);
         if (came < 0)
             return came;
@@ -994,7 +996,7 @@ static void begin(zsim_client *c, const char *op)
 {
     writer *out = &c->inside->out;
     if (!c->inside->open)
-        c->inside->in_put = 0; /* it was written here: a put is not to be interrupted */
+        c->inside->in_put = 0; /* this request overwrites the unfinished put, if any */
     out->length = 0;
     out->full = 0;
     write_raw(out, "{\"op\":\"");
@@ -1025,7 +1027,7 @@ static int send_request(zsim_client *c)
     return send_all(c, out->text, out->length);
 }
 
-/* Tell what was refused; a refused done leaves its gate open. */
+/* Report a refusal in `error`; after a refused done, its gate is open again. */
 static int refused(zsim_client *c)
 {
     char text[ZSIM_ERROR_MAX];
@@ -1035,7 +1037,7 @@ static int refused(zsim_client *c)
         set_open(c->inside, 1);
     if (error.length == 0)
         return fail(c, "zsim: the gateway refused something, and did not say why");
-    if (!zsim_text(error, "", text, sizeof text)) /* longer than that: its beginning */
+    if (!zsim_text(error, "", text, sizeof text)) /* too long: use its beginning */
         snprintf(text, sizeof text, "%.*s", (int)(error.length < 500 ? error.length : 500), error.text);
     return fail(c, "%s", text);
 }
@@ -1064,7 +1066,7 @@ static int request_on(zsim_client *c, const char *op, const char *key)
 
 /* Connecting */
 
-/* Keep what the gateway said of itself and of the run; 0 if there is none. */
+/* Store the gateway's answer to hello; return 0 if there is no run. */
 static int know(zsim_client *c)
 {
     struct zsim_inside *in = c->inside;
@@ -1203,14 +1205,14 @@ int zsim_ask(zsim_client *c, const char *key, const char *request_name, const ch
     return fail(c, "%.200s %.100s: %s", key, request_name, *why ? why : "refused");
 }
 
-/* Speaking */
+/* Publishing */
 
 static writer *target(zsim_client *c)
 {
     return c->inside->open ? &c->inside->said : &c->inside->out;
 }
 
-/* Take back what a put has written. */
+/* Discard what a put has written. */
 static int withdraw(zsim_client *c)
 {
     writer *out = target(c);
@@ -1221,12 +1223,12 @@ static int withdraw(zsim_client *c)
     return -1;
 }
 
-/* Begin an output of the gate, or a request of its own. */
+/* Begin an output of the open gate, or a separate request if none is open. */
 static writer *begin_put(zsim_client *c, const char *key)
 {
     writer *out = target(c);
     if (c->inside->in_put)
-        withdraw(c); /* begun, and never ended */
+        withdraw(c); /* an earlier put was not ended */
     c->inside->in_put = 0;
     c->inside->faulty = 0;
     c->inside->mark = out->length;
@@ -1279,7 +1281,7 @@ void zsim_put_begin(zsim_client *c, const char *key)
     c->inside->fields = 0;
 }
 
-/* Begin a field; NULL where there is no put to add it to. */
+/* Begin a field; return NULL if no put has been begun. */
 static writer *begin_field(zsim_client *c, const char *name)
 {
     writer *out;
@@ -1385,7 +1387,7 @@ int zsim_mode(zsim_client *c, const char *drone, const char *mode)
 
 /* The lockstep */
 
-/* Write a list of the words in a text. */
+/* Write the words of a text as a list. */
 static void list_field(zsim_client *c, const char *name, const char *words)
 {
     writer *out = &c->inside->out;
@@ -1410,7 +1412,7 @@ int zsim_join(zsim_client *c, const char *name, double period_s, const char *rea
     if (c->inside->sits)
         return fail(c, "zsim_join: is %.64s already; zsim_leave first, or use another connection", c->name);
     while (take(c, GATE | LEFT, 0, deadline(0.0)) > 0)
-        ; /* of a former seat */
+        ; /* lines of an earlier lockstep session */
     begin(c, "join");
     text_field(c, "name", name);
     write_name(&c->inside->out, "period_s");

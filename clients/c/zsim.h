@@ -1,7 +1,7 @@
-/* The client of `zsim gateway` for C: one header, one file, no dependency.
+/* C client for `zsim gateway`: one header and one source file without dependencies.
 
-   C99 with POSIX sockets, or Winsock. Memory is taken once, in zsim_connect; nothing is allocated afterwards.
-   A client belongs to one thread. docs/clients-c.md has a first program, docs/gateway.md what goes over the wire.
+   C99 with POSIX sockets or Winsock. Memory is allocated only in zsim_connect. Use a client in one thread only.
+   docs/clients-c.md has a first program; docs/gateway.md describes the protocol.
 
        zsim_client c;
        double p_WB[3];
@@ -14,8 +14,9 @@
        }
        zsim_close(&c);
 
-   What functions with a client return: 1 done, 0 nothing came in time, -1 failed, and `error` says why in one line.
-   Units are SI and radians, times `t_ns` simulated nanoseconds, frames those of docs/conventions.md. */
+   Functions with a client return 1 on success, 0 on a timeout or as described below, and -1 on failure, with the reason
+   as one line in `error`. Units are SI and radians; times `t_ns` are simulated nanoseconds; frames are those of
+   docs/conventions.md. */
 #ifndef ZSIM_H
 #define ZSIM_H
 
@@ -26,104 +27,109 @@
 extern "C" {
 #endif
 
-#define ZSIM_PORT 7470 /* of `zsim gateway`: lines */
-#define ZSIM_KEY_MAX 512 /* bytes of a key, its end included */
-#define ZSIM_ERROR_MAX 512 /* bytes of an error, its end included */
+#define ZSIM_PORT 7470 /* default port of the gateway for lines */
+#define ZSIM_KEY_MAX 512 /* bytes of a key, including the terminating null */
+#define ZSIM_ERROR_MAX 512 /* bytes of an error, including the terminating null */
 #ifndef ZSIM_LINE_MAX
-#define ZSIM_LINE_MAX 4194304 /* bytes of what is received; the gateway keeps 4 MB for a client */
+#define ZSIM_LINE_MAX 4194304 /* bytes of the longest received line; the gateway buffers 4 MB per client */
 #endif
 #ifndef ZSIM_REQUEST_MAX
-#define ZSIM_REQUEST_MAX 1000000 /* bytes of a request: the gateway's limit */
+#define ZSIM_REQUEST_MAX 1000000 /* bytes of the longest request: the gateway's limit */
 #endif
 
-/* JSON, read where it stands. A piece of text; length 0 is "there is none". Every reader takes any bytes. */
+/* A JSON value inside a text, which is parsed in place; length 0 means no value. All readers accept any bytes. */
 typedef struct {
     const char *text;
     size_t length;
 } zsim_json;
 
-/* The value in a text; none if the text is no JSON, or has more than 64 levels. */
+/* Return the value in a text; no value if the text is not valid JSON or has more than 64 levels. */
 zsim_json zsim_parse(const char *text, size_t length);
 
-/* The value at a path such as "inputs.0.value.position_m"; "" is the value itself. */
+/* Return the value at a path such as "inputs.0.value.position_m"; "" means the value itself. */
 zsim_json zsim_get(zsim_json value, const char *path);
 
-/* These return 1 and set what they read, or return 0 and leave it: not there, of another type, or out of range. */
+/* These return 1 and set the variable. If the value is missing, of another type, or out of range, they return 0 and do
+   not change it. */
 int zsim_number(zsim_json value, const char *path, double *number);
-int zsim_numbers(zsim_json value, const char *path, double *numbers, size_t count); /* a list of exactly so many */
+int zsim_numbers(zsim_json value, const char *path, double *numbers, size_t count); /* a list of exactly `count` */
 int zsim_integer(zsim_json value, const char *path, int64_t *number);
-int zsim_text(zsim_json value, const char *path, char *text, size_t size); /* UTF-8; what C cannot hold is U+FFFD */
+int zsim_text(zsim_json value, const char *path, char *text, size_t size); /* UTF-8; invalid code points are U+FFFD */
 
-/* Tell whether there is this text, or `true`, at a path. */
+/* Return whether the value at a path is this text, or `true`. */
 int zsim_is(zsim_json value, const char *path, const char *text);
 int zsim_is_true(zsim_json value, const char *path);
 
-/* Go through a list or a map: 1 and the next entry, until 0. `at` begins with 0; `name` is a JSON text, none in lists. */
+/* Iterate over a list or map: return 1 and the next entry, or 0 at the end. `*at` must be 0 before the first call; in
+   maps `name` is a JSON text, in lists no value. */
 int zsim_each(zsim_json value, size_t *at, zsim_json *name, zsim_json *entry);
 
-/* Write a number so that it reads back as the same bits, whatever the locale; 0 if it is not finite. */
+/* Write a number such that it is read back with the same bits, in any locale; return 0 if it is not finite. */
 int zsim_format(double number, char text[32]);
 
 struct zsim_inside;
 
 typedef struct {
-    char name[64]; /* who it is, such as client.laptop */
+    char name[64]; /* of this client, e.g. client.laptop */
     char run_id[64];
     char mode[16]; /* lockstep or realtime */
-    double gate_s; /* the grid of time */
-    int64_t t_ns; /* of the gate that came last; before the first, of the newest when it connected */
-    zsim_json info; /* all of the gateway's hello: drones, clusters, ... */
-    zsim_json inputs; /* of the gate: list of {"key", "value"}; valid until the next zsim_gate */
+    double gate_s; /* period of the gates */
+    int64_t t_ns; /* of the last gate received; before the first one, of the newest gate at the hello */
+    zsim_json info; /* the gateway's complete hello: drones, clusters, ... */
+    zsim_json inputs; /* of the last gate received: list of {"key", "value"}; valid until the next zsim_gate */
     zsim_json answer; /* to zsim_latest and zsim_ask; valid until the next call that waits */
-    uint64_t lost; /* values that came faster than they were read, and went */
+    uint64_t lost; /* number of values dropped because they arrived faster than they were read */
     char error[ZSIM_ERROR_MAX];
     struct zsim_inside *inside;
 } zsim_client;
 
-/* Connect and say hello. Waits `timeout_s` for the gateway and for a run; so long at most, later, for an answer,
-   but 1 s at least.
-   `name` without a dot becomes client.NAME; `token` is NULL where none is asked for. On -1 there is nothing to close. */
+/* Connect and say hello. Wait up to `timeout_s` for the gateway and a run; later calls wait that long for an answer,
+   but at least 1 s. A `name` without a dot becomes client.NAME; `token` is NULL if none is required. After -1 there is
+   nothing to close. */
 int zsim_connect(zsim_client *c, const char *host, int port, const char *name, const char *token, double timeout_s);
 
-/* Ask for `name`, `run_id`, `mode`, `gate_s` and `info` again: another run began. 0 if none goes on. */
+/* Update `name`, `run_id`, `mode`, `gate_s`, `t_ns` and `info`, e.g. when another run has begun; return 0 if there is
+   no run. */
 int zsim_hello(zsim_client *c);
 
-/* Leave and hang up; of a client that is closed already, nothing. */
+/* Leave the lockstep session, if any, and close the connection. Closing a client again has no effect. */
 void zsim_close(zsim_client *c);
 
-/* Values. Keys may have wildcards in subscribe, unsubscribe and latest. */
+/* Values. In subscribe, unsubscribe and latest, keys may contain wildcards. */
 typedef struct {
-    char key[ZSIM_KEY_MAX]; /* empty if it is longer */
+    char key[ZSIM_KEY_MAX]; /* empty if it does not fit */
     zsim_json value; /* valid until the next call that waits */
 } zsim_value;
 
 int zsim_subscribe(zsim_client *c, const char *key);
 int zsim_unsubscribe(zsim_client *c, const char *key);
 
-/* The next value of what is subscribed to. -1 also when a run ends, or what was said without waiting was refused. */
+/* Get the next value of the subscriptions. Also return -1 when a run ends, or when a message sent without waiting was
+   refused. */
 int zsim_next(zsim_client *c, zsim_value *value, double timeout_s);
 
-/* The last value of a key, 0 if there is none; `answer` has all that an expression takes, under "values". */
+/* Get the last value of a key; return 0 if there is none. "values" in `answer` has those of all keys that match an
+   expression. */
 int zsim_latest(zsim_client *c, const char *key, zsim_json *value);
 
-/* Ask the world or a controller: zsim_ask(c, "world/control", "pause", NULL). `args` is a JSON map or NULL.
-   1: granted, `answer` has "result". -1: refused, or nobody answers. */
+/* Send a request to the world or a controller: zsim_ask(&c, "world/control", "pause", NULL). `args` is a JSON map or
+   NULL. Return 1 if it is granted, with "result" in `answer`, and -1 if it is refused or not answered. */
 int zsim_ask(zsim_client *c, const char *key, const char *request, const char *args);
 
-/* Speak. Inside a gate all this waits for zsim_done and is stamped with the gate; elsewhere it goes at once.
-   t_ns, seq and source are filled in.
-   velocity_m_s [3]; `frame` is "heading" (the default, for NULL: x forward, y left, z up) or "world".
-   zsim_velocity does not wait for an answer: the next call that waits tells if the gateway refused it. */
+/* Publish. Between zsim_gate and zsim_done, messages are stamped with the gate and sent by zsim_done; at other times
+   they are sent immediately. t_ns, seq and source are filled in.
+   `frame` of a velocity is "heading" (x forward, y left, z up; the default, for NULL) or "world".
+   zsim_velocity does not wait for an answer: if the gateway refuses the command, the next call that waits fails. */
 int zsim_velocity(zsim_client *c, const char *drone, const double velocity_m_s[3], double yaw_rate_rad_s,
                   const char *frame);
 int zsim_mode(zsim_client *c, const char *drone, const char *mode); /* takeoff, land, emergency, reset */
 int zsim_put(zsim_client *c, const char *key, const char *json);
 
-/* The same, field by field:
+/* Publish a value field by field:
        zsim_put_begin(&c, "drone/drone1/cmd/attitude");
        zsim_add_numbers(&c, "orientation_wxyz", q_WB, 4);
        zsim_add_number(&c, "thrust_n", 4.2);
-       zsim_put_end(&c);   -1 if any of it was wrong */
+       zsim_put_end(&c);   returns -1 if any field was invalid */
 void zsim_put_begin(zsim_client *c, const char *key);
 void zsim_add_number(zsim_client *c, const char *name, double number);
 void zsim_add_numbers(zsim_client *c, const char *name, const double *numbers, size_t count);
@@ -132,15 +138,15 @@ void zsim_add_text(zsim_client *c, const char *name, const char *text);
 void zsim_add_json(zsim_client *c, const char *name, const char *json);
 int zsim_put_end(zsim_client *c);
 
-/* A seat in the lockstep. `reads` and `gates` are key expressions with spaces between them; `gates` may be NULL.
-   From here on simulated time waits for this program: answer every zsim_gate with one zsim_done. */
+/* Start a lockstep session. `reads` and `gates` are key expressions, separated by spaces; `gates` may be NULL.
+   From now on simulated time waits for this program: answer every zsim_gate with one zsim_done. */
 int zsim_join(zsim_client *c, const char *name, double period_s, const char *reads, const char *gates);
 
-/* Wait for the next gate: sets `t_ns` and `inputs`. -1 when the seat is lost; or when the last done was refused:
-   then the same gate is open again. A negative timeout waits for ever. */
+/* Wait for the next gate, and set `t_ns` and `inputs`. Return -1 if the lockstep session has ended, or if the last done
+   was refused; in that case the same gate is open again. A negative timeout is unlimited. */
 int zsim_gate(zsim_client *c, double timeout_s);
 
-/* The newest input of the gate on a key; none if there is none. */
+/* Return the newest input of the gate on a key; no value if there is none. */
 zsim_json zsim_input(const zsim_client *c, const char *key);
 
 int zsim_done(zsim_client *c);

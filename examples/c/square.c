@@ -1,9 +1,9 @@
-/* Flies drone1 through a square of 2 m at the lockstep's pace: a place in it, a controller, and an end.
+/* Flies drone1 along a 2 m square in the lockstep, with its own position controller, and lands.
 
        gcc -std=c99 -O2 -I clients/c examples/c/square.c clients/c/zsim.c -lm -o square
        ./square [HOST [PORT]]
 
-   Time waits for this program at every gate, so that it may be as slow as it likes, or stand in a debugger. */
+   Simulated time waits for this program at every gate, so it may be slow, or stopped in a debugger. */
 #include "zsim.h"
 
 #include <math.h>
@@ -11,19 +11,19 @@
 #include <stdlib.h>
 
 #define DRONE "drone/drone1"
-#define PERIOD_S 0.02 /* of the controller: a multiple of the gate */
-#define GAIN_1_S 0.8 /* speed for a metre of error */
-#define SPEED_M_S 0.8 /* at most, on each axis */
-#define NEAR_M 0.25 /* from a corner that counts as reached; the estimate is no better */
-#define LEG_S 8.0 /* for a corner that is not reached; then the next one is tried */
+#define PERIOD_S 0.02 /* period of the controller, a multiple of the gate period */
+#define GAIN_1_S 0.8 /* speed per metre of error */
+#define SPEED_M_S 0.8 /* maximum on each axis */
+#define NEAR_M 0.25 /* distance at which a corner counts as reached; the estimate is not more accurate */
+#define LEG_S 8.0 /* maximum time for a corner; then the drone flies to the next one */
 
 static const double corners[][3] = {{0, 0, 1.5}, {2, 0, 1.5}, {2, 2, 1.5}, {0, 2, 1.5}, {0, 0, 1.5}}; /* from its start */
 enum { CORNERS = sizeof corners / sizeof corners[0] };
 
 typedef struct {
-    double start[3]; /* where the estimate was before take-off [m; W] */
+    double start[3]; /* estimated position before take-off [m; W] */
     int started, corner, landing;
-    double since_s; /* when it set out for this corner */
+    double since_s; /* start of the flight to this corner */
 } flight;
 
 static int stop(const zsim_client *c)
@@ -37,7 +37,7 @@ static double limited(double value, double limit)
     return fmax(-limit, fmin(limit, value));
 }
 
-/* Set the velocity [m/s; W] towards a corner; return how far away it is [m]. */
+/* Set the velocity [m/s; W] towards the current corner; return its distance [m]. */
 static double steer(const flight *f, const double p[3], double v[3])
 {
     double far_m2 = 0;
@@ -49,7 +49,7 @@ static double steer(const flight *f, const double p[3], double v[3])
     return sqrt(far_m2);
 }
 
-/* Fly on: towards the corner, to the next one where it is reached, and down after the last. */
+/* Fly to the current corner, to the next one once it is reached, and land after the last one. */
 static void fly(zsim_client *c, flight *f, const double p[3])
 {
     double v[3], now_s = 1e-9 * (double)c->t_ns, far_m = steer(f, p, v);
@@ -64,7 +64,7 @@ static void fly(zsim_client *c, flight *f, const double p[3])
         zsim_velocity(c, "drone1", v, 0.0, "world");
 }
 
-/* Answer one gate; 0 when the drone has landed. */
+/* Send the commands of one gate; return 0 once the drone has landed. */
 static int step(zsim_client *c, flight *f)
 {
     zsim_json status = zsim_input(c, DRONE "/sensor/status");

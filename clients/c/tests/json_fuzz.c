@@ -1,5 +1,5 @@
-/* Feeds the JSON reader what no gateway sends, each time in memory of just that size, so that a sanitizer sees a byte
-   read too far. Usage: json_fuzz SEED ROUNDS < A_LINE */
+/* Feeds malformed lines to the JSON reader, each in a memory block of exactly its size, so that a sanitizer detects
+   reads beyond its end. Usage: json_fuzz SEED ROUNDS < A_LINE */
 #include "../zsim.h"
 
 #include <stdio.h>
@@ -22,7 +22,7 @@ static size_t below(size_t limit)
     return (size_t)(draw() % limit);
 }
 
-/* Spoil a line: cut it, change bytes, repeat a part, or make it anew of bytes, or of what JSON is made of. */
+/* Spoil a line: cut it, change bytes, repeat a part, or replace it by random bytes or random characters of JSON. */
 static size_t spoil(char *line, size_t length, size_t size)
 {
     static const char json[] = "{}[]\",:0123456789.eE+-\\utrfalsn ";
@@ -48,7 +48,7 @@ static size_t spoil(char *line, size_t length, size_t size)
     return length;
 }
 
-/* Read all that can be read; return how many values were there. */
+/* Call all readers; return how many values they found. */
 static size_t read_all(zsim_json json, int depth)
 {
     static const char *const paths[] = {"", "op", "value.position_m", "inputs.0.value.covariance", "0", "..", "id"};
@@ -87,7 +87,7 @@ int main(int count, char **arguments)
         memcpy(exact, line, spoilt);
         zsim_json raw = {exact, spoilt};
         valid += zsim_parse(exact, spoilt).length > 0;
-        found += read_all(raw, 0); /* also of what is no JSON: the readers promise to take any bytes */
+        found += read_all(raw, 0); /* even from invalid JSON: the readers must accept any bytes */
         free(exact);
     }
     printf("%ld lines, %lu of them JSON, %lu values\n", rounds, (unsigned long)valid, (unsigned long)found);

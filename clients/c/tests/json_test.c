@@ -1,4 +1,4 @@
-/* The JSON reader and writer of zsim.c. Ends with 1 and a line for each expectation that is not met. */
+/* Tests the JSON reader and writer of zsim.c. Prints a line for each failed expectation, and then exits with 1. */
 #include "../zsim.h"
 
 #include <float.h>
@@ -89,7 +89,7 @@ static void what_is_not_there_leaves_things_alone(void)
     EXPECT(!zsim_number(json, "p.-1", &x) && !zsim_number(json, "p.01x", &x) && !zsim_number(json, "n.0", &x));
     EXPECT(!zsim_number(json, ".", &x) && !zsim_number(json, "p.", &x) && !zsim_number(json, "p..0", &x) && x == 7.0);
     EXPECT(!zsim_integer(json, "n", &n) && !zsim_integer(json, "s", &n) && n == 7);
-    EXPECT(!zsim_text(json, "s", text, sizeof text) && strcmp(text, "old") == 0); /* six bytes are needed */
+    EXPECT(!zsim_text(json, "s", text, sizeof text) && strcmp(text, "old") == 0); /* needs six bytes */
     EXPECT(!zsim_text(json, "n", text, sizeof text));
 }
 

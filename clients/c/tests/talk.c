@@ -1,4 +1,4 @@
-/* Calls of zsim.h, one a line from standard input; prints what each returned, and what it set. For the tests.
+/* Calls a function of zsim.h for each line of standard input, and prints what it returned and set. For the tests.
 
        connect PORT TIMEOUT_S NAME [TOKEN]      subscribe KEY      next TIMEOUT_S         latest KEY PATH
        begin KEY                                add NAME TEXT      end
@@ -24,7 +24,7 @@ static void told(int result)
         printf("%d\n", result);
 }
 
-/* Print what stands at a path. */
+/* Print the value at a path, or the failure. */
 static void found(int result, zsim_json json, const char *path)
 {
     zsim_json value;

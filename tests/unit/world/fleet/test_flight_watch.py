@@ -80,7 +80,7 @@ def descend(fleet: Fleet, seconds: float) -> list[tuple[str, int, dict[str, Any]
     return found
 
 
-def test_a_touchdown_in_flight_is_reported_once_until_the_drone_takes_off():
+def test_a_touchdown_in_flight_is_reported_once_until_the_drone_climbs():
     fleet = airborne()
     assert descend(fleet, 6.0) == [("touchdown", 0, {"other": "the ground"})]
     assert fleet.status(0)[0] == "hovering"  # its commander is silent

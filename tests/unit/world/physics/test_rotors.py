@@ -127,7 +127,7 @@ def test_the_rotor_lag_is_exponential():
     st.floats(-20.0, 40.0),
     st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-0.5, 0.5)),
 )
-def test_off_centre_rotors_keep_the_limits_and_the_direction_of_tilt(thrust, asked):
+def test_the_mixer_of_off_centre_rotors_keeps_limits_and_tilt_direction(thrust, asked):
     """On the Iris, whose rear rotors carry more, thrust alone exerts no moment, and a feasible request is met."""
     drones = [{"name": "a", "model": "iris", "position_m": [0, 0, 0]}]
     scenario = resolve({"name": "t", "duration_s": 1, "drones": drones})

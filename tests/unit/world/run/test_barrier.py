@@ -52,7 +52,7 @@ def test_the_run_waits_for_every_expected_process():
     assert made.absent() == []
 
 
-def test_one_process_may_serve_for_several_expected_ones():
+def test_one_process_may_stand_in_for_several_expected_ones():
     made = Barrier(RUN, GATE_NS, ["estimator.d1", "estimator.d2", "controller.main"])
     made.join("controller.main", join(serves=("estimator.d1", "estimator.d2")), 0, 0)
     assert (made.absent(), blocked(made, 0)) == ([], ["controller.main"])

@@ -311,8 +311,8 @@ def test_only_estimators_feed_the_controller_and_the_planner():
 @pytest.mark.parametrize(
     ("done", "held_by"),
     [
-        (["estimator.d1"], {"estimator.d2": (), CONTROLLER: ("estimator.d2",)}),  # the controller is a victim
-        (ESTIMATORS, {CONTROLLER: ()}),  # or the cause
+        (["estimator.d1"], {"estimator.d2": (), CONTROLLER: ("estimator.d2",)}),  # the controller is held up
+        (ESTIMATORS, {CONTROLLER: ()}),  # the controller is the cause
     ],
 )
 def test_a_process_that_lacks_an_estimate_is_reported_as_held_up(done: list[str], held_by: dict[str, tuple[str, ...]]):

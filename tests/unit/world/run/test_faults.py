@@ -59,7 +59,7 @@ def listed(made: World) -> list[list[int]]:
 
 
 def test_a_radio_fault_is_refused_during_a_run_whose_agents_have_no_radio():
-    """Gates tell agents which of them hear each other only given a planned radio fault or a radio."""
+    """Only with a radio, or a planned radio fault, do gates tell agents which others they hear."""
     word = {"message": "Word", "key": "talk/*/word", "fields": {"said": "number"}}
     agents = {"talk": {"class": "talkers:Talker", "declared": [word]}}
     radio = {"kind": "radio", "target": "main", "range_m": 5}

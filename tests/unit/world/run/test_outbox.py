@@ -87,7 +87,7 @@ def test_joins_and_leaves_of_a_process_are_limited(world: World, period_ns: int)
     assert world.result()["refused"] == FLOOD - CHANGES_MAX
 
 
-def test_a_process_may_supersede_itself_only_so_often_unless_it_is_dead(world: World) -> None:
+def test_superseding_oneself_is_limited_but_not_a_restart_after_a_death(world: World) -> None:
     first = Join(0, 0, "run1", 1, "estimator", "here", 1, GATE_NS)
     for number in range(FLOOD):
         world.handle(keys.process("estimator.d1", "join"), replace(first, incarnation=1 + number), 0)
@@ -159,7 +159,7 @@ def test_joins_of_newcomers_are_limited_over_all_names(world: World, period_ns: 
     assert kinds(world) == {"join": 3, "leave": 1}
 
 
-def test_each_second_allows_one_more_newcomer_and_a_continued_run_agrees(world: World) -> None:
+def test_one_more_newcomer_per_second_is_allowed_also_in_a_continued_run(world: World) -> None:
     for number in range(FLOOD):
         join(world, f"console.{number}")
     events(world)

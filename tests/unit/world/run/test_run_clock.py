@@ -116,7 +116,7 @@ def test_old_ages_are_forgotten(monkeypatch):
     assert ages.summary_ms() == pytest.approx({"p50": 1.5, "p99": 1.99, "max": 2.0})
 
 
-def test_the_rate_is_simulated_over_wall_time_in_the_last_second():
+def test_the_rate_is_simulated_time_per_wall_time_over_the_last_second():
     rate = RealTimeFactor()
     assert (rate.now(), rate.wall_s) == (0.0, 0.0)
     rate.gate(0, 7_000 * MS)

@@ -61,7 +61,7 @@ class Flown:
         self.go_on(0)
 
     def go_on(self, k: int) -> None:
-        """Publish gate k, and let both answer it."""
+        """Publish gate k, and let participant and client answer it."""
         world, t_ns = self.world, k * GATE_NS
         assert world.may_advance()
         world.advance(1_000_000 * k)

@@ -55,7 +55,7 @@ SINE, COSINE = 9.8 * math.sin(0.1), 9.8 * math.cos(0.1)
 # name: (sensor, truth, mount, values calculated by hand)
 CASES: dict[str, tuple[Any, BodyTruth, MountedSensor, Any]] = {
     "at rest, gravity is felt upwards": (imu, body(), mounted((0.1, 0.2, 0.3)), ((0, 0, 9.8), STILL)),
-    # a real landed packet: theta +2.97 deg, accel x +80 mg
+    # packet of a real landed drone: theta +2.97 deg, accel x +80 mg
     "nose up: specific force along the nose": (imu, body(q=turn(pitch=-0.1)), mounted(), ((SINE, 0, COSINE), STILL)),
     "spinning at 3 rad/s about z, faster by 2 rad/s^2, 0.1 m ahead": (
         imu, body(a=(0, 0, -9.8), w=(0, 0, 3), alpha=(0, 0, 2)), mounted((0.1, 0, 0)), ((-0.9, 0.2, 0), (0, 0, 3)),
@@ -156,7 +156,7 @@ def samples(sensor: int, x_m: float, obstacles: Any = (TABLE, BALL), surfaces: A
     ids=["middle", "inside", "beside", "ball", "far"],
 )
 def test_a_sonar_measures_the_distance_to_the_surface_below(x_m: float, top_m: float):
-    """Within 3 cm, since the drone falls 8 mm and moves 4 cm in the up to 40 ms until the sample."""
+    """Within 3 cm: until the sample, at most 40 ms later, the drone falls 8 mm and moves 4 cm."""
     distance, valid = samples(SONAR, x_m)[:2]
     assert distance == pytest.approx(HEIGHT_M - top_m, abs=0.03)
     assert valid == 1.0

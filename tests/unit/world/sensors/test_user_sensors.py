@@ -84,7 +84,7 @@ def test_the_range_of_a_standing_drone_is_measured_from_its_antenna():
 
 
 def test_airspeed_is_measured_along_the_pitot_tube():
-    airspeed = importlib.import_module("airspeed")  # on the path thanks to the fixture
+    airspeed = importlib.import_module("airspeed")  # importable thanks to the fixture
     site = scenario().environment
     wind, spin = np.array([4.0, -3.0, 0.5]), np.array([0.0, 0.0, 2.0])
     mounted = truth(v_WB=np.array([1.0, 0, 0]), w_WB_B=spin, air_W=wind)

@@ -358,7 +358,7 @@ def advance(world: Lagging, pipelining: Pipelining, wall_ns: int = 0) -> int:
 def test_after_a_wait_the_world_resumes_once_the_agent_nearly_caught_up() -> None:
     world = Lagging()
     pipelining = pipelining_of(world)
-    assert advance(world, pipelining) == 6  # the first five need nothing
+    assert advance(world, pipelining) == 6  # the first five gates need no answer
     gates = []
     for _ in range(12):
         world.done += 1

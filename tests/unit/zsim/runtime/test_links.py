@@ -135,7 +135,7 @@ def test_a_cut_does_not_affect_other_links():
     assert gates(links(fault("link_cut", f"world/{ME}")), 3, status) == []
 
 
-def test_the_senders_of_a_message():
+def test_senders_follow_from_the_key_and_the_source_of_a_message():
     assert senders(ESTIMATE, estimate(1)[1]) == (OTHER,)
     assert senders(ESTIMATE, estimate(1, source="controller.main")[1]) == (OTHER,)  # they share a process
     assert senders(ESTIMATE, estimate(1, source="my.filter")[1]) == (OTHER, "my.filter")

@@ -29,7 +29,7 @@ def test_a_lasting_reason_is_shown_once():
     assert lines_of(reasons, WAITS, 0, REASON_NS) == []
     (line,) = lines_of(reasons, WAITS, REASON_NS, 10 * REASON_NS)
     assert has_terms(line, "5.00", "main", "engaged", WAITS)
-    for t_ns in (0, REASON_NS):  # each cluster has its own
+    for t_ns in (0, REASON_NS):  # each cluster has its own reasons
         lines = [reasons.line(cluster, state(t_ns, WAITS)) for cluster in ("a", "b")]
     assert [line and line.split()[2] for line in lines] == ["a,", "b,"]
 

@@ -387,7 +387,7 @@ class Second(Judge):
 
 
 @pytest.mark.parametrize(("former_gate", "killed"), [(2, True), (3, False), (4, False)])
-def test_a_process_restarted_after_its_kill_is_not_killed_again(former_gate: int, killed: bool):
+def test_a_restarted_process_is_killed_only_if_its_predecessor_was_not(former_gate: int, killed: bool):
     """Its predecessor got as far as the given gate; the kill acts at gate 3."""
     world = World(estimates(range(END + 1)))
     world.last[keys.estimate("d1")] = encode(estimate(former_gate))

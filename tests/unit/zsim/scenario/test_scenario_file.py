@@ -182,7 +182,7 @@ texts = st.text(st.characters(codec="utf-8"), max_size=30) | st.sampled_from([*L
     expressions=st.dictionaries(texts, texts, min_size=1, max_size=3),
     numbers=st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4),
 )
-def test_any_text_and_number_survives_a_round_trip(expressions: dict[str, str], numbers: list[float]):
+def test_any_text_and_number_survive_a_round_trip(expressions: dict[str, str], numbers: list[float]):
     """Texts that look like numbers stay texts; numbers keep their last bit."""
     plan = {"trajectory": {"expressions": expressions, "constants": {"f": numbers[0]}}}
     wind = {"steady_m_s": numbers[1:]}
@@ -375,7 +375,7 @@ def test_any_override_is_applied_or_refused(text: str):
 # Faults of one field
 
 
-def test_the_full_text_of_a_cluster_fault():
+def test_a_cluster_fault_has_path_value_limits_and_cluster_name():
     line = only(faults_in(STEP, "clusters.main.gains.proportional_1_s=3"))
     said = "clusters[0].gains.proportional_1_s is 3; must be > 0 and <= 2 (cluster 'main')"
     assert line == f"step.yaml: {said}"

@@ -90,7 +90,7 @@ def test_the_rim_of_a_height_map_is_its_outline():
     assert not sheet.rim[inner].any()
 
 
-def test_a_path_crosses_a_plane_also_on_the_edges_of_its_triangles():
+def test_a_path_crosses_a_plane_even_on_the_edges_of_its_triangles():
     """A path crosses a gridded plane if and only if its ends are on either side, even through edges and corners."""
     sheet = sheet_of(SimpleNamespace(obstacles=[], surfaces=[flat()]))
     rng = np.random.default_rng(4)

@@ -119,7 +119,7 @@ def test_a_port_in_use_is_refused_with_the_option_for_another() -> None:
     assert has_terms(str(caught.value), endpoint, "--listen")
 
 
-def test_a_port_without_a_listener_raises_no_listener_error() -> None:
+def test_a_missing_listener_raises_a_distinct_error() -> None:
     with pytest.raises(NoListenerError), connection.connect(f"tcp/127.0.0.1:{free_port()}", "zsim"):
         pass
 
