@@ -122,7 +122,7 @@ class EstimatorBank:
         return count >= 0
 
     def estimate(self, t_s: float, indices: Sequence[int] | None = None) -> list[StateEstimate]:
-        """Use the readings since the last gate; return estimates at `t_s` [s] of all drones, or of those in `indices`."""
+        """Use the readings since the last gate; return estimates at `t_s` [s] of all drones or of `indices`."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
         rows, counts = self._estimates.tolist(), self.rows.counts[:, COUNT.used :].tolist()
