@@ -1,26 +1,26 @@
 /**
- * The client of `zsim gateway` for browsers and Node (18 or newer): one module, no dependency.
+ * Client for `zsim gateway`, for browsers and Node (18 or newer): one module without dependencies.
  *
  *     import { connect } from "./zsim.js";
  *     const zsim = await connect("ws://127.0.0.1:8000/stream", { name: "laptop" });
  *     await zsim.mode("drone1", "takeoff");
  *     await zsim.subscribe("drone/drone1/truth", (truth) => console.log(truth.position_m));
  *
- * In Node the address may be that of the lines, `tcp://127.0.0.1:7470`, which needs no WebSocket (Node has one from 22
- * on). Everything that fails rejects with an Error whose message is one line. Units are SI and radians; `t_ns` are
- * simulated nanoseconds. docs/clients-js.md has first programs, docs/gateway.md what goes over the wire.
+ * In Node the address may also be that of the TCP lines, `tcp://127.0.0.1:7470`, which needs no WebSocket (available
+ * from Node 22 on). Failures reject with an Error whose message is one line. Units are SI and radians; `t_ns` is in
+ * simulated nanoseconds. docs/clients-js.md has first programs; docs/gateway.md describes the protocol.
  */
 
-const TIMEOUT_S = 5; // for a connection, and for an answer
-const AGAIN_S = 0.2; // until the next try to connect: a gateway on its way up is there soon enough
-const RETURN_S = 1; // more, for an answer of a gateway that waits for others' answers
+const TIMEOUT_S = 5; // default timeout for a connection and for each answer
+const AGAIN_S = 0.2; // between two attempts to connect, while a gateway may be starting
+const RETURN_S = 1; // additional timeout if the gateway itself waits for an answer
 
 /**
- * Connect and say hello; wait `timeoutS` for the gateway.
+ * Connect and say hello; wait up to `timeoutS` for the gateway.
  *
  * @param {string} address `ws://HOST:8000/stream`, `wss://…`, or in Node `tcp://HOST:7470`.
- * @param {{name?: string, token?: string, timeoutS?: number}} options `name` without a dot becomes client.NAME;
- *     `token` where the gateway asks for one.
+ * @param {{name?: string, token?: string, timeoutS?: number}} options A `name` without a dot becomes
+ *     client.NAME; `token` is needed if the gateway requires one.
  * @returns {Promise<Zsim>}
  */
 export async function connect(address, { name = "", token = "", timeoutS = TIMEOUT_S } = {}) {
@@ -53,16 +53,16 @@ function parsed(line) {
   }
 }
 
-/** Nobody answers at an address, yet. */
+/** Raised when no gateway answers at an address yet. */
 class NobodyThere extends Error {}
 
-/** One connection. */
+/** One connection to a gateway. */
 export class Zsim {
-  /** Who it is, such as client.laptop. */
+  /** Name of this client, e.g. client.laptop. */
   name = "";
-  /** What the gateway said of the run: run_id (null while none goes on), mode, gate_s, t_ns, drones, clusters. */
+  /** The run, as reported by the gateway: run_id (null if there is no run), mode, gate_s, t_ns, drones, clusters. */
   run = { run_id: null };
-  /** Resolves with the reason when the connection has ended. */
+  /** A promise of the reason why the connection ended. */
   closed;
 
   constructor(timeoutS) {
@@ -70,14 +70,14 @@ export class Zsim {
     this._wire = null;
     this._id = 0;
     this._waiting = new Map(); // id of a request: { resolve, reject, timer }
-    this._subscribed = new Map(); // expression: takers
+    this._subscribed = new Map(); // expression: list of takers
     this._handlers = { run: [], lost: [], refused: [] };
     this._seat = null;
     this._onNews = () => {};
     this.closed = new Promise((resolve) => (this._resolveClosed = resolve));
   }
 
-  /** Say who it is, and ask for `run` again. */
+  /** Tell the gateway the name of this client, and update `run`. */
   async hello(name = "", token = "") {
     const { op, id, name: given, ...run } = await this.request("hello", { ...(name && { name }), ...(token && { token }) });
     this.name = given;
@@ -85,17 +85,17 @@ export class Zsim {
     return run;
   }
 
-  /** Wait until a run goes on. */
+  /** Wait until there is a run. */
   async untilRun() {
     while (this.run.run_id === null) await new Promise((resolve) => (this._onNews = resolve));
   }
 
   /**
-   * Be told of what nobody asked for.
+   * Add a handler for messages that do not answer a request.
    *
-   * @param {"run"|"lost"|"refused"} kind `run`: ({state, run_id}), a run begun or ended, its link lost or back;
-   *     `lost`: ({lines}), values that came faster than they were read; `refused`: (Error), something said without
-   *     waiting for an answer.
+   * @param {"run"|"lost"|"refused"} kind `run`: called with {state, run_id} when a run has begun or ended, or the link
+   *     to its world is lost or back; `lost`: with {lines}, the number of values dropped because they arrived faster
+   *     than they were read; `refused`: with an Error, when a message sent without waiting was refused.
    */
   on(kind, handler) {
     this._handlers[kind].push(handler);
@@ -111,17 +111,17 @@ export class Zsim {
     });
   }
 
-  /** Publish a value. `t_ns`, `seq` and `source` are filled in. */
+  /** Publish a value, and wait for the gateway's answer. `t_ns`, `seq` and `source` are filled in. */
   async put(key, value) {
     await this.request("put", { key, value });
   }
 
-  /** Publish a value and wait for nothing; `on("refused")` is told if the gateway does not take it. */
+  /** Publish a value without waiting; if the gateway refuses it, the handlers of `on("refused")` are called. */
   send(key, value) {
     this._say("put", { key, value, quiet: true });
   }
 
-  /** Fly a drone [m/s, rad/s] without waiting. `frame`: "heading" (x forward, y left, z up) or "world". */
+  /** Command a velocity [m/s, rad/s] without waiting. `frame`: "heading" (x forward, y left, z up) or "world". */
   velocity(drone, velocity_m_s, yaw_rate_rad_s = 0, frame = "heading") {
     this.send(`drone/${drone}/cmd/velocity`, { velocity_m_s, yaw_rate_rad_s, frame });
   }
@@ -136,14 +136,14 @@ export class Zsim {
     return (await this.latestOf(key))[0]?.value;
   }
 
-  /** Return the last values of all keys that an expression takes, as a list of { key, value }. */
+  /** Return the last values of all keys that match an expression, as a list of { key, value }. */
   async latestOf(expression) {
     return (await this.request("latest", { key: expression })).values;
   }
 
   /**
-   * Be told of every value on an expression: `taker(value, key)`. Returns a function that ends it.
-   * A value that two different expressions take comes once for each: let them not overlap.
+   * Call `taker(value, key)` for every value on an expression. Returns a function that ends the subscription.
+   * A value that matches two subscribed expressions is delivered twice, so expressions should not overlap.
    */
   async subscribe(expression, taker) {
     const takers = this._subscribed.get(expression) ?? [];
@@ -164,7 +164,10 @@ export class Zsim {
     await this.request("unsubscribe", { key: expression });
   }
 
-  /** Ask the world or a controller: `ask("cluster/main/control", "engage")`. Rejects with the reason if it refuses. */
+  /**
+   * Send a request to the world or a controller: `ask("cluster/main/control", "engage")`. Rejects with the reason if
+   * it is refused.
+   */
   async ask(key, request, args = {}) {
     const fields = { key, request, args, timeout_s: this._timeoutS };
     const answer = await this.request("ask", fields, this._timeoutS + RETURN_S);
@@ -173,21 +176,21 @@ export class Zsim {
   }
 
   /**
-   * Take a seat in the lockstep: from now on simulated time waits for this program.
+   * Start a lockstep session: from now on simulated time waits for this program.
    *
    *     for await (const gate of await zsim.join("square", { reads: ["drone/drone1/estimate"] })) {
    *       gate.velocity("drone1", steer(gate.input("drone/drone1/estimate")));
    *     }
    *
-   * A gate is done when the loop comes round; leaving the loop leaves the seat. Losing the seat, and a refused output,
-   * are thrown out of the loop.
+   * The end of the loop body answers a gate; leaving the loop ends the session. The loop throws an Error if the session
+   * is lost, or if an output is refused.
    *
-   * @param {{periodS?: number, reads?: string[], gates?: string[]}} options `periodS` is the gate if not given.
+   * @param {{periodS?: number, reads?: string[], gates?: string[]}} options `periodS` is one gate by default.
    */
   async join(name, { periodS = this.run.gate_s, reads = [], gates = [] } = {}) {
     if (this._seat !== null) throw new Error("join: has a seat already; leave it first, or use another connection");
     const seat = new Seat(this);
-    this._seat = seat; // before the answer: the first gate may come with it
+    this._seat = seat; // set before the answer, because the first gate may arrive with it
     try {
       const answer = await this.request("join", { name, period_s: periodS, reads, gates });
       this.name = answer.name;
@@ -198,7 +201,7 @@ export class Zsim {
     return seat;
   }
 
-  /** Hang up. */
+  /** Close the connection. */
   close() {
     this._wire?.close();
     this._end("closed");
@@ -220,7 +223,7 @@ export class Zsim {
   }
 
   _take(line) {
-    if (this._wire === null) return; // closed: what came with the last line is for nobody
+    if (this._wire === null) return; // closed: ignore the remaining lines
     const message = parsed(line);
     if (message === null) {
       this._wire?.close();
@@ -242,7 +245,7 @@ export class Zsim {
     }
   }
 
-  /** Know the next run before anybody is told that it has begun. */
+  /** Update `run` before the handlers learn that the next run has begun. */
   async _onRun(message) {
     if (message.state === "begun") await this.hello().catch((error) => this._tell("refused", error));
     if (message.state === "ended") this.run = { run_id: null };
@@ -275,12 +278,12 @@ export class Zsim {
   }
 }
 
-/** A seat in the lockstep; see `Zsim.join`. */
+/** A lockstep session; see `Zsim.join`. */
 class Seat {
   constructor(zsim) {
     this._zsim = zsim;
-    this._come = []; // gates that have come
-    this._open = null; // the gate that is worked on
+    this._come = []; // gates that have arrived, oldest first
+    this._open = null; // the gate not answered yet
     this._doneId = 0;
     this._failed = null;
     this._wake = () => {};
@@ -300,7 +303,7 @@ class Seat {
     return { done: false, value: this._open };
   }
 
-  /** Leave; called by a loop that is left. */
+  /** Leave; called when the loop is left. */
   async return() {
     this._open?.done();
     await this._leave();
@@ -313,9 +316,9 @@ class Seat {
     await this._zsim.request("leave");
   }
 
-  /** Let time go on without it, and say why. */
+  /** Leave, so that simulated time continues without this program, and throw the reason. */
   async _giveUp() {
-    await this._leave().catch(() => undefined); // what was refused is what counts
+    await this._leave().catch(() => undefined); // report the original failure, not this one
     throw this._failed;
   }
 
@@ -340,7 +343,7 @@ class Seat {
   }
 }
 
-/** One gate: what came since the last one, and what is said to it. */
+/** One gate: the inputs since the last one, and the outputs that answer it. */
 class Gate {
   constructor(seat, { t_ns, inputs }) {
     this._seat = seat;
@@ -348,7 +351,7 @@ class Gate {
     this._isDone = false;
     /** Simulated time [ns]. */
     this.t_ns = t_ns;
-    /** List of { key, value }, in order of time. */
+    /** List of { key, value }, in time order. */
     this.inputs = inputs;
   }
 
@@ -370,7 +373,7 @@ class Gate {
     this.put(`drone/${drone}/cmd/mode`, { mode });
   }
 
-  /** Say now, rather than when the loop comes round, that this is all. */
+  /** Answer the gate now rather than at the end of the loop body. */
   done() {
     if (this._isDone) return;
     this._isDone = true;
@@ -378,7 +381,7 @@ class Gate {
   }
 }
 
-/** Tell whether a key expression takes a key: `*` is one part of it, `**` any number, `$*` any piece of a part. */
+/** Return whether a key matches an expression: `*` is one part, `**` any number of parts, `$*` any piece of a part. */
 export function matches(expression, key) {
   if (expression === key) return true;
   return expression.includes("*") && pattern(expression).test(key);
@@ -399,7 +402,7 @@ function pattern(expression) {
   return { test: (key) => found.test(`/${key}`) };
 }
 
-/** Open a WebSocket; a browser can show a token only in the address. */
+/** Open a WebSocket; a browser can send a token only in the address. */
 function openWebSocket(address, token, timeoutS, zsim) {
   if (typeof WebSocket === "undefined") {
     throw new Error("this Node has no WebSocket (22 has one); connect to the lines: tcp://HOST:7470");
@@ -422,7 +425,7 @@ function openWebSocket(address, token, timeoutS, zsim) {
   });
 }
 
-/** Open a connection to the lines, in Node. */
+/** Open a TCP connection for lines; only in Node. */
 async function openLines(address, token, timeoutS, zsim) {
   const { createConnection } = await import("node:net");
   const { hostname, port } = new URL(address.replace(/^tcp:/, "http:"));

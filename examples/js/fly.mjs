@@ -1,16 +1,16 @@
 /**
- * Flies drone1 through a square of 2 m at the lockstep's pace: a seat in it, a controller, and an end.
+ * Flies drone1 along a 2 m square in the lockstep, with its own position controller, and lands.
  *
  *     node examples/js/fly.mjs [tcp://HOST:PORT | ws://HOST:PORT/stream]
  */
 import { connect } from "../../clients/js/zsim.js";
 
 const DRONE = "drone1";
-const GAIN_1_S = 0.8; // speed for a metre of error
-const SPEED_M_S = 0.8; // at most, on each axis
-const NEAR_M = 0.25; // from a corner that counts as reached; the estimate is no better
-const LEG_S = 8; // for a corner that is not reached; then the next one is tried
-const CORNERS = [[0, 0, 1.5], [2, 0, 1.5], [2, 2, 1.5], [0, 2, 1.5], [0, 0, 1.5]]; // from where it took off
+const GAIN_1_S = 0.8; // speed per metre of error
+const SPEED_M_S = 0.8; // maximum on each axis
+const NEAR_M = 0.25; // distance at which a corner counts as reached; the estimate is not more accurate
+const LEG_S = 8; // maximum time for a corner; then the drone flies to the next one
+const CORNERS = [[0, 0, 1.5], [2, 0, 1.5], [2, 2, 1.5], [0, 2, 1.5], [0, 0, 1.5]]; // from its start
 
 const zsim = await connect(process.argv[2] ?? "tcp://127.0.0.1:7470", { name: "square", timeoutS: 30 });
 await zsim.untilRun();
@@ -31,7 +31,7 @@ for await (const gate of await zsim.join("square", { periodS: 0.02, reads })) {
 }
 zsim.close();
 
-/** The flight: towards a corner, to the next one where it is reached, and down after the last. */
+/** Return a flight to each corner in turn; it is over after the last one. */
 function flight() {
   let start = [0, 0, 0];
   let corner = 0;

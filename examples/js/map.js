@@ -1,16 +1,16 @@
-/** Drones from above on a canvas: east to the right, north up, in metres. */
+/** Draws the drones from above on a canvas: east to the right, north up, in metres. */
 
-const LEAST_M = 4; // half of the side of what is shown, at least
-const STEPS_M = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000]; // of the grid
-const LINES_MAX = 12; // of the grid, each way
+const LEAST_M = 4; // minimum of half the side of the area shown
+const STEPS_M = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000]; // possible spacings of the grid
+const LINES_MAX = 12; // maximum number of grid lines in each direction
 const COLOURS = ["#2f7de1", "#e1632f", "#2fa85a", "#a84fd0", "#c7a21a", "#20a5a8"];
 
 /**
- * Draw what `view/drones` says.
+ * Draw the drones of a message on `view/drones`.
  *
  * @param {HTMLCanvasElement} canvas
  * @param {{name: string, position_m: number[], orientation_wxyz: number[]}[]} drones
- * @param {Map<string, number[][]>} trails where each has been: [[east, north], …]
+ * @param {Map<string, number[][]>} trails past positions of each drone: [[east, north], …]
  */
 export function draw(canvas, drones, trails) {
   const pen = canvas.getContext("2d");
@@ -33,7 +33,7 @@ export function colour(i) {
   return COLOURS[i % COLOURS.length];
 }
 
-/** Return what is shown: its middle, half of its side, and where a point of the world is on the canvas. */
+/** Return the area shown: its middle, half its side, and `place`, which maps a point of the world to the canvas. */
 function fitted(drones, side) {
   const [east, north] = [0, 1].map((axis) => {
     const all = drones.map((drone) => drone.position_m[axis]);
@@ -70,7 +70,7 @@ function trail(pen, { place }, points) {
   pen.globalAlpha = 1;
 }
 
-/** A disc with a line ahead; its name and height beside it. */
+/** Draw a drone as a disc with a line ahead, and its name and height beside it. */
 function body(pen, { place }, { name, position_m, orientation_wxyz }) {
   const [x, y] = place(position_m);
   const [w, i, j, k] = orientation_wxyz;
@@ -85,6 +85,6 @@ function body(pen, { place }, { name, position_m, orientation_wxyz }) {
   pen.stroke();
   pen.lineWidth = 1;
   const label = `${name}  ${position_m[2].toFixed(1)} m`;
-  const right_px = pen.canvas.clientWidth - pen.measureText(label).width - 4; // so that it is not cut off
+  const right_px = pen.canvas.clientWidth - pen.measureText(label).width - 4; // the label stays within the canvas
   pen.fillText(label, Math.min(x + 10, right_px), y + 16);
 }

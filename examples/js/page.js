@@ -1,13 +1,13 @@
 /**
- * The page of index.html: what flies, from above, and buttons. `?gateway=ws://HOST:8000/stream&token=TOKEN` says where
- * the gateway is, if it is not beside the page on port 8000.
+ * The page of index.html: the drones from above, and buttons. `?gateway=ws://HOST:8000/stream&token=TOKEN` selects a
+ * gateway other than port 8000 of the page's own host.
  */
 import { connect } from "../../clients/js/zsim.js";
 import { colour, draw } from "./map.js";
 
-const OPERATOR = 10; // priority: programs have 0
-const HOLD_EVERY_MS = 100; // a drone that hears nothing for 0.5 s is nobody's
-const AGAIN_MS = 1000; // until the next try to connect
+const OPERATOR = 10; // priority; that of programs is 0
+const HOLD_EVERY_MS = 100; // wall time; a drone without commands for 0.5 s of simulated time hovers, and later lands
+const AGAIN_MS = 1000; // between two attempts to connect
 const NEWS_MAX = 6;
 
 const given = new URLSearchParams(location.search);
@@ -15,12 +15,12 @@ const address = given.get("gateway") ?? `ws://${location.hostname || "127.0.0.1"
 const me = `page-${Math.random().toString(36).slice(2, 8)}`;
 const find = (id) => document.getElementById(id);
 const trails = new Map(); // drone: [[east, north], …]
-const held = new Set(); // drones that this page keeps where they are
+const held = new Set(); // drones whose position this page holds
 const rows = new Map(); // drone: its row in the table
 let zsim = null;
-let held_ms = 0; // when they were last told
+let held_ms = 0; // when the held drones last received a command
 
-/** Follow one gateway for ever, whatever comes and goes. */
+/** Follow one gateway indefinitely, and reconnect after every failure. */
 async function main() {
   for (;;) {
     try {
@@ -28,7 +28,7 @@ async function main() {
       await follow();
       show(await zsim.closed);
     } catch (error) {
-      zsim?.close(); // a request that was answered too late: the next connection is the only one
+      zsim?.close(); // after a failed request: keep only the next connection
       show(error.message);
     }
     await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
@@ -78,7 +78,7 @@ function onEvent({ kind, text, t_ns }) {
 
 const takeOff = (drone) => zsim.mode(drone, "takeoff");
 
-/** Land it, also if another program flies it. */
+/** Land a drone, even if another program flies it. */
 async function land(drone) {
   held.delete(drone);
   await zsim.ask("world/control", "acquire", { drone, priority: OPERATOR });
@@ -86,7 +86,7 @@ async function land(drone) {
   await zsim.ask("world/control", "release", { drone });
 }
 
-/** Take it over and keep it where it is; or let it go. */
+/** Take over a drone and hold its position, or let it go. */
 async function hold(drone) {
   if (held.delete(drone)) {
     await zsim.ask("world/control", "release", { drone });
@@ -96,7 +96,7 @@ async function hold(drone) {
   held.add(drone);
 }
 
-/** Tell held drones to stand still; what is seen sets the pace, since browsers slow down the timers of hidden pages. */
+/** Command held drones to stand still; called at each view, since browsers slow down the timers of hidden pages. */
 function keepHolding() {
   if (performance.now() - held_ms < HOLD_EVERY_MS) return;
   held_ms = performance.now();
@@ -149,7 +149,7 @@ function show(text) {
   find("link").textContent = text;
 }
 
-/** Add a line of news; what is said again and again stands there once. */
+/** Add a line to the news; a text that is repeated is shown once. */
 function tell(text, kind, when = "") {
   const last = find("news").firstChild;
   if (last?.dataset.text === text) last.remove();

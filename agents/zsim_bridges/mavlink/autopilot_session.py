@@ -32,14 +32,14 @@ from zsim_bridges.mavlink.dialect import (
 from zsim_bridges.mavlink.personality import COPTER_MODES, PX4_MODES, FlightMode
 from zsim_bridges.vehicle_links.driver import DriverOptions
 from zsim_bridges.vehicle_links.vehicle_session import (
-    STILL,
+    ZERO_VECTOR,
     Action,
     AircraftPose,
     AircraftReadings,
     AircraftState,
     ClockOffset,
     Demand,
-    LinkFigures,
+    LinkQuality,
     UdpChannel,
     VehicleSession,
 )
@@ -279,9 +279,9 @@ class AutopilotSession(VehicleSession):
             self._ground_m = None
         return self._ground_m is None
 
-    def figures(self) -> LinkFigures:
-        figures = super().figures()
-        return figures._replace(refused=figures.refused + sum(self._parser.refused.values()))
+    def link_quality(self) -> LinkQuality:
+        quality = super().link_quality()
+        return quality._replace(refused=quality.refused + sum(self._parser.refused.values()))
 
 
 class AutopilotState:
@@ -394,7 +394,7 @@ class DemandSequence:
         if age_ns >= (CHANGED_NS if demand != self._setpoint else SETPOINT_NS):
             self._setpoint, self._setpoint_ns = demand, now_ns
             flies = demand.action == "fly"
-            vx, vy, vz = ned(demand.velocity_m_s if flies else STILL)
+            vx, vy, vz = ned(demand.velocity_m_s if flies else ZERO_VECTOR)
             yield dialect.SetPositionTargetLocalNed(
                 0,
                 *autopilot.address,
@@ -438,7 +438,7 @@ class TelemetryReadings(AircraftReadings):
         self.has_origin = local_origin_m is not None
         self.battery_percent = 0.0
         self.unix_clock = ClockOffset()
-        self._q_WB, self._w_WB_B = LEVEL, STILL
+        self._q_WB, self._w_WB_B = LEVEL, ZERO_VECTOR
         self._flow_ns = self._measured_flow_ns = -FLOW_LOST_NS
         self._pressure_pa = 0.0
 

@@ -154,7 +154,7 @@ class MavlinkServer(VehicleServer):
                     self.on_run(key, payload)
         at_gate: dict[str, ServedVehicle] = {}
         for key, payload in newest.items():
-            message = self.decoded(key, payload)
+            message = self.try_decode(key, payload)
             if message is not None:
                 drone, name = self._routes[key]
                 self._served[drone].vehicle.state.update(name, message)

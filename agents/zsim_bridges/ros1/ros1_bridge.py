@@ -127,7 +127,7 @@ class Ros1Bridge(PictureServer):
         elif not (kind == "drone" and thing in self._drones):
             self.on_run(key, payload)
         elif not leaf.startswith("cmd/"):
-            message, drone = self.decoded(key, payload), self._drones[thing]
+            message, drone = self.try_decode(key, payload), self._drones[thing]
             if isinstance(message, CameraImage):
                 drone.cameras.publish(keys.leaf(key), message)
             elif isinstance(message, CameraInfo):

@@ -1,4 +1,4 @@
-/** zsim.js against a gateway that is played: `node --test clients/js/tests`. */
+/** Tests zsim.js with a fake gateway: `node --test clients/js/tests`. */
 import assert from "node:assert/strict";
 import { createServer } from "node:net";
 import { once } from "node:events";
@@ -8,7 +8,7 @@ import { connect, matches } from "../zsim.js";
 
 const RUN = { run_id: "r1", federation: "zsim", mode: "lockstep", gate_s: 0.02, t_ns: 0, drones: ["drone1"], clusters: [] };
 
-/** A gateway that says what the test says; it serves one connection. */
+/** A gateway that sends what the test specifies; it serves one connection. */
 class FakeGateway {
   async open() {
     this._server = createServer((socket) => this._serve(socket)).listen(0, "127.0.0.1");
