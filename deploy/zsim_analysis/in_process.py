@@ -83,10 +83,10 @@ def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, 
     return with_own_agents(scenario, [agent.name for agent in agents]), agents
 
 
-def sequence_of_agents(agents: Any, alternatives: str = "") -> Sequence[Any]:
-    """Return the given agents; raise RunError, which names `alternatives` as also allowed, if they are not a sequence."""
+def sequence_of_agents(agents: Any, options: str = "") -> Sequence[Any]:
+    """Return the given agents; raise RunError, which names `options` as also allowed, if they are not a sequence."""
     if isinstance(agents, str) or not isinstance(agents, Sequence):
-        raise RunError(f"agents is {show(agents)}; must be {alternatives}a sequence of agents")
+        raise RunError(f"agents is {show(agents)}; must be {options}a sequence of agents")
     return agents
 
 

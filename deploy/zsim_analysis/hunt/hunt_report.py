@@ -197,10 +197,10 @@ def terminal_text(hunted: Hunted) -> Group:
     ]
     stages = [[each.name, str(each.flights), f"{each.wall_s:.1f} s"] for each in summary.stages]
     lines.append(FittedTable([Column("stage", "name"), Column("flights"), Column("time")], stages, "What it took"))
-    if violation := summary.violation:
+    if found := summary.violation:
         columns = [Column("cause", "text"), Column("without it"), Column("with it alone")]
-        rows = [[each.text, number(each.without), number(each.alone)] for each in violation.causes]
-        title = f"{violation.requirement}: broken in flight {violation.number}, margin {violation.unknown or number(violation.margin)}"
+        rows = [[each.text, number(each.without), number(each.alone)] for each in found.causes]
+        title = f"{found.requirement}: broken in flight {found.number}, margin {found.unknown or number(found.margin)}"
         lines.append(FittedTable(columns, rows, title, "margins; < 0: broken"))
         lines.append(Text(printable(f"again: {command(hunted)}")))
     return Group(*lines)

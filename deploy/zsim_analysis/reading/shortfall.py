@@ -440,15 +440,13 @@ def _strayed(
         yield from _far(drone, t_ns, away_m, "its place in the formation", flight)
 
 
-def _far(
-    drone: str, t_ns: NDArray[np.int64], away_m: Array, target: str, flight: RecordedFlight
-) -> Iterator[Shortfall]:
-    """Yield a shortfall if a drone was far off for STRAYED_S; `away_m` are its distances from `target` once a second."""
+def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, goal: str, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield a shortfall if a drone was far off for STRAYED_S; `away_m` are its distances from `goal` once a second."""
     stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
     strayed = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
     if strayed:
         from_ns, max_m = int(t_ns[strayed[0][0]]), max(float(away_m[each].max()) for each in strayed)
-        text = f"{drone}: up to {max_m:.0f} m from {target}, from {from_ns / 1e9:.0f} s on"
+        text = f"{drone}: up to {max_m:.0f} m from {goal}, from {from_ns / 1e9:.0f} s on"
         yield Shortfall("strayed", drone, from_ns / 1e9, f"{text}{_active_faults(drone, (from_ns, 0), flight)}", True)
 
 
@@ -549,16 +547,16 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
     flown_s = float(np.diff(np.r_[at_s, due_s])[is_followed].sum())
     if due_s - begin_s - flown_s <= LATE_MAX_S:
         return
-    due_text = f"{seconds_text(due_s)} s"
+    due = f"{seconds_text(due_s)} s"
     if not is_followed.any():
-        text = f"none of the {due_text} of its trajectory was flown"
+        text = f"none of the {due} of its trajectory was flown"
     else:
         stretches = np.split(at_s[is_followed], np.flatnonzero(np.diff(at_s[is_followed]) > 2 * SAMPLE_NS / 1e9) + 1)
         longest = max(stretches, key=len)
         span_s = (float(longest[0]), min(float(longest[-1]) + SAMPLE_NS / 1e9, due_s))
         is_interrupted = flown_s - (span_s[1] - span_s[0]) > LATE_MAX_S
         length = f"for {seconds_text(round(flown_s, 1))} s in all, at the longest " if is_interrupted else ""
-        text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {due_text}"
+        text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {due}"
     was_overridden = any(
         each.ok and each.op in LEADS and each.t_ns / 1e9 < planned.start_s + due_s for each in states.requests
     )
