@@ -1,8 +1,8 @@
 classdef Conversation < handle
     % CONVERSATION Requests and answers on a gateway's stream, and the messages in between.
     %
-    % Only one request is pending at a time. While it waits for its answer, values, gates and news of the run may arrive.
-    % Values are queued until they are taken; `gate`, `left` and `begun` show the rest.
+    % Only one request is pending at a time. While it waits for its answer, values, gates and news of the run may
+    % arrive. Values are queued until they are taken; `gate`, `left` and `begun` show the rest.
 
     properties (SetAccess = private)
         gate = []  % the gate that has arrived and is not answered yet: t_s, t_ns, inputs
