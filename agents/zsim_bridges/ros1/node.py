@@ -327,7 +327,7 @@ class SubscribedTopic:
         self.connected: dict[str, str] = {}
 
     def update(self, publishers: Iterable[str], is_complete: bool = True) -> None:
-        """Follow publishers, given by the URIs of their slave APIs: only these if `is_complete`, otherwise these in addition.
+        """Follow publishers, given by the URIs of their slave APIs: only these if `is_complete`, otherwise these too.
 
         Messages that a publisher sent before it left the graph may still be in transit, so its connection is read to
         the end.
