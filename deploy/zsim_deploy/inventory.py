@@ -377,7 +377,7 @@ def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
     if name not in scenario.own_programs:
         return ""
     values = {"endpoint": endpoint, "federation": scenario.federation, "name": name, "folder": "{folder}"}
-    return f": {shlex.join(filled(scenario.own_programs[name].command, values))}"
+    return f": {shlex.join(fill_placeholders(scenario.own_programs[name].command, values))}"
 
 
 def _is_known(name: str, scenario: Scenario) -> bool:
