@@ -169,7 +169,7 @@ def _ages_ms(session: zenoh.Session, pilots: Pilots, seconds: float) -> list[flo
 
 def _forward(tilt_rad: float) -> float:
     """Return the `forward` of a command, a fraction of zsim's tilt limit, by which the command is recognised."""
-    sent = at_commands.float_of_bits(at_commands.bits_of_float(tilt_rad / INDOOR_RAD))
+    sent = at_commands.bits_to_float(at_commands.float_to_bits(tilt_rad / INDOOR_RAD))
     return math.tan(sent * INDOOR_RAD) / math.tan(math.radians(20.0))
 
 

@@ -330,7 +330,7 @@ class Run:
             RunError: the record has no such figure.
         """
         with what_is_missing():
-            from zsim_analysis.report.make_report import marked, planned_figures
+            from zsim_analysis.report.make_report import draw_marked, planned_figures
 
         flight, formations, summary = self._judged
         known = []
@@ -339,7 +339,7 @@ class Run:
                 stem = Path(each.name).stem
                 known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
                 if name in (known[-1], stem):
-                    drawing = marked(each, summary).drawing
+                    drawing = draw_marked(each, summary).drawing
                     # without pyplot, a notebook displays a figure only if it has this method
                     setattr(drawing, "_repr_png_", _png_of(drawing))  # noqa: B010
                     return drawing

@@ -1,14 +1,15 @@
 function cluster_controller(host, varargin)
-    % Fly the paper's formation from MATLAB or Octave, in lockstep, in the place of zsim's own controller.
+    % CLUSTER_CONTROLLER Fly the paper's formation from MATLAB or Octave, in lockstep, instead of zsim's own controller.
     %
     %   zsim gateway
     %   zsim run examples/matlab/step_matlab.yaml
     %   >> cluster_controller                           on this machine, or
     %   >> cluster_controller('10.0.0.5', 'Token', 'secret')
     %
-    % Each gate brings the estimates and states of the three drones; it is answered with their velocity commands and
-    % with cluster/main/state, so that recorder, report and console see this controller as they see ours. The
-    % mathematics is in cluster_step.m and +triad. It takes off at 20 s and leads to equation (3) of the paper.
+    % At each gate the controller reads the estimates and states of the three drones, and answers with their velocity
+    % commands and with cluster/main/state, so that recorder, report and console treat it like zsim's own. The
+    % mathematics is in cluster_step.m and +triad. The drones take off at 20 s and fly to the formation of equation (3)
+    % of the paper.
     here = fileparts(mfilename('fullpath'));
     addpath(here, fullfile(here, '..', '..', 'clients', 'matlab'));
     if nargin < 1
@@ -25,7 +26,9 @@ function cluster_controller(host, varargin)
 end
 
 function target = target_of_the_paper()
-    % c_des of equation (3): x_c y_c z_c [m], roll pitch yaw phi_1 phi_2 phi_3 [rad], p q [m], beta [rad].
+    % TARGET_OF_THE_PAPER Return the plan, with c_des of equation (3) as the target.
+    %
+    % The variables are x_c y_c z_c [m], roll pitch yaw phi_1 phi_2 phi_3 [rad], p q [m], beta [rad].
     target = struct('takeoff_s', 20, 'land_s', inf, 'over_s', nan, ...
         'values', [5; -5; 15; 0; 0; pi / 2; 0; 0; 0; 4; 4; pi / 4]);
 end
@@ -48,14 +51,14 @@ function fly(c, drones, target, params)
 end
 
 function estimates = unknown()
-    % Return what is known before the first gate.
+    % UNKNOWN Return the estimates before the first gate.
     none = nan(3, 3);
     estimates = struct('t_s', 0, 'p_W', none, 'v_W', none, 'yaw', nan(3, 1), 'sigma_m', none, ...
         'age_s', inf(3, 1), 'modes', ones(3, 1), 'stamp_s', -inf(3, 1));
 end
 
 function estimates = take_in(estimates, gate, drones)
-    % Take over the messages of a gate, in the order of the drones.
+    % TAKE_IN Store the messages of a gate, in the order of the drones.
     modes = {'landed', 'taking_off', 'hovering', 'flying', 'landing', 'emergency'};
     for i = 1:3
         e = zsim.heard(gate, ['drone/' drones{i} '/estimate']);
@@ -63,7 +66,7 @@ function estimates = take_in(estimates, gate, drones)
             estimates.p_W(i, :) = e.position_m;
             estimates.v_W(i, :) = e.velocity_m_s;
             estimates.yaw(i) = e.yaw_rad;
-            estimates.sigma_m(i, :) = sqrt(e.covariance([1 8 15]));  % of the position, in 6 x 6, row by row
+            estimates.sigma_m(i, :) = sqrt(e.covariance([1 8 15]));  % of the position; covariance is 6 x 6, row by row
             estimates.stamp_s(i) = e.t_ns * 1e-9;
         end
         status = zsim.heard(gate, ['drone/' drones{i} '/sensor/status']);
@@ -76,7 +79,9 @@ function estimates = take_in(estimates, gate, drones)
 end
 
 function say(c, drones, state, velocities, yaw_rates, yaw)
-    % Send the commands of a gate, turned into the heading frame by the estimated yaw, and the cluster's state.
+    % SAY Send the commands of a gate and the cluster's state.
+    %
+    % Velocities are converted to the heading frame with the estimated yaw.
     modes = {'takeoff', 'land'};
     for i = 1:3
         if state.modes(i)

@@ -1,28 +1,29 @@
 function [velocities, yaw_rates, state] = cluster_step(state, estimates, target, params)
-    % Advance the formation controller of the paper by one gate: estimates in, velocity commands out.
+    % CLUSTER_STEP Advance the formation controller of the paper by one gate, from estimates to velocity commands.
     %
     %   state = triad.start();  params = triad.params();
     %   [velocities, yaw_rates, state] = cluster_step(state, estimates, target, params);
     %
-    % No I/O, no memory besides `state`, all sizes fixed: it can be called from a MATLAB Function block, with `state`
-    % fed back through a unit delay.
+    % The function performs no I/O, has no memory except `state`, and all sizes are fixed. It can be called from a
+    % MATLAB Function block, with `state` fed back through a unit delay.
     %
     %   estimates.t_s       simulated time [s]
-    %   estimates.p_W, v_W  3 x 3, a robot a row [m, m/s; W];  estimates.yaw  3 x 1 [rad]
+    %   estimates.p_W, v_W  3 x 3, one robot per row [m, m/s; W];  estimates.yaw  3 x 1 [rad]
     %   estimates.sigma_m   3 x 3, standard deviations of the positions;  estimates.age_s  3 x 1 [s]
     %   estimates.modes     3 x 1: 1 landed, 2 taking_off, 3 hovering, 4 flying, 5 landing, 6 emergency
-    %   target.takeoff_s    when to take off, assemble and engage;  target.land_s  when to land; inf for never
-    %   target.values       12 x 1, where to lead the engaged formation; NaN: as it is, level, heading along
-    %   target.over_s       how long to take; NaN: as fast as the limits let it. A new target may come at any gate
+    %   target.takeoff_s    time to take off, assemble and engage [s];  target.land_s  time to land [s]; inf: never
+    %   target.values       12 x 1, target of the engaged formation; NaN: the last target's value or, before the first
+    %                       one, the value at engagement, except 0 for roll, pitch and phi_1 to phi_3
+    %   target.over_s       duration [s]; NaN: as fast as the limits allow. A target may change at any gate
     %
-    %   velocities  3 x 3 [m/s, W];  yaw_rates  3 x 1 [rad/s]; for the drones that state.commanded names
+    %   velocities  3 x 3 [m/s, W];  yaw_rates  3 x 1 [rad/s]; for the drones selected by state.commanded
     %   state.modes  3 x 1, mode commands to send: 0 none, 1 takeoff, 2 land
     %   state.phase, .value, .desired, .desired_rate, .margin, .reason  for cluster/NAME/state
     %
-    % Mas, Curi, Sanchez Pena, eqs. 1 to 3; phases, limits and the reference as zsim's own controller has them.
+    % Mas, Curi, Sanchez Pena, equations (1) to (3); phases, limits and reference are those of zsim's own controller.
     dt_s = 0;
     if state.t_s >= 0
-        dt_s = min(max(estimates.t_s - state.t_s, 0), 0.1);  % 0.1 s: longest step of the integral, after a gap
+        dt_s = min(max(estimates.t_s - state.t_s, 0), 0.1);  % longest step of the integral, after a gap
     end
     state.t_s = estimates.t_s;
     state.modes = zeros(3, 1);
@@ -54,7 +55,7 @@ function [velocities, yaw_rates, state] = cluster_step(state, estimates, target,
     yaw_rates = table(:, 4);
 end
 
-% What the estimates say
+% Checks of the estimates
 
 function state = observe(state, estimates)
     state.margin = 0;
@@ -72,7 +73,7 @@ function state = observe(state, estimates)
 end
 
 function near = is_near(table)
-    near = all(abs(table) < 1e6, 2);  % m, m/s or rad: beyond it a value is a slip; false for NaN
+    near = all(abs(table) < 1e6, 2);  % m, m/s or rad: larger values are considered invalid; false for NaN
 end
 
 function down = is_down(modes)
@@ -84,7 +85,7 @@ function airborne = is_airborne(modes)
 end
 
 function fault = estimate_fault(estimates, sigma_max_m, params)
-    % Return why the first estimate that is not well is not, as a number for triad.reason.
+    % ESTIMATE_FAULT Return the fault of the first invalid estimate as a number for triad.reason; 0 if there is none.
     fault = 0;
     fit = is_near([estimates.p_W, estimates.v_W, estimates.yaw]);
     for i = 1:3
@@ -102,7 +103,7 @@ function fault = estimate_fault(estimates, sigma_max_m, params)
 end
 
 function fault = formation_fault(state, estimates, params)
-    % Return why the robots, where they are, make no formation to start from.
+    % FORMATION_FAULT Return why the robots' positions are not a valid initial formation; 0 if they are.
     fault = 5;
     if ~state.framed
         return
@@ -137,7 +138,7 @@ function fault = engagement_fault(state, estimates, params)
 end
 
 function fault = flight_fault(state, estimates, params)
-    % Return why the loop of an engaged formation cannot be closed; the limits are wider than those to engage.
+    % FLIGHT_FAULT Return why an engaged formation cannot be controlled; the limits are wider than at engagement.
     fault = 1;
     if all(is_airborne(estimates.modes))
         fault = estimate_fault(estimates, params.sigma_lost_m, params);
@@ -150,7 +151,7 @@ function fault = flight_fault(state, estimates, params)
     end
 end
 
-% The plan: take-off, engagement, target, landing, each as soon as it is due and possible
+% The plan: take-off, engagement, target and landing, each as soon as it is due and possible
 
 function state = run_plan(state, estimates, target, params)
     if estimates.t_s >= target.land_s && state.plan < 3
@@ -213,7 +214,7 @@ function [state, fault] = grant_engagement(state, estimates, params)
     end
     if fault == 0
         state.goal = state.value;
-        state.goal([4 5 7 8 9]) = 0;  % level, and the robots' headings along the formation's
+        state.goal([4 5 7 8 9]) = 0;  % level, with the robots' headings along the formation's
         state.ramp = triad.rest(state.value);
         state.integral = zeros(12, 1);
         state.fault = 0;
@@ -261,7 +262,7 @@ function [r_dot, state] = assembling(state, estimates, params)
 end
 
 function [r_dot, state] = climb(state, estimates, params)
-    % Lead the drones straight up to the assembly height, each by its own velocity loop.
+    % CLIMB Command the drones straight up to the assembly height.
     CLIMB_GAIN_1_S = 0.8;
     r_dot = zeros(12, 1);
     if estimate_fault(estimates, params.sigma_lost_m, params)
@@ -290,7 +291,7 @@ function [r_dot, state] = engaged(state, estimates, dt_s, params)
 end
 
 function r_dot = held(estimates, params)
-    HOLD_APART_M = 0.1;  % a held formation is kept this much farther apart than the minimum
+    HOLD_APART_M = 0.1;  % additional separation of a held formation
     r_dot = zeros(12, 1);
     if estimate_fault(estimates, params.sigma_lost_m, params) == 0
         apart_m = params.separation_min_m + HOLD_APART_M;
@@ -299,11 +300,11 @@ function r_dot = held(estimates, params)
 end
 
 function state = judge(state, estimates, params)
-    % Set the fault of an engaged formation, or heal it when all has been well for a while.
+    % JUDGE Set the fault of an engaged formation; when there has been none for a while, let the formation continue.
     fault = flight_fault(state, estimates, params);
     if fault == 0 && state.fault == 0
         c_des = triad.ramp_value(state.ramp, state.t_s);
-        if any(c_des ~= state.sound)  % one at rest was looked at before
+        if any(c_des ~= state.sound)  % a reference at rest is checked only once
             fault = triad.place_fault(c_des, params);
             state.sound = c_des;
         end
@@ -323,7 +324,7 @@ function state = judge(state, estimates, params)
 end
 
 function state = heal(state, params)
-    % Go on from where the formation is, at rest; the way back keeps the limits in flight.
+    % HEAL Continue from the present formation, at rest; the path back observes the limits for flight.
     wide = params;
     wide.spread_min_m = params.spread_min_m / params.flight_slack;
     wide.tilt_max_rad = params.tilt_max_rad * params.flight_slack;
@@ -340,14 +341,14 @@ end
 
 function state = landing(state, estimates, params)
     state = send(state, is_airborne(estimates.modes) | estimates.modes == 2, 2, params);
-    % A take-off sent just before may still be on its way: idle only after a while on the ground.
+    % A take-off command sent just before may still arrive, so the phase is idle only after a while on the ground.
     if all(is_down(estimates.modes)) && state.t_s - state.landing_s >= params.resend_s
         state.phase = 0;
     end
 end
 
 function state = send(state, wanted, mode, params)
-    % Send a mode to the drones that are to go, again where it had no effect after a while.
+    % SEND Send a mode command to the selected drones; repeat it if it has had no effect after a while.
     due = wanted & state.t_s - state.sent_s >= params.resend_s;
     state.sent_s(due) = state.t_s;
     state.modes(due) = mode;

@@ -1,5 +1,7 @@
 function fly_square(varargin)
-    % Fly drone1 along a square of 2 m, in lockstep: fly_square, or fly_square('10.0.0.5', 'Token', 'secret').
+    % FLY_SQUARE Fly drone1 along a 2 m square, in lockstep.
+    %
+    %   fly_square, or fly_square('10.0.0.5', 'Token', 'secret')
     addpath(fullfile(fileparts(mfilename('fullpath')), '..', '..', 'clients', 'matlab'));
     c = zsim.Client(varargin{:});
     corners = [0 0 2; 2 0 2; 2 2 2; 0 2 2; 0 0 2];  % m, in W
@@ -14,7 +16,7 @@ function fly_square(varargin)
             fprintf('%6.2f s  at %5.2f %5.2f %5.2f m\n', gate.t_s, truth.position_m);
             corners(1, :) = [];
         end
-        gate = c.step();  % answers, and waits for the next
+        gate = c.step();  % answers this gate, and waits for the next
     end
     c.land('drone1');
     c.close();

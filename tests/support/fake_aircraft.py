@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from zsim_bridges.ardrone import at_commands, navdata
-from zsim_bridges.ardrone.navdata import GPS_TAG, LAYOUTS, TAG_OF
+from zsim_bridges.ardrone.navdata import GPS_TAG, LAYOUTS, TAGS_BY_NAME
 
 STEP_NS = 5_000_000
 G = 9.80665
@@ -127,23 +127,23 @@ class FakeAircraft:
         seconds, rest = divmod(now_ns + 3_000_000_000, 1_000_000_000)
         field = FIELD_UT[0] * c + FIELD_UT[1] * s, FIELD_UT[1] * c - FIELD_UT[0] * s, FIELD_UT[2]
         mag = (
-            LAYOUTS[TAG_OF["magneto"]]
+            LAYOUTS[TAGS_BY_NAME["magneto"]]
             .zeros()
             ._replace(mx=round(field[0] / 0.3), my=round(-field[1] / 0.3), mz=round(-field[2] / 0.3))
         )
         phys = (
-            LAYOUTS[TAG_OF["phys_measures"]]
+            LAYOUTS[TAGS_BY_NAME["phys_measures"]]
             .zeros()
             ._replace(phys_accs_mg=(0.0, 0.0, -1000.0), phys_gyros_deg_s=(1.0, 2.0, self._sequence % 7))
         )
-        altitude = LAYOUTS[TAG_OF["altitude"]].zeros()._replace(altitude_raw_mm=round(1e3 * self.position[2]))
-        pressure = LAYOUTS[TAG_OF["pressure_raw"]].zeros()._replace(pressure_pa=100_000)
+        altitude = LAYOUTS[TAGS_BY_NAME["altitude"]].zeros()._replace(altitude_raw_mm=round(1e3 * self.position[2]))
+        pressure = LAYOUTS[TAGS_BY_NAME["pressure_raw"]].zeros()._replace(pressure_pa=100_000)
         yield 0, demo
-        yield TAG_OF["time"], (seconds << 21 | rest // 1000,)
-        yield TAG_OF["phys_measures"], phys
-        yield TAG_OF["altitude"], altitude
-        yield TAG_OF["pressure_raw"], pressure
-        yield TAG_OF["magneto"], mag
+        yield TAGS_BY_NAME["time"], (seconds << 21 | rest // 1000,)
+        yield TAGS_BY_NAME["phys_measures"], phys
+        yield TAGS_BY_NAME["altitude"], altitude
+        yield TAGS_BY_NAME["pressure_raw"], pressure
+        yield TAGS_BY_NAME["magneto"], mag
         if self._sequence % 40 == 0:
             yield (
                 GPS_TAG,

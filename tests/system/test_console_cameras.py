@@ -19,7 +19,7 @@ from synthetic_camera import NUMBER_BITS, SETTINGS
 from wire import PATIENCE_S, Client
 
 from zsim.contract import keys, messages
-from zsim_bridges.console.page_cameras import DIRECTIONS, SPARE, fit_distance_m
+from zsim_bridges.console.page_cameras import DIRECTIONS, FIT_MARGIN, fit_distance_m
 
 LOW = {"width": 1000, "height": 480}
 LAPTOP, DESK = {"width": 1280, "height": 720}, {"width": 1600, "height": 1000}
@@ -174,7 +174,7 @@ def place_of(page: BrowserPage, p_W: tuple[float, float, float]) -> tuple[float,
     fov, aspect, up = math.radians(FIELD_DEG), box["width"] / box["height"], np.array([0.0, 0.0, 1.0])
     centre = (STANDS.min(axis=0) + STANDS.max(axis=0)) / 2
     back = DIRECTIONS["reset"] / np.linalg.norm(DIRECTIONS["reset"])
-    eye = centre + SPARE * fit_distance_m(STANDS, centre, back, up, fov, aspect) * back
+    eye = centre + FIT_MARGIN * fit_distance_m(STANDS, centre, back, up, fov, aspect) * back
     right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
     x, y, z = np.array([right, -np.cross(back, right), -back]) @ (np.array(p_W) - eye)
     focal_px = box["height"] / 2 / math.tan(fov / 2)

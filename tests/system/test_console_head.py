@@ -170,7 +170,7 @@ def test_an_alarm_is_acknowledged_by_its_button(head: Head) -> None:
 def ended(folder: Path, **state: Any) -> dict[str, Any]:
     """Return the head's state after a run, with the files of the run's folder."""
     over = {"level": "ended", "title": "run over at 330.0 s", "detail": "step · the duration is over"}
-    return {**over, **RunFiles(folder).shown(page="", has_copies=False), **state}
+    return {**over, **RunFiles(folder).state(page="", has_copies=False), **state}
 
 
 def gone(head: Head) -> None:

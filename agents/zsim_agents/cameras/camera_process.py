@@ -36,13 +36,13 @@ from zsim_agents.cameras.scene import DroneStates, scene_of
 TICK_S = 0.1  # interval between checks for a stop while no message arrives
 # Number of gates, beyond the command delay, by which cameras may lag the world before they drop pictures: tolerates
 # messages that arrive in bursts, and exceeds the slack of cameras that gate
-BEHIND_MAX = 5
-ANSWER_S = 0.5  # timeout of queries, which the world and cameras answer within milliseconds
-OVERTAKING_S = 0.1  # delay of the bye, whose higher priority would let it reach recorders before the last pictures
+LAG_MAX_GATES = 5
+QUERY_TIMEOUT_S = 0.5  # timeout of queries, which the world and cameras answer within milliseconds
+BYE_DELAY_S = 0.1  # delay of the bye, whose higher priority would let it reach recorders before the last pictures
 DRAIN_S = 1.0  # maximum wall time to wait for the last truths of a run
 PENDING_MAX = 64  # maximum number of gates kept while the truth of a drone is missing
-ASK_S = 2.0  # minimum wall time between requests for a camera's missing info
-REPORTS_MAX = 5  # maximum number of lines printed about refused messages; the health message counts all of them
+INFO_REQUEST_PERIOD_S = 2.0  # minimum wall time between requests for a camera's missing info
+PRINTED_MAX = 5  # maximum number of lines printed about refused messages; the health message counts all of them
 
 
 class RunProcess:
@@ -52,7 +52,7 @@ class RunProcess:
         self._link, self._participant = link, participant
         self._wake_event = threading.Event()
         self._was_lost = False
-        self._is_back = False  # a lost link has been restored
+        self._was_restored = False  # a lost link has been restored
         link.declare_subscriber(keys.CLOCK, self._on_clock)
         link.on_link(self._on_link)
 
@@ -83,7 +83,7 @@ class RunProcess:
             self.wake()
 
     def _on_link(self, up: bool) -> None:
-        self._is_back = self._is_back or (up and self._was_lost)
+        self._was_restored = self._was_restored or (up and self._was_lost)
         self._was_lost = not up
         self.wake()
 
@@ -98,27 +98,29 @@ class CameraProcess(RunProcess):
         self._numbers = {drone.name: i for i, drone in enumerate(info.drones)}
         scene = scene_of(info, scenario)
         cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
-        self._eyes = [
-            _Eye(drone, name, each, Renderer(each, scene, self._numbers[drone], info.seed, f"{drone}/{name}"))
+        self._streams = [
+            _CameraStream(drone, name, each, Renderer(each, scene, self._numbers[drone], info.seed, f"{drone}/{name}"))
             for drone in drones
             for name, each in cameras[drone].items()
         ]
-        longest_ns = max((eye.latency_ns for eye in self._eyes), default=0)
-        self._behind_ns = BEHIND_MAX * info.gate_ns + info.command_delay_ns
+        longest_ns = max((stream.latency_ns for stream in self._streams), default=0)
+        self._lag_max_ns = LAG_MAX_GATES * info.gate_ns + info.command_delay_ns
         rotors = [len(drone.rotors) or ROTORS_MIN for drone in info.drones]
-        external = {i: standing(drone, rotors[i]) for i, drone in enumerate(scenario.drones) if drone.is_external}
-        self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * self._behind_ns, external)
+        external = {
+            i: stationary_truth(drone, rotors[i]) for i, drone in enumerate(scenario.drones) if drone.is_external
+        }
+        self._truths = TruthHistory(len(info.drones), info.gate_ns, longest_ns + 2 * self._lag_max_ns, external)
         self._arrived: deque[RawSample | ReceivedSample] = deque()
-        self._numbers_drawn = count()
+        self._drawing_order = count()
         self._info_seq = 0
-        self._begun = False
+        self._has_begun = False
         self._done_ns = -1
         super().__init__(link, participant)
 
     def begin(self) -> None:
         """Subscribe to the truth, publish the camera infos, and join if the world waits for this process."""
-        for eye in self._eyes:
-            self._link.declare_queryable(eye.info_key, self._on_query)
+        for stream in self._streams:
+            self._link.declare_queryable(stream.info_key, self._on_query)
         self._link.declare_subscriber(keys.truth("*"), self._on_truth)
         self._publish_infos()
         if self._participant.gates:
@@ -135,15 +137,15 @@ class CameraProcess(RunProcess):
         Before the run has begun, no truth can have been missed; querying for it is avoided, since replies to a query
         may overtake earlier publications.
         """
-        has_begun = bool(self._link.get(keys.truth("*"), timeout_s=ANSWER_S))
+        has_begun = bool(self._link.get(keys.truth("*"), timeout_s=QUERY_TIMEOUT_S))
         self._participant.announce()
         if has_begun:
             self._catch_up()
 
     def turn(self) -> None:
         self.wait()
-        if self._is_back:
-            self._is_back = False
+        if self._was_restored:
+            self._was_restored = False
             self._publish_infos()
             self._catch_up()
         self._draw()
@@ -155,12 +157,12 @@ class CameraProcess(RunProcess):
         while self._truths.newest_ns < self._participant.now_ns and time.monotonic() < end_s:
             self.wait()
             self._draw()
-        time.sleep(OVERTAKING_S)
+        time.sleep(BYE_DELAY_S)
 
     def _catch_up(self) -> None:
         """Request the newest truth if the world waits for this process, which may have missed its publication."""
         if self._participant.gates:
-            self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=ANSWER_S))
+            self._arrived.extend(self._link.get(keys.truth("*"), timeout_s=QUERY_TIMEOUT_S))
             self.wake()
 
     def _on_truth(self, sample: RawSample) -> None:
@@ -168,17 +170,17 @@ class CameraProcess(RunProcess):
         self.wake()
 
     def _on_query(self, query: Query) -> None:
-        for eye in self._eyes:
-            if keys.matches(query.expression, eye.info_key):
-                query.reply(eye.info_key, messages.encode(self._camera_info(eye)))
+        for stream in self._streams:
+            if keys.matches(query.expression, stream.info_key):
+                query.reply(stream.info_key, messages.encode(self._camera_info(stream)))
         query.end()
 
     def _draw(self) -> None:
         self._take_truths()
         newest_ns = self._truths.newest_ns
-        for eye, number in self._due():
+        for stream, number in self._due():
             self._take_truths()
-            self._expose(eye, number)
+            self._expose(stream, number)
         if newest_ns > self._done_ns:
             self._done_ns = newest_ns
             self._participant.done(newest_ns)
@@ -197,7 +199,7 @@ class CameraProcess(RunProcess):
             if number is not None:
                 self._truths.add(number, truth)
 
-    def _due(self) -> list[tuple[_Eye, int]]:
+    def _due(self) -> list[tuple[_CameraStream, int]]:
         """Return the due pictures as pairs of camera and picture number, and count those that are too old as dropped.
 
         The cameras take turns, starting with the one whose last picture is oldest, so that a process that is too slow
@@ -206,48 +208,48 @@ class CameraProcess(RunProcess):
         newest_ns = self._truths.newest_ns
         if newest_ns < 0:
             return []
-        due: list[tuple[int, int, _Eye]] = []
-        for eye in self._eyes:
-            last = eye.last_due(newest_ns)
-            first = max(eye.next, eye.last_due(newest_ns - self._behind_ns) + 1)
-            if self._begun:
-                self._participant.health.dropped += max(0, first - eye.next)
-            due += [(turn, number, eye) for turn, number in enumerate(range(first, last + 1))]
-            eye.next = max(eye.next, last + 1)
-        self._begun = True
-        return [(eye, number) for _, number, eye in sorted(due, key=lambda each: (each[0], each[2].last))]
+        due: list[tuple[int, int, _CameraStream]] = []
+        for stream in self._streams:
+            last_number = stream.last_due(newest_ns)
+            first_number = max(stream.next, stream.last_due(newest_ns - self._lag_max_ns) + 1)
+            if self._has_begun:
+                self._participant.health.dropped += max(0, first_number - stream.next)
+            due += [(rank, number, stream) for rank, number in enumerate(range(first_number, last_number + 1))]
+            stream.next = max(stream.next, last_number + 1)
+        self._has_begun = True
+        return [(stream, number) for _, number, stream in sorted(due, key=lambda each: (each[0], each[2].last))]
 
-    def _expose(self, eye: _Eye, number: int) -> None:
+    def _expose(self, stream: _CameraStream, number: int) -> None:
         """Render and publish a picture, or drop it if it is too late."""
         start_ns = time.perf_counter_ns()
-        t_sample_ns = eye.exposure_ns(number)
+        t_sample_ns = stream.exposure_ns(number)
         health = self._participant.health
-        health.lag_ns = max(0, self._truths.newest_ns - t_sample_ns - eye.latency_ns)
+        health.lag_ns = max(0, self._truths.newest_ns - t_sample_ns - stream.latency_ns)
         bodies = self._truths.bodies(t_sample_ns)
-        if bodies is None or health.lag_ns > 2 * self._behind_ns:
+        if bodies is None or health.lag_ns > 2 * self._lag_max_ns:
             health.dropped += 1
             return
         image = CameraImage(
             t_ns=self._truths.newest_ns,
-            seq=eye.seq,
+            seq=stream.seq,
             t_sample_ns=t_sample_ns,
             source=self._participant.name,
-            width=eye.camera.width_px,
-            height=eye.camera.height_px,
-            data=eye.renderer.jpeg(number, t_sample_ns / 1e9, bodies),
+            width=stream.camera.width_px,
+            height=stream.camera.height_px,
+            data=stream.renderer.jpeg(number, t_sample_ns / 1e9, bodies),
         )
-        eye.seq += 1
-        eye.last = next(self._numbers_drawn)
-        self._link.put(eye.key, image)
+        stream.seq += 1
+        stream.last = next(self._drawing_order)
+        self._link.put(stream.key, image)
         health.step(time.perf_counter_ns() - start_ns)
 
     def _publish_infos(self) -> None:
         self._info_seq += 1
-        for eye in self._eyes:
-            self._link.put(eye.info_key, self._camera_info(eye))
+        for stream in self._streams:
+            self._link.put(stream.info_key, self._camera_info(stream))
 
-    def _camera_info(self, eye: _Eye) -> CameraInfo:
-        camera = eye.camera
+    def _camera_info(self, stream: _CameraStream) -> CameraInfo:
+        camera = stream.camera
         lens, pose = lens_of(camera), camera_pose(camera)
         return CameraInfo(
             t_ns=max(0, self._truths.newest_ns),
@@ -282,10 +284,10 @@ class DetectorProcess(RunProcess):
         self._pictures: OrderedDict[str, RawSample] = OrderedDict()
         self._infos: dict[str, RawSample] = {}
         self._detectors: dict[str, HatDetector] = {}  # by camera key, as in the next two
-        self._known: dict[str, CameraInfo] = {}
-        self._asked_s: dict[str, float] = {}
+        self._known_infos: dict[str, CameraInfo] = {}
+        self._requested_s: dict[str, float] = {}
         self._seq: defaultdict[str, int] = defaultdict(int)
-        self._reported = 0
+        self._refusals_printed = 0
         super().__init__(link, participant)
 
     def begin(self) -> None:
@@ -299,9 +301,9 @@ class DetectorProcess(RunProcess):
         """Search the newest picture of each camera for hats, beginning with the camera that has waited longest."""
         self.wait()
         while self._infos:
-            self._learn(self._infos.popitem()[1])
+            self._read_info(self._infos.popitem()[1])
         for _ in range(len(self._pictures)):
-            self._look(self._pictures.popitem(last=False)[1])
+            self._detect(self._pictures.popitem(last=False)[1])
 
     def _on_info(self, sample: RawSample) -> None:
         self._infos[sample.key] = sample
@@ -313,28 +315,28 @@ class DetectorProcess(RunProcess):
         self._pictures[sample.key] = sample
         self.wake()
 
-    def _learn(self, sample: RawSample) -> None:
-        def meaning(info: CameraInfo | None) -> object:
+    def _read_info(self, sample: RawSample) -> None:
+        def detector_settings(info: CameraInfo | None) -> object:
             return info and (info.width, info.height, info.K, info.D, info.orientation_wxyz)
 
         try:
             info: CameraInfo = messages.decode(sample.key, sample.payload)
             key = sample.key.removesuffix("/info")
-            if meaning(self._known.get(key)) != meaning(info):
+            if detector_settings(self._known_infos.get(key)) != detector_settings(info):
                 self._detectors[key] = _detector_of(info, self._diameter_m)
-            self._known[key] = info
+            self._known_infos[key] = info
         except (DecodeError, PictureError) as error:
             self._refuse(sample.key, error)
 
-    def _look(self, sample: RawSample) -> None:
+    def _detect(self, sample: RawSample) -> None:
         start_ns = time.perf_counter_ns()
         health = self._participant.health
         try:
             image: CameraImage = messages.decode(sample.key, sample.payload)
-            detector, info = self._detectors.get(sample.key), self._known.get(sample.key)
+            detector, info = self._detectors.get(sample.key), self._known_infos.get(sample.key)
             if detector is None or info is None:
                 health.dropped += 1
-                self._ask(sample.key)
+                self._request_info(sample.key)
                 return
             seen = detector.seen(decoded(image.data, info.width, info.height))
         except (DecodeError, PictureError) as error:
@@ -354,21 +356,21 @@ class DetectorProcess(RunProcess):
         self._link.put(keys.detections(drone), sightings)
         health.step(time.perf_counter_ns() - start_ns)
 
-    def _ask(self, key: str) -> None:
-        if time.monotonic() - self._asked_s.get(key, -ASK_S) < ASK_S:
+    def _request_info(self, key: str) -> None:
+        if time.monotonic() - self._requested_s.get(key, -INFO_REQUEST_PERIOD_S) < INFO_REQUEST_PERIOD_S:
             return
-        self._asked_s[key] = time.monotonic()
-        for answer in self._link.get(f"{key}/info", timeout_s=ANSWER_S):
-            self._learn(RawSample("PUT", answer.key, answer.payload, "", None))
+        self._requested_s[key] = time.monotonic()
+        for reply in self._link.get(f"{key}/info", timeout_s=QUERY_TIMEOUT_S):
+            self._read_info(RawSample("PUT", reply.key, reply.payload, "", None))
 
     def _refuse(self, key: str, error: Exception) -> None:
         self._participant.health.refused += 1
-        if self._reported < REPORTS_MAX:
-            self._reported += 1
+        if self._refusals_printed < PRINTED_MAX:
+            self._refusals_printed += 1
             self._say(f"{self._participant.name}: {key}: {messages.fault_at(key, error)}")
 
 
-class _Eye:
+class _CameraStream:
     """A camera of a drone, with its renderer and the number of its next picture."""
 
     def __init__(self, drone: str, name: str, camera: Camera, renderer: Renderer) -> None:
@@ -405,9 +407,9 @@ class TruthHistory:
         self._drones, self._gate_ns = drones, gate_ns
         self._external = dict(external)
         self._simulated = frozenset(range(drones)) - external.keys()
-        self._kept = 2 + span_ns // gate_ns
+        self._gates_max = 2 + span_ns // gate_ns
         self._pending: dict[int, dict[int, Truth]] = {}
-        self._whole: dict[int, list[Truth]] = {}  # by gate, in order
+        self._complete: dict[int, list[Truth]] = {}  # by gate, in order
         self.newest_ns = -1
 
     def add(self, drone: int, truth: Truth) -> None:
@@ -424,44 +426,44 @@ class TruthHistory:
             for i, last in self._external.items():
                 moved = moved_on(last.position_m, last.velocity_m_s, t_ns - last.t_ns)
                 states.setdefault(i, replace(last, t_ns=t_ns, position_m=moved))
-            self._whole[t_ns] = [states[i] for i in range(self._drones)]
+            self._complete[t_ns] = [states[i] for i in range(self._drones)]
             self.newest_ns = t_ns
-            self._pending = {t: left for t, left in self._pending.items() if t > t_ns}
-            while len(self._whole) > self._kept:
-                del self._whole[next(iter(self._whole))]
+            self._pending = {t: pending for t, pending in self._pending.items() if t > t_ns}
+            while len(self._complete) > self._gates_max:
+                del self._complete[next(iter(self._complete))]
         elif len(self._pending) > PENDING_MAX:
             del self._pending[min(self._pending)]
 
     def bodies(self, t_ns: int) -> DroneStates | None:
         """Return the states of all drones at `t_ns`; None if a neighbouring gate is missing."""
         before_ns = t_ns // self._gate_ns * self._gate_ns
-        before, after = self._whole.get(before_ns), self._whole.get(before_ns + self._gate_ns)
+        before, after = self._complete.get(before_ns), self._complete.get(before_ns + self._gate_ns)
         if before is None:
             return None
         if t_ns == before_ns:
             after = before
-        return None if after is None else _between((t_ns - before_ns) / 1e9, self._gate_ns / 1e9, before, after)
+        return None if after is None else _interpolated((t_ns - before_ns) / 1e9, self._gate_ns / 1e9, before, after)
 
 
-def standing(drone: Drone, rotors: int) -> Truth:
+def stationary_truth(drone: Drone, rotors: int) -> Truth:
     """Return the state of a drone at rest at its start position, with stopped rotors."""
     half = 0.5 * math.radians(drone.yaw_deg)
-    still, q_WB = (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half))
-    return Truth(0, 0, drone.position_m, still, q_WB, still, still, (0.0,) * rotors)
+    zero, q_WB = (0.0, 0.0, 0.0), (math.cos(half), 0.0, 0.0, math.sin(half))
+    return Truth(0, 0, drone.position_m, zero, q_WB, zero, zero, (0.0,) * rotors)
 
 
-def _between(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence[Truth]) -> DroneStates:
-    share = t_s / gate_s
+def _interpolated(t_s: float, gate_s: float, before: Sequence[Truth], after: Sequence[Truth]) -> DroneStates:
+    fraction = t_s / gate_s
 
-    def mean(a: Sequence[float], b: Sequence[float]) -> list[float]:
-        return [x + share * (y - x) for x, y in zip(a, b, strict=True)]
+    def interpolated(a: Sequence[float], b: Sequence[float]) -> list[float]:
+        return [x + fraction * (y - x) for x, y in zip(a, b, strict=True)]
 
     poses, rates, rotors = [], [], []
     for a, b in zip(before, after, strict=True):
         start, end = ((t.position_m, t.velocity_m_s, t.orientation_wxyz) for t in (a, b))
         poses.append(pose_between(t_s, 0.0, *start, gate_s, *end))
-        rates.append(mean(a.angular_velocity_rad_s, b.angular_velocity_rad_s))
-        rotors.append(mean(a.rotor_rad_s, b.rotor_rad_s))
+        rates.append(interpolated(a.angular_velocity_rad_s, b.angular_velocity_rad_s))
+        rotors.append(interpolated(a.rotor_rad_s, b.rotor_rad_s))
     p, v, q = (np.array([pose[k] for pose in poses]) for k in range(3))
     return DroneStates(p, v, q, np.array(rates), rotors)
 

@@ -36,7 +36,7 @@ BLUE_SHARE = 0.2  # minimum (B - G) / (R - G) of magenta (the paper's has 0.59);
 BLUE_WEIGHT = 1.5  # reduction of the magenta level per unit of missing blue
 AREA_MIN_PX = 2  # minimum area of a region's box at half the resolution
 BLOBS_MAX = 100  # maximum number of regions to examine, the largest first
-ROOM_PX = 4  # margin around a region, for its edge and the background
+MARGIN_PX = 4  # margin around a region, for its edge and the background
 CORE = 0.5  # minimum level of a hat's pixels, as a fraction of the maximum level
 CORE_MIN_PX = 12  # more fully covered pixels than this give the hat's level; with fewer, it is derived from the blur
 POINT_BLUR_PX2 = 1.1  # variance of a point's blur by lens, pixel, JPEG and the mean of nine pixels [px^2]; calibrated
@@ -57,11 +57,11 @@ EDGE = 0.5  # covered share of a pixel at the edge of a ball
 EDGE_BLUR_PX2 = 1.1  # variance of the blur that moves a curved edge inwards [px^2]; calibrated
 # Calibrated terms of an edge point's maximum distance from its circle: constant [px], divided by the radius [px^2], and
 # multiplied by the noise of the covered share [px]
-NEAR_PX, NEAR_PX2, NEAR_NOISE = 0.2, 1.0, 6.0
+TOLERANCE_PX, TOLERANCE_PX2, TOLERANCE_NOISE = 0.2, 1.0, 6.0
 POINTS_MIN = 5  # minimum number of points on a circle
 REFINEMENTS = 3  # number of refinements of the set of points on a circle
 OUTSIDE = 3.0  # cost of a point outside the circle, at most 1 inside: part of a ball may be hidden, but none protrudes
-WHOLE_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of an unobstructed ball
+UNOBSTRUCTED_CENTRE = math.sqrt(2.0 / DIRECTIONS)  # Outline.centre of an unobstructed ball
 SINGULAR = 1e-9  # points are collinear up to this ratio of the determinant to the squared trace of their second moments
 
 EDGE_POINT = columns("EdgePointColumns", (Field("x", "px"), Field("y", "px"), Field("on", "1")))
@@ -100,21 +100,24 @@ class _Box(NamedTuple):
 
     u: int
     v: int
-    wide: int
-    high: int
+    width: int
+    height: int
 
     def touches(self, other: "_Box") -> bool:
         """Return whether the gap to another box is so small, for this box's size, that both are parts of one ball."""
-        gap = 1 + PIECE_GAP * max(self.wide, self.high)
-        across = max(self.u, other.u) - min(self.u + self.wide, other.u + other.wide)
-        down = max(self.v, other.v) - min(self.v + self.high, other.v + other.high)
+        gap = 1 + PIECE_GAP * max(self.width, self.height)
+        across = max(self.u, other.u) - min(self.u + self.width, other.u + other.width)
+        down = max(self.v, other.v) - min(self.v + self.height, other.v + other.height)
         return max(across, down) <= gap
 
-    def united(self, other: "_Box") -> "_Box":
+    def union(self, other: "_Box") -> "_Box":
         """Return the smallest box that contains both boxes."""
         u, v = min(self.u, other.u), min(self.v, other.v)
-        right, low = max(self.u + self.wide, other.u + other.wide), max(self.v + self.high, other.v + other.high)
-        return _Box(u, v, right - u, low - v)
+        right, bottom = (
+            max(self.u + self.width, other.u + other.width),
+            max(self.v + self.height, other.v + other.height),
+        )
+        return _Box(u, v, right - u, bottom - v)
 
 
 class HatDetector:
@@ -139,44 +142,44 @@ class HatDetector:
         mask = cv2.min(strong, cv2.addWeighted(bluish, 1.0, level, -BLUE_SHARE, 0.0))
         contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         boxes = [_Box(*cv2.boundingRect(contour)) for contour in contours]
-        large = [box for box in boxes if box.wide * box.high >= AREA_MIN_PX]
-        whole: list[_Box] = []  # unites the pieces into which a rotor guard divides a ball
-        for box in sorted(large, key=lambda box: (-box.wide * box.high, box))[:BLOBS_MAX]:
-            for i, other in enumerate(whole):
+        large = [box for box in boxes if box.width * box.height >= AREA_MIN_PX]
+        merged: list[_Box] = []  # unites the pieces into which a rotor guard divides a ball
+        for box in sorted(large, key=lambda box: (-box.width * box.height, box))[:BLOBS_MAX]:
+            for i, other in enumerate(merged):
                 if other.touches(box):
-                    whole[i] = other.united(box)
+                    merged[i] = other.union(box)
                     break
             else:
-                whole.append(box)
-        return whole
+                merged.append(box)
+        return merged
 
     def _hat(self, picture: Picture, box: _Box) -> Seen | None:
         """Return the hat in a box at half the resolution; None if there is none, or the picture's edge cuts it off."""
-        u, v, wide, high = (2 * side for side in box)
-        room = ROOM_PX + max(wide, high) // 6
-        u0, v0, u1, v1 = u - room, v - room, u + wide + room, v + high + room
-        if u <= 2 or v <= 2 or u + wide >= self._lens.width - 2 or v + high >= self._lens.height - 2:
+        u, v, width, height = (2 * side for side in box)
+        margin = MARGIN_PX + max(width, height) // 6
+        u0, v0, u1, v1 = u - margin, v - margin, u + width + margin, v + height + margin
+        if u <= 2 or v <= 2 or u + width >= self._lens.width - 2 or v + height >= self._lens.height - 2:
             return None  # a truncated hat gives neither bearing nor range
         part = slice(max(v0, 0), v1), slice(max(u0, 0), u1)
         blue, green, red = (channel.astype(np.float32) for channel in cv2.split(picture[part]))
         level, bluish = red - green, blue - green  # the magenta level is R - G, reduced where blue is missing
-        lack = np.maximum(np.float32(BLUE_SHARE) * level - bluish, 0) * np.float32(BLUE_WEIGHT)
-        level = np.where(level > 0, np.maximum(level - lack, 0), level)
+        missing_blue = np.maximum(np.float32(BLUE_SHARE) * level - bluish, 0) * np.float32(BLUE_WEIGHT)
+        level = np.where(level > 0, np.maximum(level - missing_blue, 0), level)
         sides = level[0], level[-1], level[1:-1, 0], level[1:-1, -1]
-        behind = float(np.median(np.concatenate(sides)))
+        background = float(np.median(np.concatenate(sides)))
         noise = min(_deviation(side) for side in sides)  # a hull may cross some sides, but not all
-        level -= np.float32(behind)
-        outlined = _outlined(level, noise, self._rays[part], self._lens.fx)
-        if outlined is None:
+        level -= np.float32(background)
+        found = _find_outline(level, noise, self._rays[part], self._lens.fx)
+        if found is None:
             return None
-        circle, scale = outlined
-        diameter_px, rough = 2 * circle.radius_rad * scale, circle.rough_px
-        hidden = max(0.0, circle.centre - WHOLE_CENTRE)
+        circle, scale = found
+        diameter_px, roughness_px = 2 * circle.radius_rad * scale, circle.rough_px
+        hidden = max(0.0, circle.centre - UNOBSTRUCTED_CENTRE)
         centre_px = math.hypot(
-            CENTRE[0] * circle.centre * rough, CENTRE[1] * hidden / diameter_px, CENTRE[2] / diameter_px**2
+            CENTRE[0] * circle.centre * roughness_px, CENTRE[1] * hidden / diameter_px, CENTRE[2] / diameter_px**2
         )
         size_px = math.hypot(
-            2 * circle.radius * math.hypot(DIAMETER[0] * rough, DIAMETER[1] / diameter_px), DIAMETER[2]
+            2 * circle.radius * math.hypot(DIAMETER[0] * roughness_px, DIAMETER[1] / diameter_px), DIAMETER[2]
         )
         range_m = self._radius_m / math.sin(circle.radius_rad)
         x, y, z = (self._R_BK @ circle.ray).tolist()
@@ -207,7 +210,7 @@ class Outline(NamedTuple):
     radius: float
 
 
-def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tuple[Outline, float] | None:
+def _find_outline(level: Levels, noise: float, rays: Levels, focal_px: float) -> tuple[Outline, float] | None:
     """Return a hat's outline and the pixels per radian there, or None; `level` is relative to the background."""
     mean = cv2.blur(level, (3, 3), borderType=cv2.BORDER_REPLICATE)
     v, u = divmod(int(np.argmax(mean)), level.shape[1])
@@ -223,8 +226,8 @@ def _outlined(level: Levels, noise: float, rays: Levels, focal_px: float) -> tup
         return None
     scale = focal_px / (cosine * math.sqrt(cosine))  # geometric mean of the radial and tangential scales
     circle = outline(covered, noise / peak, np.ascontiguousarray(rays), scale)  # contiguous as in `rehearse`
-    is_known = circle.share >= SHARE_OF_EDGE_MIN and 2 * circle.radius_rad * scale >= DIAMETER_MIN_PX
-    return (circle, scale) if is_known else None
+    is_reliable = circle.share >= SHARE_OF_EDGE_MIN and 2 * circle.radius_rad * scale >= DIAMETER_MIN_PX
+    return (circle, scale) if is_reliable else None
 
 
 def _covered(level: Levels, core: Picture, near: Picture, peak: float) -> Levels:
@@ -274,7 +277,7 @@ def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outl
         rays: unit vectors through the pixels, in K, float32 (h, w, 3).
         scale: pixels per radian at the ball.
     """
-    u, v = _middle(covered)
+    u, v = _centroid(covered)
     ahead = _ray(rays, u, v)
     right = cross((0.0, 1.0, 0.0), ahead)
     right = scaled(right, 1.0 / norm(right))
@@ -282,11 +285,11 @@ def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outl
     points = np.empty((DIRECTIONS, EDGE_POINT.size))
     count = 0
     for k in range(DIRECTIONS):
-        turn = 2.0 * math.pi * k / DIRECTIONS
-        cosine, sine = math.cos(turn), math.sin(turn)
-        away = _edge(covered, u, v, cosine, sine)
-        if away > 0.0:
-            ray = _ray(rays, u + away * cosine, v + away * sine)
+        angle = 2.0 * math.pi * k / DIRECTIONS
+        cosine, sine = math.cos(angle), math.sin(angle)
+        distance_px = _edge(covered, u, v, cosine, sine)
+        if distance_px > 0.0:
+            ray = _ray(rays, u + distance_px * cosine, v + distance_px * sine)
             ahead_px = dot(ray, ahead) / scale
             points[count, 0], points[count, 1], points[count, 2] = (
                 dot(ray, right) / ahead_px,
@@ -295,19 +298,24 @@ def outline(covered: NDArray, noise: float, rays: NDArray, scale: float) -> Outl
             )
             count += 1
     points = points[:count]
-    if count < POINTS_MIN or not _choose(points, noise):
+    if count < POINTS_MIN or not _mark_best_circle(points, noise):
         return NONE
-    x, y, r = _fitted(points, 0, count)
-    centre, radius, rough = _spread(points, x, y, r)
+    x, y, r = _fit_circle(points, 0, count)
+    centre, radius, roughness_px = _spread(points, x, y, r)
     ray = add(ahead, add(scaled(right, x / scale), scaled(down, y / scale)))
     radius_rad = math.atan((r + EDGE_BLUR_PX2 / (2.0 * r)) / scale)
     return Outline(
-        scaled(ray, 1.0 / norm(ray)), radius_rad, points[:, EDGE_POINT.on].sum() / DIRECTIONS, rough, centre, radius
+        scaled(ray, 1.0 / norm(ray)),
+        radius_rad,
+        points[:, EDGE_POINT.on].sum() / DIRECTIONS,
+        roughness_px,
+        centre,
+        radius,
     )
 
 
 @portable
-def _middle(covered: NDArray) -> tuple[float, float]:
+def _centroid(covered: NDArray) -> tuple[float, float]:
     """Return the centroid of the covered pixels [px]."""
     area, across, along = 1e-9, 0.0, 0.0
     for v in range(covered.shape[0]):
@@ -318,7 +326,7 @@ def _middle(covered: NDArray) -> tuple[float, float]:
 
 
 @portable
-def _between(picture: NDArray, u: float, v: float) -> float:
+def _interpolated(picture: NDArray, u: float, v: float) -> float:
     """Return the bilinearly interpolated value of a picture (h, w); 0 outside."""
     if u < 0.0 or v < 0.0 or u >= picture.shape[1] - 1 or v >= picture.shape[0] - 1:
         return 0.0
@@ -333,7 +341,7 @@ def _ray(rays: NDArray, u: float, v: float) -> Vector:
     """Return the interpolated unit vector through a point, which is clamped to the picture."""
     u = min(max(u, 0.0), rays.shape[1] - 1.001)
     v = min(max(v, 0.0), rays.shape[0] - 1.001)
-    ray = _between(rays[:, :, 0], u, v), _between(rays[:, :, 1], u, v), _between(rays[:, :, 2], u, v)
+    ray = _interpolated(rays[:, :, 0], u, v), _interpolated(rays[:, :, 1], u, v), _interpolated(rays[:, :, 2], u, v)
     return scaled(ray, 1.0 / norm(ray))
 
 
@@ -343,16 +351,16 @@ def _edge(covered: NDArray, u: float, v: float, cosine: float, sine: float) -> f
     steps = int(math.hypot(float(covered.shape[0]), float(covered.shape[1])) / STEP_PX)
     outer = 0.0
     for step in range(steps, -1, -1):
-        away = step * STEP_PX
-        share = _between(covered, u + away * cosine, v + away * sine)
+        distance_px = step * STEP_PX
+        share = _interpolated(covered, u + distance_px * cosine, v + distance_px * sine)
         if share > EDGE:
-            return away + STEP_PX * (share - EDGE) / (share - outer)
+            return distance_px + STEP_PX * (share - EDGE) / (share - outer)
         outer = share
     return 0.0
 
 
 @portable
-def _fitted(points: NDArray, first: int, count: int) -> Circle:
+def _fit_circle(points: NDArray, first: int, count: int) -> Circle:
     """Return the circle fitted to the marked points among `count` consecutive ones from `first` on, cyclically."""
     n, mx, my = 0.0, 0.0, 0.0
     for k in range(count):
@@ -374,9 +382,9 @@ def _fitted(points: NDArray, first: int, count: int) -> Circle:
 
 
 @portable
-def _near_px(r: float, noise: float) -> float:
+def _tolerance_px(r: float, noise: float) -> float:
     """Return the maximum distance of an edge point from its circle of radius r [px]."""
-    return NEAR_PX + NEAR_PX2 / r + NEAR_NOISE * noise
+    return TOLERANCE_PX + TOLERANCE_PX2 / r + TOLERANCE_NOISE * noise
 
 
 @portable
@@ -385,36 +393,36 @@ def _cost(points: NDArray, circle: Circle, noise: float) -> float:
     x, y, r = circle
     if r <= 0.0:
         return math.inf
-    near, total = _near_px(r, noise), 0.0
+    tolerance_px, total = _tolerance_px(r, noise), 0.0
     for k in range(len(points)):
-        off = math.hypot(points[k, 0] - x, points[k, 1] - y) - r
-        total += OUTSIDE if off > near else min(abs(off) / near, 1.0)
+        deviation_px = math.hypot(points[k, 0] - x, points[k, 1] - y) - r
+        total += OUTSIDE if deviation_px > tolerance_px else min(abs(deviation_px) / tolerance_px, 1.0)
     return total
 
 
 @portable
-def _choose(points: NDArray, noise: float) -> bool:
+def _mark_best_circle(points: NDArray, noise: float) -> bool:
     """Mark the points on the circle that explains all points best; return False if there are too few."""
     count = len(points)
-    least, best = math.inf, (0.0, 0.0, 0.0)
+    min_cost, best = math.inf, (0.0, 0.0, 0.0)
     for first in range(count):
-        circle = _fitted(points, first, count // 2 + 1)
+        circle = _fit_circle(points, first, count // 2 + 1)
         cost = _cost(points, circle, noise)
-        if cost < least:
-            least, best = cost, circle
-    near = np.empty(count)
+        if cost < min_cost:
+            min_cost, best = cost, circle
+    is_near = np.empty(count)
     for _ in range(REFINEMENTS):
         x, y, r = best
         if r <= 0.0:
             return False
         for k in range(count):
-            off = abs(math.hypot(points[k, 0] - x, points[k, 1] - y) - r)
-            near[k] = 1.0 if off < _near_px(r, noise) else 0.0
+            deviation_px = abs(math.hypot(points[k, 0] - x, points[k, 1] - y) - r)
+            is_near[k] = 1.0 if deviation_px < _tolerance_px(r, noise) else 0.0
         for k in range(count):  # blur makes edge points next to hidden ones unreliable
-            points[k, EDGE_POINT.on] = near[k] * near[k - 1] * near[(k + 1) % count]
+            points[k, EDGE_POINT.on] = is_near[k] * is_near[k - 1] * is_near[(k + 1) % count]
         if points[:, EDGE_POINT.on].sum() < POINTS_MIN:
             return False
-        best = _fitted(points, 0, count)
+        best = _fit_circle(points, 0, count)
     return best[2] > 0.0
 
 

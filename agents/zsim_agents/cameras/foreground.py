@@ -53,22 +53,22 @@ COLOURS = {  # B, G, R, as in the console, except for the darker underside of th
 }
 RING = 1.31  # outer radius of the hull's ring around a rotor, over the rotor radius
 RING_POINTS = 16
-RING_Z_M, RING_HIGH_M = 0.022, 0.042  # z of a ring at mid-height, and height of the ring
-ARM_Z_M, ARM_WIDE_M = 0.004, 0.014
+RING_Z_M, RING_HEIGHT_M = 0.022, 0.042  # z of a ring at mid-height, and height of the ring
+ARM_Z_M, ARM_WIDTH_M = 0.004, 0.014
 ROTOR_Z_M, ROTOR_CHORD_M = 0.030, 0.016
 LENS_M = 0.013  # radius of the lens on a drone's nose
-MOTOR_WIDE_M = 0.034
+MOTOR_WIDTH_M = 0.034
 REACH_M = 0.36  # distance from the AR.Drone's centre to the farthest point of its rotors and hull
 BODY_POINTS, NOSE_POINTS = 40, 20
-SECTOR = 5  # points along the arc of a blade's sweep
+SECTOR_POINTS = 5  # points along the arc of a blade's sweep
 BLADES = 2
 BLADE_RAD = 0.3  # angle that a blade covers at two thirds of its radius
 OPACITY = 0.16, 0.9  # minimum and maximum opacity of a blade's sweep; tuned by eye
 DETAIL_PX = 14.0  # width of a drone above which its lens, motors and rotors are drawn
 THICKNESS_MAX_PX = 80
-SEEN_M = 300.0  # distance beyond which drones are smaller than a pixel
-ROOM_M = 0.5  # upper bound on the distance of any part of an AR.Drone from its centre
-BLURRED_PX = 2.0  # motion above which drones are blurred; hulls need not be as exact as hats
+VISIBLE_MAX_M = 300.0  # distance beyond which drones are smaller than a pixel
+EXTENT_MAX_M = 0.5  # upper bound on the distance of any part of an AR.Drone from its centre
+BLUR_MIN_PX = 2.0  # motion above which drones are blurred; hulls need not be as exact as hats
 EDGE_PX = 3.0  # distance by which antialiased edges and blur may extend beyond lines
 Levels = NDArray[np.float32]
 AMBIENT, DIFFUSE = 0.72, 0.28  # shares of the light from the sky and from the sun, for matt foam outdoors
@@ -117,27 +117,27 @@ class DroneImager:
         """
         R_KB = motion.R_WK.T @ R_WB
         centres = motion.points_K(bodies.p_WB)
-        ways = motion.rates_K(centres, bodies.v_WB) * self._exposure_s
+        displacements = motion.rates_K(centres, bodies.v_WB) * self._exposure_s
         cameras_B = np.einsum("nji,nj->ni", R_KB, -centres)
         distances = np.sqrt((centres * centres).sum(axis=-1))
-        room = ROOM_M * max(model.size for model in self._models)
-        ahead = centres[:, 2] + room
-        near = np.abs(centres[:, 0]) - 2 * room < self._across * ahead
-        near &= np.abs(centres[:, 1]) - 2 * room < self._down * ahead
-        near &= (distances < SEEN_M) & (ahead > 0)
+        margin_m = EXTENT_MAX_M * max(model.size for model in self._models)
+        depth_limit = centres[:, 2] + margin_m
+        near = np.abs(centres[:, 0]) - 2 * margin_m < self._across * depth_limit
+        near &= np.abs(centres[:, 1]) - 2 * margin_m < self._down * depth_limit
+        near &= (distances < VISIBLE_MAX_M) & (depth_limit > 0)
         near[self._carrier] = False  # no part of the carrier appears in its own picture
         in_view: list[int] = np.flatnonzero(near).tolist()
         kinds: defaultdict[int, list[int]] = defaultdict(list)
         for i in in_view:
             kinds[self._kinds[i]].append(i)
         drones: dict[int, DroneImage] = {}
-        for kind, which in kinds.items():
-            drones |= self._images(kind, which, _Poses(R_KB, centres, ways, cameras_B), t_s, bodies)
+        for kind, indices in kinds.items():
+            drones |= self._images(kind, indices, _Poses(R_KB, centres, displacements, cameras_B), t_s, bodies)
         hats = centres + R_KB @ self._hat
         hat_velocities = bodies.v_WB + np.einsum("nij,nj->ni", R_WB, bodies.w_WB_B @ -skew(self._hat).T)
-        hat_ways = motion.rates_K(hats, hat_velocities) * self._exposure_s
+        hat_displacements = motion.rates_K(hats, hat_velocities) * self._exposure_s
         shown = [i for i in in_view if self._looks[i].has_hat and hats[i, 2] > NEAR_M]
-        seen = {shown[k]: image for k, image in self.hats(hats[shown], hat_ways[shown], motion).items()}
+        seen = {shown[k]: image for k, image in self.hats(hats[shown], hat_displacements[shown], motion).items()}
         images: dict[int, tuple[float, list[BallImage | DroneImage]]] = {}
         for i in in_view:
             layers = [image for image in (drones.get(i), seen.get(i)) if image is not None]
@@ -145,53 +145,57 @@ class DroneImager:
             images[i] = float(distances[i]), layers[::-1] if hat_is_behind else layers
         return images
 
-    def hats(self, centres_K: Array, ways_K: Array, motion: CameraMotion) -> dict[int, BallImage]:
+    def hats(self, centres_K: Array, displacements_K: Array, motion: CameraMotion) -> dict[int, BallImage]:
         """Return the images of hats in front of the camera, by index; for the arguments see `ball_images`."""
         colour = self._brightness * MAGENTA
-        return ball_images(self._view, centres_K, ways_K, self._radius_m, colour, SUN_W @ motion.R_WK)
+        return ball_images(self._view, centres_K, displacements_K, self._radius_m, colour, SUN_W @ motion.R_WK)
 
     def _images(
-        self, kind: int, which: list[int], poses: _Poses, t_s: float, bodies: DroneStates
+        self, kind: int, indices: list[int], poses: _Poses, t_s: float, bodies: DroneStates
     ) -> dict[int, DroneImage]:
-        """Return the images of those drones in `which`, all of one look, that are entirely in front of the camera."""
+        """Return the images of those drones in `indices`, all of one look, that are entirely in front of the camera."""
         look, model = self._looks[kind], self._models[kind]
-        speeds = np.array([bodies.rotors[i] for i in which], float)
+        speeds = np.array([bodies.rotors[i] for i in indices], float)
         blades = _blade_points(look, model.size, t_s, self._exposure_s, speeds)
-        of_model = np.broadcast_to(model.points, (len(which), *model.points.shape))
-        points_B = np.concatenate([of_model, blades], axis=1).transpose(0, 2, 1)
-        points = poses.R_KB[which] @ points_B + poses.centres[which, :, None]
-        whole = np.flatnonzero(points[:, 2].min(axis=1) > NEAR_M)
-        if not len(whole):
+        model_points = np.broadcast_to(model.points, (len(indices), *model.points.shape))
+        points_B = np.concatenate([model_points, blades], axis=1).transpose(0, 2, 1)
+        points = poses.R_KB[indices] @ points_B + poses.centres[indices, :, None]
+        in_front = np.flatnonzero(points[:, 2].min(axis=1) > NEAR_M)
+        if not len(in_front):
             return {}
-        near = np.array(which)[whole]
-        pixels = fixed(self._view.pixels(points[whole].transpose(0, 2, 1)))
-        ways_px = self._view.flow_px(poses.centres[near], poses.ways[near])
-        scales = self._view.lens.fx * model.size / poses.centres[near, 2]
-        turned = np.abs(speeds[whole]) * self._exposure_s  # angle by which each rotor turns [rad]
-        blurs: list[Kernel | None] = [None] * len(near)
-        moved = np.flatnonzero(np.hypot(*ways_px.T) > BLURRED_PX).tolist()
-        for i, kernel in zip(moved, motion_blur_kernels(ways_px[moved]) if moved else [], strict=True):
+        visible = np.array(indices)[in_front]
+        pixels = to_fixed_point(self._view.pixels(points[in_front].transpose(0, 2, 1)))
+        displacements_px = self._view.flow_px(poses.centres[visible], poses.displacements[visible])
+        scales = self._view.lens.fx * model.size / poses.centres[visible, 2]
+        turns_rad = np.abs(speeds[in_front]) * self._exposure_s  # angle by which each rotor turns [rad]
+        blurs: list[Kernel | None] = [None] * len(visible)
+        blurred = np.flatnonzero(np.hypot(*displacements_px.T) > BLUR_MIN_PX).tolist()
+        for i, kernel in zip(blurred, motion_blur_kernels(displacements_px[blurred]) if blurred else [], strict=True):
             blurs[i] = kernel
         rows = zip(
-            self._boxes(pixels, ways_px, scales),
+            self._boxes(pixels, displacements_px, scales),
             pixels,
             scales.tolist(),
             blurs,
-            (poses.cameras_B[near, 2] > 0.03 * model.size).tolist(),
-            (poses.cameras_B[near, 0] > 0.1 * model.size).tolist(),
-            np.clip(BLADE_RAD / np.maximum(turned.mean(axis=1), BLADE_RAD), *OPACITY).tolist(),
-            (turned.min(axis=1) * BLADES >= 2 * math.pi).tolist(),
+            (poses.cameras_B[visible, 2] > 0.03 * model.size).tolist(),
+            (poses.cameras_B[visible, 0] > 0.1 * model.size).tolist(),
+            np.clip(BLADE_RAD / np.maximum(turns_rad.mean(axis=1), BLADE_RAD), *OPACITY).tolist(),
+            (turns_rad.min(axis=1) * BLADES >= 2 * math.pi).tolist(),
             strict=True,
         )
-        return {i: DroneImage(model, *row) for i, row in zip(near.tolist(), rows, strict=True) if has_pixels(row[0])}
+        return {
+            i: DroneImage(model, *parameters)
+            for i, parameters in zip(visible.tolist(), rows, strict=True)
+            if has_pixels(parameters[0])
+        }
 
-    def _boxes(self, pixels: Fixed, ways_px: Array, scales: Array) -> list[list[int]]:
+    def _boxes(self, pixels: Fixed, displacements_px: Array, scales: Array) -> list[list[int]]:
         """Return the box around each drone in the picture, from its points in sixteenths of a pixel."""
-        u, v, wide, high = np.array([cv2.boundingRect(each) for each in pixels]).T / (1 << SHIFT)
-        lowest, highest = np.stack([u, v], axis=-1), np.stack([u + wide, v + high], axis=-1)
-        half_way = np.minimum(np.abs(ways_px), BLUR_MAX_PX) / 2
-        room = EDGE_PX + half_way + np.minimum(MOTOR_WIDE_M * scales, THICKNESS_MAX_PX)[:, None] / 2
-        return self._view.boxes(lowest - room, highest + room)
+        u, v, width, height = np.array([cv2.boundingRect(each) for each in pixels]).T / (1 << SHIFT)
+        lowest, highest = np.stack([u, v], axis=-1), np.stack([u + width, v + height], axis=-1)
+        half_displacement = np.minimum(np.abs(displacements_px), BLUR_MAX_PX) / 2
+        margin = EDGE_PX + half_displacement + np.minimum(MOTOR_WIDTH_M * scales, THICKNESS_MAX_PX)[:, None] / 2
+        return self._view.boxes(lowest - margin, highest + margin)
 
 
 class _Poses(NamedTuple):
@@ -202,7 +206,7 @@ class _Poses(NamedTuple):
 
     R_KB: Array
     centres: Array
-    ways: Array
+    displacements: Array
     cameras_B: Array
 
 
@@ -256,9 +260,9 @@ def _blade_points(look: DroneLook, size: float, t_s: float, exposure_s: float, s
     """
     middle = np.remainder(-look.turns * speeds * t_s, 2 * math.pi)
     sweep = np.clip(np.abs(speeds) * exposure_s, 2 * ROTOR_CHORD_M * size / look.radius_m, math.pi)
-    blades, along = math.pi * np.arange(BLADES), np.linspace(-0.5, 0.5, SECTOR)
+    blades, along = math.pi * np.arange(BLADES), np.linspace(-0.5, 0.5, SECTOR_POINTS)
     angles = (middle[..., None] + blades)[..., None] + sweep[..., None, None] * along
-    points = np.zeros((*angles.shape[:-1], SECTOR + 1, 3))
+    points = np.zeros((*angles.shape[:-1], SECTOR_POINTS + 1, 3))
     points[..., 1:, 0] = look.radius_m * np.cos(angles)
     points[..., 1:, 1] = look.radius_m * np.sin(angles)
     points[..., :2] += look.hubs_B[:, None, None]
@@ -275,10 +279,10 @@ class DroneImage(NamedTuple):
             (P + R BLADES (SECTOR + 1), 2).
         scale: factor from dimensions of the AR.Drone [m] to pixels, which includes the drone's relative size.
         blur: kernel of the drone's motion during the exposure; None if it hardly moves.
-        from_above: whether the camera is above the drone's rotors.
+        is_from_above: whether the camera is above the drone's rotors.
         shows_lens: whether the camera is in front of the drone.
         opacity: opacity of a blade's sweep.
-        whole_turns: whether the blades of each rotor cover the full circle during the exposure.
+        covers_circle: whether the blades of each rotor cover the full circle during the exposure.
     """
 
     model: _DroneModel
@@ -286,10 +290,10 @@ class DroneImage(NamedTuple):
     pixels: Fixed
     scale: float
     blur: Kernel | None
-    from_above: bool
+    is_from_above: bool
     shows_lens: bool
     opacity: float
-    whole_turns: bool
+    covers_circle: bool
 
     def draw(self, picture: Picture) -> None:
         """Draw the drone without its hat, on a separate layer if it is blurred, so that the background stays sharp."""
@@ -302,20 +306,20 @@ class DroneImage(NamedTuple):
         layer = np.zeros((*part.shape[:2], 4), np.uint8)  # the fourth channel is the share covered by the drone
         self._draw(layer, pixels)
         cv2.filter2D(layer, -1, self.blur, dst=layer, borderType=cv2.BORDER_REPLICATE)
-        passes = cv2.bitwise_not(cv2.extractChannel(layer, 3))
-        cv2.multiply(part, cv2.merge([passes] * 3), dst=part, scale=1 / 255)
+        transmitted = cv2.bitwise_not(cv2.extractChannel(layer, 3))
+        cv2.multiply(part, cv2.merge([transmitted] * 3), dst=part, scale=1 / 255)
         cv2.add(part, cv2.cvtColor(layer, cv2.COLOR_BGRA2BGR), dst=part)
 
     def _draw(self, picture: Picture, pixels: Fixed) -> None:
         scale, parts, colours = self.scale, self.model.parts, self.model.colours
-        hull = colours["hull" if self.from_above else "hull_low"]
+        hull = colours["hull" if self.is_from_above else "hull_low"]
         detailed = 2 * REACH_M * scale > DETAIL_PX
-        if detailed and not self.from_above:
+        if detailed and not self.is_from_above:
             self._draw_rotors(picture, pixels)
-        _lines(picture, pixels[parts["rings"]].reshape(-1, RING_POINTS, 2), True, hull, 0.6 * RING_HIGH_M * scale)
-        _lines(picture, pixels[parts["arms"]].reshape(-1, 2, 2), False, colours["cross"], ARM_WIDE_M * scale)
+        _lines(picture, pixels[parts["rings"]].reshape(-1, RING_POINTS, 2), True, hull, 0.6 * RING_HEIGHT_M * scale)
+        _lines(picture, pixels[parts["arms"]].reshape(-1, 2, 2), False, colours["cross"], ARM_WIDTH_M * scale)
         if detailed:
-            _lines(picture, pixels[parts["motors"]].reshape(-1, 2, 2), False, colours["cross"], MOTOR_WIDE_M * scale)
+            _lines(picture, pixels[parts["motors"]].reshape(-1, 2, 2), False, colours["cross"], MOTOR_WIDTH_M * scale)
         _fill_hull(picture, pixels[parts["body"]], hull)
         if self.shows_lens:
             _fill_hull(picture, pixels[parts["nose"]], colours["nose"])
@@ -323,21 +327,21 @@ class DroneImage(NamedTuple):
                 u, v = pixels[parts["lens"]][0].tolist()
                 radius = round(max(LENS_M * scale, 0.5) * (1 << SHIFT))
                 cv2.circle(picture, (u, v), radius, colours["cross"], cv2.FILLED, cv2.LINE_AA, SHIFT)
-        if detailed and self.from_above:
+        if detailed and self.is_from_above:
             self._draw_rotors(picture, pixels)
 
     def _draw_rotors(self, picture: Picture, pixels: Fixed) -> None:
         """Darken the sweeps of the blades."""
         swept = picture.copy()
-        sectors = pixels[len(self.model.points) :].reshape(-1, SECTOR + 1, 2)
-        circles = sectors[:, 1:].reshape(-1, BLADES * SECTOR, 2)
-        for sweep in circles if self.whole_turns else sectors:
+        sectors = pixels[len(self.model.points) :].reshape(-1, SECTOR_POINTS + 1, 2)
+        circles = sectors[:, 1:].reshape(-1, BLADES * SECTOR_POINTS, 2)
+        for sweep in circles if self.covers_circle else sectors:
             cv2.fillConvexPoly(swept, sweep, self.model.colours["rotor"], cv2.LINE_AA, SHIFT)
         cv2.addWeighted(swept, self.opacity, picture, 1 - self.opacity, 0.0, dst=picture)
 
 
-def _lines(picture: Picture, lines: Fixed, closed: bool, colour: Colour, wide_px: float) -> None:
-    thickness = min(max(1, round(wide_px)), THICKNESS_MAX_PX)
+def _lines(picture: Picture, lines: Fixed, closed: bool, colour: Colour, width_px: float) -> None:
+    thickness = min(max(1, round(width_px)), THICKNESS_MAX_PX)
     cv2.polylines(picture, [*lines], closed, colour, thickness, cv2.LINE_AA, SHIFT)
 
 
@@ -351,21 +355,21 @@ class BallImage(NamedTuple):
     Attributes:
         box: the part of the picture that contains the ball: u0, v0, u1, v1.
         light: light from the ball, plus 0.5 for rounding, (h, w, 3).
-        passes: share of the light from behind that passes the ball, (h, w, 1).
+        transmittance: share of the light from behind that passes the ball, (h, w, 1).
     """
 
     box: list[int]
     light: Levels
-    passes: Levels
+    transmittance: Levels
 
     def draw(self, picture: Picture) -> None:
         u0, v0, u1, v1 = self.box
         part = picture[v0:v1, u0:u1]
-        part[:] = part * self.passes + self.light
+        part[:] = part * self.transmittance + self.light
 
 
 def ball_images(
-    view: View, centres_K: Array, ways_K: Array, radius_m: float, colour: Array, sun_K: Array
+    view: View, centres_K: Array, displacements_K: Array, radius_m: float, colour: Array, sun_K: Array
 ) -> dict[int, BallImage]:
     """Return the images of those balls that are in the picture during an exposure, by index.
 
@@ -373,52 +377,52 @@ def ball_images(
     fastest ball in the picture requires.
 
     Args:
-        centres_K, ways_K: centres and their motion during the exposure, (M, 3) [m; K].
+        centres_K, displacements_K: centres and their motion during the exposure, (M, 3) [m; K].
         radius_m: radius of all balls.
         colour: B, G, R of all balls, (3,).
         sun_K: unit vector to the sun, (3,).
     """
     if not len(centres_K):
         return {}
-    ways_px = np.hypot(*view.flow_px(centres_K, ways_K).T)
-    boxes = _boxes(view, centres_K, ways_px, radius_m)
+    displacements_px = np.hypot(*view.flow_px(centres_K, displacements_K).T)
+    boxes = _boxes(view, centres_K, displacements_px, radius_m)
     if not boxes:
         return {}
     shown = list(boxes)
-    centres, ways = centres_K[shown], ways_K[shown]
+    centres, displacements = centres_K[shown], displacements_K[shown]
     vectors = np.empty((len(shown), 3, 4), np.float32)
-    vectors[..., 0], vectors[..., 1], vectors[..., 2], vectors[..., 3] = centres, ways, sun_K, AXIS
+    vectors[..., 0], vectors[..., 1], vectors[..., 2], vectors[..., 3] = centres, displacements, sun_K, AXIS
     parts = [
         view.rays[v0:v1, u0:u1].reshape(-1, 3) @ each
         for (u0, v0, u1, v1), each in zip(boxes.values(), vectors, strict=True)
     ]
-    along, to_way, to_sun, to_axis = np.concatenate(parts).T
-    pixels = _Pixels(along, to_way, to_sun, to_axis, [len(part) for part in parts])
-    steps = min(STEPS_MAX, max(1, math.ceil(ways_px[shown].max() / STEP_PX)))
-    covered = _covered(pixels, centres, ways, radius_m, view.lens.fx, steps)
-    rest = pixels.of_ball(radius_m**2 - (centres * centres).sum(axis=-1))  # constant term of a ray's intersection
-    meets = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + rest, 0))
-    cosine = (meets * pixels.to_sun - pixels.of_ball(centres @ sun_K)) * np.float32(DIFFUSE / radius_m)
+    along, along_displacement, along_sun, along_axis = np.concatenate(parts).T
+    pixels = _Pixels(along, along_displacement, along_sun, along_axis, [len(part) for part in parts])
+    steps = min(STEPS_MAX, max(1, math.ceil(displacements_px[shown].max() / STEP_PX)))
+    covered = _covered(pixels, centres, displacements, radius_m, view.lens.fx, steps)
+    constant = pixels.per_pixel(radius_m**2 - (centres * centres).sum(axis=-1))  # constant term of a ray's intersection
+    hit_distance = pixels.along - np.sqrt(np.maximum(pixels.along * pixels.along + constant, 0))
+    cosine = (hit_distance * pixels.along_sun - pixels.per_pixel(centres @ sun_K)) * np.float32(DIFFUSE / radius_m)
     shade = np.float32(AMBIENT) + np.minimum(np.maximum(cosine, 0), np.float32(DIFFUSE))
     light = (covered * shade)[:, None] * colour.astype(np.float32) + ROUNDING
-    passes = (1 - covered)[:, None]
+    transmittance = (1 - covered)[:, None]
     images: dict[int, BallImage] = {}
     start = 0
     for (i, box), count in zip(boxes.items(), pixels.counts, strict=True):
         size, part = (box[3] - box[1], box[2] - box[0]), slice(start, start + count)
-        images[i] = BallImage(box, light[part].reshape(*size, 3), passes[part].reshape(*size, 1))
+        images[i] = BallImage(box, light[part].reshape(*size, 3), transmittance[part].reshape(*size, 1))
         start += count
     return images
 
 
-def _boxes(view: View, centres_K: Array, ways_px: Array, radius_m: float) -> dict[int, list[int]]:
+def _boxes(view: View, centres_K: Array, displacements_px: Array, radius_m: float) -> dict[int, list[int]]:
     """Return the boxes of the picture around those balls that are in it, by index."""
     x, y, z = centres_K.T
-    before = z >= radius_m + NEAR_M
-    wide_px = view.lens.fx * radius_m / np.where(before, z - radius_m, np.inf) * (1 + np.hypot(x, y) / z)
-    reach, pixels = (1.5 + ways_px / 2 + wide_px)[:, None], view.pixels(centres_K)
+    is_in_front = z >= radius_m + NEAR_M
+    radius_px = view.lens.fx * radius_m / np.where(is_in_front, z - radius_m, np.inf) * (1 + np.hypot(x, y) / z)
+    reach, pixels = (1.5 + displacements_px / 2 + radius_px)[:, None], view.pixels(centres_K)
     boxes = view.boxes(pixels - reach, pixels + reach)
-    return {i: box for i, box in enumerate(boxes) if before[i] and has_pixels(box)}
+    return {i: box for i, box in enumerate(boxes) if is_in_front[i] and has_pixels(box)}
 
 
 class _Pixels(NamedTuple):
@@ -428,27 +432,29 @@ class _Pixels(NamedTuple):
     """
 
     along: Levels
-    to_way: Levels
-    to_sun: Levels
-    to_axis: Levels
+    along_displacement: Levels
+    along_sun: Levels
+    along_axis: Levels
     counts: list[int]
 
-    def of_ball(self, values: Array) -> Levels:
+    def per_pixel(self, values: Array) -> Levels:
         """Return values (..., M) of the balls, repeated for each of a ball's pixels, (..., P)."""
         return np.repeat(values.astype(np.float32), self.counts, axis=-1)
 
 
-def _covered(pixels: _Pixels, centres: Array, ways: Array, radius: float, focal_px: float, steps: int) -> Levels:
+def _covered(
+    pixels: _Pixels, centres: Array, displacements: Array, radius: float, focal_px: float, steps: int
+) -> Levels:
     """Return the covered share of each pixel, averaged over time, from how far within the radius its ray passes."""
-    shares = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # time since mid-exposure over the exposure time
-    moved = centres + shares[..., None] * ways
-    away2 = (moved * moved).sum(axis=-1)
-    along = pixels.along + shares.astype(np.float32) * pixels.to_way
-    beside2 = pixels.of_ball(away2) - along * along
-    px_per_m = pixels.of_ball(focal_px / np.sqrt((centres * centres).sum(axis=-1)))
-    px_per_m /= pixels.to_axis * np.sqrt(pixels.to_axis)  # geometric mean of the radial and tangential scales
-    within = (np.float32(radius) - np.sqrt(np.maximum(beside2, 0))) * px_per_m
-    return np.minimum(np.maximum(within + ROUNDING, 0), 1).mean(axis=0)
+    fractions = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # time since mid-exposure over the exposure time
+    moved = centres + fractions[..., None] * displacements
+    distance2 = (moved * moved).sum(axis=-1)
+    along = pixels.along + fractions.astype(np.float32) * pixels.along_displacement
+    offset2 = pixels.per_pixel(distance2) - along * along
+    px_per_m = pixels.per_pixel(focal_px / np.sqrt((centres * centres).sum(axis=-1)))
+    px_per_m /= pixels.along_axis * np.sqrt(pixels.along_axis)  # geometric mean of the radial and tangential scales
+    inside_px = (np.float32(radius) - np.sqrt(np.maximum(offset2, 0))) * px_per_m
+    return np.minimum(np.maximum(inside_px + ROUNDING, 0), 1).mean(axis=0)
 
 
 def draw_obstacle(
@@ -458,8 +464,8 @@ def draw_obstacle(
     if row[SHAPE] == SPHERE:
         centre_K = motion.points_K(np.array([row[CENTRE : CENTRE + 3]]))
         if centre_K[0, 2] > 0:
-            still, colour = np.zeros((1, 3)), brightness * OBSTACLE
-            for image in ball_images(view, centre_K, still, row[HALF], colour, SUN_W @ motion.R_WK).values():
+            zero, colour = np.zeros((1, 3)), brightness * OBSTACLE
+            for image in ball_images(view, centre_K, zero, row[HALF], colour, SUN_W @ motion.R_WK).values():
                 image.draw(picture)
         return
     for corners, normal in _faces(row):
@@ -489,17 +495,17 @@ def _faces(row: tuple[float, ...]) -> tuple[tuple[Array, Array], ...]:
 
 def fill_face(picture: Picture, view: View, corners_K: Array, colour: Array) -> None:
     """Fill a convex face, given by its corners (M, 3) [m; K]."""
-    seen = _in_front(corners_K)
-    if len(seen) < 3:
+    visible = _in_front(corners_K)
+    if len(visible) < 3:
         return
     if view.distorts:  # straight edges become curves
-        steps = (np.roll(seen, -1, axis=0) - seen)[:, None]
-        seen = (seen[:, None] + np.arange(PIECES)[:, None] / PIECES * steps).reshape(-1, 3)
-    outline = view.pixels(seen)
+        steps = (np.roll(visible, -1, axis=0) - visible)[:, None]
+        visible = (visible[:, None] + np.arange(PIECES)[:, None] / PIECES * steps).reshape(-1, 3)
+    outline = view.pixels(visible)
     lowest, highest = outline.min(axis=0), outline.max(axis=0)
     if (highest < 0).any() or lowest[0] > view.lens.width or lowest[1] > view.lens.height:
         return
-    cv2.fillPoly(picture, [fixed(outline)], bgr(colour), cv2.LINE_AA, SHIFT)
+    cv2.fillPoly(picture, [to_fixed_point(outline)], bgr(colour), cv2.LINE_AA, SHIFT)
 
 
 def _in_front(corners: Array) -> Array:
@@ -508,16 +514,16 @@ def _in_front(corners: Array) -> Array:
     if (depth > 0).all():
         return corners
     kept: list[Array] = []
-    for i, here in enumerate(depth):
+    for i, depth_i in enumerate(depth):
         j = (i + 1) % len(corners)
-        if here > 0:
+        if depth_i > 0:
             kept.append(corners[i])
-        if (here > 0) != (depth[j] > 0):
-            kept.append(corners[i] + (corners[j] - corners[i]) * (here / (here - depth[j])))
+        if (depth_i > 0) != (depth[j] > 0):
+            kept.append(corners[i] + (corners[j] - corners[i]) * (depth_i / (depth_i - depth[j])))
     return np.array(kept).reshape(-1, 3)
 
 
-def fixed(pixels: Array) -> NDArray[np.int32]:
+def to_fixed_point(pixels: Array) -> NDArray[np.int32]:
     """Return pixel coordinates as fixed-point numbers for OpenCV, with SHIFT fractional bits."""
     return np.rint(np.clip(pixels, -FAR_PX, FAR_PX) * (1 << SHIFT)).astype(np.int32)
 
@@ -543,7 +549,7 @@ class SurfaceImager:
         self._normals_W = normals / np.linalg.norm(normals, axis=1)[:, None]
         self._brightness = brightness
 
-    def shown(self, motion: CameraMotion) -> list[tuple[float, int]]:
+    def visible_triangles(self, motion: CameraMotion) -> list[tuple[float, int]]:
         """Return the distance [m] and index of each triangle that may be visible, and keep its data for `draw`."""
         self._points_K = motion.points_K(self._corners_W)
         z = self._points_K[..., 2]
@@ -556,19 +562,19 @@ class SurfaceImager:
         inside = ahead & (high >= 0.0).all(axis=1) & (low <= size).all(axis=1)
         bent = self._view.distorts & ((high - low).max(axis=1) > BENT_PX)
         self._is_plain = inside & ~bent
-        chosen = np.flatnonzero(inside | (~ahead & (z > NEAR_M).any(axis=1)))
-        away = self._middles_W[chosen] - motion.p_WK
-        faces = np.where((self._normals_W[chosen] * away).sum(axis=1) > 0.0, -1.0, 1.0)  # the visible side
-        lit = np.maximum(faces * (self._normals_W[chosen] @ SUN_W), 0.0)
+        indices = np.flatnonzero(inside | (~ahead & (z > NEAR_M).any(axis=1)))
+        offset = self._middles_W[indices] - motion.p_WK
+        sides = np.where((self._normals_W[indices] * offset).sum(axis=1) > 0.0, -1.0, 1.0)  # the visible side
+        lit = np.maximum(sides * (self._normals_W[indices] @ SUN_W), 0.0)
         self._shade = np.zeros(len(z))
-        self._shade[chosen] = self._brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * lit)
-        distance = np.linalg.norm(away, axis=1)
-        return list(zip(distance.tolist(), chosen.tolist(), strict=True))
+        self._shade[indices] = self._brightness * (AMBIENT - 0.15 + (DIFFUSE + 0.15) * lit)
+        distance = np.linalg.norm(offset, axis=1)
+        return list(zip(distance.tolist(), indices.tolist(), strict=True))
 
-    def draw(self, picture: NDArray[np.uint8], number: int) -> None:
-        """Draw the triangle with the given index, which `shown` must have returned."""
-        colour = self._shade[number] * SURFACE
-        if self._is_plain[number]:
-            cv2.fillConvexPoly(picture, fixed(self._pixels[number]), bgr(colour), cv2.LINE_8, SHIFT)
+    def draw(self, picture: NDArray[np.uint8], index: int) -> None:
+        """Draw the triangle with the given index, which `visible_triangles` must have returned."""
+        colour = self._shade[index] * SURFACE
+        if self._is_plain[index]:
+            cv2.fillConvexPoly(picture, to_fixed_point(self._pixels[index]), bgr(colour), cv2.LINE_8, SHIFT)
         else:
-            fill_face(picture, self._view, self._points_K[number], colour)
+            fill_face(picture, self._view, self._points_K[index], colour)

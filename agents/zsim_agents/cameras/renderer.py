@@ -24,13 +24,13 @@ from zsim.math.randomness import stream
 from zsim.scenario.surroundings import nearest
 from zsim.sensors.camera import Camera
 from zsim.sensors.camera_model import Lens, camera_pose, lens_of
-from zsim_agents.cameras.foreground import SEEN_M, DroneImager, SurfaceImager, draw_obstacle, fixed
+from zsim_agents.cameras.foreground import VISIBLE_MAX_M, DroneImager, SurfaceImager, draw_obstacle, to_fixed_point
 from zsim_agents.cameras.scene import SHIFT, CameraMotion, DroneStates, Scene, View, camera_motion, motion_blur_kernels
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
-BLURRED_PX = 0.8  # minimum motion for which the ground is blurred
-WIDER_MAX = 2.0  # maximum ratio of the undistorted to the final picture's size; beyond, edge pixels are repeated
+BLUR_MIN_PX = 0.8  # minimum motion for which the ground is blurred
+WIDENING_MAX = 2.0  # maximum ratio of the undistorted to the final picture's size; beyond, edge pixels are repeated
 MARGIN = 64  # pixels by which the noise image exceeds the picture
 NOISE_MAX = 48.0  # maximum standard deviation of the amplified noise, in grey levels
 # No chroma subsampling: it would blur the colour of hats a few pixels wide
@@ -80,10 +80,10 @@ class Renderer:
         self._imager = DroneImager(self._view, scene, carrier, self._exposure_s, self._brightness)
         shape = self._view.lens.height, self._view.lens.width
         self._noise = _Noise(seed, f"{name}/noise", shape, camera.noise * gain) if camera.noise > 0 else None
-        self._bend: tuple[Picture, Picture] | None = None
+        self._distortion_map: tuple[Picture, Picture] | None = None
         flat = self._view
         if self._view.distorts:
-            flat, self._bend = _pinhole(self._view)
+            flat, self._distortion_map = _pinhole(self._view)
         self._backdrop = Backdrop(flat, ground or meadow())
 
     def jpeg(self, number: int, t_s: float, bodies: DroneStates) -> bytes:
@@ -103,28 +103,28 @@ class Renderer:
         motion = camera_motion(self._pose, bodies, R_WB[self._carrier], self._carrier)
         grey = self._backdrop.draw(motion)
         self._blur_ground(grey, motion)
-        if self._bend is not None:
-            grey = cv2.remap(grey, *self._bend, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        if self._distortion_map is not None:
+            grey = cv2.remap(grey, *self._distortion_map, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         picture: Picture = cv2.applyColorMap(grey, self._colours)  # type: ignore[assignment]
         drones, p_W = self._imager.images(motion, t_s, bodies, R_WB), motion.p_WK.tolist()
-        things = [(distance_m, "drone", i) for i, (distance_m, _) in drones.items()]
-        things += [(nearest(row, *p_W)[0], "obstacle", i) for i, row in enumerate(self._scene.obstacles)]
-        things += [(math.dist(place, p_W), "hat", i) for i, place in enumerate(self._scene.hats.false_m)]
+        layers = [(distance_m, "drone", i) for i, (distance_m, _) in drones.items()]
+        layers += [(nearest(row, *p_W)[0], "obstacle", i) for i, row in enumerate(self._scene.obstacles)]
+        layers += [(math.dist(position, p_W), "hat", i) for i, position in enumerate(self._scene.hats.false_m)]
         if len(self._scene.surfaces):
-            things += [(distance_m, "surface", i) for distance_m, i in self._surfaces.shown(motion)]
-        for _, kind, which in sorted(things, reverse=True):  # farthest first
+            layers += [(distance_m, "surface", i) for distance_m, i in self._surfaces.visible_triangles(motion)]
+        for _, kind, index in sorted(layers, reverse=True):  # farthest first
             if kind == "obstacle":
-                draw_obstacle(picture, self._view, self._scene.obstacles[which], motion, self._brightness)
+                draw_obstacle(picture, self._view, self._scene.obstacles[index], motion, self._brightness)
             elif kind == "surface":
-                self._surfaces.draw(picture, which)
+                self._surfaces.draw(picture, index)
             elif kind == "hat":
-                centre_K = motion.points_K(np.array([self._scene.hats.false_m[which]]))
+                centre_K = motion.points_K(np.array([self._scene.hats.false_m[index]]))
                 if centre_K[0, 2] > 0:
-                    way_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
-                    for image in self._imager.hats(centre_K, way_K, motion).values():
+                    displacement_K = motion.rates_K(centre_K, np.zeros(3)) * self._exposure_s
+                    for image in self._imager.hats(centre_K, displacement_K, motion).values():
                         image.draw(picture)
             else:
-                for layer in drones[which][1]:
+                for layer in drones[index][1]:
                     layer.draw(picture)
         sigma_px = self._camera.blur_px
         if sigma_px >= 0.2:  # a smaller blur is invisible
@@ -142,11 +142,11 @@ class Renderer:
         """
         ray_K = np.array([0.0, self._view.lens.height / 4 / self._view.lens.fy, 1.0])
         down = -float(motion.R_WK[2] @ ray_K)
-        point_K = ray_K * (max(float(motion.p_WK[2]), 0.1) / down if down > 1e-3 else SEEN_M)
-        way_px = self._view.flow_px(point_K, motion.rates_K(point_K, np.zeros(3))) * self._exposure_s
-        if np.hypot(*way_px) < BLURRED_PX:
+        point_K = ray_K * (max(float(motion.p_WK[2]), 0.1) / down if down > 1e-3 else VISIBLE_MAX_M)
+        displacement_px = self._view.flow_px(point_K, motion.rates_K(point_K, np.zeros(3))) * self._exposure_s
+        if np.hypot(*displacement_px) < BLUR_MIN_PX:
             return
-        kernel = motion_blur_kernels(way_px[None])[0]
+        kernel = motion_blur_kernels(displacement_px[None])[0]
         part = grey[self._backdrop.ground_rows(motion, len(kernel))]
         if len(part):
             cv2.filter2D(part, -1, kernel, dst=part, borderType=cv2.BORDER_REPLICATE)
@@ -179,23 +179,23 @@ def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:
     """Return an undistorted view that covers the lens's field of view, and the map that distorts its picture."""
     lens = view.lens
     half = np.abs(view.plane).max(axis=(0, 1)) * (lens.fx, lens.fy)
-    most = np.array([lens.width, lens.height]) * WIDER_MAX / 2
-    width, height = (int(2 * math.ceil(side + 2)) for side in np.minimum(half, most))
-    flat = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0, 0.0, width, height)
-    at = (view.plane * (lens.fx, lens.fy) + (flat.cx, flat.cy)).astype(np.float32)
-    return view_of(flat), cv2.convertMaps(at[..., 0], at[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]
+    half_max = np.array([lens.width, lens.height]) * WIDENING_MAX / 2
+    width, height = (int(2 * math.ceil(side + 2)) for side in np.minimum(half, half_max))
+    undistorted = Lens(lens.fx, lens.fy, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0, 0.0, width, height)
+    source_px = (view.plane * (lens.fx, lens.fy) + (undistorted.cx, undistorted.cy)).astype(np.float32)
+    return view_of(undistorted), cv2.convertMaps(source_px[..., 0], source_px[..., 1], cv2.CV_16SC2)  # type: ignore[return-value]
 
 
 class Level(NamedTuple):
     """A level of the ground: its texels, the side of a texel [m], and the distance up to which the level extends [m].
 
-    `place` is the homography (3, 3) from (x, y, 1) [m; W] to texels, whose centres have integer coordinates.
+    `to_texels` is the homography (3, 3) from (x, y, 1) [m; W] to texels, whose centres have integer coordinates.
     """
 
     texels: Grey
     texel_m: float
     reach_m: float
-    place: Array
+    to_texels: Array
 
 
 class Ground:
@@ -216,8 +216,8 @@ class Ground:
             repeats = max(3, 2 * (window // side // 2) + 1)  # odd: W's origin stays in the middle
             texels = np.tile(np.rint(mean).astype(np.uint8), (repeats, repeats))
             scale, middle = 1 / (texel_m * factor), len(texels) / 2 - 0.5
-            place = np.array([[scale, 0, middle], [0, -scale, middle], [0, 0, 1.0]])
-            self.levels.append(Level(texels, texel_m * factor, self.tile_m * (repeats - 1) / 2, place))
+            to_texels = np.array([[scale, 0, middle], [0, -scale, middle], [0, 0, 1.0]])
+            self.levels.append(Level(texels, texel_m * factor, self.tile_m * (repeats - 1) / 2, to_texels))
 
 
 @cache
@@ -229,24 +229,24 @@ def meadow() -> Ground:
     step = round(1 / TEXEL_M)
     for every, width, grey in ((1, 1, 112.0), (5, 3, 144.0)):
         for start in range(0, TILE, every * step):
-            at = [(start + k - width // 2) % TILE for k in range(width)]
-            tile[at, :] = tile[:, at] = grey
+            lines = [(start + k - width // 2) % TILE for k in range(width)]
+            tile[lines, :] = tile[:, lines] = grey
     return Ground(np.rint(tile).astype(np.uint8))
 
 
 def _patches(rng: np.random.Generator, cells: int) -> Array:
     """Return smooth, periodic noise of unit variance for a tile, with `cells` cells per side."""
     coarse = np.pad(rng.standard_normal((cells, cells)), 2, mode="wrap")
-    wide = TILE // cells
-    fine = coarse if wide == 1 else cv2.resize(coarse, None, fx=wide, fy=wide, interpolation=cv2.INTER_CUBIC)
-    inner = fine[2 * wide : 2 * wide + TILE, 2 * wide : 2 * wide + TILE]
+    factor = TILE // cells
+    fine = coarse if factor == 1 else cv2.resize(coarse, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    inner = fine[2 * factor : 2 * factor + TILE, 2 * factor : 2 * factor + TILE]
     return inner / inner.std()
 
 
 def colour_map(brightness: float) -> Grey:
     """Return B, G, R of each grey at a given brightness, (256, 1, 3)."""
-    at = np.arange(256)
-    channels = [np.interp(at, list(COLOURS), [colour[k] for colour in COLOURS.values()]) for k in range(3)]
+    greys = np.arange(256)
+    channels = [np.interp(greys, list(COLOURS), [colour[k] for colour in COLOURS.values()]) for k in range(3)]
     return np.rint(brightness * np.stack(channels, axis=-1)).astype(np.uint8)[:, None, :]
 
 
@@ -276,8 +276,8 @@ class Backdrop:
         for level in self._ground.levels:  # from height h, a pixel at distance s covers s^2 / (f h) of ground in depth
             reach_m = math.sqrt(MINIFIED_MAX * level.texel_m * self._focal_px * height_m)
             limits.append(height_m / min(reach_m, 0.7 * level.reach_m))
-        least, most = _extremes(self._size, down)
-        first = next((i for i, limit in enumerate(limits[1:]) if least >= limit), None)
+        descent_min, descent_max = _extremes(self._size, down)
+        first = next((i for i, limit in enumerate(limits[1:]) if descent_min >= limit), None)
         if first is None:
             a, b, c = (-SKY_SLOPE * each for each in down)  # the sky: bluer with elevation
             rows = _rows(half_plane(self._size, (a, b, c), 0.0), self._size)
@@ -286,43 +286,49 @@ class Backdrop:
                 cv2.convertScaleAbs(upwards + np.float32(a) * self._columns, dst=self.grey[slice(*rows)])
             ground = half_plane(self._size, down, 0.0)
             if len(ground) >= 3:
-                cv2.fillConvexPoly(self.grey, fixed(np.array(ground)), self._ground.mean, cv2.LINE_AA, SHIFT)
+                cv2.fillConvexPoly(self.grey, to_fixed_point(np.array(ground)), self._ground.mean, cv2.LINE_AA, SHIFT)
             first = len(self._ground.levels) - 1
         # homography from pixels to (x, y, 1) on the ground [m], relative to the nearest repetition of the tile
         x, y = (p - self._ground.tile_m * round(p / self._ground.tile_m) for p in motion.p_WK[:2].tolist())
         to_ground = np.array([[height_m, 0, -x], [0, height_m, -y], [0, 0, -1.0]]) @ to_W
         for i in range(first, -1, -1):  # limits[i + 1] and limits[i]: minimum descent for this and the next finer level
-            if most > limits[i + 1]:
+            if descent_max > limits[i + 1]:
                 self._draw_level(self._ground.levels[i], to_ground, down, limits[i + 1], limits[i])
         return self.grey
 
-    def ground_rows(self, motion: CameraMotion, room: int) -> slice:
-        """Return the rows that show ground, plus `room` rows on either side."""
+    def ground_rows(self, motion: CameraMotion, margin: int) -> slice:
+        """Return the rows that show ground, plus `margin` rows on either side."""
         down = (-motion.R_WK[2] @ self._K_inv).tolist()
         first, end = _rows(half_plane(self._size, down, 0.0), self._size) or (0, 0)
-        return slice(max(0, first - room), min(self._size[1], end + room)) if first < end else slice(0, 0)
+        return slice(max(0, first - margin), min(self._size[1], end + margin)) if first < end else slice(0, 0)
 
-    def _draw_level(self, level: Level, to_ground: Array, down: Sequence[float], least: float, most: float) -> None:
+    def _draw_level(
+        self, level: Level, to_ground: Array, down: Sequence[float], descent_min: float, descent_max: float
+    ) -> None:
         """Draw a level in the rows that are near enough for it, except rows entirely near enough for the finer one."""
-        part = half_plane(self._size, down, least)
+        part = half_plane(self._size, down, descent_min)
         rows = _rows(part, self._size)
-        coarse = _rows(half_plane(self._size, [-each for each in down], -most), self._size) if most < math.inf else rows
+        coarse = (
+            _rows(half_plane(self._size, [-each for each in down], -descent_max), self._size)
+            if descent_max < math.inf
+            else rows
+        )
         if rows is None or coarse is None:
             return
         v0, v1 = max(rows[0], coarse[0]), min(rows[1], coarse[1])
         if v1 - v0 < 1:
             return
-        warp = level.place @ to_ground
+        warp = level.to_texels @ to_ground
         warp[:, 2] += v0 * warp[:, 1]
-        is_all = _extremes(self._size, down)[0] >= least
+        covers_rows = _extremes(self._size, down)[0] >= descent_min
         out, mask = self.grey[v0:v1], self._mask[v0:v1]
-        drawn, flags = out if is_all else self._scratch[v0:v1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        drawn, flags = out if covers_rows else self._scratch[v0:v1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         size = self._size[0], v1 - v0
         cv2.warpPerspective(level.texels, warp, size, drawn, flags, cv2.BORDER_CONSTANT, self._ground.mean)
-        if is_all:
+        if covers_rows:
             return
         mask.fill(0)
-        cv2.fillConvexPoly(mask, fixed(np.array(part) - (0, v0)), 255, cv2.LINE_8, SHIFT)
+        cv2.fillConvexPoly(mask, to_fixed_point(np.array(part) - (0, v0)), 255, cv2.LINE_8, SHIFT)
         cv2.copyTo(drawn, mask, out)
 
 
@@ -345,17 +351,17 @@ def _extremes(size: tuple[int, int], linear: Sequence[float]) -> tuple[float, fl
     return min(at_corners), max(at_corners)
 
 
-def half_plane(size: tuple[int, int], linear: Sequence[float], least: float) -> Points:
+def half_plane(size: tuple[int, int], linear: Sequence[float], threshold: float) -> Points:
     """Return the polygon in a picture where a u + b v + c >= least; with fewer than three points, it is empty."""
     a, b, c = linear
     corners = _rectangle(*size)
-    over = [a * u + b * v + c - least for u, v in corners]
+    excess = [a * u + b * v + c - threshold for u, v in corners]
     points: Points = []
     for i in range(4):
-        (u, v), (u1, v1), here, there = corners[i], corners[i - 3], over[i], over[i - 3]
-        if here >= 0:
+        (u, v), (u1, v1), value, next_value = corners[i], corners[i - 3], excess[i], excess[i - 3]
+        if value >= 0:
             points.append((u, v))
-        if (here >= 0) != (there >= 0):
-            share = here / (here - there)
+        if (value >= 0) != (next_value >= 0):
+            share = value / (value - next_value)
             points.append((u + (u1 - u) * share, v + (v1 - v) * share))
     return points

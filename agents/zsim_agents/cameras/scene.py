@@ -145,8 +145,8 @@ class View:
         x, y = undistorted(lens, u.ravel(), v.ravel())
         self.plane: Array = np.stack([x, y], axis=-1).reshape(lens.height, lens.width, 2)
         norm = np.sqrt(1.0 + (self.plane * self.plane).sum(axis=-1, keepdims=True))
-        whole = np.concatenate([self.plane, np.ones_like(norm)], axis=-1) / norm
-        self.rays: NDArray[np.float32] = np.ascontiguousarray(whole, np.float32)
+        unit_rays = np.concatenate([self.plane, np.ones_like(norm)], axis=-1) / norm
+        self.rays: NDArray[np.float32] = np.ascontiguousarray(unit_rays, np.float32)
 
     def pixels(self, points_K: Array) -> Array:
         """Return the pixel coordinates (..., 2) of points (..., 3) [m; K] in front of the camera."""
@@ -173,15 +173,16 @@ def has_pixels(box: list[int]) -> bool:
     return box[0] < box[2] and box[1] < box[3]
 
 
-def motion_blur_kernels(ways_px: Array) -> list[Kernel]:
+def motion_blur_kernels(displacements_px: Array) -> list[Kernel]:
     """Return the blur kernels of motions in an exposure, (N, 2) [px]: the share of the time spent in each pixel."""
-    lengths = np.hypot(*ways_px.T)
-    ways = ways_px * np.minimum(1.0, BLUR_MAX_PX / np.maximum(lengths, 1e-9))[:, None]
+    lengths = np.hypot(*displacements_px.T)
+    clipped = displacements_px * np.minimum(1.0, BLUR_MAX_PX / np.maximum(lengths, 1e-9))[:, None]
     count = max(2, math.ceil(min(lengths.max(), BLUR_MAX_PX) * SAMPLES_PER_PX))
-    at = ways[:, :, None] * ((np.arange(count) + 0.5) / count - 0.5)  # (N, 2, count)
-    halves = [math.ceil(way / 2) + 1 for way in np.abs(ways).max(axis=1).tolist()]
-    most = max(halves)
-    shares = np.maximum(1 - np.abs(np.arange(-most, most + 1) - at[..., None]), 0)  # per sample, by column and row
+    positions = clipped[:, :, None] * ((np.arange(count) + 0.5) / count - 0.5)  # (N, 2, count)
+    halves = [math.ceil(extent / 2) + 1 for extent in np.abs(clipped).max(axis=1).tolist()]
+    half_max = max(halves)
+    # per sample, by column and row
+    shares = np.maximum(1 - np.abs(np.arange(-half_max, half_max + 1) - positions[..., None]), 0)
     kernels = (shares[:, 1].transpose(0, 2, 1) @ shares[:, 0] / count).astype(np.float32)
-    inner = [slice(most - half, most + half + 1) for half in halves]
+    inner = [slice(half_max - half, half_max + half + 1) for half in halves]
     return [kernel[part, part] for kernel, part in zip(kernels, inner, strict=True)]

@@ -142,8 +142,8 @@ class EstimatorSet:
         return None if None in states else {"estimators": states}
 
     def restore(self, state: State) -> None:
-        for each, own in zip(cast("list[Any]", self._estimators), state["estimators"], strict=True):
-            each.restore(own)
+        for each, saved in zip(cast("list[Any]", self._estimators), state["estimators"], strict=True):
+            each.restore(saved)
 
     def warm_start(self, i: int, last: Any) -> None:
         warm_start = getattr(self._estimators[i], "warm_start", None)
@@ -153,7 +153,7 @@ class EstimatorSet:
 
 def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> StateEstimate:
     """Return an estimate as plain numbers, after validating it."""
-    what = f"{plugin.full_name(type(estimator))}.estimate returns for {drone}"
+    context = f"{plugin.full_name(type(estimator))}.estimate returns for {drone}"
     values = {}
     for field in (*SIZES, "yaw_rad", "yaw_sigma_rad"):
         size, given = SIZES.get(field, 1), getattr(estimate, field, None)
@@ -164,20 +164,20 @@ def _plain(estimate: StateEstimate, estimator: DroneEstimator, drone: str) -> St
         if len(numbers) != size or not all(map(math.isfinite, numbers)):
             found = f"{field} = {show(given)}" if hasattr(estimate, field) else f"{show(estimate)} without {field}"
             raise UserCodeError(
-                f"{what} {found}; must be {f'{size} finite numbers' if size > 1 else 'a finite number'}"
+                f"{context} {found}; must be {f'{size} finite numbers' if size > 1 else 'a finite number'}"
             )
-        wrong = ""
-        if field in ("covariance", "yaw_sigma_rad") and (least := min(numbers[:: STATES + 1])) < 0.0:
-            wrong = f"the {'variance' if field == 'covariance' else 'value'} {least:g}; must be >= 0"
+        fault = ""
+        if field in ("covariance", "yaw_sigma_rad") and (smallest := min(numbers[:: STATES + 1])) < 0.0:
+            fault = f"the {'variance' if field == 'covariance' else 'value'} {smallest:g}; must be >= 0"
         elif field == "orientation_wxyz" and abs((norm := el.length(numbers)) - 1.0) > NORM_TOLERANCE:
-            wrong = f"the norm {norm:g}; must be 1"
-        if wrong:
-            raise UserCodeError(f"{what} {field} with {wrong}")
+            fault = f"the norm {norm:g}; must be 1"
+        if fault:
+            raise UserCodeError(f"{context} {field} with {fault}")
         values[field] = tuple(numbers)
     yaw, yaw_sigma = values.pop("yaw_rad"), values.pop("yaw_sigma_rad")
     try:
         sensors = {name: (int(used), int(refused)) for name, (used, refused) in estimate.sensors.items()}
     except (AttributeError, TypeError, ValueError) as error:
         found = f"sensors = {show(getattr(estimate, 'sensors', None))}"
-        raise UserCodeError(f"{what} {found}; must be a map of (used, refused) by sensor") from error
+        raise UserCodeError(f"{context} {found}; must be a map of (used, refused) by sensor") from error
     return StateEstimate(**values, yaw_rad=yaw[0], yaw_sigma_rad=yaw_sigma[0], sensors=sensors)

@@ -70,14 +70,14 @@ class Estimator(Agent):
         self._last: dict[str, flight_messages.Estimate] = {}
         self._view_key = keys.estimates_view(self.name)
         self.takes_gates = COMPILES and not own_class
-        self._since_ns = 0
+        self._gate_start_ns = 0
         self._index = {drone: i for i, drone in enumerate(read)}
         self._names = names
         self._silent = {drone.name for drone in scenario.drones if drone.is_external}
         self._external = frozenset(self._silent)
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
-        self._since_ns = t_ns - self.period_ns
+        self._gate_start_ns = t_ns - self.period_ns
         super().deliver(t_ns, inputs)
 
     def receive(self, key: str, message: Any) -> None:
@@ -87,7 +87,7 @@ class Estimator(Agent):
         _, drone, what = keys.parts(key)
         if drone in self._index:
             # a message over a slow link has arrived since the last gate, whatever its time stamp
-            t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
+            t_arrival_s = max(message.t_ns, self._gate_start_ns) * 1e-9
             self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)
 
     def receive_gate(self, gate: GateMessages) -> None:
@@ -96,28 +96,28 @@ class Estimator(Agent):
 
     def step(self, t_ns: int) -> list[Output]:
         estimates = self._estimators.estimate(t_ns * 1e-9)
-        named = zip(self._names, self.writes, estimates, strict=True)
+        named_estimates = zip(self._names, self.writes, estimates, strict=True)
         if self._external:  # a drone whose driver has been silent since the last gate gets no estimate
-            named = [each for each in named if each[0] not in self._silent]
+            named_estimates = [each for each in named_estimates if each[0] not in self._silent]
             self._silent = set(self._external)
         make: Any = flight_messages.Estimate  # Any: sequences in a StateEstimate are not typed by length
         source, self._last, outputs = self.source, {}, []
-        for drone, key, estimate in named:
+        for drone, key, estimate in named_estimates:
             self._last[drone] = message = make(t_ns, self.next_seq(key), *estimate, source=source)
             outputs.append(Output(key, message))
         return outputs
 
     def views(self, t_ns: int) -> list[Output]:
-        shown = tuple(estimate_view(drone, estimate) for drone, estimate in self._last.items())
-        return [Output(self._view_key, ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
+        views = tuple(estimate_view(drone, estimate) for drone, estimate in self._last.items())
+        return [Output(self._view_key, ViewEstimates(t_ns, self.next_seq(self._view_key), views))]
 
     def rehearse(self) -> None:
         if isinstance(self._estimators, EstimatorSet):
             return
-        bank, drone, t_ns, still = self._build(), self._names[0], 1_000_000, (0.0, 0.0, 0.0)
+        bank, drone, t_ns, zero = self._build(), self._names[0], 1_000_000, (0.0, 0.0, 0.0)
         readings: dict[str, Struct] = {
-            "imu": messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.8), still),
-            "gps": messages.Gps(t_ns, 0, t_ns, 0.0, 0.0, 0.0, still, still, 1.0, 3, 9),
+            "imu": messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.8), zero),
+            "gps": messages.Gps(t_ns, 0, t_ns, 0.0, 0.0, 0.0, zero, zero, 1.0, 3, 9),
             "mag": messages.Mag(t_ns, 0, t_ns, (0.0, 20.0, 0.0)),
             "baro": messages.Baro(t_ns, 0, t_ns, 101_325.0, 0.0),
         }

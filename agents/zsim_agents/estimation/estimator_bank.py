@@ -50,7 +50,7 @@ from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, se
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, acceleration, heading_and_sigma, rotation_vector_quaternion
 
 _READING = struct.Struct(f"{READING.size}d")
-_ROOM = 256  # initial capacity, in readings per gate
+_CAPACITY = 256  # initial capacity, in readings per gate
 _YAW, _YAW_SIGMA = ESTIMATE.yaw, ESTIMATE.yaw_sigma
 _COVARIANCE = slice(ESTIMATE.covariance, _YAW_SIGMA)  # up to the next field
 _p_WB, _v_WB, _gyro_bias = (
@@ -59,7 +59,7 @@ _p_WB, _v_WB, _gyro_bias = (
 _q_WB = itemgetter(*range(ESTIMATE.q_WB, ESTIMATE.q_WB + 4))
 _REFUSED = len(SENSORS)  # offset from a sensor's count of used readings to that of refused ones
 
-NOBODY = -1
+NO_DRONE = -1
 NS_S = 1e-9  # s/ns
 BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # indices among the floats of these messages
 GPS_FIX, SONAR_VALID = 3, 3  # indices among the integers of these messages
@@ -96,7 +96,7 @@ class EstimatorBank:
         self.rows, self._estimates = initial_rows(drones, environment, estimation, gate_s)
         self._held, self._held_rows = hold(self.rows), self.rows
         self._readings, self._count = np.empty((0, READING.size)), 0
-        self._make_room(_ROOM)
+        self._reserve(_CAPACITY)
         self._reader = GateReader([drone.name for drone in drones])
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
@@ -104,28 +104,30 @@ class EstimatorBank:
         if sensor not in _VALUES:
             return
         if self._count == len(self._readings):
-            self._make_room(2 * self._count)
+            self._reserve(2 * self._count)
         kind, t_sample_s = SENSORS.index(sensor), message.t_sample_ns * 1e-9
-        place, values = self._count * _READING.size, _VALUES[sensor](message)
-        _READING.pack_into(self._room, place, i, kind, t_sample_s if kind == IMU else t_arrival_s, t_sample_s, *values)
+        offset, values = self._count * _READING.size, _VALUES[sensor](message)
+        _READING.pack_into(
+            self._buffer, offset, i, kind, t_sample_s if kind == IMU else t_arrival_s, t_sample_s, *values
+        )
         self._count += 1
 
     def receive_gate(self, gate: GateMessages) -> bool:
         """Store all sensor messages of a gate; store none and return False if one of them must be fully decoded."""
         while self._count + len(gate) > len(self._readings):
-            self._make_room(2 * len(self._readings))
+            self._reserve(2 * len(self._readings))
         count = self._reader.take(gate, self._readings, self._count)
         if count >= 0:
             self._count = count
         return count >= 0
 
-    def estimate(self, t_s: float, wanted: Sequence[int] | None = None) -> list[StateEstimate]:
-        """Use the readings since the last gate; return the estimates at `t_s` [s], of all drones or those `wanted`."""
+    def estimate(self, t_s: float, indices: Sequence[int] | None = None) -> list[StateEstimate]:
+        """Use the readings since the last gate; return estimates at `t_s` [s] of all drones or of `indices`."""
         count, self._count = self._count, 0
         self.use(t_s, self._readings[:count])
         rows, counts = self._estimates.tolist(), self.rows.counts[:, COUNT.used :].tolist()
-        if wanted is not None:
-            rows, counts = [rows[i] for i in wanted], [counts[i] for i in wanted]
+        if indices is not None:
+            rows, counts = [rows[i] for i in indices], [counts[i] for i in indices]
         return [
             StateEstimate(
                 _p_WB(row),
@@ -135,9 +137,9 @@ class EstimatorBank:
                 tuple(row[_COVARIANCE]),
                 row[_YAW_SIGMA],
                 _gyro_bias(row),
-                {sensor: (of[used], of[refused]) for sensor, used, refused in self.counted},
+                {sensor: (row_counts[used], row_counts[refused]) for sensor, used, refused in self.counted},
             )
-            for row, of in zip(rows, counts, strict=True)
+            for row, row_counts in zip(rows, counts, strict=True)
         ]
 
     def use(self, t_s: float, readings: Array) -> Array:
@@ -179,9 +181,9 @@ class EstimatorBank:
                 raise ValueError(f"{name} is of shape {state[name].shape}; must be {rows.shape}")
             rows[...] = state[name]
 
-    def _make_room(self, readings: int) -> None:
-        former, self._room = self._readings, bytearray(readings * _READING.size)
-        self._readings = np.frombuffer(self._room).reshape(readings, READING.size)
+    def _reserve(self, readings: int) -> None:
+        former, self._buffer = self._readings, bytearray(readings * _READING.size)
+        self._readings = np.frombuffer(self._buffer).reshape(readings, READING.size)
         self._readings[: len(former)] = former
 
 
@@ -250,18 +252,18 @@ def write_estimate(row: Array, setting: Array, P: Array, t_s: float, estimate: A
     covariance, as do possible manoeuvres.
     """
     p, v, q, a_W, w, _ = reckoning(row)
-    ahead = t_s - row[NOMINAL.t]
-    if ahead > 1e-9:
-        p, v = axpy(p, ahead, v), axpy(v, ahead, a_W)
-        q = normalised(multiply(q, rotation_vector_quaternion(scaled(w, ahead))))
+    dt = t_s - row[NOMINAL.t]
+    if dt > 1e-9:
+        p, v = axpy(p, dt, v), axpy(v, dt, a_W)
+        q = normalised(multiply(q, rotation_vector_quaternion(scaled(w, dt))))
         P = P[:9, :9].copy()
-        P[:3] += ahead * P[3:6]
-        P[:, :3] += ahead * P[:, 3:6]
-        velocity = (setting[SETTING.accel_variance] + MANOEUVRE_M_S2 * MANOEUVRE_M_S2) * ahead * ahead
+        P[:3] += dt * P[3:6]
+        P[:, :3] += dt * P[:, 3:6]
+        velocity = (setting[SETTING.accel_variance] + MANOEUVRE_M_S2 * MANOEUVRE_M_S2) * dt * dt
         for k in range(3):
-            P[k, k] += 0.25 * ahead * ahead * velocity
-            P[k, 3 + k] += 0.5 * ahead * velocity
-            P[3 + k, k] += 0.5 * ahead * velocity
+            P[k, k] += 0.25 * dt * dt * velocity
+            P[k, 3 + k] += 0.5 * dt * velocity
+            P[3 + k, k] += 0.5 * dt * velocity
             P[3 + k, 3 + k] += velocity
     yaw, yaw_sigma = heading_and_sigma(q, P)
     put(estimate, ESTIMATE.p_WB, p)
@@ -288,7 +290,7 @@ class GateReader:
     """Reads the sensor messages of drones, given in the order of the bank, from gates."""
 
     def __init__(self, drones: Sequence[str]) -> None:
-        self._whose = {
+        self._owners = {
             keys.sensor(drone, kind): (i, SENSORS.index(kind)) for i, drone in enumerate(drones) for kind in SENSORS
         }
         self._table: Sequence[str] = ()
@@ -307,7 +309,7 @@ class GateReader:
         """
         if gate.table is not self._table:
             self._table = gate.table
-            owner = np.array([self._whose.get(key, (NOBODY, NOBODY)) for key in gate.table], dtype=np.int64)
+            owner = np.array([self._owners.get(key, (NO_DRONE, NO_DRONE)) for key in gate.table], dtype=np.int64)
             self._held = hold(self._tables._replace(owner=owner))
         data = np.frombuffer(gate.buffer, dtype=np.uint8)
         if gate.which.flags.writeable:
@@ -329,13 +331,13 @@ def collect(held: Held, which: Array, ends: Array, data: Array, readings: Array,
         if i >= 0:
             if not read(program, kind, data, start + GAP, ends[m], ints, bits):
                 return -1
-            place = count
+            slot = count
             mark = ints[0] * len(RANK) + RANK[kind]
-            while place > first and readings[place - 1, READING.drone] == i and marks[place - 1 - first] > mark:
-                readings[place], marks[place - first] = readings[place - 1], marks[place - 1 - first]
-                place -= 1
-            fill(readings[place], i, kind, ints, floats)
-            marks[place - first] = mark
+            while slot > first and readings[slot - 1, READING.drone] == i and marks[slot - 1 - first] > mark:
+                readings[slot], marks[slot - first] = readings[slot - 1], marks[slot - 1 - first]
+                slot -= 1
+            fill(readings[slot], i, kind, ints, floats)
+            marks[slot - first] = mark
             count += 1
         start = ends[m]
     return count

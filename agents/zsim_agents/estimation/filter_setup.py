@@ -51,12 +51,12 @@ from zsim_agents.estimation.strapdown import (
 
 Array = NDArray[np.float64]
 
-LINK_S = 0.4  # s; design choice: latency that a radio and sparse telemetry add for an external drone
+LINK_LATENCY_S = 0.4  # s; design choice: latency that a radio and sparse telemetry add for an external drone
 LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
 CLONE_EVERY_S = 0.1  # s; design choice: process noise over half this interval is small against any sensor's noise
-CLONED_FROM = 0.01  # share of a reading's variance; design choice: less process noise since its sampling is negligible
+CLONE_SHARE_MIN = 0.01  # of a reading's variance; design choice: less process noise since its sampling is negligible
 COMPASS_SIGMA_RAD = 2.0 * SET_DOWN_SIGMA_RAD  # rad; design choice: noisier readings do not initialise the heading
-ON_ROOF_M = 0.01  # m; design choice: a drone that starts this close to an obstacle stands on it
+ROOF_DISTANCE_MAX_M = 0.01  # m; design choice: a drone that starts this close to an obstacle stands on it
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest or in gentle flight
 TILT_SIGMA_RAD = 0.05  # rad: ground that is level to 3 deg
@@ -176,7 +176,7 @@ class DroneSetup:
         self._direction_sigma = self._accel_sigma / self._gravity
         self._tilt_density = tilt_density(self._beta, self._direction_sigma, self._gravity, 1.0 / imu.rate_hz)
         latency_s = max(getattr(drone.sensors, name).latency_ms for name in SENSORS) * 1e-3
-        self._age_max_s = 2.0 * latency_s + 5.0 * gate_s + (LINK_S if drone.is_external else 0.0)
+        self._age_max_s = 2.0 * latency_s + 5.0 * gate_s + (LINK_LATENCY_S if drone.is_external else 0.0)
         self.clones = self._clone_count()
         self.biases = biases_of(drone.sensors, estimation)
         self.first: dict[BiasName, int] = {}
@@ -213,16 +213,16 @@ class DroneSetup:
         walk = self._gravity * self._gravity * tilt  # m^2/s^5
         for channel in AIDING:
             section: Sensor = getattr(sensors, channel.sensor)
-            late_s = (section.latency_ms - sensors.imu.latency_ms) * 1e-3
+            delay_s = (section.latency_ms - sensors.imu.latency_ms) * 1e-3
             is_used = channel.sensor != "mag" and (channel.sensor != "flow" or self._estimation.flow)
-            if late_s <= self._gate_s or not is_used:
+            if delay_s <= self._gate_s or not is_used:
                 continue
             if channel.field == "velocity_m_s":
-                gained = white * late_s + walk * el.power(late_s, 3.0) / 3.0  # m^2/s^2
+                added_variance = white * delay_s + walk * el.power(delay_s, 3.0) / 3.0  # m^2/s^2
             else:
-                gained = white * el.power(late_s, 3.0) / 3.0 + walk * el.power(late_s, 5.0) / 20.0  # m^2
-            if gained > CLONED_FROM * el.square(channel.sigma(sensors)):
-                longest_s = max(longest_s, late_s + self._gate_s)
+                added_variance = white * el.power(delay_s, 3.0) / 3.0 + walk * el.power(delay_s, 5.0) / 20.0  # m^2
+            if added_variance > CLONE_SHARE_MIN * el.square(channel.sigma(sensors)):
+                longest_s = max(longest_s, delay_s + self._gate_s)
         return math.ceil(longest_s / CLONE_EVERY_S) + 1 if longest_s else 0
 
     def _floor_m(self) -> float:
@@ -232,8 +232,8 @@ class DroneSetup:
         obstacles, sonar readings are refused as outliers.
         """
         x, y, z = self._drone.position_m
-        away_m = float(Surroundings(self._environment).distances_m((x, y, z))[0])
-        return z if abs(away_m) < ON_ROOF_M else 0.0
+        distance_m = float(Surroundings(self._environment).distances_m((x, y, z))[0])
+        return z if abs(distance_m) < ROOF_DISTANCE_MAX_M else 0.0
 
     def setting(self) -> list[float]:
         """Return the drone's row of SETTING columns."""
@@ -289,16 +289,16 @@ class DroneSetup:
         entries = int(self._age_max_s / self._gate_s) + 3
         row = [self.size, self.clones, self.own, entries, *map(int, flags)]
         for sensor in SENSORS:  # the columns BIAS of every channel
-            places: list[int] = []
+            bias_columns: list[int] = []
             value = 0
             for channel in AIDING:
                 if channel.sensor == sensor:
                     names = ((channel, correlated) for correlated in (False, True))
-                    places += [
+                    bias_columns += [
                         x for name in names if name in self.first for x in (self.first[name], value, channel.axes)
                     ]
                     value += channel.axes
-            row += places + [-1, 0, 0] * (CHANNELS - len(places) // BIAS.size)
+            row += bias_columns + [-1, 0, 0] * (CHANNELS - len(bias_columns) // BIAS.size)
         assert len(row) == LAYOUT.size
         return row
 

@@ -196,9 +196,9 @@ def put(row: Array, at: int, a: Vector) -> None:
 
 
 @inlined
-def increase(row: Array, at: int, more: Array, first: int) -> None:
+def increase(row: Array, at: int, error: Array, first: int) -> None:
     for k in range(3):
-        row[at + k] += more[first + k]
+        row[at + k] += error[first + k]
 
 
 @inlined

@@ -57,11 +57,11 @@ NO_SIGHTINGS = np.empty((0, SIGHTING.size))
 AMBIGUITY = 10.0
 # Standard deviations by which the positions of two hats must differ: while the filter knows them less well, as when GPS
 # is averaged on the ground, one hat is occasionally mistaken for another, and the mistake persists.
-APART = 6.0
+SEPARATION_SIGMAS = 6.0
 NEAREST_M = 0.1  # minimum distance of a hat; closer, its direction is undefined
 RANGE_MAX_M = 1e4  # maximum distance at which a hat is seen
 SIGMA_MIN_RAD, SIGMA_MIN_M = 1e-4, 1e-3  # minimum standard deviations: errors of interpolating past states
-NOBODY = -1
+NO_DRONE = -1
 
 Picture = tuple[int, str, int]  # drone, camera, time of exposure [ns]
 Sighting = tuple[float, ...]  # columns SIGHTING
@@ -75,20 +75,20 @@ class ClusterBanks:
     """
 
     def __init__(self, scenario: Scenario, drones: Sequence[str], gate_s: float) -> None:
-        mates = {drone: tuple(cluster.drones) for cluster in scenario.clusters for drone in cluster.drones}
-        groups = list(dict.fromkeys(mates.get(drone, (drone,)) for drone in drones))
+        clusters = {drone: tuple(cluster.drones) for cluster in scenario.clusters for drone in cluster.drones}
+        groups = list(dict.fromkeys(clusters.get(drone, (drone,)) for drone in drones))
         settings = (scenario.environment, scenario.estimation, gate_s)
         self._banks = [
             (JointBank if len(group) > 1 else EstimatorBank)([scenario.drone(name) for name in group], *settings)
             for group in groups
         ]
         self.drones = [drone for group in groups for drone in group]
-        self._places = [(bank, i) for bank, group in zip(self._banks, groups, strict=True) for i in range(len(group))]
-        self._wanted = [self.drones.index(drone) for drone in drones]
+        self._slots = [(bank, i) for bank, group in zip(self._banks, groups, strict=True) for i in range(len(group))]
+        self._own_indices = [self.drones.index(drone) for drone in drones]
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
-        bank, place = self._places[i]
-        bank.receive(place, sensor, message, t_arrival_s)
+        bank, slot = self._slots[i]
+        bank.receive(slot, sensor, message, t_arrival_s)
 
     def receive_gate(self, gate: GateMessages) -> bool:
         if len(self._banks) > 1:
@@ -97,13 +97,13 @@ class ClusterBanks:
 
     def estimate(self, t_s: float) -> list[StateEstimate]:
         if len(self._banks) == 1:
-            return self._banks[0].estimate(t_s, self._wanted)
+            return self._banks[0].estimate(t_s, self._own_indices)
         estimates = [each for bank in self._banks for each in bank.estimate(t_s)]
-        return [estimates[place] for place in self._wanted]
+        return [estimates[slot] for slot in self._own_indices]
 
     def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
-        bank, place = self._places[self._wanted[i]]
-        bank.warm_start(place, last)
+        bank, slot = self._slots[self._own_indices[i]]
+        bank.warm_start(slot, last)
 
     def snapshot(self) -> State:
         return {"banks": [bank.snapshot() for bank in self._banks]}
@@ -135,9 +135,9 @@ class JointBank(EstimatorBank):
         self._hat_B: Vector = float(x), float(y), float(z)
         self._cameras = [{n: camera_pose(c).p_BK.tolist() for n, c in d.sensors.cameras().items()} for d in drones]
         self._drones = {keys.sensor(drone.name, keys.SIGHTINGS): i for i, drone in enumerate(drones)}
-        self._places = PerPattern(self._sighting_places)
-        self._sighted: dict[Picture, tuple[str, list[Sighting]]] = {}  # this gate's, with the name of the detector
-        self._hats = 0  # number of hats in this gate, including those of replaced sightings
+        self._entries = PerPattern(self._sighting_entries)
+        self._sightings: dict[Picture, tuple[str, list[Sighting]]] = {}  # this gate's, with the name of the detector
+        self._hat_count = 0  # number of hats in this gate, including those of replaced sightings
         self._pictures_used: dict[Picture, None] = {}
 
     def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
@@ -153,21 +153,21 @@ class JointBank(EstimatorBank):
         # Two detectors that search the same picture make the same errors, so only one is used. In one gate it is the
         # first by name, whichever arrived first, so that all estimators of the cluster use the same one.
         picture = (i, message.camera, message.t_sample_ns)
-        other = self._sighted.get(picture)
+        other = self._sightings.get(picture)
         if picture in self._pictures_used or (other is not None and other[0] <= message.source):
             return
         camera = i, t_arrival_s, message.t_sample_ns * 1e-9, *p_BK
         rows = [
             (*camera, *seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
-            for seen in message.seen[: SIGHTINGS_MAX - self._hats]
+            for seen in message.seen[: SIGHTINGS_MAX - self._hat_count]
         ]
-        self._hats += len(rows)
-        self._sighted[picture] = (message.source, rows)
+        self._hat_count += len(rows)
+        self._sightings[picture] = (message.source, rows)
 
     def receive_gate(self, gate: GateMessages) -> bool:
         if not super().receive_gate(gate):
             return False
-        for m, i, key in self._places.of(gate):
+        for m, i, key in self._entries.of(gate):
             try:
                 message = messages.decode(key, gate.payload(m))
             except DecodeError:
@@ -175,7 +175,7 @@ class JointBank(EstimatorBank):
             self._receive_sightings(i, message, message.t_ns * 1e-9)
         return True
 
-    def _sighting_places(self, gate: GateMessages) -> list[tuple[int, int, str]]:
+    def _sighting_entries(self, gate: GateMessages) -> list[tuple[int, int, str]]:
         """Return the index in the gate, the drone and the key of each message that contains sightings."""
         by_message = ((m, gate.table[which]) for m, which in enumerate(gate.which.tolist()))
         return [(m, self._drones[key], key) for m, key in by_message if key in self._drones]
@@ -193,13 +193,13 @@ class JointBank(EstimatorBank):
 
     def use(self, t_s: float, readings: Array) -> Array:
         sightings = NO_SIGHTINGS
-        if self._sighted:
-            seen = sorted(row for _, of_picture in self._sighted.values() for row in of_picture)
+        if self._sightings:
+            seen = sorted(row for _, picture_rows in self._sightings.values() for row in picture_rows)
             sightings = np.array(seen) if seen else NO_SIGHTINGS
-            self._pictures_used |= dict.fromkeys(self._sighted)
+            self._pictures_used |= dict.fromkeys(self._sightings)
             while len(self._pictures_used) > PICTURES_KEPT:
                 del self._pictures_used[next(iter(self._pictures_used))]
-            self._sighted, self._hats = {}, 0
+            self._sightings, self._hat_count = {}, 0
         step_jointly(self.rows, t_s, readings, sightings, self._hat_B, self._estimates)
         return self._estimates
 
@@ -248,67 +248,67 @@ def _grow(rows: Rows, i: int, t_s: float) -> None:
 @portable
 def use_sightings(rows: Rows, sightings: Array, hat_B: Vector) -> None:
     """Use the sightings of a gate one by one; count those that match no hat as refused."""
-    taken = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
+    claimed = np.zeros(rows.nominal.shape[0], dtype=np.bool_)
     HJ, S, y = np.zeros((3, rows.joint.shape[0])), np.zeros((3, 3)), np.zeros(3)
     for m in range(sightings.shape[0]):
         sighting, i = sightings[m], int(sightings[m, SIGHTING.drone])
         if m == 0 or sighting[0] != sightings[m - 1, 0] or sighting[2] != sightings[m - 1, 2]:
-            taken[:] = False
-        j = owner(rows, sighting, hat_B, taken, HJ, S, y) if is_possible(rows, sighting) else NOBODY
-        if j == NOBODY:
+            claimed[:] = False
+        j = identified_drone(rows, sighting, hat_B, claimed, HJ, S, y) if is_plausible(rows, sighting) else NO_DRONE
+        if j == NO_DRONE:
             rows.counts[i, COUNT.sightings_refused] += 1
             continue
-        taken[j] = True
+        claimed[j] = True
         rows.counts[i, COUNT.sightings_used] += 1
         rows.sighted[i, j] = sighting[SIGHTING.t_sample]
         correct_all(rows, HJ, S, y)
 
 
 @portable
-def is_possible(rows: Rows, sighting: Array) -> bool:
+def is_plausible(rows: Rows, sighting: Array) -> bool:
     """Return whether a sighting's time and values are plausible, and its observer's heading is known."""
     i = int(sighting[SIGHTING.drone])
     age_s = sighting[SIGHTING.t_arrival] - sighting[SIGHTING.t_sample]
-    good = 0.0 <= age_s <= rows.setting[i, SETTING.age_max] and rows.counts[i, COUNT.heading_known] != 0
-    good = good and 0.0 < sighting[SIGHTING.range] < RANGE_MAX_M
+    is_valid = 0.0 <= age_s <= rows.setting[i, SETTING.age_max] and rows.counts[i, COUNT.heading_known] != 0
+    is_valid = is_valid and 0.0 < sighting[SIGHTING.range] < RANGE_MAX_M
     length = norm(vector(sighting, SIGHTING.direction_B))
-    return good and 0.99 < length < 1.01 and sighting[SIGHTING.sigma_range] > 0.0
+    return is_valid and 0.99 < length < 1.01 and sighting[SIGHTING.sigma_range] > 0.0
 
 
 @portable
-def owner(rows: Rows, sighting: Array, hat_B: Vector, taken: Array, HJ: Array, S: Array, y: Array) -> int:
+def identified_drone(rows: Rows, sighting: Array, hat_B: Vector, claimed: Array, HJ: Array, S: Array, y: Array) -> int:
     """Return the drone whose hat was seen; NOBODY if no hat fits, or another hat could have been seen.
 
-    HJ, S and the innovation y, (3,), are filled for the returned drone; `taken` marks drones whose hats have already
+    HJ, S and the innovation y, (3,), are filled for the returned drone; `claimed` marks drones whose hats have already
     been seen in the picture.
     """
     count, i = rows.nominal.shape[0], int(sighting[SIGHTING.drone])
-    places, seen = np.zeros((count, 3)), place_of(sighting)
-    best, second, found = math.inf, math.inf, NOBODY
+    positions, seen = np.zeros((count, 3)), place_of(sighting)
+    best, second, found = math.inf, math.inf, NO_DRONE
     trial_HJ, trial_S = np.zeros_like(HJ), np.zeros_like(S)
-    toward = across((1.0, 0.0, 0.0))
+    best_axes = across((1.0, 0.0, 0.0))
     for j in range(count):
         if j == i:
             continue
         if not rows.counts[j, COUNT.heading_known]:
-            return NOBODY  # it could be anywhere
+            return NO_DRONE  # it could be anywhere
         r, axes = predict_sighting(rows, sighting, j, hat_B, trial_HJ, trial_S)
-        places[j, 0], places[j, 1], places[j, 2] = r[0], r[1], r[2]
+        positions[j, 0], positions[j, 1], positions[j, 2] = r[0], r[1], r[2]
         trial_y = innovation(axes, seen, r)
         distance = distance_squared(rows, trial_S, trial_y)
         if distance < best:
-            best, second, found, toward = distance, best, j, axes
+            best, second, found, best_axes = distance, best, j, axes
             HJ[:], S[:], y[:] = trial_HJ, trial_S, trial_y
         elif distance < second:
             second = distance
-    if found == NOBODY or best > rows.limits[3] or second - best < AMBIGUITY or taken[found]:
-        return NOBODY
-    r = (places[found, 0], places[found, 1], places[found, 2])
+    if found == NO_DRONE or best > rows.limits[3] or second - best < AMBIGUITY or claimed[found]:
+        return NO_DRONE
+    r = (positions[found, 0], positions[found, 1], positions[found, 2])
     for j in range(count):
         if j not in (i, found):
-            other = (places[j, 0], places[j, 1], places[j, 2])
-            if distance_squared(rows, S, innovation(toward, other, r)) < APART * APART:
-                return NOBODY
+            other = (positions[j, 0], positions[j, 1], positions[j, 2])
+            if distance_squared(rows, S, innovation(best_axes, other, r)) < SEPARATION_SIGMAS * SEPARATION_SIGMAS:
+                return NO_DRONE
     return found
 
 
@@ -325,16 +325,16 @@ def predict_sighting(
     a, lag_a, state_a = recall_known(rows, i, t_s, moment(rows.nominal[i]))
     b, lag_b, state_b = recall_known(rows, j, t_s, moment(rows.nominal[j]))
     r = expected(a, b, hat_B, vector(sighting, SIGHTING.p_BK))
-    away = max(norm(r), NEAREST_M)
-    axes = across(scaled(r, 1.0 / away))
+    distance_m = max(norm(r), NEAREST_M)
+    axes = across(scaled(r, 1.0 / distance_m))
     H_i, H_j = np.zeros((3, n)), np.zeros((3, n))
     write_rows(H_i, H_j, a, b, hat_B, axes, (lag_a, lag_b))
     move_columns(H_i, 0, 3, state_a)
     move_columns(H_j, 0, 3, state_b)
-    sideways = away * max(sighting[SIGHTING.sigma_direction], SIGMA_MIN_RAD)
-    along = max(sighting[SIGHTING.sigma_range], SIGMA_MIN_M)
+    sigma_across = distance_m * max(sighting[SIGHTING.sigma_direction], SIGMA_MIN_RAD)
+    sigma_along = max(sighting[SIGHTING.sigma_range], SIGMA_MIN_M)
     HJ[:], S[:] = 0.0, 0.0
-    S[0, 0], S[1, 1], S[2, 2] = along * along, sideways * sideways, sideways * sideways
+    S[0, 0], S[1, 1], S[2, 2] = sigma_along * sigma_along, sigma_across * sigma_across, sigma_across * sigma_across
     add_projection(rows.joint, H_i, i * n, HJ)
     add_projection(rows.joint, H_j, j * n, HJ)
     add_innovation_covariance(HJ, H_i, i * n, S)
@@ -345,8 +345,8 @@ def predict_sighting(
 @portable
 def expected(a: Moment, b: Moment, hat_B: Vector, p_BK: Vector) -> Vector:
     """Return the position of drone b's hat relative to drone a's camera [m; axes of a's body]."""
-    away = subtract(add(b[1], product(matrix(b[3]), hat_B)), a[1])
-    return subtract(product(transposed(matrix(a[3])), away), p_BK)
+    offset_W = subtract(add(b[1], product(matrix(b[3]), hat_B)), a[1])
+    return subtract(product(transposed(matrix(a[3])), offset_W), p_BK)
 
 
 @portable
@@ -364,10 +364,10 @@ def write_rows(
     H_i is with respect to the errors of the observer, H_j to those of the observed drone; both are zero on entry.
     """
     R_a, hat_W = matrix(a[3]), product(matrix(b[3]), hat_B)
-    away = subtract(add(b[1], hat_W), a[1])
+    offset_W = subtract(add(b[1], hat_W), a[1])
     for r in range(3):
         w = product(R_a, axes[r])
-        by_own, by_other = cross(w, away), cross(hat_W, w)
+        by_own, by_other = cross(w, offset_W), cross(hat_W, w)
         for k in range(3):
             H_j[r, POSITION + k] = w[k]
             H_i[r, POSITION + k] = -w[k]
@@ -380,8 +380,8 @@ def write_rows(
 @portable
 def across(d: Vector) -> tuple[Vector, Vector, Vector]:
     """Return a unit vector, and two more that are perpendicular to it and to each other."""
-    side = (0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)
-    e = cross(d, side)
+    reference = (0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)
+    e = cross(d, reference)
     e = scaled(e, 1.0 / norm(e))
     return d, e, cross(d, e)
 
@@ -389,8 +389,8 @@ def across(d: Vector) -> tuple[Vector, Vector, Vector]:
 @portable
 def innovation(axes: tuple[Vector, Vector, Vector], seen: Vector, r: Vector) -> Array:
     """Return the measured minus the expected position of a hat, along and across the line of sight, (3,) [m]."""
-    miss = subtract(seen, r)
-    return np.array([dot(axes[0], miss), dot(axes[1], miss), dot(axes[2], miss)])
+    residual = subtract(seen, r)
+    return np.array([dot(axes[0], residual), dot(axes[1], residual), dot(axes[2], residual)])
 
 
 @portable

@@ -56,28 +56,28 @@ def within_gates(S: Array, y: Array, blocks: Array, limits: Array, distances: Ar
     """
     L = np.zeros((DOF_MAX, DOF_MAX))
     u = np.zeros(DOF_MAX)
-    good = True
+    is_within = True
     for block in range(blocks.shape[0]):
         first, size = blocks[block]
         total = 0.0
         for i in range(size):
-            part = y[first + i]
+            whitened = y[first + i]
             for j in range(i + 1):
                 rest = S[first + i, first + j]
                 for k in range(j):
                     rest -= L[i, k] * L[j, k]
                 if i > j:
                     L[i, j] = rest / L[j, j]
-                    part -= L[i, j] * u[j]
+                    whitened -= L[i, j] * u[j]
                 elif rest > 0.0:
                     L[i, i] = math.sqrt(rest)
                 else:
                     L[i, i] = math.nan
-            u[i] = part / L[i, i]
+            u[i] = whitened / L[i, i]
             total += u[i] * u[i]
         distances[block] = total if total == total else math.inf
-        good = good and distances[block] <= limits[size]
-    return good
+        is_within = is_within and distances[block] <= limits[size]
+    return is_within
 
 
 @portable

@@ -67,8 +67,8 @@ VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and larger squares would 
 SQUARE_MAX = 1e8  # maximum squared innovation, in squared units; more would impair the covariance's precision
 HEADING_SIGMA_RAD = 0.5  # rad: before the first magnetometer reading, which sets the heading
 SET_DOWN_SIGMA_RAD = 0.05  # rad: accuracy of setting a drone down by eye, used without a magnetometer
-MOVES_SIGMAS = 2.0  # of the velocity; design choice: the estimate of a drone at rest exceeds it in 2 % of samples
-DENIED_S = 2.0  # s since the last sighting between two drones; design choice: errors grow little meanwhile
+MOVING_SIGMAS = 2.0  # of the velocity; design choice: the estimate of a drone at rest exceeds it in 2 % of samples
+SIGHTING_AGE_MAX_S = 2.0  # s since the last sighting between two drones; design choice: errors grow little meanwhile
 HEADING_WAIT_S = 1.0  # s without a magnetometer reading, after which the scenario's heading is used
 COSINE_MIN = 0.1  # minimum cosine between the sonar's ray and the vertical; beyond 84 deg it misses the ground below
 
@@ -86,8 +86,8 @@ def accept(rows: Rows, i: int, reading: Array) -> bool:
         return False
     if kind == SONAR and reading[READING.extra] == 0.0:
         return False
-    blind_gps = kind == GPS and not (reading[READING.extra + 1] != 0.0 and abs(reading[READING.extra]) < VALUE_MAX)
-    if blind_gps or (kind == FLOW and not reading[READING.extra] > 0.0):
+    is_invalid_fix = kind == GPS and not (reading[READING.extra + 1] != 0.0 and abs(reading[READING.extra]) < VALUE_MAX)
+    if is_invalid_fix or (kind == FLOW and not reading[READING.extra] > 0.0):
         counts[COUNT.refused + kind] += 1
         return False
     t_sample_s = reading[READING.t_sample]
@@ -113,9 +113,11 @@ def start_heading(rows: Rows, i: int, P: Array, t_s: float, readings: Array, fir
     while at >= 0:
         if rows.layout[i, LAYOUT.compass] and int(readings[at, READING.sensor]) == MAG:
             R_BS = matrix_at(setting, SETTING.sensors + MAG * SENSOR.size + SENSOR.R_BS)
-            seen = product(matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values)))
+            measured_W = product(
+                matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values))
+            )
             field = vector(setting, SETTING.field_W)
-            angle = el.atan2(field[1], field[0]) - el.atan2(seen[1], seen[0])
+            angle = el.atan2(field[1], field[0]) - el.atan2(measured_W[1], measured_W[0])
             _turn_heading(row, counts, setting[SETTING.gravity], angle)  # the update gives the heading's variance
             return
         at = after[at]
@@ -155,7 +157,7 @@ def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array
     blocks, kinds = np.zeros((ROWS_MAX, 2), dtype=np.int64), np.zeros(ROWS_MAX, dtype=np.int64)
     m, b = 0, 0
     now = moment(row)
-    known = now, 0.0, 0
+    recalled = now, 0.0, 0
     at = first
     while at >= 0:
         reading = readings[at]
@@ -170,15 +172,15 @@ def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array
             H[:m] = 0.0
             m, b = 0, 0
             now = moment(row)
-            known = now, 0.0, 0
-        if known[0][0] != t_sample_s:
-            known = strapdown.recall_known(rows, i, t_sample_s, now)
-        stack(rows, i, reading, H, z, expected, m, known)
+            recalled = now, 0.0, 0
+        if recalled[0][0] != t_sample_s:
+            recalled = strapdown.recall_known(rows, i, t_sample_s, now)
+        stack(rows, i, reading, H, z, expected, m, recalled)
         if kind == FLOW and not rows.layout[i, LAYOUT.compass]:
-            distrust_turn(P, H, expected, m)
+            limit_heading_effect(P, H, expected, m)
         write_variance(reading, setting, variance, m)
         patience_s = setting[SETTING.sensors + kind * SENSOR.size + SENSOR.patience]
-        if row[NOMINAL.t] - row[NOMINAL.refused_since + kind] > patience_s and not is_denied(rows, i, kind):
+        if row[NOMINAL.t] - row[NOMINAL.refused_since + kind] > patience_s and not is_refuted(rows, i, kind):
             inflate(rows, i, P, kind, z, expected, m)
         blocks[b, 0], blocks[b, 1], kinds[b] = m, size, kind
         m, b = m + size, b + 1
@@ -190,14 +192,21 @@ def fuse(rows: Rows, i: int, P: Array, readings: Array, first: int, after: Array
 
 @inlined
 def stack(
-    rows: Rows, i: int, reading: Array, H: Array, z: Array, expected: Array, at: int, known: tuple[Moment, float, int]
+    rows: Rows,
+    i: int,
+    reading: Array,
+    H: Array,
+    z: Array,
+    expected: Array,
+    at: int,
+    recalled: tuple[Moment, float, int],
 ) -> None:
-    """Add a reading to a stack of measurements from row `at` on; `known` is the result of `strapdown.recall_known`."""
+    """Add a reading to a stack from row `at` on; `recalled` is the result of `strapdown.recall_known`."""
     kind, setting = int(reading[READING.sensor]), rows.setting[i]
-    past, lag, state = known
+    past, lag, state = recalled
     predict(H, at, kind, setting, past, lag, expected)
     strapdown.move_columns(H, at, SIZES[kind], state)
-    with_biases(rows, i, kind, H, at, expected)
+    add_biases(rows, i, kind, H, at, expected)
     for k in range(SIZES[kind]):
         z[at + k] = reading[READING.values + k]
 
@@ -205,36 +214,36 @@ def stack(
 @inlined
 def predict(H: Array, at: int, kind: int, setting: Array, past: Moment, lag: float, out: Array) -> None:
     """Write the expected reading of a sensor into out[at:], and its Jacobian into H[at:]."""
-    aid = SETTING.sensors + kind * SENSOR.size
+    base = SETTING.sensors + kind * SENSOR.size
     _, p, v, q, w, _, _ = past
-    R, arm = matrix(q), vector(setting, aid + SENSOR.p_BS)
+    R, arm = matrix(q), vector(setting, base + SENSOR.p_BS)
     if kind == GPS:
         expected = write_gps(H, at, p, v, R, w, arm, lag)
         for k in range(6):
             out[at + k] = expected[k]
     elif kind == MAG:
-        field = write_mag(H, at, R, matrix_at(setting, aid + SENSOR.R_BS), vector(setting, SETTING.field_W))
+        field = write_mag(H, at, R, matrix_at(setting, base + SENSOR.R_BS), vector(setting, SETTING.field_W))
         put(out, at, field)
     elif kind == BARO:
         out[at] = write_baro(H, at, p, R, arm, lag)
     elif kind == SONAR:
-        out[at] = write_sonar(H, at, p, R, arm, vector(setting, aid + SENSOR.down_B), setting[SETTING.floor], lag)
+        out[at] = write_sonar(H, at, p, R, arm, vector(setting, base + SENSOR.down_B), setting[SETTING.floor], lag)
     else:
         put(out, at, write_flow(H, at, v, R, w, arm))
 
 
 @inlined
-def with_biases(rows: Rows, i: int, kind: int, H: Array, at: int, out: Array) -> None:
+def add_biases(rows: Rows, i: int, kind: int, H: Array, at: int, out: Array) -> None:
     for channel in range(CHANNELS):
-        place = LAYOUT.biases + (kind * CHANNELS + channel) * BIAS.size
-        state, row = rows.layout[i, place + BIAS.state], at + rows.layout[i, place + BIAS.row]
-        for k in range(rows.layout[i, place + BIAS.axes] if state >= 0 else 0):
+        base = LAYOUT.biases + (kind * CHANNELS + channel) * BIAS.size
+        state, row = rows.layout[i, base + BIAS.state], at + rows.layout[i, base + BIAS.row]
+        for k in range(rows.layout[i, base + BIAS.axes] if state >= 0 else 0):
             H[row + k, state + k] = 1.0
             out[row + k] += rows.bias[i, state + k]
 
 
 @inlined
-def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
+def limit_heading_effect(P: Array, H: Array, expected: Array, at: int) -> None:
     """Limit the effect of flow on the heading, in two rows from `at` on, to the part of the motion that is certain.
 
     A heading error rotates the velocity. At rest the velocity error would thereby yield spurious heading information
@@ -242,7 +251,7 @@ def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
     estimators", International Journal of Robotics Research 29, 2010).
     """
     squared = expected[at] * expected[at] + expected[at + 1] * expected[at + 1]
-    noise = MOVES_SIGMAS * MOVES_SIGMAS * (P[VELOCITY, VELOCITY] + P[VELOCITY + 1, VELOCITY + 1])
+    noise = MOVING_SIGMAS * MOVING_SIGMAS * (P[VELOCITY, VELOCITY] + P[VELOCITY + 1, VELOCITY + 1])
     share = 1.0 - noise / squared if squared > noise else 0.0
     for r in range(at, at + 2):
         for k in range(3):
@@ -253,22 +262,22 @@ def distrust_turn(P: Array, H: Array, expected: Array, at: int) -> None:
 def write_variance(reading: Array, setting: Array, variance: Array, at: int) -> None:
     """Write the variances of a reading's rows: those of the scenario, or a larger one that a GPS receiver states."""
     kind = int(reading[READING.sensor])
-    known = SETTING.sensors + kind * SENSOR.size
+    base = SETTING.sensors + kind * SENSOR.size
     for k in range(SIZES[kind]):
-        variance[at + k] = setting[known + SENSOR.variance + k]
+        variance[at + k] = setting[base + SENSOR.variance + k]
     if kind == GPS:
-        claimed = reading[READING.extra] * reading[READING.extra] - setting[known + SENSOR.correlated]
+        stated = reading[READING.extra] * reading[READING.extra] - setting[base + SENSOR.correlated]
         for k in range(3):
-            variance[at + k] = max(claimed, setting[known + SENSOR.variance])
+            variance[at + k] = max(stated, setting[base + SENSOR.variance])
 
 
 @inlined
-def is_denied(rows: Rows, i: int, kind: int) -> bool:
+def is_refuted(rows: Rows, i: int, kind: int) -> bool:
     """Return whether a drone that lately saw drone i, or was seen by it, trusts its own sensor: then drone i's errs."""
     for j in range(rows.sighted.shape[0]):
         last_s = max(rows.sighted[i, j], rows.sighted[j, i])
-        trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
-        if j != i and trusted and rows.nominal[i, NOMINAL.t] - last_s < DENIED_S:
+        is_trusted = math.isnan(rows.nominal[j, NOMINAL.refused_since + kind]) and rows.counts[j, COUNT.used + kind] > 0
+        if j != i and is_trusted and rows.nominal[i, NOMINAL.t] - last_s < SIGHTING_AGE_MAX_S:
             return True
     return False
 
@@ -321,10 +330,10 @@ def correct(
     if rows.joint.shape[0]:
         return _correct_jointly(rows, i, P, H, y, variance, blocks, kinds)
     used, x, P, _ = stacked_update(P, H, variance, y, blocks, rows.limits, distances)
-    kept = keep(rows, i, used, distances, blocks, kinds)
-    if not used and kept.shape[0]:
-        _, x, P, _ = stacked_update(P, H[kept], variance[kept], y[kept], blocks[:0], rows.limits, distances)
-    if kept.shape[0]:
+    selected = select_rows(rows, i, used, distances, blocks, kinds)
+    if not used and selected.shape[0]:
+        _, x, P, _ = stacked_update(P, H[selected], variance[selected], y[selected], blocks[:0], rows.limits, distances)
+    if selected.shape[0]:
         strapdown.correct(rows.nominal[i], rows.layout[i], rows.setting[i, SETTING.gravity], x)
         if rows.layout[i, LAYOUT.aiding_biases]:
             for k in range(P.shape[0]):
@@ -340,9 +349,9 @@ def _correct_jointly(
     distances = np.zeros(ROWS_MAX)
     put_block(rows.joint, i, P)  # it may have been inflated
     used = use_own(rows, i, H, variance, y, blocks, distances)
-    kept = keep(rows, i, used, distances, blocks, kinds)
-    if not used and kept.shape[0]:
-        use_own(rows, i, H[kept], variance[kept], y[kept], blocks[:0], distances)
+    selected = select_rows(rows, i, used, distances, blocks, kinds)
+    if not used and selected.shape[0]:
+        use_own(rows, i, H[selected], variance[selected], y[selected], blocks[:0], distances)
     return block(rows.joint, i, P.shape[0])
 
 
@@ -387,17 +396,17 @@ def correct_all(rows: Rows, HJ: Array, S: Array, y: Array) -> None:
 
 
 @portable
-def keep(rows: Rows, i: int, used: bool, distances: Array, blocks: Array, kinds: Array) -> Array:
+def select_rows(rows: Rows, i: int, used: bool, distances: Array, blocks: Array, kinds: Array) -> Array:
     """Count the outcome of each block; return the indices of the rows to use: all, or those within their gates."""
-    kept, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
+    selected, m = np.zeros(ROWS_MAX, dtype=np.int64), 0
     for b in range(blocks.shape[0]):
         first, size = blocks[b, 0], blocks[b, 1]
-        good = used or distances[b] <= rows.limits[size]
-        count_outcome(rows.nominal[i], rows.counts[i], kinds[b], good)
-        for k in range(size if good else 0):
-            kept[m] = first + k
+        is_within = used or distances[b] <= rows.limits[size]
+        count_outcome(rows.nominal[i], rows.counts[i], kinds[b], is_within)
+        for k in range(size if is_within else 0):
+            selected[m] = first + k
             m += 1
-    return kept[:m]
+    return selected[:m]
 
 
 @inlined
@@ -412,11 +421,11 @@ def count_outcome(row: Array, counts: Array, kind: int, passed: bool) -> None:
         row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
 
 
-SIX = tuple[float, float, float, float, float, float]
+SixFloats = tuple[float, float, float, float, float, float]
 
 
 @inlined
-def write_gps(H: Array, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SIX:
+def write_gps(H: Array, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SixFloats:
     """Predict a GPS fix, p + R r [m] and v + R (w x r) [m/s], of an antenna at r = `arm` in B; write six rows of H."""
     offset = product(R, arm)
     swing = product(R, cross(w, arm))

@@ -62,7 +62,7 @@ class PaperEstimator:
         if sensor in self._used:
             self._used[sensor] += 1
         if sensor == "imu":
-            self._turn(message)
+            self._update_attitude(message)
         elif sensor == "flow":
             self._velocity = message.velocity_m_s if message.quality > 0.0 else None
         elif sensor == "gps" and message.fix:
@@ -80,8 +80,8 @@ class PaperEstimator:
         if self._fix:
             self._filter.correct(self._fix, self._fix_variance_factor)
             self._fix = None
-        turn = frames.quaternion_from_heading(self._filter.x[YAW] - yaw)
-        self._q = _quaternion(frames.quaternion_multiply(turn, self._q))
+        heading_correction = frames.quaternion_from_heading(self._filter.x[YAW] - yaw)
+        self._q = _quaternion(frames.quaternion_multiply(heading_correction, self._q))
         yaw = float(self._filter.x[YAW])
         velocity = linear.product(rotation_z(yaw), self._velocity or (0.0, 0.0, 0.0))
         covariance = np.zeros((6, 6))
@@ -108,7 +108,7 @@ class PaperEstimator:
         self._q, self._velocity = tuple(state["q"]), state["velocity"] and tuple(state["velocity"])
         self._used = state["used"]
 
-    def _turn(self, sample: Imu) -> None:
+    def _update_attitude(self, sample: Imu) -> None:
         t_s = sample.t_sample_ns * 1e-9
         dt = t_s - self._t_imu_s
         if dt <= 0.0:
@@ -117,10 +117,10 @@ class PaperEstimator:
             dt = self._imu_period_s
         self._t_imu_s = t_s
         self._q = madgwick_step(
-            self._q, self._in_body(sample.gyro_rad_s), self._in_body(sample.accel_m_s2), self._beta, dt
+            self._q, self._to_body(sample.gyro_rad_s), self._to_body(sample.accel_m_s2), self._beta, dt
         )
 
-    def _in_body(self, v_S: Vector) -> Vector:
+    def _to_body(self, v_S: Vector) -> Vector:
         x, y, z = frames.rotate(self._q_BS, v_S).tolist()
         return x, y, z
 
@@ -169,8 +169,8 @@ def correlation_factor(error: ErrorModel, rate_hz: float) -> float:
     if not error.correlated_sigma:
         return 1.0
     a = el.exp(-1.0 / (rate_hz * error.correlation_time_s))
-    share = el.square(error.correlated_sigma / noise_sigma(error, rate_hz))
-    return 1.0 + share * 2.0 * a / (1.0 - a)
+    correlated_share = el.square(error.correlated_sigma / noise_sigma(error, rate_hz))
+    return 1.0 + correlated_share * 2.0 * a / (1.0 - a)
 
 
 def rotation_z(yaw: float) -> NDArray[np.float64]:

@@ -87,7 +87,7 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
     `accel` is the specific force [m/s^2], `gyro` the body rate [rad/s], both in the sensor frame S.
     """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
-    if not possible(accel, gyro):
+    if not is_possible(accel, gyro):
         counts[COUNT.refused + IMU] += 1
         return
     period = setting[SETTING.period]
@@ -98,41 +98,42 @@ def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
         counts[COUNT.refused + IMU] += 1 if dt < 0.0 else 0
         return
     if dt > 1.5 * period:
-        _lose(row, dt - period)
+        _add_loss(row, dt - period)
     if layout[LAYOUT.imu_displaced]:
-        accel, gyro = _of_body(row, setting, accel, gyro, dt)
+        accel, gyro = _to_body(row, setting, accel, gyro, dt)
     state = reckoning(row)
     biases = vector(row, NOMINAL.accel_bias), vector(row, NOMINAL.gyro_bias)
-    moved = reckon(state, accel, gyro, biases[0], biases[1], setting[SETTING.beta], setting[SETTING.gravity], dt)
-    put_reckoning(row, moved)
-    before, after = state[5], moved[5]
+    propagated = reckon(state, accel, gyro, biases[0], biases[1], setting[SETTING.beta], setting[SETTING.gravity], dt)
+    put_reckoning(row, propagated)
+    before, after = state[5], propagated[5]
     jolt = abs(after[0] - before[0]) + abs(after[1] - before[1]) + abs(after[2] - before[2])
     if jolt > setting[SETTING.jolt]:
-        hidden = 0.5 * jolt * dt  # maximum velocity error if the acceleration steps at any time between two samples
-        row[NOMINAL.lost_velocity] += hidden * hidden
+        # maximum velocity error if the acceleration steps at any time between two samples
+        velocity_error = 0.5 * jolt * dt
+        row[NOMINAL.lost_velocity] += velocity_error * velocity_error
     row[NOMINAL.t] = t_s
     row[NOMINAL.dt_squared] += dt * dt
     counts[COUNT.used + IMU] += 1
 
 
 @inlined
-def possible(accel: Vector, gyro: Vector) -> bool:
+def is_possible(accel: Vector, gyro: Vector) -> bool:
     """Return whether values are possible for an IMU; NaN fails each comparison."""
-    good = True
+    is_valid = True
     for k in range(3):
-        good = good and abs(accel[k]) < ACCEL_MAX_M_S2 and abs(gyro[k]) < GYRO_MAX_RAD_S
-    return good
+        is_valid = is_valid and abs(accel[k]) < ACCEL_MAX_M_S2 and abs(gyro[k]) < GYRO_MAX_RAD_S
+    return is_valid
 
 
 @inlined
-def _lose(row: Array, missing_s: float) -> None:
-    velocity, turned = MANOEUVRE_M_S2 * missing_s, LOST_TURN_RAD_S * missing_s
-    row[NOMINAL.lost_velocity] += velocity * velocity
-    row[NOMINAL.lost_turn] += turned * turned
+def _add_loss(row: Array, missing_s: float) -> None:
+    lost_velocity, lost_turn = MANOEUVRE_M_S2 * missing_s, LOST_TURN_RAD_S * missing_s
+    row[NOMINAL.lost_velocity] += lost_velocity * lost_velocity
+    row[NOMINAL.lost_turn] += lost_turn * lost_turn
 
 
 @inlined
-def _of_body(row: Array, setting: Array, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
+def _to_body(row: Array, setting: Array, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
     """Convert a sample of a rotated or displaced IMU to the centre of mass, in body axes."""
     imu = SETTING.sensors + IMU * SENSOR.size
     R_BS = matrix_at(setting, imu + SENSOR.R_BS)
@@ -192,8 +193,8 @@ def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
     """
     row, setting = rows.nominal[i], rows.setting[i]
     dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
-    turned = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]
-    velocity = setting[SETTING.accel_variance] * dt_squared + row[NOMINAL.lost_velocity]
+    turn_variance = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]
+    velocity_variance = setting[SETTING.accel_variance] * dt_squared + row[NOMINAL.lost_velocity]
     write_prediction(
         F,
         Q,
@@ -203,7 +204,7 @@ def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
         setting[SETTING.gravity],
         setting[SETTING.levelling],
         rows.layout[i, LAYOUT.accel_bias] != 0,
-        (velocity, turned + setting[SETTING.tilt_density] * dt, turned),
+        (velocity_variance, turn_variance + setting[SETTING.tilt_density] * dt, turn_variance),
         dt,
     )
     if rows.layout[i, LAYOUT.correlated]:
@@ -218,13 +219,13 @@ def write_growth(rows: Rows, i: int, F: Array, Q: Array) -> None:
 @portable
 def correct(row: Array, layout: Array, gravity: float, error: Array) -> None:
     """Correct the state and the biases by an estimated error."""
-    with_accel_bias = layout[LAYOUT.accel_bias] != 0
-    put_reckoning(row, corrected(reckoning(row), error, with_accel_bias, gravity))
+    has_accel_bias = layout[LAYOUT.accel_bias] != 0
+    put_reckoning(row, corrected(reckoning(row), error, has_accel_bias, gravity))
     put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
     increase(row, NOMINAL.p_corrected, error, 0)
     increase(row, NOMINAL.v_corrected, error, 3)
     increase(row, NOMINAL.gyro_bias, error, 9)
-    if with_accel_bias:
+    if has_accel_bias:
         increase(row, NOMINAL.accel_bias, error, 12)
 
 
@@ -262,14 +263,14 @@ def clone(rows: Rows, i: int, J: Array, first: int) -> None:
 
 
 @inlined
-def remember(counts: Array, history: Array, longest: int, now: Moment) -> None:
+def remember(counts: Array, history: Array, capacity: int, now: Moment) -> None:
     """Add the present moment to the history as its newest entry."""
     newest = counts[COUNT.newest] + 1 if counts[COUNT.kept] else 0
-    if newest == longest:
+    if newest == capacity:
         newest = 0
     put_moment(history[newest], now)
     counts[COUNT.newest] = newest
-    counts[COUNT.kept] = min(counts[COUNT.kept] + 1, longest)
+    counts[COUNT.kept] = min(counts[COUNT.kept] + 1, capacity)
 
 
 @inlined
@@ -283,9 +284,9 @@ def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, f
     past = recall(rows.counts[i], rows.history[i], rows.layout[i, LAYOUT.history], t_s, now)
     nearest, slot = abs(now[0] - t_s), -1
     for k in range(rows.layout[i, LAYOUT.clones]):
-        away = abs(rows.clones[i, k, CLONE.t] - t_s)
-        if away < nearest:  # false for an unused clone, whose time is NaN
-            nearest, slot = away, k
+        gap_s = abs(rows.clones[i, k, CLONE.t] - t_s)
+        if gap_s < nearest:  # false for an unused clone, whose time is NaN
+            nearest, slot = gap_s, k
     if slot < 0:
         return past, now[0] - past[0], 0
     former, state = rows.clones[i, slot], rows.layout[i, LAYOUT.first_clone] + CLONED * slot
@@ -297,29 +298,29 @@ def recall_known(rows: Rows, i: int, t_s: float, now: Moment) -> tuple[Moment, f
 
 
 @inlined
-def recall(counts: Array, history: Array, longest: int, t_s: float, now: Moment) -> Moment:
+def recall(counts: Array, history: Array, capacity: int, t_s: float, now: Moment) -> Moment:
     """Return the state at `t_s` as known at `now`, including later corrections.
 
     The state is interpolated between the history's entries and `now`, constant before the oldest entry, and
-    extrapolated after `now` with constant velocity and rate. `longest` is the number of entries of the drone's ring,
+    extrapolated after `now` with constant velocity and rate. `capacity` is the number of entries of the drone's ring,
     `history`.
     """
     if t_s == now[0]:
         return now
     if t_s > now[0]:
-        return _ahead(now, t_s - now[0])
+        return _extrapolated(now, t_s - now[0])
     later = now
-    for back in range(counts[COUNT.kept]):
-        past = moment(history[(counts[COUNT.newest] - back + longest) % longest])
+    for age in range(counts[COUNT.kept]):
+        past = moment(history[(counts[COUNT.newest] - age + capacity) % capacity])
         if past[0] <= t_s:
-            earlier = _as_seen(past, now)
-            return earlier if past[0] == t_s else _between(earlier, _as_seen(later, now), t_s)
+            earlier = _with_corrections(past, now)
+            return earlier if past[0] == t_s else _interpolated(earlier, _with_corrections(later, now), t_s)
         later = past
-    return _as_seen(later, now)
+    return _with_corrections(later, now)
 
 
 @inlined
-def _as_seen(past: Moment, now: Moment) -> Moment:
+def _with_corrections(past: Moment, now: Moment) -> Moment:
     """Return a past state including the corrections since then."""
     p = subtract(add(past[1], now[5]), past[5])
     v = subtract(add(past[2], now[6]), past[6])
@@ -327,29 +328,29 @@ def _as_seen(past: Moment, now: Moment) -> Moment:
 
 
 @inlined
-def _ahead(now: Moment, dt: float) -> Moment:
+def _extrapolated(now: Moment, dt: float) -> Moment:
     t_s, p, v, q, w, p_corrected, v_corrected = now
     turned = multiply(q, rotation_vector_quaternion(scaled(w, dt)))
     return t_s + dt, axpy(p, dt, v), v, turned, w, p_corrected, v_corrected
 
 
 @inlined
-def _between(a: Moment, b: Moment, t_s: float) -> Moment:
+def _interpolated(a: Moment, b: Moment, t_s: float) -> Moment:
     """Interpolate linearly; the quaternions of neighbouring moments never differ in sign."""
-    part = (t_s - a[0]) / (b[0] - a[0])
+    fraction = (t_s - a[0]) / (b[0] - a[0])
     q_a, q_b = a[3], b[3]
     q = normalised((
-        q_a[0] + part * (q_b[0] - q_a[0]),
-        q_a[1] + part * (q_b[1] - q_a[1]),
-        q_a[2] + part * (q_b[2] - q_a[2]),
-        q_a[3] + part * (q_b[3] - q_a[3]),
+        q_a[0] + fraction * (q_b[0] - q_a[0]),
+        q_a[1] + fraction * (q_b[1] - q_a[1]),
+        q_a[2] + fraction * (q_b[2] - q_a[2]),
+        q_a[3] + fraction * (q_b[3] - q_a[3]),
     ))  # fmt: skip
-    return t_s, _mix(a[1], b[1], part), _mix(a[2], b[2], part), q, _mix(a[4], b[4], part), b[5], b[6]
+    return t_s, _lerp(a[1], b[1], fraction), _lerp(a[2], b[2], fraction), q, _lerp(a[4], b[4], fraction), b[5], b[6]
 
 
 @inlined
-def _mix(a: Vector, b: Vector, part: float) -> Vector:
-    return axpy(a, part, subtract(b, a))
+def _lerp(a: Vector, b: Vector, fraction: float) -> Vector:
+    return axpy(a, fraction, subtract(b, a))
 
 
 @inlined
@@ -467,13 +468,13 @@ def beta_for(levelling_s: float, direction_sigma_rad: float) -> float:
 
 
 @inlined
-def corrected(state: Reckoning, error: Array, with_accel_bias: bool, gravity: float) -> Reckoning:
+def corrected(state: Reckoning, error: Array, has_accel_bias: bool, gravity: float) -> Reckoning:
     """Return the state corrected by an estimated error, (n,)."""
     p, v, q, _, w, f_B = state
     p, v = add(p, vector(error, POSITION)), add(v, vector(error, VELOCITY))
     q = normalised(multiply(rotation_vector_quaternion(vector(error, ATTITUDE)), q))
     w = subtract(w, vector(error, GYRO_BIAS))
-    if with_accel_bias:
+    if has_accel_bias:
         f_B = subtract(f_B, vector(error, ACCEL_BIAS))
     return p, v, q, acceleration(q, f_B, gravity), w, f_B
 
@@ -494,7 +495,7 @@ def write_prediction(
     v_before: Vector,
     gravity: float,
     levelling_s: float,
-    with_accel_bias: bool,
+    has_accel_bias: bool,
     variances: Vector,
     dt: float,
 ) -> None:
@@ -505,12 +506,12 @@ def write_prediction(
         (v[1] - v_before[1]) / dt,
         (v[2] - v_before[2]) / dt + gravity,
     )
-    write_transition(F, f_W, matrix(state[2]), levelling_s, with_accel_bias, dt)
+    write_transition(F, f_W, matrix(state[2]), levelling_s, has_accel_bias, dt)
     write_process_noise(Q, walk, variances, dt)
 
 
 @inlined
-def write_transition(F: Array, f_W: Vector, R_WB: Matrix, levelling_s: float, with_accel_bias: bool, dt: float) -> None:
+def write_transition(F: Array, f_W: Vector, R_WB: Matrix, levelling_s: float, has_accel_bias: bool, dt: float) -> None:
     """Write the transition of the error state over `dt` [s] into F, (n, n), the identity on entry.
 
     p' = v; v' = -[f_W]x theta - R b_a; theta' = -R b_g - (theta_x, theta_y, 0)/levelling_s.
@@ -523,7 +524,7 @@ def write_transition(F: Array, f_W: Vector, R_WB: Matrix, levelling_s: float, wi
     write_minus_cross(F, VELOCITY, ATTITUDE, f_W, dt)
     write_minus_rotation(F, ATTITUDE, GYRO_BIAS, R_WB, dt)
     F[ATTITUDE, ATTITUDE] = F[ATTITUDE + 1, ATTITUDE + 1] = 1.0 / (1.0 + dt / levelling_s)
-    if with_accel_bias:
+    if has_accel_bias:
         write_minus_rotation(F, POSITION, ACCEL_BIAS, R_WB, 0.5 * dt * dt)
         write_minus_rotation(F, VELOCITY, ACCEL_BIAS, R_WB, dt)
 

@@ -33,11 +33,11 @@ from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, Mode
 
 WATCHDOG_NS = 50_000_000  # time without an AT command until the watchdog bit is set (Developer Guide 6.6, COMWDG)
 LAND_AFTER_NS = 2_000_000_000  # time of hovering without a pilot's program after which the drone lands
-MALFORMED_SHOWN = 20  # number of invalid parts of datagrams that are reported in full; further ones are only counted
+MALFORMED_REPORTED_MAX = 20  # number of invalid parts of datagrams reported in full; further ones are only counted
 LOW_BATTERY_PERCENT = 10.0  # %; zsim's firmware does not take off below this, and lands below 5 %
-RANGE_COSINE = math.cos(math.radians(75.0))  # cosine of the tilt at which the firmware cuts the motors
+CUTOUT_TILT_COSINE = math.cos(math.radians(75.0))  # cosine of the tilt at which the firmware cuts the motors
 THREADS = StateBit.AT_THREAD | StateBit.NAVDATA_THREAD | StateBit.VIDEO_THREAD | StateBit.ACQUISITION_THREAD
-ALWAYS = int(StateBit.ALTITUDE_CONTROL | StateBit.PIC_VERSION_OK | THREADS)  # bits that are set even on the ground
+ALWAYS_SET = int(StateBit.ALTITUDE_CONTROL | StateBit.PIC_VERSION_OK | THREADS)  # bits that are set even on the ground
 CONTROL_STATES = {
     "landed": ControlState.LANDED,
     "taking_off": ControlState.TAKING_OFF,
@@ -48,14 +48,14 @@ CONTROL_STATES = {
 }
 FRONT_CHANNELS = (0, 2)  # video_channel: 0 front, 1 bottom, 2 and 3 the same with the other camera inset, 4 the next
 NEXT_CHANNEL = 4
-AGAIN_NS = 500_000_000  # period at which a mode not yet entered is requested again, as a pilot's program repeats REF
-ASKED_MAX = 3  # number of requests after which a mode that is not entered is abandoned; design choice: 1.5 s in all
-PER_GATE = 3  # maximum number of setpoints sent within a gate: the world takes only one per gate
+MODE_RETRY_NS = 500_000_000  # period at which a pending mode is requested again, as a pilot's program repeats REF
+MODE_REQUESTS_MAX = 3  # number of requests after which a mode not entered is abandoned; design choice: 1.5 s in all
+SETPOINTS_PER_GATE_MAX = 3  # maximum number of setpoints sent within a gate: the world takes only one per gate
 IN_THE_AIR = ("taking_off", *AIRBORNE)
 NO_ALTITUDE_LIMIT_MM = 100_000  # value of altitude_max that stands for no limit (ARDroneLib)
 CLIMB_1_S = 1.5  # maximum climb rate per metre below the maximum height [1/s], as in zsim's firmware
 CALIBRATION_YAW_RAD_S = 1.0  # yaw rate of a calibration: a full turn takes 6 s, as on the real aircraft
-FIGURES = "flight animations are not simulated; on a real aircraft the firmware performs them"
+ANIMATIONS_REFUSED = "flight animations are not simulated; on a real aircraft the firmware performs them"
 
 
 class Outlets(NamedTuple):
@@ -76,13 +76,17 @@ class Aircraft:
         self._outlets = outlets
         self._state = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount)
         limits = drone.limits
-        highest = {
+        maxima = {
             "euler_angle_max": math.radians(limits.tilt_deg),
             "control_vz_max": 1e3 * limits.vertical_speed_m_s,
             "control_yaw": math.radians(limits.yaw_rate_deg_s),
         }
         self.configuration = Configuration(
-            {f"control:{place}{name}": v for name, v in highest.items() for place in ("", "indoor_", "outdoor_")},
+            {
+                f"control:{prefix}{name}": maximum
+                for name, maximum in maxima.items()
+                for prefix in ("", "indoor_", "outdoor_")
+            },
             {"general:ardrone_name": drone.name, "network:ssid_single_player": f"ardrone2_{drone.name}"},
         )
         sender = CommandSender(drone.name, source, outlets.put)
@@ -124,18 +128,18 @@ class Aircraft:
 
     def _watch_pilot(self) -> None:
         """Hover when the pilot's program falls silent, and land if it stays silent."""
-        silent_ns = self._silent_ns()
-        lost_ns = round(self.configuration.number("general:com_watchdog") * SECOND_NS)
-        if silent_ns <= lost_ns:
+        silence_ns = self._silence_ns()
+        timeout_ns = round(self.configuration.number("general:com_watchdog") * SECOND_NS)
+        if silence_ns <= timeout_ns:
             return
         if not self._is_lost:
             self._is_lost = True
             self._navdata.clients.clear()
             self.pilot.on_lost()
-        elif silent_ns > lost_ns + LAND_AFTER_NS:
+        elif silence_ns > timeout_ns + LAND_AFTER_NS:
             self.pilot.land()
 
-    def _silent_ns(self) -> int:
+    def _silence_ns(self) -> int:
         """Return the time since the last AT command, less one gate, the resolution of arrival times [ns]."""
         return 0 if self._command_ns is None else max(0, self._now_ns - self._command_ns - self._gate_ns)
 
@@ -149,7 +153,7 @@ class Aircraft:
         commands, refusals = at_commands.parse(datagram)
         for refusal in refusals:
             self._malformed += 1
-            self._refuse(refusal if self._malformed <= MALFORMED_SHOWN else "more data that are not AT commands")
+            self._refuse(refusal if self._malformed <= MALFORMED_REPORTED_MAX else "more data that are not AT commands")
         for command in commands:
             # a program may restart its sequence numbers at 0 or 1 at any time, and anywhere after a silence
             if command.sequence > self._last_sequence or command.sequence in (0, 1) or self._is_lost:
@@ -183,7 +187,7 @@ class Aircraft:
             case at_commands.FlatTrim() if self.pilot.state != "landed":
                 self._refuse(f"FTRIM is not obeyed: the drone is {self.pilot.state}; must be landed")
             case at_commands.Animation():
-                self._refuse(f"ANIM is not obeyed: {FIGURES}")
+                self._refuse(f"ANIM is not obeyed: {ANIMATIONS_REFUSED}")
 
     def _configure(self, config: at_commands.Config, ids: at_commands.ConfigIds | None) -> None:
         """Set an entry, and acknowledge it even if it is refused, as the real aircraft does."""
@@ -194,7 +198,7 @@ class Aircraft:
             self._refuse(f"CONFIG {key[:60]} is not obeyed: its identifiers are not the current ones")
             return
         if key == "control:flight_anim":
-            self._refuse(f"CONFIG {key} is not obeyed: {FIGURES}")
+            self._refuse(f"CONFIG {key} is not obeyed: {ANIMATIONS_REFUSED}")
             return
         try:
             self.configuration.set(key, config.value)
@@ -204,8 +208,8 @@ class Aircraft:
         if key == "general:navdata_demo":
             self._navdata.is_bootstrap = False
         elif key == "video:video_channel":
-            wanted = int(self.configuration.number("video:video_channel"))
-            self._channel = int(self.camera == CAMERAS[0]) if wanted == NEXT_CHANNEL else wanted
+            channel = int(self.configuration.number("video:video_channel"))
+            self._channel = int(self.camera == CAMERAS[0]) if channel == NEXT_CHANNEL else channel
 
     # State
 
@@ -216,13 +220,13 @@ class Aircraft:
         major, minor = CONTROL_STATES[self.pilot.state], 0
         if major == ControlState.HOVERING and self._is_lost:
             minor = LOST_COM
-        elif self.pilot.calibrates:
+        elif self.pilot.is_calibrating:
             major, minor = ControlState.HOVERING, MAGNETO_CALIBRATION
         return major << 16 | minor
 
     def _state_bits(self) -> int:
         status = self._state.status
-        is_silent = self._command_ns is None or self._silent_ns() > WATCHDOG_NS
+        is_silent = self._command_ns is None or self._silence_ns() > WATCHDOG_NS
         bits = (
             (StateBit.FLYING, self.pilot.state in (*IN_THE_AIR, "landing")),
             (StateBit.COMMAND_ACK, self._ack),
@@ -232,10 +236,10 @@ class Aircraft:
             (StateBit.ULTRASOUND_DEAF, self._content.is_sonar_deaf),
             (StateBit.BATTERY_LOW, status is not None and status.battery_percent < LOW_BATTERY_PERCENT),
         )
-        state = sum((bit for bit, is_set in bits if is_set), ALWAYS)  # `|` is slow for flags
+        state = sum((bit for bit, is_set in bits if is_set), ALWAYS_SET)  # `|` is slow for flags
         if self.pilot.state == "emergency":
             state += StateBit.EMERGENCY + (StateBit.USER_EMERGENCY if self.pilot.stopped_by_pilot else StateBit.CUTOUT)
-            if float(rotations.rotation_matrix(self._state.attitude)[2, 2]) < RANGE_COSINE:
+            if float(rotations.rotation_matrix(self._state.attitude)[2, 2]) < CUTOUT_TILT_COSINE:
                 state += StateBit.ANGLES_OUT_OF_RANGE
         return state
 
@@ -278,21 +282,21 @@ class Pilot:
         self._source = source
         self._refuse = refuse
         self._status: Status | None = None
-        self._held_take_off = self._held_emergency = False  # bits of the last REF
-        self._mode: ModeName | None = None  # the mode that is requested but not yet entered
-        self._mode_ns, self._mode_count = 0, 0
+        self._last_take_off_bit = self._last_emergency_bit = False  # bits of the last REF
+        self._requested_mode: ModeName | None = None  # the mode that is requested but not yet entered
+        self._requested_ns, self._request_count = 0, 0
         self.setpoint: TiltSetpoint | None = None
         self._sent_ns: int | None = None  # when the setpoint was last sent; None: not yet
         self._gate_ns, self._gate_count = -1, 0
-        self._psi_rad: float | None = None  # the pilot's heading in the last PCMD_MAG
-        self._calibrated_ns: int | None = None  # when the calibration turn ends
+        self._pilot_heading_rad: float | None = None  # the pilot's heading in the last PCMD_MAG
+        self._calibration_end_ns: int | None = None  # when the calibration turn ends
         self.has_flown = False
         self.stopped_by_pilot = False
 
     @property
-    def calibrates(self) -> bool:
+    def is_calibrating(self) -> bool:
         """Whether the drone is turning to calibrate its magnetometer."""
-        return self._calibrated_ns is not None
+        return self._calibration_end_ns is not None
 
     @property
     def state(self) -> str:
@@ -302,7 +306,7 @@ class Pilot:
     def _now_ns(self) -> int:
         return self._status.t_ns if self._status else 0
 
-    def flown_by(self) -> str | None:
+    def other_commander(self) -> str | None:
         """Return the name of another process that flies the drone; None if no other does."""
         commander = self._status.commander if self._status else None
         return None if commander in (None, self._source) else commander
@@ -311,7 +315,7 @@ class Pilot:
         """Return whether a command must be refused, and report the reason."""
         if self._status is None:
             self._refuse(f"{name} is not obeyed: the drone has sent no status yet")
-        elif other := self.flown_by():
+        elif other := self.other_commander():
             self._refuse(f"{name} is not obeyed: {other} flies the drone")
         else:
             return False
@@ -324,40 +328,40 @@ class Pilot:
 
         A pilot's program sends the levels of both bits again and again; rising edges trigger a take-off and the toggle.
         """
-        rises = ref.takes_off and not self._held_take_off
-        toggles = ref.emergency and not self._held_emergency
-        self._held_take_off, self._held_emergency = ref.takes_off, ref.emergency
-        if not (rises or toggles or (not ref.takes_off and self.state in IN_THE_AIR)):
-            if not ref.takes_off and self._mode == "takeoff":  # the take-off is withdrawn
-                if self._mode_count:  # it has been requested already, so the drone must land
+        is_take_off_edge = ref.takes_off and not self._last_take_off_bit
+        is_emergency_edge = ref.emergency and not self._last_emergency_bit
+        self._last_take_off_bit, self._last_emergency_bit = ref.takes_off, ref.emergency
+        if not (is_take_off_edge or is_emergency_edge or (not ref.takes_off and self.state in IN_THE_AIR)):
+            if not ref.takes_off and self._requested_mode == "takeoff":  # the take-off is withdrawn
+                if self._request_count:  # it has been requested already, so the drone must land
                     self._sender.mode(self._now_ns, "land")
-                self._mode = None
+                self._requested_mode = None
             return
         if self._is_refused("REF"):
             return
-        if toggles:
-            self._ask("reset" if self.state == "emergency" else "emergency")
-        elif self._mode in ("emergency", "reset"):
+        if is_emergency_edge:
+            self._request("reset" if self.state == "emergency" else "emergency")
+        elif self._requested_mode in ("emergency", "reset"):
             return
-        elif rises and self.state in ("landed", "landing"):
-            self._ask("takeoff")
-        elif not ref.takes_off and self._mode != "land":
-            self._ask("land")
+        elif is_take_off_edge and self.state in ("landed", "landing"):
+            self._request("takeoff")
+        elif not ref.takes_off and self._requested_mode != "land":
+            self._request("land")
 
     def on_pcmd(self, pcmd: Pcmd | PcmdMag) -> None:
         """Follow a PCMD until the next one arrives."""
         if isinstance(pcmd, PcmdMag):
-            self._psi_rad = math.pi * share(pcmd.psi)
-        if self.state not in IN_THE_AIR or self._mode in ("land", "emergency") or self._is_refused("PCMD"):
+            self._pilot_heading_rad = math.pi * clipped_fraction(pcmd.psi)
+        if self.state not in IN_THE_AIR or self._requested_mode in ("land", "emergency") or self._is_refused("PCMD"):
             return
         setpoint = HOVER
         if pcmd.flag & at_commands.PROGRESSIVE:
-            heading_rad = self._psi_rad if pcmd.flag & at_commands.ABSOLUTE else None
-            shares = map(share, (pcmd.roll, pcmd.pitch, pcmd.gaz, pcmd.yaw))
-            setpoint = TiltSetpoint(False, *shares, pilot_heading_rad=heading_rad)
-        elif self.calibrates:
+            heading_rad = self._pilot_heading_rad if pcmd.flag & at_commands.ABSOLUTE else None
+            fractions = map(clipped_fraction, (pcmd.roll, pcmd.pitch, pcmd.gaz, pcmd.yaw))
+            setpoint = TiltSetpoint(False, *fractions, pilot_heading_rad=heading_rad)
+        elif self.is_calibrating:
             return
-        self._calibrated_ns = None
+        self._calibration_end_ns = None
         self._follow(setpoint)
 
     def calibrate(self) -> None:
@@ -366,66 +370,66 @@ class Pilot:
             self._refuse(f"CALIB is not obeyed: the drone is {self.state}; must be in the air")
         elif not self._is_refused("CALIB"):
             self._follow(HOVER)
-            self._calibrated_ns = self._now_ns + self._setpoints.turn_ns
+            self._calibration_end_ns = self._now_ns + self._setpoints.turn_ns
 
     def on_lost(self) -> None:
         """Hover in place, since the pilot's program is silent; its next REF counts as its first."""
-        self._held_take_off = self._held_emergency = False
+        self._last_take_off_bit = self._last_emergency_bit = False
         if self._is_own_flight():
-            self._calibrated_ns = None
+            self._calibration_end_ns = None
             self._follow(HOVER)
 
     def land(self) -> None:
         """Land, since the pilot's program remains silent."""
-        if self._is_own_flight() and self._mode != "land":
-            self._ask("land")
+        if self._is_own_flight() and self._requested_mode != "land":
+            self._request("land")
 
     def _is_own_flight(self) -> bool:
-        return self.state in IN_THE_AIR and self.has_flown and not self.flown_by()
+        return self.state in IN_THE_AIR and self.has_flown and not self.other_commander()
 
     # Gates
 
     def on_status(self, status: Status) -> None:
         self._status = status
-        if status.state == "emergency" and self._mode == "takeoff":
-            self._mode = None
-        if status.state != "emergency" and self._mode != "emergency":
+        if status.state == "emergency" and self._requested_mode == "takeoff":
+            self._requested_mode = None
+        if status.state != "emergency" and self._requested_mode != "emergency":
             self.stopped_by_pilot = False
         if status.state in ("landed", "emergency", "landing"):
-            self.setpoint = self._calibrated_ns = None
-        if status.state in ("landed", "emergency") and self._mode != "takeoff":
+            self.setpoint = self._calibration_end_ns = None
+        if status.state in ("landed", "emergency") and self._requested_mode != "takeoff":
             self.has_flown = False
-        if self._mode is not None:
-            self._pursue(self._mode)
-        if self._calibrated_ns is not None and status.t_ns >= self._calibrated_ns:
-            self._calibrated_ns, self._sent_ns = None, None
-        if self.flown_by():
+        if self._requested_mode is not None:
+            self._repeat_request(self._requested_mode)
+        if self._calibration_end_ns is not None and status.t_ns >= self._calibration_end_ns:
+            self._calibration_end_ns, self._sent_ns = None, None
+        if self.other_commander():
             self.setpoint = None
         self._send_due()
 
-    def _ask(self, mode: ModeName) -> None:
-        self._mode, self._mode_count = mode, 0
-        self.setpoint = self._calibrated_ns = None
+    def _request(self, mode: ModeName) -> None:
+        self._requested_mode, self._request_count = mode, 0
+        self.setpoint = self._calibration_end_ns = None
         self.stopped_by_pilot = mode == "emergency"
-        self._pursue(mode)
+        self._repeat_request(mode)
 
-    def _pursue(self, mode: ModeName) -> None:
+    def _repeat_request(self, mode: ModeName) -> None:
         """Request a mode whenever due, until it is entered or abandoned."""
-        entered = {
+        is_entered = {
             "takeoff": self.state in (*IN_THE_AIR, "emergency"),
             "land": self.state not in IN_THE_AIR,
             "emergency": self.state == "emergency",
             "reset": self.state != "emergency",
         }
-        if entered[mode]:
-            self._mode = None
+        if is_entered[mode]:
+            self._requested_mode = None
         elif mode == "takeoff" and self.state != "landed":
             return  # wait until the drone has landed
-        elif not self._mode_count or self._now_ns - self._mode_ns >= AGAIN_NS:
-            if self._mode_count == ASKED_MAX:
-                self._mode = None
+        elif not self._request_count or self._now_ns - self._requested_ns >= MODE_RETRY_NS:
+            if self._request_count == MODE_REQUESTS_MAX:
+                self._requested_mode = None
                 return
-            self._mode_ns, self._mode_count = self._now_ns, self._mode_count + 1
+            self._requested_ns, self._request_count = self._now_ns, self._request_count + 1
             self.has_flown = self.has_flown or mode == "takeoff"
             self._sender.mode(self._now_ns, mode)
 
@@ -442,9 +446,9 @@ class Pilot:
         if now_ns != self._gate_ns:
             self._gate_ns, self._gate_count = now_ns, 0
         is_due = self._sent_ns is None or now_ns - self._sent_ns >= self._setpoints.repeat_ns(self.setpoint)
-        if is_due and self._gate_count < PER_GATE:
+        if is_due and self._gate_count < SETPOINTS_PER_GATE_MAX:
             self._sent_ns, self._gate_count, self.has_flown = now_ns, self._gate_count + 1, True
-            if self.calibrates:
+            if self.is_calibrating:
                 self._setpoints.send_turn(now_ns)
             else:
                 self._setpoints.send(now_ns, self.setpoint)
@@ -478,7 +482,7 @@ class SetpointSender:
         if setpoint.pilot_heading_rad is not None:
             return 0
         climb_m_s = self._configuration.number("control:control_vz_max") / 1e3 if setpoint.up > 0.0 else -math.inf
-        return 0 if self._climb_left_m_s() < climb_m_s else REPEAT_NS
+        return 0 if self._max_climb_m_s() < climb_m_s else REPEAT_NS
 
     def send(self, t_ns: int, setpoint: TiltSetpoint) -> None:
         if setpoint.hover:
@@ -487,26 +491,26 @@ class SetpointSender:
         number = self._configuration.number
         right, back = setpoint.right, setpoint.back
         if setpoint.pilot_heading_rad is not None:
-            turn = setpoint.pilot_heading_rad - self.heading_rad
-            sine, cosine = el.sin(turn), el.cos(turn)
+            angle_rad = setpoint.pilot_heading_rad - self.heading_rad
+            sine, cosine = el.sin(angle_rad), el.cos(angle_rad)
             right, back = cosine * right - sine * back, sine * right + cosine * back
         tilt_rad = number("control:euler_angle_max")
-        right, back = (share(el.tan(part * tilt_rad) / self._tilt_slope) for part in (right, back))
-        climb_m_s = min(setpoint.up * number("control:control_vz_max") / 1e3, self._climb_left_m_s())
-        yaw_left = share(-setpoint.clockwise * number("control:control_yaw") / self._yaw_rad_s)
-        self._sender.tilt(t_ns, -back, -right, share(climb_m_s / self._climb_m_s), yaw_left, hover=False)
+        right, back = (clipped_fraction(el.tan(fraction * tilt_rad) / self._tilt_slope) for fraction in (right, back))
+        climb_m_s = min(setpoint.up * number("control:control_vz_max") / 1e3, self._max_climb_m_s())
+        yaw_left = clipped_fraction(-setpoint.clockwise * number("control:control_yaw") / self._yaw_rad_s)
+        self._sender.tilt(t_ns, -back, -right, clipped_fraction(climb_m_s / self._climb_m_s), yaw_left, hover=False)
 
     def send_turn(self, t_ns: int) -> None:
         self._sender.velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
 
-    def _climb_left_m_s(self) -> float:
+    def _max_climb_m_s(self) -> float:
         """Return the maximum climb rate with which the drone stays below altitude_max."""
-        highest_mm = self._configuration.number("control:altitude_max")
-        if highest_mm >= NO_ALTITUDE_LIMIT_MM:
+        max_altitude_mm = self._configuration.number("control:altitude_max")
+        if max_altitude_mm >= NO_ALTITUDE_LIMIT_MM:
             return math.inf
-        return CLIMB_1_S * (highest_mm / 1e3 - self.altitude_m)
+        return CLIMB_1_S * (max_altitude_mm / 1e3 - self.altitude_m)
 
 
-def share(value: float) -> float:
+def clipped_fraction(value: float) -> float:
     """Return a fraction of a limit, clipped to [-1, 1]."""
     return min(1.0, max(-1.0, value))

@@ -25,7 +25,7 @@ from zsim_bridges.ardrone.navdata import (
     GPS_TAG,
     MAG_UT_PER_LSB,
     MAGNETO,
-    MICROSECONDS,
+    MICROSECONDS_MASK,
     PHYS,
     PRESSURE,
     SECONDS_SHIFT,
@@ -37,7 +37,7 @@ from zsim_bridges.ardrone.navdata import (
 )
 from zsim_bridges.vehicle_links.driver import DriverOptions
 from zsim_bridges.vehicle_links.vehicle_session import (
-    STILL,
+    ZERO_VECTOR,
     AircraftPose,
     AircraftReadings,
     AircraftState,
@@ -50,17 +50,17 @@ NAVDATA, AT = 0, 1  # channels
 REQUEST_NS = 100_000_000  # silence after which navdata is requested again, as in npm ar-drone
 CONFIG_NS = 500_000_000  # time without an acknowledgement after which an entry is sent again
 WATCHDOG_NS = 1_000_000_000  # period of watchdog resets: half of the aircraft's com_watchdog
-RESTARTED = 100  # packets; a sequence number that falls back by at least this much shows that the aircraft restarted
+RESTART_DROP_MIN = 100  # packets; a sequence number that falls by at least this much shows a restart of the aircraft
 PERIOD_NS = 30_000_000  # maximum time between commands (Developer Guide, 6.3)
-CHANGED_NS = 15_000_000  # minimum time between changed demands; design choice: below a gate, which brings one command
+CHANGE_INTERVAL_NS = 15_000_000  # minimum time between changed demands; design choice: below a gate (one command each)
 PULSE_NS = 90_000_000  # duration of an emergency pulse: three datagrams carry the bit, so two of them may be lost
 # Minimum time between emergency pulses: longer than one takes to show in navdata, since a second would undo the first
-PULSES_NS = 400_000_000
+PULSE_INTERVAL_NS = 400_000_000
 VELOCITY_1_S = 2.5  # velocity gain; tuned: 46 deg of phase margin with 0.14 s of delay and 0.14 s of tilt lag
 INTEGRAL_1_S2 = 2.0  # integral gain; tuned: as fast as that margin allows, since gusts last only a few seconds
 DRAG_1_S = 0.58  # deceleration by drag per unit of speed (tum_ardrone's model, fitted to flights)
 STEP_S_MAX = 0.1  # maximum time step of the integration; longer pauses count as this long
-ANSWER_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
+RESPONSE_NS = 240_000_000  # command delay and tilt lag (tum_ardrone: 0.1 s and 0.14 s)
 HOVER = Pcmd(0, 0, 0.0, 0.0, 0.0, 0.0)  # flag 0: hold the position
 STATES: dict[int, DroneState] = {
     ControlState.FLYING: "flying",
@@ -102,21 +102,21 @@ class AircraftSession(VehicleSession):
         self._entries = [Config(0, key, value) for key, value in settings.items()]
         self._pending: deque[Config] = deque(self._entries)
         self._sequence = 0
-        self._newest = 0
-        self._bits = StateBit(0)
+        self._newest_sequence = 0
+        self._state_bits = StateBit(0)
         self._state: DroneState = "landed"
         self._battery = 0.0
         self._requested_ns = self._config_ns = self._cleared_ns = self._watchdog_ns = -WATCHDOG_NS
         self._sent: Config | None = None  # the entry that awaits its acknowledgement
 
     @classmethod
-    def of_run(
+    def from_run(
         cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, ultrasound: int
     ) -> "AircraftSession":
         origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m
-        place = options.origin_m or scenario.drone(options.drone).position_m
+        start_m = options.origin_m or scenario.drone(options.drone).position_m
         yaw_rad = None if options.yaw_deg is None else math.radians(options.yaw_deg)
-        return cls(host, NavdataReadings(origin, place, scenario.environment.magnetic_field_ut, yaw_rad), ultrasound)
+        return cls(host, NavdataReadings(origin, start_m, scenario.environment.magnetic_field_ut, yaw_rad), ultrasound)
 
     # From the aircraft
 
@@ -128,21 +128,21 @@ class AircraftSession(VehicleSession):
         except NavdataError:
             self._refused += 1
             return
-        if self._newest - RESTARTED < packet.sequence <= self._newest:
+        if self._newest_sequence - RESTART_DROP_MIN < packet.sequence <= self._newest_sequence:
             return  # duplicated or out of order
-        if packet.sequence < self._newest:
+        if packet.sequence < self._newest_sequence:
             self._loss.restart()
-        self._newest = packet.sequence
+        self._newest_sequence = packet.sequence
         self._loss.add(packet.sequence)
         self._received_ns = now_ns
-        self._take(packet, now_ns)
+        self._process(packet, now_ns)
 
-    def _take(self, packet: Navdata, now_ns: int) -> None:
-        if StateBit.COM_LOST in packet.state and StateBit.COM_LOST not in self._bits:
+    def _process(self, packet: Navdata, now_ns: int) -> None:
+        if StateBit.COM_LOST in packet.state and StateBit.COM_LOST not in self._state_bits:
             self.texts.append("the aircraft has not received our commands for a while")
         if packet.bootstrap and not self._pending:
             self._pending.extend(self._entries)  # the aircraft was restarted
-        self._bits = packet.state
+        self._state_bits = packet.state
         demo = packet.options.get(DEMO)
         if demo is not None:
             self._battery = float(min(100, demo.battery_percent))
@@ -160,20 +160,20 @@ class AircraftSession(VehicleSession):
         if silent_ns >= REQUEST_NS:
             self._requested_ns = now_ns
             yield NAVDATA, navdata.REQUEST_UNICAST
-        emergency = StateBit.EMERGENCY in self._bits
+        emergency = StateBit.EMERGENCY in self._state_bits
         flight = self._commands.advance(now_ns, demand, emergency, self._navdata.pose)
         datagram = b""
-        for command in [*self._set_up(now_ns), *flight]:
+        for command in [*self._setup_commands(now_ns), *flight]:
             self._sequence += 1
             datagram += at_commands.format_command(command._replace(sequence=self._sequence))
         if datagram:
             yield AT, datagram
 
-    def _set_up(self, now_ns: int) -> Iterator[Command]:
+    def _setup_commands(self, now_ns: int) -> Iterator[Command]:
         """Yield what the set-up needs next; an entry's acknowledgement is cleared before the next entry is sent."""
         if self._received_ns is None:
             return
-        acknowledged = StateBit.COMMAND_ACK in self._bits
+        acknowledged = StateBit.COMMAND_ACK in self._state_bits
         if now_ns - self._watchdog_ns >= WATCHDOG_NS:
             self._watchdog_ns = now_ns
             yield ResetWatchdog(0)
@@ -203,47 +203,49 @@ class FlightCommands:
         self._axes = _Axis(), _Axis()
         self._sent_ns = -PERIOD_NS
         self._last: Demand | None = None
-        self._rose_ns = -PULSES_NS  # when the emergency bit last rose
+        self._pulse_start_ns = -PULSE_INTERVAL_NS  # when the emergency bit last rose
 
     def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
         """Yield the commands that are due; `emergency` states whether the aircraft is in an emergency."""
-        if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGED_NS):
+        if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGE_INTERVAL_NS):
             return
         self._last, self._sent_ns = demand, now_ns
         match demand.action:
             case "none":
                 return
             case "kill":
-                yield self._toggle(now_ns, due=not emergency)
+                yield self._emergency_ref(now_ns, is_due=not emergency)
             case "land":
                 yield at_commands.ref(0, takes_off=False)
                 yield HOVER
             case "reset":
-                yield self._toggle(now_ns, due=emergency)
+                yield self._emergency_ref(now_ns, is_due=emergency)
             case _ if emergency:
                 return
             case _:
                 yield at_commands.ref(0, takes_off=True)
                 yield self._pcmd(now_ns, demand, pose)
 
-    def _toggle(self, now_ns: int, due: bool) -> Command:
-        """Return the next REF of a pulse of the emergency bit, begun if `due`; the aircraft obeys the rising edge."""
-        if due and now_ns - self._rose_ns >= PULSES_NS:
-            self._rose_ns = now_ns
-        return at_commands.ref(0, takes_off=False, emergency=now_ns - self._rose_ns < PULSE_NS)
+    def _emergency_ref(self, now_ns: int, is_due: bool) -> Command:
+        """Return the next REF of an emergency pulse, started if `is_due`; the aircraft obeys its rising edge."""
+        if is_due and now_ns - self._pulse_start_ns >= PULSE_INTERVAL_NS:
+            self._pulse_start_ns = now_ns
+        return at_commands.ref(0, takes_off=False, emergency=now_ns - self._pulse_start_ns < PULSE_NS)
 
     def _pcmd(self, now_ns: int, demand: Demand, pose: AircraftPose | None) -> Command:
         """Return the PCMD for a demand; its values are fractions of the limits in the aircraft's configuration."""
         if demand.action != "fly" or pose is None:
             self._axes = _Axis(), _Axis()
             return HOVER
-        wanted, yaw_rad = demand.velocity_m_s, float(heading(pose.q_WB))
-        full = G_M_S2 * math.tan(TILT_RAD)
-        x, y = (axis.accel(now_ns, wanted[k], pose.velocity_m_s[k], full) for k, axis in enumerate(self._axes))
+        demanded, yaw_rad = demand.velocity_m_s, float(heading(pose.q_WB))
+        max_accel_m_s2 = G_M_S2 * math.tan(TILT_RAD)
+        x, y = (
+            axis.accel(now_ns, demanded[k], pose.velocity_m_s[k], max_accel_m_s2) for k, axis in enumerate(self._axes)
+        )
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        up, turn = wanted[2] / CLIMB_M_S, demand.yaw_rate_rad_s / YAW_RATE_RAD_S
-        shares = (y * c - x * s) / full, (x * c + y * s) / full, up, turn
-        left, forward, up, yaw_left = (max(-1.0, min(1.0, share)) for share in shares)
+        up, turn = demanded[2] / CLIMB_M_S, demand.yaw_rate_rad_s / YAW_RATE_RAD_S
+        fractions = (y * c - x * s) / max_accel_m_s2, (x * c + y * s) / max_accel_m_s2, up, turn
+        left, forward, up, yaw_left = (max(-1.0, min(1.0, fraction)) for fraction in fractions)
         return Pcmd(0, at_commands.PROGRESSIVE, -left, -forward, up, -yaw_left)
 
 
@@ -255,26 +257,26 @@ class _Axis:
     """
 
     def __init__(self) -> None:
-        self._then_ns: int | None = None
+        self._last_ns: int | None = None
         self._reference = 0.0
         self._wind_m_s2 = 0.0
         self._references: deque[tuple[int, float]] = deque()
 
-    def accel(self, now_ns: int, wanted: float, measured: float, most_m_s2: float) -> float:
-        """Return the acceleration [m/s^2] that the tilt must produce; from `most_m_s2` on, wind is not integrated."""
-        dt_s = 0.0 if self._then_ns is None else min(STEP_S_MAX, (now_ns - self._then_ns) * 1e-9)
-        if self._then_ns is None:
+    def accel(self, now_ns: int, demanded: float, measured: float, max_m_s2: float) -> float:
+        """Return the acceleration [m/s^2] that the tilt must produce; from `max_m_s2` on, wind is not integrated."""
+        dt_s = 0.0 if self._last_ns is None else min(STEP_S_MAX, (now_ns - self._last_ns) * 1e-9)
+        if self._last_ns is None:
             self._reference = measured
-        self._then_ns = now_ns
-        slope = VELOCITY_1_S * (wanted - self._reference)
+        self._last_ns = now_ns
+        slope = VELOCITY_1_S * (demanded - self._reference)
         self._reference += dt_s * slope
         references = self._references
         references.append((now_ns, self._reference))
-        while len(references) > 1 and references[1][0] <= now_ns - ANSWER_NS:
+        while len(references) > 1 and references[1][0] <= now_ns - RESPONSE_NS:
             references.popleft()
         error = references[0][1] - measured  # relative to the reference to which the measured velocity responds
         accel = slope + DRAG_1_S * self._reference + VELOCITY_1_S * error + self._wind_m_s2
-        if abs(accel) < most_m_s2:
+        if abs(accel) < max_m_s2:
             self._wind_m_s2 += INTEGRAL_1_S2 * error * dt_s
         return accel
 
@@ -301,22 +303,22 @@ class NavdataReadings(AircraftReadings):
         self._north_rad = math.atan2(field_ut[1], field_ut[0])
         self._stated_yaw_rad = yaw_rad
         self._yaw_offset_rad: float | None = None
-        self._then_ns: int | None = None
+        self._last_demo_ns: int | None = None
         self._gps_ns: int | None = None
 
     def receive(self, packet: Navdata, now_ns: int) -> None:
         options, taken_ns = packet.options, now_ns
         if time := options.get(TIME):
-            stamp_ns = (time.time >> SECONDS_SHIFT) * 1_000_000_000 + (time.time & MICROSECONDS) * 1_000
+            stamp_ns = (time.time >> SECONDS_SHIFT) * 1_000_000_000 + (time.time & MICROSECONDS_MASK) * 1_000
             taken_ns = self.clock.taken_ns(stamp_ns, now_ns)
         if demo := options.get(DEMO):
             self._on_demo(demo, options, taken_ns)
         if phys := options.get(PHYS):
-            accel = tuple(G_M_S2 * part / 1e3 for part in _flipped(phys.phys_accs_mg))
-            gyro = tuple(map(math.radians, _flipped(phys.phys_gyros_deg_s)))
+            accel = tuple(G_M_S2 * part / 1e3 for part in _frd_to_flu(phys.phys_accs_mg))
+            gyro = tuple(map(math.radians, _frd_to_flu(phys.phys_gyros_deg_s)))
             self.read("imu", taken_ns, accel, gyro)
         if mag := options.get(MAGNETO):
-            self.read("mag", taken_ns, tuple(MAG_UT_PER_LSB * part for part in _flipped((mag.mx, mag.my, mag.mz))))
+            self.read("mag", taken_ns, tuple(MAG_UT_PER_LSB * part for part in _frd_to_flu((mag.mx, mag.my, mag.mz))))
         if (pressure := options.get(PRESSURE)) and pressure.pressure_pa > 0:
             height_m = self.pose.position_m[2] if self.pose else self._ground_m
             self.read_pressure(taken_ns, float(pressure.pressure_pa), height_m)
@@ -330,21 +332,21 @@ class NavdataReadings(AircraftReadings):
         """Update the pose, integrating the velocity that the aircraft measures relative to its heading."""
         roll, pitch = math.radians(demo.phi_mdeg / 1e3), -math.radians(demo.theta_mdeg / 1e3)
         yaw = -math.radians(demo.psi_mdeg / 1e3)
-        dt_s = 0.0 if self._then_ns is None else (taken_ns - self._then_ns) * 1e-9
-        self._then_ns = taken_ns
+        dt_s = 0.0 if self._last_demo_ns is None else (taken_ns - self._last_demo_ns) * 1e-9
+        self._last_demo_ns = taken_ns
         if mag := options.get(MAGNETO):
-            m = _flipped((mag.mx, mag.my, mag.mz))  # the Earth's magnetic field in B
+            m = _frd_to_flu((mag.mx, mag.my, mag.mz))  # the Earth's magnetic field in B
             my, mz = m[1] * math.cos(roll) - m[2] * math.sin(roll), m[1] * math.sin(roll) + m[2] * math.cos(roll)
             mx = m[0] * math.cos(pitch) + mz * math.sin(pitch)
             self._align(yaw, self._north_rad - math.atan2(my, mx), dt_s)
         yaw += self._yaw_offset_rad or 0.0
-        own = _flipped((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
+        own = _frd_to_flu((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
         velocity = turned_about_up(own, yaw)
         if 0.0 < dt_s < GAP_S_MAX:
             self._x, self._y = self._x + dt_s * velocity[0], self._y + dt_s * velocity[1]
         w, x, y, z = quaternion_from_rpy((roll, pitch, yaw)).tolist()
         position = self._x, self._y, self._ground_m + max(0, demo.altitude_mm) / 1e3
-        rate = self._last["imu"][1] if "imu" in self._last else STILL
+        rate = self._last["imu"][1] if "imu" in self._last else ZERO_VECTOR
         self.pose = AircraftPose(taken_ns, position, velocity, (w, x, y, z), rate)
         self.read("flow", taken_ns, own, 1.0)
 
@@ -361,17 +363,17 @@ class NavdataReadings(AircraftReadings):
 
     def _on_gps(self, gps: Any, taken_ns: int) -> None:
         """Process each fix once, and let the position follow it slowly."""
-        place = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
-        values = self.gps_values(place, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, FIX_3D, gps.satellites)
-        before_ns, fix = self._gps_ns, (place, gps.speed_m_s, gps.degree)
+        geodetic = gps.latitude_deg, gps.longitude_deg, gps.elevation_m
+        values = self.gps_values(geodetic, gps.speed_m_s, math.radians(gps.degree), gps.ehpe_m, FIX_3D, gps.satellites)
+        previous_ns, fix = self._gps_ns, (geodetic, gps.speed_m_s, gps.degree)
         if fix != self._fix and self.read("gps", taken_ns, *values):
             self._gps_ns, self._fix = taken_ns, fix
-            if before_ns is not None:  # the first fix is less accurate than the given position
+            if previous_ns is not None:  # the first fix is less accurate than the given position
                 x, y, _ = values[3]
-                share = min(1.0, GPS_1_S * (taken_ns - before_ns) * 1e-9)
-                self._x, self._y = self._x + share * (x - self._x), self._y + share * (y - self._y)
+                weight = min(1.0, GPS_1_S * (taken_ns - previous_ns) * 1e-9)
+                self._x, self._y = self._x + weight * (x - self._x), self._y + weight * (y - self._y)
 
 
-def _flipped(v: Any) -> Vector:
+def _frd_to_flu(v: Any) -> Vector:
     """Convert a body vector from axes forward, right, down to B."""
     return float(v[0]), -float(v[1]), -float(v[2])

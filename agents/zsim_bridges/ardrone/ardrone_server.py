@@ -30,20 +30,20 @@ from zsim_bridges.vehicle_links import drone_link
 from zsim_bridges.vehicle_links.server import PictureServer, Say
 
 AUTHENTICATION_PORT = 5552  # UDP, on which programs look for drones (ARDroneLib, config.h)
-QUESTION, ANSWER = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
+AUTH_REQUEST, AUTH_REPLY = b"PARROT AUTH", b"PARROT AUTH OK"  # ARDroneLib, ardrone_auth.c
 BACKLOG_MAX = 500_000  # unsent bytes, a few seconds of video, beyond which a connection skips to the next IDR frame
 NOT_PERMITTED = (errno.EACCES, errno.EPERM)  # errors of opening a port below 1024 without the privilege to do so
 CONNECTIONS_MAX = 8  # maximum simultaneous connections per port; design choice: a pilot's program needs only one
 LINE_MAX = 512  # maximum length of a line [bytes]
-BROKEN = (OSError, EOFError, TimeoutError, ValueError)  # errors of a broken connection or an overlong line
+CONNECTION_ERRORS = (OSError, EOFError, TimeoutError, ValueError)  # errors of a broken connection or an overlong line
 Address = tuple[str, int]
 Refuse = Callable[[str], None]
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 VERSION_PORT, FILES_PORT = 5551, 21  # TCP ports for FTP: of the version, and of videos (ARDroneLib, config.h)
 VERSION_FILES = {"version.txt": b"2.4.8\r\n"}  # the newest firmware of an AR.Drone 2.0
-DATA_WITHIN_S = 10.0  # wall time within which a client must open the data connection
-IDLE_S = 300.0  # wall time without a command after which a connection is closed
-_FIXED = {
+DATA_TIMEOUT_S = 10.0  # wall time within which a client must open the data connection
+IDLE_TIMEOUT_S = 300.0  # wall time without a command after which a connection is closed
+_FIXED_REPLIES = {
     "USER": "230 logged in",
     "PASS": "230 logged in",
     "SYST": "215 UNIX Type: L8",
@@ -115,7 +115,7 @@ class ArdroneServer(PictureServer):
         if not (kind == "drone" and thing in self._drones and is_onboard):
             self.on_run(key, payload)
             return
-        message = self.decoded(key, payload)
+        message = self.try_decode(key, payload)
         if message is not None:
             try:
                 self._drones[thing].aircraft.update(message)
@@ -123,7 +123,7 @@ class ArdroneServer(PictureServer):
                 self.refuse(f"{key}: {error}")
 
     def on_picture(self, key: str, payload: bytes) -> None:
-        image = self.decoded(key, payload)
+        image = self.try_decode(key, payload)
         drone = self._drones.get(keys.thing(key))
         if image is not None and drone is not None and keys.leaf(key) == drone.aircraft.camera:
             drone.video.on_picture(image)
@@ -132,9 +132,9 @@ class ArdroneServer(PictureServer):
         """Count and print the commands from pilots' programs that the world refuses."""
         if (event.kind, event.source) != ("refused", self.observer.name):
             return
-        _, thing, what = keys.parts(event.subject)
+        _, thing, leaf = keys.parts(event.subject)
         drone = self._drones.get(thing)
-        is_overtaken = what != "cmd/mode" and drone is not None and drone.aircraft.pilot.setpoint is None
+        is_overtaken = leaf != "cmd/mode" and drone is not None and drone.aircraft.pilot.setpoint is None
         if not is_overtaken:  # at the gate in which a landing begins, a setpoint is expected to be refused
             self.refuse(f"{event.subject}: {event.data.get('reason', event.text)}")
 
@@ -146,9 +146,9 @@ class DroneServer:
         self.address = address
         self._name = drone.name
         self._refuse: Callable[[str], None] = lambda reason: server.refuse(f"{drone.name}: {reason}")
-        self._navdata = DatagramPort(peers, lambda *asked: self.aircraft.on_navdata_request(*asked), self._refuse)
+        self._navdata = DatagramPort(peers, lambda *request: self.aircraft.on_navdata_request(*request), self._refuse)
         commands = DatagramPort(peers, lambda datagram, _: self.aircraft.on_at(datagram), self._refuse)
-        self._authentication = DatagramPort(peers, self._on_question, self._refuse)
+        self._authentication = DatagramPort(peers, self._on_auth_request, self._refuse)
         self._control = StreamPort(peers, read_until_end, self._refuse)
         outlets = Outlets(server.link.put, self._navdata.send, self._control.broadcast, server.refuse)
         self.aircraft = Aircraft(drone, server.observer.name, server.info.gate_ns, outlets)
@@ -170,31 +170,33 @@ class DroneServer:
         Raises:
             RunError: a port is taken, or the address is not this host's.
         """
-        for opened, kind, port in self._ports:
+        for endpoint, kind, port in self._ports:
             try:
-                await opened.open(self.address, port)
+                await endpoint.open(self.address, port)
             except OSError as error:
-                why = {
+                reason = {
                     errno.EADDRINUSE: "another program uses it; end that program, or give other --addresses",
                     errno.EADDRNOTAVAIL: "the address is not this host's; give one of this host's as --addresses",
                 }.get(error.errno or 0, error.strerror or str(error))
-                raise RunError(f"{self._name}: {kind} port {port} of {self.address} cannot be opened: {why}") from error
+                raise RunError(
+                    f"{self._name}: {kind} port {port} of {self.address} cannot be opened: {reason}"
+                ) from error
         try:  # optional, since few programs use this port and opening it needs a privilege
             await self._files.open(self.address, FILES_PORT)
         except OSError as error:
-            why = "needs a privilege" if error.errno in NOT_PERMITTED else error.strerror
-            return [f"{self._name}: TCP port {FILES_PORT} is not served ({why}); ps_drone uses it"]
+            reason = "needs a privilege" if error.errno in NOT_PERMITTED else error.strerror
+            return [f"{self._name}: TCP port {FILES_PORT} is not served ({reason}); ps_drone uses it"]
         return []
 
     async def close(self) -> None:
         self.video.close()
-        for opened, _, _ in self._ports:
-            await opened.close()
+        for endpoint, _, _ in self._ports:
+            await endpoint.close()
         await self._files.close()
 
-    def _on_question(self, datagram: bytes, address: Address) -> None:
-        if datagram.startswith(QUESTION):
-            self._authentication.send(ANSWER, address)
+    def _on_auth_request(self, datagram: bytes, address: Address) -> None:
+        if datagram.startswith(AUTH_REQUEST):
+            self._authentication.send(AUTH_REPLY, address)
         else:
             self._refuse("a datagram on the authentication port is not a PARROT AUTH")
 
@@ -205,63 +207,63 @@ class VideoServer:
     def __init__(self, peers: "AllowedHosts", refuse: Refuse) -> None:
         self._refuse = refuse
         self.port = StreamPort(peers, self._serve, refuse)
-        self._ready: set[asyncio.StreamWriter] = set()  # those sent an IDR frame and all frames since
-        self._newest: CameraImage | None = None
-        self._busy: asyncio.Task[None] | None = None
+        self._in_sync: set[asyncio.StreamWriter] = set()  # those sent an IDR frame and all frames since
+        self._next_image: CameraImage | None = None
+        self._stream_task: asyncio.Task[None] | None = None
         self._encoder: VideoEncoder | None = None
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="video")
-        self._frames = self._sent = 0
+        self._frame_count = self._sent_bytes = 0
 
     @property
     def is_watched(self) -> bool:
         return bool(self.port.writers)
 
     def close(self) -> None:
-        if self._busy is not None:
-            self._busy.cancel()
+        if self._stream_task is not None:
+            self._stream_task.cancel()
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             await read_until_end(reader, writer)
         finally:
-            self._ready.discard(writer)
+            self._in_sync.discard(writer)
 
     def on_picture(self, image: CameraImage) -> None:
         """Stream an image; while another is being encoded, only the newest waits."""
-        self._newest = image
-        if self.is_watched and self._busy is None:
-            self._busy = asyncio.get_running_loop().create_task(self._stream())
+        self._next_image = image
+        if self.is_watched and self._stream_task is None:
+            self._stream_task = asyncio.get_running_loop().create_task(self._stream())
 
     async def _stream(self) -> None:
         loop = asyncio.get_running_loop()
         try:
-            while self._newest is not None and self.is_watched:
-                image, self._newest = self._newest, None
-                begins = any(writer not in self._ready for writer in self.port.writers)
+            while self._next_image is not None and self.is_watched:
+                image, self._next_image = self._next_image, None
+                needs_idr = any(writer not in self._in_sync for writer in self.port.writers)
                 try:
-                    frame = await loop.run_in_executor(self._thread, self._encode, image, begins)
+                    frame = await loop.run_in_executor(self._thread, self._encode, image, needs_idr)
                 except ValueError as error:
                     self._refuse(f"a picture cannot be streamed: {error}")
                     continue
                 if frame is not None:
                     self._send(image, frame)
         finally:
-            self._busy = None
+            self._stream_task = None
 
-    def _encode(self, image: CameraImage, begins: bool) -> VideoFrame | None:
+    def _encode(self, image: CameraImage, needs_idr: bool) -> VideoFrame | None:
         self._encoder = self._encoder or VideoEncoder()
-        return self._encoder.encode(image.data, begins)
+        return self._encoder.encode(image.data, needs_idr)
 
     def _send(self, image: CameraImage, frame: VideoFrame) -> None:
         """Send a frame to every connection that can decode it and keeps up."""
-        packet = pave_header(frame, self._frames, image.t_sample_ns // 1_000_000, self._sent) + frame.data
-        self._frames, self._sent = self._frames + 1, self._sent + len(frame.data)
+        packet = pave_header(frame, self._frame_count, image.t_sample_ns // 1_000_000, self._sent_bytes) + frame.data
+        self._frame_count, self._sent_bytes = self._frame_count + 1, self._sent_bytes + len(frame.data)
         for writer in tuple(self.port.writers):
             if writer.transport.get_write_buffer_size() > BACKLOG_MAX:
-                self._ready.discard(writer)
-            elif frame.is_idr or writer in self._ready:
-                self._ready.add(writer)
+                self._in_sync.discard(writer)
+            elif frame.is_idr or writer in self._in_sync:
+                self._in_sync.add(writer)
                 writer.write(packet)
 
 
@@ -276,65 +278,70 @@ class FileServer:
         self.port = StreamPort(peers, self._serve, refuse)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        data: StreamPort | None = None
-        waiting: asyncio.Queue[bytes | None] = asyncio.Queue(1)
+        data_port: StreamPort | None = None
+        content_queue: asyncio.Queue[bytes | None] = asyncio.Queue(1)
         _reply(writer, "220 AR.Drone")
         try:
-            while line := await asyncio.wait_for(reader.readline(), IDLE_S):
+            while line := await asyncio.wait_for(reader.readline(), IDLE_TIMEOUT_S):
                 verb, _, argument = line.decode("ascii", "replace").strip().partition(" ")
                 verb = verb.upper()
                 if verb == "QUIT":
                     _reply(writer, "221 bye")
                     return
                 if verb in ("PASV", "EPSV"):
-                    if data is not None:
-                        await data.close()
-                    data, waiting = await self._open_data(writer, verb)
+                    if data_port is not None:
+                        await data_port.close()
+                    data_port, content_queue = await self._open_data(writer, verb)
                 elif verb in ("RETR", "LIST", "NLST"):
-                    await self._transfer(writer, data, waiting, verb, argument)
-                    data = None
+                    await self._transfer(writer, data_port, content_queue, verb, argument)
+                    data_port = None
                 elif verb == "SIZE":
                     content = self._files.get(argument.lstrip("/"))
                     _reply(writer, "550 no such file" if content is None else f"213 {len(content)}")
                 else:
-                    _reply(writer, _FIXED.get(verb, "502 not implemented"))
+                    _reply(writer, _FIXED_REPLIES.get(verb, "502 not implemented"))
                 await writer.drain()
         finally:
-            if data is not None:
-                await data.close()
+            if data_port is not None:
+                await data_port.close()
 
     async def _open_data(self, writer: asyncio.StreamWriter, verb: str) -> "tuple[StreamPort, asyncio.Queue]":
         """Listen for a data connection, and reply with its address."""
-        waiting: asyncio.Queue[bytes | None] = asyncio.Queue(1)
+        content_queue: asyncio.Queue[bytes | None] = asyncio.Queue(1)
 
-        async def send(_: asyncio.StreamReader, to: asyncio.StreamWriter) -> None:
-            content = await asyncio.wait_for(waiting.get(), DATA_WITHIN_S)
-            to.write(content or b"")
-            await to.drain()
-            waiting.task_done()
+        async def send(_: asyncio.StreamReader, data_writer: asyncio.StreamWriter) -> None:
+            content = await asyncio.wait_for(content_queue.get(), DATA_TIMEOUT_S)
+            data_writer.write(content or b"")
+            await data_writer.drain()
+            content_queue.task_done()
 
-        data = StreamPort(self._peers, send, self._refuse)
-        port = await data.open(self._address, 0)
-        place = ",".join([*self._address.split("."), str(port >> 8), str(port & 0xFF)])
-        _reply(writer, f"227 passive ({place})" if verb == "PASV" else f"229 passive (|||{port}|)")
-        return data, waiting
+        data_port = StreamPort(self._peers, send, self._refuse)
+        port = await data_port.open(self._address, 0)
+        endpoint = ",".join([*self._address.split("."), str(port >> 8), str(port & 0xFF)])
+        _reply(writer, f"227 passive ({endpoint})" if verb == "PASV" else f"229 passive (|||{port}|)")
+        return data_port, content_queue
 
     async def _transfer(
-        self, writer: asyncio.StreamWriter, data: "StreamPort | None", waiting: asyncio.Queue, verb: str, argument: str
+        self,
+        writer: asyncio.StreamWriter,
+        data_port: "StreamPort | None",
+        content_queue: asyncio.Queue,
+        verb: str,
+        argument: str,
     ) -> None:
         name = argument.lstrip("/")
-        if data is None:
+        if data_port is None:
             _reply(writer, "425 use PASV first")
         elif verb == "RETR" and name not in self._files:
             _reply(writer, "550 no such file")
         else:
             listing = "".join(f"{each}\r\n" for each in self._files).encode("ascii")
             _reply(writer, "150 sending data")
-            waiting.put_nowait(self._files[name] if verb == "RETR" else listing)
-            await asyncio.wait_for(waiting.join(), DATA_WITHIN_S)
+            content_queue.put_nowait(self._files[name] if verb == "RETR" else listing)
+            await asyncio.wait_for(content_queue.join(), DATA_TIMEOUT_S)
             _reply(writer, "226 done")
-        if data is not None:
-            await data.close()
+        if data_port is not None:
+            await data_port.close()
 
 
 def _reply(writer: asyncio.StreamWriter, text: str) -> None:
@@ -342,11 +349,11 @@ def _reply(writer: asyncio.StreamWriter, text: str) -> None:
 
 
 class DatagramPort(asyncio.DatagramProtocol):
-    """A UDP port: `take` is called with each datagram from a peer and its source address; others are refused."""
+    """A UDP port: `on_datagram` is called with each datagram from a peer and its source address; others are refused."""
 
-    def __init__(self, peers: "AllowedHosts", take: Callable[[bytes, Address], None], refuse: Refuse) -> None:
+    def __init__(self, peers: "AllowedHosts", on_datagram: Callable[[bytes, Address], None], refuse: Refuse) -> None:
         self._peers = peers
-        self._take = take
+        self._on_datagram = on_datagram
         self._refuse = refuse
         self._transport: asyncio.DatagramTransport | None = None
 
@@ -362,7 +369,7 @@ class DatagramPort(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         if self._peers.allow(addr[0]):
-            self._take(data, addr[:2])
+            self._on_datagram(data, addr[:2])
         else:
             self._refuse(f"{addr[0]} sends datagrams and is not a --peer")
 
@@ -423,7 +430,7 @@ class StreamPort:
     async def _serve_one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.writers.add(writer)
         try:
-            with contextlib.suppress(*BROKEN):
+            with contextlib.suppress(*CONNECTION_ERRORS):
                 await self._serve(reader, writer)
         finally:
             self.writers.discard(writer)
@@ -499,10 +506,10 @@ def peer_addresses(hosts: Iterable[str]) -> frozenset[str]:
     Raises:
         RunError: a name has no address.
     """
-    found: set[str] = set()
+    addresses: set[str] = set()
     for host in hosts:
         try:
-            found.update(str(info[4][0]) for info in socket.getaddrinfo(host, None, socket.AF_INET))
+            addresses.update(str(info[4][0]) for info in socket.getaddrinfo(host, None, socket.AF_INET))
         except OSError as error:
             raise RunError(f"--peer {host}: has no IPv4 address here ({error.strerror})") from None
-    return frozenset(found)
+    return frozenset(addresses)

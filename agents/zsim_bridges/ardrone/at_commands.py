@@ -142,7 +142,7 @@ class Ignored(NamedTuple):
 
 FlightCommand = Ref | Pcmd | PcmdMag | FlatTrim | Calibrate | Animation
 Command = FlightCommand | ConfigIds | Config | Control | ResetWatchdog | Led | Ignored
-KINDS: dict[str, type[Any]] = {
+COMMAND_TYPES: dict[str, type[Any]] = {
     "REF": Ref,
     "PCMD": Pcmd,
     "PCMD_MAG": PcmdMag,
@@ -155,10 +155,10 @@ KINDS: dict[str, type[Any]] = {
     "LED": Led,
     "ANIM": Animation,
 }
-_NAME_OF = {kind: name for name, kind in KINDS.items()}
+_COMMAND_NAMES = {kind: name for name, kind in COMMAND_TYPES.items()}
 _TYPE_NAMES = {int: "an integer", float: "a float", str: "a string"}
 _BITS, _FLOAT = struct.Struct("<i"), struct.Struct("<f")
-_FORM = re.compile(r"AT\*([A-Z_]{1,20})=(\d{1,10})(?:,(.*))?")
+_COMMAND = re.compile(r"AT\*([A-Z_]{1,20})=(\d{1,10})(?:,(.*))?")
 _ARGUMENT = re.compile(r'(?:"([^"]*)"|(-?\d{1,10}))(?:,|\Z)')
 _SEQUENCE_MAX = 2**32 - 1
 
@@ -186,26 +186,26 @@ def parse(datagram: bytes) -> Parsed:
         except _RefusalError as error:
             parsed.refusals.append(str(error))
     if rest.strip(b"\n\0 "):
-        parsed.refusals.append(f"{_shown(rest)} does not end in a carriage return; must be a complete command")
+        parsed.refusals.append(f"{_quoted(rest)} does not end in a carriage return; must be a complete command")
     return parsed
 
 
 def _command(part: bytes) -> Command:
     if len(part) >= COMMAND_MAX:
         raise _RefusalError(f"a command has {len(part) + 1} characters; must have at most {COMMAND_MAX}")
-    if not part.isascii() or not (form := _FORM.fullmatch(part.decode("ascii").strip("\n "))):
-        raise _RefusalError(f"{_shown(part)} is not an AT command; must be AT*NAME=sequence,arguments")
-    name, sequence, text = form[1], int(form[2]), form[3] or ""
+    if not part.isascii() or not (match := _COMMAND.fullmatch(part.decode("ascii").strip("\n "))):
+        raise _RefusalError(f"{_quoted(part)} is not an AT command; must be AT*NAME=sequence,arguments")
+    name, sequence, text = match[1], int(match[2]), match[3] or ""
     if sequence > _SEQUENCE_MAX:
         raise _RefusalError(f"{name} has the sequence number {sequence}; must be <= {_SEQUENCE_MAX}")
     if name in IGNORED_NAMES:
         return Ignored(sequence, name)
-    if name not in KINDS:
-        raise _RefusalError(f"{name} is not known; must be one of {', '.join(KINDS)}")
-    arguments, types = list(_arguments(name, text)), _argument_types(KINDS[name])
+    if name not in COMMAND_TYPES:
+        raise _RefusalError(f"{name} is not known; must be one of {', '.join(COMMAND_TYPES)}")
+    arguments, types = list(_arguments(name, text)), _argument_types(COMMAND_TYPES[name])
     if len(arguments) != len(types):
         raise _RefusalError(f"{name} has {len(arguments)} arguments; must have {len(types)}")
-    return KINDS[name](sequence, *(_value(name, *pair) for pair in zip(types, arguments, strict=True)))
+    return COMMAND_TYPES[name](sequence, *(_value(name, *pair) for pair in zip(types, arguments, strict=True)))
 
 
 def _argument_types(kind: type[Any]) -> list[type]:
@@ -214,13 +214,15 @@ def _argument_types(kind: type[Any]) -> list[type]:
 
 def _arguments(name: str, text: str) -> Iterator[int | str]:
     """Yield the arguments of a command; a comma after the last one is allowed."""
-    at = 0
-    while at < len(text):
-        match = _ARGUMENT.match(text, at)
+    position = 0
+    while position < len(text):
+        match = _ARGUMENT.match(text, position)
         if match is None:
-            raise _RefusalError(f'{name} has the argument {text[at : at + 20]!r}; must be an integer or a "string"')
+            raise _RefusalError(
+                f'{name} has the argument {text[position : position + 20]!r}; must be an integer or a "string"'
+            )
         yield match[1] if match[2] is None else int(match[2])
-        at = match.end()
+        position = match.end()
 
 
 def _value(name: str, type_: type, argument: int | str) -> Any:
@@ -229,22 +231,22 @@ def _value(name: str, type_: type, argument: int | str) -> Any:
             return argument
     elif type_ is int and -(2**31) <= argument < 2**32:
         return argument
-    elif type_ is float and -(2**31) <= argument < 2**31 and math.isfinite(value := float_of_bits(argument)):
+    elif type_ is float and -(2**31) <= argument < 2**31 and math.isfinite(value := bits_to_float(argument)):
         return value
     needed = f"{_TYPE_NAMES[type_]}, finite, of 32 bits"
     raise _RefusalError(f"{name} has the argument {str(argument)[:20]!r}; must be {needed}")
 
 
-def _shown(part: bytes) -> str:
+def _quoted(part: bytes) -> str:
     return repr(part[:40].decode("ascii", "replace"))
 
 
-def float_of_bits(bits: int) -> float:
+def bits_to_float(bits: int) -> float:
     """Return the float with the same 32 bits as a signed integer."""
     return _FLOAT.unpack(_BITS.pack(bits))[0]
 
 
-def bits_of_float(value: float) -> int:
+def float_to_bits(value: float) -> int:
     """Return the signed integer with the same 32 bits as a float."""
     return _BITS.unpack(_FLOAT.pack(value))[0]
 
@@ -256,8 +258,8 @@ def format_command(command: Command) -> bytes:
     texts = [str(sequence)]
     value: Any
     for type_, value in zip(_argument_types(type(command)), values, strict=True):
-        texts.append(f'"{value}"' if type_ is str else str(bits_of_float(value) if type_ is float else value))
-    return f"AT*{_NAME_OF[type(command)]}={','.join(texts)}\r".encode("ascii")
+        texts.append(f'"{value}"' if type_ is str else str(float_to_bits(value) if type_ is float else value))
+    return f"AT*{_COMMAND_NAMES[type(command)]}={','.join(texts)}\r".encode("ascii")
 
 
 def ref(sequence: int, takes_off: bool, emergency: bool = False) -> Ref:
@@ -269,8 +271,8 @@ def ref(sequence: int, takes_off: bool, emergency: bool = False) -> Ref:
 CONTROL_PORT = 5559  # TCP (ARDroneLib, config.h)
 TEXT_MAX = 128  # characters in a value (Developer Guide 8.1)
 DEFAULT_ID = "00000000"  # initial identifier at each level (Developer Guide 8.1)
-KEPT_MAX = 64  # maximum number of configurations kept per level, since clients may invent any number of identifiers
-END = b"\0"
+CONFIGURATIONS_MAX = 64  # maximum number of configurations per level, since clients may invent many identifiers
+TERMINATOR = b"\0"
 _BLOCKS = ("applis", "profiles", "sessions")
 _ID = re.compile(r"[0-9A-Za-z]{1,32}")
 Category = Literal["common", "application", "user", "session"]
@@ -402,22 +404,26 @@ class Configuration:
     """The values of all entries.
 
     Args:
-        highest: the aircraft's own maxima, by entry, where they are below the SDK's.
+        maxima: the aircraft's own maxima, by entry, where they are below the SDK's.
         fixed: values specific to this aircraft, by entry.
     """
 
-    def __init__(self, highest: Mapping[str, float], fixed: Mapping[str, str]) -> None:
-        self._highest = highest
+    def __init__(self, maxima: Mapping[str, float], fixed: Mapping[str, str]) -> None:
+        self._maxima = maxima
         self._common: dict[str, str] = dict(fixed)
-        self._kept: dict[Category, dict[str, dict[str, str]]] = {level: {DEFAULT_ID: {}} for level in _LEVELS.values()}
-        self._described: dict[Category, dict[str, str]] = {level: {DEFAULT_ID: "default"} for level in _LEVELS.values()}
-        self._current: dict[Category, str] = dict.fromkeys(_LEVELS.values(), DEFAULT_ID)
+        self._values_by_id: dict[Category, dict[str, dict[str, str]]] = {
+            level: {DEFAULT_ID: {}} for level in _LEVELS.values()
+        }
+        self._descriptions: dict[Category, dict[str, str]] = {
+            level: {DEFAULT_ID: "default"} for level in _LEVELS.values()
+        }
+        self._current_ids: dict[Category, str] = dict.fromkeys(_LEVELS.values(), DEFAULT_ID)
 
     def text(self, key: str) -> str:
         """Return the value of an entry as text, limited to what the aircraft is capable of."""
         entry = ENTRIES[key]
         value = self._values(entry).get(key, entry.default)
-        high = self._highest.get(key)
+        high = self._maxima.get(key)
         return value if high is None or float(value) <= high else f"{high:g}"
 
     def number(self, key: str) -> float:
@@ -430,17 +436,17 @@ class Configuration:
         """Return the values of all entries, those of section `custom` last."""
         custom: dict[str, str] = {}
         for name, level in _LEVELS.items():
-            current = self._current[level]
+            current = self._current_ids[level]
             custom[f"custom:{name}_id"] = current
-            custom[f"custom:{name}_desc"] = self._described[level][current]
+            custom[f"custom:{name}_desc"] = self._descriptions[level][current]
         return {**{key: self.text(key) for key in ENTRIES}, **custom}
 
     def custom_list(self) -> dict[str, dict[str, str]]:
         """Return the stored custom configurations: for each level's block, the descriptions by identifier."""
-        return {block: dict(self._described[level]) for block, level in zip(_BLOCKS, _LEVELS.values(), strict=True)}
+        return {block: dict(self._descriptions[level]) for block, level in zip(_BLOCKS, _LEVELS.values(), strict=True)}
 
     def is_current(self, session: str, user: str, application: str) -> bool:
-        current = self._current
+        current = self._current_ids
         return (session, user, application) == (current["session"], current["user"], current["application"])
 
     def set(self, key: str, value: str) -> None:
@@ -459,48 +465,50 @@ class Configuration:
             raise ConfigurationError(f"{key[:60]!r} is not an entry of the configuration")
         self._values(entry)[key] = _checked(key, entry, value)
         # keep the limits in force equal to the indoor or outdoor set in use
-        place = "outdoor" if self.flag("control:outdoor") else "indoor"
+        variant = "outdoor" if self.flag("control:outdoor") else "indoor"
         if key == "control:outdoor":
             for limit in LIMITS:
-                self._copy(f"control:{place}_{limit}", f"control:{limit}")
+                self._copy(f"control:{variant}_{limit}", f"control:{limit}")
         elif section == "control" and name in LIMITS:
-            self._copy(key, f"control:{place}_{name}")
-        elif section == "control" and name.removeprefix(f"{place}_") in LIMITS:
-            self._copy(key, f"control:{name.removeprefix(f'{place}_')}")
+            self._copy(key, f"control:{variant}_{name}")
+        elif section == "control" and name.removeprefix(f"{variant}_") in LIMITS:
+            self._copy(key, f"control:{name.removeprefix(f'{variant}_')}")
 
     def _values(self, entry: ConfigurationEntry) -> dict[str, str]:
         if entry.category == "common":
             return self._common
-        return self._kept[entry.category][self._current[entry.category]]
+        return self._values_by_id[entry.category][self._current_ids[entry.category]]
 
     def _copy(self, key: str, to_key: str) -> None:
         values = self._values(ENTRIES[to_key])
         values[to_key] = self._values(ENTRIES[key]).get(key, ENTRIES[key].default)
 
     def _set_custom(self, name: str, value: str) -> None:
-        prefix, _, what = name.rpartition("_")
+        prefix, _, suffix = name.rpartition("_")
         level = _LEVELS.get(prefix)
-        if level is None or what not in ("id", "desc"):
+        if level is None or suffix not in ("id", "desc"):
             raise ConfigurationError(f"'custom:{name[:40]}' is not an entry of the configuration")
-        if what == "desc":
-            self._described[level][self._current[level]] = _checked_text(f"custom:{name}", value)
+        if suffix == "desc":
+            self._descriptions[level][self._current_ids[level]] = _checked_text(f"custom:{name}", value)
         elif value.startswith("-"):
             identifier = value[1:]
-            deleted = [each for each in self._kept[level] if each != DEFAULT_ID and identifier in ("all", each)]
+            deleted = [each for each in self._values_by_id[level] if each != DEFAULT_ID and identifier in ("all", each)]
             if not deleted and identifier != "all":
                 raise ConfigurationError(f"there is no configuration {identifier[:40]!r} at the level {level}")
             for each in deleted:
-                del self._kept[level][each], self._described[level][each]
-            if self._current[level] not in self._kept[level]:
-                self._current[level] = DEFAULT_ID
+                del self._values_by_id[level][each], self._descriptions[level][each]
+            if self._current_ids[level] not in self._values_by_id[level]:
+                self._current_ids[level] = DEFAULT_ID
         else:
             if not _ID.fullmatch(value):
                 raise ConfigurationError(f"the identifier {value[:40]!r} must consist of at most 32 letters and digits")
-            if value not in self._kept[level]:
-                if len(self._kept[level]) >= KEPT_MAX:
-                    raise ConfigurationError(f"there are {KEPT_MAX} configurations at the level {level}; delete some")
-                self._kept[level][value], self._described[level][value] = {}, ""
-            self._current[level] = value
+            if value not in self._values_by_id[level]:
+                if len(self._values_by_id[level]) >= CONFIGURATIONS_MAX:
+                    raise ConfigurationError(
+                        f"there are {CONFIGURATIONS_MAX} configurations at the level {level}; delete some"
+                    )
+                self._values_by_id[level][value], self._descriptions[level][value] = {}, ""
+            self._current_ids[level] = value
 
 
 def _checked(key: str, entry: ConfigurationEntry, value: str) -> str:
@@ -531,11 +539,11 @@ def _checked_text(key: str, value: str) -> str:
 
 
 def format_configuration(entries: Mapping[str, str]) -> bytes:
-    return "".join(f"{key} = {value}\n" for key, value in entries.items()).encode("ascii", "replace") + END
+    return "".join(f"{key} = {value}\n" for key, value in entries.items()).encode("ascii", "replace") + TERMINATOR
 
 
-def format_custom_list(kept: Mapping[str, Mapping[str, str]]) -> bytes:
+def format_custom_list(descriptions: Mapping[str, Mapping[str, str]]) -> bytes:
     parts: list[str] = []
-    for block, entries in kept.items():
+    for block, entries in descriptions.items():
         parts += [f"[{block}]", *(f"{identifier},{text}" for identifier, text in entries.items())]
-    return "".join(f"{part}\r" for part in parts).encode("ascii", "replace") + END
+    return "".join(f"{part}\r" for part in parts).encode("ascii", "replace") + TERMINATOR

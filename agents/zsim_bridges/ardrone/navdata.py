@@ -32,12 +32,15 @@ REQUEST_UNICAST = b"\x01\x00\x00\x00"  # a program's request for navdata (ARDron
 MAGIC = 0x5566_7788
 MAGICS = (MAGIC, 0x5566_7789)  # the second is sent by newer firmware (npm ar-drone, parseNavdata.js)
 DEMO_RATE_HZ, FULL_RATE_HZ = 15, 200  # Developer Guide 7.1
-SECONDS_SHIFT, MICROSECONDS = 21, (1 << 21) - 1  # option `time`: seconds above, microseconds below (navdata_common.h)
-HEADER = struct.Struct("<HH")  # tag and size of an option
+SECONDS_SHIFT, MICROSECONDS_MASK = (
+    21,
+    (1 << 21) - 1,
+)  # option `time`: seconds above, microseconds below (navdata_common.h)
+OPTION_HEADER = struct.Struct("<HH")  # tag and size of an option
 CHECKSUM_TAG = 0xFFFF
 GPS_TAG = 27  # in older SDKs, the tag of option zimmu_3000, of 12 bytes
 CLIENTS_MAX = 8  # maximum number of programs that receive navdata; a further one displaces the oldest
-REQUESTS = (b"\x01", b"Init")  # first bytes of a request for navdata (ARDroneLib; its Windows client)
+REQUEST_PREFIXES = (b"\x01", b"Init")  # first bytes of a request for navdata (ARDroneLib; its Windows client)
 SECOND_NS = 1_000_000_000
 ACCEL_LSB_PER_G, ACCEL_ZERO_LSB = (
     512,
@@ -53,14 +56,14 @@ are assumed."""
 SECONDS_MASK = 0x7FF  # the seconds in option `time` have 11 bits
 FIX_3D = 3  # fix type of a GPS receiver, as in NMEA
 _INT16 = 32_767
-_UNUSED_OF_DEMO = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frame count and camera detections
+_DEMO_UNUSED = (0, *(0.0,) * 12, 0, 0, *(0.0,) * 12)  # frame count and camera detections
 Send = Callable[[bytes, Hashable], None]
 """Sends a datagram to an address."""
-Putters = dict[str, Callable[..., None]]
+OptionWriters = dict[str, Callable[..., None]]
 """Functions that write an option's numbers, by the option's name."""
-_START = struct.Struct("<IIII")
-_SUM = struct.Struct("<HHI")
-_MOST = 1 << 32
+_PACKET_HEADER = struct.Struct("<IIII")
+_CHECKSUM = struct.Struct("<HHI")
+_CHECKSUM_MODULUS = 1 << 32
 
 _TABLE = f"""
 0 demo ctrl_state,battery_percent:I theta_mdeg,phi_mdeg,psi_mdeg:f altitude_mm:i vx_mm_s,vy_mm_s,vz_mm_s:f
@@ -123,7 +126,7 @@ class OptionLayout(WireLayout):
     def __init__(self, entry: Entry) -> None:
         super().__init__(entry.fields)
         self.tag, self.name = entry.number, entry.name
-        self.size = HEADER.size + self.codec.size
+        self.size = OPTION_HEADER.size + self.codec.size
         self.make: Callable[..., Any] = namedtuple(entry.name, [field.name for field in entry.fields])
 
     def zeros(self) -> Any:
@@ -135,13 +138,13 @@ class OptionLayout(WireLayout):
 
 LAYOUTS = {entry.number: OptionLayout(entry) for entry in read_table(_TABLE)}
 """Layouts by tag."""
-TAG_OF = {layout.name: tag for tag, layout in LAYOUTS.items()}
+TAGS_BY_NAME = {layout.name: tag for tag, layout in LAYOUTS.items()}
 FULL_TAGS = tuple(tag for tag in LAYOUTS if tag < GPS_TAG)
 """The options of a full packet, which has 1904 bytes. The GPS option is sent only on request, because clients disagree
 about the meaning of its tag."""
-DEMO, TIME, PHYS, PWM = (TAG_OF[name] for name in ("demo", "time", "phys_measures", "pwm"))
-ALTITUDE, PRESSURE, MAGNETO = (TAG_OF[name] for name in ("altitude", "pressure_raw", "magneto"))
-KALMAN_PRESSURE = TAG_OF["kalman_pressure"]
+DEMO, TIME, PHYS, PWM = (TAGS_BY_NAME[name] for name in ("demo", "time", "phys_measures", "pwm"))
+ALTITUDE, PRESSURE, MAGNETO = (TAGS_BY_NAME[name] for name in ("altitude", "pressure_raw", "magneto"))
+KALMAN_PRESSURE = TAGS_BY_NAME["kalman_pressure"]
 
 
 StateBit = IntFlag(
@@ -190,7 +193,7 @@ class Navdata(NamedTuple):
 
 def checksum(packet: bytes | bytearray | memoryview) -> int:
     """Return the checksum of a packet without its checksum option: the sum of all bytes."""
-    return int(np.frombuffer(packet, np.uint8).sum(dtype=np.uint64)) % _MOST
+    return int(np.frombuffer(packet, np.uint8).sum(dtype=np.uint64)) % _CHECKSUM_MODULUS
 
 
 def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, Iterable[Any]]] = ()) -> bytes:
@@ -199,12 +202,12 @@ def pack(state: int, sequence: int, vision: int, options: Iterable[tuple[int, It
     Raises:
         struct.error: a value is out of range for its field.
     """
-    parts = [_START.pack(MAGIC, state, sequence, vision)]
+    parts = [_PACKET_HEADER.pack(MAGIC, state, sequence, vision)]
     for tag, values in options:
         layout = LAYOUTS[tag]
-        parts += [HEADER.pack(tag, layout.size), layout.codec.pack(*layout.flat(values))]
+        parts += [OPTION_HEADER.pack(tag, layout.size), layout.codec.pack(*layout.flat(values))]
     body = b"".join(parts)
-    return body + _SUM.pack(CHECKSUM_TAG, _SUM.size, checksum(body))
+    return body + _CHECKSUM.pack(CHECKSUM_TAG, _CHECKSUM.size, checksum(body))
 
 
 def unpack(datagram: bytes) -> Navdata:
@@ -213,34 +216,34 @@ def unpack(datagram: bytes) -> Navdata:
     Raises:
         NavdataError: the datagram is not a packet, or its checksum is wrong.
     """
-    if len(datagram) < _START.size + _SUM.size:
-        raise NavdataError(f"has {len(datagram)} bytes; must have at least {_START.size + _SUM.size}")
-    magic, state, sequence, vision = _START.unpack_from(datagram)
+    if len(datagram) < _PACKET_HEADER.size + _CHECKSUM.size:
+        raise NavdataError(f"has {len(datagram)} bytes; must have at least {_PACKET_HEADER.size + _CHECKSUM.size}")
+    magic, state, sequence, vision = _PACKET_HEADER.unpack_from(datagram)
     if magic not in MAGICS:
         raise NavdataError(f"begins with 0x{magic:08x}; must be one of {', '.join(f'0x{each:08x}' for each in MAGICS)}")
     options: dict[int, Any] = {}
     unknown: dict[int, bytes] = {}
-    at = _START.size
+    offset = _PACKET_HEADER.size
     while True:
-        if at + HEADER.size > len(datagram):
+        if offset + OPTION_HEADER.size > len(datagram):
             raise NavdataError("has no checksum")
-        tag, size = HEADER.unpack_from(datagram, at)
-        if size < HEADER.size or at + size > len(datagram):
+        tag, size = OPTION_HEADER.unpack_from(datagram, offset)
+        if size < OPTION_HEADER.size or offset + size > len(datagram):
             beyond = f"beyond the packet's {len(datagram)} bytes"
-            raise NavdataError(f"option {tag} at byte {at} has the size {size}, {beyond}")
+            raise NavdataError(f"option {tag} at byte {offset} has the size {size}, {beyond}")
         if tag == CHECKSUM_TAG:
-            if size != _SUM.size:
-                raise NavdataError(f"the checksum's size is {size}; must be {_SUM.size}")
-            found, expected = _SUM.unpack_from(datagram, at)[2], checksum(datagram[:at])
-            if found != expected:
-                raise NavdataError(f"the checksum is {found}; must be {expected}")
+            if size != _CHECKSUM.size:
+                raise NavdataError(f"the checksum's size is {size}; must be {_CHECKSUM.size}")
+            received, expected = _CHECKSUM.unpack_from(datagram, offset)[2], checksum(datagram[:offset])
+            if received != expected:
+                raise NavdataError(f"the checksum is {received}; must be {expected}")
             return Navdata(StateBit(state), sequence, vision, options, unknown)
         layout = LAYOUTS.get(tag)
         if layout is not None and layout.size == size:
-            options[tag] = layout.option(layout.codec.unpack_from(datagram, at + HEADER.size))
+            options[tag] = layout.option(layout.codec.unpack_from(datagram, offset + OPTION_HEADER.size))
         else:
-            unknown[tag] = datagram[at + HEADER.size : at + size]
-        at += size
+            unknown[tag] = datagram[offset + OPTION_HEADER.size : offset + size]
+        offset += size
 
 
 class NavdataTemplate:
@@ -249,26 +252,26 @@ class NavdataTemplate:
     def __init__(self, tags: Sequence[int]) -> None:
         self.tags = tuple(tags)
         self._packet = bytearray(pack(0, 0, 0, ((tag, LAYOUTS[tag].zeros()) for tag in tags)))
-        self._end = len(self._packet) - _SUM.size
+        self._end = len(self._packet) - _CHECKSUM.size
         self._body = np.frombuffer(self._packet, np.uint8)[: self._end]
-        self._places: dict[int, int] = {}
-        at = _START.size
+        self._offsets: dict[int, int] = {}
+        offset = _PACKET_HEADER.size
         for tag in tags:
-            self._places[tag] = at + HEADER.size
-            at += LAYOUTS[tag].size
+            self._offsets[tag] = offset + OPTION_HEADER.size
+            offset += LAYOUTS[tag].size
 
-    def filler(self, tag: int) -> Callable[..., None]:
+    def option_writer(self, tag: int) -> Callable[..., None]:
         """Return a function that writes an option's numbers in wire order, or does nothing if the packet lacks it."""
-        at, packet = self._places.get(tag), self._packet
-        if at is None:
+        offset, packet = self._offsets.get(tag), self._packet
+        if offset is None:
             return lambda *_: None
         pack_into = LAYOUTS[tag].codec.pack_into
-        return lambda *numbers: pack_into(packet, at, *numbers)
+        return lambda *numbers: pack_into(packet, offset, *numbers)
 
     def packet(self, state: int, sequence: int, vision: int) -> bytes:
-        _START.pack_into(self._packet, 0, MAGIC, state, sequence, vision)
-        total = int(self._body.sum(dtype=np.uint64)) % _MOST
-        _SUM.pack_into(self._packet, self._end, CHECKSUM_TAG, _SUM.size, total)
+        _PACKET_HEADER.pack_into(self._packet, 0, MAGIC, state, sequence, vision)
+        total = int(self._body.sum(dtype=np.uint64)) % _CHECKSUM_MODULUS
+        _CHECKSUM.pack_into(self._packet, self._end, CHECKSUM_TAG, _CHECKSUM.size, total)
         return bytes(self._packet)
 
 
@@ -300,15 +303,15 @@ class NavdataSender:
         self._state_bits = state_bits
         self._ctrl_state = ctrl_state
         self._refuse = refuse
-        self._last: tuple[int, int] | None = None  # rate [Hz] of the last packet, and its number since simulated time 0
+        self._last_packet: tuple[int, int] | None = None  # rate [Hz] of the last packet, and its number since time 0
         self.clients: dict[Hashable, None] = {}
         self._sequence = 0
-        self._prepare(())
+        self._build_template(())
         self.is_bootstrap = True
 
     def on_request(self, datagram: bytes, address: Hashable, t_ns: int) -> bool:
         """Send navdata to an address from now on; return False if the datagram does not request it."""
-        if not datagram.startswith(REQUESTS):
+        if not datagram.startswith(REQUEST_PREFIXES):
             return False
         if address not in self.clients:
             while len(self.clients) >= CLIENTS_MAX:
@@ -321,26 +324,26 @@ class NavdataSender:
         """Send a packet if one is due: a fixed number in each simulated second, without drift."""
         is_full = not (self.is_bootstrap or self._configuration.flag("general:navdata_demo"))
         rate_hz = FULL_RATE_HZ if is_full else DEMO_RATE_HZ
-        number = rate_hz, t_ns * rate_hz // SECOND_NS
-        if self.clients and number != self._last:
-            self._last = number
+        slot = rate_hz, t_ns * rate_hz // SECOND_NS
+        if self.clients and slot != self._last_packet:
+            self._last_packet = slot
             packet = self._packet(t_ns)
             for address in tuple(self.clients):
                 self._send(packet, address)
 
     def on_gate(self) -> None:
         """Have the values that change at gates updated in the next packet."""
-        self._is_gate_new = True
+        self._is_gate_pending = True
 
     def _packet(self, t_ns: int) -> bytes:
         tags = self._tags()
         if tags != self._template.tags:
-            self._prepare(tags)
+            self._build_template(tags)
         try:
-            if self._is_gate_new:
-                self._is_gate_new = False
-                self._content.fill_gate(self._put, tags)
-            self._content.fill_packet(self._put, self._ctrl_state(), t_ns)
+            if self._is_gate_pending:
+                self._is_gate_pending = False
+                self._content.fill_gate(self._writers, tags)
+            self._content.fill_packet(self._writers, self._ctrl_state(), t_ns)
         except (struct.error, ArithmeticError, ValueError) as error:
             self._refuse(f"navdata has a value out of range for its field ({error})")
         self._sequence += 1
@@ -351,10 +354,10 @@ class NavdataSender:
             bits += StateBit.NAVDATA_DEMO
         return self._template.packet(bits, self._sequence & 0xFFFF_FFFF, 0)
 
-    def _prepare(self, tags: tuple[int, ...]) -> None:
+    def _build_template(self, tags: tuple[int, ...]) -> None:
         self._template = NavdataTemplate(tags)
-        self._put = {name: self._template.filler(tag) for name, tag in TAG_OF.items()}
-        self._is_gate_new = True
+        self._writers = {name: self._template.option_writer(tag) for name, tag in TAGS_BY_NAME.items()}
+        self._is_gate_pending = True
 
     def _tags(self) -> tuple[int, ...]:
         """Return the tags of a packet's options; GPS only if its bit in navdata_options is set."""
@@ -419,31 +422,31 @@ class NavdataContent:
             self._unwrapped_deg += (self._angles_deg[2] - last_psi_deg + 180.0) % 360.0 - 180.0
         return self._angles_deg
 
-    def fill_packet(self, put: Putters, ctrl_state: int, t_ns: int) -> None:
+    def fill_packet(self, write: OptionWriters, ctrl_state: int, t_ns: int) -> None:
         state = self._state
         theta, phi, psi = (1e3 * angle for angle in self.angles_deg)
         charge = state.status.battery_percent if state.status else 0.0
         velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
         vx, vy, vz = 1e3 * velocity[0], -1e3 * velocity[1], -1e3 * velocity[2]
         altitude_mm = max(0, round(1e3 * state.altitude_m))
-        put["demo"](ctrl_state, round(charge), theta, phi, psi, altitude_mm, vx, vy, vz, *_UNUSED_OF_DEMO)
+        write["demo"](ctrl_state, round(charge), theta, phi, psi, altitude_mm, vx, vy, vz, *_DEMO_UNUSED)
         seconds, rest_ns = divmod(max(0, t_ns), SECOND_NS)
-        put["time"]((seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000)  # wraps around after 2048 s
-        put["euler_angles"](theta, phi)
+        write["time"]((seconds & SECONDS_MASK) << SECONDS_SHIFT | rest_ns // 1000)  # wraps around after 2048 s
+        write["euler_angles"](theta, phi)
         if state.imu is not None:
             fx, fy, fz = (accel / G_M_S2 for accel in state.imu.accel_m_s2)
             p, q, r = (math.degrees(rate) for rate in state.imu.gyro_rad_s)
-            put["phys_measures"](0.0, 0, 1e3 * fx, -1e3 * fy, -1e3 * fz, p, -q, -r, 0, 0, 0)
+            write["phys_measures"](0.0, 0, 1e3 * fx, -1e3 * fy, -1e3 * fz, p, -q, -r, 0, 0, 0)
             accs = [round(min(max(ACCEL_ZERO_LSB + ACCEL_LSB_PER_G * f, 0), 2 * _INT16)) for f in (fx, -fy, fz)]
             gyros = [_int16(GYRO_LSB_PER_DEG_S * rate) for rate in (p, -q, -r)]
-            put["raw_measures"](
+            write["raw_measures"](
                 *accs, *gyros, 0, 0, round(np.interp(charge, *VOLTAGE_MV)), *(0,) * 10, self._echo_mm(), 0
             )
 
     def _echo_mm(self) -> int:
         return round(1e3 * self._sonar.range_m) if self._sonar and self._sonar.valid else 0
 
-    def fill_gate(self, put: Putters, tags: tuple[int, ...]) -> None:
+    def fill_gate(self, write: OptionWriters, tags: tuple[int, ...]) -> None:
         """Fill in the values that change at gates, of the options in `tags` only, to save time."""
         state = self._state
         climb_mm_s = 1e3 * state.flow.velocity_m_s[2] if state.flow else 0.0
@@ -451,12 +454,12 @@ class NavdataContent:
             motors = [0, 0, 0, 0]
             for i, speed in enumerate(self._rotors_rad_s[:4]):
                 motors[i] = min(PWM_MAX, max(0, round(PWM_MAX * speed / self._rotor_max_rad_s)))
-            put["pwm"](*motors, *(0,) * 4, *(0.0,) * 4, *(0,) * 3, 0.0, *(0,) * 3, 0.0, *(0,) * 4, 0.0, 0.0)
+            write["pwm"](*motors, *(0,) * 4, *(0.0,) * 4, *(0,) * 3, 0.0, *(0,) * 3, 0.0, *(0,) * 4, 0.0, 0.0)
         if ALTITUDE in tags:
             altitude_mm = max(0, round(1e3 * state.altitude_m))
-            put["altitude"](altitude_mm, climb_mm_s, 0, self._echo_mm(), *(0.0,) * 5, 0, 0.0, 0.0, 0)
+            write["altitude"](altitude_mm, climb_mm_s, 0, self._echo_mm(), *(0.0,) * 5, 0, 0.0, 0.0, 0)
         if PRESSURE in tags:
-            put["pressure_raw"](0, 0, 0, round(state.baro.pressure_pa) if state.baro else 0)
+            write["pressure_raw"](0, 0, 0, round(state.baro.pressure_pa) if state.baro else 0)
         if MAGNETO in tags:
             x, y, z = state.mag.field_ut if state.mag else (0.0, 0.0, 0.0)
             field_ut = (x, -y, -z)
@@ -465,14 +468,14 @@ class NavdataContent:
             heading_deg, radius = self.heading_deg, math.hypot(*field_ut) / MAG_UT_PER_LSB
             headings = (heading_deg, self._unwrapped_deg, heading_deg)
             is_calibrated = int(state.mag is not None)
-            put["magneto"](*lsb, *field_mg, *field_mg, 0.0, 0.0, 0.0, *headings, is_calibrated, 0, radius, 0.0, 0.0)
+            write["magneto"](*lsb, *field_mg, *field_mg, 0.0, 0.0, 0.0, *headings, is_calibrated, 0, radius, 0.0, 0.0)
         if KALMAN_PRESSURE in tags:
             height_mm = 1e3 * state.altitude_m
-            put["kalman_pressure"](0.0, height_mm, climb_mm_s, *(0.0,) * 7, 0, 0.0, 0, 0.0, 0.0, 0, 0)
+            write["kalman_pressure"](0.0, height_mm, climb_mm_s, *(0.0,) * 7, 0, 0.0, 0, 0.0, 0.0, 0, 0)
         if GPS_TAG in tags and self._gps is not None:
-            self._fill_gps(put["gps"], self._gps)
+            self._fill_gps(write["gps"], self._gps)
 
-    def _fill_gps(self, put: Callable[..., None], gps: messages.Gps) -> None:
+    def _fill_gps(self, write: Callable[..., None], gps: messages.Gps) -> None:
         has_fix = int(gps.fix >= FIX_3D)
         option = LAYOUTS[GPS_TAG].zeros()
         option = option._replace(
@@ -491,7 +494,7 @@ class NavdataContent:
             satellites=gps.satellites,
             plugged=1,
         )
-        put(*LAYOUTS[GPS_TAG].flat(option))
+        write(*LAYOUTS[GPS_TAG].flat(option))
 
 
 def angles_deg(q_WB: Quaternion) -> Vector:

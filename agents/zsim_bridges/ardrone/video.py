@@ -19,7 +19,7 @@ WIDTH_PX, HEIGHT_PX, CODED_HEIGHT_PX = (
     368,
 )  # displayed size; the coded height is a whole number of macroblocks
 RATE_HZ = 30  # frames per second, for the encoder's rate control
-IDR_EVERY = 30  # frames; design choice: after a loss, decoding can resume within a second
+IDR_INTERVAL = 30  # frames; design choice: after a loss, decoding can resume within a second
 BIT_RATE = 1_000_000  # bit/s; the SDK's video:bitrate, 1000 kbit/s
 IDR_FRAME, P_FRAME = 1, 3  # frame types in a header; an IDR frame includes SPS and PPS
 IDR, SPS, PPS = 5, 7, 8  # types of NAL units (ITU-T H.264, table 7-1)
@@ -83,14 +83,14 @@ class VideoEncoder:
         codec: Any = av.CodecContext.create("libx264", "w")
         codec.width, codec.height, codec.pix_fmt = WIDTH_PX, HEIGHT_PX, "yuv420p"
         codec.time_base, codec.framerate = Fraction(1, RATE_HZ), Fraction(RATE_HZ)
-        codec.bit_rate, codec.gop_size, codec.max_b_frames = BIT_RATE, IDR_EVERY, 0
+        codec.bit_rate, codec.gop_size, codec.max_b_frames = BIT_RATE, IDR_INTERVAL, 0
         codec.thread_count = 1
         codec.options = PRESET
         self._codec = codec
         self._count = 0
 
-    def encode(self, jpeg: bytes, begins: bool) -> VideoFrame | None:
-        """Return the frame of a JPEG image, None if the encoder returns no data; `begins`: decoding can begin with it.
+    def encode(self, jpeg: bytes, force_idr: bool) -> VideoFrame | None:
+        """Return the frame of a JPEG image, None if the encoder returns no data; `force_idr`: decoding can begin here.
 
         Raises:
             VideoError: the data are not a readable JPEG.
@@ -108,7 +108,7 @@ class VideoEncoder:
             raise VideoError("it is not a readable JPEG")
         picture = pictures[0].reformat(WIDTH_PX, HEIGHT_PX, "yuv420p")
         picture.pts, picture.time_base = self._count, self._codec.time_base
-        picture.pict_type = PictureType.I if begins else PictureType.NONE
+        picture.pict_type = PictureType.I if force_idr else PictureType.NONE
         self._count += 1
         data = b"".join(bytes(packet) for packet in self._codec.encode(picture))
         if not data:
@@ -120,11 +120,11 @@ class VideoEncoder:
 def nal_units(data: bytes) -> Iterator[tuple[int, int]]:
     """Yield the type and the size of each NAL unit, including its start code (ITU-T H.264, annex B)."""
     starts = []
-    at = data.find(b"\0\0\1")
-    while at >= 0:
-        starts.append((at - 1 if at and data[at - 1] == 0 else at, at + 3))
-        at = data.find(b"\0\0\1", at + 3)
-    ends = [begin for begin, _ in starts[1:]] + [len(data)]
-    for (begin, content), end in zip(starts, ends, strict=True):
+    position = data.find(b"\0\0\1")
+    while position >= 0:
+        starts.append((position - 1 if position and data[position - 1] == 0 else position, position + 3))
+        position = data.find(b"\0\0\1", position + 3)
+    ends = [start for start, _ in starts[1:]] + [len(data)]
+    for (start, content), end in zip(starts, ends, strict=True):
         if content < len(data):
-            yield data[content] & 0x1F, end - begin
+            yield data[content] & 0x1F, end - start

@@ -22,7 +22,7 @@ from zsim.sensors.camera import CAMERAS, PictureError, frame_of
 from zsim.sensors.camera_model import Lens, pixel, undistorted
 from zsim.transport.session import RawSample, Session
 
-ASKED_S = 15.0  # wall; a page silent for longer counts as asleep; a slow page may take seconds to show a picture
+REQUEST_EXPIRY_S = 15.0  # wall; a page silent for longer counts as asleep; slow pages take seconds to show a picture
 MESSAGE_BYTES = 1_000  # maximum size of a picture's message without the image data
 SIGHTINGS_KEPT = 8  # number of sightings kept per camera and key: half a second at 15 Hz
 MARKS_MAX = 40  # maximum number of marks on a picture; more would hide it
@@ -33,8 +33,8 @@ NORM_MIN = 1e-6  # minimum norm of a quaternion, and minimum forward component o
 AGE_MAX_NS = 300_000_000  # simulated; maximum time between a picture and sightings drawn on it: 3 pictures at 10 Hz
 PICTURE_BYTES_MAX = 1_000_000  # maximum size of a picture; ten such pictures a second fill 80 Mbit/s
 PIXELS_MAX = 1920 * 1200  # number of pixels of the largest camera in a scenario; a browser needs 4 bytes for each
-ENDS = b"\xff\xd9"  # last bytes of a JPEG; ITU-T T.81, table B.1
-SHOWN = frozenset({0xC0, 0xC1, 0xC2})  # markers of frames that browsers show: baseline, extended, progressive
+JPEG_END = b"\xff\xd9"  # last bytes of a JPEG; ITU-T T.81, table B.1
+SUPPORTED_MARKERS = frozenset({0xC0, 0xC1, 0xC2})  # frames that browsers show: baseline, extended, progressive
 
 
 class CameraPicture(NamedTuple):
@@ -53,7 +53,7 @@ class Mark(Struct, frozen=True):
     text: str
 
 
-class _Watched:
+class _WatchedCamera:
     """The state of a camera while a page watches it."""
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class CameraFeed:
         self._lock = threading.Lock()
         self._infos: dict[str, CameraInfo] = {}
         self._requests: dict[object, tuple[tuple[str, ...], float]] = {}  # by page: cameras, and expiry [s; wall]
-        self._watched: dict[str, _Watched] = {}
+        self._watched: dict[str, _WatchedCamera] = {}
         self._undeclare: dict[str, Callable[[], None]] = {}  # by key
         self._number = 0
         self.refused: Counter[str] = Counter()  # number of refused pictures by camera
@@ -99,7 +99,7 @@ class CameraFeed:
         except ZsimError:
             return  # an older certificate does not permit the query; cameras that appear later are still discovered
         for sample in samples:
-            self._on_info(sample, kept=True)
+            self._on_info(sample, is_retained=True)
 
     def close(self) -> None:
         with self._lock:
@@ -112,7 +112,7 @@ class CameraFeed:
             now_s = self._wall_s()
             self._requests = {page: each for page, each in self._requests.items() if each[1] > now_s}
             wanted = {camera for cameras, _ in self._requests.values() for camera in cameras if camera in self._infos}
-            self._watched = {camera: self._watched.get(camera) or _Watched() for camera in wanted}
+            self._watched = {camera: self._watched.get(camera) or _WatchedCamera() for camera in wanted}
         wanted_keys = {keys.camera(*camera.split("/")) for camera in wanted}
         wanted_keys |= {key for camera in wanted for key in _sighting_keys(camera)}
         for key in self._undeclare.keys() - wanted_keys:
@@ -127,10 +127,10 @@ class CameraFeed:
         infos = self._infos.copy()
         return tuple((camera, infos[camera]) for camera in self._order if camera in infos)
 
-    def ask(self, page: object, cameras: Iterable[str]) -> None:
-        """Request pictures of these cameras, and no others, for a page; to be repeated within ASKED_S."""
+    def request_pictures(self, page: object, cameras: Iterable[str]) -> None:
+        """Request pictures of these cameras, and no others, for a page; to be repeated within REQUEST_EXPIRY_S."""
         with self._lock:
-            self._requests[page] = tuple(cameras), self._wall_s() + ASKED_S
+            self._requests[page] = tuple(cameras), self._wall_s() + REQUEST_EXPIRY_S
 
     def release(self, page: object) -> None:
         with self._lock:
@@ -144,7 +144,7 @@ class CameraFeed:
                 return None
             payload, watched.payload = watched.payload, None
             if payload is not None:
-                watched.picture = self._checked(camera, payload) or watched.picture
+                watched.picture = self._decode_picture(camera, payload) or watched.picture
             return watched.picture
 
     def marks(self, camera: str) -> tuple[Mark, ...]:
@@ -155,12 +155,12 @@ class CameraFeed:
                 return ()
             t_ns = watched.picture.image.t_sample_ns
             for key in _sighting_keys(camera):
-                found = sightings_of(t_ns, watched.sightings.get(key, ()))
-                if found is not None:
-                    return marks_of(info, found.seen[:MARKS_MAX], self._hat_m)
+                sightings = sightings_of(t_ns, watched.sightings.get(key, ()))
+                if sightings is not None:
+                    return marks_of(info, sightings.seen[:MARKS_MAX], self._hat_m)
         return ()
 
-    def shown(self, camera: str) -> tuple[CameraInfo, CameraPicture] | None:
+    def info_and_picture(self, camera: str) -> tuple[CameraInfo, CameraPicture] | None:
         info, picture = self._infos.get(camera), self.picture(camera)
         return None if info is None or picture is None else (info, picture)
 
@@ -180,9 +180,9 @@ class CameraFeed:
 
     # Callbacks; in Zenoh's threads
 
-    def _on_info(self, sample: Any, kept: bool = False) -> None:
+    def _on_info(self, sample: Any, is_retained: bool = False) -> None:
         camera = _camera_of(sample.key)
-        if camera not in self._order or (kept and camera in self._infos):
+        if camera not in self._order or (is_retained and camera in self._infos):
             return  # a description that has arrived in the meantime is newer than the kept one
         try:
             info = messages.decode(sample.key, sample.payload)
@@ -208,19 +208,19 @@ class CameraFeed:
 
     def _on_sightings(self, sample: RawSample) -> None:
         try:
-            seen = messages.decode(sample.key, sample.payload)
+            sightings = messages.decode(sample.key, sample.payload)
         except DecodeError:
-            seen = None
+            sightings = None
         with self._lock:
             self._observer.health.received += 1
-            if not isinstance(seen, Sightings):
+            if not isinstance(sightings, Sightings):
                 self._observer.health.refused += 1
                 return
-            watched = self._watched.get(f"{keys.thing(sample.key)}/{seen.camera}")
+            watched = self._watched.get(f"{keys.thing(sample.key)}/{sightings.camera}")
             if watched is not None:
-                watched.sightings.setdefault(sample.key, deque(maxlen=SIGHTINGS_KEPT)).append(seen)
+                watched.sightings.setdefault(sample.key, deque(maxlen=SIGHTINGS_KEPT)).append(sightings)
 
-    def _checked(self, camera: str, payload: bytes) -> CameraPicture | None:
+    def _decode_picture(self, camera: str, payload: bytes) -> CameraPicture | None:
         """Return a valid picture; count an invalid one as refused."""
         try:
             image: CameraImage = messages.decode(keys.camera(*camera.split("/")), payload)
@@ -238,8 +238,8 @@ class CameraFeed:
 
 
 def _camera_of(key: str) -> str:
-    _, drone, what = keys.parts(key)
-    return f"{drone}/{what.split('/')[1]}"
+    _, drone, channel = keys.parts(key)
+    return f"{drone}/{channel.split('/')[1]}"
 
 
 def _sighting_keys(camera: str) -> tuple[str, str]:
@@ -257,13 +257,13 @@ def check_picture(data: bytes, width: int, height: int) -> None:
     if len(data) > PICTURE_BYTES_MAX:
         raise PictureError(f"picture has {len(data)} bytes; must have {PICTURE_BYTES_MAX} at most")
     frame = frame_of(data)
-    if frame.marker not in SHOWN or not data.endswith(ENDS):
+    if frame.marker not in SUPPORTED_MARKERS or not data.endswith(JPEG_END):
         raise PictureError(
             "JPEG is truncated, or browsers cannot show it; must be complete, and baseline or progressive"
         )
     if (frame.width, frame.height) != (width, height):
-        found = f"{frame.width} × {frame.height}"
-        raise PictureError(f"JPEG is {found}, its message says {width} × {height}; must be the same")
+        size = f"{frame.width} × {frame.height}"
+        raise PictureError(f"JPEG is {size}, its message says {width} × {height}; must be the same")
     if width * height > PIXELS_MAX:
         raise PictureError(f"picture is {width} × {height}; must have {PIXELS_MAX} pixels at most")
 
@@ -320,8 +320,8 @@ def _pixel_of(lens: Lens, ray_K: rotation.Vector) -> tuple[float, float] | None:
     u, v = pixel(lens, x / z, y / z, 1.0)
     if not (-0.5 <= u <= lens.width - 0.5 and -0.5 <= v <= lens.height - 0.5):
         return None
-    back = undistorted(lens, u, v)
-    return (u, v) if math.dist(back, (x / z, y / z)) <= FOLD_MAX else None
+    reprojected = undistorted(lens, u, v)
+    return (u, v) if math.dist(reprojected, (x / z, y / z)) <= FOLD_MAX else None
 
 
 def range_text(seen: Seen) -> str:

@@ -14,7 +14,7 @@ import viser
 
 from zsim_agents.formation.flight_check import DOWN
 from zsim_bridges.console.console_tables import DroneRow, drone_table, event_table, figure_lines, preflight_lines
-from zsim_bridges.console.control_desk import EVERY, RUN, ControlDesk, ControlForm
+from zsim_bridges.console.control_desk import ALL_PARTS, RUN, ControlDesk, ControlForm
 from zsim_bridges.console.formation_form import FormationForm
 from zsim_bridges.console.histories import TRAIL_S, TRAILS_S, FlightHistory, VariablePlots
 from zsim_bridges.console.orders import CommandClient, RequestOutcome
@@ -119,7 +119,7 @@ class ConsolePage:
         gui.main_panel.set_width(PANEL_PX)
         self.phases = gui.add_html("")
         self.control_folder = gui.add_folder(None)
-        with self._part(gui, EVERY):
+        with self._part(gui, ALL_PARTS):
             self.fleet = FleetForm(gui, self._client, run.scenario)
         if len(run.spaces) > 1:
             choice = gui.add_dropdown("formation", list(run.spaces))

@@ -115,7 +115,7 @@ class Console:
             head=lambda: self._run_page.head() if self._run_page else no_run_head(self._world, self._ended),
             command=self._command,
             files=self._files,
-            looked=self._on_look,
+            on_poll=self._on_poll,
         )
         self._proxy = HttpProxy(address, token, backend)
 
@@ -146,24 +146,24 @@ class Console:
         finally:
             page.close()
 
-    def remain(self, end_reason: Callable[[], str | None], deserted: Callable[[], bool]) -> None:
+    def remain(self, end_reason: Callable[[], str | None], is_abandoned: Callable[[], bool]) -> None:
         """Serve the pages of a finished run until there is a reason to end and the pages have copies of its files.
 
         Args:
             end_reason: returns the reason, None while there is none.
-            deserted: returns whether to stop waiting for the pages' copies.
+            is_abandoned: returns whether to stop waiting for the pages' copies.
         """
         while not (reason := end_reason()):
             time.sleep(REASON_S)
         self._ended = reason
         if self._run_page:
             self._run_page.end(reason)
-        self._files.offer(OFFER_S, deserted)
+        self._files.offer(OFFER_S, is_abandoned)
 
-    def _on_look(self, key: str, role: str, address: str) -> None:
+    def _on_poll(self, key: str, role: str, address: str) -> None:
         client_id = self._cameras.client_id(key)
         if self._run_page and client_id is not None:
-            self._run_page.desk.look(client_id, role, address)
+            self._run_page.desk.record_poll(client_id, role, address)
 
     def _command(self, request: OrderRequest) -> dict[str, Any]:
         if self._run_page:
@@ -344,7 +344,7 @@ class RunPage:
         with self._server.atomic():
             if view is not None:
                 self._draw(view)
-            self._page_cameras.draw_frusta(self._scene.drones, self.cameras.shown)
+            self._page_cameras.draw_frusta(self._scene.drones, self.cameras.info_and_picture)
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
                 self._update_tables(wall_s)

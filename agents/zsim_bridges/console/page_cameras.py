@@ -24,7 +24,7 @@ OFFSET_M = np.array([-2.3, -3.9, 1.7])  # offset of a page's camera from its tar
 DISTANCE_MIN_M = float(np.linalg.norm(OFFSET_M))
 SLOPE_MIN = 0.05  # half the visible width per distance on the narrowest page considered; a hidden page has no width
 REACH_M = 0.6  # radius of a drone together with the name above it
-FAR_M = 15.0  # distance beyond which a drone is too small, less than about 15 pixels, to count as in view
+VISIBLE_MAX_M = 15.0  # distance beyond which a drone is too small, less than about 15 pixels, to count as in view
 MARGIN = 0.85  # share of half the page within which points count as in view
 UP_W = np.array([0.0, 0.0, 1.0])
 DIRECTIONS = {  # directions from the target to the camera; not straight from above, where the up direction is undefined
@@ -33,8 +33,8 @@ DIRECTIONS = {  # directions from the target to the camera; not straight from ab
     "side": np.array([0.0, -1.0, 0.06]),
 }
 DEADBAND = 0.05  # share of the camera's distance; shorter moves are not followed, so that the page need not redraw
-SPARE = 1.15  # ratio of the camera's distance to that at which everything is just in view
-NEARER = 0.6  # the camera comes nearer if the fitting distance is less than this share of the present one
+FIT_MARGIN = 1.15  # ratio of the camera's distance to that at which everything is just in view
+APPROACH_SHARE = 0.6  # the camera comes nearer if the fitting distance is less than this share of the present one
 NODE = "/camera_frustum"
 SCALE = 0.8  # size of a frustum, with a picture about a metre wide; design choice: suits a hull of half a metre
 EDGE_PX = 2.0
@@ -54,36 +54,38 @@ class CameraView(NamedTuple):
 
     def contains(self, p_W: Array) -> bool:
         """Return whether a point [m; W] is in view and near enough."""
-        ahead = _unit(self.look_at - self.position)
-        right = _unit(np.cross(ahead, self.up))
-        away = p_W - self.position
-        x, y, z = away @ right, away @ np.cross(ahead, right), away @ ahead
-        half = MARGIN * math.tan(self.fov / 2) * z
-        return bool(0.0 < z <= FAR_M and abs(y) <= half and abs(x) <= half * self.aspect)
+        forward = _unit(self.look_at - self.position)
+        right = _unit(np.cross(forward, self.up))
+        offset = p_W - self.position
+        x, y, z = offset @ right, offset @ np.cross(forward, right), offset @ forward
+        half_height = MARGIN * math.tan(self.fov / 2) * z
+        return bool(0.0 < z <= VISIBLE_MAX_M and abs(y) <= half_height and abs(x) <= half_height * self.aspect)
 
     def offset(self) -> Array:
         """Return an offset from a new target to the camera [m; W]: the present one, at most |OFFSET_M| long."""
-        back = self.position - self.look_at
-        return back * min(1.0, float(np.linalg.norm(OFFSET_M) / np.linalg.norm(back)))
+        to_camera = self.position - self.look_at
+        return to_camera * min(1.0, float(np.linalg.norm(OFFSET_M) / np.linalg.norm(to_camera)))
 
 
-def fit_distance_m(points_W: Array, centre_W: Array, back_W: Array, up_W: Array, fov: float, aspect: float) -> float:
+def fit_distance_m(
+    points_W: Array, centre_W: Array, to_camera_W: Array, up_W: Array, fov: float, aspect: float
+) -> float:
     """Return the distance at which a camera aimed at a centre has all points in view [m]; at least DISTANCE_MIN_M.
 
     Args:
         points_W: the points, (n, 3) m.
         centre_W: the camera's target, (3,) m.
-        back_W: direction from the target to the camera, (3,); not parallel to `up_W`.
+        to_camera_W: direction from the target to the camera, (3,); not parallel to `up_W`.
         up_W: up direction of the camera, (3,).
         fov: vertical angle of view [rad].
         aspect: width / height.
     """
-    back = _unit(back_W)
-    right = _unit(np.cross(up_W, back))
-    away = points_W - centre_W
-    across = np.abs(np.column_stack((away @ right, away @ np.cross(back, right)))) + REACH_M
+    to_camera = _unit(to_camera_W)
+    right = _unit(np.cross(up_W, to_camera))
+    offsets = points_W - centre_W
+    lateral = np.abs(np.column_stack((offsets @ right, offsets @ np.cross(to_camera, right)))) + REACH_M
     slopes = np.maximum(MARGIN * math.tan(fov / 2) * np.array([aspect, 1.0]), SLOPE_MIN)
-    return float(np.max(across / slopes + (away @ back)[:, None], initial=DISTANCE_MIN_M))
+    return float(np.max(lateral / slopes + (offsets @ to_camera)[:, None], initial=DISTANCE_MIN_M))
 
 
 def _unit(vector: Array) -> Array:
@@ -105,9 +107,9 @@ class _Page:
     follows: bool = True  # whether its camera moves with the formation
     fits: bool = True  # whether the camera's distance is adjusted to keep all drones in view
     direction: Array | None = field(default_factory=DIRECTIONS["reset"].copy)  # next viewing direction; None: unchanged
-    moved: bool = True  # whether its camera must be aimed again
+    needs_aim: bool = True  # whether its camera must be aimed again
     camera: str = ""  # the drone's camera whose frustum is shown; empty for none
-    clicked: str = ""  # the drone last clicked in the page's scene, until `take_click`
+    clicked: str = ""  # the drone last clicked in the page's scene, until `pop_click`
 
 
 @dataclass
@@ -135,7 +137,7 @@ class PageCameras:
     def _on_connect(self, client: viser.ClientHandle) -> None:
         page = _Page(client)
         self._move(page)
-        page.moved = True  # aim again at the next picture: the present target may be that of another run
+        page.needs_aim = True  # aim again at the next picture: the present target may be that of another run
         with self._lock:
             self._pages[client.client_id] = page
         client.gui.add_html(f'<i data-zsim-page="{page.key}"></i>', order=-2.0)
@@ -157,7 +159,7 @@ class PageCameras:
         """Aim all cameras again at the first picture of another run."""
         with self._lock:
             for page in self._pages.values():
-                page.moved = True
+                page.needs_aim = True
 
     def look(self, client_id: int, follows: bool, fits: bool, direction: str = "") -> None:
         """Set whether a page's camera follows and keeps all in view; look from a direction in `DIRECTIONS`, if any."""
@@ -165,7 +167,7 @@ class PageCameras:
             page = self._pages.get(client_id)
             if page is None:
                 return
-            page.moved = page.moved or direction in DIRECTIONS or (fits and not page.fits)
+            page.needs_aim = page.needs_aim or direction in DIRECTIONS or (fits and not page.fits)
             page.direction = DIRECTIONS.get(direction, page.direction)
             page.follows, page.fits = follows, fits
 
@@ -180,22 +182,22 @@ class PageCameras:
         if not len(p_W):
             return
         with self._lock:
-            pages = [page for page in self._pages.values() if page.follows or page.moved]
+            pages = [page for page in self._pages.values() if page.follows or page.needs_aim]
         for page in pages:
             self._move(page)
 
     def _move(self, page: _Page) -> None:
         camera, points = page.client.camera, self._points
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
-        back = camera.position - camera.look_at
-        now_m = float(np.linalg.norm(back))
-        direction = page.direction if page.direction is not None else back / max(now_m, 1e-9)
+        to_camera = camera.position - camera.look_at
+        present_m = float(np.linalg.norm(to_camera))
+        direction = page.direction if page.direction is not None else to_camera / max(present_m, 1e-9)
         fit_m = fit_distance_m(points, centre, direction, UP_W, camera.fov, camera.aspect)
-        keeps = not page.moved and (not page.fits or NEARER * now_m <= fit_m <= now_m)
-        near = float(np.linalg.norm(centre - camera.look_at)) <= DEADBAND * now_m
-        if not (keeps and near):
-            page.moved, page.direction = False, None
-            distance_m = now_m if keeps else SPARE * fit_m
+        keeps_distance = not page.needs_aim and (not page.fits or APPROACH_SHARE * present_m <= fit_m <= present_m)
+        is_near = float(np.linalg.norm(centre - camera.look_at)) <= DEADBAND * present_m
+        if not (keeps_distance and is_near):
+            page.needs_aim, page.direction = False, None
+            distance_m = present_m if keeps_distance else FIT_MARGIN * fit_m
             _aim(page.client, centre, direction * distance_m / float(np.linalg.norm(direction)))
 
     # Frusta
@@ -213,7 +215,7 @@ class PageCameras:
             if client_id in self._pages:
                 self._pages[client_id].clicked = drone
 
-    def take_click(self, key: str) -> str:
+    def pop_click(self, key: str) -> str:
         """Return the drone last clicked in a page's scene, once; empty for none."""
         clicked = ""
         with self._lock:
@@ -223,19 +225,19 @@ class PageCameras:
         return clicked
 
     def draw_frusta(
-        self, drones: DronePoses | None, shown: Callable[[str], tuple[CameraInfo, CameraPicture] | None]
+        self, drones: DronePoses | None, view_of: Callable[[str], tuple[CameraInfo, CameraPicture] | None]
     ) -> None:
-        """Draw the chosen frusta, and remove the others; `shown` returns a camera with its newest picture."""
+        """Draw the chosen frusta, and remove the others; `view_of` returns a camera with its newest picture."""
         with self._lock:
             chosen = {number: (page.client, page.camera) for number, page in self._pages.items() if page.camera}
         for number, frustum in list(self._frusta.items()):
             if number not in chosen or chosen[number][1] != frustum.camera:
                 self._frusta.pop(number).node.remove()
         for number, (client, camera) in chosen.items():
-            found, index = shown(camera), drone_index(drones, camera)
-            if found is None or drones is None or index is None:
+            view, index = view_of(camera), drone_index(drones, camera)
+            if view is None or drones is None or index is None:
                 continue
-            info, picture = found
+            info, picture = view
             p_W, q_WK = frustum_pose(info, drones.p_W[index], drones.q_WB[index])
             frustum = self._frusta.get(number)
             if frustum is None:

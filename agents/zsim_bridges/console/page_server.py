@@ -91,14 +91,14 @@ PARTS = (  # files added to viser's page; each may use what those before it defi
     "touch.html",
 )
 # wall; without a poll for this long a page counts as closed; above GONE_MS of head_bar.html + LOOK_MS of orders.html
-LOOKED_S = 5.0
-MTIME_S = 2.0  # maximum amount by which a file's time may be too early: the resolution of FAT
+POLL_TIMEOUT_S = 5.0
+MTIME_ERROR_S = 2.0  # maximum amount by which a file's time may be too early: the resolution of FAT
 POLL_S = 0.1  # wall; period of checking whether all pages have their copies
-LOOKS_MAX = 200  # maximum number of pages remembered; at most 50 of operators and 50 of viewers are open
+POLLING_PAGES_MAX = 200  # maximum number of pages remembered; at most 50 of operators and 50 of viewers are open
 _ORDERS = msgspec.json.Decoder(OrderRequest)
 NAME_MAX = 64  # maximum number of characters in the name of a key that modifies a click
 VALUE_MAX = 2_000  # maximum number of characters of a control's text: expressions of twelve variables, a line each
-EXACT_MAX = 2**53  # a page's numbers are exact up to this; larger ones do not fit any message
+INTEGER_EXACT_MAX = 2**53  # a page's numbers are exact up to this; larger ones do not fit any message
 Value = bool | message.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
 Permits = Callable[[int, str], bool]
 """Returns whether a page, by viser's number, may use a shared control, by its id."""
@@ -132,25 +132,25 @@ class RunFiles:
         root = folder and folder.absolute()
         self.paths = {"report": root / "report.html", "record": root / RECORD} if root else {}
         self._since_s = time.time()
-        self._looked_s: dict[str, float] = {}  # when pages without copies last polled [s; monotonic], by their names
-        self._leaves = False
+        self._polled_s: dict[str, float] = {}  # when pages without copies last polled [s; monotonic], by their names
+        self._is_exiting = False
 
-    def shown(self, page: str, has_copies: bool) -> dict[str, Any]:
+    def state(self, page: str, has_copies: bool) -> dict[str, Any]:
         """Return the state of the files for a page (empty: unnamed); `has_copies`: the page needs no more copies."""
-        self._looked_s.pop(page, None)
+        self._polled_s.pop(page, None)
         if page and not has_copies:
-            while len(self._looked_s) >= LOOKS_MAX:
-                del self._looked_s[min(self._looked_s, key=self._looked_s.__getitem__)]
-            self._looked_s[page] = time.monotonic()
+            while len(self._polled_s) >= POLLING_PAGES_MAX:
+                del self._polled_s[min(self._polled_s, key=self._polled_s.__getitem__)]
+            self._polled_s[page] = time.monotonic()
         files = {name: {"path": str(path), "size_bytes": self.size_bytes(path)} for name, path in self.paths.items()}
-        return {"files": files, "leaves": self._leaves}
+        return {"files": files, "leaves": self._is_exiting}
 
-    def offer(self, within_s: float, deserted: Callable[[], bool]) -> None:
-        """Tell pages to copy the files before the console exits; wait until all open ones have, or `deserted`."""
-        self._leaves = True
-        until_s = time.monotonic() + within_s
-        while (now_s := time.monotonic()) < until_s and not deserted():
-            if not any(now_s - looked_s < LOOKED_S for looked_s in list(self._looked_s.values())):
+    def offer(self, within_s: float, is_abandoned: Callable[[], bool]) -> None:
+        """Tell pages to copy the files before the console exits; wait until all open ones have, or `is_abandoned`."""
+        self._is_exiting = True
+        deadline_s = time.monotonic() + within_s
+        while (now_s := time.monotonic()) < deadline_s and not is_abandoned():
+            if not any(now_s - polled_s < POLL_TIMEOUT_S for polled_s in list(self._polled_s.values())):
                 return
             time.sleep(POLL_S)
 
@@ -160,7 +160,7 @@ class RunFiles:
             status = path.stat()
         except OSError:
             return None
-        is_own = stat.S_ISREG(status.st_mode) and status.st_mtime >= self._since_s - MTIME_S
+        is_own = stat.S_ISREG(status.st_mode) and status.st_mtime >= self._since_s - MTIME_ERROR_S
         return status.st_size if is_own else None
 
 
@@ -176,7 +176,7 @@ class ViserBackend(NamedTuple):
     head: Callable[[], dict[str, Any]]  # returns what the head of the page shows
     command: Callable[[OrderRequest], dict[str, Any]]  # takes an order; returns its progress
     files: RunFiles
-    looked: Callable[[str, str, str], None]  # called with key, role and address of a page whenever it polls
+    on_poll: Callable[[str, str, str], None]  # called with key, role and address of a page whenever it polls
 
 
 class HttpProxy:
@@ -213,9 +213,9 @@ class HttpProxy:
     async def _open(self) -> ServedSite:
         app = web.Application(client_max_size=MESSAGE_MAX)
         app.add_routes([web.get(path, self._page) for path in ("/", VIEW_PATH)])
-        shared = {"/state": self._state, "/head": self._head, "/cameras": self._cameras, "/actions": self._actions}
-        shared |= {f"/{name}": partial(self._file, path) for name, path in self._backend.files.paths.items()}
-        for path, handler in shared.items():
+        handlers = {"/state": self._state, "/head": self._head, "/cameras": self._cameras, "/actions": self._actions}
+        handlers |= {f"/{name}": partial(self._file, path) for name, path in self._backend.files.paths.items()}
+        for path, handler in handlers.items():
             app.add_routes([web.get(each, self._permitted(handler)) for each in (path, f"{VIEW_PATH}{path}")])
         app.add_routes([web.post("/command", self._permitted(self._command))])  # viewers have no such path
         host, port, or_any = self._address
@@ -251,9 +251,9 @@ class HttpProxy:
         if page_request.token:
             # The token moves to a cookie. The path is relative, since a reverse proxy may serve the page below another.
             response = web.Response(status=303, headers={**HEADERS, "Location": f".{page_request.path}"})
-            shown = self._tokens.role_of_address(page_request)
-            if shown is not None:
-                name = self._tokens.cookie(shown)
+            token_role = self._tokens.role_of_address(page_request)
+            if token_role is not None:
+                name = self._tokens.cookie(token_role)
                 response.set_cookie(name, page_request.token, httponly=True, samesite="Strict", path="/")
             return response
         if request.headers.get("Upgrade", "").lower() == "websocket":
@@ -267,16 +267,16 @@ class HttpProxy:
     async def _head(self, request: web.Request, role: str) -> web.Response:
         key = request.headers.get(CLIENT_HEADER, "")
         if key:
-            self._backend.looked(key, role, request.remote or "")
-        files = self._backend.files.shown(request.headers.get(PAGE_HEADER, ""), COPIED_HEADER in request.headers)
+            self._backend.on_poll(key, role, request.remote or "")
+        files = self._backend.files.state(request.headers.get(PAGE_HEADER, ""), COPIED_HEADER in request.headers)
         return _json_response({**self._backend.head(), **files})
 
     async def _file(self, path: Path, _: web.Request, role: str) -> web.StreamResponse:
         """Serve a file of the run: a page to display, or a file to download."""
         if self._backend.files.size_bytes(path) is None:
             return web.Response(status=404, text=f"{path} does not exist yet\n", headers=HEADERS)
-        kept = {} if path.suffix == ".html" else {"Content-Disposition": f'attachment; filename="{path.name}"'}
-        return web.FileResponse(path, headers={**HEADERS, **kept})
+        disposition = {} if path.suffix == ".html" else {"Content-Disposition": f'attachment; filename="{path.name}"'}
+        return web.FileResponse(path, headers={**HEADERS, **disposition})
 
     async def _command(self, request: web.Request, role: str) -> web.Response:
         try:
@@ -293,14 +293,14 @@ class HttpProxy:
     async def _actions(self, request: web.Request, role: str) -> web.StreamResponse:
         return await self._stream(f"actions of {role}", lambda: self._backend.serve_actions(request, role))
 
-    async def _stream(self, what: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
-        if self._open_pages[what] >= PAGES_MAX:
+    async def _stream(self, purpose: str, serve: Callable[[], Awaitable[web.StreamResponse]]) -> web.StreamResponse:
+        if self._open_pages[purpose] >= PAGES_MAX:
             return web.Response(status=503, text=f"{PAGES_MAX} pages are open already; close one\n", headers=HEADERS)
-        self._open_pages[what] += 1
+        self._open_pages[purpose] += 1
         try:
             return await serve()
         finally:
-            self._open_pages[what] -= 1
+            self._open_pages[purpose] -= 1
 
     async def _relay(self, request: web.Request, role: str) -> web.WebSocketResponse:
         header = request.headers.get("Sec-WebSocket-Protocol", "")
@@ -321,10 +321,10 @@ class HttpProxy:
 
         try:
             connecting = self._client.ws_connect(url, protocols=protocols, headers=headers, compress=0, max_msg_size=0)
-            async with connecting as inner:
+            async with connecting as viser_socket:
                 directions = (
-                    forward(inner, page, lambda _: True),
-                    forward(page, inner, lambda data: permits(data, role)),
+                    forward(viser_socket, page, lambda _: True),
+                    forward(page, viser_socket, lambda data: permits(data, role)),
                 )
                 tasks = [asyncio.ensure_future(each) for each in directions]
                 await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -337,8 +337,8 @@ class HttpProxy:
         return page
 
 
-def _json_response(shown: dict[str, Any], status: int = 200) -> web.Response:
-    body = msgspec.json.encode(shown)
+def _json_response(data: dict[str, Any], status: int = 200) -> web.Response:
+    body = msgspec.json.encode(data)
     return web.Response(body=body, status=status, content_type="application/json", headers=HEADERS)
 
 
@@ -353,8 +353,8 @@ def _page(style: str = "") -> bytes:
     parts = "".join(folder.joinpath(name).read_text("utf-8") for name in PARTS)
     head, end, tail = html.rpartition("</body>")
     document = f"{head}{parts}{end}{tail}" if end else f"{html}{parts}"
-    shown_as = folder.joinpath(style).read_text("utf-8") if style else ""
-    return gzip.compress(document.replace("</head>", f"{shown_as}</head>", 1).encode())
+    style_html = folder.joinpath(style).read_text("utf-8") if style else ""
+    return gzip.compress(document.replace("</head>", f"{style_html}</head>", 1).encode())
 
 
 # Who may open a page
@@ -441,8 +441,8 @@ class AnyThreadEvent(asyncio.Event):
 class Buffer(AsyncMessageBuffer):
     """viser's message buffer, with an event that any thread may set; silently drops writes to closed pages."""
 
-    def __init__(self, *args: Any, **more: Any) -> None:
-        super().__init__(*args, **more)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
         self.message_event = AnyThreadEvent()
         self._warned_push_after_done = True  # a page may close while a picture is being drawn for it
 
@@ -475,7 +475,7 @@ class PrivateViser:
 def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
     handle_update, pages = server.gui._handle_gui_updates, server.gui._websock_interface
 
-    async def guarded(client_id: Any, message: GuiUpdateMessage) -> None:
+    async def handle_guarded(client_id: Any, message: GuiUpdateMessage) -> None:
         if permits(client_id, message.uuid):
             await handle_update(client_id, message)
             return
@@ -486,7 +486,7 @@ def _guard_controls(server: viser.ViserServer, permits: Permits) -> None:
             page.gui._websock_interface.queue_message(previous)
 
     pages.unregister_handler(GuiUpdateMessage, handle_update)
-    pages.register_handler(GuiUpdateMessage, guarded)
+    pages.register_handler(GuiUpdateMessage, handle_guarded)
 
 
 @contextlib.contextmanager
@@ -494,13 +494,13 @@ def _requiring_secret(secret: str) -> Iterator[None]:
     """Make servers started in this context refuse connections without the secret."""
     serve = websockets.asyncio.server.serve
 
-    def serve_checked(*args: Any, process_request: Callable[..., Any] | None = None, **more: Any) -> Any:
+    def serve_checked(*args: Any, process_request: Callable[..., Any] | None = None, **kwargs: Any) -> Any:
         def check(connection: Any, request: Request) -> Response | None:
             if not secrets.compare_digest(request.headers.get(SECRET_HEADER, ""), secret):
                 return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", Headers(), b"")
             return None
 
-        return serve(*args, process_request=check, **more)
+        return serve(*args, process_request=check, **kwargs)
 
     websockets.asyncio.server.serve = serve_checked  # type: ignore[assignment, misc]
     try:
@@ -577,8 +577,8 @@ class PageControls:
 
     def accepts(self, uuid: str, value: Value) -> bool:
         """Return whether a control accepts a value; viser would fail to convert an invalid one."""
-        found = (gui._gui_input_handle_from_uuid.get(uuid) for gui in (self._gui, *self._pages()))
-        handle: Any = next((each for each in found if each is not None), None)
+        handles = (gui._gui_input_handle_from_uuid.get(uuid) for gui in (self._gui, *self._pages()))
+        handle: Any = next((each for each in handles if each is not None), None)
         if handle is None or getattr(handle, "disabled", False):
             return False
         options = getattr(handle, "options", None)
@@ -587,7 +587,7 @@ class PageControls:
         for kind in (bool, str):
             if isinstance(handle.value, kind) or isinstance(value, kind):
                 return isinstance(handle.value, kind) and isinstance(value, kind)
-        return abs(value) <= EXACT_MAX  # type: ignore[arg-type]
+        return abs(value) <= INTEGER_EXACT_MAX  # type: ignore[arg-type]
 
 
 def is_permitted(data: bytes, role: str, controls: PageControls) -> bool:

@@ -98,7 +98,7 @@ class SteerDrone(_Action, frozen=True, tag="steer"):
     speed_m_s: Annotated[float, Meta(ge=0.0, le=SPEED_MAX_M_S)] = 1.0
 
 
-class GoToPlace(_Action, frozen=True, tag="go"):
+class GoToPoint(_Action, frozen=True, tag="go"):
     """Send the taken drone to a point in W, at the drone's present height unless `z_m` is given.
 
     `then`: append the point to the present waypoints instead of replacing them.
@@ -114,9 +114,9 @@ class LeaveDrone(_Action, frozen=True, tag="leave"):
     """Release the taken drone."""
 
 
-_Look = LookFrom | LookAtPlan | ChooseDrone | SelectDrone
-_Operate = PlayRecord | TakeDrone | SteerDrone | GoToPlace | LeaveDrone
-_ACTIONS = msgspec.json.Decoder(_Look | _Operate)
+_ViewAction = LookFrom | LookAtPlan | ChooseDrone | SelectDrone
+_OperatorAction = PlayRecord | TakeDrone | SteerDrone | GoToPoint | LeaveDrone
+_ACTIONS = msgspec.json.Decoder(_ViewAction | _OperatorAction)
 
 
 class ActionSockets:
@@ -167,11 +167,11 @@ class ActionSockets:
         `page`, its socket, identifies the page that flies a drone.
         """
         try:
-            action: _Look | _Operate = _ACTIONS.decode(text)
+            action: _ViewAction | _OperatorAction = _ACTIONS.decode(text)
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return None
         flying = self._flying()
-        if isinstance(action, _Operate):
+        if isinstance(action, _OperatorAction):
             return self._operate(action, page, flying) if role == OPERATOR else None
         client_id = self._cameras.client_id(action.page)
         if isinstance(action, LookAtPlan) and page is not None:
@@ -189,7 +189,7 @@ class ActionSockets:
             flying.pages.toggle(client_id, action.drone)
         return {}
 
-    def _operate(self, action: _Operate, page: Any, flying: PageFlying | None) -> dict[str, Any]:
+    def _operate(self, action: _OperatorAction, page: Any, flying: PageFlying | None) -> dict[str, Any]:
         if isinstance(action, PlayRecord):
             record = self._record()
             if record is not None:
@@ -207,7 +207,7 @@ class ActionSockets:
         elif isinstance(action, SteerDrone):
             deflections = action.forward, action.left, action.up, action.turn
             answer = flying.control.steer(page, Stick(*deflections, action.speed_m_s) if action.held else None)
-        elif isinstance(action, GoToPlace):
+        elif isinstance(action, GoToPoint):
             answer = flying.control.go(page, action.x_m, action.y_m, action.z_m, action.then)
         else:
             answer = flying.control.leave(page)
@@ -239,27 +239,27 @@ class PageBatches:
 
     def __init__(self) -> None:
         self._cameras: list[dict[str, Any]] = []
-        self._shown: dict[str, tuple[Any, ...]] = {}
+        self._sent: dict[str, tuple[Any, ...]] = {}
 
     def next(self, feed: CameraFeed | None, want: tuple[str, ...], clicked: str = "") -> bytes | None:
         """Return the next message, None while nothing has changed and no drone was clicked."""
-        found = [] if feed is None else feed.cameras()
-        cameras = [{"name": name, "width": info.width, "height": info.height} for name, info in found]
+        feed_cameras = [] if feed is None else feed.cameras()
+        cameras = [{"name": name, "width": info.width, "height": info.height} for name, info in feed_cameras]
         header: dict[str, Any] = {"cameras": None, "pictures": []}
         if cameras != self._cameras:
-            self._cameras, self._shown, header["cameras"] = cameras, {}, cameras
+            self._cameras, self._sent, header["cameras"] = cameras, {}, cameras
         jpegs = []
         for camera in dict.fromkeys(want):
             picture = feed.picture(camera) if feed is not None else None
             if feed is None or picture is None:
                 continue
-            shown, now = self._shown.get(camera), (feed, picture.number, feed.marks(camera))
-            if shown == now:
+            sent, newest = self._sent.get(camera), (feed, picture.number, feed.marks(camera))
+            if sent == newest:
                 continue
-            self._shown[camera] = now
-            data = b"" if shown is not None and shown[:2] == now[:2] else picture.image.data
+            self._sent[camera] = newest
+            data = b"" if sent is not None and sent[:2] == newest[:2] else picture.image.data
             t_s = picture.image.t_sample_ns / 1e9
-            header["pictures"].append({"camera": camera, "size": len(data), "t_s": t_s, "marks": now[2]})
+            header["pictures"].append({"camera": camera, "size": len(data), "t_s": t_s, "marks": newest[2]})
             jpegs.append(data)
         if header["cameras"] is None and not header["pictures"] and not clicked:
             return None
@@ -287,16 +287,16 @@ class CameraSockets:
 
         Only changes are sent, at least PERIOD_S apart, and none before the page has shown the previous ones.
         """
-        wanted, ready = PicturesRequest(), asyncio.Event()
+        request, ready = PicturesRequest(), asyncio.Event()
 
         async def send() -> None:
             batches = PageBatches()
             while True:
                 await ready.wait()
-                feed, want = self._feed(), wanted.want
+                feed, want = self._feed(), request.want
                 if feed is not None:
-                    feed.ask(socket, (*want, wanted.frustum) if wanted.frustum else want)
-                batch = batches.next(feed, want, self._cameras.take_click(wanted.page))
+                    feed.request_pictures(socket, (*want, request.frustum) if request.frustum else want)
+                batch = batches.next(feed, want, self._cameras.pop_click(request.page))
                 if batch is not None:
                     ready.clear()
                     await socket.send_bytes(batch)
@@ -308,15 +308,15 @@ class CameraSockets:
                 if message.type is not WSMsgType.TEXT:
                     break
                 try:
-                    wanted = _PICTURES.decode(message.data)
+                    request = _PICTURES.decode(message.data)
                 except (msgspec.MsgspecError, ValueError, RecursionError):
                     break
-                self._cameras.show_frustum(wanted.page, wanted.frustum)
+                self._cameras.show_frustum(request.page, request.frustum)
                 ready.set()
         finally:
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
-            self._cameras.show_frustum(wanted.page, "")
+            self._cameras.show_frustum(request.page, "")
             feed = self._feed()
             if feed is not None:
                 feed.release(socket)

@@ -32,8 +32,8 @@ from zsim.transport.session import Query, RawSample, Session
 from zsim.vehicles.vehicle import ROTORS_MIN
 from zsim_bridges.vehicle_links.vehicle_session import (
     LINK_LOST_S,
-    STANDING,
-    STILL,
+    MOTORS_OFF_STATES,
+    ZERO_VECTOR,
     AircraftState,
     ClockOffset,
     Failsafe,
@@ -43,7 +43,7 @@ from zsim_bridges.vehicle_links.vehicle_session import (
     VehicleSession,
 )
 
-_POSITION = re.compile(r"\s*,\s*")
+_SEPARATOR = re.compile(r"\s*,\s*")
 _HOST = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.-]*[A-Za-z0-9])?")  # a host name or an IPv4 address
 
 
@@ -68,10 +68,10 @@ TICK_S = 0.01  # s, wall; at most half of the period at which setpoints are repe
 REPORT_S = 1.0  # s, wall; period of reports on the link
 LANDING_S = 30.0  # s, wall; time to wait for the aircraft to land before exiting
 PATIENCE_S = 5.0  # s, wall; silence after which possible causes are printed: five heartbeat periods
-FORMER_S = 2.0  # s, wall; time to wait for a port; ample, since a replaced driver keeps its port for about 10 ms
-AGAIN_S = 0.02  # s, wall; pause between attempts to open a port
-WAITING_MAX = 4000  # readings, 10 s of a 200 Hz IMU and all other sensors; beyond this, the oldest are dropped
-EXTRAPOLATED_NS = 500_000_000  # maximum time over which a pose is extrapolated: half of LINK_LOST_S
+PORT_WAIT_S = 2.0  # s, wall; time to wait for a port; ample, since a replaced driver keeps its port for about 10 ms
+PORT_RETRY_S = 0.02  # s, wall; pause between attempts to open a port
+READINGS_MAX = 4000  # readings, 10 s of a 200 Hz IMU and all other sensors; beyond this, the oldest are dropped
+EXTRAPOLATION_MAX_NS = 500_000_000  # maximum time over which a pose is extrapolated: half of LINK_LOST_S
 Say = Callable[[str], None]
 SessionMaker = Callable[[Info, Scenario, DriverOptions], VehicleSession]
 
@@ -219,18 +219,18 @@ class DriverProcess:
         if time.monotonic() >= self._hint_s:
             self._hint_s = math.inf
             self._hint()
-        is_due = time.monotonic() - self._reported_s > REPORT_S or self._reported != self._reported_now()
+        is_due = time.monotonic() - self._reported_s > REPORT_S or self._reported != self._current_report()
         if is_due and self._has_clock:
             self._report(self._clock.now_ns())
 
     def _hint(self) -> None:
         """Print possible causes if nothing has been received from the aircraft."""
         if self._session.state.received_ns is None:
-            channel, refused = self._session.channels[0], self._session.figures().refused
+            channel, refused_count = self._session.channels[0], self._session.link_quality().refused
             silence = self._sockets[0].fault.lower() or "nothing arrives"
-            what = f"{refused} messages from other senders arrived" if refused else silence
+            cause = f"{refused_count} messages from other senders arrived" if refused_count else silence
             advice = "check its address, that it is switched on, and over MAVLink its system id and key"
-            self._say(f"no aircraft at {channel.host}:{channel.port} ({what}); {advice}")
+            self._say(f"no aircraft at {channel.host}:{channel.port} ({cause}); {advice}")
 
     def _send(self) -> None:
         now_ns = self._clock.now_ns()
@@ -238,7 +238,7 @@ class DriverProcess:
         for channel, datagram in self._session.advance(now_ns, demand):
             self._sockets[channel].send(datagram)
 
-    def _reported_now(self) -> tuple[Connection, str, str]:
+    def _current_report(self) -> tuple[Connection, str, str]:
         received_ns, now_ns = self._session.state.received_ns, self._clock.now_ns()
         state: Connection = "armed" if self._failsafe.armed else "connected"
         if received_ns is None:
@@ -249,11 +249,11 @@ class DriverProcess:
 
     def _report(self, now_ns: int) -> None:
         """Publish the state of the link, and print changes of it."""
-        state, phase, reason = now = self._reported_now()
+        state, phase, reason = now = self._current_report()
         if now != self._reported:
             self._say(f"link {state}, {phase}{f' ({reason})' if reason else ''}")
         self._reported, self._reported_s = now, time.monotonic()
-        figures = self._session.figures()
+        quality = self._session.link_quality()
         received_ns, channel = self._session.state.received_ns, self._session.channels[0]
         message = flight_messages.LinkState(
             t_ns=self._observer.now_ns,
@@ -262,29 +262,29 @@ class DriverProcess:
             peer=f"{channel.host}:{channel.port}",
             state=state,
             age_ms=None if received_ns is None else (now_ns - received_ns) / 1e6,
-            loss_percent=figures.loss_percent,
-            round_trip_ms=figures.round_trip_ms,
-            clock_offset_ms=figures.clock_offset_ms,
-            refused=figures.refused,
+            loss_percent=quality.loss_percent,
+            round_trip_ms=quality.round_trip_ms,
+            clock_offset_ms=quality.clock_offset_ms,
+            refused=quality.refused,
         )
         self._report_seq += 1
         self._link.put(keys.link(self._drone), message)
 
-    async def _land_and_leave(self, interrupted: bool) -> None:
+    async def _land_and_leave(self, is_interrupted: bool) -> None:
         """Land an aircraft that this driver still flies, or finish a kill; a replacement driver takes over instead."""
         if self._observer.superseded:
             return
-        reason = "its driver is stopped" if interrupted else self._observer.end_reason or RUN_ENDED
-        if not interrupted:
+        reason = "its driver is stopped" if is_interrupted else self._observer.end_reason or RUN_ENDED
+        if not is_interrupted:
             self._observer.leave(reason)  # the run is over; the aircraft may still be descending
         self._failsafe.land(reason, self._clock.now_ns())
-        until_s = time.monotonic() + LANDING_S
+        deadline_s = time.monotonic() + LANDING_S
         if self._failsafe.phase == "landing":
             self._say(f"{reason}; it lands; a second Ctrl-C exits without waiting")
-        while (stopping := self._failsafe.is_stopping(self._session.state)) and time.monotonic() < until_s:
+        while (is_stopping := self._failsafe.is_stopping(self._session.state)) and time.monotonic() < deadline_s:
             self._tick()
             await asyncio.sleep(TICK_S)
-        if stopping:
+        if is_stopping:
             state = self._session.state.state
             self._say(f"it is still {state} after {LANDING_S:g} s; take it over by hand")
 
@@ -324,7 +324,7 @@ class ExternalDrone:
         self._hover_rad_s = hover_rad_s
         self._drone = drone
         self._to_simulated = to_simulated
-        self.readings: deque[Reading] = deque(maxlen=WAITING_MAX)
+        self.readings: deque[Reading] = deque(maxlen=READINGS_MAX)
         self._seq: dict[str, int] = {}
         self._gate_ns = -1
 
@@ -333,24 +333,24 @@ class ExternalDrone:
         if t_ns <= self._gate_ns or vehicle.pose is None:
             return []
         self._gate_ns = t_ns
-        sent: list[tuple[str, Any]] = []
-        measured = [(min(t_ns, self._to_simulated(reading.taken_ns)), reading) for reading in self.readings]
+        outputs: list[tuple[str, Any]] = []
+        timed_readings = [(min(t_ns, self._to_simulated(reading.taken_ns)), reading) for reading in self.readings]
         self.readings.clear()
-        for sample_ns, reading in sorted(measured, key=lambda entry: entry[0]):  # none is later than the gate
+        for sample_ns, reading in sorted(timed_readings, key=lambda entry: entry[0]):  # none is later than the gate
             key = keys.sensor(self._drone, reading.sensor)
             message = STOCK[reading.sensor].message
-            sent.append((key, message(t_ns, self._next(key), max(0, sample_ns), *reading.values)))
+            outputs.append((key, message(t_ns, self._next(key), max(0, sample_ns), *reading.values)))
         pose = vehicle.pose
-        age_ns = max(0, min(EXTRAPOLATED_NS, t_ns - self._to_simulated(pose.taken_ns)))
+        age_ns = max(0, min(EXTRAPOLATION_MAX_NS, t_ns - self._to_simulated(pose.taken_ns)))
         x, y, z = (p + age_ns * 1e-9 * v for p, v in zip(pose.position_m, pose.velocity_m_s, strict=True))
-        rotors = (0.0,) * len(self._hover_rad_s) if vehicle.state in STANDING else self._hover_rad_s
-        motion = ((x, y, z), pose.velocity_m_s, pose.q_WB, pose.w_WB_B, STILL, rotors)
+        rotors = (0.0,) * len(self._hover_rad_s) if vehicle.state in MOTORS_OFF_STATES else self._hover_rad_s
+        motion = ((x, y, z), pose.velocity_m_s, pose.q_WB, pose.w_WB_B, ZERO_VECTOR, rotors)
         key = keys.truth(self._drone)
-        sent.append((key, flight_messages.Truth(t_ns, self._next(key), *motion)))
+        outputs.append((key, flight_messages.Truth(t_ns, self._next(key), *motion)))
         key = keys.status(self._drone)
-        status = (vehicle.state, vehicle.battery_percent, False, commander, len(sent))
-        sent.append((key, flight_messages.Status(t_ns, self._next(key), *status)))
-        return sent
+        status = (vehicle.state, vehicle.battery_percent, False, commander, len(outputs))
+        outputs.append((key, flight_messages.Status(t_ns, self._next(key), *status)))
+        return outputs
 
     def _next(self, key: str) -> int:
         self._seq[key] = self._seq.get(key, -1) + 1
@@ -381,22 +381,24 @@ class AircraftSocket(asyncio.DatagramProtocol):
             RunError: the local port is taken, or the aircraft's address cannot be reached.
         """
         local = ("0.0.0.0", channel.local_port) if channel.local_port else None
-        until_s = time.monotonic() + FORMER_S
+        deadline_s = time.monotonic() + PORT_WAIT_S
         loop = asyncio.get_running_loop()
         while self._transport is None:
             try:
-                to = channel.host, channel.port
-                self._transport, _ = await loop.create_datagram_endpoint(lambda: self, remote_addr=to, local_addr=local)
+                remote = channel.host, channel.port
+                self._transport, _ = await loop.create_datagram_endpoint(
+                    lambda: self, remote_addr=remote, local_addr=local
+                )
             except OSError as error:
-                if error.errno == errno.EADDRINUSE and time.monotonic() <= until_s:
-                    await asyncio.sleep(AGAIN_S)
+                if error.errno == errno.EADDRINUSE and time.monotonic() <= deadline_s:
+                    await asyncio.sleep(PORT_RETRY_S)
                     continue
-                why = error.strerror or str(error)
+                reason = error.strerror or str(error)
                 if error.errno in (errno.EADDRINUSE, errno.EACCES):
                     advice = "give another --local-port, or end the program that uses it"
-                    raise RunError(f"UDP port {channel.local_port} cannot be opened: {why}; {advice}") from error
+                    raise RunError(f"UDP port {channel.local_port} cannot be opened: {reason}; {advice}") from error
                 advice = "give the address of the aircraft"
-                raise RunError(f"{channel.host}:{channel.port} cannot be reached: {why}; {advice}") from error
+                raise RunError(f"{channel.host}:{channel.port} cannot be reached: {reason}; {advice}") from error
 
     def send(self, datagram: bytes) -> None:
         if self._transport is not None:
@@ -437,7 +439,7 @@ def position(text: str) -> Vector:
         RunError: the text has another form.
     """
     try:
-        x, y, z = map(float, _POSITION.split(text.strip()))
+        x, y, z = map(float, _SEPARATOR.split(text.strip()))
     except ValueError:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):

@@ -19,7 +19,7 @@ REPEAT_NS = (
     100_000_000  # ns; repetition period of setpoints: a commander silent for 0.5 s counts as lost (`silence.hover_s`)
 )
 STEP_S_MAX = 0.1  # s; the filter does not integrate over longer gaps between IMU samples
-POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an estimate is at most a few gates late
+POSITIONS_MAX = 32  # gates for which the integrated position is remembered; an estimate is at most a few gates late
 ModeName = Literal["takeoff", "land", "emergency", "reset"]
 
 
@@ -94,7 +94,7 @@ class OnboardState:
         self.altitude_m = 0.0
         self._ground_baro_m: float | None = None
         self._x_m = self._y_m = 0.0
-        self._positions: deque[tuple[int, Vector]] = deque(maxlen=POSITIONS_KEPT)
+        self._positions: deque[tuple[int, Vector]] = deque(maxlen=POSITIONS_MAX)
         self.origin_m: Vector | None = None
 
     def update(self, message: Any) -> Any:
@@ -103,9 +103,9 @@ class OnboardState:
         message = message if q_BS is None else _rotated(message, q_BS)
         match message:
             case messages.Imu():
-                before, self.imu = self.imu, message
-                if self.estimate is None and before is not None:
-                    dt = (message.t_sample_ns - before.t_sample_ns) * 1e-9
+                previous, self.imu = self.imu, message
+                if self.estimate is None and previous is not None:
+                    dt = (message.t_sample_ns - previous.t_sample_ns) * 1e-9
                     if 0.0 < dt < STEP_S_MAX:
                         rate, force = message.gyro_rad_s, message.accel_m_s2
                         self.attitude = madgwick_step(self.attitude, rate, force, BETA_RAD_S, dt)
@@ -123,9 +123,9 @@ class OnboardState:
                 if self._ground_baro_m is None and self.baro is not None:
                     self._ground_baro_m = self.baro.altitude_m - self.altitude_m
             case messages.Flow():
-                before, self.flow = self.flow, message
-                if before is not None:
-                    dt = (message.t_sample_ns - before.t_sample_ns) * 1e-9
+                previous, self.flow = self.flow, message
+                if previous is not None:
+                    dt = (message.t_sample_ns - previous.t_sample_ns) * 1e-9
                     yaw = float(rotations.heading(self.attitude))
                     vx, vy, _ = rotations.turned_about_up(message.velocity_m_s, yaw)
                     self._x_m += dt * vx

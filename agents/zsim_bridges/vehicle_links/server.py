@@ -25,7 +25,7 @@ class TrafficIntake:
     """Messages in the order in which they passed through the world; a slow reader continues with the newest.
 
     The messages that such a reader has not yet read are dropped, since acting on old messages is worse than missing
-    some. `news` is set when there is something to read.
+    some. `arrival_event` is set when there is something to read.
     """
 
     def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
@@ -34,10 +34,10 @@ class TrafficIntake:
         self._loop = loop
         self._backlog: deque[Sequence[Passed]] = deque()
         self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
-        self.news = asyncio.Event()
+        self.arrival_event = asyncio.Event()
         for sample in link.get(keys.CLOCK):  # a world that is stopped or has ended no longer publishes its clock
             self._backlog.append([sample])
-        self.news.set()
+        self.arrival_event.set()
         self._thread.start()
 
     def close(self) -> None:
@@ -46,44 +46,44 @@ class TrafficIntake:
 
     def arrivals(self) -> Iterator[list[ReceivedSample]]:
         """Yield what has arrived so far, in the batches in which it arrived."""
-        self.news.clear()
+        self.arrival_event.clear()
         for _ in range(len(self._backlog)):
             try:
-                passed = self._backlog.popleft()
+                batch = self._backlog.popleft()
             except IndexError:  # dropped by the other thread in the meantime
                 return
-            yield list(samples(passed))
+            yield list(samples(batch))
 
     def _run(self) -> None:
         while True:
             try:
-                passed = self._traffic.receive()
+                batch = self._traffic.receive()
             except SessionError:
                 return
-            if passed:
+            if batch:
                 if len(self._backlog) >= BACKLOG:
                     self._health.dropped += len(self._backlog)
                     self._backlog.clear()
                 self._health.received += 1
-                self._backlog.append(passed)
+                self._backlog.append(batch)
                 with contextlib.suppress(RuntimeError):  # raised if the reader's loop is closed
-                    self._loop.call_soon_threadsafe(self.news.set)
+                    self._loop.call_soon_threadsafe(self.arrival_event.set)
 
     def _count_refused(self) -> None:
         self._health.refused += 1
 
 
-WAITING_MAX = 10  # images waiting for the loop; beyond this, the oldest are dropped
+IMAGES_QUEUED_MAX = 10  # images waiting for the loop; beyond this, the oldest are dropped
 
 
 class PictureIntake:
     """Receives the images of the cameras in use, with a subscription to each."""
 
-    def __init__(self, link: Session, loop: asyncio.AbstractEventLoop, take: Callable[[str, bytes], None]) -> None:
+    def __init__(self, link: Session, loop: asyncio.AbstractEventLoop, on_image: Callable[[str, bytes], None]) -> None:
         self._link = link
         self._loop = loop
-        self._take = take
-        self._waiting: deque[RawSample] = deque(maxlen=WAITING_MAX)
+        self._on_image = on_image
+        self._queue: deque[RawSample] = deque(maxlen=IMAGES_QUEUED_MAX)
         self._undeclare: dict[str, Callable[[], None]] = {}
 
     def follow(self, wanted: Iterable[str]) -> None:
@@ -99,14 +99,14 @@ class PictureIntake:
 
     def _on_picture(self, sample: RawSample) -> None:
         """Pass on an image; called in a Zenoh thread."""
-        self._waiting.append(sample)
+        self._queue.append(sample)
         with contextlib.suppress(RuntimeError):  # raised if the loop is closed
             self._loop.call_soon_threadsafe(self._deliver)
 
     def _deliver(self) -> None:
-        while self._waiting:
-            sample = self._waiting.popleft()
-            self._take(sample.key, sample.payload)
+        while self._queue:
+            sample = self._queue.popleft()
+            self._on_image(sample.key, sample.payload)
 
 
 POLL_S = 0.1  # period of checks for a stop request
@@ -145,7 +145,7 @@ class VehicleServer(ABC):
             stack.callback(intake.close)
             while not (stopped() or self.observer.end_reason):
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(intake.news.wait(), POLL_S)
+                    await asyncio.wait_for(intake.arrival_event.wait(), POLL_S)
                 await self.on_arrivals(intake)
                 self.observer.tick()
 
@@ -165,10 +165,10 @@ class VehicleServer(ABC):
         """Handle the run's clock and events."""
         if key == keys.CLOCK:
             self.observer.update_clock(payload)
-        elif key == keys.EVENT and (event := self.decoded(key, payload)) is not None:
+        elif key == keys.EVENT and (event := self.try_decode(key, payload)) is not None:
             self.on_event(event)
 
-    def decoded(self, key: str, payload: bytes) -> Any:
+    def try_decode(self, key: str, payload: bytes) -> Any:
         """Decode a message; if this fails, count it and return None."""
         try:
             return messages.decode(key, payload)
@@ -200,8 +200,8 @@ class PictureServer(VehicleServer):
         stack.callback(self._pictures.follow, ())
 
     async def on_arrivals(self, intake: TrafficIntake) -> None:
-        for arrived in intake.arrivals():
-            for key, payload in arrived:
+        for batch in intake.arrivals():
+            for key, payload in batch:
                 self.forward(key, payload)
                 if keys.is_status(key):  # a gate of a large fleet takes long; let clients' commands go first
                     await asyncio.sleep(0)

@@ -34,9 +34,9 @@ SIGMA_UNKNOWN_M = 2.0  # m, for a GPS receiver that does not report its accuracy
 P0_PA = 101_325.0  # Pa, pressure at sea level (ISO 2533)
 SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
 EXPONENT = 0.190263  # R lapse / g (ISO 2533)
-PRESSURES = 250  # readings averaged; 10 s at 25 Hz reduce 0.1 m of noise to less than 1 cm
-STILL: Vector = (0.0, 0.0, 0.0)
-STANDING: tuple[DroneState, ...] = ("landed", "emergency")  # states in which no rotor turns
+PRESSURES_AVERAGED = 250  # readings averaged; 10 s at 25 Hz reduce 0.1 m of noise to less than 1 cm
+ZERO_VECTOR: Vector = (0.0, 0.0, 0.0)
+MOTORS_OFF_STATES: tuple[DroneState, ...] = ("landed", "emergency")  # states in which no rotor turns
 LOSS_WINDOW = 1000  # messages over which the loss is computed, a few seconds of telemetry
 Action = Literal["none", "take_off", "hold", "fly", "land", "kill", "reset"]
 TAKEOFF_S = 20.0  # time limit of a take-off: four times what an AR.Drone needs
@@ -44,7 +44,7 @@ RESET_S = 2.0  # time limit of a reset: ten times what an AR.Drone needs to leav
 LINK_LOST_S = 1.0  # silence that means a lost link: telemetry comes ten times a second, heartbeats once
 BRAKING_M_S2 = 1.0  # half the acceleration of an AR.Drone at 12 deg of tilt; limits the speed towards the fence
 RETURN_M_S = 0.5  # speed of the return into the fence; slow, since nobody commanded it
-BREACH_M = 1.0  # distance outside the fence at which the aircraft lands; a margin, since it should stop at the fence
+BREACH_MARGIN_M = 1.0  # distance outside the fence at which the aircraft lands; positive, since it should stop at it
 Phase = Literal["idle", "taking_off", "airborne", "landing", "killed", "resetting"]
 
 
@@ -53,9 +53,9 @@ class AircraftPose(NamedTuple):
 
     taken_ns: int
     position_m: Vector
-    velocity_m_s: Vector = STILL
+    velocity_m_s: Vector = ZERO_VECTOR
     q_WB: Quaternion = LEVEL
-    w_WB_B: Vector = STILL
+    w_WB_B: Vector = ZERO_VECTOR
 
 
 class AircraftState(NamedTuple):
@@ -75,7 +75,7 @@ class Demand(NamedTuple):
     """
 
     action: Action
-    velocity_m_s: Vector = STILL
+    velocity_m_s: Vector = ZERO_VECTOR
     yaw_rate_rad_s: float = 0.0
 
 
@@ -97,17 +97,17 @@ class FlightLimits(NamedTuple):
         """Return a velocity [m/s; W] reduced to the limits and, if the position is known, to stop before the fence."""
         x, y, z = velocity_m_s
         speed = el.hypot(x, y)
-        share = min(1.0, self.speed_m_s / speed) if speed else 1.0
-        x, y, z = x * share, y * share, max(-self.climb_m_s, min(self.climb_m_s, z))
+        scale = min(1.0, self.speed_m_s / speed) if speed else 1.0
+        x, y, z = x * scale, y * scale, max(-self.climb_m_s, min(self.climb_m_s, z))
         if position_m is None:
             return x, y, z
         distance = el.hypot(position_m[0], position_m[1])
         if distance > 0.0 and not math.isinf(self.radius_m):
             out_x, out_y = position_m[0] / distance, position_m[1] / distance
-            excess = x * out_x + y * out_y - _approach(self.radius_m - distance)
+            excess = x * out_x + y * out_y - _approach_speed(self.radius_m - distance)
             if excess > 0.0:
                 x, y = x - excess * out_x, y - excess * out_y
-        return x, y, min(z, _approach(self.ceiling_m - position_m[2]))
+        return x, y, min(z, _approach_speed(self.ceiling_m - position_m[2]))
 
     def yaw_rate(self, yaw_rate_rad_s: float) -> float:
         return max(-self.yaw_rate_rad_s, min(self.yaw_rate_rad_s, yaw_rate_rad_s))
@@ -115,10 +115,10 @@ class FlightLimits(NamedTuple):
     def is_breached(self, position_m: Sequence[float]) -> bool:
         """Return whether an aircraft at a position [m; W] is so far outside the fence that it must land."""
         distance = el.hypot(position_m[0], position_m[1])
-        return distance > self.radius_m + BREACH_M or position_m[2] > self.ceiling_m + BREACH_M
+        return distance > self.radius_m + BREACH_MARGIN_M or position_m[2] > self.ceiling_m + BREACH_MARGIN_M
 
 
-def _approach(distance_m: float) -> float:
+def _approach_speed(distance_m: float) -> float:
     """Return the maximum speed towards a fence from which the aircraft can still stop; outside, negative, to return."""
     return math.sqrt(2.0 * BRAKING_M_S2 * distance_m) if distance_m > 0.0 else max(-RETURN_M_S, distance_m)
 
@@ -140,9 +140,9 @@ class Failsafe:
         self.phase: Phase = "idle"
         self.commander: str | None = None
         self.reason = ""
-        self._uncommanded = False  # whether the landing under way was not commanded
+        self._is_uncommanded = False  # whether the landing under way was not commanded
         self._setpoint: flight_messages.Velocity | None = None
-        self._setpoint_ns = self._clock_ns = self._began_ns = 0
+        self._setpoint_ns = self._clock_ns = self._entered_ns = 0
 
     # Operators
 
@@ -150,14 +150,14 @@ class Failsafe:
         """Start obeying commands; return None, or the reason for a refusal."""
         if _is_lost(vehicle, now_ns):
             return "nothing is received from the aircraft; check its address, and that it is switched on"
-        self.armed, self._uncommanded = True, False
+        self.armed, self._is_uncommanded = True, False
         if self.phase == "killed":
-            self._enter("idle", now_ns)
+            self._enter_phase("idle", now_ns)
         return None
 
     def disarm(self, vehicle: AircraftState) -> str | None:
         """Stop obeying commands; return None, or the reason for a refusal."""
-        if vehicle.state not in STANDING:
+        if vehicle.state not in MOTORS_OFF_STATES:
             return f"the aircraft is {vehicle.state}; land first, or kill"
         self.armed, self.phase = False, "idle"
         return None
@@ -165,18 +165,18 @@ class Failsafe:
     def kill(self, now_ns: int, source: str) -> None:
         """Stop the motors, armed or not, and disarm."""
         self.armed = False
-        self._enter("killed", now_ns)
+        self._enter_phase("killed", now_ns)
         self.reason = f"killed by {source}"
 
     def is_stopping(self, vehicle: AircraftState) -> bool:
         """Return whether a landing or a stop of the motors is under way."""
-        return self.phase == "landing" or (self.phase == "killed" and vehicle.state not in STANDING)
+        return self.phase == "landing" or (self.phase == "killed" and vehicle.state not in MOTORS_OFF_STATES)
 
     def land(self, reason: str, now_ns: int) -> None:
         """Land if this driver is flying the aircraft."""
         if self.phase in ("taking_off", "airborne"):
-            self._enter("landing", now_ns)
-            self.reason, self._uncommanded = reason, True
+            self._enter_phase("landing", now_ns)
+            self.reason, self._is_uncommanded = reason, True
 
     # The run
 
@@ -194,7 +194,7 @@ class Failsafe:
             case _ if not self.armed:
                 return "its driver is not armed; an operator must arm it"
             case flight_messages.Mode(mode="land"):
-                self._enter("landing", now_ns)
+                self._enter_phase("landing", now_ns)
                 return None
             case flight_messages.Mode():
                 return self._take_off(now_ns, vehicle)
@@ -213,7 +213,7 @@ class Failsafe:
         if self._is_outside(vehicle):
             return "the aircraft stands outside the fence; carry it inside, or start the driver with another fence"
         self._setpoint = self.commander = None
-        self._enter("taking_off", now_ns)
+        self._enter_phase("taking_off", now_ns)
         return None
 
     def _reset(self, now_ns: int, vehicle: AircraftState) -> str | None:
@@ -221,13 +221,13 @@ class Failsafe:
         if self.is_stopping(vehicle):
             return f"the aircraft is {vehicle.state}; its motors are being stopped"
         if self.phase == "killed" or vehicle.state == "emergency":
-            self._enter("resetting", now_ns)
+            self._enter_phase("resetting", now_ns)
         return None
 
     # The aircraft
 
     def demand(self, now_ns: int, vehicle: AircraftState) -> Demand:
-        self._advance(now_ns, vehicle)
+        self._advance_phase(now_ns, vehicle)
         match self.phase:
             case "killed":
                 return Demand("kill")
@@ -240,49 +240,51 @@ class Failsafe:
             case "taking_off":
                 return Demand("take_off")
             case "airborne":
-                return self._airborne(now_ns, vehicle)
+                return self._flight_demand(now_ns, vehicle)
             case _:
                 return Demand("none")
 
-    def _advance(self, now_ns: int, vehicle: AircraftState) -> None:
+    def _advance_phase(self, now_ns: int, vehicle: AircraftState) -> None:
         """Enter the next phase once the aircraft has reached it, or because of a silence."""
-        airborne = vehicle.state in AIRBORNE
-        has_had_time = now_ns - self._began_ns > LINK_LOST_S * 1e9  # for the telemetry to show that it obeys
+        is_airborne = vehicle.state in AIRBORNE
+        has_had_time = now_ns - self._entered_ns > LINK_LOST_S * 1e9  # for the telemetry to show that it obeys
         if self.phase in ("taking_off", "airborne") and vehicle.state == "emergency":
-            self.reason, self._uncommanded = "the aircraft is in an emergency", True
-            self._settle(now_ns)
-        elif self.phase == "taking_off" and airborne:
-            self._enter("airborne", now_ns)
-        elif self.phase == "taking_off" and now_ns - self._began_ns > TAKEOFF_S * 1e9:
+            self.reason, self._is_uncommanded = "the aircraft is in an emergency", True
+            self._end_flight(now_ns)
+        elif self.phase == "taking_off" and is_airborne:
+            self._enter_phase("airborne", now_ns)
+        elif self.phase == "taking_off" and now_ns - self._entered_ns > TAKEOFF_S * 1e9:
             self.land(f"the take-off took longer than {TAKEOFF_S:g} s", now_ns)
-        elif self.phase == "landing" and vehicle.state in STANDING and has_had_time:
-            self._settle(now_ns)
-        elif self.phase == "resetting" and (vehicle.state != "emergency" or now_ns - self._began_ns > RESET_S * 1e9):
-            self._enter("idle", now_ns)
-        elif self.phase == "idle" and self.armed and airborne:
-            self._enter("airborne", now_ns)  # the driver was restarted in flight
+        elif self.phase == "landing" and vehicle.state in MOTORS_OFF_STATES and has_had_time:
+            self._end_flight(now_ns)
+        elif self.phase == "resetting" and (vehicle.state != "emergency" or now_ns - self._entered_ns > RESET_S * 1e9):
+            self._enter_phase("idle", now_ns)
+        elif self.phase == "idle" and self.armed and is_airborne:
+            self._enter_phase("airborne", now_ns)  # the driver was restarted in flight
         elif self.phase == "airborne" and vehicle.state == "landed" and has_had_time:
-            self.reason, self._uncommanded = "the aircraft landed without a command", True
-            self._settle(now_ns)
+            self.reason, self._is_uncommanded = "the aircraft landed without a command", True
+            self._end_flight(now_ns)
         elif self.phase == "airborne" and vehicle.state == "landing":
             self.land("the aircraft lands by itself", now_ns)
         elif self.phase == "airborne" and self._setpoint is not None and now_ns - self._setpoint_ns > self._land_ns:
             self.land(f"{self.commander} is silent", now_ns)
         elif self.phase in ("taking_off", "airborne") and self._is_outside(vehicle):
             self.land("it is outside the fence", now_ns)
-        elif self.phase in ("taking_off", "airborne") and now_ns - max(self._clock_ns, self._began_ns) > self._land_ns:
+        elif (
+            self.phase in ("taking_off", "airborne") and now_ns - max(self._clock_ns, self._entered_ns) > self._land_ns
+        ):
             self.land("the world is silent", now_ns)
 
-    def _settle(self, now_ns: int) -> None:
+    def _end_flight(self, now_ns: int) -> None:
         """Record that the aircraft is down; after an uncommanded landing, only an operator can let it fly again."""
-        self._enter("idle", now_ns)
-        if self._uncommanded:
-            self.armed, self._uncommanded = False, False
+        self._enter_phase("idle", now_ns)
+        if self._is_uncommanded:
+            self.armed, self._is_uncommanded = False, False
 
     def _is_outside(self, vehicle: AircraftState) -> bool:
         return vehicle.pose is not None and self._limits.is_breached(vehicle.pose.position_m)
 
-    def _airborne(self, now_ns: int, vehicle: AircraftState) -> Demand:
+    def _flight_demand(self, now_ns: int, vehicle: AircraftState) -> Demand:
         setpoint, pose = self._setpoint, vehicle.pose
         if setpoint is None or pose is None or now_ns - self._setpoint_ns > self._hover_ns:
             return Demand("hold")
@@ -292,9 +294,9 @@ class Failsafe:
         velocity = self._limits.limited(velocity, pose.position_m)
         return Demand("fly", velocity, self._limits.yaw_rate(setpoint.yaw_rate_rad_s))
 
-    def _enter(self, phase: Phase, now_ns: int) -> None:
+    def _enter_phase(self, phase: Phase, now_ns: int) -> None:
         if phase != self.phase:
-            self.phase, self._began_ns = phase, now_ns
+            self.phase, self._entered_ns = phase, now_ns
         if phase in ("landing", "killed"):
             self._setpoint = self.commander = None
 
@@ -312,7 +314,7 @@ class UdpChannel(NamedTuple):
     local_port: int = 0
 
 
-class LinkFigures(NamedTuple):
+class LinkQuality(NamedTuple):
     """The quality of the link; None for unknown values.
 
     Attributes:
@@ -360,9 +362,9 @@ class VehicleSession(ABC):
     def advance(self, now_ns: int, demand: Demand) -> Iterable[tuple[int, bytes]]:
         """Return the datagrams that are due, each with its channel; called at least every 20 ms."""
 
-    def figures(self) -> LinkFigures:
+    def link_quality(self) -> LinkQuality:
         clock = self.readings.clock
-        return LinkFigures(self._loss.percent, clock.round_trip_ms, clock.ahead_ms, self._refused)
+        return LinkQuality(self._loss.percent, clock.round_trip_ms, clock.ahead_ms, self._refused)
 
 
 class StreamLoss:
@@ -418,7 +420,7 @@ class AircraftReadings:
         self._last: dict[str, tuple] = {}
         self._fix: tuple = ()
         self._pressure_offset_m = 0.0
-        self._pressures = 0
+        self._pressure_count = 0
 
     def take(self) -> list[Reading]:
         taken, self.readings = self.readings, []
@@ -441,24 +443,24 @@ class AircraftReadings:
         """
         # Altitude at which the standard atmosphere has this pressure, valid below 11 km.
         altitude_m = SCALE_M * (1.0 - (max(pressure_pa, 0.0) / P0_PA) ** EXPONENT)
-        if self._pressures < PRESSURES:
-            self._pressures += 1
-            self._pressure_offset_m += (altitude_m - height_m - self._pressure_offset_m) / self._pressures
+        if self._pressure_count < PRESSURES_AVERAGED:
+            self._pressure_count += 1
+            self._pressure_offset_m += (altitude_m - height_m - self._pressure_offset_m) / self._pressure_count
         self.read("baro", taken_ns, pressure_pa, altitude_m - self._pressure_offset_m)
 
     def gps_values(
-        self, place: Vector, speed_m_s: float, course_rad: float, sigma_m: float, fix: int, satellites: int
+        self, geodetic: Vector, speed_m_s: float, course_rad: float, sigma_m: float, fix: int, satellites: int
     ) -> tuple:
         """Return the values of a fix, with its position in W; the climb rate is the pose's, since the wires send none.
 
         Args:
-            place: latitude, longitude [deg], height [m].
+            geodetic: latitude, longitude [deg], height [m].
             course_rad: clockwise from north.
             sigma_m: standard deviation of the position; 0 if unknown.
         """
-        x, y, z = geodetic_to_enu(place, self._origin).tolist()
+        x, y, z = geodetic_to_enu(geodetic, self._origin).tolist()
         velocity = speed_m_s * math.sin(course_rad), speed_m_s * math.cos(course_rad), self.climb_m_s
-        return *place, (x, y, z), velocity, sigma_m or SIGMA_UNKNOWN_M, fix, satellites
+        return *geodetic, (x, y, z), velocity, sigma_m or SIGMA_UNKNOWN_M, fix, satellites
 
     @property
     def climb_m_s(self) -> float:
@@ -477,27 +479,27 @@ class ClockOffset:
     """
 
     def __init__(self) -> None:
-        self._least: deque[tuple[int, int]] = deque()  # arrivals and differences; both increase
+        self._min_differences: deque[tuple[int, int]] = deque()  # arrivals and differences; both increase
         self._round_trips: deque[tuple[int, int]] = deque()
 
     def add(self, stamp_ns: int, arrival_ns: int) -> None:
         """Record a message's timestamp by the other clock, and its arrival by this one."""
-        _keep_least(self._least, arrival_ns, arrival_ns - stamp_ns)
+        _update_window_minimum(self._min_differences, arrival_ns, arrival_ns - stamp_ns)
 
     def add_round_trip(self, duration_ns: int, arrival_ns: int) -> None:
         """Record the round trip of a request and its answer."""
-        _keep_least(self._round_trips, arrival_ns, duration_ns)
+        _update_window_minimum(self._round_trips, arrival_ns, duration_ns)
 
     @property
     def offset_ns(self) -> int:
         """This clock's time minus the other's; 0 while unknown."""
         round_trip_ns = self._round_trips[0][1] if self._round_trips else 0
-        return self._least[0][1] - round_trip_ns // 2 if self._least else 0
+        return self._min_differences[0][1] - round_trip_ns // 2 if self._min_differences else 0
 
     @property
     def ahead_ms(self) -> float | None:
         """The other clock's time minus this one's; None while unknown."""
-        return -self.offset_ns / 1e6 if self._least else None
+        return -self.offset_ns / 1e6 if self._min_differences else None
 
     @property
     def round_trip_ms(self) -> float | None:
@@ -514,10 +516,10 @@ class ClockOffset:
         return local_ns - self.offset_ns
 
 
-def _keep_least(kept: deque[tuple[int, int]], now_ns: int, value: int) -> None:
+def _update_window_minimum(window: deque[tuple[int, int]], now_ns: int, value: int) -> None:
     """Add a value to a queue whose first entry is the minimum within a window."""
-    while kept and kept[-1][1] >= value:
-        kept.pop()
-    kept.append((now_ns, value))
-    while now_ns - kept[0][0] > WINDOW_NS:
-        kept.popleft()
+    while window and window[-1][1] >= value:
+        window.pop()
+    window.append((now_ns, value))
+    while now_ns - window[0][0] > WINDOW_NS:
+        window.popleft()

@@ -83,15 +83,15 @@ class WireLayout:
         self.fields, self._wire = tuple(fields), tuple(wire or fields)
         self.codec = Struct("<" + "".join(field.format for field in self._wire))
         self.is_flat = not any(field.length for field in fields)
-        places: dict[str, int | slice] = {}
-        at = 0
+        positions: dict[str, int | slice] = {}
+        position = 0
         for field in self._wire:
             length = field.length if field.is_array and field.length else 1
-            places[field.name] = slice(at, at + length) if field.is_array else at
-            at += length
-        found = [places[field.name] for field in fields]
-        self._pick = itemgetter(*found) if len(found) > 1 else lambda flat: (flat[found[0]],)
-        self._texts = [place for place, field in enumerate(fields) if field.code == "c"]
+            positions[field.name] = slice(position, position + length) if field.is_array else position
+            position += length
+        selected = [positions[field.name] for field in fields]
+        self._select = itemgetter(*selected) if len(selected) > 1 else lambda flat: (flat[selected[0]],)
+        self._text_indices = [index for index, field in enumerate(fields) if field.code == "c"]
 
     def flat(self, values: Iterable[Any]) -> Iterator[Any]:
         """Yield the codec's flat values for the fields' values, both in wire order."""
@@ -103,9 +103,9 @@ class WireLayout:
 
     def nested(self, flat: Sequence[Any]) -> Sequence[Any]:
         """Return the fields' values, in their order of definition, for the flat values of the codec."""
-        values = self._pick(flat)
-        if self._texts:
+        values = self._select(flat)
+        if self._text_indices:
             values = list(values)
-            for place in self._texts:
-                values[place] = values[place].partition(b"\0")[0].decode(errors="replace")
+            for index in self._text_indices:
+                values[index] = values[index].partition(b"\0")[0].decode(errors="replace")
         return values

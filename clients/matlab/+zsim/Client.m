@@ -1,5 +1,7 @@
 classdef Client < handle
-    % A client of a running zsim federation, through `zsim gateway`; for MATLAB R2020b or newer and GNU Octave 7.
+    % CLIENT Client for a running zsim federation, through `zsim gateway`.
+    %
+    % For MATLAB R2020b or newer and GNU Octave 7 or newer.
     %
     %   c = zsim.Client('127.0.0.1');
     %   c.takeoff('drone1');
@@ -13,37 +15,39 @@ classdef Client < handle
     %   gate = c.step();
     %   while ~isempty(gate)                         % [] when the run is over; c.left says why
     %       e = zsim.heard(gate, 'drone/drone1/estimate');
-    %       c.velocity('drone1', [0.5 0 0], 0);      % said in a gate, it is part of its answer
+    %       c.velocity('drone1', [0.5 0 0], 0);      % in a gate, it is part of the answer
     %       gate = c.step();                         % answers this gate, waits for the next
     %   end
     %
     % Keys, messages, units and frames are those of docs/protocol.md. Lists of numbers are rows, 1 x n. Times t_ns are
-    % doubles, exact up to 2^53 ns, 104 days.
+    % doubles, exact up to 2^53 ns (104 days).
     %
-    % Errors: zsim:connection (no gateway within Wait, or it is gone), zsim:refused (what was asked for; nothing has
-    % happened), zsim:timeout (no answer), zsim:argument (a value that cannot be sent, or an unknown option).
+    % Errors: zsim:connection (no gateway within Wait, or the connection is lost), zsim:refused (a request was refused,
+    % and had no effect), zsim:timeout (no answer), zsim:argument (a value that cannot be sent, or an unknown option).
 
     properties (SetAccess = private)
-        name = ''  % in whose name it speaks, e.g. client.laptop
+        name = ''  % name under which this client sends, e.g. client.laptop
         run = []  % run_id, federation, mode, gate_s, drones (cell of names), clusters (struct array: name, drones)
     end
 
     properties (Dependent)
-        left  % why a seat in the lockstep is no more; '' while there is one, or was none
-        lost  % values of subscriptions that went because they were not taken in time
+        left  % why the last lockstep session ended; '' during a session, or if there was none
+        lost  % number of values of subscriptions dropped because they were not taken in time
     end
 
     properties (Access = private)
         talk  % zsim.Conversation
         timeout_s
-        outputs = {}  % JSON of what is said to the gate that is open
+        outputs = {}  % messages for the open gate, as JSON
     end
 
     methods
         function c = Client(host, varargin)
-            % Connect to a gateway. Options by name and value:
-            %   'Port' (7470), 'Token' (the variable ZSIM_TOKEN), 'Name' (what the gateway calls it),
-            %   'Timeout' (10 s, for an answer), 'Wait' (30 s, for the gateway to come up and a run to begin)
+            % CLIENT Connect to a gateway.
+            %
+            % Options by name and value, with their defaults:
+            %   'Port' (7470), 'Token' (the environment variable ZSIM_TOKEN), 'Name' (chosen by the gateway),
+            %   'Timeout' (10 s, for an answer), 'Wait' (30 s, for the gateway to start and a run to begin)
             if nargin < 1
                 host = '127.0.0.1';
             end
@@ -60,8 +64,9 @@ classdef Client < handle
         % Last values
 
         function value = latest(c, key)
-            % Return the last value of a key, [] if there is none yet; of an expression with *, a struct array of
-            % key and value.
+            % LATEST Return the last value of a key, or [] if there is none yet.
+            %
+            % For an expression with *, return a struct array of key and value.
             answer = c.request('latest', ['"key":' text_of(key)]);
             found = zsim.entries(answer.values);
             if any(char(key) == '*')
@@ -88,7 +93,7 @@ classdef Client < handle
         % Subscriptions
 
         function subscribe(c, key)
-            % Have every value on a key or expression from now on; take them with `next`.
+            % SUBSCRIBE Subscribe to a key or expression; `next` returns its values.
             c.request('subscribe', ['"key":' text_of(key)]);
         end
 
@@ -97,8 +102,9 @@ classdef Client < handle
         end
 
         function [value, key] = next(c, timeout_s)
-            % Return the oldest value of the subscriptions that was not taken, and its key; both [] if none has come
-            % after timeout_s (without it: 10 s).
+            % NEXT Return the oldest value of the subscriptions that has not been taken, and its key.
+            %
+            % Both are [] if there is none within timeout_s (default: the option Timeout).
             if nargin < 2
                 timeout_s = c.timeout_s;
             end
@@ -108,12 +114,14 @@ classdef Client < handle
         % Publications
 
         function put(c, key, value)
-            % Publish a value; t_ns, seq and source may be left out. In a gate it is part of the answer.
+            % PUT Publish a value; t_ns, seq and source can be omitted. In a gate, it is part of the answer.
             c.say(char(key), zsim.encode(value));
         end
 
         function velocity(c, drone, velocity_m_s, yaw_rate_rad_s, frame)
-            % Fly a velocity [m/s] and turn at a rate [rad/s]; frame 'heading' (forward, left, up) or 'world'.
+            % VELOCITY Command a velocity [m/s] and a yaw rate [rad/s].
+            %
+            % frame is 'heading' (forward, left, up; the default) or 'world'.
             if nargin < 4
                 yaw_rate_rad_s = 0;
             end
@@ -131,7 +139,7 @@ classdef Client < handle
             c.say(['drone/' char(drone) '/cmd/velocity'], [said '}']);
         end
 
-        % Modes, of all drones or of one
+        % Modes, for all drones or for one
 
         function takeoff(c, varargin), c.mode('takeoff', varargin{:}); end
         function land(c, varargin), c.mode('land', varargin{:}); end
@@ -139,7 +147,7 @@ classdef Client < handle
         function reset(c, varargin), c.mode('reset', varargin{:}); end
 
         function mode(c, mode, drone)
-            % Ask for a mode: takeoff, land, emergency or reset; of one drone, or of all.
+            % MODE Command a mode (takeoff, land, emergency, reset) for one drone, or without drone for all.
             drones = c.run.drones;
             if nargin > 2
                 drones = cellstr(drone);
@@ -152,7 +160,9 @@ classdef Client < handle
         % Requests
 
         function result = ask(c, key, op, args, timeout_s)
-            % Ask whoever answers on a key, e.g. c.ask('world/control', 'rate', struct('value', 2)); args may be {}.
+            % ASK Send a request on a key, and return the result.
+            %
+            %   c.ask('world/control', 'rate', struct('value', 2))          % args may be {}
             if nargin < 4 || isempty(args)
                 args = struct();
             end
@@ -172,7 +182,7 @@ classdef Client < handle
         function rate(c, value), c.ask('world/control', 'rate', struct('value', value)); end
 
         function advance(c, gates)
-            % Let a paused world go on by so many gates (1).
+            % ADVANCE Advance a paused world by a number of gates (default: 1).
             if nargin < 2
                 gates = 1;
             end
@@ -180,7 +190,7 @@ classdef Client < handle
         end
 
         function stop(c, reason)
-            % End the run.
+            % STOP End the run.
             if nargin < 2
                 reason = ['asked by ' c.name];
             end
@@ -195,11 +205,12 @@ classdef Client < handle
             c.ask('world/control', 'release', struct('drone', char(drone)));
         end
 
-        % A formation, by its controller
+        % Requests to a formation's controller
 
         function clusterTarget(c, name, values, over_s)
-            % Lead a formation to values by name, e.g. struct('z_c', 10), in over_s or as fast as allowed; a
-            % containers.Map where names have dots.
+            % CLUSTERTARGET Lead a formation to given values of its variables, e.g. struct('z_c', 10).
+            %
+            % over_s is the duration [s]; without it, as fast as allowed. For names with dots, use a containers.Map.
             args = struct('values', values);
             if nargin > 3
                 args.over_s = over_s;
@@ -208,7 +219,9 @@ classdef Client < handle
         end
 
         function clusterTrajectory(c, name, args)
-            % Lead a formation along a trajectory: args as docs/protocol.md gives them, with expressions or waypoints.
+            % CLUSTERTRAJECTORY Lead a formation along a trajectory.
+            %
+            % args are those of docs/protocol.md, with expressions or waypoints.
             c.ask_cluster(name, 'trajectory', args);
         end
 
@@ -221,9 +234,10 @@ classdef Client < handle
         % The lockstep
 
         function keys = join(c, name, period_s, reads, gates)
-            % Take a seat in the lockstep: from now on simulated time waits for `step` every period_s.
-            %   reads: key expressions of what each gate brings; gates: keys that close one (see docs/gateway.md)
-            % Returns the keys that close a gate.
+            % JOIN Start a lockstep session: from now on simulated time waits for `step` every period_s.
+            %
+            %   reads: key expressions of the inputs; gates: keys that complete a gate (see docs/gateway.md)
+            % Returns the keys that complete a gate.
             if nargin < 4
                 reads = {};
             end
@@ -239,10 +253,12 @@ classdef Client < handle
         end
 
         function gate = step(c, outputs)
-            % Answer the gate that came last with all that was said in it, and wait for the next.
-            %   outputs: n x 2 cell of key and value, more to answer with
-            % Returns t_s, t_ns and inputs (struct array: key, value; in order of time); [] when the run is over,
-            % `left` then says why. After a refused answer the gate is still open: say it again.
+            % STEP Answer the last gate with everything sent since then, and wait for the next one.
+            %
+            %   outputs: n x 2 cell of key and value, to be sent as well
+            % Returns t_s, t_ns and inputs (struct array: key, value; in time order), or [] when the run is over; `left`
+            % is then the reason. After a refused answer the gate is still open: send corrected values, and call `step`
+            % again.
             if nargin > 1
                 for k = 1:size(outputs, 1)
                     c.put(outputs{k, :});
@@ -255,7 +271,7 @@ classdef Client < handle
         end
 
         function leave(c, reason)
-            % Answer the gate that came last, and give the seat up: time waits for this program no longer.
+            % LEAVE Answer the last gate, and end the session: simulated time no longer waits for this program.
             if nargin < 2
                 reason = 'left';
             end
@@ -267,19 +283,21 @@ classdef Client < handle
         % The end
 
         function close(c)
-            % Leave the lockstep, if it has a seat there, and end the connection.
+            % CLOSE End the lockstep session, if any, and close the connection.
             try
                 if c.talk.seated
                     c.leave('closed');
                 end
             catch
-                % Nobody is left to be told.
+                % The connection is lost; there is nothing left to end.
             end
             c.talk.close();
         end
 
         function delete(c)
-            % End the connection; a seat dies with it, and the world does what the scenario's on_death says.
+            % DELETE Close the connection.
+            %
+            % If a lockstep session is open, the world acts according to on_death of the scenario.
             if ~isempty(c.talk)
                 c.talk.close();
             end
@@ -288,7 +306,7 @@ classdef Client < handle
 
     methods (Access = private)
         function greet(c, given, start)
-            % Say who it is, and wait for a run, until given.wait after start.
+            % GREET Say hello, and wait for a run until given.wait after start.
             said = ['"name":' text_of(given.name) ',"token":' text_of(given.token)];
             try
                 c.know(c.talk.request('hello', said));
@@ -303,7 +321,7 @@ classdef Client < handle
         end
 
         function know(c, hello)
-            % Take over what the gateway tells of the run.
+            % KNOW Store what the gateway reports about the run.
             c.name = hello.name;
             c.talk.heed();
             if isempty(hello.run_id)
@@ -319,7 +337,7 @@ classdef Client < handle
         end
 
         function renew(c)
-            % Learn of a run that has begun since.
+            % RENEW Update `run` if another run has begun.
             if c.talk.begun
                 c.know(c.talk.request('hello', '"name":""'));
             end
@@ -331,7 +349,7 @@ classdef Client < handle
         end
 
         function say(c, key, json)
-            % Publish a value that is JSON already, in a gate with its answer.
+            % SAY Publish a value given as JSON; in a gate, with its answer.
             said = ['"key":' text_of(key) ',"value":' json];
             if ~isempty(c.talk.gate)
                 c.outputs{end + 1} = ['{' said '}'];
@@ -347,7 +365,7 @@ classdef Client < handle
 end
 
 function given = options(pairs)
-    % Return the options of the constructor, those given in the place of the defaults.
+    % OPTIONS Return the options of the constructor, with defaults for those not given.
     given = struct('port', 7470, 'token', getenv('ZSIM_TOKEN'), 'name', '', 'timeout', 10, 'wait', 30);
     if mod(numel(pairs), 2)
         error('zsim:argument', 'options come as name and value, e.g. zsim.Client(''127.0.0.1'', ''Port'', 7470)');
@@ -367,6 +385,6 @@ function text = text_of(value)
 end
 
 function text = texts_of(value)
-    % Return one text, a cell or a string array of them as a list, of one too.
+    % TEXTS_OF Return a text, or a cell or string array of texts, as a JSON list.
     text = zsim.encode(reshape(cellstr(value), 1, []));
 end

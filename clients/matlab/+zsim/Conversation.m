@@ -1,15 +1,15 @@
 classdef Conversation < handle
-    % Requests and their answers on a gateway's stream, and what comes between them: values, gates, news of the run.
+    % CONVERSATION Requests and answers on a gateway's stream, and the messages in between.
     %
-    % One at a time: a request waits for its answer. Gates and news are kept where `gate`, `left` and `begun` show them,
-    % values in a queue until somebody takes them.
+    % Only one request is pending at a time. While it waits for its answer, values, gates and news of the run may
+    % arrive. Values are queued until they are taken; `gate`, `left` and `begun` show the rest.
 
     properties (SetAccess = private)
-        gate = []  % the gate that has come and is not answered yet: t_s, t_ns, inputs
-        left = ''  % why a seat in the lockstep is no more; '' while there is one, or was none
-        seated = false  % whether there is one
-        begun = true  % whether a run has begun since somebody heeded it
-        lost = 0  % values that went because they were not taken in time
+        gate = []  % the gate that has arrived and is not answered yet: t_s, t_ns, inputs
+        left = ''  % why the last lockstep session ended; '' during a session, or if there was none
+        seated = false  % whether a lockstep session is open
+        begun = true  % whether a run has begun since the last call of `heed`
+        lost = 0  % number of values dropped because they were not taken in time
     end
 
     properties (Access = private)
@@ -20,8 +20,8 @@ classdef Conversation < handle
     end
 
     properties (Constant, Access = private)
-        QUEUE_MAX = 100000  % values that wait to be taken; a drone's sensors of five minutes
-        FOREVER_S = 1e9  % a gate is waited for as long as time stands still
+        QUEUE_MAX = 100000  % maximum number of queued values; five minutes of a drone's sensors
+        FOREVER_S = 1e9  % timeout for a gate, since simulated time may stop indefinitely
     end
 
     methods
@@ -32,7 +32,7 @@ classdef Conversation < handle
         end
 
         function answer = request(talk, op, fields, timeout_s)
-            % Send a request, its fields as JSON, and return its answer.
+            % REQUEST Send a request, with its fields as JSON, and return its answer.
             if nargin < 4
                 timeout_s = talk.timeout_s;
             end
@@ -52,7 +52,9 @@ classdef Conversation < handle
         end
 
         function [value, key] = next(talk, timeout_s)
-            % Return the oldest value that was not taken, and its key; both [] if none has come after timeout_s.
+            % NEXT Return the oldest value that has not been taken, and its key.
+            %
+            % Both are [] if there is none within timeout_s.
             value = [];
             key = [];
             start = tic;
@@ -71,7 +73,7 @@ classdef Conversation < handle
         end
 
         function await_run(talk, timeout_s, wait_s)
-            % Wait until a run has begun, for timeout_s, which is what is left of wait_s.
+            % AWAIT_RUN Wait until a run has begun, for at most timeout_s, the rest of wait_s.
             start = tic;
             while ~talk.begun
                 line = talk.wire.receive(max(0, timeout_s - toc(start)));
@@ -84,14 +86,14 @@ classdef Conversation < handle
         end
 
         function heed(talk)
-            % What is to be known of the run that has begun is known.
+            % HEED Record that the client knows of the run that has begun.
             talk.begun = false;
         end
 
-        % A seat in the lockstep
+        % The lockstep
 
         function answer = sit(talk, fields)
-            % Join; the first gate may come at any time from then on.
+            % SIT Join the lockstep; the first gate may arrive at any time from then on.
             talk.left = '';
             talk.gate = [];
             answer = talk.request('join', fields);
@@ -99,7 +101,7 @@ classdef Conversation < handle
         end
 
         function step(talk, outputs)
-            % Answer the gate that is open with outputs (cell of JSON), and wait for the next or the end of the seat.
+            % STEP Answer the open gate with outputs (cell of JSON); wait for the next gate or the end of the session.
             answered = talk.gate;
             id = talk.answer(outputs);
             try
@@ -118,7 +120,7 @@ classdef Conversation < handle
         end
 
         function rise(talk, outputs, fields)
-            % Answer the gate that is open, and leave.
+            % RISE Answer the open gate, and leave the lockstep.
             talk.answer(outputs);
             talk.request('leave', fields);
             talk.gate = [];
@@ -138,7 +140,7 @@ classdef Conversation < handle
         end
 
         function id = answer(talk, outputs)
-            % Say done for the gate that is open; return the id of that, 0 where none is.
+            % ANSWER Send a done for the open gate; return the id of the done, or 0 if no gate is open.
             id = 0;
             if ~isempty(talk.gate)
                 fields = sprintf('"t_ns":%.0f,"outputs":[%s]', talk.gate.t_ns, strjoin(outputs, ','));
@@ -148,11 +150,13 @@ classdef Conversation < handle
         end
 
         function answer = take_in(talk, line, id)
-            % Take in a line: return it if it answers the request of this id, keep what else it brings, else [].
+            % TAKE_IN Return a line if it answers the request with this id, otherwise [].
+            %
+            % The contents of other lines are stored.
             answer = [];
             if isempty(line)
                 return
-            elseif strncmp(line, '{"op":"value"', 13)  % not decoded before somebody takes it
+            elseif strncmp(line, '{"op":"value"', 13)  % decoded only when it is taken
                 talk.keep(line);
                 return
             end
@@ -173,7 +177,7 @@ classdef Conversation < handle
                 case 'error'
                     if ~isfield(said, 'id') || isequal(said.id, id)
                         error('zsim:refused', '%s', said.error);
-                    end  % else of a request that was given up
+                    end  % otherwise it is for a request that has timed out
                 otherwise
                     if isfield(said, 'id') && isequal(said.id, id)
                         answer = said;
@@ -182,7 +186,7 @@ classdef Conversation < handle
         end
 
         function keep(talk, line)
-            % Keep a value; when too many wait the oldest goes.
+            % KEEP Queue a value; if the queue is full, drop the oldest one.
             if talk.queue.count >= talk.QUEUE_MAX
                 talk.queue.take();
                 talk.lost = talk.lost + 1;

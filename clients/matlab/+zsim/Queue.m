@@ -1,18 +1,18 @@
 classdef Queue < handle
-    % First in, first out; adding and taking cost the same however many there are.
+    % QUEUE First-in, first-out queue; adding and taking an item take constant time.
 
     properties (SetAccess = private)
         count = 0
     end
 
     properties (Access = private)
-        full = {}  % blocks, the oldest first
-        growing = {}  % the block that is added to
-        taken = 0  % of the oldest block
+        full = {}  % complete blocks, oldest first
+        growing = {}  % the block to which items are added
+        taken = 0  % number of items taken from the oldest block
     end
 
     properties (Constant, Access = private)
-        BLOCK = 256  % adding copies one block: Octave copies a cell that is a property
+        BLOCK = 256  % items per block; adding copies one block, since Octave copies a cell that is a property
     end
 
     methods
@@ -26,7 +26,7 @@ classdef Queue < handle
         end
 
         function item = take(queue)
-            % Return the oldest item; an error if there is none.
+            % TAKE Return the oldest item; an error if there is none.
             if isempty(queue.full)
                 queue.full = {queue.growing};
                 queue.growing = {};

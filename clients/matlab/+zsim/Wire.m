@@ -1,30 +1,31 @@
 classdef Wire < handle
-    % Lines of text on a TCP connection: MATLAB's tcpclient, or Octave's sockets package.
+    % WIRE Lines of text over TCP, using MATLAB's tcpclient or Octave's package sockets.
     %
-    %   wire = zsim.Wire('127.0.0.1', 7470, 30)      % waits 30 s for somebody to listen there
+    %   wire = zsim.Wire('127.0.0.1', 7470, 30)      % waits up to 30 s for the port to open
     %   wire.send('{"op":"hello"}')
-    %   line = wire.receive(1.0)         % '' if none came within 1 s
+    %   line = wire.receive(1.0)         % '' if none arrives within 1 s
     %
-    % Octave's instrument-control has a tcpclient too, but took twice as long for a round trip. A property or a method
-    % costs Octave as much as ten sums, so what each line goes through is written out in few functions.
+    % Octave's package instrument-control has a tcpclient too, but a round trip took twice as long with it. In Octave,
+    % accessing a property or calling a method takes as long as ten additions, so the code that handles each line is in
+    % few functions.
     %
-    % Errors: zsim:connection where there is no connection, or no longer.
+    % Errors: zsim:connection if there is no connection, or it is lost.
 
     properties (SetAccess = private)
-        address  % host:port, for messages
+        address  % host:port, for error messages
     end
 
     properties (Access = private)
-        socket = []  % of Octave, a descriptor; [] in MATLAB and once closed
-        device = []  % of MATLAB, a tcpclient; [] in Octave and once closed
-        lines = {}  % whole lines that have come, not all of them handed out
-        taken = 0  % how many have
-        begun = {}  % pieces of a line that has not ended yet
+        socket = []  % a descriptor in Octave; [] in MATLAB, and once closed
+        device = []  % a tcpclient in MATLAB; [] in Octave, and once closed
+        lines = {}  % complete lines that have arrived, and are not all returned yet
+        taken = 0  % number of these lines already returned
+        begun = {}  % pieces of an incomplete line
     end
 
     methods
         function wire = Wire(host, port, wait_s)
-            AGAIN_S = 0.1;  % between two tries: a gateway on its way up is there soon enough, and nobody is flooded
+            AGAIN_S = 0.1;  % between two attempts, while a gateway may be starting
             wire.address = sprintf('%s:%d', host, port);
             start = tic;
             while ~wire.dial(host, port)
@@ -36,7 +37,7 @@ classdef Wire < handle
         end
 
         function send(wire, text)
-            % Send a line; text is without the newline.
+            % SEND Send a line; text has no newline.
             text = [text char(10)];
             s = wire.socket;
             if isempty(s)
@@ -54,7 +55,7 @@ classdef Wire < handle
         end
 
         function line = receive(wire, timeout_s)
-            % Return the next line, '' if none has come after timeout_s of wall time.
+            % RECEIVE Return the next line, or '' if none arrives within timeout_s of wall time.
             lines = wire.lines;
             if isempty(lines)
                 line = wire.fill(timeout_s);
@@ -69,7 +70,7 @@ classdef Wire < handle
         end
 
         function close(wire)
-            % End the connection; nothing happens if it is closed.
+            % CLOSE Close the connection; no effect if it is already closed.
             if ~isempty(wire.socket)
                 disconnect(wire.socket);
             end
@@ -80,7 +81,7 @@ classdef Wire < handle
 
     methods (Access = private)
         function is_up = dial(wire, host, port)
-            % Return whether somebody took the connection; what no waiting mends is an error.
+            % DIAL Return whether a connection was established; raise an error that waiting cannot resolve.
             is_up = true;
             try
                 if exist('OCTAVE_VERSION', 'builtin')
@@ -97,7 +98,7 @@ classdef Wire < handle
         end
 
         function line = fill(wire, timeout_s)
-            % Wait for whole lines, keep them, and return the first. Each byte is looked at once.
+            % FILL Wait for complete lines, store them, and return the first one. Each byte is examined once.
             line = '';
             start = tic;
             while true
@@ -121,9 +122,9 @@ classdef Wire < handle
         end
 
         function bytes = read(wire, timeout_s, start)
-            % Return what has come, [] if nothing has until timeout_s after start.
-            SLICE_S = 0.25;  % longest wait without looking for Ctrl-C
-            CHUNK = 65536;  % bytes read at once
+            % READ Return the bytes that have arrived, or [] if there are none until timeout_s after start.
+            SLICE_S = 0.25;  % longest wait without checking for Ctrl-C
+            CHUNK = 65536;  % maximum number of bytes read at once
             bytes = [];
             s = wire.socket;
             if isempty(s)
@@ -159,12 +160,12 @@ function text = decoded(socket, bytes)
     if isempty(socket)
         text = native2unicode(bytes, 'UTF-8');
     else
-        text = char(bytes);  % text of Octave is UTF-8
+        text = char(bytes);  % text in Octave is UTF-8
     end
 end
 
 function bytes = available(device, timeout_s, start)
-    SPIN_S = 0.002;  % asked without a break for so long, because a pause takes a millisecond or more
+    SPIN_S = 0.002;  % duration of polling without pauses, because a pause takes a millisecond or more
     bytes = [];
     asked = tic;
     while device.NumBytesAvailable == 0
@@ -199,6 +200,6 @@ function connection = matlab_connection(host, port)
     try
         connection = tcpclient(host, port, 'ConnectTimeout', 10, 'EnableTransferDelay', false);
     catch
-        connection = tcpclient(host, port, 'ConnectTimeout', 10);  % a release that does not know the last option
+        connection = tcpclient(host, port, 'ConnectTimeout', 10);  % for releases without EnableTransferDelay
     end
 end

@@ -1,10 +1,11 @@
 function value = decode(text)
-    % Return JSON as values, lists of numbers as rows: 1 x n, where jsondecode gives n x 1.
+    % DECODE Decode JSON, with lists of numbers as rows.
     %
-    % So [0 0 1] - estimate.position_m is a difference, and not a 3 x 3 table. Lists of texts are cells n x 1, lists of
-    % objects struct arrays n x 1, or cells where their fields differ; a number alone in its list is that number.
-    %
-    % A list within a list is a row of a table, so [1,2] becomes [[1,2]] after a name. In a text no quote stands
-    % without a backslash before it: what is replaced is never part of one.
+    % Rows are 1 x n, whereas jsondecode returns n x 1. Thus [0 0 1] - estimate.position_m is 1 x 3 rather than 3 x 3.
+    % Lists of texts are n x 1 cells; lists of objects are n x 1 struct arrays, or cells if their fields differ. A list
+    % of one number is that number.
+
+    % A list within a list is decoded as a row of a matrix, so [1,2] after a name is replaced by [[1,2]]. In a text
+    % every quote is preceded by a backslash, so the pattern never matches within one.
     value = jsondecode(regexprep(text, '(?<=[^\\]":)\[([^\[\]{}"]+)\]', '[[$1]]'));
 end

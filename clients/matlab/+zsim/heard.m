@@ -1,5 +1,5 @@
 function value = heard(gate, key)
-    % Return the newest message on a key among the inputs of a gate, [] if there is none.
+    % HEARD Return the newest message on a key among the inputs of a gate, or [] if there is none.
     %
     %   gate = c.step();
     %   e = zsim.heard(gate, 'drone/drone1/estimate');

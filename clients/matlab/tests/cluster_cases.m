@@ -1,8 +1,10 @@
 function cluster_cases(path)
-    % Print what triad and cluster_step make of the cases in a JSON file; tests/unit/clients/test_octave_cluster.py compares.
+    % CLUSTER_CASES Print the results of triad and cluster_step for the cases in a JSON file.
     %
-    %   maps     robots p_W, yaw and their rates r_dot, a reference c_des with its rate, integral, dt_s, v_W
-    %   flights  gates: what the estimates say; targets: from which gate on which target
+    %   maps     p_W, yaw and v_W of robots and their rates r_dot, a reference c_des with its rate, integral, dt_s
+    %   flights  gates: the estimates at each gate; targets: each target, and from when on it applies
+    %
+    % tests/unit/clients/test_octave_cluster.py compares them with zsim's results.
     here = fileparts(mfilename('fullpath'));
     addpath(fullfile(here, '..'), fullfile(here, '..', '..', '..', 'examples', 'matlab'));
     cases = jsondecode(fileread(path));
@@ -29,7 +31,7 @@ function said = mapped(of, params)
 end
 
 function said = flown(flight, params)
-    % Step through a recorded flight; a null of JSON is NaN here, or [] where all of a table was null.
+    % FLOWN Step through a recorded flight; JSON's null is NaN here, or [] if a whole table was null.
     state = triad.start();
     said = cell(1, numel(flight.gates));
     for k = 1:numel(said)

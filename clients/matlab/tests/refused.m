@@ -1,5 +1,5 @@
 function message = refused(identifier, action)
-    % Run an action that must fail with this identifier; return what the error says.
+    % REFUSED Run an action that must fail with this identifier; return the error message.
     try
         action();
     catch reason

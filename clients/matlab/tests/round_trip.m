@@ -1,12 +1,13 @@
 function round_trip(port, count)
-    % Print, as JSON, how long a control loop waits for the gateway, in milliseconds of wall time.
+    % ROUND_TRIP Print, as JSON, how long a control loop waits for the gateway, in milliseconds of wall time.
     %
-    %   latest  from asking for one key to its value, decoded
+    %   latest  from the request for one key to its decoded value
     %   put     from a velocity command to its answer
-    %   gate    from `step` to the next gate, decoded: answer, gateway, world (one drone), gateway
+    %   gate    from `step` to the next decoded gate: answer, gateway, world (one drone), gateway
     %
-    % For a run of one drone that nobody else flies, on this machine; count (2000) of each, of which p50, p99 and max,
-    % and quiet_p50: the least median of ten parts, since a busy machine slows some of them.
+    % Needs a run of one drone on this machine, without another commander. Each operation is repeated count times
+    % (default: 2000). The results are p50, p99, max, and quiet_p50: the smallest median of ten parts, since a busy
+    % machine slows down some of them.
     here = fileparts(mfilename('fullpath'));
     addpath(fullfile(here, '..'));
     if nargin < 2
@@ -36,7 +37,7 @@ function stepped(c)
 end
 
 function figure = timed(action, count)
-    WARM = 50;  % the first ones load and compile
+    WARM = 50;  % uncounted repetitions, which load and compile code
     ms = zeros(1, count);
     for k = 1 - WARM:count
         start = tic;

@@ -1,7 +1,8 @@
 function run_tests(varargin)
-    % Run the client's tests, or those named: run_tests('test_json'). An error at the end if one has failed.
+    % RUN_TESTS Run the client's tests, or those named: run_tests('test_json').
     %
-    % They need no gateway; tests/system/test_octave.py runs those that do.
+    % Raises an error at the end if any has failed. These tests need no gateway; tests/system/test_octave.py runs those
+    % that do.
     here = fileparts(mfilename('fullpath'));
     addpath(here, fullfile(here, '..'));
     names = varargin;

@@ -1,5 +1,5 @@
 function test_controller()
-    % cluster_step takes off, engages and leads to its target, drones that follow at once; no NaN, no size changes.
+    % TEST_CONTROLLER Test that cluster_step flies ideal drones to its target, without NaN or a change of size.
     here = fileparts(mfilename('fullpath'));
     addpath(fullfile(here, '..', '..', '..', 'examples', 'matlab'));
     params = triad.params();

@@ -1,5 +1,5 @@
 function test_queue()
-    % First in, first out, over the borders of its blocks.
+    % TEST_QUEUE Test that items leave the queue in the order in which they were added, across its blocks.
     queue = zsim.Queue();
     rand('state', 4);  %#ok<RAND>
     added = 0;

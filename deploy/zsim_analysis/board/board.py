@@ -36,7 +36,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import LAWS, Scenario
 from zsim_agents.hosting import check_classes
 from zsim_agents.laws.pilot import FormationReference, polygon
-from zsim_analysis.board.measures import Figure, flown_of, measures, shape_errors
+from zsim_analysis.board.measures import Figure, formation_track, measures, shape_errors
 from zsim_analysis.reading.recorded_flight import RecordedFlight
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep import Journal, SweepScreen, failures, read_journal
@@ -120,22 +120,22 @@ def fly_board(request: BoardRequest) -> list[Row]:
     """
     tasks = _tasks(request)
     with held_folder(request.out, JOURNAL, OWN_FILES, request.force, "write a board into", "another board is flown"):
-        known = {row["identity"]: row for row in read_journal(request.out / JOURNAL)}
-        missing = [task for task in tasks if task.varied["identity"] not in known]
+        rows_by_identity = {row["identity"]: row for row in read_journal(request.out / JOURNAL)}
+        missing = [task for task in tasks if task.varied["identity"] not in rows_by_identity]
         with SweepScreen(len(tasks), len(tasks) - len(missing), request.console) as screen:
-            what = f"{len(request.laws)} laws, {len(request.scenarios)} scenarios, {request.seeds} seeds"
-            screen.say(f"board: {what}, into {request.out}")
+            extent = f"{len(request.laws)} laws, {len(request.scenarios)} scenarios, {request.seeds} seeds"
+            screen.say(f"board: {extent}, into {request.out}")
             if missing:
                 pool = ProcessPool(min(request.workers or cores(), len(missing)), screen.say)
                 with Journal(request.out / JOURNAL) as journal, closing(pool.rows(iter(missing))) as rows:
                     for row in rows:
                         journal.append(row)
-                        known[row["identity"]] = row
+                        rows_by_identity[row["identity"]] = row
                         screen.finished(row["failure"] is not None)
-            found = [known[task.varied["identity"]] for task in tasks]
-            for line in failures(found):
+            board_rows = [rows_by_identity[task.varied["identity"]] for task in tasks]
+            for line in failures(board_rows):
                 screen.say(line)
-    return found
+    return board_rows
 
 
 def _tasks(request: BoardRequest) -> list[Task]:
@@ -152,33 +152,33 @@ def _tasks(request: BoardRequest) -> list[Task]:
     for seed in range(1, request.seeds + 1):
         for scenario in request.scenarios:
             for law in request.laws:
-                flown = resolved(law, scenario, seed)
-                text = f"{__version__}\n{scenario_file.to_text(flown)}"
+                flight_scenario = resolved(law, scenario, seed)
+                text = f"{__version__}\n{scenario_file.to_text(flight_scenario)}"
                 varied = {"scenario": scenario, "law": law, "identity": hashlib.sha256(text.encode()).hexdigest()}
-                tasks.append(Task(len(tasks), 0, varied, flown, more=partial(columns, law, scenario)))
+                tasks.append(Task(len(tasks), 0, varied, flight_scenario, more=partial(columns, law, scenario)))
     return tasks
 
 
 def columns(law: str, scenario: str, flight: RecordedFlight) -> dict[str, Any]:
     """Return the measures of a flight, and its drones' positions and shape errors every TRACK_S."""
     figure = planned_figure(scenario) if law == CLUSTER_SPACE else None
-    flown = flown_of(flight, figure, whole=True)
-    step = max(1, round(TRACK_S / float(np.median(np.diff(flown.t_s))))) if len(flown.t_s) > 1 else 1
+    formation = formation_track(flight, figure, entire_flight=True)
+    step = max(1, round(TRACK_S / float(np.median(np.diff(formation.t_s))))) if len(formation.t_s) > 1 else 1
     series = dict(
-        zip(SERIES, (flown.t_s[::step], flown.p[::step], shape_errors(flown)[::step]), strict=True)
+        zip(SERIES, (formation.t_s[::step], formation.p[::step], shape_errors(formation)[::step]), strict=True)
     )  # fmt: skip
-    found = measures(flight, figure)
-    cpu = found["cpu_per_s"]
+    results = measures(flight, figure)
+    cpu = results["cpu_per_s"]
     contacts = sum(event.kind == "collision" for event in flight.events)
-    kept = {name: np.round(values, DECIMALS).tolist() for name, values in series.items()}
-    return {**found, "cpu_per_s": None if cpu is None else 1e3 * cpu, "contacts": float(contacts), **kept}
+    rounded_series = {name: np.round(values, DECIMALS).tolist() for name, values in series.items()}
+    return {**results, "cpu_per_s": None if cpu is None else 1e3 * cpu, "contacts": float(contacts), **rounded_series}
 
 
 def planned_figure(scenario: str) -> Figure:
     """Return the figure that the stock controller is to form in a scenario."""
-    entry, flight = shipped()["scenarios"][scenario], shipped()["flight"]
-    places = polygon(len(shipped()["base"]["drones"]), flight["radius_m"])
-    return Figure(FormationReference(entry["centre_m"], 0.0, 1.0, flight["start_s"]), places, ("translation",))
+    entry, flight = board_document()["scenarios"][scenario], board_document()["flight"]
+    positions = polygon(len(board_document()["base"]["drones"]), flight["radius_m"])
+    return Figure(FormationReference(entry["centre_m"], 0.0, 1.0, flight["start_s"]), positions, ("translation",))
 
 
 def board_of(request: BoardRequest, rows: Sequence[Row]) -> Board:
@@ -186,14 +186,16 @@ def board_of(request: BoardRequest, rows: Sequence[Row]) -> Board:
     entries = []
     for scenario in request.scenarios:
         for law in request.laws:
-            of = [row for row in rows if (row["scenario"], row["law"]) == (scenario, law)]
-            flown = [row for row in of if row["failure"] is None]
-            values = {each.name: [row[each.name] for row in flown if row[each.name] is not None] for each in MEASURES}
-            folded = [
-                {name: float(fold(given)) if given else None for name, given in values.items()}
-                for fold in (np.mean, min, max)
+            all_rows = [row for row in rows if (row["scenario"], row["law"]) == (scenario, law)]
+            completed_rows = [row for row in all_rows if row["failure"] is None]
+            values = {
+                each.name: [row[each.name] for row in completed_rows if row[each.name] is not None] for each in MEASURES
+            }
+            statistics = [
+                {name: float(reduce(samples)) if samples else None for name, samples in values.items()}
+                for reduce in (np.mean, min, max)
             ]
-            entries.append(Entry(scenario, law, len(of), len(of) - len(flown), *folded))
+            entries.append(Entry(scenario, law, len(all_rows), len(all_rows) - len(completed_rows), *statistics))
     return Board(request.laws, request.scenarios, request.seeds, __version__, entries)
 
 
@@ -231,16 +233,16 @@ def write_tables(out: Path, board: Board, rows: Sequence[Row]) -> None:
 
 
 @cache
-def shipped() -> Mapping[str, Any]:
+def board_document() -> Mapping[str, Any]:
     return yaml.safe_load(files("zsim_analysis.board").joinpath("scenarios.yaml").read_text(encoding="utf-8"))
 
 
 def scenario_names() -> list[str]:
-    return [*shipped()["scenarios"]]
+    return [*board_document()["scenarios"]]
 
 
 def about(scenario: str) -> str:
-    return shipped()["scenarios"][scenario]["about"]
+    return board_document()["scenarios"][scenario]["about"]
 
 
 def chosen(given: str | None, known: Sequence[str], option: str, open_to_classes: bool = False) -> list[str]:
@@ -266,35 +268,39 @@ def resolved(law: str, scenario: str, seed: int) -> Scenario:
 
 def document(law: str, scenario: str, seed: int) -> dict[str, Any]:
     """Return the scenario of a flight as a raw document."""
-    entry, flight = shipped()["scenarios"][scenario], shipped()["flight"]
-    found = copy.deepcopy(shipped()["base"])
-    found |= {"name": f"board-{scenario.replace('_', '-')}", "seed": seed, "report": {"window_s": entry["window_s"]}}
+    entry, flight = board_document()["scenarios"][scenario], board_document()["flight"]
+    result = copy.deepcopy(board_document()["base"])
+    result |= {"name": f"board-{scenario.replace('_', '-')}", "seed": seed, "report": {"window_s": entry["window_s"]}}
     for path, value in entry.get("set", {}).items():
         *sections, last = path.split(".")
-        inner = found
+        section_fields = result
         for section in sections:
-            inner = inner.setdefault(section, {})
-        inner[last] = copy.deepcopy(value)
-    names = [drone["name"] for drone in found["drones"]]
-    lost = entry.get("radio", {}).get("loss", 0.0)
+            section_fields = section_fields.setdefault(section, {})
+        section_fields[last] = copy.deepcopy(value)
+    names = [drone["name"] for drone in result["drones"]]
+    loss_probability = entry.get("radio", {}).get("loss", 0.0)
     if law == CLUSTER_SPACE:
-        found["clusters"] = [_cluster(names, entry["centre_m"], flight)]
+        result["clusters"] = [_cluster(names, entry["centre_m"], flight)]
         links = [f"estimator.{name}/controller.{CONTROLLER}" for name in names] + [f"world/controller.{CONTROLLER}"]
-        losses = [{"kind": "link_loss", "target": link, "probability": lost} for link in links] if lost else []
-        found["faults"] = [*found.get("faults", []), *losses]
-        return found
+        losses = (
+            [{"kind": "link_loss", "target": link, "probability": loss_probability} for link in links]
+            if loss_probability
+            else []
+        )
+        result["faults"] = [*result.get("faults", []), *losses]
+        return result
     parameters = {"takeoff_s": flight["takeoff_s"], "height_m": flight["height_m"], "start_s": flight["start_s"]}
-    found["agents"] = {PILOT: {"class": law, "parameters": {**parameters, "centre_m": entry["centre_m"]}}}
-    if lost:
-        found["radio"] = {"loss": lost}
-    return found
+    result["agents"] = {PILOT: {"class": law, "parameters": {**parameters, "centre_m": entry["centre_m"]}}}
+    if loss_probability:
+        result["radio"] = {"loss": loss_probability}
+    return result
 
 
 def _cluster(names: list[str], centre_m: list[float | str], flight: Mapping[str, Any]) -> dict[str, Any]:
     """Return the equivalent cluster: a pentagon template that gathers, then is led along the centre's path."""
-    places = [[*place, 0.0] for place in polygon(len(names), flight["radius_m"]).tolist()]
+    positions = [[*position, 0.0] for position in polygon(len(names), flight["radius_m"]).tolist()]
     start = {"x_c": 0, "y_c": 0, "z_c": flight["height_m"], "yaw": 0}
     expressions = {"x_c": centre_m[0], "y_c": centre_m[1]}
     trajectory = {"start_s": flight["start_s"], "expressions": expressions}
     plan = {"takeoff_s": flight["takeoff_s"], "target": start, "trajectory": trajectory}
-    return {"name": CONTROLLER, "drones": names, "space": "template", "template_m": places, "plan": plan}
+    return {"name": CONTROLLER, "drones": names, "space": "template", "template_m": positions, "plan": plan}

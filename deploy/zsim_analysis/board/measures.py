@@ -33,7 +33,7 @@ class Figure(NamedTuple):
     invariances: tuple[str, ...]  # of "translation", "rotation" and "scale", those that the law leaves open
 
 
-class Wanted(NamedTuple):
+class DesiredTrack(NamedTuple):
     """The desired figure of a formation over time."""
 
     centre: Array  # (T, 2) desired centre [m; W]
@@ -41,12 +41,12 @@ class Wanted(NamedTuple):
     invariances: tuple[str, ...]  # as in `Figure`
 
 
-class Flown(NamedTuple):
+class FormationTrack(NamedTuple):
     """The horizontal motion of a formation within its window."""
 
     t_s: Array  # (T,)
     p: Array  # (T, n, 2) true positions [m; W]; NaN for drones that are not in the air
-    wanted: Wanted | None
+    desired: DesiredTrack | None
 
 
 def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, float | None]:
@@ -66,64 +66,68 @@ def measures(flight: RecordedFlight, figure: Figure | None = None) -> dict[str, 
         flight: the flight as arrays.
         figure: the desired figure; None: that in the pilots' parameters.
     """
-    flown = flown_of(flight, figure)
+    formation = formation_track(flight, figure)
     window_s, _ = window_of(flight)
     length_s = max(flight.last_ns / 1e9, 1e-9)
-    within = [_within(track, window_s) for track in flight.tracks]
-    found: dict[str, float | None] = {
-        "shape_error_m": _shape_error(flight.scenario, flown),
+    clipped = [_within(track, window_s) for track in flight.tracks]
+    values: dict[str, float | None] = {
+        "shape_error_m": _shape_error(flight.scenario, formation),
         "place_error_m": None,
         "centre_error_m": None,
         "effort_m2_s": _effort(flight),
-        "separation_m": min_separation_m(within),
+        "separation_m": min_separation_m(clipped),
         "messages_per_drone_s": _messages(flight) / (len(flight.tracks) * length_s),
         "cpu_per_s": flight.cpu_s / length_s if flight.cpu_s else None,
     }
-    if flown.wanted is not None:
-        centre, places, _ = flown.wanted
-        if places is not None:  # the desired centre of the drones in the air only
-            centre = _mean(np.where(np.isnan(flown.p), np.nan, places))
-            found["place_error_m"] = _rms(flown.p - places)
-        found["centre_error_m"] = _rms(_mean(flown.p) - centre)
-    return found
+    if formation.desired is not None:
+        centre, positions, _ = formation.desired
+        if positions is not None:  # the desired centre of the drones in the air only
+            centre = _mean(np.where(np.isnan(formation.p), np.nan, positions))
+            values["place_error_m"] = _rms(formation.p - positions)
+        values["centre_error_m"] = _rms(_mean(formation.p) - centre)
+    return values
 
 
-def flown_of(flight: RecordedFlight, figure: Figure | None = None, whole: bool = False) -> Flown:
+def formation_track(
+    flight: RecordedFlight, figure: Figure | None = None, entire_flight: bool = False
+) -> FormationTrack:
     """Return the motion of all drones within the report's window, or over the whole flight."""
     (start, end), _ = window_of(flight)
-    if whole:
+    if entire_flight:
         start, end = flight.first_ns / 1e9, flight.last_ns / 1e9
     tracks = flight.tracks
     t_ns, rows = common_instants(tracks)
-    chosen = (t_ns >= start * 1e9) & (t_ns <= end * 1e9)
-    p = np.stack([track.p_W[row[chosen], :2] for track, row in zip(tracks, rows, strict=True)], axis=1)
-    t_ns = t_ns[chosen]
+    is_inside = (t_ns >= start * 1e9) & (t_ns <= end * 1e9)
+    p = np.stack([track.p_W[row[is_inside], :2] for track, row in zip(tracks, rows, strict=True)], axis=1)
+    t_ns = t_ns[is_inside]
     for column, track in enumerate(tracks):
         latest = np.searchsorted(track.status_t_ns, t_ns, side="right") - 1
         aloft = np.array([state in AIRBORNE for state in track.states], bool)
         p[~aloft[np.maximum(latest, 0)], column] = np.nan
     t_s, figure = t_ns / 1e9, figure or figure_of(flight.scenario)
-    return Flown(t_s, p, _wanted(figure, t_s) if figure else None)
+    return FormationTrack(t_s, p, _desired_track(figure, t_s) if figure else None)
 
 
-def shape_errors(flown: Flown) -> Array:
+def shape_errors(formation: FormationTrack) -> Array:
     """Return the root mean square distance from the best-fitting positions over time (T,) [m].
 
     The figure is translated, rotated and scaled to fit, where the law leaves this open. NaN if there are no desired
     positions or fewer than two drones are in the air.
     """
-    wanted = flown.wanted
-    if wanted is None or wanted.places is None:
-        return np.full(len(flown.t_s), np.nan)
-    planes = (flown.p, np.where(np.isnan(flown.p), np.nan, wanted.places))
+    desired = formation.desired
+    if desired is None or desired.places is None:
+        return np.full(len(formation.t_s), np.nan)
+    planes = (formation.p, np.where(np.isnan(formation.p), np.nan, desired.places))
     p, c = (each[..., 0] + 1j * each[..., 1] for each in planes)  # positions in the plane as complex numbers
     with np.errstate(invalid="ignore", divide="ignore"):
-        if "translation" in wanted.invariances:
+        if "translation" in desired.invariances:
             p, c = p - _mean(p)[:, None], c - _mean(c)[:, None]
         product, size = np.nansum(c.conj() * p, axis=1), np.nansum(np.abs(c) ** 2, axis=1)
-        turn = product / np.abs(product) if "rotation" in wanted.invariances else np.ones(len(p), complex)
-        growth = np.maximum((product / turn).real, 0.0) / size if "scale" in wanted.invariances else np.ones(len(p))
-        errors = np.sqrt(_mean(np.abs(p - (growth * turn)[:, None] * c) ** 2).real)
+        rotation = product / np.abs(product) if "rotation" in desired.invariances else np.ones(len(p), complex)
+        scaling = (
+            np.maximum((product / rotation).real, 0.0) / size if "scale" in desired.invariances else np.ones(len(p))
+        )
+        errors = np.sqrt(_mean(np.abs(p - (scaling * rotation)[:, None] * c) ** 2).real)
     return np.where((~np.isnan(p)).sum(axis=1) > 1, errors, np.nan)
 
 
@@ -137,10 +141,10 @@ def lattice_errors(p: Array, spacing_m: float, reach_m: float) -> Array:
 
 def law_of(scenario: Scenario | None) -> tuple[type[Pilot], Any] | None:
     """Return the law by which pilots fly a scenario, and its parameters; None if no law flies it."""
-    for own in scenario.own_agents.values() if scenario else ():
-        kind: Any = plugin.load(own.named, "class", object)
+    for agent in scenario.own_agents.values() if scenario else ():
+        kind: Any = plugin.load(agent.named, "class", object)
         if issubclass(kind, Pilot):
-            return kind, msgspec.convert(own.parameters, kind.Parameters)
+            return kind, msgspec.convert(agent.parameters, kind.Parameters)
     return None
 
 
@@ -148,28 +152,32 @@ def figure_of(scenario: Scenario | None) -> Figure | None:
     """Return the figure in the parameters of a scenario's pilots; None if no law flies it."""
     if scenario is None or (law := law_of(scenario)) is None:
         return None
-    kind, own = law
+    kind, parameters = law
     if not issubclass(kind, ShapePilot):
-        return Figure(kind.reference_of(own), None, ())
-    places = np.array(own.places_m) if own.places_m else polygon(len(scenario.drones), own.radius_m)
-    return Figure(kind.reference_of(own), places, kind.invariances)
+        return Figure(kind.reference_of(parameters), None, ())
+    positions = (
+        np.array(parameters.places_m) if parameters.places_m else polygon(len(scenario.drones), parameters.radius_m)
+    )
+    return Figure(kind.reference_of(parameters), positions, kind.invariances)
 
 
-def _wanted(figure: Figure, t_s: Array) -> Wanted:
+def _desired_track(figure: Figure, t_s: Array) -> DesiredTrack:
     poses = [figure.reference.at(float(t)) for t in t_s]
     centre = np.array([pose.p_W for pose in poses]).reshape(-1, 2)
     if figure.places is None:
-        return Wanted(centre, None, figure.invariances)
-    turns = np.array([pose.turn for pose in poses]).reshape(-1, 2, 2)
-    return Wanted(centre, centre[:, None] + np.einsum("tij,nj->tni", turns, figure.places), figure.invariances)
+        return DesiredTrack(centre, None, figure.invariances)
+    rotations = np.array([pose.turn for pose in poses]).reshape(-1, 2, 2)
+    return DesiredTrack(
+        centre, centre[:, None] + np.einsum("tij,nj->tni", rotations, figure.places), figure.invariances
+    )
 
 
-def _shape_error(scenario: Scenario | None, flown: Flown) -> float | None:
+def _shape_error(scenario: Scenario | None, formation: FormationTrack) -> float | None:
     law = law_of(scenario)
     if law and issubclass(law[0], OlfatiSaber):
         spacing_m = law[1].spacing_m
-        return _root_mean_square(lattice_errors(flown.p, spacing_m, law[1].range_ratio * spacing_m))
-    return _root_mean_square(shape_errors(flown))
+        return _root_mean_square(lattice_errors(formation.p, spacing_m, law[1].range_ratio * spacing_m))
+    return _root_mean_square(shape_errors(formation))
 
 
 def _effort(flight: RecordedFlight) -> float | None:
@@ -186,19 +194,19 @@ def _effort(flight: RecordedFlight) -> float | None:
 def _messages(flight: RecordedFlight) -> int:
     if law_of(flight.scenario):
         return sum(count for key, count in flight.others.items() if key.endswith(Motion.key.rpartition("/")[2]))
-    heard = sum(len(each.t_ns) for each in flight.estimates.values())
-    return heard + sum(len(each.t_ns) for each in flight.commands.values()) if flight.clusters else 0
+    received = sum(len(each.t_ns) for each in flight.estimates.values())
+    return received + sum(len(each.t_ns) for each in flight.commands.values()) if flight.clusters else 0
 
 
 def _within(track: Track, window_s: tuple[float, float]) -> Track:
-    chosen = (track.t_ns >= window_s[0] * 1e9) & (track.t_ns <= window_s[1] * 1e9)
-    return replace(track, t_ns=track.t_ns[chosen], truth=track.truth[chosen])
+    is_inside = (track.t_ns >= window_s[0] * 1e9) & (track.t_ns <= window_s[1] * 1e9)
+    return replace(track, t_ns=track.t_ns[is_inside], truth=track.truth[is_inside])
 
 
 def _mean(values: Any) -> Any:
     """Return the mean over the drones (second axis), ignoring NaN; NaN where all are NaN."""
-    known = ~np.isnan(values)
-    count = known.sum(axis=1)
+    finite = ~np.isnan(values)
+    count = finite.sum(axis=1)
     return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
 
 
@@ -207,5 +215,5 @@ def _rms(vectors: Array) -> float | None:
 
 
 def _root_mean_square(values: Array) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else None
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else None

@@ -74,16 +74,16 @@ def laplacian(graph: Graph) -> Array:
 
 def consensus_rate(graph: Graph, h: float = 0.005) -> float:
     """Return the asymptotic rate at which the errors of consensus decay [1/s], for k = 1."""
-    near = [neighbours(graph, i) for i in range(N)]
+    adjacency = [neighbours(graph, i) for i in range(N)]
     zero = np.zeros(1)
     p = np.array([[1.0], [-2.0], [0.5], [3.0], [-1.0]])
     p -= np.mean(p)
-    sizes = []
+    norms = []
     for _ in range(round(12.0 / (np.linalg.eigvalsh(laplacian(graph))[1] * h))):
-        p = p + h * np.array([consensus([(p[j] - p[i], zero) for j in near[i]], 1.0) for i in range(N)])
-        sizes.append(float(np.linalg.norm(p)))
-    half = np.log(sizes[len(sizes) // 2 :])
-    return float(-(half[-1] - half[0]) / (h * (len(half) - 1)))
+        p = p + h * np.array([consensus([(p[j] - p[i], zero) for j in adjacency[i]], 1.0) for i in range(N)])
+        norms.append(float(np.linalg.norm(p)))
+    second_half = np.log(norms[len(norms) // 2 :])
+    return float(-(second_half[-1] - second_half[0]) / (h * (len(second_half) - 1)))
 
 
 def delay_margin(graph: Graph) -> float:
@@ -92,18 +92,18 @@ def delay_margin(graph: Graph) -> float:
     The network is integrated for many delays at once, each a dimension with its own step; the margin is where
     the growth of the fastest mode changes sign.
     """
-    near, values, vectors = [neighbours(graph, i) for i in range(N)], *np.linalg.eigh(laplacian(graph))
+    adjacency, values, vectors = [neighbours(graph, i) for i in range(N)], *np.linalg.eigh(laplacian(graph))
     delays = np.linspace(0.8, 1.2, DELAYS) * math.pi / (2.0 * values[-1])
     h, zero = delays / STEPS_OF_DELAY, np.zeros(DELAYS)
-    past = [np.repeat(vectors[:, -1:], DELAYS, axis=1)] * (STEPS_OF_DELAY + 1)
+    history = [np.repeat(vectors[:, -1:], DELAYS, axis=1)] * (STEPS_OF_DELAY + 1)
     peaks = []
     for _ in range(2):  # peak over ten periods (of four delays each), early and late
         peak = np.zeros(DELAYS)
         for _ in range(10 * 4 * STEPS_OF_DELAY):
-            late = past.pop(0)
-            u = np.array([consensus([(late[j] - late[i], zero) for j in near[i]], 1.0) for i in range(N)])
-            past.append(past[-1] + h * u)
-            peak = np.maximum(peak, np.abs(past[-1]).max(axis=0))
+            delayed = history.pop(0)
+            u = np.array([consensus([(delayed[j] - delayed[i], zero) for j in adjacency[i]], 1.0) for i in range(N)])
+            history.append(history[-1] + h * u)
+            peak = np.maximum(peak, np.abs(history[-1]).max(axis=0))
         peaks.append(peak)
     growth = np.log(peaks[1] / peaks[0])
     return float(np.interp(0.0, growth, delays))
@@ -122,20 +122,20 @@ class FlockTrack(NamedTuple):
 @cache
 def free_flock(n: int = FLOCK, with_aim: bool = True, seed: int = 1) -> FlockTrack:
     """Return the track of the flock in the paper's simulation section, with its scattered start and parameters."""
-    draw = stream(seed, "papers/flock")
-    p, v = draw.normal(0.0, AREA_STD, (n, 2)), draw.uniform(-2.0, -1.0, (n, 2))
+    rng = stream(seed, "papers/flock")
+    p, v = rng.normal(0.0, AREA_STD, (n, 2)), rng.uniform(-2.0, -1.0, (n, 2))
     rows = []
-    every = round(1.0 / FLOCK_H_S)
+    sample_steps = round(1.0 / FLOCK_H_S)
     for step in range(round(FLOCK_S / FLOCK_H_S) + 1):
         pairs = KDTree(p).query_ball_point(p, R)
-        if step % every == 0:
+        if step % sample_steps == 0:
             energy, _ = deviation_energy(p, D, R)
-            scatter = float(np.mean(np.linalg.norm(v - np.mean(v, axis=0), axis=1)))
-            rows.append((step * FLOCK_H_S, _connectivity(pairs), energy / D**2, scatter))
+            velocity_scatter = float(np.mean(np.linalg.norm(v - np.mean(v, axis=0), axis=1)))
+            rows.append((step * FLOCK_H_S, _connectivity(pairs), energy / D**2, velocity_scatter))
         u = np.zeros((n, 2))
         for i in range(n):
-            heard = [Heard("", p[j], v[j]) for j in sorted(pairs[i]) if j != i]
-            u[i] = alpha_force(p[i], v[i], heard, D, R, FLOCK_C1["alpha"])
+            received = [Heard("", p[j], v[j]) for j in sorted(pairs[i]) if j != i]
+            u[i] = alpha_force(p[i], v[i], received, D, R, FLOCK_C1["alpha"])
             if with_aim:
                 u[i] += gamma_force(p[i], v[i], np.zeros(2), np.zeros(2), FLOCK_C1["gamma"])
         v = v + FLOCK_H_S * u
@@ -153,8 +153,8 @@ def _connectivity(pairs: list[list[int]]) -> float:
             i = group[i]
         return i
 
-    for i, near in enumerate(pairs):
-        for j in near:
+    for i, adjacent in enumerate(pairs):
+        for j in adjacent:
             group[root(i)] = root(j)
     return (len(pairs) - sum(root(i) == i for i in range(len(pairs)))) / (len(pairs) - 1)
 
@@ -173,26 +173,28 @@ class BearingTrack(NamedTuple):
 def bearing_flight(seed: int = 1, h: float = 0.05, duration_s: float = 80.0) -> BearingTrack:
     """Return the track of a pentagon with two diagonals from a random start, by fourth-order Runge–Kutta."""
     graph, c = [*RING, (0, 2), (0, 3)], polygon(N, 1.0)
-    near = [neighbours(graph, i) for i in range(N)]
+    adjacency = [neighbours(graph, i) for i in range(N)]
 
     def bearing(p: Array, i: int, j: int) -> Array:
         z = p[j] - p[i]
         return z / math.sqrt(z @ z)
 
-    wanted = {(i, j): bearing(c, i, j) for i in range(N) for j in near[i]}
+    desired_bearings = {(i, j): bearing(c, i, j) for i in range(N) for j in adjacency[i]}
 
     def u(p: Array) -> Array:
-        return np.array([bearing_only([(bearing(p, i, j), wanted[i, j]) for j in near[i]], 1.0) for i in range(N)])
+        return np.array(
+            [bearing_only([(bearing(p, i, j), desired_bearings[i, j]) for j in adjacency[i]], 1.0) for i in range(N)]
+        )
 
     p = stream(seed, "papers/bearings").uniform(-2.0, 2.0, (N, 2))
-    first, scale = np.mean(p, axis=0), _scale(p)
-    target = first + scale * c / _scale(c)
+    start_centroid, start_scale = np.mean(p, axis=0), _scale(p)
+    target = start_centroid + start_scale * c / _scale(c)
     rows, drifts = [], [(0.0, 0.0)]
     for step in range(round(duration_s / h)):
         if step % 10 == 0:
-            error = sum(float(np.linalg.norm(bearing(p, i, j) - wanted[i, j])) for i, j in graph)
+            error = sum(float(np.linalg.norm(bearing(p, i, j) - desired_bearings[i, j])) for i, j in graph)
             rows.append((step * h, error, float(np.linalg.norm(p - target))))
-            drifts.append((float(np.linalg.norm(np.mean(p, axis=0) - first)), abs(_scale(p) - scale)))
+            drifts.append((float(np.linalg.norm(np.mean(p, axis=0) - start_centroid)), abs(_scale(p) - start_scale)))
         k1 = u(p)
         k2 = u(p + h / 2 * k1)
         k3 = u(p + h / 2 * k2)
@@ -202,8 +204,8 @@ def bearing_flight(seed: int = 1, h: float = 0.05, duration_s: float = 80.0) -> 
 
 
 def _scale(p: Array) -> float:
-    arms = p - np.mean(p, axis=0)
-    return math.sqrt(float(np.mean(np.sum(arms * arms, axis=1))))
+    offsets = p - np.mean(p, axis=0)
+    return math.sqrt(float(np.mean(np.sum(offsets * offsets, axis=1))))
 
 
 def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
@@ -217,18 +219,18 @@ def lines(progress: Callable[[str], None] = lambda _: None) -> Iterator[Line]:
     for with_aim in (True, False):
         progress(f"a flock of {FLOCK}, {'with' if with_aim else 'without'} an aim …")
         track = free_flock(with_aim=with_aim)
-        what = "with its aim" if with_aim else "without, for comparison"
+        variant = "with its aim" if with_aim else "without, for comparison"
         line = partial(Line, "Olfati-Saber 2006")
-        yield line(f"relative connectivity of {FLOCK}, {what}", 1.0, float(track.connectivity[-1]))
-        yield line(f"deviation energy / d^2, {what}", 0.0, float(track.energy[-1]))
-        yield line(f"velocity mismatch (m/s), {what}", 0.0, float(track.mismatch[-1]))
+        yield line(f"relative connectivity of {FLOCK}, {variant}", 1.0, float(track.connectivity[-1]))
+        yield line(f"deviation energy / d^2, {variant}", 0.0, float(track.energy[-1]))
+        yield line(f"velocity mismatch (m/s), {variant}", 0.0, float(track.mismatch[-1]))
     progress("shapes by bearings …")
     tracks = [bearing_flight(seed) for seed in range(1, STARTS + 1)]
     line = partial(Line, "Zhao, Zelazo 2016")
     yield line("drift of the centroid (m)", 0.0, max(track.centroid_drift for track in tracks))
     yield line("drift of the scale (m)", 0.0, max(track.scale_drift for track in tracks))
-    reached = sum(float(track.distance[-1] < REACHED_M) for track in tracks)
-    yield line(f"starts of {STARTS} from which the figure is reached", float(STARTS), reached)
+    reached_count = sum(float(track.distance[-1] < REACHED_M) for track in tracks)
+    yield line(f"starts of {STARTS} from which the figure is reached", float(STARTS), reached_count)
 
 
 def write_papers(out: Path, progress: Callable[[str], None]) -> list[Line]:
@@ -237,13 +239,13 @@ def write_papers(out: Path, progress: Callable[[str], None]) -> list[Line]:
     Raises:
         ReportError: the folder cannot be written.
     """
-    found = list(lines(progress))
+    results = list(lines(progress))
     with file_fault(out, "cannot be written", OTHER_OUT, ReportError):
         out.mkdir(parents=True, exist_ok=True)
-        (out / "papers.md").write_text(markdown(found), encoding="utf-8")
+        (out / "papers.md").write_text(markdown(results), encoding="utf-8")
         for figure in figures(progress):
             (out / figure.name).write_bytes(figure.png())
-    return found
+    return results
 
 
 def cells(line: Line) -> list[str]:
@@ -251,14 +253,14 @@ def cells(line: Line) -> list[str]:
     return [line.paper, line.what, f"{line.expected:.4g}", found]
 
 
-def markdown(found: Sequence[Line]) -> str:
-    rows = (f"| {' | '.join(cells(line))} |\n" for line in found)
+def markdown(results: Sequence[Line]) -> str:
+    rows = (f"| {' | '.join(cells(line))} |\n" for line in results)
     return f"| paper | | expected | here |\n|---|---|--:|--:|\n{''.join(rows)}"
 
 
-def terminal_table(found: Sequence[Line]) -> FittedTable:
+def terminal_table(results: Sequence[Line]) -> FittedTable:
     columns = [Column("paper", "text"), Column("", "text"), Column("expected", right=True), Column("here", right=True)]
-    return FittedTable(columns, [cells(line) for line in found])
+    return FittedTable(columns, [cells(line) for line in results])
 
 
 def figures(progress: Callable[[str], None] = lambda _: None) -> Iterator[style.ReportFigure]:

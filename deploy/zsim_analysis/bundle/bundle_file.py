@@ -31,7 +31,7 @@ FORMAT = 1
 MEMBERS_MAX = 5000
 MANIFEST_BYTES_MAX = 4 << 20
 NAME_MAX = 200  # longest name of a member [characters]
-PIECE_BYTES = 1 << 20
+CHUNK_BYTES = 1 << 20
 DATE = (1980, 1, 1, 0, 0, 0)  # date of every member: the earliest that a zip archive can hold
 MODE = (stat.S_IFREG | 0o644) << 16
 UNIX = 3  # stored as the creating system on every system, so that the bytes are the same
@@ -114,7 +114,7 @@ def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | byt
                     entry.create_system, entry.external_attr = UNIX, MODE
                     entry.file_size = len(content) if isinstance(content, bytes) else content.stat().st_size
                     with archive.open(entry, "w") as target:
-                        for piece in _pieces(content):
+                        for piece in _chunks(content):
                             target.write(piece)
             part.replace(out)
         finally:
@@ -150,17 +150,17 @@ def is_bundle(path: Path) -> bool:
     return path.is_file() and (path.suffix == SUFFIX or zipfile.is_zipfile(path))
 
 
-def other_versions(lock: Iterable[str]) -> list[str]:
+def differing_packages(lock: Iterable[str]) -> list[str]:
     """Return the packages of a lock that are installed here in another version, or not at all."""
     differing = []
     for line in lock:
         name, _, version = line.partition("==")
         try:
-            here = importlib.metadata.version(name)
+            installed = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            here = "none"
-        if here != version:
-            differing.append(f"{name} {version}, here {here}")
+            installed = "none"
+        if installed != version:
+            differing.append(f"{name} {version}, here {installed}")
     return differing
 
 
@@ -183,31 +183,33 @@ def _manifest(path: Path, archive: zipfile.ZipFile) -> Manifest:
         if fault := _fault_of(entry, names):
             raise RunError(f"{path}: member {entry.filename[:NAME_MAX]!r} {fault}")
         names.add(entry.filename.casefold())
-    size, stated = path.stat().st_size, sum(entry.file_size for entry in entries)
-    if stated > size:
-        raise RunError(f"{path}: its members have {stated} bytes, but the file only {size}; members must not overlap")
+    size, declared_bytes = path.stat().st_size, sum(entry.file_size for entry in entries)
+    if declared_bytes > size:
+        raise RunError(
+            f"{path}: its members have {declared_bytes} bytes, but the file only {size}; members must not overlap"
+        )
     if MANIFEST not in archive.namelist():
         raise RunError(f"{path}: contains no {MANIFEST}; must be written by `zsim bundle`")
-    head = archive.getinfo(MANIFEST)
-    if head.file_size > MANIFEST_BYTES_MAX:
-        raise RunError(f"{path}: {MANIFEST} has {head.file_size} bytes; must be <= {MANIFEST_BYTES_MAX}")
-    text = archive.read(head)
+    manifest_entry = archive.getinfo(MANIFEST)
+    if manifest_entry.file_size > MANIFEST_BYTES_MAX:
+        raise RunError(f"{path}: {MANIFEST} has {manifest_entry.file_size} bytes; must be <= {MANIFEST_BYTES_MAX}")
+    text = archive.read(manifest_entry)
     try:
         version: Any = msgspec.json.decode(text)
         if isinstance(version, dict) and version.get("format", FORMAT) != FORMAT:
-            found = version["format"]
-            raise RunError(f"{path}: {MANIFEST} is of format {found!r:.40}; must be {FORMAT}; use a newer zsim")
+            found_format = version["format"]
+            raise RunError(f"{path}: {MANIFEST} is of format {found_format!r:.40}; must be {FORMAT}; use a newer zsim")
         manifest = msgspec.json.decode(text, type=Manifest)
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise RunError(f"{path}: {MANIFEST} cannot be read ({error}); must be as `zsim bundle` wrote it") from error
     if manifest.sealed().seal != manifest.seal:
         raise RunError(f"{path}: was changed: the content of {MANIFEST} does not match its seal")
-    held = {entry.filename for entry in entries} - {MANIFEST}
-    if others := sorted(held ^ set(manifest.files)):
-        fault = f"is not in {MANIFEST}" if others[0] in held else f"is missing, but listed in {MANIFEST}"
-        raise RunError(f"{path}: was changed: {others[0]} {fault}")
+    members = {entry.filename for entry in entries} - {MANIFEST}
+    if mismatched := sorted(members ^ set(manifest.files)):
+        fault = f"is not in {MANIFEST}" if mismatched[0] in members else f"is missing, but listed in {MANIFEST}"
+        raise RunError(f"{path}: was changed: {mismatched[0]} {fault}")
     for name in (README, SCENARIO, LOCK):
-        if name not in held:
+        if name not in members:
             raise RunError(f"{path}: contains no {name}; must be written by `zsim bundle`")
     return manifest
 
@@ -234,10 +236,10 @@ def _extract(path: Path, archive: zipfile.ZipFile, name: str, expected: File, fo
     target.parent.mkdir(parents=True, exist_ok=True)
     digest, size = hashlib.sha256(), 0
     with archive.open(name) as source, target.open("xb") as file:
-        while piece := source.read(PIECE_BYTES):
-            digest.update(piece)
-            file.write(piece)
-            size += len(piece)
+        while chunk := source.read(CHUNK_BYTES):
+            digest.update(chunk)
+            file.write(chunk)
+            size += len(chunk)
     if (digest.hexdigest(), size) != (expected.sha256, expected.bytes):
         raise RunError(f"{path}: was changed: the content of {name} does not match {MANIFEST}")
 
@@ -245,17 +247,17 @@ def _extract(path: Path, archive: zipfile.ZipFile, name: str, expected: File, fo
 def _hashed(content: Path | bytes) -> tuple[str, int]:
     """Return the SHA-256 and the size in bytes of `content`."""
     digest, size = hashlib.sha256(), 0
-    for piece in _pieces(content):
-        digest.update(piece)
-        size += len(piece)
+    for chunk in _chunks(content):
+        digest.update(chunk)
+        size += len(chunk)
     return digest.hexdigest(), size
 
 
-def _pieces(content: Path | bytes) -> Iterator[bytes]:
+def _chunks(content: Path | bytes) -> Iterator[bytes]:
     if isinstance(content, bytes):
         yield content
         return
     file: IO[bytes]
     with content.open("rb") as file:
-        while piece := file.read(PIECE_BYTES):
-            yield piece
+        while chunk := file.read(CHUNK_BYTES):
+            yield chunk

@@ -19,7 +19,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.hosting import agents_of
 from zsim_analysis.bundle import bundle_file as names
-from zsim_analysis.bundle.bundle_file import Manifest, opened, other_versions, pins_of
+from zsim_analysis.bundle.bundle_file import Manifest, differing_packages, opened, pins_of
 from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading import recorded_run
 from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, content_of, first_difference
@@ -43,8 +43,8 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
     with opened(path) as (manifest, folder):
         scenario = check_content(path, manifest, folder)
         lock = pins_of((folder / names.LOCK).read_text("utf-8"), f"{path}: {names.LOCK}")
-        if others := other_versions([*lock, *manifest.needs]):
-            note(f"packages differ: {_shown(others)}; --install creates an environment with those of the bundle")
+        if differing := differing_packages([*lock, *manifest.needs]):
+            note(f"packages differ: {_shown(differing)}; --install creates an environment with those of the bundle")
         if (folder / names.RECORD).exists():
             outputs = None if commands_only or manifest.not_run_again else manifest.outputs
             fault = rerun_record(folder / names.RECORD, commands_only, say, note, outputs)
@@ -102,16 +102,16 @@ def _fly_again(manifest: Manifest, folder: Path, scenario: Scenario, say: Say) -
         say(f"truth_sha256 is the same: {sha256}")
         say(f"the agents' outputs are the same, on {len(outputs)} keys")
         return ""
-    what = "truth differs" if sha256 != manifest.truth_sha256 else f"outputs differ on {listed(differing)}"
+    summary = "truth differs" if sha256 != manifest.truth_sha256 else f"outputs differ on {listed(differing)}"
     try:
-        first = first_difference((folder / names.GATES).read_bytes(), watch.digests.csv())
+        difference = first_difference((folder / names.GATES).read_bytes(), watch.digests.csv())
     except (ValueError, UnicodeError) as error:
         raise RunError(f"{names.GATES} cannot be read ({error}); must be as `zsim bundle` wrote it") from error
-    if first is None:
-        return f"{what}, in the last gates, which are not in {names.GATES}"
-    t_ns, key = first
+    if difference is None:
+        return f"{summary}, in the last gates, which are not in {names.GATES}"
+    t_ns, key = difference
     gate = f"gate {t_ns // flight.info.gate_ns} at {t_ns / 1e9:.2f} s"
-    return f"{what}, first {key} at {gate}; without a record, the field is unknown"
+    return f"{summary}, first {key} at {gate}; without a record, the field is unknown"
 
 
 class _Watch:
@@ -140,14 +140,14 @@ class _Watch:
 
 def _note_machines(manifest: Manifest, note: Say) -> None:
     """Note the differences between the machine that flew the bundle and this one."""
-    here = {**machine(), **parts()}
+    this_machine = {**machine(), **parts()}
     if not manifest.machine:
-        prints = f"of fingerprint {', '.join(manifest.fingerprints)}, here {fingerprint()}"
-        note(f"the machines: the one that flew the bundle is unknown, {prints}")
+        fingerprints = f"of fingerprint {', '.join(manifest.fingerprints)}, here {fingerprint()}"
+        note(f"the machines: the one that flew the bundle is unknown, {fingerprints}")
     elif differing := [
-        f"{name} {manifest.machine.get(name, 'none')}, here {here.get(name, 'none')}"
-        for name in sorted({*manifest.machine, *here})
-        if manifest.machine.get(name) != here.get(name)
+        f"{name} {manifest.machine.get(name, 'none')}, here {this_machine.get(name, 'none')}"
+        for name in sorted({*manifest.machine, *this_machine})
+        if manifest.machine.get(name) != this_machine.get(name)
     ]:
         note(f"the machines differ: {_shown(differing)}")
     else:
@@ -155,5 +155,5 @@ def _note_machines(manifest: Manifest, note: Say) -> None:
 
 
 def _shown(differing: list[str]) -> str:
-    more = len(differing) - SHOWN
-    return "; ".join(differing[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
+    omitted = len(differing) - SHOWN
+    return "; ".join(differing[:SHOWN]) + (f"; and {omitted} more" if omitted > 0 else "")

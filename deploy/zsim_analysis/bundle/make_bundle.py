@@ -52,7 +52,7 @@ BYTES_MAX = 50_000_000  # largest total size of users' modules, which should hol
 MODULE = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 PATH = re.compile(r"(?<![\w./~-])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"()]+[/\\])+")  # the folders of an absolute path
 FREE_TEXT = ("text", "reason", "error", "failure")  # message fields that hold free text
-OF_THE_WALL_CLOCK = (
+WALL_CLOCK_FIELDS = (
     *("run_id", "date", "changed", "versions", "fingerprint", "mode", "real_time_factor", "wall_s", "command_age_ms"),
     *("deadlines", "deadline_misses", "deadline_misses_by", "links", "participants", "events", "events_left_out"),
     *("record", "notes"),
@@ -60,12 +60,12 @@ OF_THE_WALL_CLOCK = (
 
 
 def make_bundle(
-    place: Path, out: Path | None, with_record: bool, force: bool, note: Callable[[str], None]
+    run_path: Path, out: Path | None, with_record: bool, force: bool, note: Callable[[str], None]
 ) -> WrittenBundle:
     """Write the bundle of a run.
 
     Args:
-        place: the folder of the run, or its record.
+        run_path: the folder of the run, or its record.
         out: the bundle file; None: named after the scenario, in the working folder.
         with_record: whether to include the record; only a flight that its scenario alone reproduces can do without.
         force: whether to replace an existing file.
@@ -75,37 +75,37 @@ def make_bundle(
         RunError: the record is not that of a complete flight that can be flown again, the scenario names something
             that a bundle cannot hold, or the file cannot be written.
     """
-    record = record_at(place)
+    record = record_at(run_path)
     completeness = record_completeness(record)
     if not completeness.complete:
-        raise RunError(f"{place}: the record is {completeness}; must be that of a complete flight")
+        raise RunError(f"{run_path}: the record is {completeness}; must be that of a complete flight")
     with recorded_run.open_run(record) as run:
         out = out or Path(f"{run.scenario.name}{names.SUFFIX}")
         refuse_existing(out, force)  # before figures are drawn, which takes seconds
-        _check(place, run)
+        _check(run_path, run)
         agents = recorded_run.recorded_agents(run.reader, run.info, run.scenario)
         expected = _Expected(run, agents)
         if not with_record and (reason := agents.why_not or expected.others):
-            raise RunError(f"{place}: {reason}: only the record has that; omit --no-record")
-        own = run.scenario.own_code()
-        modules = own_modules(own)
-        lock, needs = locked(modules.packages)
+            raise RunError(f"{run_path}: {reason}: only the record has that; omit --no-record")
+        own_code = run.scenario.own_code()
+        modules = collect_own_modules(own_code)
+        lock, needs = package_pins(modules.packages)
         if lacking := sorted(modules.packages - {each.partition("==")[0].replace("-", "_") for each in needs}):
             note(f"{', '.join(lacking)}: not in a package index under this name; must be installed to fly the bundle")
         hosts = _Hosts(run.reader)
         folder = temporary_folder("bundle-")
         members: dict[str, Path | bytes] = {names.SCENARIO: run.info.scenario.encode(), **modules.files}
         members[names.LOCK] = "".join(f"{line}\n" for line in lock).encode()
-        copied = folder / names.RECORD
-        _copy_record(run.reader, copied, hosts, bool(modules.files), note)
+        record_copy = folder / names.RECORD
+        _copy_record(run.reader, record_copy, hosts, bool(modules.files), note)
         if with_record:
-            members[names.RECORD] = copied
+            members[names.RECORD] = record_copy
         else:
             members[names.GATES] = expected.digests.csv()
-        flown_here = fingerprint() == run.info.fingerprint and hosts.are_only(socket.gethostname())
-        if not flown_here:
+        was_flown_here = fingerprint() == run.info.fingerprint and hosts.are_only(socket.gethostname())
+        if not was_flown_here:
             note("flown on another machine, or by another version, than this one: the bundle does not name the machine")
-        _add_figures(members, copied)
+        _add_figures(members, record_copy)
         manifest = Manifest(
             format=names.FORMAT,
             zsim=run.info.version,
@@ -117,34 +117,34 @@ def make_bundle(
             truth_sha256=agents.truth_sha256 or "",
             outputs=expected.hashes.hexdigests(),
             until_ns=recorded_run.answered_until_ns(run.reader, run.info),
-            own_code=own,
+            own_code=own_code,
             needs=needs,
             not_run_again=agents.why_not,
             fingerprints=sorted({run.info.fingerprint, *agents.fingerprints}),
-            machine={**machine(), **parts()} if flown_here else {},
+            machine={**machine(), **parts()} if was_flown_here else {},
             files={},
         )
         members[names.README] = _readme(manifest, members).encode()
         return write_bundle(out, manifest, members, force)
 
 
-def _check(place: Path, run: RecordedRun) -> None:
+def _check(run_path: Path, run: RecordedRun) -> None:
     """Raise RunError for a run that cannot be flown again elsewhere."""
     reader, info, scenario = run
     if reader.damaged:
-        raise RunError(f"{place}: the record is damaged: {reader.damaged[0]}; must be intact")
+        raise RunError(f"{run_path}: the record is damaged: {reader.damaged[0]}; must be intact")
     if info.replay_of:
-        raise RunError(f"{place}: is the record of a replay; give that of run {info.replay_of}")
+        raise RunError(f"{run_path}: is the record of a replay; give that of run {info.replay_of}")
     if external := scenario.external():
         raise RunError(
-            f"{place}: has drones whose bodies are external ({listed(external)}); they cannot be flown again"
+            f"{run_path}: has drones whose bodies are external ({listed(external)}); they cannot be flown again"
         )
     if scenario_file.sha256(info.scenario) != info.scenario_sha256:
-        raise RunError(f"{place}: its scenario does not match its recorded hash; must be as the world recorded it")
+        raise RunError(f"{run_path}: its scenario does not match its recorded hash; must be as the world recorded it")
     for path, value in _texts(yaml_file.value(info.scenario)):
         if PATH.match(value):
             raise RunError(
-                f"{place}: {path} is {value!r}, an absolute path, which no other machine has; must be relative"
+                f"{run_path}: {path} is {value!r}, an absolute path, which no other machine has; must be relative"
             )
 
 
@@ -222,7 +222,7 @@ class _Hosts:
             return self._stands_for.setdefault(value, f"host{len(self._stands_for) + 1}")
         if field in FREE_TEXT:
             text = PATH.sub("", value)
-            return self._pattern.sub(lambda found: self._stands_for[found[0]], text) if self._pattern else text
+            return self._pattern.sub(lambda match: self._stands_for[match[0]], text) if self._pattern else text
         return value
 
 
@@ -270,7 +270,7 @@ class OwnModules(NamedTuple):
     packages: set[str]  # names as in imports, up to the first dot
 
 
-def own_modules(names: Iterable[str]) -> OwnModules:
+def collect_own_modules(names: Iterable[str]) -> OwnModules:
     """Return users' modules: those of the given classes, functions and modules, and all that these import in turn.
 
     Args:
@@ -280,11 +280,11 @@ def own_modules(names: Iterable[str]) -> OwnModules:
         DocumentError: a module is not found.
         RunError: the modules are too large or cannot be read.
     """
-    found = OwnModules({}, set())
-    wanted = [(name.partition(":")[0], True) for name in names]
+    modules = OwnModules({}, set())
+    pending = [(name.partition(":")[0], True) for name in names]
     seen = set(PACKAGES) | set(sys.stdlib_module_names)
-    while wanted:
-        name, is_needed = wanted.pop()
+    while pending:
+        name, is_needed = pending.pop()
         package = name.partition(".")[0]
         if package in seen:
             continue
@@ -295,31 +295,33 @@ def own_modules(names: Iterable[str]) -> OwnModules:
             if is_needed:
                 raise
             continue  # an optional import
-        places = [Path(spec.origin)] if spec.origin else [Path(each) for each in spec.submodule_search_locations or ()]
-        if spec.origin in ("built-in", "frozen") or any(plugin.is_library(f"{place}") for place in places):
-            found.packages.add(package)
+        locations = (
+            [Path(spec.origin)] if spec.origin else [Path(each) for each in spec.submodule_search_locations or ()]
+        )
+        if spec.origin in ("built-in", "frozen") or any(plugin.is_library(f"{location}") for location in locations):
+            modules.packages.add(package)
             continue
-        for path, inside in _sources(package, places):
-            found.files[f"{MODULES}/{inside}"] = path
+        for path, inside in _sources(package, locations):
+            modules.files[f"{MODULES}/{inside}"] = path
             if path.suffix == ".py":
-                wanted += [(each, False) for each in _imports(path)]
-    size = sum(path.stat().st_size for path in found.files.values())
+                pending += [(each, False) for each in _imports(path)]
+    size = sum(path.stat().st_size for path in modules.files.values())
     if size > BYTES_MAX:
         raise RunError(f"the scenario's own modules have {size} bytes; must be <= {BYTES_MAX}; keep data elsewhere")
-    return found
+    return modules
 
 
-def _sources(package: str, places: Iterable[Path]) -> Iterator[tuple[Path, str]]:
+def _sources(package: str, locations: Iterable[Path]) -> Iterator[tuple[Path, str]]:
     """Yield the files of a module or a package, with their paths relative to the folder that contains it."""
-    for place in places:
-        if place.is_file() and place.name != "__init__.py":
-            yield place, place.name
+    for location in locations:
+        if location.is_file() and location.name != "__init__.py":
+            yield location, location.name
             continue
-        folder = place if place.is_dir() else place.parent
+        folder = location if location.is_dir() else location.parent
         for path in sorted(folder.rglob("*")):
             inside = path.relative_to(folder)
-            named = all(PART.fullmatch(part) for part in inside.parts)
-            if named and "__pycache__" not in inside.parts and path.is_file():
+            is_valid_name = all(PART.fullmatch(part) for part in inside.parts)
+            if is_valid_name and "__pycache__" not in inside.parts and path.is_file():
                 yield path, f"{package}/{inside.as_posix()}"
 
 
@@ -340,12 +342,12 @@ def _imports(path: Path) -> set[str]:
             node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
         ]
         pickled = base64.b64decode(max(texts, key=len))
-        named = {arg for _, arg, _ in pickletools.genops(pickled) if isinstance(arg, str)}
-        names |= set(filter(MODULE.fullmatch, named))
+        strings = {arg for _, arg, _ in pickletools.genops(pickled) if isinstance(arg, str)}
+        names |= set(filter(MODULE.fullmatch, strings))
     return names
 
 
-def locked(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
+def package_pins(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
     """Return lines NAME==VERSION of all packages that zsim and the given packages need, and those of the given ones.
 
     A package that was not installed from an index has no line.
@@ -354,12 +356,12 @@ def locked(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
         packages: names as in imports.
     """
     by_import = importlib.metadata.packages_distributions()
-    own = {_canonical(name) for each in packages for name in by_import.get(each, ())}
+    own_packages = {_canonical(name) for each in packages for name in by_import.get(each, ())}
     pins: dict[str, str] = {}
-    wanted = [(PROJECT, frozenset(EXTRAS)), *((name, frozenset[str]()) for name in sorted(own))]
+    pending = [(PROJECT, frozenset(EXTRAS)), *((name, frozenset[str]()) for name in sorted(own_packages))]
     seen: set[tuple[str, frozenset[str]]] = set()
-    while wanted:
-        name, extras = wanted.pop()
+    while pending:
+        name, extras = pending.pop()
         if (name, extras) in seen:
             continue
         seen.add((name, extras))
@@ -367,14 +369,14 @@ def locked(packages: Iterable[str] = ()) -> tuple[list[str], list[str]]:
             installed = importlib.metadata.distribution(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-        of_index = "+" not in installed.version and not json.loads(installed.read_text("direct_url.json") or "{}")
-        if name != PROJECT and of_index:
+        is_from_index = "+" not in installed.version and not json.loads(installed.read_text("direct_url.json") or "{}")
+        if name != PROJECT and is_from_index:
             pins[name] = f"{name}=={installed.version}"
         for line in installed.requires or ():
             needed = Requirement(line)
             if needed.marker is None or any(needed.marker.evaluate({"extra": extra}) for extra in extras or ("",)):
-                wanted.append((_canonical(needed.name), frozenset(needed.extras)))
-    return sorted(pins.values()), sorted(pins[name] for name in own if name in pins)
+                pending.append((_canonical(needed.name), frozenset(needed.extras)))
+    return sorted(pins.values()), sorted(pins[name] for name in own_packages if name in pins)
 
 
 def _canonical(name: str) -> str:
@@ -389,12 +391,12 @@ def _add_figures(members: dict[str, Path | bytes], record: Path) -> None:
     flight, formations, summary = judge(record, answers=True)
     for figure in figures(flight, formations, summary):
         members[f"{names.FIGURES}/{figure.name}"] = figure.png()
-        members[f"{names.FIGURES}/{Path(figure.name).stem}.csv"] = _drawn(figure.drawing)
-    kept = {name: value for name, value in msgspec.to_builtins(summary).items() if name not in OF_THE_WALL_CLOCK}
-    members[names.RESULTS] = indented_json(kept, "sorted")
+        members[f"{names.FIGURES}/{Path(figure.name).stem}.csv"] = _curve_table(figure.drawing)
+    results = {name: value for name, value in msgspec.to_builtins(summary).items() if name not in WALL_CLOCK_FIELDS}
+    members[names.RESULTS] = indented_json(results, "sorted")
 
 
-def _drawn(drawing: Any) -> bytes:
+def _curve_table(drawing: Any) -> bytes:
     """Return the curves of a figure as a table: panel, curve, x, y."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")

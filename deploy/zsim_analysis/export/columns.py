@@ -26,8 +26,8 @@ from zsim_analysis.reading.recorded_run import decode_or_none
 
 CELLS = 100_000  # cells per batch: about 5 MB as Python objects
 PROGRESS_EVERY = 10_000  # messages between two calls of `progress`
-WHOLE_MAX = 2**63 - 1
-QUATERNION, NO_WORD = "_wxyz", r"\W"
+INTEGER_MAX = 2**63 - 1
+QUATERNION, NON_WORD = "_wxyz", r"\W"
 COUNTS = ("used", "refused")  # an estimate's counts of a sensor's samples
 _NUMERIC = inspect.IntType | inspect.FloatType
 
@@ -55,8 +55,8 @@ class MessageSelection(NamedTuple):
 
 def subject(key: str) -> str:
     """Return the drone, cluster or process that a key is about; `world` if it is about none."""
-    kind, whose, what = keys.parts(key)
-    return (what or "world") if kind == "view" else whose if what else "world"
+    kind, owner, leaf = keys.parts(key)
+    return (leaf or "world") if kind == "view" else owner if leaf else "world"
 
 
 class RowBatch(NamedTuple):
@@ -81,15 +81,19 @@ class Columns(NamedTuple):
 
 def table_columns(kind: type[Struct], names: Mapping[str, Sequence[str]]) -> tuple[Columns, ...]:
     """Return the columns of a message type's table, given the names or keys that occur in each open field."""
-    opens = open_fields(kind)
-    hidden = {"t_ns", "seq", *(["names"] if "named" in opens.values() else [])}  # column names carry the `names`
-    own = [field for field in _fields(kind) if field.name not in hidden]
+    open_kinds = open_fields(kind)
+    hidden = {"t_ns", "seq", *(["names"] if "named" in open_kinds.values() else [])}  # column names carry the `names`
+    shown_fields = [field for field in _fields(kind) if field.name not in hidden]
     return (
         Columns("name", "text", ("name",), lambda batch: batch.names),
         Columns("t_s", "number", ("t_s",), lambda batch: [message.t_ns / 1e9 for message in batch.messages]),
         Columns("t_ns", "whole", ("t_ns",), lambda batch: [message.t_ns for message in batch.messages]),
         *([_plain("seq", "whole")] if "seq" in kind.__struct_fields__ else []),
-        *(each for field in own for each in _columns(field, opens.get(field.name), names.get(field.name, ()))),
+        *(
+            each
+            for field in shown_fields
+            for each in _columns(field, open_kinds.get(field.name), names.get(field.name, ()))
+        ),
         Columns("wall_ns", "whole", ("wall_ns",), lambda batch: np.array(batch.wall_ns, np.uint64).astype(np.int64)),
     )
 
@@ -114,17 +118,17 @@ def as_array(kind: Kind, values: Values) -> NDArray[Any]:
 
 def open_fields(kind: type[Struct]) -> dict[str, Literal["named", "numbers", "pairs"]]:
     """Return the fields of a message whose columns depend on its content: named variables, maps of numbers or pairs."""
-    opens: dict[str, Literal["named", "numbers", "pairs"]] = {}
+    open_kinds: dict[str, Literal["named", "numbers", "pairs"]] = {}
     for field in _fields(kind):
         match field.type:
-            case inspect.VarTupleType(item_type=item, min_length=least) if isinstance(item, _NUMERIC) and not least:
+            case inspect.VarTupleType(item_type=item, min_length=minimum) if isinstance(item, _NUMERIC) and not minimum:
                 if "names" in kind.__struct_fields__:
-                    opens[field.name] = "named"
+                    open_kinds[field.name] = "named"
             case inspect.DictType(value_type=value) if isinstance(value, _NUMERIC):
-                opens[field.name] = "numbers"
+                open_kinds[field.name] = "numbers"
             case inspect.DictType(value_type=inspect.TupleType(item_types=items)) if len(items) == len(COUNTS):
-                opens[field.name] = "pairs"
-    return opens
+                open_kinds[field.name] = "pairs"
+    return open_kinds
 
 
 def table_name(kind: type[Struct]) -> str:
@@ -147,11 +151,11 @@ def _columns(field: inspect.Field, open_kind: str | None, names: Sequence[str]) 
     if open_kind:
         return [_open(name, names, open_kind)]
     if isinstance(info, inspect.UnionType):
-        others = [each for each in info.types if not isinstance(each, inspect.NoneType)]
-        info = others[0] if len(others) == 1 else info
+        alternatives = [each for each in info.types if not isinstance(each, inspect.NoneType)]
+        info = alternatives[0] if len(alternatives) == 1 else info
     match info:
         case inspect.IntType():
-            return [_plain(name, "whole", convert=lambda value: value if abs(value or 0) <= WHOLE_MAX else None)]
+            return [_plain(name, "whole", convert=lambda value: value if abs(value or 0) <= INTEGER_MAX else None)]
         case inspect.FloatType():
             return [_plain(name, "number")]
         case inspect.BoolType():
@@ -186,23 +190,23 @@ def _open(name: str, names: Sequence[str], kind: str) -> Columns:
     Messages may differ in their `names`.
     """
     ends = [f"_{end}" for end in COUNTS] if kind == "pairs" else [""]
-    columns = tuple(f"{name}_{re.sub(NO_WORD, '_', each)}{end}" for each in names for end in ends)
-    places = {each: slice(i * len(ends), (i + 1) * len(ends)) for i, each in enumerate(names)}
+    columns = tuple(f"{name}_{re.sub(NON_WORD, '_', each)}{end}" for each in names for end in ends)
+    slices = {each: slice(i * len(ends), (i + 1) * len(ends)) for i, each in enumerate(names)}
 
     def values(batch: RowBatch) -> Values:
         table = np.full((len(batch.messages), len(columns)), np.nan)
         for row, message in zip(table, batch.messages, strict=True):
             content = getattr(message, name)
             if kind == "named":  # all at once, as large formations have thousands
-                row[[places[each].start for each in message.names]] = content
+                row[[slices[each].start for each in message.names]] = content
                 continue
             for each, value in content.items():
-                row[places[each]] = value
+                row[slices[each]] = value
         return table
 
     if kind == "named":
         return Columns(name, "number", columns, values, names=tuple(names))
-    return Columns(name, "number", columns, values, keys=places)
+    return Columns(name, "number", columns, values, keys=slices)
 
 
 def _components(name: str, info: inspect.Type) -> list[str]:
@@ -284,10 +288,10 @@ class TableSurvey:
             self.rows[self.kinds.get(key)] += counts[key]
         opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
         self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # names in the open fields of all messages
-            kind: {field: {} for field in opens} for kind, opens in opened.items()
+            kind: {field: {} for field in open_kinds} for kind, open_kinds in opened.items()
         }
-        wanted = [key for key, kind in self.kinds.items() if opened[kind]]
-        for recorded in selection.messages(reader, wanted) if wanted else ():
+        open_keys = [key for key, kind in self.kinds.items() if opened[kind]]
+        for recorded in selection.messages(reader, open_keys) if open_keys else ():
             if (message := decode_or_none(recorded)) is not None:
                 for field, open_kind in opened[type(message)].items():
                     names = message.names if open_kind == "named" else getattr(message, field)
@@ -305,8 +309,8 @@ class TableSurvey:
 
     def rows_within(self, kind: type[Struct]) -> int:
         """Return the number of messages of a type within the times, by reading them all."""
-        wanted = [key for key, of in self.kinds.items() if of is kind]
-        return sum(1 for _ in self._selection.messages(self._reader, wanted))
+        matching_keys = [key for key, key_kind in self.kinds.items() if key_kind is kind]
+        return sum(1 for _ in self._selection.messages(self._reader, matching_keys))
 
     def decode(self, recorded: Recorded) -> Any:
         """Return the message, a Foreign if its key is not in the contract; None if it does not match its key's type."""
@@ -353,11 +357,18 @@ def batches(
         name, rows = subject(recorded.key), [message]
         if isinstance(message, Sightings):
             source = message.source or ("world" if keys.is_sensor(recorded.key) else "")
-            head = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
+            common_fields = (message.t_ns, message.seq, message.t_sample_ns, source, message.camera, len(message.seen))
             rows = [
-                Sighting(*head, hat, seen.direction_B, seen.range_m, seen.sigma_direction_rad, seen.sigma_range_m)
-                for hat, seen in enumerate(message.seen)
-            ] or [Sighting(*head)]
+                Sighting(
+                    *common_fields,
+                    hat,
+                    sighting.direction_B,
+                    sighting.range_m,
+                    sighting.sigma_direction_rad,
+                    sighting.sigma_range_m,
+                )
+                for hat, sighting in enumerate(message.seen)
+            ] or [Sighting(*common_fields)]
         for row in rows:
             kind = type(row)
             only = name if by_name and kind is not Foreign else ""  # foreign names may be invalid as file names

@@ -61,14 +61,14 @@ def convert(
     reader: RecordReader, selection: MessageSelection, path: Path, progress: Callable[[int, int], None]
 ) -> ConvertedRun:
     """Write the MCAP file; return its content. `progress` is called with the number of messages read and the total."""
-    wanted = [key for key in selection.keys(reader) if messages.type_of(key) in DRAWN or key == keys.INFO]
-    total = sum(reader.topics()[key] for key in wanted)
+    selected_keys = [key for key in selection.keys(reader) if messages.type_of(key) in DRAWN or key == keys.INFO]
+    total = sum(reader.topics()[key] for key in selected_keys)
     recorded = reader.last(keys.INFO)
     info = decode_or_none(recorded) if recorded else None
     search_modules(reader.path, info)
     scenario = scenario_of(info)
-    decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
-    rotors = _rotors(info, scenario, dict.fromkeys(subject(key) for key in wanted if key.startswith("drone/")))
+    decoded = DecodedMessages(selection.messages(reader, selected_keys), _decode, lambda done: progress(done, total))
+    rotors = _rotors(info, scenario, dict.fromkeys(subject(key) for key in selected_keys if key.startswith("drone/")))
     spaces: dict[str, ClusterSpace] = {}
     if scenario:
         for cluster in scenario.clusters:
@@ -77,7 +77,7 @@ def convert(
     file = FoxgloveFile(path, rotors, spaces)
     with deferred_signals() as check:
         try:
-            for instant in chain(_cameras_before(reader, selection, wanted), _instants(decoded)):
+            for instant in chain(_cameras_before(reader, selection, selected_keys), _instants(decoded)):
                 file.write(instant)
                 check()
         finally:
@@ -96,21 +96,21 @@ def deferred_signals() -> Iterator[Callable[[], None]]:
 
     An exception that their handlers raise within a call into the Foxglove library would be printed, then lost.
     """
-    came: list[int] = []
+    pending: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
-    former = {number: handler for number in numbers if callable(handler := signal.getsignal(number))}
+    previous = {number: handler for number in numbers if callable(handler := signal.getsignal(number))}
 
     def check() -> None:
-        if came:
-            number = came.pop(0)
-            former[signal.Signals(number)](number, None)
+        if pending:
+            number = pending.pop(0)
+            previous[signal.Signals(number)](number, None)
 
-    for number in former:
-        signal.signal(number, lambda signum, _: came.append(signum))
+    for number in previous:
+        signal.signal(number, lambda signum, _: pending.append(signum))
     try:
         yield check
     finally:
-        for number, handler in former.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
     check()
 
@@ -125,12 +125,12 @@ def _rotors(info: Info | None, scenario: Scenario | None, present: Mapping[str, 
     If `world/info` does not give a drone's rotors, they are assumed to form a cross.
     """
     arms_m = {drone.name: drone.arm_m for drone in scenario.drones} if scenario else {}
-    named = {drone.name: drone.rotors for drone in info.drones} if info else {}
+    rotors_by_drone = {drone.name: drone.rotors for drone in info.drones} if info else {}
     rotors = {}
     for name in sorted(present, key=list({**arms_m, **present}).index):
         arm_m = arms_m.get(name, ARM_M)
         cross = [RotorDisc(rotor.x_m, rotor.y_m, ROTOR_RADIUS * arm_m) for rotor in cross_layout(arm_m)]
-        rotors[name] = [RotorDisc(each.x_m, each.y_m, each.radius_m) for each in named.get(name, ())] or cross
+        rotors[name] = [RotorDisc(each.x_m, each.y_m, each.radius_m) for each in rotors_by_drone.get(name, ())] or cross
     return rotors
 
 
@@ -151,8 +151,8 @@ class Instant:
 
 def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
     """Group messages, given in order of time, by time; `world/info` is left out."""
-    drawn = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
-    for t_ns, group in groupby(drawn, key=lambda pair: pair[1].t_ns):
+    decoded_messages = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
+    for t_ns, group in groupby(decoded_messages, key=lambda pair: pair[1].t_ns):
         instant = Instant(t_ns)
         newest: dict[type, dict[str, Any]] = {
             Truth: instant.truth,
@@ -177,13 +177,13 @@ def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
 def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: Iterable[str]) -> Iterator[Instant]:
     """Yield the latest calibrations from before the selected times, as cameras may publish them only once."""
     from_ns = round((selection.from_s or 0.0) * 1e9)
-    of_cameras = [key for key in wanted if messages.type_of(key) is CameraInfo]
-    known: dict[str, CameraInfo] = {}
-    for recorded in reader.messages(of_cameras) if from_ns and of_cameras else ():
+    camera_keys = [key for key in wanted if messages.type_of(key) is CameraInfo]
+    calibrations: dict[str, CameraInfo] = {}
+    for recorded in reader.messages(camera_keys) if from_ns and camera_keys else ():
         if recorded.t_ns < from_ns and (info := _decode(recorded)) is not None:
-            known[recorded.key] = msgspec.structs.replace(info, t_ns=from_ns)
-    if known:
-        yield Instant(from_ns, cameras=list(known.items()))
+            calibrations[recorded.key] = msgspec.structs.replace(info, t_ns=from_ns)
+    if calibrations:
+        yield Instant(from_ns, cameras=list(calibrations.items()))
 
 
 class FoxgloveFile:
@@ -256,12 +256,12 @@ class FoxgloveFile:
         self._write_scene(instant)
 
     def _write_drone(self, instant: Instant, name: str) -> None:
-        at, t_ns = build.timestamp(instant.t_ns), instant.t_ns
+        stamp, t_ns = build.timestamp(instant.t_ns), instant.t_ns
         truth, estimate = instant.truth.get(name), instant.estimates.get(name)
         for topic, state in ((f"/drone/{name}/pose", truth), (f"/drone/{name}/estimate", estimate)):
             if state is not None:
                 placed = build.pose(state.position_m, state.orientation_wxyz)
-                message = PoseInFrame(timestamp=at, frame_id=build.WORLD, pose=placed)
+                message = PoseInFrame(timestamp=stamp, frame_id=build.WORLD, pose=placed)
                 self._log(topic, channels.PoseInFrameChannel, message, t_ns)
         status = self._status.get(name)
         values = build.drone_numbers(truth, estimate, status)
@@ -271,7 +271,7 @@ class FoxgloveFile:
     def _write_cluster(self, instant: Instant, name: str, state: ClusterState) -> None:
         if name not in self.variables:
             tidied = [build.tidy(each) for each in state.names]
-            fields = [f"{what}_{each}" for what in ("desired", "estimated", "true") for each in tidied]
+            fields = [f"{source}_{each}" for source in ("desired", "estimated", "true") for each in tidied]
             kind = NumericMessageType(f"Cluster_{build.tidy(name)}", [*fields, "margin"], ("phase", "reason"))
             self.variables[name] = kind
         numbers = self.variables[name]
@@ -291,15 +291,15 @@ class FoxgloveFile:
         if truth and self._is_due(TRAILS, t_ns, TRAIL_STEP_NS):
             self._log(TRAILS, channels.SceneUpdateChannel, self._trails.update(t_ns, truth, self._colours), t_ns)
         if truth and self._is_due(POINTS, t_ns):
-            places = [(state.position_m, self._colours.get(d, GREY)) for d, state in truth.items()]
-            self._log(POINTS, channels.PointCloudChannel, build.points(t_ns, places), t_ns)
+            points = [(state.position_m, self._colours.get(d, GREY)) for d, state in truth.items()]
+            self._log(POINTS, channels.PointCloudChannel, build.points(t_ns, points), t_ns)
         if instant.states and self._is_due(FORMATIONS, t_ns):
             desired = {c: m for c, state in instant.states.items() if (m := self._places(c, state)) is not None}
             scene = build.formations(t_ns, instant.states, truth, desired)
             self._log(FORMATIONS, channels.SceneUpdateChannel, scene, t_ns)
             if desired:
-                places = [(place, MAGENTA) for each in desired.values() for place in each.tolist()]
-                self._log(DESIRED, channels.PointCloudChannel, build.points(t_ns, places), t_ns)
+                points = [(position, MAGENTA) for each in desired.values() for position in each.tolist()]
+                self._log(DESIRED, channels.PointCloudChannel, build.points(t_ns, points), t_ns)
         if instant.estimates and self._is_due(ESTIMATES, t_ns):
             scene = build.ellipsoids(t_ns, instant.estimates, self._colours)
             self._log(ESTIMATES, channels.SceneUpdateChannel, scene, t_ns)
@@ -335,8 +335,8 @@ class FoxgloveFile:
 
 def _camera_of(key: str) -> tuple[str, str]:
     """Return a camera's drone and frame from its key; in the frame, x points right in the picture, y down, z ahead."""
-    _, drone, what = keys.parts(key)
-    return drone, f"{build.frame(drone)}/{what.split('/')[1]}_camera"
+    _, drone, leaf = keys.parts(key)
+    return drone, f"{build.frame(drone)}/{leaf.split('/')[1]}_camera"
 
 
 class CheckedFile:
@@ -351,18 +351,18 @@ class CheckedFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb")
         self._failure: OSError | None = None
-        self._at = self._end = 0  # position and end of the file as the library sees them
+        self._position = self._end = 0  # position and end of the file as the library sees them
 
     def write(self, data: bytes | bytearray) -> int:
         self._try(self._file.write, data)
-        self._at += len(data)
-        self._end = max(self._end, self._at)
+        self._position += len(data)
+        self._end = max(self._end, self._position)
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
         self._try(self._file.seek, offset, whence)
-        self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._end}[whence]
-        return self._at
+        self._position = offset + {SEEK_SET: 0, SEEK_CUR: self._position, SEEK_END: self._end}[whence]
+        return self._position
 
     def flush(self) -> None:
         self._try(self._file.flush)
@@ -380,9 +380,9 @@ class CheckedFile:
         finally:
             self.check()
 
-    def _try(self, act: Callable[..., object], *args: Any) -> None:
+    def _try(self, operation: Callable[..., object], *args: Any) -> None:
         if self._failure is None:
             try:
-                act(*args)
+                operation(*args)
             except OSError as error:
                 self._failure = error

@@ -57,13 +57,13 @@ class NumericMessageType:
         self.name = f"{PACKAGE}.{name}"
         self.numbers = tuple(numbers)
         self._number_keys = [_key(tag, _EIGHT) for tag in range(1, len(numbers) + 1)]
-        self._text_keys = [_key(len(numbers) + place, _BYTES) for place in range(1, len(texts) + 1)]
+        self._text_keys = [_key(len(numbers) + index, _BYTES) for index in range(1, len(texts) + 1)]
         fields = [*((each, _DOUBLE) for each in numbers), *((each, _STRING) for each in texts)]
         described = b""
         for number, (field, kind) in enumerate(fields, start=1):  # one FieldDescriptorProto each
             counted = ((3, number), (4, _OPTIONAL), (5, kind))
-            rest = b"".join(_key(tag, 0) + _varint(value) for tag, value in counted)
-            described += _bytes(2, _bytes(1, field.encode()) + rest)
+            number_keys = b"".join(_key(tag, 0) + _varint(value) for tag, value in counted)
+            described += _bytes(2, _bytes(1, field.encode()) + number_keys)
         file = (
             _bytes(1, f"{PACKAGE}/{name}.proto".encode())
             + _bytes(2, PACKAGE.encode())
@@ -187,8 +187,8 @@ def location_fix(gps: Gps, drone: str, tint: str) -> fox.LocationFix:
 
 
 def compressed_image(image: CameraImage, frame_id: str) -> fox.CompressedImage:
-    at = timestamp(max(0, image.t_sample_ns))
-    return fox.CompressedImage(timestamp=at, frame_id=frame_id, data=image.data, format=image.format)
+    stamp = timestamp(max(0, image.t_sample_ns))
+    return fox.CompressedImage(timestamp=stamp, frame_id=frame_id, data=image.data, format=image.format)
 
 
 def camera_calibration(info: CameraInfo, frame_id: str) -> fox.CameraCalibration:
@@ -270,7 +270,7 @@ def arm_of(discs: Iterable[RotorDisc]) -> float:
 
 def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> fox.SceneUpdate:
     """Return all drones, each in its own frame, so that one message suffices; `rotors` are by drone."""
-    at, entities = timestamp(t_ns), []
+    stamp, entities = timestamp(t_ns), []
     for name, mark in colours_of(rotors).items():
         discs = rotors[name]
         arm_m = arm_of(discs)
@@ -287,7 +287,7 @@ def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> fox.SceneUpd
         look = {"billboard": True, "font_size": 12.0, "scale_invariant": True, "color": colour(mark)}
         label = fox.TextPrimitive(pose=pose((0, 0, 2 * arm_m)), text=name, **look)
         parts: dict[str, Any] = {"cubes": cubes, "cylinders": cylinders, "lines": [arms], "texts": [label]}
-        entities.append(fox.SceneEntity(timestamp=at, id=name, frame_id=frame(name), frame_locked=True, **parts))
+        entities.append(fox.SceneEntity(timestamp=stamp, id=name, frame_id=frame(name), frame_locked=True, **parts))
     return fox.SceneUpdate(entities=entities)
 
 
@@ -303,33 +303,33 @@ def formations(
     t_ns: int, states: Mapping[str, ClusterState], truth: Mapping[str, Truth], desired_m: Mapping[str, Values]
 ) -> fox.SceneUpdate:
     """Return the outline of each cluster's drones, and ghosts at their desired positions (n, 3), where known."""
-    at, entities = timestamp(t_ns), []
+    stamp, entities = timestamp(t_ns), []
     for name, state in states.items():
         lines, ghosts = [], []
-        places = [truth[drone].position_m for drone in state.drones if drone in truth]
-        if len(places) > 1:
-            lines.append(_line(places, colour(DARK), fox.LinePrimitiveLineType.LineLoop))
+        positions = [truth[drone].position_m for drone in state.drones if drone in truth]
+        if len(positions) > 1:
+            lines.append(_line(positions, colour(DARK), fox.LinePrimitiveLineType.LineLoop))
         if name in desired_m:
             lines.append(_line(desired_m[name], colour(MAGENTA, 0.6), fox.LinePrimitiveLineType.LineLoop))
             ghosts = [
-                fox.SpherePrimitive(pose=pose(place), size=vector((0.5, 0.5, 0.2)), color=colour(MAGENTA, 0.3))
-                for place in desired_m[name]
+                fox.SpherePrimitive(pose=pose(position), size=vector((0.5, 0.5, 0.2)), color=colour(MAGENTA, 0.3))
+                for position in desired_m[name]
             ]
-        entities.append(_entity(at, name, lines=lines, spheres=ghosts))
+        entities.append(_entity(stamp, name, lines=lines, spheres=ghosts))
     return fox.SceneUpdate(entities=entities)
 
 
 def ellipsoids(t_ns: int, estimates: Mapping[str, Estimate], colours: Mapping[str, str]) -> fox.SceneUpdate:
     """Return ellipsoids of SIGMAS standard deviations around the estimated positions."""
-    at, entities = timestamp(t_ns), []
+    stamp, entities = timestamp(t_ns), []
     for name, estimate in estimates.items():
         sigma_m, axes = principal_axes(np.array(estimate.covariance).reshape(6, 6)[:3, :3])
-        shown = fox.SpherePrimitive(
+        ellipsoid = fox.SpherePrimitive(
             pose=pose(estimate.position_m, axes),
             size=vector([2.0 * SIGMAS * each for each in sigma_m]),
             color=colour(colours.get(name, GREY), 0.25),
         )
-        entities.append(_entity(at, name, spheres=[shown]))
+        entities.append(_entity(stamp, name, spheres=[ellipsoid]))
     return fox.SceneUpdate(entities=entities)
 
 
@@ -341,12 +341,12 @@ class DroneTrails:
         self._length = round(TRAIL_S * 1e9) // TRAIL_STEP_NS + 1
 
     def update(self, t_ns: int, truth: Mapping[str, Truth], colours: Mapping[str, str]) -> fox.SceneUpdate:
-        at, entities = timestamp(t_ns), []
+        stamp, entities = timestamp(t_ns), []
         for name, state in truth.items():
             path = self._paths.setdefault(name, deque(maxlen=self._length))
             path.append(state.position_m)
             trail = _line(path, colour(colours.get(name, GREY), 0.7), fox.LinePrimitiveLineType.LineStrip)
-            entities.append(_entity(at, name, lines=[trail]))
+            entities.append(_entity(stamp, name, lines=[trail]))
         return fox.SceneUpdate(entities=entities)
 
 
@@ -363,5 +363,5 @@ def _line(
     return fox.LinePrimitive(type=kind, pose=pose((0, 0, 0)), points=corners, **look)
 
 
-def _entity(at: fox.Timestamp, name: str, **parts: Any) -> fox.SceneEntity:
-    return fox.SceneEntity(timestamp=at, id=name, frame_id=WORLD, **parts)
+def _entity(stamp: fox.Timestamp, name: str, **parts: Any) -> fox.SceneEntity:
+    return fox.SceneEntity(timestamp=stamp, id=name, frame_id=WORLD, **parts)

@@ -69,7 +69,7 @@ def export(
     out: Path | None = None,
     selection: MessageSelection | None = None,
     force: bool = False,
-    progress: Progress = lambda done, of: None,
+    progress: Progress = lambda done, total: None,
     by_name: bool = False,
 ) -> ExportResult:
     """Write the record of a run in the format of another tool, completely or not at all.
@@ -104,7 +104,7 @@ def _tables(
     total = sum(survey.rows.values())
     messages = selection.messages(reader, survey.wanted)
     decoded = DecodedMessages(messages, survey.decode, lambda done: progress(done, total))
-    with placed(target) as (new,):
+    with staged_outputs(target) as (new,):
         if form is not Format.MAT:
             new.mkdir()
         with MatFile(new, survey) if form is Format.MAT else TableFolder(new, form.value, survey) as sink:
@@ -138,11 +138,11 @@ def _foxglove(
     from zsim_analysis.export import viewers
     from zsim_analysis.export.foxglove_file import convert
 
-    beside = (target.with_name(f"{target.stem}{LAYOUT}"), target.with_suffix(BLUEPRINT))
-    targets = (target, *(beside if viewers.has_rerun() else beside[:1]))
+    companions = (target.with_name(f"{target.stem}{LAYOUT}"), target.with_suffix(BLUEPRINT))
+    targets = (target, *(companions if viewers.has_rerun() else companions[:1]))
     for path in targets:
         check_free(path, force, reader.path)
-    with placed(*targets) as (new, new_layout, *new_blueprint):
+    with staged_outputs(*targets) as (new, new_layout, *new_blueprint):
         run = convert(reader, selection, new, progress)
         if not run.topics:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
@@ -182,8 +182,8 @@ def check_free(target: Path, force: bool, record: Path) -> None:
     if target.is_dir():
         try:
             tables = json.loads((target / MANIFEST).read_bytes())["tables"].keys()
-            others = {path.name for path in target.iterdir()} - {MANIFEST, *tables}
-            other = f"it contains {min(others)}" if others else ""
+            unexpected = {path.name for path in target.iterdir()} - {MANIFEST, *tables}
+            other = f"it contains {min(unexpected)}" if unexpected else ""
         except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
             other = f"it has no {MANIFEST}"
         if other:
@@ -204,7 +204,7 @@ def check_free(target: Path, force: bool, record: Path) -> None:
 
 
 @contextmanager
-def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
+def staged_outputs(*targets: Path) -> Iterator[tuple[Path, ...]]:
     """Yield a temporary path for each file or folder to be written; at the end, move them to their targets together.
 
     Existing targets are replaced: call `check_free` first.
@@ -279,8 +279,8 @@ class TableFolder:
         # messages never contain NaN, so NaN marks a missing value
         rows = [pa.array(values, _TYPES[kind], from_pandas=True) for _, kind, values in column_values(table, batch)]
         self._sinks[file].write(pa.RecordBatch.from_arrays(rows, schema=schema))
-        before = self._written[file].rows if file in self._written else 0
-        self._written[file] = WrittenTable(file, before + len(batch.names), schema.names)
+        rows_before = self._written[file].rows if file in self._written else 0
+        self._written[file] = WrittenTable(file, rows_before + len(batch.names), schema.names)
 
     def finish(self) -> list[WrittenTable]:
         self._stack.close()
@@ -315,21 +315,21 @@ class _Parquet:
     def __init__(self, file: BinaryIO, schema: pa.Schema) -> None:
         self._schema = schema
         self._writer = pq.ParquetWriter(file, schema, compression="zstd")
-        self._held: list[pa.RecordBatch] = []
+        self._buffered: list[pa.RecordBatch] = []
 
     def write(self, batch: pa.RecordBatch) -> None:
-        self._held.append(batch)
-        if sum(each.num_rows for each in self._held) >= ROW_GROUP:
+        self._buffered.append(batch)
+        if sum(each.num_rows for each in self._buffered) >= ROW_GROUP:
             self._flush()
 
     def close(self) -> None:
-        if self._held:
+        if self._buffered:
             self._flush()
         self._writer.close()
 
     def _flush(self) -> None:
-        self._writer.write_table(pa.Table.from_batches(self._held, self._schema))
-        self._held = []
+        self._writer.write_table(pa.Table.from_batches(self._buffered, self._schema))
+        self._buffered = []
 
 
 # MAT-file Level 5, https://www.mathworks.com/help/pdf_doc/matlab/matfile_format.pdf, which MATLAB and Octave load

@@ -90,9 +90,9 @@ def layout(run: foxglove_file.ConvertedRun) -> str:
     states = [(_path(f"/cluster/{name}/variables", "phase"), name) for name in run.variables]
     tabs = []
     for cluster, plots in variable_plots(run.variables).items():
-        before = f"{cluster}: " if len(run.variables) > 1 else ""
+        prefix = f"{cluster}: " if len(run.variables) > 1 else ""
         for group in (plots[i : i + TAB] for i in range(0, len(plots), TAB)):
-            title = before + ", ".join(name for name, _ in group)
+            title = prefix + ", ".join(name for name, _ in group)
             panels = [_plot(name, curves, coloured=True) for name, curves in group]
             tabs.append(layouts.TabItem(title=title, content=_column(*((1, panel) for panel in panels))))
     if plots := drone_plots(run.topics, dict(sorted(colours_of(run.rotors).items()))):

@@ -1,11 +1,12 @@
 function [c, sound] = forward(p_W, yaw)
-    % Return the cluster variables of three robots, and whether they have a frame.
+    % FORWARD Return the cluster variables of three robots.
     %
-    %   p_W    3 x 3, a robot a row [m]; yaw  3 x 1 [rad]
+    %   p_W    3 x 3, one robot per row [m];  yaw  3 x 1 [rad]
     %   c      12 x 1: x_c y_c z_c [m], roll pitch yaw phi_1 phi_2 phi_3 [rad], p q [m], beta [rad]
+    %   sound  whether the robots have a frame; if not, c is zero
     %
-    % The frame C has its origin at the centroid, x from the middle of robots 2 and 3 to robot 1, z along d2 x d3;
-    % robot 2 is on the left. Robots in line or in one place have none, and c is zero then.
+    % The frame C has its origin at the centroid, x from the midpoint of robots 2 and 3 to robot 1, and z along d2 x d3;
+    % robot 2 is on the left. Robots that are in line or at one point have no frame.
     c = zeros(12, 1);
     d2 = (p_W(2, :) - p_W(1, :)).';
     d3 = (p_W(3, :) - p_W(1, :)).';

@@ -1,14 +1,16 @@
 function [r_dot, guarded] = hold_apart(r_dot, p_W, v_W, separation_min_m, params)
-    % Return the robots' velocities with dangerous approaches taken out, and whether there were any.
+    % HOLD_APART Remove dangerous approaches from the robots' velocities.
     %
-    % Two robots at distance d are held to d' >= -(d_near - separation_min) / guard_horizon: the distance predicted over
-    % the horizon stays above the minimum, and below it the approach is reversed. d_near allows for the velocities that
-    % the robots have, which last for their response time. Each of a pair takes half of the change.
+    % The rate of the distance d of two robots is limited to d' >= -(d_near - separation_min) / guard_horizon, so the
+    % distance predicted over the horizon stays above the minimum, and below the minimum the robots separate. d_near
+    % accounts for the present velocities, which persist for the response time. Each robot of a pair takes half of the
+    % change.
     %
-    %   r_dot  12 x 1, robot by robot [m/s, rad/s];  p_W, v_W  3 x 3, a robot a row, estimates
-    SWEEPS = 4;  % one settles two robots, three in a corner need a few
-    NEAR_M = 1e-6;  % robots that are nearer have no direction from one to the other: they part eastwards
-    SETTLED_M_S = 1e-9;  % a rate that lacks less is reached
+    %   r_dot    12 x 1, robot by robot [m/s, rad/s];  p_W, v_W  3 x 3, one robot per row, estimates
+    %   guarded  whether there were dangerous approaches
+    SWEEPS = 4;  % one sweep suffices for two robots; three close to each other need a few
+    NEAR_M = 1e-6;  % closer robots have no direction from one to the other: they separate eastwards
+    SETTLED_M_S = 1e-9;  % a rate that is short by less counts as reached
     FROM = [1 1 2];
     TO = [2 3 3];
     lines = p_W(TO, :) - p_W(FROM, :);

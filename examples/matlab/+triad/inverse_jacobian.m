@@ -1,10 +1,11 @@
 function [J_inv, sound] = inverse_jacobian(c)
-    % Return J^-1 (12 x 12) with r_dot = J^-1 c_dot in closed form, and whether the shape has an extent.
+    % INVERSE_JACOBIAN Return J^-1 (12 x 12) with r_dot = J^-1 c_dot, in closed form.
     %
     %   r_dot  12 x 1: vx vy vz [m/s, W] and yaw rate [rad/s], robot by robot
+    %   sound  whether the shape has an extent
     %
-    % Robot i moves at v_c + R_WC (w_WC_C x place_i + the derivatives of its place by the shape times their rates),
-    % and turns at yaw' + phi_i'.
+    % Robot i moves at v_c + R_WC (w_WC_C x place_i + the derivatives of place_i with respect to p, q and beta times
+    % their rates), and turns at yaw' + phi_i'.
     J_inv = zeros(12, 12);
     [place_C, sound, cut] = triad.places(c(10), c(11), c(12));
     if ~sound
@@ -25,25 +26,27 @@ function [J_inv, sound] = inverse_jacobian(c)
 end
 
 function axes_C = euler_axes(roll, pitch)
-    % Return w_WC_C of a unit rate of roll, of pitch and of yaw, as columns.
+    % EULER_AXES Return w_WC_C for unit rates of roll, pitch and yaw, as columns.
     axes_C = [1, 0,          -sin(pitch)
               0, cos(roll),  sin(roll) * cos(pitch)
               0, -sin(roll), cos(roll) * cos(pitch)];
 end
 
 function S = skew(a)
-    % Return the matrix with S b = a x b.
+    % SKEW Return the matrix S with S b = a x b.
     S = [0, -a(3), a(2); a(3), 0, -a(1); -a(2), a(1), 0];
 end
 
 function rates_C = shape_rates(p, q, cut)
-    % Return the derivatives of the three places by p, q and beta, 3 x 9 by robot; the centroid stays.
+    % SHAPE_RATES Return the derivatives of the robots' places with respect to p, q and beta, 3 x 9, robot by robot.
+    %
+    % The centroid does not move.
     ca2 = cut(1);
     sa2 = cut(2);
     ca3 = cut(3);
     sa3 = cut(4);
     h = cut(5);
-    by_p = -sa2 / h;  % of the angle of robot 2; that of robot 3 turns the other way
+    by_p = -sa2 / h;  % derivatives of the angle of robot 2; robot 3's has the opposite sense
     by_q = sa3 / h;
     of_2 = [-ca2 + p * sa2 * by_p, p * sa2 * by_q, p * sa2 * q * ca3 / h
             sa2 + p * ca2 * by_p,  p * ca2 * by_q, p * ca2 * q * ca3 / h

@@ -1,8 +1,9 @@
 function [J, sound] = jacobian(p_W, yaw)  %#ok<INUSD>
-    % Return J (12 x 12) with c_dot = J r_dot, and whether the robots have a frame and a heading.
+    % JACOBIAN Return J (12 x 12) with c_dot = J r_dot.
     %
-    %   p_W    3 x 3, a robot a row [m]; yaw  3 x 1 [rad]
+    %   p_W    3 x 3, one robot per row [m];  yaw  3 x 1 [rad]
     %   r_dot  12 x 1: vx vy vz [m/s, W] and yaw rate [rad/s], robot by robot
+    %   sound  whether the robots have a frame and a heading
     J = zeros(12, 12);
     d2 = (p_W(2, :) - p_W(1, :)).';
     d3 = (p_W(3, :) - p_W(1, :)).';
@@ -13,8 +14,8 @@ function [J, sound] = jacobian(p_W, yaw)  %#ok<INUSD>
     x = R_WC(:, 1);
     y = R_WC(:, 2);
     z = R_WC(:, 3);
-    flat = hypot(x(1), x(2));  % cos of pitch
-    sound = flat > 1e-9;  % at 90 deg roll and yaw are one rotation
+    flat = hypot(x(1), x(2));  % cosine of the pitch
+    sound = flat > 1e-9;  % at a pitch of 90 deg, roll and yaw are the same rotation
     if ~sound
         return
     end
@@ -28,14 +29,14 @@ function [J, sound] = jacobian(p_W, yaw)  %#ok<INUSD>
 end
 
 function rates = body_rates(d2_x, d3_x, y, z, h, area)
-    % Return w_WC_C of the velocities of the three robots (3 x 9).
+    % BODY_RATES Return the matrix (3 x 9) from the velocities of the robots to w_WC_C.
     rates = [(d3_x - d2_x) * z / area, -d3_x * z / area, d2_x * z / area
              -2 * z / h,               z / h,            z / h
              2 * y / h,                -y / h,           -y / h];
 end
 
 function T = euler_rates(R_WC, cos_pitch)
-    % Return T (3 x 3) with (roll', pitch', yaw') = T w_WC_C.
+    % EULER_RATES Return T (3 x 3) with (roll', pitch', yaw') = T w_WC_C.
     sin_pitch = -R_WC(3, 1);
     roll = atan2(R_WC(3, 2), R_WC(3, 3));
     T = [1, sin(roll) * sin_pitch / cos_pitch, cos(roll) * sin_pitch / cos_pitch
@@ -44,7 +45,7 @@ function T = euler_rates(R_WC, cos_pitch)
 end
 
 function rows = triangle(d2, d3, z)
-    % Return the rows of J for p, q and beta (3 x 9).
+    % TRIANGLE Return the rows of J for p, q and beta (3 x 9).
     p = norm(d2);
     q = norm(d3);
     u2 = (d2 / p).';

@@ -1,5 +1,5 @@
 function fault = place_fault(c, params)
-    % Return why the robots may not stand where c puts them, as a number for triad.reason; 0: they may.
+    % PLACE_FAULT Return why the robots must not be at their positions in c, as a number for triad.reason; 0: they may.
     p_W = triad.robots(c);
     if triad.least_distance(p_W) < params.separation_min_m
         fault = 11;

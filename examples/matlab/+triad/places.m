@@ -1,7 +1,8 @@
 function [place_C, sound, cut] = places(p, q, beta)
-    % Return the places of the robots in the cluster frame, a robot a column (3 x 3) [m], and whether there is an axis.
+    % PLACES Return the positions of the robots in the cluster frame.
     %
-    %   cut  [cos a2, sin a2, cos a3, sin a3, h]: how -x_C cuts beta, a2 to robot 2 and a3 to robot 3, h = |d2 + d3| [m]
+    %   place_C  3 x 3, one robot per column [m];  sound  whether the x axis of the frame exists
+    %   cut      as triad.split_beta returns it
     cut = triad.split_beta(p, q, beta);
     sound = cut(5) > 0;
     from_1 = [[0; 0; 0], [-p * cut(1); p * cut(2); 0], [-q * cut(3); -q * cut(4); 0]];

@@ -1,12 +1,13 @@
 function [ramp, fault] = plan_ramp(c, c_dot, goal, t_s, over_s, params)
-    % Return the ramp from c, moving at c_dot, onto a goal (12 x 1 each), and why it may not be flown (0: it may).
+    % PLAN_RAMP Return the ramp from c, moving at c_dot, to a goal (12 x 1 each).
     %
-    %   over_s  how long it takes [s]; NaN: as fast as the limits let it
+    %   over_s  duration [s]; NaN: as fast as the limits allow
+    %   fault   why the ramp must not be flown, as a number for triad.reason; 0: it may
     %
-    % The goal and the way are checked: shape, distances, heights, and the robots' speeds.
+    % The goal and the path are checked for shape, distances, heights, and the robots' speeds.
     RAMP_MIN_S = 2;
     RAMP_MAX_S = 3600;
-    TOLERANCE = 1.02;  % of the share: ramps are sampled, and one may start at the limit
+    TOLERANCE = 1.02;  % factor of the share: ramps are sampled, and may start at the limit
     ramp = triad.rest(goal);
     ramp.start_s = t_s;
     ramp.offset = triad.difference(c, goal);
@@ -18,7 +19,7 @@ function [ramp, fault] = plan_ramp(c, c_dot, goal, t_s, over_s, params)
     ramp.over_s = RAMP_MIN_S;
     excess = peak_load(ramp, params) / params.share;
     while excess > TOLERANCE
-        ramp.over_s = ramp.over_s * max(min(excess, 10), 1.2);  % 1.2: least step of the search
+        ramp.over_s = ramp.over_s * max(min(excess, 10), 1.2);  % 1.2: smallest step of the search
         if ~(ramp.over_s <= RAMP_MAX_S)
             fault = 13;
             return
@@ -36,7 +37,7 @@ function [ramp, fault] = plan_ramp(c, c_dot, goal, t_s, over_s, params)
 end
 
 function fault = way_fault(ramp, params, tolerance)
-    % Return why the way may not be flown, sampled 41 to 301 times.
+    % WAY_FAULT Return why the path must not be flown, from 41 to 301 samples; 0: it may.
     SAMPLE_S = 0.5;  % at 2 m/s a robot moves 1 m between two samples
     count = min(max(ceil(ramp.over_s / SAMPLE_S) + 1, 41), 301);
     times_s = linspace(ramp.start_s, ramp.start_s + ramp.over_s, count);
@@ -62,7 +63,7 @@ function fault = fault_at(c, c_dot, params, tolerance)
 end
 
 function most = peak_load(ramp, params)
-    SAMPLES = 33;  % odd: one falls on the peak rate of a ramp, its middle
+    SAMPLES = 33;  % odd, so that one is at the middle of the ramp, where its rate is highest
     times_s = linspace(ramp.start_s, ramp.start_s + ramp.over_s, SAMPLES);
     most = 0;
     for k = 1:SAMPLES

@@ -1,8 +1,8 @@
 function [c, c_dot] = ramp_value(ramp, t_s)
-    % Return a reference and its rate (12 x 1 each) at t_s [s]; angles are continuous, not wrapped.
+    % RAMP_VALUE Return a reference and its rate (12 x 1 each) at t_s [s]; angles are continuous, not wrapped.
     %
-    % c = goal + the offset of the start, which a quintic takes to zero with its first and second derivative: from rest
-    % the minimum-jerk move. After over_s it stands at the goal.
+    % c is the goal plus the initial offset, which a quintic takes to zero together with its first and second
+    % derivatives; from rest, this is the minimum-jerk motion. After over_s the reference rests at the goal.
     c = ramp.goal;
     c_dot = zeros(12, 1);
     if t_s - ramp.start_s >= ramp.over_s

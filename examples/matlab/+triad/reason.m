@@ -1,5 +1,5 @@
 function text = reason(number)
-    % Return a fault in words, '' for 0.
+    % REASON Return the text of a fault; '' for 0.
     texts = { ...
         '', ...                                                                 % 0
         'a drone is in another state', ...                                      % 1

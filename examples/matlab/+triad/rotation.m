@@ -1,5 +1,5 @@
 function R_WC = rotation(roll, pitch, yaw)
-    % Return R_WC = Rz(yaw) Ry(pitch) Rx(roll).
+    % ROTATION Return R_WC = Rz(yaw) Ry(pitch) Rx(roll).
     sr = sin(roll);
     cr = cos(roll);
     sp = sin(pitch);

@@ -1,6 +1,6 @@
 function fault = shape_fault(c, spread_min_m, tilt_max_rad, condition_max)
-    % Return why c (12 x 1) is no formation to engage, to lead to or to fly, as a number for triad.reason; 0: it is one.
-    FAR = 1e6;  % m or rad: beyond it a value is a slip
+    % SHAPE_FAULT Return why c (12 x 1) is not a valid formation, as a number for triad.reason; 0: it is.
+    FAR = 1e6;  % m or rad: larger values are considered invalid
     inside = all(abs(c) < FAR) && abs(c(5)) < pi / 2 && c(10) > 0 && c(11) > 0 && c(12) > 0 && c(12) < pi;
     if ~inside
         fault = 7;

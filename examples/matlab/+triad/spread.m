@@ -1,4 +1,4 @@
 function spread_m = spread(c)
-    % Return sin(beta) min(p, q), the smallest height of the triangle [m]; 0 where the shape is singular.
+    % SPREAD Return sin(beta) min(p, q), the smaller height of the triangle on p and q [m]; 0 for a singular shape.
     spread_m = sin(c(12)) * min(c(10), c(11));
 end

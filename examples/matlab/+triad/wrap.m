@@ -1,4 +1,4 @@
 function angle = wrap(angle)
-    % Return angles [rad] taken to [-pi, pi].
+    % WRAP Return angles [rad] wrapped to [-pi, pi].
     angle = angle - 2 * pi * round(angle / (2 * pi));
 end

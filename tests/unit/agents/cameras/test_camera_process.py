@@ -19,11 +19,11 @@ from zsim.scenario import scenario_file
 from zsim_agents.cameras import camera_process
 from zsim_agents.cameras.camera_process import (
     PENDING_MAX,
-    REPORTS_MAX,
+    PRINTED_MAX,
     CameraProcess,
     DetectorProcess,
     TruthHistory,
-    standing,
+    stationary_truth,
 )
 from zsim_agents.cameras.detector import PIXELS_MAX
 from zsim_agents.cameras.renderer import Renderer
@@ -117,7 +117,7 @@ def test_a_gating_camera_draws_the_first_picture_despite_early_answers(
 PLACED = scenario_file.resolve(
     {"name": "t", "duration_s": 1, "drones": [{"name": "d2", "position_m": [7, 0, 0], "yaw_deg": 90}]}
 )
-STANDING = standing(PLACED.drones[0], 4)
+STANDING = stationary_truth(PLACED.drones[0], 4)
 
 
 def history(gates: int, span_gates: int = 5) -> TruthHistory:
@@ -260,7 +260,7 @@ def test_invalid_pictures_are_reported_only_a_few_times() -> None:
     detecting = Detecting()
     for _ in range(50):
         detecting.take((FRONT, image(0, data=NO_JPEG)))
-    assert (detecting.counted()[1], len(detecting.said)) == (50, REPORTS_MAX)
+    assert (detecting.counted()[1], len(detecting.said)) == (50, PRINTED_MAX)
 
 
 @pytest.mark.parametrize(

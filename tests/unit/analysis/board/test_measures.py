@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from zsim_agents.laws.pilot import polygon
-from zsim_analysis.board.measures import Flown, Wanted, lattice_errors, shape_errors
+from zsim_analysis.board.measures import DesiredTrack, FormationTrack, lattice_errors, shape_errors
 
 C = polygon(5, 3.0)
 T = np.arange(4.0)
@@ -22,7 +22,7 @@ def turned(c: NDArray[Any], degrees: float) -> NDArray[Any]:
 
 def error(p: NDArray[Any], *invariances: str) -> float:
     wanted = np.broadcast_to(C, (4, 5, 2))
-    flown = Flown(T, np.broadcast_to(p, (4, 5, 2)).copy(), Wanted(np.zeros((4, 2)), wanted, invariances))
+    flown = FormationTrack(T, np.broadcast_to(p, (4, 5, 2)).copy(), DesiredTrack(np.zeros((4, 2)), wanted, invariances))
     return float(shape_errors(flown)[0])
 
 

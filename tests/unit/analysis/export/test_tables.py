@@ -36,7 +36,7 @@ from zsim.record import RecordReader, RecordWriter
 from zsim.sensors.sensor import message_type
 from zsim_analysis.export import Format, make_export
 from zsim_analysis.export.columns import MessageSelection, Sighting, table_columns, table_name
-from zsim_analysis.export.make_export import export, matlab_names, placed
+from zsim_analysis.export.make_export import export, matlab_names, staged_outputs
 from zsim_deploy import arguments
 from zsim_deploy.cli.cli import app
 
@@ -283,7 +283,7 @@ def test_an_interrupt_while_an_export_is_put_in_place_changes_nothing(
         return target
 
     def put() -> None:
-        with placed(folder, file) as (new_folder, new_file):
+        with staged_outputs(folder, file) as (new_folder, new_file):
             new_folder.mkdir()
             new_file.write_text("new")
             monkeypatch.setattr(Path, "replace", interrupted)
@@ -296,7 +296,10 @@ def test_an_interrupt_while_an_export_is_put_in_place_changes_nothing(
 
 
 def test_a_target_whose_name_is_too_long_is_refused(tmp_path: Path) -> None:
-    with refused(ReportError, "written", os.strerror(errno.ENAMETOOLONG)), placed(tmp_path / ("x" * 300) / "csv"):
+    with (
+        refused(ReportError, "written", os.strerror(errno.ENAMETOOLONG)),
+        staged_outputs(tmp_path / ("x" * 300) / "csv"),
+    ):
         pass
 
 

@@ -188,8 +188,8 @@ def test_loss_is_measured_and_garbage_is_counted():
         loop.session.receive(0, cut, loop.now_ns)
         loop.session.receive(0, bytes(flipped), loop.now_ns)
         loop.session.receive(0, draw.bytes(50), loop.now_ns)
-    figures = loop.session.figures()
-    assert figures.loss_percent == pytest.approx(5, abs=2)
-    assert figures.refused == 900
-    assert figures.clock_offset_ms == pytest.approx(3000, abs=10)
+    quality = loop.session.link_quality()
+    assert quality.loss_percent == pytest.approx(5, abs=2)
+    assert quality.refused == 900
+    assert quality.clock_offset_ms == pytest.approx(3000, abs=10)
     assert loop.session.state == before

@@ -8,7 +8,7 @@ import pytest
 
 from zsim_bridges.ardrone import at_commands as at
 from zsim_bridges.ardrone.at_commands import (
-    KEPT_MAX,
+    CONFIGURATIONS_MAX,
     Configuration,
     ConfigurationError,
     format_configuration,
@@ -80,7 +80,7 @@ def test_levels_can_be_deleted(configuration: Configuration):
 
 
 def test_the_number_of_identifiers_is_limited(configuration: Configuration):
-    for k in range(1, KEPT_MAX):
+    for k in range(1, CONFIGURATIONS_MAX):
         configuration.set("custom:session_id", f"{k:08x}")
     with pytest.raises(ConfigurationError, match="delete some"):
         configuration.set("custom:session_id", "ffffffff")
@@ -146,8 +146,8 @@ COMMANDS = [
 
 @pytest.mark.parametrize(("value", "bits"), FLOATS.items())
 def test_a_float_is_encoded_as_the_integer_of_the_same_bits(value: float, bits: int):
-    assert at.bits_of_float(value) == bits
-    assert at.float_of_bits(bits) == struct.unpack("<f", struct.pack("<f", value))[0]
+    assert at.float_to_bits(value) == bits
+    assert at.bits_to_float(bits) == struct.unpack("<f", struct.pack("<f", value))[0]
 
 
 def test_commands_are_encoded_as_in_the_developer_guide():

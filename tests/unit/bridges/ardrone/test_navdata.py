@@ -50,9 +50,9 @@ def test_a_packed_option_is_unpacked_unchanged(tag: int):
 def test_a_template_gives_the_same_packet_as_packing():
     template = NavdataTemplate(FULL_TAGS)
     for tag in FULL_TAGS:
-        template.filler(tag)(*LAYOUTS[tag].flat(counted(tag)))
-    template.filler(26)(77)
-    template.filler(GPS_TAG)(1, 2, 3)  # GPS is not in the template
+        template.option_writer(tag)(*LAYOUTS[tag].flat(counted(tag)))
+    template.option_writer(26)(77)
+    template.option_writer(GPS_TAG)(1, 2, 3)  # GPS is not in the template
     expected = [(tag, counted(tag) if tag != 26 else (77,)) for tag in FULL_TAGS]
     assert template.packet(5, 6, 0) == navdata.pack(5, 6, 0, expected)
 
@@ -106,7 +106,7 @@ def test_corrupt_packets_raise_no_other_error():
 def test_pyardrone_reads_every_number_of_every_option():
     template = NavdataTemplate(FULL_TAGS)
     for tag in FULL_TAGS:
-        template.filler(tag)(*LAYOUTS[tag].flat(counted(tag)))
+        template.option_writer(tag)(*LAYOUTS[tag].flat(counted(tag)))
     read = pyardrone_reads("navdata", template.packet(int(StateBit.FLYING), 12, 1))
     assert read.pop("metadata") == [navdata.MAGIC, 1, 12, 1]
     assert len(read.pop("cks")) == 1

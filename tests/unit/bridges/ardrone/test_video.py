@@ -13,8 +13,8 @@ from zsim.contract.flight_messages import CameraImage
 from zsim_bridges.ardrone import video
 from zsim_bridges.ardrone.ardrone_server import AllowedHosts, VideoServer
 from zsim_bridges.ardrone.video import (
-    IDR_EVERY,
     IDR_FRAME,
+    IDR_INTERVAL,
     P_FRAME,
     VideoEncoder,
     VideoError,
@@ -69,7 +69,7 @@ def shades(frames: list[bytes]) -> list[float]:
 
 def test_decoded_frames_have_the_brightness_of_the_pictures():
     encoder = VideoEncoder()
-    frames = [encoder.encode(jpeg(shade), begins=False) for shade in (40, 120, 200)]
+    frames = [encoder.encode(jpeg(shade), force_idr=False) for shade in (40, 120, 200)]
     assert [frame.is_idr for frame in frames if frame] == [True, False, False]
     brightness = shades([frame.data for frame in frames if frame])
     assert brightness[0] < brightness[1] < brightness[2]
@@ -77,9 +77,9 @@ def test_decoded_frames_have_the_brightness_of_the_pictures():
 
 def test_idr_frames_have_sps_and_pps_and_are_periodic_or_on_request():
     encoder = VideoEncoder()
-    frames = [encoder.encode(jpeg(100), begins=k == 5) for k in range(IDR_EVERY + 6)]
+    frames = [encoder.encode(jpeg(100), force_idr=k == 5) for k in range(IDR_INTERVAL + 6)]
     begins = [k for k, frame in enumerate(frames) if frame and frame.is_idr]
-    assert begins == [0, 5, IDR_EVERY + 5]
+    assert begins == [0, 5, IDR_INTERVAL + 5]
     for frame in frames:
         assert frame is not None
         assert (frame.sps_size > 0, frame.pps_size > 0) == (frame.is_idr, frame.is_idr)
@@ -89,7 +89,7 @@ def test_idr_frames_have_sps_and_pps_and_are_periodic_or_on_request():
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"\xff\xd8\xff" + bytes(500)])
 def test_an_unreadable_picture_is_refused(data: bytes):
     with pytest.raises(VideoError, match="readable JPEG"):
-        VideoEncoder().encode(data, begins=False)
+        VideoEncoder().encode(data, force_idr=False)
 
 
 class Header(NamedTuple):

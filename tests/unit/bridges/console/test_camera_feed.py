@@ -22,9 +22,9 @@ from zsim.errors import SessionError
 from zsim.sensors.camera import PictureError, frame_of
 from zsim_bridges.console.camera_feed import (
     AGE_MAX_NS,
-    ASKED_S,
     PICTURE_BYTES_MAX,
     RADIUS_MIN_PX,
+    REQUEST_EXPIRY_S,
     SIGHTINGS_KEPT,
     CameraFeed,
     check_picture,
@@ -89,7 +89,7 @@ class Run:
         self.say(keys.camera("drone1", name), msgspec.structs.replace(message, **changes))
 
     def watch(self, *cameras: str) -> None:
-        self.feed.ask(PAGE, cameras)
+        self.feed.request_pictures(PAGE, cameras)
         self.feed.update()
 
 
@@ -139,9 +139,9 @@ def test_only_cameras_watched_by_a_page_are_subscribed_to(run: Run):
 
 
 def test_subscriptions_end_when_pages_close_or_fall_silent(watched: Run):
-    watched.feed.ask("another", [FRONT])
+    watched.feed.request_pictures("another", [FRONT])
     watched.feed.release(PAGE)
-    for later_s, keys_left in ((ASKED_S - 0.1, {"drone/drone1/camera/front"}), (0.1, set())):
+    for later_s, keys_left in ((REQUEST_EXPIRY_S - 0.1, {"drone/drone1/camera/front"}), (0.1, set())):
         watched.wall_s += later_s
         watched.feed.update()
         assert watched.link.pictures() == keys_left

@@ -105,10 +105,10 @@ class Desk(ControlDesk):
 
     def __init__(self) -> None:
         self.wall_s = 100.0
-        self.told: list[tuple[int, str]] = []
-        super().__init__(["main"], lambda page, line: self.told.append((page, line)), lambda: self.wall_s)
+        self.notices: list[tuple[int, str]] = []
+        super().__init__(["main"], lambda page, line: self.notices.append((page, line)), lambda: self.wall_s)
         for page, role in ((4, "operator"), (7, "operator"), (9, "viewer")):
-            self.look(page, role, f"10.0.0.{page}")
+            self.record_poll(page, role, f"10.0.0.{page}")
 
     def holders(self) -> list[str]:
         return [each.holder for each in self.holdings(4, self.parts)]
@@ -137,16 +137,16 @@ def test_one_page_is_in_control_and_the_others_see_it(desk: Desk):
 
 def test_control_is_requested_and_granted_or_kept(desk: Desk):
     desk.use(4, "main")
-    desk.ask(7, "main")
-    assert [page for page, _ in desk.told] == [4]
+    desk.request(7, "main")
+    assert [page for page, _ in desk.notices] == [4]
     assert desk.refusal(7, "main")
     desk.answer(9, "main", granted=True)  # not in control, so without effect
     assert desk.holders() == [ONE, ""]
     desk.answer(4, "main", granted=False)
-    assert (desk.holders(), desk.told[-1][0]) == ([ONE, ""], 7)
+    assert (desk.holders(), desk.notices[-1][0]) == ([ONE, ""], 7)
     desk.answer(4, "main", granted=True)  # no request is pending
     assert desk.holders() == [ONE, ""]
-    desk.ask(7, "main")
+    desk.request(7, "main")
     desk.answer(4, "main", granted=True)
     assert desk.holders() == [TWO, ""]
     assert has_terms(desk.refusal(4, "main"), TWO)
@@ -155,21 +155,21 @@ def test_control_is_requested_and_granted_or_kept(desk: Desk):
 def test_a_lost_page_loses_the_parts_that_another_requests(desk: Desk):
     desk.use(4, "main")
     desk.use(4, RUN)
-    desk.ask(7, "main")
+    desk.request(7, "main")
     desk.wall_s += LOST_S
     desk.release_lost()
     assert desk.holders() == [ONE, ONE]
     desk.wall_s += 0.1
     desk.release_lost()
     assert desk.holders() == [TWO, ONE]
-    assert {page for page, _ in desk.told[-2:]} == {4, 7}
+    assert {page for page, _ in desk.notices[-2:]} == {4, 7}
     assert desk.holdings(7, [RUN])[0].silent_s > LOST_S  # the others see that it is silent
 
 
 def test_a_closed_page_releases_its_parts_to_the_requesting_page(desk: Desk):
     desk.use(4, "main")
     desk.use(4, RUN)
-    desk.ask(7, "main")
+    desk.request(7, "main")
     desk.close(4)
     assert desk.holders() == [TWO, ""]
     desk.close(7)
@@ -178,7 +178,7 @@ def test_a_closed_page_releases_its_parts_to_the_requesting_page(desk: Desk):
 
 def test_a_closed_page_is_not_granted_control(desk: Desk):
     desk.use(4, "main")
-    desk.ask(7, "main")
+    desk.request(7, "main")
     desk.close(7)
     desk.answer(4, "main", granted=True)
     assert desk.holders() == [ONE, ""]

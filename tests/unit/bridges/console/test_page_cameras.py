@@ -13,8 +13,8 @@ import synthetic_camera
 from zsim.math import frames
 from zsim_bridges.console.page_cameras import (
     DISTANCE_MIN_M,
-    FAR_M,
     OFFSET_M,
+    VISIBLE_MAX_M,
     CameraView,
     PageCameras,
     drone_index,
@@ -225,13 +225,13 @@ def test_a_closed_page_or_run_leaves_no_frustum(frustums: PageCameras, pages: li
 
 def test_a_click_is_returned_once_and_only_to_its_page(frustums: PageCameras, pages: list[Page], followed: Pages):
     frustums.click(2, "drone1")
-    assert frustums.take_click(pages[0].key) == ""
-    assert [frustums.take_click(pages[1].key) for _ in range(2)] == ["drone1", ""]
+    assert frustums.pop_click(pages[0].key) == ""
+    assert [frustums.pop_click(pages[1].key) for _ in range(2)] == ["drone1", ""]
 
     frustums.click(1, "drone1")
     followed.go(pages[0])
     frustums.click(1, "drone1")
-    assert frustums.take_click(pages[0].key) == ""
+    assert frustums.pop_click(pages[0].key) == ""
 
 
 @pytest.mark.parametrize(
@@ -359,7 +359,7 @@ NORTHWARDS = CameraView(np.zeros(3), np.array([0.0, 2.0, 0.0]), np.array([0.0, 0
         ((0.0, 5.0, -6.0), False),
         ((-9.0, 5.0, 0.0), False),
         ((0.0, -5.0, 0.0), False),  # behind
-        ((0.0, FAR_M + 1.0, 0.0), False),
+        ((0.0, VISIBLE_MAX_M + 1.0, 0.0), False),
     ],
 )
 def test_a_point_is_in_view_if_the_page_shows_it(p_W: tuple[float, float, float], seen: bool):

@@ -121,14 +121,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def test_existing_files_are_shown_with_their_sizes(tmp_path: Path) -> None:
     files = RunFiles(tmp_path)
     (tmp_path / "run.mcap").write_bytes(b"1234567")
-    shown = files.shown(PAGE, has_copies=False)
+    shown = files.state(PAGE, has_copies=False)
     assert not shown["leaves"]
     assert {name: each["size_bytes"] for name, each in shown["files"].items()} == {"report": None, "record": 7}
     assert shown["files"]["record"]["path"] == str(tmp_path / "run.mcap")
 
 
 def test_a_console_without_a_folder_shows_no_files() -> None:
-    assert RunFiles(None).shown(PAGE, has_copies=False) == {"files": {}, "leaves": False}
+    assert RunFiles(None).state(PAGE, has_copies=False) == {"files": {}, "leaves": False}
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_a_console_without_a_folder_shows_no_files() -> None:
         ({PAGE: False}, 5.0, None, 5.0),
         ({PAGE: True}, None, None, 0.0),
         ({PAGE: False}, 1e9, None, 20.0),  # never gets its copies
-        ({PAGE: False, "another page": True}, None, None, page_server.LOOKED_S),  # the other page was closed
+        ({PAGE: False, "another page": True}, None, None, page_server.POLL_TIMEOUT_S),  # the other page was closed
         ({"": False}, None, None, 0.0),  # not a page
         ({PAGE: False}, None, 1.0, 1.0),
     ],
@@ -153,19 +153,19 @@ def test_the_console_waits_until_open_pages_have_their_copies(
 ) -> None:
     files = RunFiles(tmp_path)
     for page, has_copies in looks.items():
-        assert not files.shown(page, has_copies)["leaves"]
+        assert not files.state(page, has_copies)["leaves"]
     if copied_s is not None:
-        clock.at_sleep = lambda: files.shown(PAGE, clock.now_s > 1000.0 + copied_s)  # type: ignore[func-returns-value]
-    files.offer(20.0, deserted=lambda: deserted_s is not None and clock.now_s > 1000.0 + deserted_s)
+        clock.at_sleep = lambda: files.state(PAGE, clock.now_s > 1000.0 + copied_s)  # type: ignore[func-returns-value]
+    files.offer(20.0, is_abandoned=lambda: deserted_s is not None and clock.now_s > 1000.0 + deserted_s)
     assert clock.now_s == pytest.approx(1000.0 + waited_s, abs=2 * page_server.POLL_S)
-    assert files.shown(PAGE, has_copies=True)["leaves"]
+    assert files.state(PAGE, has_copies=True)["leaves"]
 
 
 def test_the_number_of_known_pages_is_bounded(clock: Clock, tmp_path: Path) -> None:
     files = RunFiles(tmp_path)
-    for number in range(10 * page_server.LOOKS_MAX):
-        files.shown(f"page {number}", has_copies=False)
-    assert len(files._looked_s) == page_server.LOOKS_MAX
+    for number in range(10 * page_server.POLLING_PAGES_MAX):
+        files.state(f"page {number}", has_copies=False)
+    assert len(files._polled_s) == page_server.POLLING_PAGES_MAX
 
 
 def test_a_report_of_an_earlier_run_is_not_shown(tmp_path: Path) -> None:
@@ -173,9 +173,9 @@ def test_a_report_of_an_earlier_run_is_not_shown(tmp_path: Path) -> None:
     report.write_text("of another run")
     os.utime(report, (1.0, 1.0))
     files = RunFiles(tmp_path)
-    assert files.shown("", has_copies=False)["files"]["report"]["size_bytes"] is None
+    assert files.state("", has_copies=False)["files"]["report"]["size_bytes"] is None
     report.write_text("of this run")
-    assert files.shown("", has_copies=False)["files"]["report"]["size_bytes"] == len("of this run")
+    assert files.state("", has_copies=False)["files"]["report"]["size_bytes"] == len("of this run")
 
 
 CAMERA = msgspec.to_builtins(

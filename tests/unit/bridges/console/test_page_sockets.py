@@ -167,7 +167,7 @@ class Feed:
     def cameras(self) -> tuple[Any, ...]:
         return ((CAMERA, INFO),)
 
-    def ask(self, page: object, cameras: tuple[str, ...]) -> None:
+    def request_pictures(self, page: object, cameras: tuple[str, ...]) -> None:
         self.asked[page] = cameras
 
     def release(self, page: object) -> None:
@@ -222,7 +222,7 @@ class Page:
         self.clicked = [""]
         frustums: Any = SimpleNamespace(
             show_frustum=lambda *chosen: self.chosen.append(chosen),
-            take_click=lambda _: self.clicked.pop() if self.clicked else "",
+            pop_click=lambda _: self.clicked.pop() if self.clicked else "",
         )
         self.sockets = CameraSockets(lambda: self.feed, frustums)
 

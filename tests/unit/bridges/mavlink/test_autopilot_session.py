@@ -188,13 +188,13 @@ def test_the_first_or_the_requested_autopilot_is_accepted_and_no_other():
     stranger = Link(9, 1)
     loop.session.receive(0, stranger.pack(dialect.Heartbeat(2, PX4, 128, 0, 4, 3)), loop.now_ns)
     loop.session.receive(0, stranger.pack(dialect.LocalPositionNed(0, 50.0)), loop.now_ns)
-    assert loop.session.figures().refused == 2
+    assert loop.session.link_quality().refused == 2
     assert loop.pose.position_m[1] == pytest.approx(0.0)
     assert sum("system 9" in text for text in loop.session.texts) == 1
     session = AutopilotSession(UdpChannel("127.0.0.1", 1), ORIGIN, 2.0, system=3)
     for system in (1, 3):
         session.receive(0, Link(system, 1).pack(dialect.Heartbeat(2, PX4, 0, 0, 3, 3)), 0)
-    assert session.figures().refused == 1
+    assert session.link_quality().refused == 1
     assert session.state.received_ns == 0
 
 
@@ -209,23 +209,23 @@ def test_with_a_key_both_sides_must_sign(key: bytes, flies: bool):
     loop._parser = Parser(Signing(key))
     loop.run(8, Demand("take_off"))
     assert (loop.session.state.state == "hovering") is flies
-    assert (loop.session.figures().refused > 100) is not flies
+    assert (loop.session.link_quality().refused > 100) is not flies
 
 
 def test_message_loss_round_trip_and_clock_offset_are_measured():
     loop = Loop(PX4)
     loop.run(5)
-    figures = loop.session.figures()
-    assert figures.loss_percent == 0
-    assert figures.round_trip_ms == pytest.approx(20, abs=1)
-    assert figures.clock_offset_ms == pytest.approx(7000, abs=11)
+    quality = loop.session.link_quality()
+    assert quality.loss_percent == 0
+    assert quality.round_trip_ms == pytest.approx(20, abs=1)
+    assert quality.clock_offset_ms == pytest.approx(7000, abs=11)
     draw = np.random.default_rng(1)
     for _ in range(200):
         loop.now_ns += STEP_NS
         for datagram in loop.vehicle.step(loop.now_ns):
             if draw.random() > 0.1:
                 loop.session.receive(0, datagram, loop.now_ns)
-    assert loop.session.figures().loss_percent == pytest.approx(10, abs=4)
+    assert loop.session.link_quality().loss_percent == pytest.approx(10, abs=4)
 
 
 def test_garbage_is_counted_and_changes_nothing():
@@ -235,7 +235,7 @@ def test_garbage_is_counted_and_changes_nothing():
     for length in itertools.islice(itertools.cycle((1, 8, 40, 300)), 400):
         loop.session.receive(0, b"\xfd" + draw.bytes(length), loop.now_ns)
     assert loop.session.state == before
-    assert loop.session.figures().refused >= 400
+    assert loop.session.link_quality().refused >= 400
 
 
 # Axes and units

@@ -20,7 +20,7 @@ from zsim.transport.session import RawSample, ReceivedSample
 from zsim_bridges.ros1 import node as wire
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.ros1_bridge import Ros1Bridge
-from zsim_bridges.vehicle_links.server import WAITING_MAX, PictureIntake, TrafficIntake
+from zsim_bridges.vehicle_links.server import IMAGES_QUEUED_MAX, PictureIntake, TrafficIntake
 
 ZERO, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 OWN, ACTIVE = "/quad_1/ardrone/{}/{}", "/quad_1/ardrone/{}"
@@ -169,7 +169,7 @@ def test_a_slow_consumer_continues_with_the_newest_gates(monkeypatch: pytest.Mon
         health = HealthMeter("ros1")
         intake = TrafficIntake(link, about, health, asyncio.get_running_loop())
         await asyncio.to_thread(link.emptied.wait, 120.0)
-        await asyncio.wait_for(intake.news.wait(), 120.0)
+        await asyncio.wait_for(intake.arrival_event.wait(), 120.0)
         found = list(intake.arrivals())
         intake.close()
         return found, health
@@ -205,7 +205,7 @@ def test_togglecam_switches_the_active_camera_back_and_forth() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
     for _ in range(2):
-        assert drone.node.services["/quad_1/ardrone/togglecam"].act() is None
+        assert drone.node.services["/quad_1/ardrone/togglecam"].action() is None
         for camera in ("front", "bottom"):
             drone.topics.cameras.publish(camera, image(0))
     frames = [message.header.frame_id for message in subscribers[ACTIVE.format(IMAGE)].ros_messages]
@@ -215,7 +215,7 @@ def test_togglecam_switches_the_active_camera_back_and_forth() -> None:
 def test_camera_info_comes_with_each_picture_and_its_stamp() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
-    drone.topics.cameras.learn("front", info())
+    drone.topics.cameras.store_info("front", info())
     for number in (1, 2):
         drone.topics.cameras.publish("front", image(number * GATE_NS))
     got = subscribers[OWN.format("front", INFO)].ros_messages
@@ -230,7 +230,7 @@ def test_camera_info_comes_with_each_picture_and_its_stamp() -> None:
 def test_the_cameras_are_in_the_frame_tree() -> None:
     drone = Drone()
     tf = drone.subscriber("/tf")
-    drone.topics.cameras.learn("front", info())
+    drone.topics.cameras.store_info("front", info())
     drone.deliver(status(0))
     (found,) = [t for t in tf.ros_messages[0].transforms if t.child_frame_id == "quad_1/ardrone_base_frontcam"]
     assert found.header.frame_id == "quad_1/ardrone_base_link"
@@ -278,12 +278,12 @@ def test_a_busy_event_loop_gets_the_newest_pictures() -> None:
     async def look() -> None:
         loop = asyncio.get_running_loop()
         intake = PictureIntake(link, loop, lambda key, payload: received.append(messages.decode(key, payload).seq))
-        for number in range(3 * WAITING_MAX):
+        for number in range(3 * IMAGES_QUEUED_MAX):
             intake._on_picture(RawSample("PUT", FRONT, messages.encode(image(0, number)), "", None))
         await asyncio.sleep(0)
 
     asyncio.run(look())
-    assert received == list(range(2 * WAITING_MAX, 3 * WAITING_MAX))
+    assert received == list(range(2 * IMAGES_QUEUED_MAX, 3 * IMAGES_QUEUED_MAX))
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", messages.encode(image(0, 0, NO_JPEG))])

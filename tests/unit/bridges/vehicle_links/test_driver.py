@@ -34,7 +34,7 @@ from zsim_bridges.vehicle_links.vehicle_session import (
     AircraftReadings,
     AircraftState,
     Demand,
-    LinkFigures,
+    LinkQuality,
     Reading,
     UdpChannel,
     VehicleSession,
@@ -71,8 +71,8 @@ class Session(VehicleSession):
     def advance(self, now_ns: int, demand: Demand) -> Iterator[tuple[int, bytes]]:
         yield 0, demand.action.encode()
 
-    def figures(self) -> LinkFigures:
-        return LinkFigures(loss_percent=1.0)
+    def link_quality(self) -> LinkQuality:
+        return LinkQuality(loss_percent=1.0)
 
 
 class Aircraft(asyncio.DatagramProtocol):
@@ -273,7 +273,7 @@ async def test_a_new_driver_waits_for_the_port_of_its_predecessor() -> None:
 async def test_a_socket_that_cannot_be_opened_is_refused_with_advice(
     monkeypatch: pytest.MonkeyPatch, taken: bool
 ) -> None:
-    monkeypatch.setattr(driver, "FORMER_S", 0.0)
+    monkeypatch.setattr(driver, "PORT_WAIT_S", 0.0)
     loop = asyncio.get_running_loop()
     other, _ = await loop.create_datagram_endpoint(asyncio.DatagramProtocol, local_addr=("0.0.0.0", 0))
     port = other.get_extra_info("sockname")[1] if taken else 0
