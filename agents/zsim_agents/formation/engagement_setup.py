@@ -99,7 +99,7 @@ class PlannedMotion(NamedTuple):
     until_s: float
     path: str  # path in the cluster's section of the scenario
 
-    def places(self, t_s: float) -> Array:
+    def positions(self, t_s: float) -> Array:
         """Return the reference positions of the robots, (n, 3) [m; W]."""
         return self.space.inverse(self.reference.value(t_s)[0])[0]
 
