@@ -9,7 +9,7 @@ WORKERS ?= 4
 FLIGHT := python
 CONSTRAINTS ?= constraints.txt
 KERNELS := $(shell grep -rlF --include=*.py zsim.math.compiled zsim world agents)
-# Constraints are set in the environment, so that the build of zsim has them too; empty: the newest versions of all packages.
+# Constraints are set in the environment, so that they apply to the build of zsim too; empty: the newest versions.
 HELD = PIP_CONSTRAINT=$(CONSTRAINTS) PIP_BUILD_CONSTRAINT=$(CONSTRAINTS)
 PIP = $(HELD) $(BIN)/pip install --disable-pip-version-check --no-compile
 COMPILED = @$(MAKE) --silent --no-print-directory $(VENV)/.compiled
@@ -82,17 +82,16 @@ $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(VENV)/bin/python
 	@$(PIP) -e '.[dev]'
 	@touch $@ $(VENV)/.all $(VENV)/.run
 
-# A target of its own, so that it runs in parallel with what needs no kernel. Two processes compile; a function that one
-# has compiled is found by the other. Kernels that have changed are compiled here, since otherwise every process of a
-# flight would compile them.
+# A separate target, so that it runs in parallel with those that need no kernels. Two processes compile; each uses the
+# functions that the other has compiled. Changed kernels are compiled here, since otherwise every process of a flight
+# would compile them.
 $(VENV)/.compiled: pyproject.toml $(KERNELS)
 	@echo "compiling the kernels, which takes about a minute; once on this machine, and after changes of their files"
 	@$(BIN)/python -P -m zsim_deploy.roles.warm_up agents & agents=$$!; \
 		$(BIN)/python -P -m zsim_deploy.roles.warm_up world; world=$$?; wait $$agents && exit $$world
 	@touch $@
 
-# Compiles the imports of the tests to bytecode once; otherwise all WORKERS do so at the same time, which takes a quarter
-# of a minute.
+# Compiles the imports of the tests to bytecode once; otherwise all WORKERS do so at the same time, which takes 15 s.
 $(VENV)/.bytecode: pyproject.toml
 	@$(BIN)/pytest -n 0 --collect-only -q >/dev/null 2>&1 || true # the tests themselves report errors
 	@touch $@

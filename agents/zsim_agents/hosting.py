@@ -34,10 +34,10 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
     """
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in known):
-            how = "match" if any(sign in pattern for sign in "*?[") else "be"
-            more = [f"and {len(known) - NAMED_MAX} more"] if len(known) > NAMED_MAX else []
-            listed = ", ".join([*known[:NAMED_MAX], *more]) or "none"
-            raise RunError(f"{what} is {pattern!r}; must {how} one of {listed}")
+            verb = "match" if any(sign in pattern for sign in "*?[") else "be"
+            rest = [f"and {len(known) - NAMED_MAX} more"] if len(known) > NAMED_MAX else []
+            listed = ", ".join([*known[:NAMED_MAX], *rest]) or "none"
+            raise RunError(f"{what} is {pattern!r}; must {verb} one of {listed}")
     return [name for name in known if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
@@ -126,7 +126,7 @@ def check_plans(scenario: Scenario, source: str) -> None:
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
     """Return the matching agents of all roles as one; RunError: none match, or the scenario is impossible."""
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
-    by_role = {role: [thing for each, _, thing in split if each == role] for role in agent_roles(scenario)}
+    by_role = {role: [member for each, _, member in split if each == role] for role in agent_roles(scenario)}
     members = [agent for role, names in by_role.items() if names for agent in make_agents(role, info, scenario, names)]
     return members[0] if len(members) == 1 else AgentGroup(members, output_hold_ns(info))
 
@@ -158,19 +158,19 @@ class AgentSpec(NamedTuple):
     name: str  # name of its process
 
     @classmethod
-    def parse(cls, words: Sequence[str], name: str = "") -> "AgentSpec":
-        """Return the agent that the words describe, after loading its class in this process.
+    def parse(cls, arguments: Sequence[str], name: str = "") -> "AgentSpec":
+        """Return the agent that the arguments describe, after loading its class in this process.
 
         Raises:
             RunError: a setting or a name is malformed.
             DocumentError: the class does not exist.
         """
-        given, _, named = words[0].rpartition("=")
+        given, _, named = arguments[0].rpartition("=")
         settings: dict[str, Any] = {}
-        for word in words[1:]:
-            setting, equals, value = word.partition("=")
+        for argument in arguments[1:]:
+            setting, equals, value = argument.partition("=")
             if not (equals and setting.isidentifier()):
-                raise RunError(f"setting of {named} is {word!r}; must be NAME=VALUE")
+                raise RunError(f"setting of {named} is {argument!r}; must be NAME=VALUE")
             try:
                 settings[setting] = yaml_file.value(value)
             except ValueError as error:
@@ -178,8 +178,8 @@ class AgentSpec(NamedTuple):
         made = plugin.load_any(named, "agent", Agent)
         return cls(named, settings, keys.name(name or given or process_name(made)))
 
-    def words(self) -> list[str]:
-        """Return the words from which `parse` creates this spec."""
+    def arguments(self) -> list[str]:
+        """Return the arguments from which `parse` creates this spec."""
         named = f"{self.name}={self.named}"
         return [named, *(f"{setting}={json.dumps(value)}" for setting, value in self.settings.items())]
 
@@ -237,20 +237,20 @@ def own_agent(
             raise RunError(f"agent is {show(made)}; must be a zsim.Agent, or a class or a function that makes one")
         kind = f"{made.__module__}:{made.__qualname__}" if isinstance(made, type | FunctionType) else show(made)
         try:
-            taken = signature(made)
+            accepted = signature(made)
         except ValueError as error:  # a partial whose arguments the class does not take
             raise RunError(f"{kind} cannot be made: {error}") from None
         given = {"info": info, "scenario": scenario, per: name.partition(".")[2]}
-        given = {key: value for key, value in given.items() if key in taken.parameters}
+        given = {key: value for key, value in given.items() if key in accepted.parameters}
         make: Callable[..., Agent] = made
         if parameters.has_parameters(made):
             make = parameters.bound(made, dict(settings), kind)
         else:
             given |= settings
         try:
-            taken.bind(**given)
+            accepted.bind(**given)
         except TypeError as error:
-            raise RunError(f"{kind} takes {taken}, and cannot be made: {error}") from None
+            raise RunError(f"{kind} takes {accepted}, and cannot be made: {error}") from None
         try:
             made = make(**given)
         except plugin.RAISED as error:

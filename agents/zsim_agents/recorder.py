@@ -32,10 +32,11 @@ NAME = "recorder"
 PAUSE_S = 0.01  # interval between reads of the queue, since each wake-up is costly
 TICK_S = 0.1  # interval between checks of the open chunk's age and for a requested stop
 JOIN_S = 1.0  # wall time after which a join is repeated if no event confirms it, since the world may have missed it
-SLACK_NS = 4_000_000_000  # maximum lead of the world over the record on disk; the world's history covers 5 s
+LEAD_MAX_NS = 4_000_000_000  # maximum lead of the world over the record on disk; the world's history covers 5 s
 DRAIN_S = 1.0  # time to wait for the byes of other processes after the clock has stopped
 STOP_DRAIN_S = 0.5  # time to wait for the end of the run after a requested stop, since both may be stopped together
-QUIET_S = 1.5  # time without a clock after which one must have been missed: even a paused world sends one per second
+CLOCK_TIMEOUT_S = 1.5  # time without a clock after which one was missed: even a paused world sends one per second
+
 REPLAY_S = 5.0  # timeout of queries, which a hub answers within milliseconds
 FLUSH_NS = 1_000_000_000  # simulated time between writes to disk
 REPEATED_NS = 1_000_000_000  # simulated time after catching up within which other processes may repeat messages
@@ -73,28 +74,28 @@ class Recorder:
         self._stopped = stopped
         self._print = say
         self._deserted = deserted
-        self._part = Participant(link, info, NAME, slack_ns=SLACK_NS, calculates=False)
-        self.health = self._part.health
+        self._participant = Participant(link, info, NAME, slack_ns=LEAD_MAX_NS, calculates=False)
+        self.health = self._participant.health
         self._joined_s = 0.0
         self._others: dict[str, int] = {}  # incarnations of the processes that have joined and not left, by name
         self._links: deque[bool] = deque()
-        self._link_lost = False
-        self._must_look = False
+        self._is_link_lost = False
+        self._must_check_run = False
         self._writer = RecordWriter(path, goes_on=is_of_run(path, info.run_id))
         self._head = msgspec.msgpack.Decoder(_Head)
         self._clock = msgspec.msgpack.Decoder(Clock)
         self._known = KnownMessages()
         self._gates = GateCount()
-        self._caught_up = False
+        self._has_caught_up = False
         self._known_until_ns = 0
-        self._over = threading.Event()
+        self._stop_event = threading.Event()
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
         self._held: list[Passed] = []  # received messages, to be written after missed ones
-        self._is_back = False  # in realtime, whether a lost link is restored but missed messages are not yet fetched
-        self._quiet_since_s: float | None = None  # since when no clock has arrived after a lost link in realtime
-        self._on_disk_ns = 0  # simulated time of the last write to disk
-        self._left_out = 0
+        self._must_fetch = False  # in realtime, whether a lost link is restored but missed messages are not yet fetched
+        self._silent_since_s: float | None = None  # since when no clock has arrived after a lost link in realtime
+        self._flushed_ns = 0  # simulated time of the last write to disk
+        self._refused_count = 0
 
     def run(self) -> str:
         """Record until the run ends; return why it ended.
@@ -105,14 +106,18 @@ class Recorder:
             SupersededError: another recorder of this name has taken over.
         """
         self._traffic = Traffic(self._link, run_key_table(self._info), self._on_refused)
-        self._beside = [self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))]
+        self._extra_subscriptions = [
+            self._link.subscribe(expression) for expression in ("view/**", keys.camera("*", "*"))
+        ]
         self._link.declare_process(NAME)
         self._link.on_link(self._on_link)
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         try:
             if self._writer.has_former:
                 self._resume()
-                self._print(f"{NAME}: goes on with {self._writer.path} after t = {self._part.now_ns / 1e9:.2f} s")
+                self._print(
+                    f"{NAME}: goes on with {self._writer.path} after t = {self._participant.now_ns / 1e9:.2f} s"
+                )
             else:  # a replay may no longer contain these last values
                 lasting = {keys.INFO: messages.encode(self._info)}
                 for key in (keys.INFO, keys.FAULTS, keys.camera_info("*", "*")):
@@ -125,22 +130,22 @@ class Recorder:
             self._write_held()
             self._writer.close()
         except RecordError as error:  # without a bye, the world would wait for a restart
-            self._part.leave(str(error))
+            self._participant.leave(str(error))
             raise
         finally:
-            self._over.set()
+            self._stop_event.set()
             if ticker.is_alive():
                 ticker.join()
-        if self._left_out:
+        if self._refused_count:
             why = f"a record holds {CHANNELS_MAX} keys, and these are on further keys"
-            self._print(f"{NAME}: {self._left_out} messages are missing from the record: {why}")
-        if self._part.superseded:
-            why = self._part.end_reason
+            self._print(f"{NAME}: {self._refused_count} messages are missing from the record: {why}")
+        if self._participant.superseded:
+            why = self._participant.end_reason
             raise SupersededError(f"{NAME}: {why}; this recorder ends; its record is {self._writer.path}")
         if reason == ANOTHER_RUN:
             raise RunError(f"{NAME}: {reason}; the record {self._writer.path} is complete up to the end of that run")
         if not self._deserted():
-            self._part.leave(reason)
+            self._participant.leave(reason)
         return reason
 
     def _loop(self) -> str:
@@ -151,21 +156,21 @@ class Recorder:
             if self._is_another_run():  # first, since received messages may be later than missed ones
                 return ANOTHER_RUN
             self._write_arrived(arrived)
-            if self._quiet_since_s is not None and time.monotonic() - self._quiet_since_s > QUIET_S:
+            if self._silent_since_s is not None and time.monotonic() - self._silent_since_s > CLOCK_TIMEOUT_S:
                 # the last messages, such as the end of the run, were published before the link was restored
-                self._quiet_since_s, self._is_back = None, False
+                self._silent_since_s, self._must_fetch = None, False
                 self._fetch_missed()
                 self._write_held()
-            for sample in chain.from_iterable(subscription.drain() for subscription in self._beside):
+            for sample in chain.from_iterable(subscription.drain() for subscription in self._extra_subscriptions):
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
-            if self._part.now_ns - self._on_disk_ns >= FLUSH_NS:
-                self._put_on_disk()
-            self.health.refused += self._writer.refused - self._left_out  # messages refused for lack of channels
-            self._left_out = self._writer.refused
-            if not self._part.admitted and time.monotonic() - self._joined_s > JOIN_S:
+            if self._participant.now_ns - self._flushed_ns >= FLUSH_NS:
+                self._flush()
+            self.health.refused += self._writer.refused - self._refused_count  # messages refused for lack of channels
+            self._refused_count = self._writer.refused
+            if not self._participant.admitted and time.monotonic() - self._joined_s > JOIN_S:
                 self._join()
-            if self._part.superseded:
+            if self._participant.superseded:
                 return "superseded"
             if self._ended_s is None and self._stopped():
                 self._stopped_s = self._stopped_s or time.monotonic()
@@ -174,21 +179,21 @@ class Recorder:
             if self._ended_s is not None and (not self._others or time.monotonic() - self._ended_s > DRAIN_S):
                 return run_messages.RUN_ENDED
 
-    def _put_on_disk(self) -> None:
+    def _flush(self) -> None:
         self._writer.flush()
-        self._on_disk_ns = t_ns = self._part.now_ns
-        self._part.done(t_ns)
+        self._flushed_ns = t_ns = self._participant.now_ns
+        self._participant.done(t_ns)
 
     def _join(self, again: bool = False) -> None:
         """Join, so that the world is at most SLACK_NS ahead of the record on disk from now on."""
-        self._part.join(again)
+        self._participant.join(again)
         self._joined_s = time.monotonic()
-        self._put_on_disk()
+        self._flush()
 
     def _tick(self) -> None:
-        while not self._over.wait(TICK_S):
+        while not self._stop_event.wait(TICK_S):
             self._traffic.wake()
-            self._part.publish_health()
+            self._participant.publish_health()
 
     def _on_refused(self) -> None:
         self.health.refused += 1
@@ -196,7 +201,7 @@ class Recorder:
     def _resume(self) -> None:
         """Continue from the end of a predecessor's record, which may be the end of the run."""
         if last := self._known.add_tail(self._writer.path):
-            self._part.now_ns = last.t_ns
+            self._participant.now_ns = last.t_ns
             clock = self._clock_in(last.payload)
             self._gates = GateCount(clock)
             if clock is not None and clock.state == "stopped":
@@ -207,15 +212,15 @@ class Recorder:
 
         The request is repeated until the world answers; a message that is received twice is written once.
         """
-        self._caught_up = False
+        self._has_caught_up = False
         while True:
             try:
                 self._write_known(self._replayed(before))
             except NoWorldError:
-                if self._pauses():
+                if self._may_continue():
                     continue
             break
-        self._caught_up, self._known_until_ns = True, self._part.now_ns + REPEATED_NS
+        self._has_caught_up, self._known_until_ns = True, self._participant.now_ns + REPEATED_NS
 
     def _write_known(self, written: Iterable[Message]) -> None:
         for key, payload in written:
@@ -241,15 +246,15 @@ class Recorder:
         self._known.add_tail(self._writer.path)
         self._catch_up(before)
 
-    def _pauses(self) -> bool:
+    def _may_continue(self) -> bool:
         """Wait for a tick; return whether the process may continue."""
-        self._over.wait(TICK_S)
+        self._stop_event.wait(TICK_S)
         return not self._stopped()
 
     def _world_info(self) -> messages.Info | None:
         """Return `world/info`, waiting up to REPLAY_S for a world that has just been restarted; None if unanswered."""
         until_s = time.monotonic() + REPLAY_S
-        while (info := read_info(self._link)) is None and time.monotonic() < until_s and self._pauses():
+        while (info := read_info(self._link)) is None and time.monotonic() < until_s and self._may_continue():
             pass
         return info
 
@@ -263,20 +268,20 @@ class Recorder:
             up = self._links.popleft()
             if not up:
                 self._print(f"{NAME}: lost the link to the world; waiting for it to come back")
-            self._must_look = up and self._link_lost
-            self._link_lost = not up
-        info = self._world_info() if self._must_look else None
+            self._must_check_run = up and self._is_link_lost
+            self._is_link_lost = not up
+        info = self._world_info() if self._must_check_run else None
         if info is None:
             return False
-        self._must_look = False
+        self._must_check_run = False
         if info.run_id != self._info.run_id:
             return True
         if self._info.mode == "lockstep":
             self._fetch_missed()
         else:  # the world may be far ahead of the messages in transit
-            self._quiet_since_s = time.monotonic()
-            self._is_back = True
-        if not self._part.superseded:  # which a missed message may have revealed
+            self._silent_since_s = time.monotonic()
+            self._must_fetch = True
+        if not self._participant.superseded:  # which a missed message may have revealed
             self._join(again=True)
         return False
 
@@ -291,19 +296,19 @@ class Recorder:
             self._held.append(passed)
             if isinstance(passed, ReceivedSample) and passed.key == keys.CLOCK:
                 clock = self._clock_in(passed.payload)
-                if clock is not None and (self._gates.misses(clock) or (self._is_back and self._holds_own_join())):
+                if clock is not None and (self._gates.misses(clock) or (self._must_fetch and self._holds_own_join())):
                     info = self._world_info()
                     if info is not None and info.run_id == self._info.run_id:
-                        self._is_back = False
+                        self._must_fetch = False
                         self._fetch_missed(clock)
                 self._write_held()
-        if not self._is_back:
+        if not self._must_fetch:
             self._write_held()
 
     def _holds_own_join(self) -> bool:
         events = (each for each in self._held if isinstance(each, ReceivedSample) and each.key == keys.EVENT)
-        entries = (self._part.entry_in(event.payload) for event in events)
-        return any(entry is not None and self._part.is_own(entry) for entry in entries)
+        entries = (self._participant.entry_in(event.payload) for event in events)
+        return any(entry is not None and self._participant.is_own(entry) for entry in entries)
 
     def _write_held(self) -> None:
         for passed in self._held:
@@ -314,7 +319,7 @@ class Recorder:
                     self._write(key, payload)
             else:
                 self.health.received += len(passed)
-                self._part.now_ns = passed.t_ns
+                self._participant.now_ns = passed.t_ns
                 self._writer.add_gate(passed, time.time_ns())
         self._held.clear()
 
@@ -326,20 +331,20 @@ class Recorder:
             t_ns = max(0, min(self._head.decode(payload).t_ns, 2**62))
         except messages.REFUSALS:
             self.health.refused += 1
-            t_ns = self._part.now_ns  # a message without a time is recorded at the world's time
+            t_ns = self._participant.now_ns  # a message without a time is recorded at the world's time
         self._writer.add(key, payload, messages.encoding(key), t_ns, time.time_ns())
         if key == keys.CLOCK:
-            self._part.now_ns = t_ns
+            self._participant.now_ns = t_ns
             self._on_clock(payload)
         elif key == keys.EVENT:
-            self._part.take_event(payload)
-            if self._part.must_rejoin:
-                self._part.must_rejoin = False
+            self._participant.take_event(payload)
+            if self._participant.must_rejoin:
+                self._participant.must_rejoin = False
                 self._join(again=True)
         elif key.startswith("process/"):
-            self._note_process(key, payload)
+            self._track_process(key, payload)
 
-    def _note_process(self, key: str, payload: bytes) -> None:
+    def _track_process(self, key: str, payload: bytes) -> None:
         """Track which other processes have joined and not left."""
         name, kind = keys.thing(key), messages.type_of(key)
         if name == NAME or kind not in (run_messages.Join, run_messages.Bye):
@@ -366,13 +371,13 @@ class Recorder:
             return
         if gap := self._gates.add(clock):
             self._print(f"{NAME}: gates are missing from the record, and the world no longer has them: {gap}")
-        if self._quiet_since_s is not None:
-            self._quiet_since_s = time.monotonic()
+        if self._silent_since_s is not None:
+            self._silent_since_s = time.monotonic()
         if clock.state == "stopped" and self._ended_s is None:
             self._ended_s = time.monotonic()
-        elif self._caught_up and clock.t_ns > self._known_until_ns:
+        elif self._has_caught_up and clock.t_ns > self._known_until_ns:
             self._known.clear()
-        elif self._caught_up:
+        elif self._has_caught_up:
             self._known.keep_outputs()  # this clock was not replayed, so later messages were not either
 
 

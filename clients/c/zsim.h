@@ -54,7 +54,7 @@ zsim_json zsim_get(zsim_json value, const char *path);
 int zsim_number(zsim_json value, const char *path, double *number);
 int zsim_numbers(zsim_json value, const char *path, double *numbers, size_t count); /* a list of exactly `count` */
 int zsim_integer(zsim_json value, const char *path, int64_t *number);
-int zsim_text(zsim_json value, const char *path, char *text, size_t size); /* UTF-8; invalid code points are U+FFFD */
+int zsim_text(zsim_json value, const char *path, char *text, size_t size); /* UTF-8; NUL, lone surrogates are U+FFFD */
 
 /* Return whether the value at a path is this text, or `true`. */
 int zsim_is(zsim_json value, const char *path, const char *text);

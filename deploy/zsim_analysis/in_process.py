@@ -83,11 +83,11 @@ def with_agents(scenario: Scenario, own: Sequence[OwnAgent]) -> tuple[Scenario, 
     return with_own_agents(scenario, [agent.name for agent in agents]), agents
 
 
-def sequence_of_agents(given: Any, others: str = "") -> Sequence[Any]:
-    """Return the given agents; raise RunError, which names `others` as also allowed, if they are not a sequence."""
-    if isinstance(given, str) or not isinstance(given, Sequence):
-        raise RunError(f"agents is {show(given)}; must be {others}a sequence of agents")
-    return given
+def sequence_of_agents(agents: Any, options: str = "") -> Sequence[Any]:
+    """Return the given agents; raise RunError, which names `options` as also allowed, if they are not a sequence."""
+    if isinstance(agents, str) or not isinstance(agents, Sequence):
+        raise RunError(f"agents is {show(agents)}; must be {options}a sequence of agents")
+    return agents
 
 
 class FlightObserver(Protocol):
@@ -127,14 +127,14 @@ class InProcessFlight:
             scenario = replace(scenario, processes=replace(scenario.processes, expect=[]))
         self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id, changed)
         self.info = self.world.info()
-        others = [own_agent(each, self.info, scenario) for each in own]
-        taken = {name for agent in others for name in (agent.name, *agent.serves)}
-        known, wanted = agent_names(scenario), expected_processes(scenario)
-        for name in set(wanted) - set(known) - taken:
+        own_agents = [own_agent(each, self.info, scenario) for each in own]
+        occupied_names = {name for agent in own_agents for name in (agent.name, *agent.serves)}
+        stock_names, expected = agent_names(scenario), expected_processes(scenario)
+        for name in set(expected) - set(stock_names) - occupied_names:
             if lets_drop(scenario.processes.on_overdue or {}, name):
                 self.world.expired(name)  # no other process can join
-        names = [name for name in wanted if name in known and name not in taken]
-        self.agents = [*others]
+        names = [name for name in expected if name in stock_names and name not in occupied_names]
+        self.agents = [*own_agents]
         if names:
             self.agents.insert(0, hosted(self.info, scenario, names))
         self._caller = Caller(self.info) if steered else None
@@ -193,8 +193,8 @@ class InProcessFlight:
         for agent in self.agents:
             if key in agent.control_keys():
                 return agent.control(key, request)
-        known = [keys.CONTROL, *(each for agent in self.agents for each in agent.control_keys())]
-        return ControlAnswer(False, f"{key}: no process answers on it; must be one of {', '.join(known)}")
+        control_keys = [keys.CONTROL, *(each for agent in self.agents for each in agent.control_keys())]
+        return ControlAnswer(False, f"{key}: no process answers on it; must be one of {', '.join(control_keys)}")
 
     def snapshot(self) -> tuple[Any, ...]:
         """Return the state from which `restore` continues bit-identically.

@@ -53,7 +53,7 @@ class RerunResult(NamedTuple):
 
 
 def rerun_record(
-    place: Path, commands_only: bool, say: Say, note: Say, outputs: Mapping[str, str] | None = None
+    run_path: Path, commands_only: bool, say: Say, note: Say, outputs: Mapping[str, str] | None = None
 ) -> str:
     """Fly a recorded run again; return how the truth differs from the record, empty if it is bit-identical.
 
@@ -64,58 +64,58 @@ def rerun_record(
         RunError, RecordError: there is no record, it does not begin with the start of a flight, or the run cannot be
             flown again.
     """
-    with recorded_run.open_run(place) as record:
+    with recorded_run.open_run(run_path) as record:
         if record.info.replay_of:
-            raise RunError(f"{place}: is the record of a replay; rerun that of run {record.info.replay_of}")
+            raise RunError(f"{run_path}: is the record of a replay; rerun that of run {record.info.replay_of}")
         if not plugin.may_import() and (names := record.scenario.own_code()):
             reason = f"its scenario names {listed(names)}: code that a rerun runs, and only with --trust"
-            raise RunError(f"{place}: {reason}")
+            raise RunError(f"{run_path}: {reason}")
         if external := record.scenario.external():
             reason = f"has drones whose bodies are external ({listed(external)}); they cannot be flown again"
-            raise RunError(f"{place}: {reason}")
+            raise RunError(f"{run_path}: {reason}")
         agents = recorded_run.recorded_agents(record.reader, record.info, record.scenario)
         no_agents = agents._replace(processes=(), requests=(), failure="")
-        here, recorded_by = fingerprint(), record.info.version
-        if others := {record.info.fingerprint, *agents.fingerprints} - {here}:
-            of = f"{', '.join(sorted(others))}; here {here}"
-            note(f"recorded with other code (fingerprint {of}): the same bits are not promised")
+        own_fingerprint, recorded_by = fingerprint(), record.info.version
+        if other_fingerprints := {record.info.fingerprint, *agents.fingerprints} - {own_fingerprint}:
+            fingerprints_text = f"{', '.join(sorted(other_fingerprints))}; here {own_fingerprint}"
+            note(f"recorded with other code (fingerprint {fingerprints_text}): the same bits are not promised")
         if recorded_by != __version__:
             note(f"recorded by zsim {recorded_by}, flown again by {__version__}: the same bits are not promised")
         if commands_only or agents.why_not:
-            why = "as requested" if commands_only else agents.why_not
-            say(f"agents are not run again: {why}; the world alone, with all recorded commands")
+            reason_text = "as requested" if commands_only else agents.why_not
+            say(f"agents are not run again: {reason_text}; the world alone, with all recorded commands")
             return _judge(record.reader, agents.truth_sha256, _fly(record, no_agents), say)
         say(f"run again: world, {', '.join(map(str, agents.processes))}")
-        again = _fly(record, agents)
-        fault = _judge(record.reader, agents.truth_sha256, again, say)
-        if not fault and again.failure != agents.failure:
+        result = _fly(record, agents)
+        fault = _judge(record.reader, agents.truth_sha256, result, say)
+        if not fault and result.failure != agents.failure:
             say(f"on record {agents.failure or 'no class of a user failed'}")
-            fault = f"flown again, {again.failure or 'it does not fail'}"
-        elif not fault and again.failure:
-            say(f"ended as on record: {again.failure}")
+            fault = f"flown again, {result.failure or 'it does not fail'}"
+        elif not fault and result.failure:
+            say(f"ended as on record: {result.failure}")
         if outputs is not None and not fault:
-            fault = _compare_outputs(outputs, again, say)
-        if again.compared.first is None:
+            fault = _compare_outputs(outputs, result, say)
+        if result.compared.first is None:
             return fault
         alone = _fly(record, no_agents)
         if alone.compared.first is not None:
             say(f"the world alone, with all recorded commands, differs too: first {alone.compared.first}")
         else:
             say("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
-        if again.first_output:
-            say(f"the first answer that differs is {again.first_output}")
+        if result.first_output:
+            say(f"the first answer that differs is {result.first_output}")
         return fault
 
 
-def _compare_outputs(expected: Mapping[str, str], again: RerunResult, say: Say) -> str:
+def _compare_outputs(expected: Mapping[str, str], result: RerunResult, say: Say) -> str:
     """Report how the agents' outputs compare; return how they differ, empty if they do not."""
-    keys_of_both = sorted({*expected, *again.outputs})
-    differing = [key for key in keys_of_both if expected.get(key) != again.outputs.get(key)]
+    keys_of_both = sorted({*expected, *result.outputs})
+    differing = [key for key in keys_of_both if expected.get(key) != result.outputs.get(key)]
     if not differing:
         say(f"the agents' outputs are the same, on {len(expected)} keys")
         return ""
     say(f"the agents' outputs differ on {len(differing)} of {len(keys_of_both)} keys: {listed(differing)}")
-    return f"outputs differ, first {again.first_output or differing[0]}"
+    return f"outputs differ, first {result.first_output or differing[0]}"
 
 
 def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) -> RerunResult:
@@ -131,8 +131,8 @@ def _fly(record: recorded_run.RecordedRun, agents: recorded_run.RecordedAgents) 
         for gate in recorded_run.gates(reader, world.names):
             missing = [name for name in world.names if name not in gate.truth]
             if gate.t_ns != due_ns or missing:
-                what = f"no truth of {missing[0]} at" if gate.t_ns == due_ns else "nothing of"
-                until = f"the record has {what} {due_ns / 1e9:.2f} s"
+                missing_text = f"no truth of {missing[0]} at" if gate.t_ns == due_ns else "nothing of"
+                until = f"the record has {missing_text} {due_ns / 1e9:.2f} s"
                 break
             bus.fly_to(gate)
             compared.add(gate.t_ns, gate.truth, bus.truth)
@@ -185,19 +185,19 @@ class Difference(NamedTuple):
 
     def __str__(self) -> str:
         angle_deg, rate_deg_s = math.degrees(self.angle_rad), math.degrees(self.rate_rad_s)
-        by = f"{self.position_m:.3g} m, {self.velocity_m_s:.3g} m/s, {angle_deg:.3g} deg, {rate_deg_s:.3g} deg/s"
-        of = f": {self.field} in {keys.truth(self.drone)}" if self.field else ""
-        return f"{self.drone} at {self.t_ns / 1e9:.3f} s by {by}{of}"
+        size_text = f"{self.position_m:.3g} m, {self.velocity_m_s:.3g} m/s, {angle_deg:.3g} deg, {rate_deg_s:.3g} deg/s"
+        field_text = f": {self.field} in {keys.truth(self.drone)}" if self.field else ""
+        return f"{self.drone} at {self.t_ns / 1e9:.3f} s by {size_text}{field_text}"
 
 
-def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Difference | None:
+def difference(t_ns: int, drone: str, recorded: bytes, repeated: bytes) -> Difference | None:
     """Return the difference between two true states; None if the COUNTED fields are bit-identical.
 
     Raises:
         DecodeError: one of them is not a truth message.
     """
     key = keys.truth(drone)
-    a, b = messages.decode(key, recorded), messages.decode(key, flown)
+    a, b = messages.decode(key, recorded), messages.decode(key, repeated)
     if all(getattr(a, part) == getattr(b, part) for part in COUNTED):
         return None
     cosine = abs(sum(p * q for p, q in zip(a.orientation_wxyz, b.orientation_wxyz, strict=True)))
@@ -212,10 +212,10 @@ def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Differen
     )
 
 
-def differing_field(recorded: Any, flown: Any, fields: Sequence[str]) -> str:
+def differing_field(recorded: Any, repeated: Any, fields: Sequence[str]) -> str:
     """Return the first field that differs between two messages, with its index and both values; empty if none does."""
     for name in fields:
-        a, b = getattr(recorded, name), getattr(flown, name)
+        a, b = getattr(recorded, name), getattr(repeated, name)
         if a == b:
             continue
         if isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
@@ -234,12 +234,12 @@ class TruthComparison:
         self.first: Difference | None = None
         self.last: Difference | None = None
 
-    def add(self, t_ns: int, recorded: Mapping[str, bytes], flown: Mapping[str, bytes]) -> None:
+    def add(self, t_ns: int, recorded: Mapping[str, bytes], repeated: Mapping[str, bytes]) -> None:
         """Compare the truth of a gate of both flights, given as payloads by drone."""
         self.instants += 1
         for drone in self._drones:
-            if recorded[drone] != flown[drone] and (
-                differing := difference(t_ns, drone, recorded[drone], flown[drone])
+            if recorded[drone] != repeated[drone] and (
+                differing := difference(t_ns, drone, recorded[drone], repeated[drone])
             ):
                 self.first = self.first or differing
                 self.last = differing
@@ -279,8 +279,8 @@ class OutputComparison:
             self._note(identity[2], identity[0])
 
     def _note(self, t_ns: int, key: str, field: str = "") -> None:
-        found = (t_ns, keys.leaf(key) != "estimate", key, field)
-        self._first = min(found, self._first or found)
+        entry = (t_ns, keys.leaf(key) != "estimate", key, field)
+        self._first = min(entry, self._first or entry)
 
 
 # Flight
@@ -404,11 +404,11 @@ class RerunBus(Bus):
             else:
                 self._world.handle(key, message, 0)
         elif keys.thing(key) not in self._rerun:  # a done, a bye, or a join, which is repeated when its event says so
-            joined = (keys.thing(key), message.incarnation) if isinstance(message, run_messages.Join) else None
-            if joined is None or self._admitted is None or joined in self._admitted:
+            join_identity = (keys.thing(key), message.incarnation) if isinstance(message, run_messages.Join) else None
+            if join_identity is None or self._admitted is None or join_identity in self._admitted:
                 self._world.handle(key, message, 0)
             else:
-                self._withheld[joined] = message
+                self._withheld[join_identity] = message
 
     def _hand_over(self, key: str, message: Any, source: str) -> None:
         """Pass what another process published to the agents that read it."""
@@ -419,11 +419,11 @@ class RerunBus(Bus):
     def _feed_event(self, event: run_messages.Event) -> None:
         """Repeat what reached the world other than as a message: deaths, requests, and withheld joins."""
         if event.kind in ADMISSIONS and event.source not in self._rerun:
-            joined = _joined(event)
-            if (join := self._withheld.pop(joined, None)) is not None:
-                self._world.handle(keys.process(joined[0], "join"), join, 0)
-        left = event.kind == "leave" and self._world.barrier.has_farewell(event.subject)
-        if (event.kind == "death" or left) and event.subject not in self._rerun:
+            join_identity = _joined(event)
+            if (join := self._withheld.pop(join_identity, None)) is not None:
+                self._world.handle(keys.process(join_identity[0], "join"), join, 0)
+        has_left = event.kind == "leave" and self._world.barrier.has_farewell(event.subject)
+        if (event.kind == "death" or has_left) and event.subject not in self._rerun:
             self._world.died(event.subject, 0)
         elif event.kind == "overdue" and event.subject not in self._rerun:
             self._world.expired(event.subject)

@@ -103,7 +103,7 @@ function fault = estimate_fault(estimates, sigma_max_m, params)
 end
 
 function fault = formation_fault(state, estimates, params)
-    % FORMATION_FAULT Return why the robots' positions are no valid initial formation; 0 if they are.
+    % FORMATION_FAULT Return why the robots' positions are not a valid initial formation; 0 if they are.
     fault = 5;
     if ~state.framed
         return
@@ -262,7 +262,7 @@ function [r_dot, state] = assembling(state, estimates, params)
 end
 
 function [r_dot, state] = climb(state, estimates, params)
-    % CLIMB Command the drones straight up to the assembly height, independently of each other.
+    % CLIMB Command the drones straight up to the assembly height.
     CLIMB_GAIN_1_S = 0.8;
     r_dot = zeros(12, 1);
     if estimate_fault(estimates, params.sigma_lost_m, params)

@@ -132,7 +132,7 @@ def test_samples_come_in_the_order_of_the_robots() -> None:
     sample = Range(t_ns=0, seq=0, t_sample_ns=0, beams=(), ranges_m=(), max_m=4.0)
     grants.put(keys.sensor("c", "range"), sample)
     assert grants.samples(Cluster, "range", Range) == (None, None, sample)
-    grants.seat(["c", "a", "b"])
+    grants.reorder(["c", "a", "b"])
     assert grants.samples(Cluster, "range", Range) == (sample, None, None)
     grants.put(keys.sensor("a", "range"), sample)
     assert grants.samples(Cluster, "range", Range) == (sample, sample, None)

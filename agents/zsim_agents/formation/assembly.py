@@ -26,10 +26,10 @@ from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.trajectory import named_values, variable_of
 
 PEAK_RATE = 1.875  # peak rate of the minimum-jerk function of time over its mean rate
-LEAST_S = 2.0  # minimum duration, as for a ramp of the reference
-BEHIND_M = 0.7  # distance of a robot from its reference at which all wait; design choice: 1/3 of the minimum separation
-IN_PLACE_M = 0.5  # maximum distance from the goal on arrival; design choice: two sigma of an estimated side
-PLACE = ("x_c", "y_c", "z_c", "yaw")  # variables that are defined for robots in any arrangement
+DURATION_MIN_S = 2.0  # minimum duration, as for a ramp of the reference
+LAG_M = 0.7  # distance of a robot from its reference at which all wait; design choice: 1/3 of the minimum separation
+ARRIVAL_TOLERANCE_M = 0.5  # maximum distance from the goal on arrival; design choice: two sigma of an estimated side
+POSE_NAMES = ("x_c", "y_c", "z_c", "yaw")  # variables that are defined for robots in any arrangement
 
 
 class Assembly:
@@ -38,21 +38,21 @@ class Assembly:
     def __init__(self, start_W: Array, goal_W: Array, c: Array, over_s: float, gains: FormationGains) -> None:
         self.c, self.over_s = c, over_s
         self._start_W, self._goal_W, self._gains = start_W, goal_W, gains
-        self._flown_s = 0.0
+        self._elapsed_s = 0.0
 
     @property
-    def left_s(self) -> float:
-        return self.over_s - self._flown_s
+    def remaining_s(self) -> float:
+        return self.over_s - self._elapsed_s
 
     def advance(self, p_W: Array, dt_s: float) -> None:
         """Advance the common time by dt_s, unless one of the robots, at p_W (n, 3) [m], is far behind."""
-        if float(np.linalg.norm(self._way()[0] - p_W, axis=1).max()) <= BEHIND_M:
-            self._flown_s = min(self._flown_s + dt_s, self.over_s)
+        if float(np.linalg.norm(self._reference()[0] - p_W, axis=1).max()) <= LAG_M:
+            self._elapsed_s = min(self._elapsed_s + dt_s, self.over_s)
 
     def velocities(self, p_W: Array) -> Array:
         """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], not yet guarded."""
-        place_W, rate_W = self._way()
-        v_W = rate_W + self._gains.k_1_s * (place_W - p_W)
+        position_W, rate_W = self._reference()
+        v_W = rate_W + self._gains.k_1_s * (position_W - p_W)
         speed = np.sqrt(v_W[:, 0] ** 2 + v_W[:, 1] ** 2)
         v_W[:, :2] *= np.minimum(1.0, self._gains.speed_max_m_s / np.maximum(speed, 1e-9))[:, None]
         v_W[:, 2] = np.clip(v_W[:, 2], -self._gains.climb_max_m_s, self._gains.climb_max_m_s)
@@ -60,27 +60,27 @@ class Assembly:
 
     def farthest(self, p_W: Array) -> tuple[int, float]:
         """Return the index of the robot farthest from its goal, and the distance [m]."""
-        away_m = np.linalg.norm(self._goal_W - p_W, axis=1)
-        return int(np.argmax(away_m)), float(away_m.max())
+        distances_m = np.linalg.norm(self._goal_W - p_W, axis=1)
+        return int(np.argmax(distances_m)), float(distances_m.max())
 
     def arrived(self, p_W: Array) -> bool:
-        return self.left_s <= 0.0 and self.farthest(p_W)[1] <= IN_PLACE_M
+        return self.remaining_s <= 0.0 and self.farthest(p_W)[1] <= ARRIVAL_TOLERANCE_M
 
-    def _way(self) -> tuple[Array, Array]:
+    def _reference(self) -> tuple[Array, Array]:
         """Return the reference positions and velocities of the robots, each (n, 3)."""
-        s = self._flown_s / self.over_s
-        ways_W = self._goal_W - self._start_W
-        share, rate = s * s * s * (10.0 - s * (15.0 - 6.0 * s)), 30.0 * s * s * (1.0 - s) * (1.0 - s) / self.over_s
-        return self._start_W + share * ways_W, rate * ways_W
+        s = self._elapsed_s / self.over_s
+        displacements_W = self._goal_W - self._start_W
+        fraction, rate = s * s * s * (10.0 - s * (15.0 - 6.0 * s)), 30.0 * s * s * (1.0 - s) * (1.0 - s) / self.over_s
+        return self._start_W + fraction * displacements_W, rate * displacements_W
 
     def snapshot(self) -> State:
-        places = {"start_W": self._start_W, "goal_W": self._goal_W, "c": self.c}
-        return {**places, "over_s": self.over_s, "flown_s": self._flown_s}
+        positions = {"start_W": self._start_W, "goal_W": self._goal_W, "c": self.c}
+        return {**positions, "over_s": self.over_s, "flown_s": self._elapsed_s}
 
     @classmethod
     def restored(cls, state: State, gains: FormationGains) -> Assembly:
         assembly = cls(state["start_W"], state["goal_W"], state["c"], state["over_s"], gains)
-        assembly._flown_s = state["flown_s"]
+        assembly._elapsed_s = state["flown_s"]
         return assembly
 
 
@@ -101,25 +101,25 @@ def assembly_goal(
     if base is None:
         base = np.zeros(space.size)
         heading = el.atan2(math.fsum(map(el.sin, yaw.tolist())), math.fsum(map(el.cos, yaw.tolist())))
-        for name, value in zip(PLACE, (*p_W.mean(axis=0).tolist(), heading), strict=True):
+        for name, value in zip(POSE_NAMES, (*p_W.mean(axis=0).tolist(), heading), strict=True):
             if name in space.names:
                 base[space.index(name)] = value
         given = {variable_of(space, name, "assemble", ".values").entry for name in values}
-        known = (name in PLACE or space.neutral[i] or i in given for i, name in enumerate(space.names))
-        if lacking := [name for name, is_known in zip(space.names, known, strict=True) if not is_known]:
-            raise RefusalError(f"the drones are not in a formation yet; values must name {', '.join(lacking)} as well")
+        are_known = (name in POSE_NAMES or space.neutral[i] or i in given for i, name in enumerate(space.names))
+        if missing := [name for name, is_known in zip(space.names, are_known, strict=True) if not is_known]:
+            raise RefusalError(f"the drones are not in a formation yet; values must name {', '.join(missing)} as well")
     return named_values(space, values, "assemble", base, ".values")
 
 
 def planned_assembly(
-    space: ClusterSpace, c: Array, p_W: Array, gains: FormationGains, apart: float = 1.0
+    space: ClusterSpace, c: Array, p_W: Array, gains: FormationGains, separation_share: float = 1.0
 ) -> tuple[Assembly, NDArray[np.intp]]:
     """Return the paths of robots at p_W (n, 3) [m] to their positions in c (4n,), and the new order of the robots.
 
     Entry k of the order is the previous index of the robot that becomes robot k.
 
     Args:
-        apart: share of the minimum separation that the paths must keep.
+        separation_share: share of the minimum separation that the paths must keep.
 
     Raises:
         RefusalError: c cannot be engaged, or two robots would come too close to each other.
@@ -129,12 +129,12 @@ def planned_assembly(
     goal_W = space.inverse(c)[0]
     order = np.argsort(assign(p_W, goal_W))
     start_W = p_W[order]
-    least_m, distance = apart * gains.separation_min_m, straight_separation(start_W, goal_W)
-    if distance < least_m - ROUNDING_M:
-        near = f"on the paths to their positions two drones come within {distance:.2f} m"
-        sure = f"certain if starts and goals are each {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
-        raise RefusalError(f"{near}; allowed: {least_m:g} m or more, {sure}")
-    return Assembly(start_W, goal_W, c, _least_s(start_W, goal_W, gains), gains), order
+    min_m, distance = separation_share * gains.separation_min_m, straight_separation(start_W, goal_W)
+    if distance < min_m - ROUNDING_M:
+        finding = f"on the paths to their positions two drones come within {distance:.2f} m"
+        remedy = f"certain if starts and goals are each {math.sqrt(2.0) * gains.separation_min_m:.2f} m apart"
+        raise RefusalError(f"{finding}; allowed: {min_m:g} m or more, {remedy}")
+    return Assembly(start_W, goal_W, c, _min_duration_s(start_W, goal_W, gains), gains), order
 
 
 def assign(starts_m: Array, goals_m: Array) -> NDArray[np.intp]:
@@ -165,9 +165,9 @@ def straight_separation(starts_m: Array, goals_m: Array) -> float:
     return float(np.sqrt(((from_ + b[:, None] * change) ** 2).sum(axis=1)).min())
 
 
-def _least_s(start_W: Array, goal_W: Array, gains: FormationGains) -> float:
+def _min_duration_s(start_W: Array, goal_W: Array, gains: FormationGains) -> float:
     """Return the duration [s] of the longest path at the share of the robots' limits that a reference may use."""
-    ways = np.abs(goal_W - start_W)
-    aside_m, up_m = float(np.sqrt(ways[:, 0] ** 2 + ways[:, 1] ** 2).max()), float(ways[:, 2].max())
-    slowest = max(aside_m / gains.speed_max_m_s, up_m / gains.climb_max_m_s)
-    return max(LEAST_S, PEAK_RATE * slowest / SHAPE.share)
+    deltas = np.abs(goal_W - start_W)
+    horizontal_m, vertical_m = float(np.sqrt(deltas[:, 0] ** 2 + deltas[:, 1] ** 2).max()), float(deltas[:, 2].max())
+    time_at_limits_s = max(horizontal_m / gains.speed_max_m_s, vertical_m / gains.climb_max_m_s)
+    return max(DURATION_MIN_S, PEAK_RATE * time_at_limits_s / SHAPE.share)

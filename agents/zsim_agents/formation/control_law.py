@@ -37,7 +37,7 @@ Kind = TypeVar("Kind", bound=Sample)
 
 RATES = ("vx", "vy", "vz", "yaw rate")  # components of a robot's velocity, in the order of r_dot
 NEAR_M = 1e-6  # distance below which the direction between two robots is undefined
-SETTLED_M_S = 1e-9  # smaller deficits of the separation rate are ignored
+DEFICIT_MIN_M_S = 1e-9  # smaller deficits of the separation rate are ignored
 LOAD_MIN = 1e-9  # avoids division by zero
 GUARD_SWEEPS = 4  # passes over all pairs: one is enough for two robots; three close together need a few
 
@@ -181,17 +181,17 @@ class ControlLaw(ABC):
         return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
 
     def _checked(self, r_dot: Any) -> Array:
-        what, size = f"{plugin.full_name(type(self))}.rates returns", self.space.size
+        context, size = f"{plugin.full_name(type(self))}.rates returns", self.space.size
         try:
             rates = plugin.numbers(r_dot)
         except ValueError as error:
-            raise UserCodeError(f"{what} {show(r_dot)}; must be {size} real numbers") from error
+            raise UserCodeError(f"{context} {show(r_dot)}; must be {size} real numbers") from error
         if rates.shape != (size,):
-            raise UserCodeError(f"{what} an array of shape {rates.shape}; must be ({size},), four for each robot")
-        wrong = np.flatnonzero(~np.isfinite(rates))
-        if wrong.size:
-            robot, k = divmod(int(wrong[0]), len(RATES))
-            raise UserCodeError(f"{what} {rates[wrong[0]]} as {RATES[k]} of {self.robots[robot]}; must be finite")
+            raise UserCodeError(f"{context} an array of shape {rates.shape}; must be ({size},), four for each robot")
+        invalid = np.flatnonzero(~np.isfinite(rates))
+        if invalid.size:
+            robot, k = divmod(int(invalid[0]), len(RATES))
+            raise UserCodeError(f"{context} {rates[invalid[0]]} as {RATES[k]} of {self.robots[robot]}; must be finite")
         return rates
 
 
@@ -222,7 +222,7 @@ class ProportionalLaw(ControlLaw):
         return self.space.motion(c, c_dot)
 
     def followed(self, dt_s: float) -> None:
-        grow(self.integral, self._error, self.gains.integral_1_s2 * dt_s, self._clamp)
+        accumulate(self.integral, self._error, self.gains.integral_1_s2 * dt_s, self._clamp)
 
 
 LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}  # stock laws by name in a scenario
@@ -244,33 +244,37 @@ class Grants:
     """
 
     def __init__(
-        self, cluster: str = "NAME", drones: Sequence[str] = (), sensors: Sequence[str] = (), its_map: Map | None = None
+        self,
+        cluster: str = "NAME",
+        drones: Sequence[str] = (),
+        sensors: Sequence[str] = (),
+        scenario_map: Map | None = None,
     ) -> None:
         self.t_ns = 0
-        self._cluster, self._map = cluster, its_map
+        self._cluster, self._map = cluster, scenario_map
         self._newest: dict[str, list[Sample | None]] = {name: [None] * len(drones) for name in sensors}
         self._received: dict[str, Any] = {name: type_of(keys.sensor(drones[0], name)) for name in sensors}
         self._drones: Sequence[str] = drones
-        self._places = self._numbered()
-        self.keys = tuple(self._places)
+        self._slots = self._slots_by_key()
+        self.keys = tuple(self._slots)
 
-    def _numbered(self) -> dict[str, tuple[str, int]]:
+    def _slots_by_key(self) -> dict[str, tuple[str, int]]:
         return {keys.sensor(drone, name): (name, i) for name in self._newest for i, drone in enumerate(self._drones)}
 
-    def seat(self, drones: Sequence[str]) -> None:
+    def reorder(self, drones: Sequence[str]) -> None:
         """Set the names of the drones, in the order of the robots."""
         if not self.keys:
             return
         order = [self._drones.index(drone) for drone in drones]
         self._newest = {name: [newest[k] for k in order] for name, newest in self._newest.items()}
         self._drones = drones
-        self._places = self._numbered()
+        self._slots = self._slots_by_key()
 
     def put(self, key: str, sample: Sample) -> None:
-        name, place = self._places[key]
-        former = self._newest[name][place]
+        name, index = self._slots[key]
+        former = self._newest[name][index]
         if former is None or sample.t_ns >= former.t_ns:  # in real time, an older sample may arrive after a newer one
-            self._newest[name][place] = sample
+            self._newest[name][index] = sample
 
     def samples(self, law: type, sensor: str, kind: type[Kind]) -> tuple[Kind | None, ...]:
         """Implement `ControlLaw.samples`; `law` is the law's class, for the text of a UserCodeError."""
@@ -279,12 +283,12 @@ class Grants:
             raise self._not_granted(law, f"sensor {sensor!r:.40}", "law_sensors", f"law_sensors: [{listed}]")
         received = self._received[sensor]
         if received not in (None, kind) and not _is_declared_as(received, kind):
-            what = f"{plugin.full_name(law)} reads {sensor!r} as {getattr(kind, '__name__', kind)!s:.40}"
-            raise UserCodeError(f"{what}; must be {received.__name__}, the class of its messages")
+            finding = f"{plugin.full_name(law)} reads {sensor!r} as {getattr(kind, '__name__', kind)!s:.40}"
+            raise UserCodeError(f"{finding}; must be {received.__name__}, the class of its messages")
         newest = self._newest[sensor]
-        for place, sample in enumerate(newest):
+        for index, sample in enumerate(newest):
             if sample is not None and type(sample) is not kind:  # its class was built from `world/info`
-                newest[place] = convert(sample, kind, from_attributes=True)
+                newest[index] = convert(sample, kind, from_attributes=True)
         return tuple(newest)  # type: ignore[return-value] - converted above
 
     def map_for(self, law: type) -> Map:
@@ -297,25 +301,30 @@ class Grants:
         return UserCodeError(f"{where}; write `{line}` there, or leave it out of the class")
 
     def snapshot(self) -> State:
-        newest = ((key, self._newest[name][place]) for key, (name, place) in self._places.items())
+        newest = ((key, self._newest[name][index]) for key, (name, index) in self._slots.items())
         return {key: encode(sample) for key, sample in newest if sample is not None}
 
     def restore(self, state: State) -> None:
         for key, payload in state.items():
-            name, place = self._places[key]
-            self._newest[name][place] = decode(key, payload)
+            name, index = self._slots[key]
+            self._newest[name][index] = decode(key, payload)
 
 
 def grants_of(cluster: Cluster, environment: Environment) -> Grants:
     surfaces = [] if environment.surfaces is UNSET else environment.surfaces
-    its_map = Map(environment.obstacles, surfaces) if cluster.law_map is True else None
-    return Grants(cluster.name, cluster.drones, cluster.law_sensors or (), its_map)
+    scenario_map = Map(environment.obstacles, surfaces) if cluster.law_map is True else None
+    return Grants(cluster.name, cluster.drones, cluster.law_sensors or (), scenario_map)
 
 
 def granted(law: Any, grants: Grants) -> Any:
     """Return a subclass of a law's class whose instances have these grants once `ControlLaw` is constructed."""
-    own = {"_granted": grants, "__module__": law.__module__, "__qualname__": law.__qualname__, "__doc__": law.__doc__}
-    return type(law.__name__, (law,), own)
+    attributes = {
+        "_granted": grants,
+        "__module__": law.__module__,
+        "__qualname__": law.__qualname__,
+        "__doc__": law.__doc__,
+    }
+    return type(law.__name__, (law,), attributes)
 
 
 def _is_declared_as(received: Any, kind: Any) -> bool:
@@ -330,13 +339,13 @@ def put_cluster_rate(
 ) -> None:
     """Write c_des - c, angles by the shorter way round, to `error`, and c_dot_des + k error + integral to `c_dot`."""
     for i in range(c.size):
-        apart = c_des[i] - c[i]
-        error[i] = apart - period[i] * np.rint(apart / TAU)
+        difference = c_des[i] - c[i]
+        error[i] = difference - period[i] * np.rint(difference / TAU)
         c_dot[i] = c_dot_des[i] + k * error[i] + integral[i]
 
 
 @portable
-def grow(integral: Array, error: Array, rate: float, clamp: Array) -> None:
+def accumulate(integral: Array, error: Array, rate: float, clamp: Array) -> None:
     for k in range(integral.size):
         integral[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])
 
@@ -368,34 +377,34 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, limits: RobotLimits) -> tuple[
     separate. d_near is the distance after the response time, during which an approach at the present velocities goes
     on. Each robot of a pair takes half of the change; a few sweeps settle several pairs.
     """
-    parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
-    guards, alarms = hold_apart(p_W, v_W, parted_W, order, *limits)
-    return parted_W, numbered(order) if guards else (), numbered(order.T) if alarms else ()
+    guarded_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
+    guards, alarms = hold_apart(p_W, v_W, guarded_W, order, *limits)
+    return guarded_W, numbered(order) if guards else (), numbered(order.T) if alarms else ()
 
 
 def numbered(order: Order) -> Pairs:
     """Return the pairs that are numbered above the diagonal, in the order of their numbers."""
     numbers = order.tolist()
-    places = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]
-    return tuple((i, j) for _, i, j in sorted(places))
+    entries = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]
+    return tuple((i, j) for _, i, j in sorted(entries))
 
 
 @portable
 def limited(
-    r_dot: Array, p_W: Array, v_W: Array, v_cmd_W: Array, yaw_rate: Array, order: Order, *limits_of: float
+    r_dot: Array, p_W: Array, v_W: Array, v_cmd_W: Array, yaw_rate: Array, order: Order, *limit_values: float
 ) -> tuple[float, int, int]:
     """Write the saturated and guarded velocities (n, 3) and yaw rates (n,) for r_dot (4n,).
 
     Return the factor of the saturation, then the result of `hold_apart`. limits_of are the fields of a RobotLimits:
     passing a tuple to compiled code takes longer than the computation.
     """
-    limits = RobotLimits(*limits_of)
+    limits = RobotLimits(*limit_values)
     for i in range(yaw_rate.size):
         v_cmd_W[i, 0], v_cmd_W[i, 1], v_cmd_W[i, 2] = r_dot[4 * i], r_dot[4 * i + 1], r_dot[4 * i + 2]
         yaw_rate[i] = r_dot[4 * i + 3]
     factor = min(1.0, 1.0 / max(load(v_cmd_W, yaw_rate, limits), LOAD_MIN))
     scale(v_cmd_W, yaw_rate, factor)
-    guards, alarms = hold_apart(p_W, v_W, v_cmd_W, order, *limits_of)
+    guards, alarms = hold_apart(p_W, v_W, v_cmd_W, order, *limit_values)
     if guards:
         scale(v_cmd_W, yaw_rate, 1.0 / max(load(v_cmd_W, yaw_rate, limits), 1.0))
     return factor, guards, alarms
@@ -404,13 +413,13 @@ def limited(
 @portable
 def load(v_W: Array, yaw_rate: Array, limits: RobotLimits) -> float:
     """Return the maximum ratio of any robot's speed, climb or yaw rate to its limit."""
-    most = 0.0
+    max_ratio = 0.0
     for i in range(yaw_rate.size):
         speed = math.sqrt(v_W[i, 0] * v_W[i, 0] + v_W[i, 1] * v_W[i, 1])
-        most = max(most, speed / limits.speed_max_m_s)
-        most = max(most, abs(v_W[i, 2]) / limits.climb_max_m_s)
-        most = max(most, abs(yaw_rate[i]) / limits.yaw_rate_max_rad_s)
-    return most
+        max_ratio = max(max_ratio, speed / limits.speed_max_m_s)
+        max_ratio = max(max_ratio, abs(v_W[i, 2]) / limits.climb_max_m_s)
+        max_ratio = max(max_ratio, abs(yaw_rate[i]) / limits.yaw_rate_max_rad_s)
+    return max_ratio
 
 
 @portable
@@ -422,41 +431,41 @@ def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
 
 
 @portable
-def near_pairs(p_W: Array, within_m: float) -> PairTable:
+def near_pairs(p_W: Array, distance_max_m: float) -> PairTable:
     """Return the pairs (i, j), i < j, of positions (n, 3) closer than a distance, sorted by j, then i, (m, 2)."""
     n = p_W.shape[0]
     pairs, count = np.empty((n * (n - 1) // 2, 2), np.int64), 0
     for j in range(1, n):
         for i in range(j):
             x, y, z = p_W[j, 0] - p_W[i, 0], p_W[j, 1] - p_W[i, 1], p_W[j, 2] - p_W[i, 2]
-            if not math.sqrt(x * x + y * y + z * z) >= within_m:  # also true for NaN
+            if not math.sqrt(x * x + y * y + z * z) >= distance_max_m:  # also true for NaN
                 pairs[count, 0], pairs[count, 1] = i, j
                 count += 1
     return pairs[:count]
 
 
 @portable
-def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
+def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limit_values: float) -> tuple[int, int]:
     """Modify commands in place until every pair separates at least at its required rate (see `guard`).
 
     Return the numbers of modified pairs and of pairs closer than the alarm threshold. In `order`, (n, n), the former
     are numbered from 1 above the diagonal and the latter below it; all other entries are zero.
     """
-    limits = RobotLimits(*limits_of)
+    limits = RobotLimits(*limit_values)
     order[:] = 0
     near = near_pairs(p_W, max(reach(limits), limits.separation_alarm_m))
     alarms = note_alarms(p_W, near, limits.separation_alarm_m, order)
     guards = 0
     for _ in range(GUARD_SWEEPS):
-        settled = True
+        is_settled = True
         for k in range(near.shape[0]):
             i, j = near[k, 0], near[k, 1]
-            if part(p_W, v_W, v_cmd_W, i, j, limits):
-                settled = False
+            if separate(p_W, v_W, v_cmd_W, i, j, limits):
+                is_settled = False
                 if order[i, j] == 0:
                     guards += 1
                     order[i, j] = guards
-        if settled:
+        if is_settled:
             break
     return guards, alarms
 
@@ -474,21 +483,21 @@ def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: O
 
 
 @portable
-def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
+def separate(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
     """Make robots i and j separate at least at the required rate, each by half; return whether that took a change."""
     line_W = subtract(row(p_W, j), row(p_W, i))
     distance = norm(line_W)
     if distance >= reach(limits):
         return False
     u_W = direction(line_W, distance)
-    near = distance + min(along(u_W, v_W, i, j), 0.0) * limits.response_s
-    least = (limits.separation_min_m - near) / limits.guard_horizon_s
-    lacking = least - along(u_W, v_cmd_W, i, j)
-    if lacking <= SETTLED_M_S:
+    predicted_m = distance + min(separation_rate(u_W, v_W, i, j), 0.0) * limits.response_s
+    min_rate = (limits.separation_min_m - predicted_m) / limits.guard_horizon_s
+    deficit = min_rate - separation_rate(u_W, v_cmd_W, i, j)
+    if deficit <= DEFICIT_MIN_M_S:
         return False
     for k in range(3):
-        v_cmd_W[i, k] -= u_W[k] * lacking / 2
-        v_cmd_W[j, k] += u_W[k] * lacking / 2
+        v_cmd_W[i, k] -= u_W[k] * deficit / 2
+        v_cmd_W[j, k] += u_W[k] * deficit / 2
     return True
 
 
@@ -501,7 +510,7 @@ def reach(limits: RobotLimits) -> float:
 
 
 @portable
-def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
+def separation_rate(u_W: Vector, v_W: Array, i: int, j: int) -> float:
     """Return the rate at which robot j moves away from robot i along the line between them [m/s]."""
     return dot(u_W, subtract(row(v_W, j), row(v_W, i)))
 

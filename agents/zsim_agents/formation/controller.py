@@ -41,7 +41,7 @@ class Controller(Agent):
         spec = scenario.cluster(cluster)
         self.name = f"controller.{cluster}"
         self.period_ns = info.gate_ns
-        self._name(spec.drones)
+        self._set_drones(spec.drones)
         estimates, states = (tuple(map(key, spec.drones)) for key in (keys.estimate, keys.status))
         self._engagement = engagement_of(scenario, spec)
         self._grants = self._engagement.law.grants
@@ -62,26 +62,26 @@ class Controller(Agent):
         self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # requests since the last gate
 
     def receive(self, key: str, message: Any) -> None:
-        place = self._place.get(key)
-        if place is None:
+        index = self._index_of.get(key)
+        if index is None:
             self._grants.put(key, message)
         elif type(message) is flight_messages.Estimate:
-            former = self._estimates[place]
+            former = self._estimates[index]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in real time, messages may arrive out of order
-                self._estimates[place] = message
-        elif message.t_ns >= self._status_ns[place]:  # as for estimates
-            self._states[place], self._status_ns[place] = message.state, message.t_ns
+                self._estimates[index] = message
+        elif message.t_ns >= self._status_ns[index]:  # as for estimates
+            self._states[index], self._status_ns[index] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
         self._stepped_ns = self._grants.t_ns = t_ns
         output = self._engagement.step(self._gate(t_ns))
-        self._seat(self._engagement.drones)
+        self._reorder(self._engagement.drones)
         source, outputs = self.source, []
         answered, self._answered = self._answered, []
         for request, answer in answered:  # published at this gate: a re-run repeats these requests before it
-            key, of_request = self._request_key, (request.op, request.args, request.source)
+            key, request_fields = self._request_key, (request.op, request.args, request.source)
             message = run_messages.ClusterRequest(
-                t_ns, self.next_seq(key), *of_request, answer.ok, answer.error, source
+                t_ns, self.next_seq(key), *request_fields, answer.ok, answer.error, source
             )
             outputs.append(Output(key, message))
         for drone, mode in output.modes:
@@ -111,21 +111,21 @@ class Controller(Agent):
         outputs.append(Output(self._state_key, state))
         return outputs
 
-    def _seat(self, drones: Sequence[str]) -> None:
+    def _reorder(self, drones: Sequence[str]) -> None:
         """Assign the drones to rows in the order of the robots, which an assembly changes."""
         if drones == self.drones:
             return
-        places = [self.drones.index(drone) for drone in drones]
-        self._estimates = [self._estimates[k] for k in places]
-        self._states = [self._states[k] for k in places]
-        self._status_ns = [self._status_ns[k] for k in places]
-        self._name(drones)
-        self._grants.seat(drones)
+        indices = [self.drones.index(drone) for drone in drones]
+        self._estimates = [self._estimates[k] for k in indices]
+        self._states = [self._states[k] for k in indices]
+        self._status_ns = [self._status_ns[k] for k in indices]
+        self._set_drones(drones)
+        self._grants.reorder(drones)
 
-    def _name(self, drones: Sequence[str]) -> None:
+    def _set_drones(self, drones: Sequence[str]) -> None:
         self.drones = tuple(drones)
         self._velocity_keys = [keys.command(drone, "velocity") for drone in drones]
-        self._place = {key(drone): i for i, drone in enumerate(drones) for key in (keys.status, keys.estimate)}
+        self._index_of = {key(drone): i for i, drone in enumerate(drones) for key in (keys.status, keys.estimate)}
 
     def _gate(self, t_ns: int) -> GateInput:
         positions, velocities, variances, yaws, yaw_sigmas, ages_s = [], [], [], [], [], []
@@ -158,7 +158,7 @@ class Controller(Agent):
             return ControlAnswer(ok=False, error=error)
         try:
             refusal = self._engagement.request(read_request(request.op, request.args))
-            self._seat(self._engagement.drones)
+            self._reorder(self._engagement.drones)
         except RequestError as error:
             refusal = str(error)
         answer = ControlAnswer(ok=refusal is None, error=refusal or "")
@@ -182,7 +182,7 @@ class Controller(Agent):
         }
 
     def restore(self, state: State) -> None:
-        self._seat(state["engagement"]["drones"])
+        self._reorder(state["engagement"]["drones"])
         pairs = zip(map(keys.estimate, self.drones), state["estimates"], strict=True)
         self._estimates = [messages.decode(key, payload) if payload else _UNKNOWN for key, payload in pairs]
         self._states, self._status_ns = state["states"], state["status_ns"]
@@ -197,7 +197,7 @@ class Controller(Agent):
     def warm_start(self, key: str, message: flight_messages.ClusterState) -> None:
         drones = message.drones if sorted(message.drones) == sorted(self.drones) else self.drones
         self._engagement.warm_start(message.phase, np.array(message.desired), message.plan_step, drones)
-        self._seat(self._engagement.drones)
+        self._reorder(self._engagement.drones)
 
 
 _UNKNOWN = flight_messages.Estimate(

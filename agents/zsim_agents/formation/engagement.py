@@ -30,9 +30,9 @@ from zsim_agents.formation.flight_check import (
     ASSEMBLY_HEIGHT_M,
     DOWN,
     GUARD_PARTS,
-    HEAL_S,
     HELD_ON_REQUEST,
     READY_TO_ENGAGE,
+    RECOVERY_S,
     REJOINING,
     RESEND_S,
     SHAPE,
@@ -57,7 +57,7 @@ from zsim_agents.formation.flight_plan import (
     RefusalError,
     Scheduled,
 )
-from zsim_agents.formation.guidance import IN_PLACE_M, Guidance, Places
+from zsim_agents.formation.guidance import REJOINED_M, AssignedPositions, Guidance
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
 DT_MAX_S = 0.1  # maximum integration step, which applies after a gap
@@ -99,12 +99,12 @@ class Engagement:
         self._phase = "idle"
         self._gate: GateInput | None = None
         self._dt_s = 0.0
-        self._modes: dict[str, float] = {}  # time of the last mode command, by drone
+        self._modes_sent_s: dict[str, float] = {}  # time of the last mode command, by drone
         self._landing_s = -math.inf
         self._fault = ""  # why the control loop of an engaged formation is open
-        self._well_since_s = math.inf
+        self._faultless_since_s = math.inf
         self._assembly: Assembly | None = None  # set while the drones fly to assigned positions or wait there
-        self._places: Places | None = None  # set while the drones of a held formation are led back
+        self._positions: AssignedPositions | None = None  # set while the drones of a held formation are led back
         self._checked = np.empty(0)  # the last faultless reference; a reference at rest stays the same array
         self._wrapped = self._checked, self._checked  # the last reference, without and with wrapped angles
 
@@ -118,12 +118,12 @@ class Engagement:
         self._dt_s = min(max(gate.t_s - last_s, 0.0), DT_MAX_S)
         self._gate = gate
         self.check.observe(gate)
-        self.plan.run(gate.t_s, self._try)
+        self.plan.run(gate.t_s, self._submit)
         gate = self._gate  # the robots in the order set by the last assembly
-        if self._phase in ("assembling", "engaged") and gate.down:
-            self._phase, self._places, self._assembly = "idle", None, None
+        if self._phase in ("assembling", "engaged") and gate.is_down:
+            self._phase, self._positions, self._assembly = "idle", None, None
         if self._phase == "engaged":
-            self._judge(gate)
+            self._update_fault(gate)
             return self._hold(gate) if self._fault else self._fly(gate)
         if self._assembly is not None:
             return self._assemble(gate, self._assembly)
@@ -132,14 +132,14 @@ class Engagement:
         if self._phase != "landing":
             return self._output(gate, "")
         # a take-off command may still be in transit: idle only after some time on the ground
-        if gate.down and gate.t_s - self._landing_s >= RESEND_S:
+        if gate.is_down and gate.t_s - self._landing_s >= RESEND_S:
             self._phase = "idle"
         modes = self._mode_commands(gate, "land", AIRBORNE | {"taking_off"})
         return self._output(gate, self.check.state_fault(gate, DOWN | {"landing"}) or "", modes=modes)
 
     def request(self, request: FlightRequest) -> str | None:
         """Grant a request and return None, or change nothing and return why it is refused."""
-        refusal = self._try(request)
+        refusal = self._submit(request)
         if refusal is None and request is Order.LAND:
             self.plan.clear()
         elif refusal is None and not isinstance(request, Order):
@@ -157,7 +157,7 @@ class Engagement:
             drones: names of the drones in the order of the robots, if it differs from the scenario's.
         """
         self._phase = "engaged" if phase == "held" else phase
-        self._name(drones or self.drones)
+        self._set_drones(drones or self.drones)
         if self._phase == "engaged":
             self.guidance.engage(desired)
         self.plan.start_at(plan_step)
@@ -174,11 +174,11 @@ class Engagement:
             "assembly": self._assembly and self._assembly.snapshot(),
             "landing_s": self._landing_s,
             "fault": self._fault,
-            "well_since_s": self._well_since_s,
-            "modes": self._modes,
+            "well_since_s": self._faultless_since_s,
+            "modes": self._modes_sent_s,
             "value": self.check.value,
             "checked": self._checked,
-            "places": None if self._places is None else self._places.p_W,
+            "places": None if self._positions is None else self._positions.p_W,
             "guidance": self.guidance.snapshot(),
             "plan": self.plan.snapshot(),
             "law": law,
@@ -187,12 +187,12 @@ class Engagement:
     def restore(self, state: State, gate: GateInput | None) -> None:
         """Restore the snapshot of another process and the last gate that it processed."""
         self._phase, self._landing_s = state["phase"], state["landing_s"]
-        self._name(state["drones"])
+        self._set_drones(state["drones"])
         self._assembly = state["assembly"] and Assembly.restored(state["assembly"], self.gains)
-        self._fault, self._well_since_s = state["fault"], state["well_since_s"]
-        self._modes, self._checked = state["modes"], state["checked"]
+        self._fault, self._faultless_since_s = state["fault"], state["well_since_s"]
+        self._modes_sent_s, self._checked = state["modes"], state["checked"]
         self.check.value = state["value"]
-        self._places = None if state["places"] is None else self._places_at(state["places"])
+        self._positions = None if state["places"] is None else self._assigned_positions(state["places"])
         self.guidance.restore(state["guidance"])
         self.plan.restore(state["plan"])
         self.law.restore(state["law"])
@@ -200,7 +200,7 @@ class Engagement:
         if gate:
             self.check.observe(gate)
 
-    def _try(self, request: FlightRequest) -> str | None:
+    def _submit(self, request: FlightRequest) -> str | None:
         if self._gate is None:
             return "no gate was seen yet; ask again when the simulation runs"
         try:
@@ -216,25 +216,25 @@ class Engagement:
             if fault := self.check.take_off_fault(gate, self.plan.assembles):
                 raise RefusalError(fault)
             self._phase = "taking_off"
-            self._modes.clear()
+            self._modes_sent_s.clear()
         elif request is Order.ENGAGE:
             self._grant_engagement(gate)
         elif request is Order.LAND:
-            if self._phase == "idle" and gate.down:
+            if self._phase == "idle" and gate.is_down:
                 raise RefusalError("all drones are on the ground")
-            self._phase, self._landing_s, self._places, self._assembly = "landing", gate.t_s, None, None
-            self._modes.clear()
+            self._phase, self._landing_s, self._positions, self._assembly = "landing", gate.t_s, None, None
+            self._modes_sent_s.clear()
         elif request is Order.REJOIN:
             if self._phase != "engaged" or not self._fault:
                 raise RefusalError(f"phase is {self.phase}; possible when held by a fault")
-            if fault := self._unflyable(gate):
+            if fault := self._control_fault(gate):
                 raise RefusalError(fault)
             c = self._checked if self._checked.size else self.guidance.value(gate.t_s)[0]
             if fault := formation_fault(self.space, c, self.gains, SHAPE_IN_FLIGHT):
                 raise RefusalError(fault)
-            self._places = self._places_at(self.space.inverse(c)[0])
-        elif request is Order.PAUSE and self._places is not None:
-            self._places = None
+            self._positions = self._assigned_positions(self.space.inverse(c)[0])
+        elif request is Order.PAUSE and self._positions is not None:
+            self._positions = None
         elif isinstance(request, Assemble):
             self._grant_assembly(request, gate)
         elif self._phase != "engaged":
@@ -254,7 +254,7 @@ class Engagement:
             return
         if self._phase != "assembling":
             raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
-        if fault := self._way_left(gate) or self.check.engagement_fault(gate):
+        if fault := self._arrival_fault(gate) or self.check.engagement_fault(gate):
             raise RefusalError(fault)
         if self._assembly is None:
             self.guidance.engage(self.check.value)
@@ -269,7 +269,7 @@ class Engagement:
         """Assign the drones to the positions of a formation and start their flight there."""
         if self._phase not in ("assembling", "engaged") or self._fault:
             raise RefusalError(self._fault or f"phase is {self.phase}; possible when assembling or engaged")
-        if fault := self._way_left(gate) or self.check.assembly_fault(gate):
+        if fault := self._arrival_fault(gate) or self.check.assembly_fault(gate):
             raise RefusalError(fault)
         if self._phase == "engaged":
             base = self.guidance.base(gate.t_s)
@@ -278,27 +278,28 @@ class Engagement:
         c = assembly_goal(self.space, request.values, base, gate.p_W, gate.yaw)
         self._assembly, order = planned_assembly(self.space, c, gate.p_W, self.gains)
         self._phase = "assembling"
-        self._name([self.drones[k] for k in order.tolist()])
-        self._gate = gate.of(order)
+        self._set_drones([self.drones[k] for k in order.tolist()])
+        self._gate = gate.reordered(order)
         self.check.observe(self._gate)
 
-    def _name(self, drones: Sequence[str]) -> None:
+    def _set_drones(self, drones: Sequence[str]) -> None:
         """Set the names of the drones, in the order of the robots."""
         self.drones = self.law.robots = self.check.drones = tuple(drones)
 
-    def _way_left(self, gate: GateInput) -> str | None:
+    def _arrival_fault(self, gate: GateInput) -> str | None:
         """Return how far the drones still are from their assigned positions, as a text; None after arrival."""
         if self._assembly is None or self._assembly.arrived(gate.p_W):
             return None
-        i, away_m = self._assembly.farthest(gate.p_W)
+        i, distance_m = self._assembly.farthest(gate.p_W)
         return (
-            f"{self.drones[i]} is {away_m:.1f} m from its position, {self._assembly.left_s:.1f} s of the paths are left"
+            f"{self.drones[i]} is {distance_m:.1f} m from its position, "
+            f"{self._assembly.remaining_s:.1f} s of the paths are left"
         )
 
-    def _places_at(self, p_W: Array) -> Places:
-        return Places(p_W, self.gains, self._held_limits, SHAPE.share)
+    def _assigned_positions(self, p_W: Array) -> AssignedPositions:
+        return AssignedPositions(p_W, self.gains, self._held_limits, SHAPE.share)
 
-    def _unflyable(self, gate: GateInput) -> str | None:
+    def _control_fault(self, gate: GateInput) -> str | None:
         """Return why the drones cannot be led individually; None if they can."""
         return self.check.state_fault(gate, AIRBORNE) or self.check.estimate_fault(gate)
 
@@ -306,8 +307,8 @@ class Engagement:
         """Return mode commands for the drones in one of the given states, each at most once per RESEND_S."""
         due = []
         for drone, state in zip(self.drones, gate.states, strict=True):
-            if state in states and gate.t_s - self._modes.get(drone, -math.inf) >= RESEND_S:
-                self._modes[drone] = gate.t_s
+            if state in states and gate.t_s - self._modes_sent_s.get(drone, -math.inf) >= RESEND_S:
+                self._modes_sent_s[drone] = gate.t_s
                 due.append(ModeCommand(drone, mode))
         return tuple(due)
 
@@ -322,20 +323,22 @@ class Engagement:
             reason = self.check.engagement_fault(gate) or READY_TO_ENGAGE
         below_m = ASSEMBLY_HEIGHT_M - gate.p_W[:, 2]
         climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), ASSEMBLY_CLIMB_M_S)
-        return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
+        return self._output(
+            gate, reason, modes=modes, command=self._vertical_command(gate, climb_m_s, self.gains.limits)
+        )
 
     def _assemble(self, gate: GateInput, assembly: Assembly) -> GateOutput:
         """Lead the drones to their positions without turning; all stop if one cannot be controlled."""
-        if fault := self._unflyable(gate):
-            return self._output(gate, fault, command=self._upright(gate, 0.0, self.gains.limits))
+        if fault := self._control_fault(gate):
+            return self._output(gate, fault, command=self._vertical_command(gate, 0.0, self.gains.limits))
         assembly.advance(gate.p_W, self._dt_s)
         command = self._guarded(gate, assembly.velocities(gate.p_W), self.gains.limits)
-        reason = self._way_left(gate) or self.check.engagement_fault(gate) or READY_TO_ENGAGE
+        reason = self._arrival_fault(gate) or self.check.engagement_fault(gate) or READY_TO_ENGAGE
         return self._output(gate, reason, command=command)
 
-    def _judge(self, gate: GateInput) -> None:
+    def _update_fault(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or clear it after HEAL_S without a fault."""
-        fault = self._way_fault(gate) or self.check.flight_fault(gate)
+        fault = self._rejoin_fault(gate) or self.check.flight_fault(gate)
         if not fault and not self._fault:  # the checks of a request cover only a limited time of the reference
             try:
                 c_des = self.guidance.value(gate.t_s)[0]
@@ -346,29 +349,29 @@ class Engagement:
                 fault = str(error)
             fault = f"reference: {fault}" if fault else None
         if fault:
-            self._fault, self._well_since_s = fault, math.inf
+            self._fault, self._faultless_since_s = fault, math.inf
         elif self._fault:
-            self._well_since_s = min(self._well_since_s, gate.t_s)
-            if gate.t_s - self._well_since_s < HEAL_S:
+            self._faultless_since_s = min(self._faultless_since_s, gate.t_s)
+            if gate.t_s - self._faultless_since_s < RECOVERY_S:
                 return
             try:
                 self.guidance.rejoin(self.check.value, gate.t_s)
             except REFUSALS as refusal:
-                self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
+                self._fault, self._faultless_since_s = f"cannot go on: {refusal}", gate.t_s
             else:
-                self._fault, self._places = "", None
+                self._fault, self._positions = "", None
                 self.law.reset()
 
-    def _way_fault(self, gate: GateInput) -> str | None:
+    def _rejoin_fault(self, gate: GateInput) -> str | None:
         """Return which drone has not rejoined its position; stop leading the drones if one cannot be controlled."""
-        if self._places is None:
+        if self._positions is None:
             return None
-        if self._unflyable(gate):
-            self._places = None
+        if self._control_fault(gate):
+            self._positions = None
             return None
-        i, away_m = self._places.farthest(gate.p_W)
-        place = f"{self.drones[i]} is {away_m:.1f} m from its position; allowed: {IN_PLACE_M:g} m"
-        return f"{REJOINING}: {place}" if away_m > IN_PLACE_M else None
+        i, distance_m = self._positions.farthest(gate.p_W)
+        finding = f"{self.drones[i]} is {distance_m:.1f} m from its position; allowed: {REJOINED_M:g} m"
+        return f"{REJOINING}: {finding}" if distance_m > REJOINED_M else None
 
     def _fly(self, gate: GateInput) -> GateOutput:
         c_des, c_dot_des = self.guidance.value(gate.t_s)
@@ -382,10 +385,10 @@ class Engagement:
 
     def _hold(self, gate: GateInput) -> GateOutput:
         """Stop the drones of a held formation, or lead them to their positions without turning."""
-        if self._places is None:
-            command = self._upright(gate, 0.0, self._held_limits)
+        if self._positions is None:
+            command = self._vertical_command(gate, 0.0, self._held_limits)
         else:
-            command = self._guarded(gate, self._places.velocities(gate.p_W), self._held_limits)
+            command = self._guarded(gate, self._positions.velocities(gate.p_W), self._held_limits)
         return self._output(gate, self._fault, command=command)
 
     def _guarded(self, gate: GateInput, v_W: Array, limits: RobotLimits) -> FormationCommand:
@@ -393,7 +396,7 @@ class Engagement:
         v_W, guarded, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, guarded, alarmed)
 
-    def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
+    def _vertical_command(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
         """Return the command for climb rates (n,) [m/s], guarded, without turning; zero if an estimate is unusable."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
@@ -413,8 +416,8 @@ class Engagement:
     ) -> GateOutput:
         """Return the output of a gate; without a reference, the desired value is the estimate."""
         if command and command.alarmed:
-            near = f"closer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
-            reason = f"{TOO_NEAR}, {near}; {reason}"
+            finding = f"closer than {self.gains.separation_alarm_m:g} m: {self._pairs(command.alarmed)}"
+            reason = f"{TOO_NEAR}, {finding}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
         desired, desired_rate = reference or (self.check.value, np.zeros(self.space.size))

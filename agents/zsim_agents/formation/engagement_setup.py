@@ -54,11 +54,11 @@ from zsim_agents.formation.spaces.cluster_space import (
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, Shifted, ramp_onto
 
-APART_M = 2.0  # distance between robots in a rehearsal; any value well above zero
+SEPARATION_M = 2.0  # distance between robots in a rehearsal; any value well above zero
 READY_S = 3.0  # minimum time from the take-off order to hovering drones and engagement; AR.Drones take 4 to 12 s
-ROOM = 1.05  # factor on the speed limits; design choice: a drone's position in the formation is off by some centimetres
-WAY_ROOM = 1.25  # factor on a path from the start; design choice: its length changes as the drones drift in their climb
-NEAR_ROOM = 0.9  # factor on the minimum separation and height; design choice, for the same reasons
+SPEED_SLACK = 1.05  # factor on the speed limits; design choice: positions in the formation are off by some centimetres
+PATH_SLACK = 1.25  # factor on a path from the start; design choice: its length changes as drones drift in their climb
+SEPARATION_SLACK = 0.9  # factor on the minimum separation and height; design choice, for the same reasons
 STEP_S, STEPS_MIN, STEPS_MAX = 0.1, 41, 3001  # sampling of a checked reference
 
 
@@ -99,7 +99,7 @@ class PlannedMotion(NamedTuple):
     until_s: float
     path: str  # path in the cluster's section of the scenario
 
-    def places(self, t_s: float) -> Array:
+    def positions(self, t_s: float) -> Array:
         """Return the reference positions of the robots, (n, 3) [m; W]."""
         return self.space.inverse(self.reference.value(t_s)[0])[0]
 
@@ -122,7 +122,9 @@ def planned_motion(scenario: Scenario, cluster: Cluster) -> PlannedMotion | None
             try:
                 if isinstance(request, Assemble):
                     start = goal = assembly_goal(space, request.values, None if start is None else goal, p_W, yaw)
-                    ready_s = max(ready_s, step.at_s) + planned_assembly(space, goal, p_W, gains, NEAR_ROOM)[0].over_s
+                    ready_s = (
+                        max(ready_s, step.at_s) + planned_assembly(space, goal, p_W, gains, SEPARATION_SLACK)[0].over_s
+                    )
                     p_W, yaw = space.inverse(goal)
                 elif isinstance(request, MoveTo | Follow) and start is not None:
                     if isinstance(request, MoveTo):
@@ -174,15 +176,15 @@ def _rehearse(
     law: Callable[[ClusterSpace, FormationGains], ControlLaw],
 ) -> None:
     """Step a separate engagement by one gate, so that all code is compiled or loaded before the flight."""
-    p_W, yaw = space.inverse(space.specimen(max(gains.separation_min_m, APART_M)))
-    c, none, still = space.forward(p_W, yaw), np.zeros((space.n, 3)), np.zeros(space.n)
+    p_W, yaw = space.inverse(space.specimen(max(gains.separation_min_m, SEPARATION_M)))
+    c, zero_vectors, zeros = space.forward(p_W, yaw), np.zeros((space.n, 3)), np.zeros(space.n)
     rehearsal = Engagement(space, drones, gains, law=law)
     rehearsal.warm_start("engaged", c)
-    rehearsal.step(GateInput(0.0, p_W, yaw, none, none, still, still, ("flying",) * space.n))
+    rehearsal.step(GateInput(0.0, p_W, yaw, zero_vectors, zero_vectors, zeros, zeros, ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
     all_near(p_W, yaw)
     closest_pair(p_W)
-    guard(p_W, none, none, gains.limits)
+    guard(p_W, zero_vectors, zero_vectors, gains.limits)
     load(*robot_rates(space, c, c), gains.limits)
 
 
@@ -210,8 +212,8 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
     ready_s = plan.takeoff_s + READY_S
     begins_s = max(ready_s, plan.trajectory.start_s) if plan.trajectory else ready_s
     if plan.land_s is not None and plan.land_s < begins_s:
-        what = "trajectory" if plan.trajectory else "target"
-        reason = f"the {what} of the plan begins at {begins_s:g} s at the earliest"
+        kind = "trajectory" if plan.trajectory else "target"
+        reason = f"the {kind} of the plan begins at {begins_s:g} s at the earliest"
         raise PlanError(f"plan.land_s is {plan.land_s:g}; must be later: {reason}")
     p_W, yaw = _hovers(scenario, cluster)
     start = _formation_at(space, p_W, yaw)
@@ -225,7 +227,7 @@ def _check_flyable(scenario: Scenario, cluster: Cluster, space: ClusterSpace, ga
             if isinstance(request, Assemble):
                 base = None if start is None else goal
                 start = goal = assembly_goal(space, request.values, base, p_W, yaw)
-                planned_assembly(space, goal, p_W, gains, NEAR_ROOM)
+                planned_assembly(space, goal, p_W, gains, SEPARATION_SLACK)
                 p_W, yaw = space.inverse(goal)
             elif start is None:
                 continue  # the take-off order, before any formation exists
@@ -254,14 +256,14 @@ class _Rehearsal:
     def __init__(self, scenario: Scenario, cluster: Cluster, space: ClusterSpace, gains: FormationGains) -> None:
         self._space, self._share = space, SHAPE.share
         self._drones = [(name, scenario.drone(name).limits) for name in cluster.drones]
-        of_drones = [each for _, each in self._drones]
+        drone_limits = [each for _, each in self._drones]
         self._limits: RobotLimits = gains.limits._replace(
-            speed_max_m_s=min(gains.speed_max_m_s, *(each.horizontal_speed_m_s for each in of_drones)),
-            climb_max_m_s=min(gains.climb_max_m_s, *(each.vertical_speed_m_s for each in of_drones)),
-            yaw_rate_max_rad_s=min(gains.yaw_rate_max_rad_s, *(math.radians(e.yaw_rate_deg_s) for e in of_drones)),
+            speed_max_m_s=min(gains.speed_max_m_s, *(each.horizontal_speed_m_s for each in drone_limits)),
+            climb_max_m_s=min(gains.climb_max_m_s, *(each.vertical_speed_m_s for each in drone_limits)),
+            yaw_rate_max_rad_s=min(gains.yaw_rate_max_rad_s, *(math.radians(e.yaw_rate_deg_s) for e in drone_limits)),
         )
-        wide = replace(gains, separation_min_m=NEAR_ROOM * gains.separation_min_m)
-        self._wide = wide, replace(SHAPE_IN_FLIGHT, height_min_m=NEAR_ROOM * SHAPE.height_min_m)
+        relaxed = replace(gains, separation_min_m=SEPARATION_SLACK * gains.separation_min_m)
+        self._relaxed = relaxed, replace(SHAPE_IN_FLIGHT, height_min_m=SEPARATION_SLACK * SHAPE.height_min_m)
         self._exact = gains, SHAPE
         self._planner = RampPlanner(space, gains, SHAPE)
 
@@ -274,7 +276,7 @@ class _Rehearsal:
             self._planner.fastest((start, rest), home, 0.0)
             return
         peak, _ = self._peak(ramp_onto(self._space, start, rest, home, 0.0, over_s), 0.0, over_s)
-        if peak > WAY_ROOM * LOAD_TOLERANCE * self._share:
+        if peak > PATH_SLACK * LOAD_TOLERANCE * self._share:
             factor = peak / self._share
             raise PlanError(
                 f"plan.target_over_s is {over_s:g}; must be {factor:.2g} times as long, {factor * over_s:.1f} s or "
@@ -291,7 +293,7 @@ class _Rehearsal:
         from_s = max(0.0, ready_s - start_s)
         to_s = min(from_s + HORIZON_S, math.inf if length_s is None else length_s)
         peak, peak_s = self._peak(trajectory, from_s, to_s)
-        if peak > ROOM * LOAD_TOLERANCE * self._share:
+        if peak > SPEED_SLACK * LOAD_TOLERANCE * self._share:
             factor = peak / self._share
             raise PlanError(
                 f"plan.trajectory needs {peak:.2f} times the speed limits of a robot {peak_s:.1f} s after its start; "
@@ -301,9 +303,9 @@ class _Rehearsal:
             if fault := self._fault_at(trajectory.value(t_s)[0]):
                 raise PlanError(f"plan.trajectory: {t_s:.1f} s after its start {fault}")
         ramp = self._planner.fastest((start, np.zeros_like(start)), Shifted(trajectory, start_s), ready_s)
-        there_s = ready_s + ramp.over_s
-        if end_s < math.inf and there_s > ready_s + WAY_ROOM * (end_s - ready_s):
-            reason = f"the formation does not reach it before {there_s:.0f} s"
+        arrival_s = ready_s + ramp.over_s
+        if end_s < math.inf and arrival_s > ready_s + PATH_SLACK * (end_s - ready_s):
+            reason = f"the formation does not reach it before {arrival_s:.0f} s"
             raise PlanError(f"plan.trajectory is over at {end_s:g} s; must start later: {reason}")
 
     def _peak(self, reference: Reference, from_s: float, to_s: float) -> tuple[float, float]:
@@ -315,7 +317,7 @@ class _Rehearsal:
 
     def _fault_at(self, c: Array) -> str | None:
         space = self._space
-        if formation_fault(space, c, *self._wide):
+        if formation_fault(space, c, *self._relaxed):
             return formation_fault(space, c, *self._exact)
         heights_m = space.inverse(c)[0][:, 2].tolist()
         for (name, limits), height_m in zip(self._drones, heights_m, strict=True):

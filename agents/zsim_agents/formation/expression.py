@@ -90,9 +90,9 @@ class Expression:
             name = self._source(tree.func)
             if name not in _FUNCTIONS or tree.keywords:
                 raise self._error(f"calls {name!r}; allowed: {self._allowed()}")
-            function, least, most = _FUNCTIONS[name]
-            if not least <= len(tree.args) <= most:
-                count = f"{least}" if least == most else f"{least} to {most}"
+            function, args_min, args_max = _FUNCTIONS[name]
+            if not args_min <= len(tree.args) <= args_max:
+                count = f"{args_min}" if args_min == args_max else f"{args_min} to {args_max}"
                 raise self._error(f"calls {name} with {len(tree.args)} arguments; allowed: {count}")
             return self._apply(function, tree.args, depth)
         raise self._error(f"contains {self._source(tree)!r}; allowed: {self._allowed()}")

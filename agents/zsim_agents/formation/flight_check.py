@@ -19,9 +19,9 @@ from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
-FAR = 1e6  # m, m/s or rad; any greater value is taken for an error
+VALUE_MAX = 1e6  # m, m/s or rad; any greater value is taken for an error
 ROUNDING_M = 1e-9  # tolerance above the rounding of a computed position (1e-14 m at 50 m): the limit itself is allowed
-VALID, STALE, NOT_FINITE, UNCERTAIN, TURNED = range(5)  # findings of `estimate_flaw`
+VALID, STALE, NOT_FINITE, POSITION_UNCERTAIN, HEADING_UNCERTAIN = range(5)  # findings of `estimate_flaw`
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
 DOWN = frozenset({"landed", "emergency"})  # states of a drone on the ground or falling
 # Reasons in the cluster state, from which a display derives the possible requests
@@ -61,11 +61,11 @@ SHAPE_IN_FLIGHT = dataclasses.replace(  # a formation in flight is held outside 
     condition_max=math.inf,
 )
 ASSEMBLY_HEIGHT_M = 1.5  # height of the climb before engagement: many rotor radii, yet drones survive a fall from it
-ASSEMBLY_WITHIN_M = 0.3  # tolerance of that height, three sigma of the barometer
+ASSEMBLY_TOLERANCE_M = 0.3  # tolerance of that height, three sigma of the barometer
 ASSEMBLY_CLIMB_M_S = 0.5  # maximum climb rate: half of the firmware's limit, so that all drones climb equally fast
 AGE_MAX_S = 0.5  # maximum age of a usable estimate: 25 gates, as long as the firmware tolerates silence
 IN_FLIGHT_FACTOR = 2.0  # factor on the sigma limits in flight: 2 m for a position, the sigma of a single GPS fix
-HEAL_S = 0.5  # time without a fault before a held formation continues: 25 gates rule out coincidence
+RECOVERY_S = 0.5  # time without a fault before a held formation continues: 25 gates rule out coincidence
 RESEND_S = 1.0  # period of resending an ineffective mode command: ten times its delay in the paper's scenario
 
 
@@ -96,14 +96,14 @@ class GateInput(Struct, eq=False):
     age_s: Array
     states: tuple[str, ...]
 
-    def of(self, order: NDArray[np.intp]) -> GateInput:
+    def reordered(self, order: NDArray[np.intp]) -> GateInput:
         """Return the gate with the robots reordered; `order` (n,) holds their present indices."""
         motion = self.p_W[order], self.yaw[order], self.v_W[order]
-        known = self.sigma_m[order], self.yaw_sigma[order], self.age_s[order]
-        return GateInput(self.t_s, *motion, *known, tuple(self.states[k] for k in order.tolist()))
+        accuracies = self.sigma_m[order], self.yaw_sigma[order], self.age_s[order]
+        return GateInput(self.t_s, *motion, *accuracies, tuple(self.states[k] for k in order.tolist()))
 
     @property
-    def down(self) -> bool:  # whether no drone is in the air
+    def is_down(self) -> bool:  # whether no drone is in the air
         return DOWN.issuperset(self.states)
 
 
@@ -121,10 +121,10 @@ class Setpoint(Struct, eq=False):
 
 def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | None, ...]:
     """Return setpoints from velocities (n, 3) and yaw rates (n,); None for drones that do not follow setpoints."""
-    every = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
+    commands = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
     if AIRBORNE.issuperset(gate.states):
-        return tuple(every)
-    return tuple(setpoint if state in AIRBORNE else None for setpoint, state in zip(every, gate.states, strict=True))
+        return tuple(commands)
+    return tuple(setpoint if state in AIRBORNE else None for setpoint, state in zip(commands, gate.states, strict=True))
 
 
 class GateOutput(Struct, eq=False):
@@ -169,12 +169,12 @@ class FlightCheck:
         self._no_frame: str | None = "nothing was observed yet"
         self._flaw = (VALID, 0)  # first flaw of the observed gate under the limits in flight
         sigmas = limits.sigma_max_m, limits.yaw_sigma_max_rad
-        self._at_start = (AGE_MAX_S, *sigmas)
-        self._in_flight = (AGE_MAX_S, *(IN_FLIGHT_FACTOR * sigma for sigma in sigmas))
+        self._start_limits = (AGE_MAX_S, *sigmas)
+        self._flight_limits = (AGE_MAX_S, *(IN_FLIGHT_FACTOR * sigma for sigma in sigmas))
 
     def observe(self, gate: GateInput) -> None:
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
-        self._flaw = _first_flaw(gate, *self._in_flight)
+        self._flaw = _first_flaw(gate, *self._flight_limits)
         if self._flaw[0] != VALID and not all_near(gate.p_W, gate.yaw):
             return
         try:
@@ -201,10 +201,10 @@ class FlightCheck:
         """Return why the drones cannot be led individually after their climb."""
         if fault := self._start_fault(gate, AIRBORNE):
             return fault
-        low = int(np.argmin(gate.p_W[:, 2]))
-        least_m = ASSEMBLY_HEIGHT_M - ASSEMBLY_WITHIN_M
-        if gate.p_W[low, 2] < least_m:
-            return f"{self.drones[low]} is at z = {gate.p_W[low, 2]:.2f} m; allowed: {least_m:.2f} m or more"
+        lowest = int(np.argmin(gate.p_W[:, 2]))
+        height_min_m = ASSEMBLY_HEIGHT_M - ASSEMBLY_TOLERANCE_M
+        if gate.p_W[lowest, 2] < height_min_m:
+            return f"{self.drones[lowest]} is at z = {gate.p_W[lowest, 2]:.2f} m; allowed: {height_min_m:.2f} m or more"
         return None
 
     def flight_fault(self, gate: GateInput) -> str | None:
@@ -229,8 +229,10 @@ class FlightCheck:
 
     def formation(self) -> Array | None:
         """Return the cluster variables (4n,) of the observed gate; None if the robots form no flyable formation."""
-        is_one = self._no_frame is None and shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread) is None
-        return self.value if is_one else None
+        is_flyable = (
+            self._no_frame is None and shape_fault(self.space, self.value, SHAPE_IN_FLIGHT, self._spread) is None
+        )
+        return self.value if is_flyable else None
 
     def estimate_fault(self, gate: GateInput) -> str | None:
         """Return why the flight cannot continue on the estimates of the observed gate."""
@@ -244,7 +246,7 @@ class FlightCheck:
         return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
 
     def _start_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
-        return self.state_fault(gate, allowed) or self._flaw_text(gate, _first_flaw(gate, *self._at_start))
+        return self.state_fault(gate, allowed) or self._flaw_text(gate, _first_flaw(gate, *self._start_limits))
 
     def _flaw_text(self, gate: GateInput, flaw: tuple[int, int], factor: float = 1.0) -> str | None:
         kind, i = flaw
@@ -254,32 +256,32 @@ class FlightCheck:
         if kind == STALE:
             return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {AGE_MAX_S:g} s"
         if kind == NOT_FINITE:
-            return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
-        if kind == TURNED:
-            sigma_deg, most_deg = math.degrees(gate.yaw_sigma[i]), math.degrees(factor * self.limits.yaw_sigma_max_rad)
-            return f"the heading of {drone} has a sigma of {sigma_deg:.1f} deg; allowed: {most_deg:g} deg"
-        worst_m, most_m = max(gate.sigma_m[i].tolist()), factor * self.limits.sigma_max_m
-        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {most_m:g} m"
+            return f"the estimate of {drone} is not finite; allowed: up to {VALUE_MAX:g} m, m/s or rad"
+        if kind == HEADING_UNCERTAIN:
+            sigma_deg, max_deg = math.degrees(gate.yaw_sigma[i]), math.degrees(factor * self.limits.yaw_sigma_max_rad)
+            return f"the heading of {drone} has a sigma of {sigma_deg:.1f} deg; allowed: {max_deg:g} deg"
+        worst_m, max_m = max(gate.sigma_m[i].tolist()), factor * self.limits.sigma_max_m
+        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {max_m:g} m"
 
 
 def _first_flaw(gate: GateInput, age_max_s: float, sigma_max_m: float, yaw_sigma_max: float) -> tuple[int, int]:
-    of_gate = gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, gate.yaw_sigma
-    return estimate_flaw(*of_gate, age_max_s, sigma_max_m, yaw_sigma_max)
+    estimates = gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, gate.yaw_sigma
+    return estimate_flaw(*estimates, age_max_s, sigma_max_m, yaw_sigma_max)
 
 
 @portable
 def all_near(p_W: Array, yaw: Array) -> bool:
-    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR in magnitude."""
-    fit = True
+    """Return whether all positions (n, 3) and headings (n,) are finite and below VALUE_MAX in magnitude."""
+    is_valid = True
     for i in range(yaw.size):
-        fit = fit and near(p_W, i) and abs(yaw[i]) < FAR
-    return fit
+        is_valid = is_valid and is_near(p_W, i) and abs(yaw[i]) < VALUE_MAX
+    return is_valid
 
 
 @portable
-def near(vectors: Array, i: int) -> bool:
-    """Return whether row i of vectors (n, 3) is finite and below FAR in magnitude."""
-    return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
+def is_near(vectors: Array, i: int) -> bool:
+    """Return whether row i of vectors (n, 3) is finite and below VALUE_MAX in magnitude."""
+    return abs(vectors[i, 0]) < VALUE_MAX and abs(vectors[i, 1]) < VALUE_MAX and abs(vectors[i, 2]) < VALUE_MAX
 
 
 @portable
@@ -296,18 +298,18 @@ def estimate_flaw(
 ) -> tuple[int, int]:
     """Return the flaw of the first unusable estimate and the index of its drone; (VALID, 0) if all are usable.
 
-    UNCERTAIN means that the sigma of the position is too large; TURNED, that of the heading.
+    POSITION_UNCERTAIN and HEADING_UNCERTAIN mean that the sigma is too large.
     """
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
             return STALE, i
-        if not (near(p_W, i) and near(v_W, i) and abs(yaw[i]) < FAR):
+        if not (is_near(p_W, i) and is_near(v_W, i) and abs(yaw[i]) < VALUE_MAX):
             return NOT_FINITE, i
         for k in range(3):
             if not sigma_m[i, k] <= sigma_max_m:
-                return UNCERTAIN, i
+                return POSITION_UNCERTAIN, i
         if not yaw_sigma[i] <= yaw_sigma_max:
-            return TURNED, i
+            return HEADING_UNCERTAIN, i
     return VALID, 0
 
 
@@ -319,17 +321,17 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: floa
     outside = first_outside(c, space.bounds)
     if outside >= 0:
         name, value, (low, high) = space.names[outside], float(c[outside]), space.bounds[outside].tolist()
-        if not abs(value) < FAR:
-            return f"{name} is {value:g}; allowed: up to {FAR:g}"
+        if not abs(value) < VALUE_MAX:
+            return f"{name} is {value:g}; allowed: up to {VALUE_MAX:g}"
         return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
     spread = space.spread(c) if spread is None else spread
     if spread <= limits.spread_min_m:
         return f"{space.spread_text} is {spread:.2f} m; allowed: above {limits.spread_min_m:g} m"
     for k in space.tilts:
         if abs(c[k]) >= limits.tilt_max_rad:
-            tilt_deg, most_deg = math.degrees(c[k]), math.degrees(limits.tilt_max_rad)
+            tilt_deg, max_deg = math.degrees(c[k]), math.degrees(limits.tilt_max_rad)
             tilt = f"{space.names[k]} of the formation is {tilt_deg:.1f} deg"
-            return f"{tilt}; allowed: below {most_deg:g} deg either way"
+            return f"{tilt}; allowed: below {max_deg:g} deg either way"
     condition = space.condition(c) if math.isfinite(limits.condition_max) else 0.0
     if not condition < limits.condition_max:
         return f"condition number of J^-1 is {condition:.1f}; allowed: below {limits.condition_max:g}"
@@ -347,9 +349,9 @@ def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
 
 @portable
 def first_outside(c: Array, bounds: Array) -> int:
-    """Return the index of the first variable of c beyond FAR or outside its open bounds (4n, 2), else -1."""
+    """Return the index of the first variable of c beyond VALUE_MAX or outside its open bounds (4n, 2), else -1."""
     for k in range(c.size):
-        if not (abs(c[k]) < FAR and bounds[k, 0] < c[k] < bounds[k, 1]):  # also true for NaN
+        if not (abs(c[k]) < VALUE_MAX and bounds[k, 0] < c[k] < bounds[k, 1]):  # also true for NaN
             return k
     return -1
 
@@ -362,7 +364,7 @@ def formation_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
     """Return why the robots' positions in c are not allowed (too close together or too low), or None."""
     p_W, _ = space.inverse(c)
-    if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
+    if has_valid_positions(p_W, gains.separation_min_m, limits.height_min_m):
         return None
     distance, i, j = closest_pair(p_W)
     if distance < gains.separation_min_m - ROUNDING_M:
@@ -371,14 +373,14 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
     heights = p_W[:, 2].tolist()
     lowest = min(heights)
     if lowest < limits.height_min_m - ROUNDING_M:
-        low = heights.index(lowest)
-        return f"robot {low + 1} is at z = {lowest:.2f} m; allowed: {limits.height_min_m:g} m or more"
+        robot = heights.index(lowest)
+        return f"robot {robot + 1} is at z = {lowest:.2f} m; allowed: {limits.height_min_m:g} m or more"
     return None
 
 
 @portable
-def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
-    fit = closest_pair(p_W)[0] >= separation_min_m - ROUNDING_M
+def has_valid_positions(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
+    is_valid = closest_pair(p_W)[0] >= separation_min_m - ROUNDING_M
     for i in range(p_W.shape[0]):
-        fit = fit and p_W[i, 2] >= height_min_m - ROUNDING_M
-    return fit
+        is_valid = is_valid and p_W[i, 2] >= height_min_m - ROUNDING_M
+    return is_valid

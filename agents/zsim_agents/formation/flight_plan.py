@@ -24,7 +24,7 @@ from zsim_agents.formation.trajectory import (
 )
 
 RETRY_S = 0.5  # period of retrying a refused request
-WAITS = " of the plan waits: "  # separates the step from the reason in the note of a plan
+WAITING = " of the plan waits: "  # separates the step from the reason in the note of a plan
 
 
 class RefusalError(ValueError):
@@ -158,26 +158,26 @@ class FlightPlan:
                 raise PlanError(f"{path}{text}") from None
         self._steps = tuple(steps)
         self._next = 0  # index of the first uncompleted step
-        self._flown = 0  # index of the first step of the reference being flown, else _next
-        self._try_s = -math.inf
+        self._active = 0  # index of the first step of the reference being flown, else _next
+        self._retry_s = -math.inf
         self.note = ""
 
     def run(self, t_s: float, request: Callable[[FlightRequest], str | None]) -> None:
         """Submit the requests due at `t_s` to `request`, which returns the reason for a refusal."""
-        for place in range(len(self._steps) - 1, self._next, -1):
-            step = self._steps[place]
+        for index in range(len(self._steps) - 1, self._next, -1):
+            step = self._steps[index]
             if step.at_s <= t_s and step.request is Order.LAND:
-                self._go_to(place)
+                self._go_to(index)
                 break
-        while self._next < len(self._steps) and t_s >= max(self._steps[self._next].at_s, self._try_s):
+        while self._next < len(self._steps) and t_s >= max(self._steps[self._next].at_s, self._retry_s):
             due = self._steps[self._next].request
             if refusal := request(due):
-                self._try_s = t_s + RETRY_S
+                self._retry_s = t_s + RETRY_S
                 op = due.value if isinstance(due, Order) else _OPERATION_OF[type(due)]
-                self.note = f"{op}{WAITS}{refusal}"
+                self.note = f"{op}{WAITING}{refusal}"
                 return
-            flown = self._next + 1 if isinstance(due, Order) else self._flown
-            self._go_to(self._next + 1, flown)
+            active = self._next + 1 if isinstance(due, Order) else self._active
+            self._go_to(self._next + 1, active)
 
     @property
     def assembles(self) -> bool:
@@ -186,36 +186,36 @@ class FlightPlan:
 
     def resume_at(self, flying: bool) -> int:
         """Return the number of steps that a restart skips: the completed ones, except those being flown."""
-        return self._flown if flying else self._next
+        return self._active if flying else self._next
 
     def start_at(self, step: int) -> None:
         """Skip the steps completed before a restart."""
         self._go_to(min(step, len(self._steps)))
 
     def snapshot(self) -> State:
-        return {"next": self._next, "flown": self._flown, "try_s": self._try_s, "note": self.note}
+        return {"next": self._next, "flown": self._active, "try_s": self._retry_s, "note": self.note}
 
     def restore(self, state: State) -> None:
-        self._next, self._flown = state["next"], state["flown"]
-        self._try_s, self.note = state["try_s"], state["note"]
+        self._next, self._active = state["next"], state["flown"]
+        self._retry_s, self.note = state["try_s"], state["note"]
 
     def overrule(self) -> None:
         """Record that the reference no longer follows the plan."""
-        self._flown = self._next
+        self._active = self._next
 
     def clear(self) -> None:
         """Drop all uncompleted steps."""
         self._go_to(len(self._steps))
 
-    def _go_to(self, step: int, flown: int | None = None) -> None:
-        self._next, self._flown = step, step if flown is None else flown
-        self._try_s, self.note = -math.inf, ""
+    def _go_to(self, step: int, active: int | None = None) -> None:
+        self._next, self._active = step, step if active is None else active
+        self._retry_s, self.note = -math.inf, ""
 
 
 def waiting_step(reason: str) -> tuple[str, str] | None:
     """Return the waiting step of the plan and why it waits, from a cluster state's reason; None if no step waits."""
-    before, waits, why = reason.rpartition(WAITS)
-    return (before.rpartition("; ")[2], why) if waits else None
+    before, separator, why = reason.rpartition(WAITING)
+    return (before.rpartition("; ")[2], why) if separator else None
 
 
 def plan_of(cluster: Cluster) -> list[Scheduled]:
@@ -275,12 +275,12 @@ def read_request(op: object, args: object = None) -> FlightRequest:
             allowed = ", ".join(fields) or "none"
             raise RequestError(f"{op}: field {str(name)[:40]!r} is unknown; allowed: {allowed}")
         if fields[name].startswith("a map"):
-            fits = isinstance(value, Mapping)
+            is_valid = isinstance(value, Mapping)
         elif fields[name].startswith("a list"):
-            fits = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+            is_valid = isinstance(value, Sequence) and not isinstance(value, str | bytes)
         else:
-            fits = value is None or finite_number(value) is not None
-        if not fits:
+            is_valid = value is None or finite_number(value) is not None
+        if not is_valid:
             raise RequestError(f"{op}: {name} is {str(value)[:40]!r}; allowed: {fields[name]}")
     given: dict[str, Any] = {name: value for name, value in arguments.items() if value is not None}
     return _KINDS[op](**given) if op in _KINDS else Order(op)

@@ -31,8 +31,8 @@ RAMP_SAMPLES = 33  # odd, so that one falls on the middle of a ramp, where its r
 LOAD_TOLERANCE = 1.02  # factor on the allowed share of the speed limits: ramps are sampled, and may start at the limit
 # Horizontal distance from its position within which a robot climbs or descends, and distance at which it has rejoined;
 # design choice: half of the minimum separation
-BENEATH_M = 1.0
-IN_PLACE_M = 1.0
+VERTICAL_WITHIN_M = 1.0
+REJOINED_M = 1.0
 
 
 class Guidance:
@@ -52,40 +52,40 @@ class Guidance:
         self._gains = gains
         self._planner = RampPlanner(space, gains, SHAPE)
         self._home: Reference = Hold(np.zeros(space.size))
-        self._flown: Reference = self._home
+        self._active: Reference = self._home
         self._goal = np.zeros(space.size)
-        self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last result of `value`
+        self._cached: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last result of `value`
 
     def value(self, t_s: float) -> tuple[Array, Array]:
         """Return c_des and its rate, each (4n,); cached per gate."""
-        if self._known is None or self._known[0] is not self._flown or self._known[1] != t_s:
-            self._known = (self._flown, t_s, self._flown.value(t_s))
-        return self._known[2]
+        if self._cached is None or self._cached[0] is not self._active or self._cached[1] != t_s:
+            self._cached = (self._active, t_s, self._active.value(t_s))
+        return self._cached[2]
 
     def trajectory_t_s(self, t_s: float) -> float | None:
         """Return the time since the start of the trajectory [s]; None if no trajectory is running."""
         if not isinstance(self._home, Shifted) or self.paused:
             return None
-        own_s, end_s = t_s - self._home.start_s, self._home.of.duration_s
-        return own_s if own_s >= 0.0 and (end_s is None or own_s <= end_s) else None
+        local_s, end_s = t_s - self._home.start_s, self._home.of.duration_s
+        return local_s if local_s >= 0.0 and (end_s is None or local_s <= end_s) else None
 
     def engage(self, c: Array) -> None:
         """Hold the formation at the estimate c (4n,)."""
         self._goal = c.copy()
         self._goal[self.space.neutral] = 0.0
-        self._home = self._flown = Hold(c)
+        self._home = self._active = Hold(c)
         self.paused = False
 
     def engage_at(self, c: Array, goal: Array, t_s: float) -> None:
         """Start at rest at the estimate c (4n,), and move to the goal (4n,) near it."""
         home = Hold(goal)
-        self._flown = self._planner.ramp((c, np.zeros_like(c)), home, t_s)
+        self._active = self._planner.ramp((c, np.zeros_like(c)), home, t_s)
         self._home, self._goal, self.paused = home, goal.copy(), False
 
     def target(self, request: MoveTo, t_s: float) -> None:
         goal = request.goal(self.space, self.base(t_s))
         home = Hold(goal)
-        self._flown = self._planner.ramp(self.value(t_s), home, t_s, request.over_s)
+        self._active = self._planner.ramp(self.value(t_s), home, t_s, request.over_s)
         self._home, self._goal, self.paused = home, goal, False
 
     def follow(self, request: Follow, t_s: float) -> None:
@@ -96,21 +96,21 @@ class Guidance:
             ramp = self._planner.fastest(self.value(t_s), begin, t_s)
             start_s = t_s + ramp.over_s
         home = Shifted(trajectory, start_s)
-        self._flown = self._planner.ramp(self.value(t_s), home, t_s)
+        self._active = self._planner.ramp(self.value(t_s), home, t_s)
         self._home, self.paused = home, False
 
     def pause(self, t_s: float) -> None:
         """Come to rest near the present reference, or immediately if no ramp is allowed."""
         c, c_dot = self.value(t_s)
         try:
-            self._flown = self._planner.ramp((c, c_dot), Hold(c), t_s)
+            self._active = self._planner.ramp((c, c_dot), Hold(c), t_s)
         except TrajectoryError:
-            self._flown = Hold(c)
+            self._active = Hold(c)
         self.paused = True
 
     def resume(self, t_s: float) -> None:
         """Continue to the home reference after a pause."""
-        self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
+        self._active = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
     def rejoin(self, c: Array, t_s: float) -> None:
@@ -120,18 +120,18 @@ class Guidance:
         """
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
-        self._flown = RampPlanner(self.space, self._gains, SHAPE_IN_FLIGHT).ramp(start, home, t_s)
+        self._active = RampPlanner(self.space, self._gains, SHAPE_IN_FLIGHT).ramp(start, home, t_s)
 
     def snapshot(self) -> State:
         return {
             "home": state_of(self._home),
-            "flown": state_of(self._flown),
+            "flown": state_of(self._active),
             "goal": self._goal,
             "paused": self.paused,
         }
 
     def restore(self, state: State) -> None:
-        self._home, self._flown = reference_of(self.space, state["home"]), reference_of(self.space, state["flown"])
+        self._home, self._active = reference_of(self.space, state["home"]), reference_of(self.space, state["flown"])
         self._goal, self.paused = state["goal"], state["paused"]
 
     def base(self, t_s: float) -> Array:
@@ -161,11 +161,11 @@ class RampPlanner:
                 raise TrajectoryError(f"the reference is not allowed: {fault}")
             ramp = self.fastest(start, onto, start_s)
             if over_s is not None:
-                least_s, ramp = ramp.over_s, None
+                min_s, ramp = ramp.over_s, None
                 if 0.0 < over_s <= RAMP_MAX_S:
                     ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
                 if ramp is None or self._peak_load(ramp) > self._limits.share * LOAD_TOLERANCE:
-                    allowed = f"allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s"
+                    allowed = f"allowed at the robots' limits: {min_s:.1f} s to {RAMP_MAX_S:g} s"
                     raise TrajectoryError(f"over_s is {over_s:g} s; {allowed}")
             fault = self.reference_fault(ramp, start_s, start_s + ramp.over_s)
         except SingularClusterError as error:
@@ -207,7 +207,7 @@ class RampPlanner:
         return None
 
 
-class Places:
+class AssignedPositions:
     """The assigned positions p_W (n, 3) [m] in a held formation, and the motion of each robot to its own.
 
     A robot far from its position (for example after landing and taking off again) distorts the shape so that it cannot
@@ -223,13 +223,13 @@ class Places:
     def velocities(self, p_W: Array) -> Array:
         """Return the velocities (n, 3) [m/s, W] of robots at p_W (n, 3) [m], not yet guarded."""
         v_W = self._gain_1_s * (self.p_W - p_W)
-        aside_m = np.linalg.norm((self.p_W - p_W)[:, :2], axis=1)
-        speed_m_s = self._gain_1_s * aside_m
+        horizontal_m = np.linalg.norm((self.p_W - p_W)[:, :2], axis=1)
+        speed_m_s = self._gain_1_s * horizontal_m
         v_W[:, :2] *= np.minimum(1.0, self._speed_max_m_s / np.maximum(speed_m_s, self._speed_max_m_s))[:, None]
-        v_W[:, 2] = np.clip(v_W[:, 2], -self._climb_max_m_s, self._climb_max_m_s) * (aside_m <= BENEATH_M)
+        v_W[:, 2] = np.clip(v_W[:, 2], -self._climb_max_m_s, self._climb_max_m_s) * (horizontal_m <= VERTICAL_WITHIN_M)
         return v_W
 
     def farthest(self, p_W: Array) -> tuple[int, float]:
         """Return the index of the robot farthest from its position, and the distance [m]."""
-        away_m = np.linalg.norm(self.p_W - p_W, axis=1)
-        return int(np.argmax(away_m)), float(away_m.max())
+        distances_m = np.linalg.norm(self.p_W - p_W, axis=1)
+        return int(np.argmax(distances_m)), float(distances_m.max())

@@ -120,15 +120,15 @@ class ExpressionTrajectory:
         self._moving: list[tuple[Variable, Expression]] = []
         given = set[int]()
         for name, text in expressions.items():
-            place = f"expressions: {name}", f".expressions.{name}"
+            location = f"expressions: {name}", f".expressions.{name}"
             variable = variable_of(space, name, "expressions", ".expressions")
-            _refuse_twice(space, variable, given, place)
+            _refuse_twice(space, variable, given, location)
             if not isinstance(text, str) and finite_number(text) is None:
                 raise ExpressionError(f"{name}: found {str(text)[:40]!r}; allowed: text or a finite number")
             expression = Expression(name, text if isinstance(text, str) else repr(float(text)), constants)
             if expression.constant:
                 value = expression(0.0)[0]
-                _refuse_turns(space, variable, value, place)
+                _refuse_turns(space, variable, value, location)
                 self._base[variable.entry] = value * variable.scale
             else:
                 self._moving.append((variable, expression))
@@ -161,41 +161,41 @@ class WaypointTrajectory:
         if not 1 <= len(waypoints) <= WAYPOINTS_MAX:
             raise TrajectoryError(f"trajectory: {len(waypoints)} waypoints; allowed: 1 to {WAYPOINTS_MAX}")
         self._times: list[float] = []
-        places: list[Array] = []
+        points: list[Array] = []
         for number, waypoint in enumerate(waypoints, start=1):
             is_map = isinstance(waypoint, Mapping)
             given = waypoint.get("at_s") if is_map else waypoint
             at_s = finite_number(given) if is_map else None
-            least = self._times[-1] if self._times else -1e-9
-            if at_s is None or not at_s > least:
-                more = f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more"
-                finding = f"is {str(given)[:40]}; allowed: a number of seconds{more}"
+            min_s = self._times[-1] if self._times else -1e-9
+            if at_s is None or not at_s > min_s:
+                bound = f" above {min_s:g}, that of the waypoint before" if self._times else ", 0 or more"
+                finding = f"is {str(given)[:40]}; allowed: a number of seconds{bound}"
                 raise TrajectoryError(finding, f"waypoint {number}: at_s", f".waypoints[{number - 1}].at_s")
             self._times.append(at_s)
             unknown = sorted(str(key)[:40] for key in waypoint if key not in ("at_s", "values"))
             if unknown:
                 raise TrajectoryError(f"waypoint {number}: field {unknown[0]!r} is unknown; allowed: at_s, values")
-            before, at = places[-1] if places else base, f".waypoints[{number - 1}].values"
-            named = named_values(space, waypoint.get("values"), f"waypoint {number}", before, at)
-            places.append(before + space.difference(named, before) if places else named)
-        self._places = np.array(places)
-        self._slopes = np.zeros_like(self._places)
-        if len(places) > 2:
+            before, path = points[-1] if points else base, f".waypoints[{number - 1}].values"
+            named = named_values(space, waypoint.get("values"), f"waypoint {number}", before, path)
+            points.append(before + space.difference(named, before) if points else named)
+        self._points = np.array(points)
+        self._slopes = np.zeros_like(self._points)
+        if len(points) > 2:
             from scipy.interpolate import PchipInterpolator  # imported here because it loads slowly
 
-            self._slopes[1:-1] = PchipInterpolator(self._times, self._places)(self._times[1:-1], 1)
+            self._slopes[1:-1] = PchipInterpolator(self._times, self._points)(self._times[1:-1], 1)
         self.duration_s: float | None = self._times[-1]
         self.arguments = {"waypoints": [dict(waypoint) for waypoint in waypoints], "base": base.copy()}
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        after = bisect.bisect_right(self._times, t_s)
-        if after in (0, len(self._times)):
-            place = self._places[min(after, len(self._times) - 1)]
-            return place.copy(), np.zeros_like(place)
-        span = self._times[after] - self._times[after - 1]
-        s = (t_s - self._times[after - 1]) / span
-        start, step = self._places[after - 1], self._places[after] - self._places[after - 1]
-        m0, m1 = self._slopes[after - 1] * span, self._slopes[after] * span
+        next_index = bisect.bisect_right(self._times, t_s)
+        if next_index in (0, len(self._times)):
+            point = self._points[min(next_index, len(self._times) - 1)]
+            return point.copy(), np.zeros_like(point)
+        span = self._times[next_index] - self._times[next_index - 1]
+        s = (t_s - self._times[next_index - 1]) / span
+        start, step = self._points[next_index - 1], self._points[next_index] - self._points[next_index - 1]
+        m0, m1 = self._slopes[next_index - 1] * span, self._slopes[next_index] * span
         c = start + s * (m0 + s * (3 * step - 2 * m0 - m1 + s * (m0 + m1 - 2 * step)))
         c_dot = (m0 + s * (6 * step - 4 * m0 - 2 * m1 + 3 * s * (m0 + m1 - 2 * step))) / span
         return c, c_dot
@@ -236,13 +236,13 @@ def put_ramped(
     c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float, value: Array, rate: Array
 ) -> None:
     """Write c and c_dot plus the remaining offset and its rate at fraction s of a ramp of duration over_s."""
-    left = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
-    left_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
-    swing = s * (1.0 - s * s * (6.0 - s * (8.0 - 3.0 * s))) * over_s
-    swing_rate = 1.0 - s * s * (18.0 - s * (32.0 - 15.0 * s))
+    offset_weight = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
+    offset_weight_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
+    rate_weight = s * (1.0 - s * s * (6.0 - s * (8.0 - 3.0 * s))) * over_s
+    rate_weight_rate = 1.0 - s * s * (18.0 - s * (32.0 - 15.0 * s))
     for k in range(c.size):
-        value[k] = c[k] + left * offset[k] + swing * offset_rate[k]
-        rate[k] = c_dot[k] + left_rate * offset[k] + swing_rate * offset_rate[k]
+        value[k] = c[k] + offset_weight * offset[k] + rate_weight * offset_rate[k]
+        rate[k] = c_dot[k] + offset_weight_rate * offset[k] + rate_weight_rate * offset_rate[k]
 
 
 def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
@@ -262,18 +262,18 @@ _KINDS: dict[str, Any] = {
 
 def state_of(reference: Reference) -> State:
     """Return a reference as plain values; TypeError: its class is not defined in this module."""
-    for kind, known in _KINDS.items():
-        if type(reference) is known:
+    for kind, known_class in _KINDS.items():
+        if type(reference) is known_class:
             arguments = getattr(reference, "arguments", None) or vars(reference)
-            own = {name: state_of(value) if name in ("of", "onto") else value for name, value in arguments.items()}
-            return {"kind": kind, **own}
+            fields = {name: state_of(value) if name in ("of", "onto") else value for name, value in arguments.items()}
+            return {"kind": kind, **fields}
     raise TypeError(f"reference: {type(reference).__name__} has no state; must be one of this module")
 
 
 def reference_of(space: ClusterSpace, state: State) -> Reference:
     """Return the reference of a state; KeyError, TypeError, ValueError: the state is not from `state_of`."""
-    own = ((name, value) for name, value in state.items() if name != "kind")
-    arguments = {name: reference_of(space, value) if name in ("of", "onto") else value for name, value in own}
+    fields = ((name, value) for name, value in state.items() if name != "kind")
+    arguments = {name: reference_of(space, value) if name in ("of", "onto") else value for name, value in fields}
     kind = _KINDS[state["kind"]]
     make: Any = kind
     return make(space, **arguments) if kind in (ExpressionTrajectory, WaypointTrajectory) else make(**arguments)
@@ -308,32 +308,34 @@ def named_values(space: Variables, values: object, where: str, base: Array, at: 
     c, given = base.copy(), set[int]()
     for name, value in values.items():
         variable = variable_of(space, name, where, at)
-        place = f"{where}: {name}", f"{at}.{name}"
-        _refuse_twice(space, variable, given, place)
+        location = f"{where}: {name}", f"{at}.{name}"
+        _refuse_twice(space, variable, given, location)
         number = finite_number(value)
         if isinstance(value, str):
             expression = Expression(str(name), value)
             number = expression(0.0)[0] if expression.constant else None
         if number is None:
-            raise TrajectoryError(f"is {str(value)[:40]}; allowed: a finite number, or an expression without t", *place)
-        _refuse_turns(space, variable, number, place)
+            raise TrajectoryError(
+                f"is {str(value)[:40]}; allowed: a finite number, or an expression without t", *location
+            )
+        _refuse_turns(space, variable, number, location)
         c[variable.entry] = number * variable.scale
     return c
 
 
-def _refuse_twice(space: Variables, variable: Variable, given: set[int], place: tuple[str, str]) -> None:
+def _refuse_twice(space: Variables, variable: Variable, given: set[int], location: tuple[str, str]) -> None:
     """Raise TrajectoryError for a variable given twice, in two units; otherwise record it."""
     if variable.entry in given:
         name = space.names[variable.entry]
-        raise TrajectoryError(f"is the same variable in a second unit; allowed: {name} or {name}{DEGREES}", *place)
+        raise TrajectoryError(f"is the same variable in a second unit; allowed: {name} or {name}{DEGREES}", *location)
     given.add(variable.entry)
 
 
-def _refuse_turns(space: Variables, variable: Variable, value: float, place: tuple[str, str]) -> None:
+def _refuse_turns(space: Variables, variable: Variable, value: float, location: tuple[str, str]) -> None:
     """Raise TrajectoryError for an angle beyond one turn, which was probably meant in degrees."""
     if not space.in_radians[variable.entry] or abs(value * variable.scale) <= ANGLE_MAX_RAD:
         return
     if variable.scale != 1.0:
-        raise TrajectoryError(f"is {value:g} deg; allowed: -360 to 360 deg", *place)
+        raise TrajectoryError(f"is {value:g} deg; allowed: -360 to 360 deg", *location)
     remedy = f"allowed: -6.283 to 6.283 rad, or degrees as {space.names[variable.entry]}{DEGREES}"
-    raise TrajectoryError(f"is {value:g} rad; {remedy}", *place)
+    raise TrajectoryError(f"is {value:g} rad; {remedy}", *location)

@@ -29,16 +29,16 @@ def bearing_only(relative: list[tuple[Array, Array]], k: float) -> Array:
         k: gain [m/s].
     """
     size = len(relative[0][0]) if relative else 2
-    return k * added([g * total(g * wanted) - wanted for g, wanted in relative], size)
+    return k * added([g * total(g * desired) - desired for g, desired in relative], size)
 
 
 def bearing_rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
     """Return R_B (m d, n d) for positions (n, d) and m edges (i, j): the derivative of the bearings."""
-    places = np.asarray(p, float)
-    n, d = places.shape
+    positions = np.asarray(p, float)
+    n, d = positions.shape
     R = np.zeros((len(edges), d, n, d))
     for row, (i, j) in enumerate(edges):
-        z = places[j] - places[i]
+        z = positions[j] - positions[i]
         size = el.length(z.tolist())
         P = (np.eye(d) - np.outer(z, z) / (size * size)) / size
         R[row, :, j], R[row, :, i] = P, -P

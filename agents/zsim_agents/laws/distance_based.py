@@ -34,11 +34,11 @@ def distance_based(relative: list[tuple[Array, float]], k: float) -> Array:
 
 def rigidity_matrix(p: ArrayLike, edges: list[tuple[int, int]]) -> Array:
     """Return R (m, n d) for positions (n, d) and m edges (i, j): half the derivative of the squared lengths."""
-    places = np.asarray(p, float)
-    n, d = places.shape
+    positions = np.asarray(p, float)
+    n, d = positions.shape
     R = np.zeros((len(edges), n, d))
     for row, (i, j) in enumerate(edges):
-        R[row, i] = places[i] - places[j]
+        R[row, i] = positions[i] - positions[j]
         R[row, j] = -R[row, i]
     return R.reshape(len(edges), n * d)
 

@@ -86,10 +86,8 @@ def beta_force(v: Array, obstacles: list[tuple[float, Array]], d: float, c1: flo
     for distance, away in obstacles:
         z = -max(distance, 0.0) * away
         size = sigma_norm(max(distance, 0.0))
-        into = total(v * away) * away
-        u += (
-            c1 * phi_beta(size, d) * sigma_gradient(z) - 2.0 * math.sqrt(c1) * bump(size / sigma_norm(d), H_BETA) * into
-        )
+        v_n = total(v * away) * away
+        u += c1 * phi_beta(size, d) * sigma_gradient(z) - 2.0 * math.sqrt(c1) * bump(size / sigma_norm(d), H_BETA) * v_n
     return u
 
 
@@ -106,8 +104,8 @@ def deviation_energy(p: Array, d: float, r: float) -> tuple[float, int]:
     """
     z = p[:, None] - p[None]
     lengths = np.sqrt(np.sum(z * z, axis=2))[np.triu_indices(len(p), 1)]
-    near = lengths[lengths < r]
-    return float(2.0 * np.sum((near - d) ** 2) / (2 * len(near) + 1)), len(near)
+    edge_lengths = lengths[lengths < r]
+    return float(2.0 * np.sum((edge_lengths - d) ** 2) / (2 * len(edge_lengths) + 1)), len(edge_lengths)
 
 
 class OlfatiSaber(Pilot):

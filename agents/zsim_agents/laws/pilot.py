@@ -49,10 +49,10 @@ Array = NDArray[np.float64]
 ENGAGE_M = 0.3  # a drone this close to its flight height engages its law, and stays engaged
 CLIMB_1_S = 1.0  # gain of the height control
 CLIMB_MAX_M_S = 0.8  # below the 1 m/s that the AR.Drone's firmware allows
-ASK_NS = 1_000_000_000  # time between two take-off or landing commands
+COMMAND_PERIOD_NS = 1_000_000_000  # time between two take-off or landing commands
 UNSTAMPED = (0, 0, "")  # t_ns, seq, source of a command, filled in on sending
 AIRBORNE = ("hovering", "flying")
-TINY = 1e-9  # m: closer drones have no defined direction to each other
+DISTANCE_MIN_M = 1e-9  # m: closer drones have no defined direction to each other
 
 
 class Motion(AgentMessage, frozen=True):
@@ -81,7 +81,7 @@ class Pose(NamedTuple):
     turn: Array  # (2, 2) s R(psi)
     turn_rate: Array  # (2, 2) its derivative [1/s]
 
-    def place(self, c: Array) -> tuple[Array, Array]:
+    def offset(self, c: Array) -> tuple[Array, Array]:
         """Return the offset of a position c (2,) of the formation from the centre [m; W], and its rate [m/s]."""
         return turned(self.turn, c), turned(self.turn_rate, c)
 
@@ -184,27 +184,27 @@ class Pilot(Agent):
 
     def step(self, t_ns: int) -> list[Output]:
         own, outputs = self.parameters, []
-        airborne = self._state in AIRBORNE
+        is_airborne = self._state in AIRBORNE
         height_error = own.height_m - float(self._p_W[2])
-        self._has_flown |= airborne
-        self._is_engaged = airborne and (self._is_engaged or abs(height_error) <= ENGAGE_M)
+        self._has_flown |= is_airborne
+        self._is_engaged = is_airborne and (self._is_engaged or abs(height_error) <= ENGAGE_M)
         if t_ns // self._message_ns != (t_ns - self._gate_ns) // self._message_ns:
             p_W, v_W = triple(self._p_W), triple(self._v_W)
             outputs.append(self.message(t_ns, Motion(position_m=p_W, velocity_m_s=v_W, is_engaged=self._is_engaged)))
-        ask = t_ns >= own.takeoff_s * 1e9 and t_ns % ASK_NS < self._gate_ns
+        must_take_off = t_ns >= own.takeoff_s * 1e9 and t_ns % COMMAND_PERIOD_NS < self._gate_ns
         if own.land_s is not None and t_ns >= own.land_s * 1e9:
-            if airborne and t_ns % ASK_NS < self._gate_ns:
+            if is_airborne and t_ns % COMMAND_PERIOD_NS < self._gate_ns:
                 outputs.append(self.command(t_ns, self._drone, Mode(*UNSTAMPED, "land")))
-        elif self._state == "landed" and ask and not self._has_flown:
+        elif self._state == "landed" and must_take_off and not self._has_flown:
             outputs.append(self.command(t_ns, self._drone, Mode(*UNSTAMPED, "takeoff")))
-        elif airborne:
-            v_W = self._wanted(t_ns) if self._is_engaged else np.zeros(2)
+        elif is_airborne:
+            v_W = self._law_velocity(t_ns) if self._is_engaged else np.zeros(2)
             climb = min(max(CLIMB_1_S * height_error, -CLIMB_MAX_M_S), CLIMB_MAX_M_S)
             command = Velocity(*UNSTAMPED, (float(v_W[0]), float(v_W[1]), climb), 0.0, "world")
             outputs.append(self.command(t_ns, self._drone, command))
         return outputs
 
-    def _wanted(self, t_ns: int) -> Array:
+    def _law_velocity(self, t_ns: int) -> Array:
         heard = [
             Heard(name, np.array(m.position_m[:2]), np.array(m.velocity_m_s[:2]))
             for name, m in sorted(self._heard.items())
@@ -312,9 +312,9 @@ class FormationReference:
 
     def at(self, t_s: float) -> Pose:
         """Return the reference at a simulated time; ExpressionError: it has no value there."""
-        since_s = t_s - self._start_s
-        (x, vx), (y, vy), (psi_deg, turn_deg_s), (s, s_dot) = (each(max(since_s, 0.0)) for each in self._functions)
-        if since_s < 0.0:
+        elapsed_s = t_s - self._start_s
+        (x, vx), (y, vy), (psi_deg, turn_deg_s), (s, s_dot) = (each(max(elapsed_s, 0.0)) for each in self._functions)
+        if elapsed_s < 0.0:
             vx = vy = turn_deg_s = s_dot = 0.0
         psi, w = math.radians(psi_deg), math.radians(turn_deg_s)
         c, sn = el.cos(psi), el.sin(psi)
@@ -353,7 +353,7 @@ def length(v: Array) -> float:
 def unit(v: Array) -> Array:
     """Return v / |v|; the unit vector along x for a vector without direction."""
     size = length(v)
-    return v / size if size > TINY else np.eye(len(v))[0]
+    return v / size if size > DISTANCE_MIN_M else np.eye(len(v))[0]
 
 
 def triple(v: Array) -> tuple[float, float, float]:
@@ -374,7 +374,7 @@ def added(terms: Sequence[Array], size: int = 2) -> Array:
     return sum(terms, np.zeros(size))
 
 
-def limited(v: Array, most: float) -> Array:
-    """Return v, scaled to length `most` if it is longer."""
+def limited(v: Array, length_max: float) -> Array:
+    """Return v, scaled to length `length_max` if it is longer."""
     size = length(v)
-    return v * (most / size) if size > most else v
+    return v * (length_max / size) if size > length_max else v

@@ -48,8 +48,8 @@ class ShapePilot(Pilot):
 
     def begin(self, scenario: Scenario) -> None:
         own, names = self.parameters, [drone.name for drone in scenario.drones]
-        places = np.array(own.places_m) if own.places_m else polygon(len(names), own.radius_m)
-        self._places: dict[str, Array] = dict(zip(names, places, strict=True))
+        positions = np.array(own.places_m) if own.places_m else polygon(len(names), own.radius_m)
+        self._positions: dict[str, Array] = dict(zip(names, positions, strict=True))
         self._informed = self._drone in (names[:1] if own.informed is None else own.informed)
 
     @staticmethod
@@ -58,26 +58,26 @@ class ShapePilot(Pilot):
 
     def relative(self, now: Sight) -> list[tuple[Array, Array]]:
         """Return z_ij = p_j - p_i [m; W] of each neighbour, and its desired value."""
-        own = now.reference.place(self._places[self._drone])[0]
-        return [(each.p_W - now.p_W, now.reference.place(self._places[each.name])[0] - own) for each in now.heard]
+        own = now.reference.offset(self._positions[self._drone])[0]
+        return [(each.p_W - now.p_W, now.reference.offset(self._positions[each.name])[0] - own) for each in now.heard]
 
-    def own_place(self, now: Sight) -> tuple[Array, Array]:
+    def own_reference(self, now: Sight) -> tuple[Array, Array]:
         """Return the drone's reference position p_i* [m; W] and its rate v_i* [m/s]."""
-        c, c_dot = now.reference.place(self._places[self._drone])
+        c, c_dot = now.reference.offset(self._positions[self._drone])
         return now.reference.p_W + c, now.reference.v_W + c_dot
 
     def tied(self, now: Sight) -> Array:
         """Return the terms (2,) that tie the shape to the reference [m/s; W]."""
-        p_W, v_W = self.own_place(now)
-        feed = v_W if self.parameters.feedforward or self._informed else np.zeros(2)
-        return feed + self.parameters.pin_1_s * (p_W - now.p_W) if self._informed else feed
+        p_W, v_W = self.own_reference(now)
+        feedforward = v_W if self.parameters.feedforward or self._informed else np.zeros(2)
+        return feedforward + self.parameters.pin_1_s * (p_W - now.p_W) if self._informed else feedforward
 
     @classmethod
     def flaws(cls, parameters: Mapping[str, Any], scenario: Scenario) -> Iterator[Fault]:
         yield from super().flaws(parameters, scenario)
-        drones, places = [drone.name for drone in scenario.drones], parameters["places_m"]
-        if places and len(places) != len(drones):
-            yield "places_m", f"has {len(places)} positions; must have {len(drones)}, one for each drone"
+        drones, positions = [drone.name for drone in scenario.drones], parameters["places_m"]
+        if positions and len(positions) != len(drones):
+            yield "places_m", f"has {len(positions)} positions; must have {len(drones)}, one for each drone"
         for name in parameters["informed"] or ():
             if name not in drones:
                 yield "informed", f"names {name!r}; must be one of {', '.join(drones)}"

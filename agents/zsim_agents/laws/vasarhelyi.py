@@ -66,24 +66,24 @@ class Vasarhelyi(Pilot):
 
     def velocity(self, now: Sight) -> Array:
         own = self.parameters
-        wanted = now.reference.v_W.copy()
+        velocity = now.reference.v_W.copy()
         if own.v_flock_m_s:
-            wanted += own.v_flock_m_s * unit(now.v_W)
+            velocity += own.v_flock_m_s * unit(now.v_W)
         for each in now.heard:
             z, r = each.p_W - now.p_W, length(each.p_W - now.p_W)
-            wanted += repelled(z, own.r0_rep_m, own.p_rep_1_s)
-            brake = braking(r - own.r0_frict_m, own.a_frict_m_s2, own.p_frict_1_s)
-            wanted += friction(each.v_W - now.v_W, max(own.v_frict_m_s, brake), own.c_frict)
+            velocity += repelled(z, own.r0_rep_m, own.p_rep_1_s)
+            allowed = braking(r - own.r0_frict_m, own.a_frict_m_s2, own.p_frict_1_s)
+            velocity += friction(each.v_W - now.v_W, max(own.v_frict_m_s, allowed), own.c_frict)
         for distance, away, v_wall in self._walls(now):
-            brake = braking(distance - own.r0_shill_m, own.a_shill_m_s2, own.p_shill_1_s)
-            wanted += friction(v_wall + own.v_shill_m_s * away - now.v_W, brake, 1.0)
-        return wanted
+            allowed = braking(distance - own.r0_shill_m, own.a_shill_m_s2, own.p_shill_1_s)
+            velocity += friction(v_wall + own.v_shill_m_s * away - now.v_W, allowed, 1.0)
+        return velocity
 
     def _walls(self, now: Sight) -> list[tuple[float, Array, Array]]:
         """Return the distance [m], the direction away and the velocity [m/s] of each wall and obstacle."""
         own, walls = self.parameters, []
-        most, final = own.v_shill_m_s + own.speed_max_m_s, own.a_shill_m_s2 / own.p_shill_1_s
-        reach = own.r0_shill_m + (most * most + final * final) / (
+        speed_max, final_speed = own.v_shill_m_s + own.speed_max_m_s, own.a_shill_m_s2 / own.p_shill_1_s
+        reach = own.r0_shill_m + (speed_max * speed_max + final_speed * final_speed) / (
             2.0 * own.a_shill_m_s2
         )  # beyond this distance, (4) allows any speed
         walls += [(distance, away, np.zeros(2)) for distance, away in self.obstacles_near(now.p_W, reach)]

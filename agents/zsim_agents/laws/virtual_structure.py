@@ -12,11 +12,11 @@ from zsim_agents.laws.pilot import Array, Sight
 from zsim_agents.laws.shape import ShapePilot
 
 
-def virtual_structure(p: Array, place: Array, rate: Array, k: float) -> Array:
+def virtual_structure(p: Array, reference: Array, rate: Array, k: float) -> Array:
     """Return u_i of (1) for a position [m], its reference [m], the reference's rate [m/s], (d,) each, and k [1/s]."""
-    return rate + k * (place - p)
+    return rate + k * (reference - p)
 
 
 class VirtualStructure(ShapePilot):
     def velocity(self, now: Sight) -> Array:
-        return virtual_structure(now.p_W, *self.own_place(now), self.parameters.gain_1_s)
+        return virtual_structure(now.p_W, *self.own_reference(now), self.parameters.gain_1_s)

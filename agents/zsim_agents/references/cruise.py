@@ -32,18 +32,18 @@ from zsim.math import elementary as el
 from zsim.math.rotation import Vector
 from zsim.scenario.scenario import Piloted
 from zsim_agents.formation.spaces.cluster_space import Array
-from zsim_agents.references.path import DEGREE, LEAST_S, SHARE, PathLimits, PiecewisePolynomial
+from zsim_agents.references.path import DEGREE, DURATION_MIN_S, SHARE, PathLimits, PiecewisePolynomial
 
 K_YAW_1_S = 1.0  # gain of the heading loop; design choice: a decade below the yaw loop's bandwidth
-LOST_M = 2.0  # deviation beyond which the path is planned anew; design choice: above the tracking error without wind
+DEVIATION_MAX_M = 2.0  # beyond it, the path is planned anew; design choice: above the tracking error without wind
 RISE_S = 0.5  # time in which climb and yaw rates rise from 0 to their limits; design choice: above both loops' lags
 HALVINGS = 60  # bisection steps: enough to determine a time to the last bit
 SHORT_S = 1e-9  # duration below which a part is omitted
 
-Four = Sequence[float]
+Vector4 = Sequence[float]
 """x, y, z [m; W] and yaw [rad], or their rates."""
 Axes = tuple[float | None, float | None, float | None, float | None]
-"""Like `Four`, with None for an axis without a goal."""
+"""Like `Vector4`, with None for an axis without a goal."""
 
 
 class Cruise(NamedTuple):
@@ -54,7 +54,7 @@ class Cruise(NamedTuple):
     down_m_s: float = math.inf
 
 
-FREE = Cruise()
+UNLIMITED = Cruise()
 
 
 class Course:
@@ -71,30 +71,36 @@ class Course:
     def __init__(self, limits: PathLimits, law: Piloted) -> None:
         self._limits, self._law = limits._replace(accel_m_s2=SHARE * limits.accel_m_s2), law
         self._goal: Axes | None = None
-        self._rate: Four = (0.0,) * 4
-        self._speeds = FREE
-        self._way: PiecewisePolynomial | None = None
-        self._begun_s = 0.0
+        self._rate: Vector4 = (0.0,) * 4
+        self._speeds = UNLIMITED
+        self._path: PiecewisePolynomial | None = None
+        self._path_start_s = 0.0
 
     def leave(self) -> None:
         """Clear the path: the next one starts at the drone."""
-        self._goal = self._way = None
+        self._goal = self._path = None
 
     def send(
-        self, goal: Axes, t_s: float, here: Four, moving: Four, rate: Four = (0.0,) * 4, speeds: Cruise = FREE
+        self,
+        goal: Axes,
+        t_s: float,
+        position: Vector4,
+        drone_rate: Vector4,
+        rate: Vector4 = (0.0,) * 4,
+        speeds: Cruise = UNLIMITED,
     ) -> None:
-        """Set the goal and the rate to follow; `here` and `moving` are the drone's own position and rate at `t_s`."""
-        own, own_rate = self._motion(t_s, here, moving)
+        """Set the goal and the rate to follow; `position` and `drone_rate` are those of the drone at `t_s`."""
+        own, own_rate = self._motion(t_s, position, drone_rate)
         self._goal, self._rate, self._speeds = goal, rate, speeds
         self._begin(t_s, own, own_rate)
 
-    def stop(self, t_s: float, here: Four, moving: Four) -> Vector:
+    def stop(self, t_s: float, position: Vector4, drone_rate: Vector4) -> Vector:
         """Return the position [m; W] where the drone can come to rest; arguments as in `send`."""
-        own, rate = (np.array(each, float) for each in self._motion(t_s, here, moving))
+        own, rate = (np.array(each, float) for each in self._motion(t_s, position, drone_rate))
         x, y, z = cruise_to_rest(own, self._limits, rate).value(math.inf)[0][:3].tolist()
         return x, y, z
 
-    def velocity(self, t_s: float, here: Four, moving: Four) -> tuple[Vector, float]:
+    def velocity(self, t_s: float, position: Vector4, drone_rate: Vector4) -> tuple[Vector, float]:
         """Return the velocity [m/s; W] and yaw rate [rad/s] to command; arguments as in `send`.
 
         Raises:
@@ -103,27 +109,27 @@ class Course:
         goal = self._goal
         if goal is None:
             raise RuntimeError("velocity: the drone has not been sent anywhere")
-        if self._is_lost(t_s, here):
-            self._begin(t_s, here, moving)
-        place = [own if to is None else to for own, to in zip(here, goal, strict=True)]
-        ahead = list(self._rate)
-        if self._way is not None:
-            now, (_, later) = self._state(t_s)[0], self._state(t_s + self._law.lead_s)
+        if self._is_off_path(t_s, position):
+            self._begin(t_s, position, drone_rate)
+        target = [own if to is None else to for own, to in zip(position, goal, strict=True)]
+        target_rate = list(self._rate)
+        if self._path is not None:
+            path_position, (_, future_rate) = self._state(t_s)[0], self._state(t_s + self._law.lead_s)
             for k in self._axes():
-                place[k], ahead[k] = now[k], later[k]
+                target[k], target_rate[k] = path_position[k], future_rate[k]
         limits, speeds = self._limits, self._speeds
-        most = min(limits.speed_m_s, speeds.horizontal_m_s), min(limits.climb_m_s, speeds.up_m_s)
-        bounds = PathLimits(*most, limits.yaw_rate_rad_s, limits.accel_m_s2)
-        velocity, turn = velocity_towards(place, ahead, here, bounds, self._law, speeds.down_m_s)
+        speeds_max = min(limits.speed_m_s, speeds.horizontal_m_s), min(limits.climb_m_s, speeds.up_m_s)
+        bounds = PathLimits(*speeds_max, limits.yaw_rate_rad_s, limits.accel_m_s2)
+        velocity, turn = velocity_towards(target, target_rate, position, bounds, self._law, speeds.down_m_s)
         return velocity, self._rate[3] if goal[3] is None else turn
 
-    def _motion(self, t_s: float, here: Four, moving: Four) -> tuple[Four, Four]:
+    def _motion(self, t_s: float, position: Vector4, drone_rate: Vector4) -> tuple[Vector4, Vector4]:
         """Return position and rate: those of the path on the axes it controls, those of the drone on the others."""
-        own, rate = list(here), list(moving)
-        if self._way is not None and not self._is_lost(t_s, here):
-            place, pace = self._state(t_s)
+        own, rate = list(position), list(drone_rate)
+        if self._path is not None and not self._is_off_path(t_s, position):
+            path_position, path_rate = self._state(t_s)
             for k in self._axes():
-                own[k], rate[k] = place[k], pace[k]
+                own[k], rate[k] = path_position[k], path_rate[k]
         return own, rate
 
     def _axes(self) -> list[int]:
@@ -131,44 +137,51 @@ class Course:
         goal = self._goal or (None,) * 4
         return [k for k in range(4) if goal[k] is not None and self._rate[k] == 0.0]
 
-    def _begin(self, t_s: float, here: Four, moving: Four) -> None:
-        led, goal = self._axes(), self._goal
-        if not led or goal is None:
-            self._way = None
+    def _begin(self, t_s: float, position: Vector4, drone_rate: Vector4) -> None:
+        path_axes, goal = self._axes(), self._goal
+        if not path_axes or goal is None:
+            self._path = None
             return
-        start, rate = np.array(here, float), np.zeros(4)
-        rate[led] = np.array(moving)[led]
-        to = start.copy()
-        to[led] = [goal[k] for k in led]
-        self._way, self._begun_s = cruise(start, to, self._limits, rate, self._speeds), t_s
+        start, rate = np.array(position, float), np.zeros(4)
+        rate[path_axes] = np.array(drone_rate)[path_axes]
+        end = start.copy()
+        end[path_axes] = [goal[k] for k in path_axes]
+        self._path, self._path_start_s = cruise(start, end, self._limits, rate, self._speeds), t_s
 
     def _state(self, t_s: float) -> tuple[list[float], list[float]]:
-        place, rate = (self._way.value(t_s - self._begun_s)) if self._way else (np.zeros(4), np.zeros(4))
-        return place.tolist(), rate.tolist()
+        path_position, rate = (self._path.value(t_s - self._path_start_s)) if self._path else (np.zeros(4), np.zeros(4))
+        return path_position.tolist(), rate.tolist()
 
-    def _is_lost(self, t_s: float, here: Four) -> bool:
-        if self._way is None:
+    def _is_off_path(self, t_s: float, position: Vector4) -> bool:
+        if self._path is None:
             return False
-        place, _ = self._state(t_s)
-        return el.length(place[k] - here[k] for k in self._axes() if k < 3) > LOST_M
+        path_position, _ = self._state(t_s)
+        return el.length(path_position[k] - position[k] for k in self._axes() if k < 3) > DEVIATION_MAX_M
 
 
 def velocity_towards(
-    place: Four, ahead: Four, here: Four, limits: PathLimits, law: Piloted, down_m_s: float = math.inf
+    target: Vector4,
+    target_rate: Vector4,
+    position: Vector4,
+    limits: PathLimits,
+    law: Piloted,
+    down_m_s: float = math.inf,
 ) -> tuple[Vector, float]:
-    """Return the velocity [m/s; W] and yaw rate [rad/s] with which a drone at `here` tracks a reference at `place`.
+    """Return the velocity [m/s; W] and yaw rate [rad/s] for a drone at `position` to track a reference at `target`.
 
     Args:
-        ahead: rate of the reference `law.lead_s` later.
+        target_rate: rate of the reference `law.lead_s` later.
         limits: limits of the result.
         down_m_s: limit of the descent, if lower than that in `limits`.
     """
-    x, y, z = (v + law.gain_1_s * (p - own) for v, p, own in zip(ahead[:3], place[:3], here[:3], strict=True))
+    x, y, z = (
+        v + law.gain_1_s * (p - own) for v, p, own in zip(target_rate[:3], target[:3], position[:3], strict=True)
+    )
     speed = el.hypot(x, y)
-    share = min(1.0, limits.speed_m_s / speed) if speed else 1.0
-    turn = ahead[3] + K_YAW_1_S * math.remainder(place[3] - here[3], math.tau)
-    up, down, most = limits.climb_m_s, min(limits.climb_m_s, down_m_s), limits.yaw_rate_rad_s
-    return (x * share, y * share, min(max(z, -down), up)), min(max(turn, -most), most)
+    scale = min(1.0, limits.speed_m_s / speed) if speed else 1.0
+    turn = target_rate[3] + K_YAW_1_S * math.remainder(target[3] - position[3], math.tau)
+    up, down, yaw_rate_max = limits.climb_m_s, min(limits.climb_m_s, down_m_s), limits.yaw_rate_rad_s
+    return (x * scale, y * scale, min(max(z, -down), up)), min(max(turn, -yaw_rate_max), yaw_rate_max)
 
 
 class _Bounds(NamedTuple):
@@ -186,24 +199,24 @@ class _Bounds(NamedTuple):
 
     def speed_along(self, x: float, y: float, z: float) -> float:
         """Return the maximum speed in a direction [m/s]."""
-        aside, climb = el.hypot(x, y), self.up if z > 0.0 else self.down
-        return min(self.speed / aside if aside else math.inf, climb / abs(z) if z else math.inf)
+        horizontal, climb = el.hypot(x, y), self.up if z > 0.0 else self.down
+        return min(self.speed / horizontal if horizontal else math.inf, climb / abs(z) if z else math.inf)
 
 
-class _Part(NamedTuple):
-    """A part of a path at constant acceleration; `place` and `velocity` are those at its start."""
+class _Segment(NamedTuple):
+    """A part of a path at constant acceleration; `position` and `velocity` are those at its start."""
 
     duration_s: float
-    place: Vector
+    position: Vector
     velocity: Vector
     accel: Vector
 
 
-STILL: Vector = (0.0, 0.0, 0.0)
+ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 def cruise(
-    start: Array, goal: Array, limits: PathLimits, rate: Array | None = None, speeds: Cruise = FREE
+    start: Array, goal: Array, limits: PathLimits, rate: Array | None = None, speeds: Cruise = UNLIMITED
 ) -> PiecewisePolynomial:
     """Return the path from a position (4,) with a rate (4,), by default 0, to rest at a goal (4,).
 
@@ -212,16 +225,16 @@ def cruise(
     Args:
         limits: limits of the speeds and of the horizontal acceleration; climb and yaw rates reach theirs in RISE_S.
     """
-    vx, vy, vz, turning = (0.0, 0.0, 0.0, 0.0) if rate is None else rate.tolist()
+    vx, vy, vz, yaw_rate = (0.0, 0.0, 0.0, 0.0) if rate is None else rate.tolist()
     (x, y, z, yaw), (to_x, to_y, to_z, to_yaw) = start.tolist(), goal.tolist()
     speed = min(limits.speed_m_s, speeds.horizontal_m_s)
     up, down = min(limits.climb_m_s, speeds.up_m_s), min(limits.climb_m_s, speeds.down_m_s)
     bounds = _Bounds(speed, up, down, limits.accel_m_s2, limits.climb_m_s / RISE_S)
-    turn = limits.yaw_rate_rad_s
-    way = _parts((x, y, z), (vx, vy, vz), (to_x, to_y, to_z), bounds)
-    turns = _Bounds(turn, turn, turn, turn / RISE_S, turn / RISE_S)
-    turned = yaw + math.remainder(to_yaw - yaw, math.tau)
-    return _polynomials(way, _parts((yaw, 0.0, 0.0), (turning, 0.0, 0.0), (turned, 0.0, 0.0), turns))
+    yaw_rate_max = limits.yaw_rate_rad_s
+    translation = _segments((x, y, z), (vx, vy, vz), (to_x, to_y, to_z), bounds)
+    yaw_bounds = _Bounds(yaw_rate_max, yaw_rate_max, yaw_rate_max, yaw_rate_max / RISE_S, yaw_rate_max / RISE_S)
+    end_yaw = yaw + math.remainder(to_yaw - yaw, math.tau)
+    return _polynomials(translation, _segments((yaw, 0.0, 0.0), (yaw_rate, 0.0, 0.0), (end_yaw, 0.0, 0.0), yaw_bounds))
 
 
 def cruise_through(
@@ -229,7 +242,7 @@ def cruise_through(
     goals: Sequence[Array],
     limits: PathLimits,
     rate: Array | None = None,
-    speeds: Cruise = FREE,
+    speeds: Cruise = UNLIMITED,
     radius_m: float = 0.0,
 ) -> PiecewisePolynomial:
     """Return the path through goals (4,) to rest at the last one; other arguments as in `cruise`.
@@ -239,105 +252,108 @@ def cruise_through(
     durations: list[Array] = []
     coefficients: list[Array] = []
     for goal in goals:
-        way = cruise(start, goal, limits, rate, speeds)
-        end_s = way.duration_s or 0.0
+        path = cruise(start, goal, limits, rate, speeds)
+        end_s = path.duration_s or 0.0
         if radius_m and goal is not goals[-1]:
-            early, late = 0.0, end_s
+            low_s, high_s = 0.0, end_s
             for _ in range(HALVINGS):
-                middle = (early + late) / 2.0
-                near = el.distance(way.value(middle)[0][:3].tolist(), goal[:3].tolist()) <= radius_m
-                early, late = (early, middle) if near else (middle, late)
-            end_s = late
-            way = way.until(end_s)
-        start, rate = way.value(end_s)
-        durations.append(way.durations_s)
-        coefficients.append(way.coefficients)
+                middle_s = (low_s + high_s) / 2.0
+                is_near = el.distance(path.value(middle_s)[0][:3].tolist(), goal[:3].tolist()) <= radius_m
+                low_s, high_s = (low_s, middle_s) if is_near else (middle_s, high_s)
+            end_s = high_s
+            path = path.until(end_s)
+        start, rate = path.value(end_s)
+        durations.append(path.durations_s)
+        coefficients.append(path.coefficients)
     return PiecewisePolynomial(np.concatenate(durations), np.concatenate(coefficients))
 
 
 def cruise_to_rest(start: Array, limits: PathLimits, rate: Array) -> PiecewisePolynomial:
     """Return the shortest straight path on which a drone moving at a rate (4,) comes to rest."""
-    aside, climb, turn = el.hypot(rate[0], rate[1]), abs(float(rate[2])), abs(float(rate[3]))
-    rise_s = max(aside / limits.accel_m_s2, climb / limits.climb_m_s * RISE_S), turn / limits.yaw_rate_rad_s * RISE_S
+    horizontal, climb, turn = el.hypot(rate[0], rate[1]), abs(float(rate[2])), abs(float(rate[3]))
+    rise_s = (
+        max(horizontal / limits.accel_m_s2, climb / limits.climb_m_s * RISE_S),
+        turn / limits.yaw_rate_rad_s * RISE_S,
+    )
     stop = start + rate * np.array([*(rise_s[0],) * 3, rise_s[1]]) / 2.0
     return cruise(start, stop, limits, rate)
 
 
-def _parts(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> list[_Part]:
+def _segments(start: Vector, velocity: Vector, goal: Vector, bounds: _Bounds) -> list[_Segment]:
     """Return the parts of a path, without those of zero duration."""
     x, y, z = (to - from_ for to, from_ in zip(goal, start, strict=True))
     vx, vy, vz = velocity
 
     def cruise_after(t1: float) -> tuple[Vector, float]:
         """Return q for `t1`, and the time from the middle of the first part to the middle of the last."""
-        along = x - vx * t1 / 2.0, y - vy * t1 / 2.0, z - vz * t1 / 2.0
-        left = el.length(along)
-        if left == 0.0:
-            return STILL, 0.0
-        ex, ey, ez = (each / left for each in along)
+        displacement = x - vx * t1 / 2.0, y - vy * t1 / 2.0, z - vz * t1 / 2.0
+        distance = el.length(displacement)
+        if distance == 0.0:
+            return ZERO, 0.0
+        ex, ey, ez = (each / distance for each in displacement)
         half, accel = t1 / 2.0, 1.0 / bounds.rise_s(ex, ey, ez)
-        least = 2.0 * left / (half + math.sqrt(half * half + 2.0 * left / accel))  # |q| for which t2 is 0
-        q = min(bounds.speed_along(ex, ey, ez), least)
-        return (q * ex, q * ey, q * ez), left / q
+        peak_speed = 2.0 * distance / (half + math.sqrt(half * half + 2.0 * distance / accel))  # |q| for which t2 is 0
+        q = min(bounds.speed_along(ex, ey, ez), peak_speed)
+        return (q * ex, q * ey, q * ez), distance / q
 
     t1 = 0.0
     if any(velocity):
-        early, t1 = 0.0, bounds.rise_s(bounds.speed, 0.0, max(bounds.up, bounds.down)) + bounds.rise_s(*velocity)
+        low, t1 = 0.0, bounds.rise_s(bounds.speed, 0.0, max(bounds.up, bounds.down)) + bounds.rise_s(*velocity)
         for _ in range(HALVINGS):
-            middle = (early + t1) / 2.0
+            middle = (low + t1) / 2.0
             (qx, qy, qz), _ = cruise_after(middle)
-            early, t1 = (early, middle) if bounds.rise_s(qx - vx, qy - vy, qz - vz) <= middle else (middle, t1)
+            low, t1 = (low, middle) if bounds.rise_s(qx - vx, qy - vy, qz - vz) <= middle else (middle, t1)
     elif (rise_s := bounds.rise_s(x, y, z)) > 0.0:  # of the displacement as if a velocity; if t2 = 0, |q| t1 = |D|
         t1 = min(math.sqrt(rise_s), rise_s * bounds.speed_along(x, y, z))
     (qx, qy, qz), over_s = cruise_after(t1)
-    parts = []
+    segments = []
     if t1 > SHORT_S:
         accel = (qx - vx) / t1, (qy - vy) / t1, (qz - vz) / t1
-        parts.append(_Part(t1, start, velocity, accel))
-        start = _moved(start, velocity, accel, t1)
+        segments.append(_Segment(t1, start, velocity, accel))
+        start = _position_after(start, velocity, accel, t1)
     t3 = bounds.rise_s(qx, qy, qz)
     t2 = over_s - t1 / 2.0 - t3 / 2.0
     if t2 > SHORT_S:
-        parts.append(_Part(t2, start, (qx, qy, qz), STILL))
-        start = _moved(start, (qx, qy, qz), STILL, t2)
+        segments.append(_Segment(t2, start, (qx, qy, qz), ZERO))
+        start = _position_after(start, (qx, qy, qz), ZERO, t2)
     if t3 > SHORT_S:
-        parts.append(_Part(t3, start, (qx, qy, qz), (-qx / t3, -qy / t3, -qz / t3)))
-    return parts or [_Part(LEAST_S, goal, STILL, STILL)]
+        segments.append(_Segment(t3, start, (qx, qy, qz), (-qx / t3, -qy / t3, -qz / t3)))
+    return segments or [_Segment(DURATION_MIN_S, goal, ZERO, ZERO)]
 
 
-def _moved(place: Vector, velocity: Vector, accel: Vector, t: float) -> Vector:
-    x, y, z = (p + v * t + a * t * t / 2.0 for p, v, a in zip(place, velocity, accel, strict=True))
+def _position_after(position: Vector, velocity: Vector, accel: Vector, t: float) -> Vector:
+    x, y, z = (p + v * t + a * t * t / 2.0 for p, v, a in zip(position, velocity, accel, strict=True))
     return x, y, z
 
 
-def _polynomials(way: list[_Part], turn: list[_Part]) -> PiecewisePolynomial:
+def _polynomials(translation: list[_Segment], turn: list[_Segment]) -> PiecewisePolynomial:
     """Return a translation and a turn that start together as one path."""
-    begins = [_begins(way), _begins(turn)]
-    times = sorted({t for each in begins for t in each})
-    kept = [t for t, after in pairwise(times) if after - t > SHORT_S]
-    coefficients = np.zeros((len(kept), DEGREE + 1, 4))
-    for row, t in zip(coefficients, kept, strict=True):
-        for parts, own, columns in zip((way, turn), begins, (slice(0, 3), slice(3, 4)), strict=True):
+    starts_s = [_start_times(translation), _start_times(turn)]
+    times = sorted({t for each in starts_s for t in each})
+    times_kept = [t for t, after in pairwise(times) if after - t > SHORT_S]
+    coefficients = np.zeros((len(times_kept), DEGREE + 1, 4))
+    for row, t in zip(coefficients, times_kept, strict=True):
+        for segments, own, columns in zip((translation, turn), starts_s, (slice(0, 3), slice(3, 4)), strict=True):
             count = columns.stop - columns.start
-            place, velocity, accel = _state(parts, own, t)
-            row[:3, columns] = np.array([place[:count], velocity[:count], [a / 2.0 for a in accel[:count]]])
-    return PiecewisePolynomial(np.diff([*kept, times[-1]]), coefficients)
+            position, velocity, accel = _state(segments, own, t)
+            row[:3, columns] = np.array([position[:count], velocity[:count], [a / 2.0 for a in accel[:count]]])
+    return PiecewisePolynomial(np.diff([*times_kept, times[-1]]), coefficients)
 
 
-def _begins(parts: list[_Part]) -> list[float]:
+def _start_times(segments: list[_Segment]) -> list[float]:
     """Return the start times of the parts, and the end of the last one."""
     times = [0.0]
-    for part in parts:
-        times.append(times[-1] + part.duration_s)
+    for segment in segments:
+        times.append(times[-1] + segment.duration_s)
     return times
 
 
-def _state(parts: list[_Part], begins: list[float], t: float) -> tuple[Vector, Vector, Vector]:
+def _state(segments: list[_Segment], starts_s: list[float], t: float) -> tuple[Vector, Vector, Vector]:
     """Return position, velocity and acceleration at `t`; at a boundary, of the later part; rest after the last."""
-    number = max(k for k, begin in enumerate(begins) if begin <= t)
-    if number == len(parts):
-        last = parts[-1]
-        return _moved(last.place, last.velocity, last.accel, last.duration_s), STILL, STILL
-    part, own = parts[number], t - begins[number]
-    x, y, z = (v + a * own for v, a in zip(part.velocity, part.accel, strict=True))
-    return _moved(part.place, part.velocity, part.accel, own), (x, y, z), part.accel
+    index = max(k for k, start_s in enumerate(starts_s) if start_s <= t)
+    if index == len(segments):
+        last = segments[-1]
+        return _position_after(last.position, last.velocity, last.accel, last.duration_s), ZERO, ZERO
+    segment, local_s = segments[index], t - starts_s[index]
+    x, y, z = (v + a * local_s for v, a in zip(segment.velocity, segment.accel, strict=True))
+    return _position_after(segment.position, segment.velocity, segment.accel, local_s), (x, y, z), segment.accel

@@ -47,17 +47,17 @@ if TYPE_CHECKING:
     from zsim_agents.formation.engagement_setup import PlannedMotion
 
 READY_S = 4.0  # minimum time from the take-off command to the first path; an AR.Drone takes at least 4 s to take off
-WAY_SHARE = 0.5  # usable share of the limits on the approach to a path that starts at rest, which need not be fast
+APPROACH_SHARE = 0.5  # usable share of the limits on the approach to a path that starts at rest, which need not be fast
 ROUNDING = 1.0 + 1e-9  # tolerance for durations that just satisfy the limits
 HEIGHT_MIN_M = 0.2  # minimum height of a path: above most of the ground effect of the smallest drones
 SAMPLES_MAX, SAMPLE_S = 4001, 0.05  # sampling of a path's heights
 TOLERANCE_M = 1e-3  # tolerance of the minimum distance between two paths
 STEP_S = 0.05  # interval at which the distances between all paths are checked
-LEAST_STEP_S = 1e-4  # minimum length of an interval that is still halved
-LATE_S = 15.0  # maximum delay of a formation: take-off takes up to 12 s (READY_S planned), engagement awaits estimates
-LOOK_S, FINE_S = 0.1, 0.01  # interval at which distances to a formation are checked: normally, and at close range
-NEARER_M = 0.5  # maximum decrease within LOOK_S of the distance between a drone and a robot of a formation
-PLACE_NAMES = ("x", "y", "z", "yaw")
+STEP_MIN_S = 1e-4  # minimum length of an interval that is still halved
+DELAY_MAX_S = 15.0  # of a formation: take-off takes up to 12 s (READY_S planned), engagement awaits estimates
+COARSE_STEP_S, FINE_STEP_S = 0.1, 0.01  # interval of checks of distances to a formation: normally, and at close range
+APPROACH_MAX_M = 0.5  # maximum decrease within COARSE_STEP_S of the distance between a drone and a robot of a formation
+VARIABLE_NAMES = ("x", "y", "z", "yaw")
 QUANTITIES = (
     ("horizontal speed", "m/s"),
     ("climb", "m/s"),
@@ -77,10 +77,10 @@ class FlightError(ValueError):
         self.path, self.text = path, text
 
 
-class Place:
+class PoseVariables:
     """The position and heading of one drone as variables, with the interface of a cluster space."""
 
-    names = PLACE_NAMES
+    names = VARIABLE_NAMES
     in_radians = np.array([False, False, False, True])
 
     def index(self, name: str) -> int:
@@ -163,33 +163,38 @@ def flight_of(scenario: Scenario, drone: str) -> Flight:
     Raises:
         FlightError: the flight is impossible.
     """
-    flown = scenario.piloted()[drone]
-    if isinstance(flown, Exchange):
-        return exchange_flights(scenario, flown)[drone]
+    settings = scenario.piloted()[drone]
+    if isinstance(settings, Exchange):
+        return exchange_flights(scenario, settings)[drone]
     spec = scenario.drone(drone)
     limits, hover = limits_of(spec, scenario.environment.gravity_m_s2), hover_of(spec)
-    if flown.start_s is None:
+    if settings.start_s is None:
         return Flight(hover)
-    path = fitted_path(flown, limits, hover[3], spec.limits.altitude_m)
-    way = way_to(hover, path, limits)
-    from_s, least_s = flown.start_s - (way.duration_s or 0.0), flown.takeoff_s + READY_S
-    if from_s < least_s:
-        needed = f"must be >= {least_s + (way.duration_s or 0.0):.2f}: it takes off at {flown.takeoff_s:g} s, then the"
-        raise FlightError("start_s", f"is {flown.start_s:g}; {needed} approach takes {way.duration_s:.2f} s")
-    return Flight(hover, (Leg(from_s, way, "approaching"), Leg(flown.start_s, path, "path")))
+    path = fitted_path(settings, limits, hover[3], spec.limits.altitude_m)
+    approach = approach_to(hover, path, limits)
+    from_s, earliest_s = settings.start_s - (approach.duration_s or 0.0), settings.takeoff_s + READY_S
+    if from_s < earliest_s:
+        needed = (
+            f"must be >= {earliest_s + (approach.duration_s or 0.0):.2f}: "
+            f"it takes off at {settings.takeoff_s:g} s, then the"
+        )
+        raise FlightError("start_s", f"is {settings.start_s:g}; {needed} approach takes {approach.duration_s:.2f} s")
+    return Flight(hover, (Leg(from_s, approach, "approaching"), Leg(settings.start_s, path, "path")))
 
 
-def way_to(start: Array, path: Reference, limits: PathLimits, begin: EndMotion | None = None) -> PiecewisePolynomial:
+def approach_to(
+    start: Array, path: Reference, limits: PathLimits, begin: EndMotion | None = None
+) -> PiecewisePolynomial:
     """Return the approach from a position and yaw (4,) to the start of a path.
 
     Raises:
         FlightError: no path within the limits exists, usually since the path to be joined starts too fast.
     """
-    place, rate = path.value(0.0)
+    position, rate = path.value(0.0)
     end = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
-    own = limits.share(SHARE if rate.any() else WAY_SHARE)
+    usable = limits.share(SHARE if rate.any() else APPROACH_SHARE)
     try:
-        return move(start, place, own, begin=begin, end=end)
+        return move(start, position, usable, begin=begin, end=end)
     except TrajectoryError as error:
         raise FlightError("", str(error)) from None
 
@@ -202,9 +207,9 @@ def fitted_path(spec: DroneReference, limits: PathLimits, yaw: float, altitude_m
     """
     (kind,) = spec.paths()
     try:
-        own = _paths_of(spec, yaw)[kind]()
+        unscaled = _paths_of(spec, yaw)[kind]()
         origin = np.array([*spec.origin_m, 0.0])
-        path = Scaled(own, spec.time_scale, origin)
+        path = Scaled(unscaled, spec.time_scale, origin)
         factor = peaks_of(path).factor(limits.share(SHARE))
         if factor > ROUNDING:
             if not spec.fit:
@@ -223,15 +228,15 @@ def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Ref
     base = np.array([0.0, 0.0, 0.0, yaw])
 
     def expressions() -> Reference:
-        return ExpressionTrajectory(Place(), spec.expressions, base, spec.constants, spec.duration_s)
+        return ExpressionTrajectory(PoseVariables(), spec.expressions, base, spec.constants, spec.duration_s)
 
-    def laps(curve: Any, of: Any) -> Reference:
-        return Laps(lambda angle: _turned(curve(angle), yaw), of.period_s, of.laps)
+    def laps(curve: Any, settings: Any) -> Reference:
+        return Laps(lambda angle: _turned(curve(angle), yaw), settings.period_s, settings.laps)
 
     round_, eight = spec.circle, spec.figure_eight
     return {
-        "waypoints": lambda: WaypointTrajectory(Place(), _named(spec.waypoints), base),
-        "minimum_snap": lambda: _through(spec.minimum_snap, yaw),
+        "waypoints": lambda: WaypointTrajectory(PoseVariables(), _named(spec.waypoints), base),
+        "minimum_snap": lambda: _minimum_snap_path(spec.minimum_snap, yaw),
         "expressions": expressions,
         "pieces": lambda: _polynomials(spec),
         "circle": lambda: laps(circle(round_.radius_m, round_.climb_m), round_) if round_ else Flight(base),
@@ -239,31 +244,31 @@ def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Ref
     }
 
 
-def _turned(at: tuple[Array, Array], yaw: float) -> tuple[Array, Array]:
-    at[0][3] = yaw
-    return at
+def _turned(point: tuple[Array, Array], yaw: float) -> tuple[Array, Array]:
+    point[0][3] = yaw
+    return point
 
 
 def _named(points: Sequence[PathPoint]) -> list[dict[str, Any]]:
     """Return points in the form that `WaypointTrajectory` takes."""
     named = []
     for point in points:
-        values: dict[str, float] = dict(zip(PLACE_NAMES, point.position_m, strict=False))
+        values: dict[str, float] = dict(zip(VARIABLE_NAMES, point.position_m, strict=False))
         if point.yaw_deg is not None:
             values["yaw_deg"] = point.yaw_deg
         named.append({"at_s": point.at_s, "values": values})
     return named
 
 
-def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
+def _minimum_snap_path(points: Sequence[PathPoint], yaw: float) -> Reference:
     """Return the minimum-snap path through points, at rest until the time of the first one, turning the shorter way.
 
     `yaw` is the heading at points before the first one that states its own [rad].
     """
-    places = np.empty((len(points), 4))
-    for row, point in zip(places, points, strict=True):
-        wanted = yaw if point.yaw_deg is None else math.radians(point.yaw_deg)
-        yaw += math.remainder(wanted - yaw, math.tau)
+    positions = np.empty((len(points), 4))
+    for row, point in zip(positions, points, strict=True):
+        desired_yaw = yaw if point.yaw_deg is None else math.radians(point.yaw_deg)
+        yaw += math.remainder(desired_yaw - yaw, math.tau)
         row[:] = *point.position_m, yaw
     times = [point.at_s for point in points]
     if len(times) < 2:
@@ -271,32 +276,32 @@ def _through(points: Sequence[PathPoint], yaw: float) -> Reference:
     for number, (before_s, after_s) in enumerate(pairwise(times), start=1):
         if after_s <= before_s:
             raise TrajectoryError(f"[{number}].at_s is {after_s:g}; must be > {before_s:g}, the one before")
-    path = minimum_snap([t - times[0] for t in times], places)
+    path = minimum_snap([t - times[0] for t in times], positions)
     if not times[0]:
         return path
     rest = np.zeros((1, *path.coefficients.shape[1:]))
-    rest[0, 0] = places[0]
+    rest[0, 0] = positions[0]
     durations = np.concatenate(([times[0]], path.durations_s))
     return PiecewisePolynomial(durations, np.concatenate((rest, path.coefficients)))
 
 
 def _polynomials(spec: DroneReference) -> Reference:
     coefficients = np.zeros((len(spec.pieces), 8, 4))
-    for own, piece in zip(coefficients, spec.pieces, strict=True):
+    for piece_coefficients, piece in zip(coefficients, spec.pieces, strict=True):
         for k, terms in enumerate((piece.x, piece.y, piece.z, piece.yaw)):
-            own[: len(terms), k] = terms
+            piece_coefficients[: len(terms), k] = terms
     return PiecewisePolynomial(np.array([piece.duration_s for piece in spec.pieces]), coefficients)
 
 
-def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, now: str) -> str:
-    """Return the error text on the quantity that exceeds its limit most; `now` states the current time scale."""
-    shares = [own / most for own, most in zip(peaks[:4], limits, strict=True)]
-    weighed = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # weighted as in `Peaks.factor`
-    worst = int(np.argmax(weighed))
-    what, unit = QUANTITIES[worst]
-    found = f"needs a {what} of {peaks[worst]:.3g} {unit} at {peaks.at_s[worst]:.2f} s"
+def _too_fast(peaks: Peaks, limits: PathLimits, factor: float, scale_text: str) -> str:
+    """Return the error text on the quantity that exceeds its limit most; `scale_text` states the current time scale."""
+    shares = [peak / limit for peak, limit in zip(peaks[:4], limits, strict=True)]
+    weighted = [*shares[:3], math.sqrt(shares[3] * SHARE)]  # weighted as in `Peaks.factor`
+    worst = int(np.argmax(weighted))
+    quantity, unit = QUANTITIES[worst]
+    found = f"needs a {quantity} of {peaks[worst]:.3g} {unit} at {peaks.at_s[worst]:.2f} s"
     allowed = f"must be at most {SHARE * limits[worst]:.3g}, {SHARE:g} of the drone's limit"
-    return f"{found}; {allowed}: slow it down by a factor of {round_up(factor):g} ({now}), or set fit: true"
+    return f"{found}; {allowed}: slow it down by a factor of {round_up(factor):g} ({scale_text}), or set fit: true"
 
 
 def _check_heights(path: Reference, altitude_max_m: float) -> None:
@@ -304,13 +309,13 @@ def _check_heights(path: Reference, altitude_max_m: float) -> None:
     end_s = 600.0 if end_s is None else end_s
     times = np.linspace(0.0, end_s, min(max(math.ceil(end_s / SAMPLE_S) + 1, 2), SAMPLES_MAX)).tolist()
     heights = [float(path.value(t)[0][2]) for t in times]
-    low = int(np.argmin(heights))
-    if heights[low] < HEIGHT_MIN_M:
-        found = f"leads to z = {heights[low]:.2f} m at {times[low]:.2f} s"
+    lowest = int(np.argmin(heights))
+    if heights[lowest] < HEIGHT_MIN_M:
+        found = f"leads to z = {heights[lowest]:.2f} m at {times[lowest]:.2f} s"
         raise FlightError("", f"{found}; must be >= {HEIGHT_MIN_M:g} m: raise origin_m[2]")
-    high = int(np.argmax(heights))
-    if heights[high] > altitude_max_m:
-        found = f"leads to z = {heights[high]:.2f} m at {times[high]:.2f} s"
+    highest = int(np.argmax(heights))
+    if heights[highest] > altitude_max_m:
+        found = f"leads to z = {heights[highest]:.2f} m at {times[highest]:.2f} s"
         raise FlightError("", f"{found}; must be <= {altitude_max_m:g} m, its limits.altitude_m")
 
 
@@ -325,34 +330,34 @@ def exchange_flights(scenario: Scenario, exchange: Exchange) -> dict[str, Flight
     specs = [scenario.drone(name) for name in exchange.drones]
     gravity = scenario.environment.gravity_m_s2
     limits = np.array([limits_of(spec, gravity).share(SHARE) for spec in specs])  # columns as in PathLimits
-    places = np.array([hover_of(spec) for spec in specs])
-    hovers, stages = places.copy(), list[tuple[float, float, Array]]()
+    positions = np.array([hover_of(spec) for spec in specs])
+    hovers, stages = positions.copy(), list[tuple[float, float, Array]]()
     unit = minimum_snap((0.0, 1.0), np.array([[0.0] * 4, [1.0, 0.0, 0.0, 0.0]]))
     rise, peaks = unit.coefficients[0, :, 0], unit.peaks()
-    free_s = exchange.takeoff_s + READY_S
+    ready_s = exchange.takeoff_s + READY_S
     for number, stage in enumerate(exchange.stages):
-        at = f"stages[{number}]"
-        if stage.start_s < free_s:
-            raise FlightError(f"{at}.start_s", f"is {stage.start_s:g}; must be >= {free_s:.2f}, when all are ready")
+        path = f"stages[{number}]"
+        if stage.start_s < ready_s:
+            raise FlightError(f"{path}.start_s", f"is {stage.start_s:g}; must be >= {ready_s:.2f}, when all are ready")
         for index, (_, _, z) in enumerate(stage.places_m):
             if z < HEIGHT_MIN_M:
-                raise FlightError(f"{at}.places_m[{index}][2]", f"is {z:g}; must be >= {HEIGHT_MIN_M:g}")
-        goals = places.copy()
-        goals[:, :3] = np.array(stage.places_m)[_assigned(places[:, :3].tobytes(), tuple(stage.places_m))]
-        ways = goals - places
-        aside_m, up_m = np.sqrt(np.square(ways[:, :2]).sum(axis=1)), np.abs(ways[:, 2])
-        speeds = peaks.speed_m_s * np.maximum(aside_m / limits[:, 0], up_m / limits[:, 1])
-        least_s = float(np.maximum(speeds, np.sqrt(peaks.accel_m_s2 * aside_m / limits[:, 3])).max())
+                raise FlightError(f"{path}.places_m[{index}][2]", f"is {z:g}; must be >= {HEIGHT_MIN_M:g}")
+        goals = positions.copy()
+        goals[:, :3] = np.array(stage.places_m)[_assigned(positions[:, :3].tobytes(), tuple(stage.places_m))]
+        deltas = goals - positions
+        horizontal_m, vertical_m = np.sqrt(np.square(deltas[:, :2]).sum(axis=1)), np.abs(deltas[:, 2])
+        speeds = peaks.speed_m_s * np.maximum(horizontal_m / limits[:, 0], vertical_m / limits[:, 1])
+        min_s = float(np.maximum(speeds, np.sqrt(peaks.accel_m_s2 * horizontal_m / limits[:, 3])).max())
         over_s = stage.over_s
-        if least_s > over_s * ROUNDING:
+        if min_s > over_s * ROUNDING:
             if not exchange.fit:
-                needed = f"must be >= {round_up(least_s):g} for the longest distance, or set fit: true"
-                raise FlightError(f"{at}.over_s", f"is {over_s:g}; {needed}")
-            over_s = round_up(least_s)
-        coefficients = (rise / [el.power(over_s, float(k)) for k in range(len(rise))])[:, None] * ways[:, None, :]
-        coefficients[:, 0] += places
+                needed = f"must be >= {round_up(min_s):g} for the longest distance, or set fit: true"
+                raise FlightError(f"{path}.over_s", f"is {over_s:g}; {needed}")
+            over_s = round_up(min_s)
+        coefficients = (rise / [el.power(over_s, float(k)) for k in range(len(rise))])[:, None] * deltas[:, None, :]
+        coefficients[:, 0] += positions
         stages.append((stage.start_s, over_s, coefficients))
-        places, free_s = goals, stage.start_s + over_s
+        positions, ready_s = goals, stage.start_s + over_s
 
     def legs(k: int) -> Iterator[Leg]:
         for start_s, over_s, coefficients in stages:
@@ -366,8 +371,8 @@ def _assigned(starts_m: bytes, goals_m: tuple[tuple[float, float, float], ...]) 
     return assign(np.frombuffer(starts_m).reshape(-1, 3), np.array(goals_m))
 
 
-def land_s_of(flown: Piloted) -> float:
-    return math.inf if flown.land_s is None else flown.land_s
+def land_s_of(settings: Piloted) -> float:
+    return math.inf if settings.land_s is None else settings.land_s
 
 
 # All flights of a scenario
@@ -380,28 +385,30 @@ def flight_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
     """
     flights: dict[str, Flight] = {}
     exchanges = [] if not isinstance(scenario.exchanges, list) else scenario.exchanges
-    sound = True
+    is_valid = True
     for index, exchange in enumerate(exchanges):
         try:
             flights |= exchange_flights(scenario, exchange)
         except FlightError as fault:
-            sound = False
+            is_valid = False
             yield f"exchanges[{index}]{'.' * bool(fault.path)}{fault.path}", fault.text
     for index, drone in enumerate(scenario.drones):
         if isinstance(drone.reference, DroneReference):
             try:
                 flights[drone.name] = flight_of(scenario, drone.name)
             except FlightError as fault:
-                sound = False
+                is_valid = False
                 path = f"drones[{index}].reference{'.' * bool(fault.path)}{fault.path}"
                 yield path, f"{fault.text} (drone {drone.name!r})"
-    if sound and (text := too_near(scenario, flights)):
+    if is_valid and (text := separation_fault(scenario, flights)):
         yield "drones", text
-    if sound and scenario.clusters:
-        yield from _meetings(scenario, flights, {name: land_s_of(each) for name, each in scenario.piloted().items()})
+    if is_valid and scenario.clusters:
+        yield from _formation_faults(
+            scenario, flights, {name: land_s_of(each) for name, each in scenario.piloted().items()}
+        )
 
 
-def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
+def separation_fault(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
     """Return a text about the first two drones whose flights come too close, or None."""
     names = [*flights]
     try:
@@ -416,9 +423,9 @@ def too_near(scenario: Scenario, flights: Mapping[str, Flight]) -> str | None:
     if found is None:
         return None
     pair = f"{names[found.first]} and {names[found.second]}"
-    least = float(clearance[found.first] + clearance[found.second])
-    near = f"{pair} are {found.distance_m:.2f} m apart at {found.t_s:.2f} s"
-    return f"have references on which {near}; must be >= {least:g} m"
+    separation_min_m = float(clearance[found.first] + clearance[found.second])
+    finding = f"{pair} are {found.distance_m:.2f} m apart at {found.t_s:.2f} s"
+    return f"have references on which {finding}; must be >= {separation_min_m:g} m"
 
 
 def checked_flight(scenario: Scenario, drone: str) -> Flight:
@@ -434,9 +441,9 @@ def checked_flight(scenario: Scenario, drone: str) -> Flight:
     except FlightError as fault:
         raise RunError(f"reference of {drone}: {fault}") from fault
     if drone == next(iter(scenario.piloted())):
-        wrong = next(flight_faults(scenario), None)
-        if wrong is not None:
-            raise RunError(f"{wrong[0]} {wrong[1]}")
+        first_fault = next(flight_faults(scenario), None)
+        if first_fault is not None:
+            raise RunError(f"{first_fault[0]} {first_fault[1]}")
     return flight
 
 
@@ -449,14 +456,14 @@ class Approach(NamedTuple):
     t_s: float
 
 
-def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -> Approach | None:
+def first_approach(paths: Sequence[Reference], clearances_m: Array, until_s: float) -> Approach | None:
     """Return the earliest approach of two paths closer than allowed, to within a millimetre; None if there is none.
 
     Within an interval, the distance between two paths is at least the mean of its values at both ends minus half the
     interval's length times the sum of the peak speeds; where this bound is too small, the interval is halved.
 
     Args:
-        least_m: clearance of each drone [m], (n,); the minimum distance of a pair is the sum of both clearances.
+        clearances_m: clearance of each drone [m], (n,); the minimum distance of a pair is the sum of both clearances.
         until_s: end of the search.
     """
     from scipy.spatial import KDTree
@@ -467,40 +474,40 @@ def first_approach(paths: Sequence[Reference], least_m: Array, until_s: float) -
     speed = np.array([el.hypot(each.speed_m_s, each.climb_m_s) for each in peaks])
     steps = max(2, math.ceil(until_s / STEP_S) + 1)
     times = np.linspace(0.0, until_s, steps).tolist()
-    places = np.array([[path.value(t)[0][:3] for path in paths] for t in times])
+    positions = np.array([[path.value(t)[0][:3] for path in paths] for t in times])
     step_s = times[1] - times[0]
-    reach = 2.0 * float(least_m.max() + speed.max() * step_s)
+    reach = 2.0 * float(clearances_m.max() + speed.max() * step_s)
     for k, t in enumerate(times[:-1]):
-        for i, j in sorted(KDTree(places[k]).query_pairs(reach)):
-            near = (paths[i], paths[j], float(speed[i] + speed[j]), float(least_m[i] + least_m[j]))
-            found = _nearer(*near, t, times[k + 1])
+        for i, j in sorted(KDTree(positions[k]).query_pairs(reach)):
+            pair = (paths[i], paths[j], float(speed[i] + speed[j]), float(clearances_m[i] + clearances_m[j]))
+            found = _find_approach(*pair, t, times[k + 1])
             if found is not None:
                 return Approach(i, j, *found)
     return None
 
 
-def _nearer(
-    a: Reference, b: Reference, speed: float, least_m: float, from_s: float, to_s: float
+def _find_approach(
+    a: Reference, b: Reference, speed: float, separation_min_m: float, from_s: float, to_s: float
 ) -> tuple[float, float] | None:
-    """Return the first distance below `least_m` between `from_s` and `to_s`, and its time; None if there is none."""
+    """Return the first distance below `separation_min_m` between `from_s` and `to_s` and its time, or None."""
 
-    def apart(t_s: float) -> float:
+    def distance_at(t_s: float) -> float:
         return el.distance(a.value(t_s)[0][:3].tolist(), b.value(t_s)[0][:3].tolist())
 
-    open_ = [(from_s, apart(from_s), to_s, apart(to_s))]
-    while open_:
-        low, at_low, high, at_high = open_.pop()
+    intervals = [(from_s, distance_at(from_s), to_s, distance_at(to_s))]
+    while intervals:
+        low, at_low, high, at_high = intervals.pop()
         for distance, t_s in ((at_low, low), (at_high, high)):
-            if distance < least_m - TOLERANCE_M:
+            if distance < separation_min_m - TOLERANCE_M:
                 return distance, t_s
-        if (at_low + at_high - speed * (high - low)) / 2.0 < least_m - TOLERANCE_M and high - low > LEAST_STEP_S:
+        if (at_low + at_high - speed * (high - low)) / 2.0 < separation_min_m - TOLERANCE_M and high - low > STEP_MIN_S:
             middle = (low + high) / 2.0
-            at_middle = apart(middle)
-            open_ += [(middle, at_middle, high, at_high), (low, at_low, middle, at_middle)]
+            at_middle = distance_at(middle)
+            intervals += [(middle, at_middle, high, at_high), (low, at_low, middle, at_middle)]
     return None
 
 
-def _meetings(
+def _formation_faults(
     scenario: Scenario, flights: Mapping[str, Reference], until_s: Mapping[str, float]
 ) -> Iterator[tuple[str, str]]:
     """Yield, for each formation that comes too close to a drone with a reference, the field's path and a text.
@@ -519,35 +526,41 @@ def _meetings(
             continue  # reported by the check of the plan, or caused by user code that is not loaded here
         if planned is None:
             continue
-        own_m = max(clearance[name] for name in cluster.drones)
-        found = [_meeting(planned, flights[name], until_s[name], own_m + clearance[name]) for name in flights]
-        met = [(each, name) for each, name in zip(found, flights, strict=True) if each is not None]
-        if met:
-            (t_s, distance_m, robot), name = min(met)
-            near = f"brings robot {robot + 1} within {distance_m:.2f} m of {name}, on its reference, at {t_s:.1f} s"
-            least = own_m + clearance[name]
-            yield f"clusters[{index}].{planned.path}", f"{near}; must be >= {least:g} m (cluster {cluster.name!r})"
+        cluster_clearance_m = max(clearance[name] for name in cluster.drones)
+        found = [
+            _find_meeting(planned, flights[name], until_s[name], cluster_clearance_m + clearance[name])
+            for name in flights
+        ]
+        meetings = [(each, name) for each, name in zip(found, flights, strict=True) if each is not None]
+        if meetings:
+            (t_s, distance_m, robot), name = min(meetings)
+            finding = f"brings robot {robot + 1} within {distance_m:.2f} m of {name}, on its reference, at {t_s:.1f} s"
+            separation_min_m = cluster_clearance_m + clearance[name]
+            yield (
+                f"clusters[{index}].{planned.path}",
+                f"{finding}; must be >= {separation_min_m:g} m (cluster {cluster.name!r})",
+            )
 
 
-def _meeting(
-    planned: PlannedMotion, flight: Reference, until_s: float, least_m: float
+def _find_meeting(
+    planned: PlannedMotion, flight: Reference, until_s: float, separation_min_m: float
 ) -> tuple[float, float, int] | None:
     """Return when a drone first comes too close to a robot, their distance, and the robot's index; None if never."""
-    from_s, to_s = planned.from_s + LATE_S, min(planned.until_s, until_s)
-    for t_s in np.arange(from_s, to_s, LOOK_S).tolist():
-        if float(_distances(planned, flight, t_s).min()) >= least_m + NEARER_M:
+    from_s, to_s = planned.from_s + DELAY_MAX_S, min(planned.until_s, until_s)
+    for t_s in np.arange(from_s, to_s, COARSE_STEP_S).tolist():
+        if float(_distances(planned, flight, t_s).min()) >= separation_min_m + APPROACH_MAX_M:
             continue
-        for fine_s in np.arange(t_s, min(t_s + LOOK_S, to_s), FINE_S).tolist():
+        for fine_s in np.arange(t_s, min(t_s + COARSE_STEP_S, to_s), FINE_STEP_S).tolist():
             distances = _distances(planned, flight, fine_s)
             robot = int(distances.argmin())
-            if distances[robot] < least_m:
+            if distances[robot] < separation_min_m:
                 return fine_s, float(distances[robot]), robot
     return None
 
 
 def _distances(planned: PlannedMotion, flight: Reference, t_s: float) -> Array:
-    apart_W = planned.places(t_s) - flight.value(t_s)[0][:3]
-    return np.sqrt((apart_W**2).sum(axis=1))
+    offsets_W = planned.positions(t_s) - flight.value(t_s)[0][:3]
+    return np.sqrt((offsets_W**2).sum(axis=1))
 
 
 def _clearance_m(scenario: Scenario, drone: str) -> float:

@@ -37,9 +37,9 @@ DIFFERENCE_S = 1e-4  # step of central differences of rates; relative error 1e-7
 FACTOR_DIGITS = 3  # decimals to which the factor of a fitted path is rounded up
 SHARE = 0.8  # share of the drone's limits that a path may use, as in formations; the rest is left to the feedback
 # Minimum duration of a move (25 gates), maximum unless a longer one is requested, and its growth per step of the search
-LEAST_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1
-STILL = 1e-9  # value below which a quantity counts as zero
-RAMP = 0.25  # duration of speeding up from rest, and of slowing down, as a share of a lap's
+DURATION_MIN_S, MOVE_MAX_S, GROWTH = 0.5, 3600.0, 1.1
+NEGLIGIBLE = 1e-9  # value below which a quantity counts as zero
+RAMP_SHARE = 0.25  # duration of speeding up from rest, and of slowing down, as a share of a lap's
 Curve = Callable[[float], tuple[Array, Array]]
 """Maps the angle [rad] to the position (4,) and its derivative with respect to the angle."""
 
@@ -67,7 +67,7 @@ class Peaks(NamedTuple):
 
     def factor(self, limits: PathLimits) -> float:
         """Return the factor by which to stretch the duration to just satisfy the limits; below 1, it may shrink."""
-        speeds = max(own / most for own, most in zip(self[:3], limits[:3], strict=True))
+        speeds = max(peak / limit for peak, limit in zip(self[:3], limits[:3], strict=True))
         return max(speeds, math.sqrt(self.accel_m_s2 / limits.accel_m_s2))  # acceleration scales as 1/t^2
 
 
@@ -90,15 +90,15 @@ class PiecewisePolynomial:
         clamped = min(max(t_s, 0.0), float(self.begins_s[-1]))
         piece = bisect.bisect_right(self._begins, clamped) - 1
         local = clamped - self._begins[piece]
-        place, rate = [], []
+        position, rate = [], []
         for highest, *others in self._axes[piece]:  # in plain floats: numpy takes five times as long
             value, slope = highest, 0.0
             for coefficient in others:
                 slope = slope * local + value
                 value = value * local + coefficient
-            place.append(value)
+            position.append(value)
             rate.append(slope)
-        return np.array(place), np.array(rate) if clamped == t_s else np.zeros(4)
+        return np.array(position), np.array(rate) if clamped == t_s else np.zeros(4)
 
     def until(self, end_s: float) -> PiecewisePolynomial:
         """Return the part of the path before `end_s` > 0."""
@@ -109,15 +109,16 @@ class PiecewisePolynomial:
 
     def peaks(self) -> Peaks:
         """Return the peaks over all pieces, with times accurate to 1e-10 of a piece."""
-        greatest = [(0.0, 0.0)] * 4
-        for begin_s, duration_s, own in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
-            unit = own * _powers(duration_s, len(own))[:, None]  # in local time from 0 to 1, for good scaling
+        maxima = [(0.0, 0.0)] * 4
+        for begin_s, duration_s, coefficients in zip(self.begins_s, self.durations_s, self.coefficients, strict=False):
+            # in local time from 0 to 1, for good scaling
+            unit = coefficients * _powers(duration_s, len(coefficients))[:, None]
             v = polynomial.polyder(unit) / duration_s
             a = polynomial.polyder(v) / duration_s
             for k, columns in enumerate((v[:, :2], v[:, 2:3], v[:, 3:], a[:, :2])):
-                most, at = _greatest(columns)
-                greatest[k] = max(greatest[k], (math.sqrt(most), float(begin_s + at * duration_s)))
-        values, times = zip(*greatest, strict=True)
+                peak, fraction = _maximum(columns)
+                maxima[k] = max(maxima[k], (math.sqrt(peak), float(begin_s + fraction * duration_s)))
+        values, times = zip(*maxima, strict=True)
         return Peaks(*values, at_s=times)
 
 
@@ -126,7 +127,7 @@ def _powers(x: float, count: int) -> Array:
     return np.array([el.power(x, float(k)) for k in range(count)])
 
 
-def _greatest(columns: Array) -> tuple[float, float]:
+def _maximum(columns: Array) -> tuple[float, float]:
     """Return the maximum over [0, 1] of the sum of squares of k polynomials, and where it is.
 
     It is found by sampling and golden section; only maxima narrower than the spacing of the samples can be missed.
@@ -134,29 +135,29 @@ def _greatest(columns: Array) -> tuple[float, float]:
     Args:
         columns: coefficients of t^0 to t^(n - 1), a column per polynomial, (n, k).
     """
-    falling = columns[::-1].T.tolist()
+    descending = columns[::-1].T.tolist()
 
     def value(t: float) -> float:
         total = 0.0
-        for column in falling:
-            own = 0.0
+        for column in descending:
+            result = 0.0
             for coefficient in column:
-                own = own * t + coefficient
-            total += own * own
+                result = result * t + coefficient
+            total += result * result
         return total
 
     samples = np.square(polynomial.polyval(np.linspace(0.0, 1.0, PEAK_SAMPLES + 1), columns)).sum(axis=0)
     best = int(np.argmax(samples))
     low, high = max(best - 1, 0) / PEAK_SAMPLES, min(best + 1, PEAK_SAMPLES) / PEAK_SAMPLES
-    at = best / PEAK_SAMPLES
-    most = value(at)
+    argmax = best / PEAK_SAMPLES
+    peak = value(argmax)
     for _ in range(GOLDEN_STEPS):
         left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
         a, b = value(left), value(right)
         low, high = (low, right) if a > b else (left, high)
-        if max(a, b) > most:
-            most, at = (a, left) if a > b else (b, right)
-    return most, at
+        if max(a, b) > peak:
+            peak, argmax = (a, left) if a > b else (b, right)
+    return peak, argmax
 
 
 class EndMotion(NamedTuple):
@@ -172,7 +173,7 @@ def at_rest() -> EndMotion:
 
 
 def minimum_snap(
-    times_s: Sequence[float], places: Array, begin: EndMotion | None = None, end: EndMotion | None = None
+    times_s: Sequence[float], positions: Array, begin: EndMotion | None = None, end: EndMotion | None = None
 ) -> PiecewisePolynomial:
     """Return the path through positions at given times that minimises the integral of the squared fourth derivative.
 
@@ -182,7 +183,7 @@ def minimum_snap(
 
     Args:
         times_s: increasing times, (m,); the path starts at the first.
-        places: x, y, z [m; W] and yaw [rad] at these times, (m, 4).
+        positions: x, y, z [m; W] and yaw [rad] at these times, (m, 4).
         begin, end: derivatives at the first and at the last time.
     """
     ends = begin or at_rest(), end or at_rest()
@@ -195,13 +196,13 @@ def minimum_snap(
 
     def put(row: int, piece: int, values: Array, first: int = 0) -> None:
         """Write a row's entries for the coefficients of a piece, from that of t^`first` on."""
-        at = piece * size + first - row + BELOW
-        diagonals[row, at : at + len(values)] = values
+        column = piece * size + first - row + BELOW
+        diagonals[row, column : column + len(values)] = values
 
     row = 0
     for p in range(m):
         put(row, p, np.ones(1))
-        b[row] = places[p]
+        b[row] = positions[p]
         if p == 0:
             for d in range(1, ENDS + 1):
                 put(row + d, 0, slopes[d, d : d + 1], d)
@@ -214,7 +215,7 @@ def minimum_snap(
                 put(row + d, p, -slopes[d, d : d + 1] * el.power(ratio, float(d)), d)
             row += DEGREE
         put(row, p, slopes[0])
-        b[row] = places[p + 1]
+        b[row] = positions[p + 1]
         row += 1
     for d in range(1, ENDS + 1):
         put(row + d - 1, m - 1, slopes[d])
@@ -240,15 +241,15 @@ def move(
         TrajectoryError: no path of an hour or less, or of `over_s`, satisfies the limits, usually since the motion at
             an end exceeds them.
     """
-    turned = start[3] + math.remainder(goal[3] - start[3], math.tau)
-    places = np.array([start, [*goal[:3], turned]])
+    end_yaw = start[3] + math.remainder(goal[3] - start[3], math.tau)
+    positions = np.array([start, [*goal[:3], end_yaw]])
     if begin is None and end is None:
-        unit = minimum_snap((0.0, 1.0), places).peaks().factor(limits)
-        return minimum_snap((0.0, max(over_s, LEAST_S, round_up(unit))), places)
-    length_s = max(over_s, LEAST_S)
+        unit = minimum_snap((0.0, 1.0), positions).peaks().factor(limits)
+        return minimum_snap((0.0, max(over_s, DURATION_MIN_S, round_up(unit))), positions)
+    length_s = max(over_s, DURATION_MIN_S)
     length_max_s = max(over_s, MOVE_MAX_S)
     while length_s <= length_max_s:  # by search: the given motions do not scale with the duration
-        path = minimum_snap((0.0, length_s), places, begin, end)
+        path = minimum_snap((0.0, length_s), positions, begin, end)
         if path.peaks().factor(limits) <= 1.0:
             return path
         length_s *= GROWTH
@@ -274,8 +275,8 @@ class Scaled:
         return None if own is None else own * self.factor
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        place, rate = self.of.value(t_s / self.factor)
-        return place + self.origin, rate / self.factor
+        position, rate = self.of.value(t_s / self.factor)
+        return position + self.origin, rate / self.factor
 
     def peaks(self) -> Peaks:
         own, f = peaks_of(self.of), self.factor
@@ -296,13 +297,13 @@ def peaks_of(path: Reference) -> Peaks:
     def quantities(t_s: float) -> Array:
         rate = path.value(t_s)[1]
         before, after = max(0.0, t_s - DIFFERENCE_S), min(end_s, t_s + DIFFERENCE_S)
-        accel = (path.value(after)[1] - path.value(before)[1]) / max(after - before, STILL)
+        accel = (path.value(after)[1] - path.value(before)[1]) / max(after - before, NEGLIGIBLE)
         return np.array([el.length(rate[:2]), abs(rate[2]), abs(rate[3]), el.length(accel[:2])])
 
     table = np.array([quantities(t_s) for t_s in times.tolist()])
     found = [_refined(lambda t, k=k: float(quantities(t)[k]), times, table[:, k]) for k in range(4)]
-    values, at = zip(*found, strict=True)
-    return Peaks(*values, at_s=at)
+    values, times_s = zip(*found, strict=True)
+    return Peaks(*values, at_s=times_s)
 
 
 def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -> tuple[float, float]:
@@ -311,7 +312,7 @@ def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -
 
     best = int(np.argmax(samples))
     low, high = times[max(best - 1, 0)], times[min(best + 1, len(times) - 1)]
-    if high > low and samples[best] > STILL:
+    if high > low and samples[best] > NEGLIGIBLE:
         inner = minimize_scalar(lambda t: -quantity(t), bounds=(low, high), method="bounded", options={"xatol": 1e-6})
         if -inner.fun > samples[best]:
             return float(-inner.fun), float(inner.x)
@@ -321,22 +322,22 @@ def _refined(quantity: Callable[[float], float], times: Array, samples: Array) -
 def circle(radius_m: float, climb_m: float = 0.0) -> Curve:
     """Return a circle around the origin, counter-clockwise from (radius, 0); a helix if `climb_m` per lap is not 0."""
 
-    def at(angle: float) -> tuple[Array, Array]:
+    def point_at(angle: float) -> tuple[Array, Array]:
         c, s, rise = radius_m * el.cos(angle), radius_m * el.sin(angle), climb_m / math.tau
         return np.array([c, s, rise * angle, 0.0]), np.array([-s, c, rise, 0.0])
 
-    return at
+    return point_at
 
 
 def figure_eight(length_m: float, width_m: float) -> Curve:
     """Return the lemniscate of Gerono with its length along x, starting at the crossing, which is the origin."""
 
-    def at(angle: float) -> tuple[Array, Array]:
+    def point_at(angle: float) -> tuple[Array, Array]:
         x, y = length_m / 2.0, width_m / 2.0
-        place = np.array([x * el.sin(angle), y * el.sin(2.0 * angle), 0.0, 0.0])
-        return place, np.array([x * el.cos(angle), 2.0 * y * el.cos(2.0 * angle), 0.0, 0.0])
+        position = np.array([x * el.sin(angle), y * el.sin(2.0 * angle), 0.0, 0.0])
+        return position, np.array([x * el.cos(angle), 2.0 * y * el.cos(2.0 * angle), 0.0, 0.0])
 
-    return at
+    return point_at
 
 
 class Laps:
@@ -348,21 +349,21 @@ class Laps:
     def __init__(self, curve: Curve, period_s: float, laps: float) -> None:
         self._curve = curve
         self._rate = math.tau / period_s
-        self._ramp_s = RAMP * period_s
+        self._ramp_s = RAMP_SHARE * period_s
         self.duration_s: float | None = self._ramp_s + laps * period_s
 
     def value(self, t_s: float) -> tuple[Array, Array]:
         end_s = self.duration_s or 0.0
         t = min(max(t_s, 0.0), end_s)
-        angle, rate = self._begun(t)
-        left = end_s - t
-        if left < self._ramp_s:
-            rest, rate = self._begun(left)
-            angle = self._rate * (end_s - self._ramp_s) - rest
-        place, slope = self._curve(angle)
-        return place, slope * rate
+        angle, rate = self._ramp_motion(t)
+        remaining_s = end_s - t
+        if remaining_s < self._ramp_s:
+            remaining_angle, rate = self._ramp_motion(remaining_s)
+            angle = self._rate * (end_s - self._ramp_s) - remaining_angle
+        position, slope = self._curve(angle)
+        return position, slope * rate
 
-    def _begun(self, t: float) -> tuple[float, float]:
+    def _ramp_motion(self, t: float) -> tuple[float, float]:
         """Return the angle [rad] and angular rate [rad/s] at a time `t` [s] after the start from rest."""
         s = t / self._ramp_s
         if s >= 1.0:

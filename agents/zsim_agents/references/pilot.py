@@ -7,7 +7,7 @@ hold: come to rest and hover
 goto {position_m, yaw_deg, speed_m_s}: fly to a position at a cruise speed (default: the limits) and stop there
 goto {places_m, yaw_deg, speed_m_s, radius_m}: fly through positions, passing each within radius_m; 0: stop at each
 goto {position_m, yaw_deg, over_s}: fly to a position on a minimum-snap path that takes over_s
-follow {minimum_snap: [...], fit: true, ...}: fly to the start of a path, then along it; fields: FOLLOWED
+follow {minimum_snap: [...], fit: true, ...}: fly to the start of a path, then along it; fields: FOLLOW_FIELDS
 """
 
 from __future__ import annotations
@@ -30,26 +30,27 @@ from zsim.schema.quantities import NonNegative, Positive, Real
 from zsim_agents.formation.flight_check import AGE_MAX_S, AIRBORNE, RESEND_S
 from zsim_agents.formation.spaces.cluster_space import Array
 from zsim_agents.formation.trajectory import TrajectoryError
-from zsim_agents.references.cruise import FREE, Cruise, cruise_through, cruise_to_rest, velocity_towards
+from zsim_agents.references.cruise import UNLIMITED, Cruise, cruise_through, cruise_to_rest, velocity_towards
 from zsim_agents.references.flight import (
     HEIGHT_MIN_M,
     SHARE,
     Flight,
     FlightError,
     Leg,
+    approach_to,
     checked_flight,
     fitted_path,
     land_s_of,
     limits_of,
-    way_to,
 )
 from zsim_agents.references.path import EndMotion, PathLimits, move
 
 REQUESTS_MAX = 1000  # maximum number of requests between two gates, as for a controller
-PLAIN = ("takeoff", "land", "hold")
-OPERATIONS = (*PLAIN, "goto", "follow")
-OF_EXPRESSIONS = ("constants", "duration_s")
-FOLLOWED = (*PATHS, *OF_EXPRESSIONS, "origin_m", "time_scale", "fit")  # a reference's other fields are for scenarios
+WITHOUT_ARGUMENTS = ("takeoff", "land", "hold")
+OPERATIONS = (*WITHOUT_ARGUMENTS, "goto", "follow")
+EXPRESSION_FIELDS = ("constants", "duration_s")
+# a reference's other fields are for scenarios
+FOLLOW_FIELDS = (*PATHS, *EXPRESSION_FIELDS, "origin_m", "time_scale", "fit")
 
 
 class ReferencePilot(Agent):
@@ -72,7 +73,8 @@ class ReferencePilot(Agent):
         self._reference_key, self._request_key = keys.reference(drone), keys.drone_request(drone)
         self.writes, self.repeats = (self._reference_key,), (self._request_key,)
         self._flight = checked_flight(scenario, drone)
-        self._asked: tuple[float, str, dict[str, Any], list[float], list[float]] | None = None  # last granted request
+        # the last granted request
+        self._last_request: tuple[float, str, dict[str, Any], list[float], list[float]] | None = None
         self._takeoff_s, self._land_s = self._settings.takeoff_s, land_s_of(self._settings)
         self._has_flown = self._is_over = False
         self._mode_ns = -round(RESEND_S * 1e9)
@@ -95,7 +97,7 @@ class ReferencePilot(Agent):
             self._is_over = True  # regardless of who landed the drone: it takes off again only on request
         if not self._is_over:
             outputs += self._commands(t_ns, t_s)
-        place, rate = self._flight.value(t_s)
+        position, rate = self._flight.value(t_s)
         phase, path_t_s = self._phase(t_s)
         outputs.append(
             Output(
@@ -104,9 +106,9 @@ class ReferencePilot(Agent):
                     t_ns,
                     self.next_seq(self._reference_key),
                     phase,
-                    _vector(place),
+                    _vector(position),
                     _vector(rate),
-                    float(place[3]),
+                    float(position[3]),
                     float(rate[3]),
                     path_t_s,
                     self.source,
@@ -135,11 +137,14 @@ class ReferencePilot(Agent):
 
     def _velocity(self, t_s: float, estimate: Estimate, age_s: float) -> tuple[tuple[float, float, float], float]:
         """Return the velocity [m/s; W] and yaw rate [rad/s] that track the reference within the drone's limits."""
-        place, _ = self._flight.value(t_s)
-        _, ahead = self._flight.value(t_s + self._settings.lead_s)
-        x, y, z = (at + moving * age_s for at, moving in zip(estimate.position_m, estimate.velocity_m_s, strict=True))
-        here = x, y, z, estimate.yaw_rad
-        return velocity_towards(place.tolist(), ahead.tolist(), here, self._limits, self._settings)
+        position, _ = self._flight.value(t_s)
+        _, future_rate = self._flight.value(t_s + self._settings.lead_s)
+        x, y, z = (
+            coordinate + speed * age_s
+            for coordinate, speed in zip(estimate.position_m, estimate.velocity_m_s, strict=True)
+        )
+        current = x, y, z, estimate.yaw_rad
+        return velocity_towards(position.tolist(), future_rate.tolist(), current, self._limits, self._settings)
 
     def _mode(self, t_ns: int, mode: Any) -> list[Output]:
         """Return a mode command, or nothing if the last one was sent less than RESEND_S ago."""
@@ -159,7 +164,7 @@ class ReferencePilot(Agent):
             error = f"{key}: {REQUESTS_MAX} requests are already waiting for the next gate; repeat the request after it"
             return ControlAnswer(ok=False, error=error)
         try:
-            result, error = self._take(request), ""
+            result, error = self._handle(request), ""
         except (DroneRequestError, FlightError) as fault:
             result, error = None, f"{request.op[:40]}: {fault}"
         answer = ControlAnswer(ok=not error, error=error, result=result)
@@ -169,29 +174,29 @@ class ReferencePilot(Agent):
     def repeat(self, key: str, message: ClusterRequest) -> None:
         self.control(key, ControlRequest(message.op, message.args, message.source))
 
-    def _take(self, request: ControlRequest) -> dict[str, Any] | None:
-        asked = read_request(request.op, request.args)
+    def _handle(self, request: ControlRequest) -> dict[str, Any] | None:
+        parsed = read_request(request.op, request.args)
         t_s = self._t_ns * 1e-9
-        if asked == "land":
+        if parsed == "land":
             if self._state not in AIRBORNE:
                 raise DroneRequestError(f"{self._drone} is {self._state}; must be in the air")
             self._land_s, self._mode_ns = t_s, self._t_ns - round(RESEND_S * 1e9)
             return None
-        if asked == "takeoff":
+        if parsed == "takeoff":
             if self._state != "landed" or self._estimate is None:
                 raise DroneRequestError(f"{self._drone} is {self._state}; must be landed and have an estimate")
             x, y, z = self._estimate.position_m
             hover = [x, y, z + self._spec.takeoff_height_m, self._estimate.yaw_rad]
-            self._asked, self._flight = (t_s, "takeoff", {}, hover, [0.0] * 4), Flight(np.array(hover))
+            self._last_request, self._flight = (t_s, "takeoff", {}, hover, [0.0] * 4), Flight(np.array(hover))
             self._takeoff_s, self._land_s, self._has_flown, self._is_over = t_s, math.inf, False, False
             self._mode_ns = self._t_ns - round(RESEND_S * 1e9)
             return None
         if self._state not in AIRBORNE or self._is_over or t_s >= self._land_s:
             state = "landed, or about to" if self._state in AIRBORNE else self._state
             raise DroneRequestError(f"{self._drone} is {state}; must be flying its reference: request takeoff first")
-        place, rate = self._flight.value(t_s)
-        flight = requested_flight(asked, t_s, place, rate, self._spec, self._limits)
-        self._flight, self._asked = flight, (t_s, request.op, request.args, place.tolist(), rate.tolist())
+        position, rate = self._flight.value(t_s)
+        flight = requested_flight(parsed, t_s, position, rate, self._spec, self._limits)
+        self._flight, self._last_request = flight, (t_s, request.op, request.args, position.tolist(), rate.tolist())
         return {"from_s": t_s, "until_s": flight.duration_s}
 
     def _requests_of_gate(self, t_ns: int) -> list[Output]:
@@ -211,7 +216,7 @@ class ReferencePilot(Agent):
 
     def snapshot(self) -> State | None:
         return {
-            "asked": list(self._asked) if self._asked else None,
+            "asked": list(self._last_request) if self._last_request else None,
             "times": [self._takeoff_s, None if math.isinf(self._land_s) else self._land_s],
             "flags": [self._has_flown, self._is_over],
             "mode_ns": self._mode_ns,
@@ -222,12 +227,16 @@ class ReferencePilot(Agent):
 
     def restore(self, state: State) -> None:
         if state["asked"] is not None:
-            t_s, op, args, place, rate = state["asked"]
-            self._asked = t_s, op, args, place, rate
-            at, moving = np.array(place), np.array(rate)
-            asked = read_request(op, args)
-            own = op == "takeoff"
-            self._flight = Flight(at) if own else requested_flight(asked, t_s, at, moving, self._spec, self._limits)
+            t_s, op, args, position, rate = state["asked"]
+            self._last_request = t_s, op, args, position, rate
+            start, start_rate = np.array(position), np.array(rate)
+            parsed = read_request(op, args)
+            is_takeoff = op == "takeoff"
+            self._flight = (
+                Flight(start)
+                if is_takeoff
+                else requested_flight(parsed, t_s, start, start_rate, self._spec, self._limits)
+            )
         self._takeoff_s, land_s = state["times"]
         self._land_s = math.inf if land_s is None else land_s
         self._has_flown, self._is_over = state["flags"]
@@ -242,8 +251,8 @@ class ReferencePilot(Agent):
         self._is_over = self._has_flown = message.phase == "over"
 
 
-def _vector(place: Array) -> tuple[float, float, float]:
-    x, y, z = place[:3].tolist()
+def _vector(position: Array) -> tuple[float, float, float]:
+    x, y, z = position[:3].tolist()
     return x, y, z
 
 
@@ -261,14 +270,14 @@ class Goto(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     radius_m: NonNegative = 0.0
     over_s: NonNegative = 0.0
 
-    def places(self) -> list[Position]:
+    def positions(self) -> list[Position]:
         return self.places_m if self.position_m is None else [self.position_m]
 
 
-Asked = Literal["takeoff", "land", "hold"] | Goto | DroneReference
+DroneRequest = Literal["takeoff", "land", "hold"] | Goto | DroneReference
 
 
-def read_request(op: str, args: Mapping[str, Any]) -> Asked:
+def read_request(op: str, args: Mapping[str, Any]) -> DroneRequest:
     """Return a request from its operation and arguments.
 
     Raises:
@@ -276,67 +285,69 @@ def read_request(op: str, args: Mapping[str, Any]) -> Asked:
     """
     if op not in OPERATIONS:
         raise DroneRequestError(f"is unknown; allowed: {', '.join(OPERATIONS)}")
-    if op in PLAIN:
+    if op in WITHOUT_ARGUMENTS:
         if args:
             raise DroneRequestError(f"{next(iter(args))!s:.40} is given; must have no arguments")
         return op  # type: ignore[return-value]
     kind = Goto if op == "goto" else DroneReference
-    wrong = [f"{path} {text}" for path, text in faults(dict(args), kind)]
-    if wrong:
-        raise DroneRequestError("; ".join(wrong[:3]))
-    asked = convert(dict(args), kind)
-    if isinstance(asked, DroneReference) and len(asked.paths()) != 1:
-        given = " and ".join(asked.paths()) or "none"
+    invalid = [f"{path} {text}" for path, text in faults(dict(args), kind)]
+    if invalid:
+        raise DroneRequestError("; ".join(invalid[:3]))
+    parsed = convert(dict(args), kind)
+    if isinstance(parsed, DroneReference) and len(parsed.paths()) != 1:
+        given = " and ".join(parsed.paths()) or "none"
         raise DroneRequestError(f"has {given} of {', '.join(PATHS)}; must have one")
-    if isinstance(asked, DroneReference) and (unused := list(_unused(asked, args))):
-        raise DroneRequestError(f"{'; '.join(unused[:3])}; allowed: {', '.join(FOLLOWED)}")
-    if isinstance(asked, Goto):
-        if (asked.position_m is None) != bool(asked.places_m):
-            found = "is given beside" if asked.places_m else "is missing, and so is"
+    if isinstance(parsed, DroneReference) and (unused := list(_unused(parsed, args))):
+        raise DroneRequestError(f"{'; '.join(unused[:3])}; allowed: {', '.join(FOLLOW_FIELDS)}")
+    if isinstance(parsed, Goto):
+        if (parsed.position_m is None) != bool(parsed.places_m):
+            found = "is given beside" if parsed.places_m else "is missing, and so is"
             raise DroneRequestError(f"position_m {found} places_m; must have one of them")
-        if asked.over_s and (asked.places_m or asked.speed_m_s):
-            other = "places_m" if asked.places_m else "speed_m_s"
-            raise DroneRequestError(f"over_s is {asked.over_s:g} beside {other}; one of them must be left out")
-    return asked
+        if parsed.over_s and (parsed.places_m or parsed.speed_m_s):
+            other = "places_m" if parsed.places_m else "speed_m_s"
+            raise DroneRequestError(f"over_s is {parsed.over_s:g} beside {other}; one of them must be left out")
+    return parsed
 
 
-def _unused(asked: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
+def _unused(reference: DroneReference, args: Mapping[str, Any]) -> Iterator[str]:
     """Yield the faults of the fields that are not allowed in a request."""
     for name, value in args.items():
-        if name not in FOLLOWED:
+        if name not in FOLLOW_FIELDS:
             yield f"{name} is {show(value)}; must be left out of a request"
-        elif name in OF_EXPRESSIONS and not asked.expressions:
+        elif name in EXPRESSION_FIELDS and not reference.expressions:
             yield f"{name} is {show(value)}; must be left out without expressions"
 
 
-def requested_flight(asked: Any, t_s: float, place: Array, rate: Array, drone: Drone, limits: PathLimits) -> Flight:
+def requested_flight(
+    request: Any, t_s: float, position: Array, rate: Array, drone: Drone, limits: PathLimits
+) -> Flight:
     """Return the flight requested at `t_s`; it begins with the current position and rate, both (4,).
 
     Raises:
         FlightError: the flight is impossible.
     """
     begin = EndMotion(rate, np.zeros(4), np.zeros(4)) if rate.any() else None
-    if isinstance(asked, DroneReference):
-        path = fitted_path(asked, limits, float(place[3]), drone.limits.altitude_m)
-        way = way_to(place, path, limits, begin)
-        path_s = t_s + (way.duration_s or 0.0)
-        return Flight(place, (Leg(t_s, way, "approaching"), Leg(path_s, path, "path")))
-    own = limits.share(SHARE)
-    if not isinstance(asked, Goto):
-        return Flight(place, (Leg(t_s, cruise_to_rest(place, own, rate), "approaching"),))
-    yaw = float(place[3]) if asked.yaw_deg is None else math.radians(asked.yaw_deg)
+    if isinstance(request, DroneReference):
+        path = fitted_path(request, limits, float(position[3]), drone.limits.altitude_m)
+        approach = approach_to(position, path, limits, begin)
+        path_s = t_s + (approach.duration_s or 0.0)
+        return Flight(position, (Leg(t_s, approach, "approaching"), Leg(path_s, path, "path")))
+    usable = limits.share(SHARE)
+    if not isinstance(request, Goto):
+        return Flight(position, (Leg(t_s, cruise_to_rest(position, usable, rate), "approaching"),))
+    yaw = float(position[3]) if request.yaw_deg is None else math.radians(request.yaw_deg)
     low, high = HEIGHT_MIN_M, drone.limits.altitude_m
-    for k, (_, _, z) in enumerate(asked.places()):
+    for k, (_, _, z) in enumerate(request.positions()):
         if not low <= z <= high:
-            field = f"places_m[{k}][2]" if asked.places_m else "position_m[2]"
+            field = f"places_m[{k}][2]" if request.places_m else "position_m[2]"
             raise FlightError(field, f"is {z:g}; must be >= {low:g} and <= {high:g}")
-    goals = [np.array([*each, yaw]) for each in asked.places()]
-    if asked.over_s:
+    goals = [np.array([*each, yaw]) for each in request.positions()]
+    if request.over_s:
         try:
-            way = move(place, goals[0], own, asked.over_s, begin)
+            approach = move(position, goals[0], usable, request.over_s, begin)
         except TrajectoryError as error:
             raise FlightError("", str(error)) from None
     else:
-        speeds = FREE if asked.speed_m_s is None else Cruise(*(asked.speed_m_s,) * 3)
-        way = cruise_through(place, goals, own, rate, speeds, asked.radius_m)
-    return Flight(place, (Leg(t_s, way, "approaching"),))
+        speeds = UNLIMITED if request.speed_m_s is None else Cruise(*(request.speed_m_s,) * 3)
+        approach = cruise_through(position, goals, usable, rate, speeds, request.radius_m)
+    return Flight(position, (Leg(t_s, approach, "approaching"),))

@@ -110,7 +110,7 @@ class AircraftSession(VehicleSession):
         self._sent: Config | None = None  # the entry that awaits its acknowledgement
 
     @classmethod
-    def of_run(
+    def from_run(
         cls, info: Info, scenario: Scenario, options: DriverOptions, host: str, ultrasound: int
     ) -> "AircraftSession":
         origin = info.origin.latitude_deg, info.origin.longitude_deg, info.origin.height_m

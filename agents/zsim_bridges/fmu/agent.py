@@ -21,7 +21,7 @@ from zsim.errors import RunError, UserCodeError, printable
 from zsim.math import elementary as el
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
-from zsim_bridges.fmu.mapping import FORMATION, Formation, MappedVariable, mapping_of
+from zsim_bridges.fmu.mapping import FORMATION_QUANTITIES, Formation, MappedVariable, mapping_of
 from zsim_bridges.fmu.model import FmuInstance, FmuModel, Inputs, Variable
 
 Frame = Literal["heading", "world"]
@@ -98,101 +98,105 @@ class Fmu:
 class FmuAgent(Agent):
     """The agent that runs an FMU."""
 
-    def __init__(self, of: Fmu, info: Info, scenario: Scenario) -> None:
+    def __init__(self, fmu: Fmu, info: Info, scenario: Scenario) -> None:
         super().__init__()
         drones = [drone.name for drone in info.drones]
-        if of.drone is not None and of.drone not in drones:
-            raise RunError(f"--drone is {of.drone!r}; must be one of {', '.join(drones)}")
-        self._model = model = FmuModel(of.path)
-        self.name = of.name or f"fmu.{of.drone or 'main'}"
-        self._say = of.say or _print
-        self.period_ns = _period_ns(model, of.period_s, info)
+        if fmu.drone is not None and fmu.drone not in drones:
+            raise RunError(f"--drone is {fmu.drone!r}; must be one of {', '.join(drones)}")
+        self._model = model = FmuModel(fmu.path)
+        self.name = fmu.name or f"fmu.{fmu.drone or 'main'}"
+        self._say = fmu.say or _print
+        self.period_ns = _period_ns(model, fmu.period_s, info)
         formation = cache(partial(Formation, scenario))
-        mapping = mapping_of(model, of.map, info, of.drone, lambda cluster: formation(cluster).names)
+        mapping = mapping_of(model, fmu.map, info, fmu.drone, lambda cluster: formation(cluster).names)
         if not mapping.outputs:
-            known = ", ".join(each.name for each in model.variables.values() if each.causality == "output") or "none"
-            raise RunError(f"{of.path}: maps no output; must map at least one of {known}")
+            output_names = (
+                ", ".join(each.name for each in model.variables.values() if each.causality == "output") or "none"
+            )
+            raise RunError(f"{fmu.path}: maps no output; must map at least one of {output_names}")
         self._inputs = mapping.inputs
         self._formations = {
             key: formation(keys.thing(key))
             for key in (link.place.key for link in (*mapping.inputs, *mapping.outputs))
-            if keys.parts(key)[2] in FORMATION
+            if keys.parts(key)[2] in FORMATION_QUANTITIES
         }
-        self._writers = _writers(mapping.outputs, of.frame, self._formations)
-        self._given = [link.variable for writer in self._writers for link in writer.links]
+        self._writers = _writers(mapping.outputs, fmu.frame, self._formations)
+        self._output_variables = [link.variable for writer in self._writers for link in writer.links]
         self._commanded = sorted({drone for writer in self._writers for drone in writer.commanded})
-        self._takeoff_ns = None if of.takeoff_s is None else round(of.takeoff_s * 1e9)
+        self._takeoff_ns = None if fmu.takeoff_s is None else round(fmu.takeoff_s * 1e9)
         self._latest: dict[str, Any] = {}
         self._states: dict[str, Any] = {}  # firmware states, by drone
-        self._raised: set[str] = set()  # modes whose outputs were true at the last step
+        self._active_flags: set[str] = set()  # modes whose outputs were true at the last step
         self._has_started = False
         self._declare_keys(info)
         for line in mapping.notes:
-            self._say(f"{self.name}: {of.path.name}: {line}")
-        if not model.restores:
-            self._say(f"{self.name}: {of.path.name} cannot save its state; a restart begins anew")
-        self._unit = FmuInstance(model, self.name, lambda line: self._say(f"{self.name}: {line}"), of.log)
-        self._unit.write([_parameter(model, name, value) for name, value in of.param.items()])
+            self._say(f"{self.name}: {fmu.path.name}: {line}")
+        if not model.can_restore:
+            self._say(f"{self.name}: {fmu.path.name} cannot save its state; a restart begins anew")
+        self._instance = FmuInstance(model, self.name, lambda line: self._say(f"{self.name}: {line}"), fmu.log)
+        self._instance.write([_parameter(model, name, value) for name, value in fmu.param.items()])
 
     def _declare_keys(self, info: Info) -> None:
         reads = {link.place.key for link in self._inputs} - self._formations.keys()
         reads |= {keys.estimate(drone) for formation in self._formations.values() for drone in formation.drones}
-        about = [key for key in (*reads, *(writer.key for writer in self._writers)) if key.startswith("drone/")]
-        concerned = {*map(keys.thing, about), *self._commanded}
-        drones = [drone.name for drone in info.drones if drone.name in concerned or not concerned]
+        drone_keys = [key for key in (*reads, *(writer.key for writer in self._writers)) if key.startswith("drone/")]
+        involved_drones = {*map(keys.thing, drone_keys), *self._commanded}
+        drones = [drone.name for drone in info.drones if drone.name in involved_drones or not involved_drones]
         statuses = [keys.status(drone) for drone in drones]
         self.counted = tuple(
             drone for drone in drones if any(keys.is_sensor(key) and keys.thing(key) == drone for key in reads)
         )
-        every_gate = [key for key in reads if messages.type_of(key) in messages.RELAYED]
-        plain = [key for key in (*reads, *statuses) if not (keys.is_sensor(key) and keys.thing(key) in self.counted)]
-        self.reads = tuple(sorted({*plain, *map(keys.sensors, self.counted)}))
-        self.gate_keys = (*statuses, *sorted(every_gate))
+        relayed_keys = [key for key in reads if messages.type_of(key) in messages.RELAYED]
+        individual_keys = [
+            key for key in (*reads, *statuses) if not (keys.is_sensor(key) and keys.thing(key) in self.counted)
+        ]
+        self.reads = tuple(sorted({*individual_keys, *map(keys.sensors, self.counted)}))
+        self.gate_keys = (*statuses, *sorted(relayed_keys))
         self.writes = tuple(writer.key for writer in self._writers if not writer.commanded)
-        self._wanted = reads
+        self._read_keys = reads
 
     def receive(self, key: str, message: Any) -> None:
-        if key in self._wanted:
+        if key in self._read_keys:
             self._latest[key] = message
         if type(message) is Status:
             self._states[keys.thing(key)] = message.state
 
     def step(self, t_ns: int) -> list[Output]:
         t_s = t_ns / 1e9
-        inputs = self._values()
+        inputs = self._input_values()
         if not self._has_started:
-            self._unit.start(t_s, inputs)
+            self._instance.start(t_s, inputs)
             self._has_started = True
         else:
-            self._unit.write(inputs)
-        self._unit.step(t_s, self.period_ns / 1e9)
-        given = self._unit.read(self._given)
-        for variable, values in zip(self._given, given, strict=True):
+            self._instance.write(inputs)
+        self._instance.step(t_s, self.period_ns / 1e9)
+        output_values = self._instance.read(self._output_variables)
+        for variable, values in zip(self._output_variables, output_values, strict=True):
             for value in values:
                 if isinstance(value, float) and not math.isfinite(value):
                     raise UserCodeError(f"{self._model.path}: output {variable.name} is {value}; must be finite")
-        outputs = self._takeoffs(t_ns)
-        begin = 0
+        outputs = self._takeoff_commands(t_ns)
+        start = 0
         for writer in self._writers:
-            values = given[begin : begin + len(writer.links)]
-            begin += len(writer.links)
+            values = output_values[start : start + len(writer.links)]
+            start += len(writer.links)
             outputs += writer.outputs(self, t_ns, values)
         return outputs
 
-    def _values(self) -> Inputs:
+    def _input_values(self) -> Inputs:
         """Return values for the inputs whose messages have arrived; the other inputs keep their start values."""
         values = []
         for link in self._inputs:
             place = link.place
             message = self._latest.get(place.key)
-            read = place.read(message) if message is not None else None
+            field_values = place.read(message) if message is not None else None
             if place.key in self._formations and (c := self._formations[place.key].c(self._latest)) is not None:
-                read = [c[i] for i in place.indices or ()]
-            if read is not None:
-                values.append((link.variable, link.converted(read)))
+                field_values = [c[i] for i in place.indices or ()]
+            if field_values is not None:
+                values.append((link.variable, link.converted(field_values)))
         return values
 
-    def _takeoffs(self, t_ns: int) -> list[Output]:
+    def _takeoff_commands(self, t_ns: int) -> list[Output]:
         if self._takeoff_ns is None or t_ns < self._takeoff_ns:
             return []
         self._takeoff_ns = None
@@ -202,40 +206,40 @@ class FmuAgent(Agent):
     def mode(self, t_ns: int, key: str, mode: Any) -> Output:
         return Output(key, Mode(t_ns, self.next_seq(key), self.source, mode))
 
-    def motion(self, t_ns: int, formation: Formation, c_dot: Sequence[float]) -> list[Output]:
+    def motion_commands(self, t_ns: int, formation: Formation, c_dot: Sequence[float]) -> list[Output]:
         """Return velocity commands for cluster rates c_dot (4n,), to the formation's drones that accept setpoints."""
         outputs = []
         for drone, command in zip(formation.drones, formation.velocities(self._latest, c_dot), strict=False):
-            if self.takes_setpoints(drone):
+            if self.accepts_setpoints(drone):
                 key = keys.command(drone, "velocity")
                 outputs.append(Output(key, replace(command, t_ns=t_ns, seq=self.next_seq(key), source=self.source)))
         return outputs
 
-    def takes_setpoints(self, drone: str) -> bool:
+    def accepts_setpoints(self, drone: str) -> bool:
         return state_refusal(drone, self._states.get(drone, "landed"), "setpoint") is None
 
-    def rises(self, flag: str, is_set: bool) -> bool:
+    def record_edge(self, flag: str, is_set: bool) -> bool:
         """Record a flag and return whether it has become true since the last step."""
-        was_set = flag in self._raised
-        (self._raised.add if is_set else self._raised.discard)(flag)
+        was_set = flag in self._active_flags
+        (self._active_flags.add if is_set else self._active_flags.discard)(flag)
         return is_set and not was_set
 
     def snapshot(self) -> State | None:
-        if not self._model.restores or not self._has_started:
+        if not self._model.can_restore or not self._has_started:
             return None
         return {
-            "fmu": self._unit.state(),
+            "fmu": self._instance.state(),
             "latest": [[key, messages.encode(message)] for key, message in sorted(self._latest.items())],
             "states": dict(self._states),
-            "raised": sorted(self._raised),
+            "raised": sorted(self._active_flags),
             "takeoff_ns": self._takeoff_ns,
         }
 
     def restore(self, state: State) -> None:
-        self._unit.restore(state["fmu"])
+        self._instance.restore(state["fmu"])
         self._has_started = True
         self._latest = {key: messages.decode(key, payload) for key, payload in state["latest"]}
-        self._states, self._raised = dict(state["states"]), set(state["raised"])
+        self._states, self._active_flags = dict(state["states"]), set(state["raised"])
         self._takeoff_ns = state["takeoff_ns"]
 
 
@@ -258,34 +262,36 @@ class _Writer:
 
     def _check_complete(self, leaf: str) -> None:
         sizes = {"velocity_m_s": 3, "position_m": 3, "thrust_n": 1}
-        needed = {"attitude": ("thrust_n",), "estimate": ("position_m", "velocity_m_s")}.get(leaf, ())
-        for field in needed:
-            given = sum(link.place.size for link in self.links if link.place.field == field)
-            if given < sizes[field]:
-                raise RunError(f"{self.key}: {given} of {sizes[field]} values of {field} are mapped; must be all")
+        required_fields = {"attitude": ("thrust_n",), "estimate": ("position_m", "velocity_m_s")}.get(leaf, ())
+        for field in required_fields:
+            mapped_count = sum(link.place.size for link in self.links if link.place.field == field)
+            if mapped_count < sizes[field]:
+                raise RunError(
+                    f"{self.key}: {mapped_count} of {sizes[field]} values of {field} are mapped; must be all"
+                )
 
     def outputs(self, agent: FmuAgent, t_ns: int, values: Sequence[Sequence[Any]]) -> list[Output]:
         if self._is_mode:
             return [
                 agent.mode(t_ns, self.key, link.place.field)
                 for link, (value,) in zip(self.links, values, strict=True)
-                if agent.rises(f"{self._drone}.{link.place.field}", value > 0)
+                if agent.record_edge(f"{self._drone}.{link.place.field}", value > 0)
             ]
-        if self.commanded and not agent.takes_setpoints(self._drone):
+        if self.commanded and not agent.accepts_setpoints(self._drone):
             return []
         fields: dict[str, Any] = dict(self._fields)
-        for link, own in zip(self.links, values, strict=True):
-            place, given = link.place, link.converted(list(own))
+        for link, output_values in zip(self.links, values, strict=True):
+            place, field_values = link.place, link.converted(list(output_values))
             if place.kind == "boolean":
-                given = [value > 0 for value in given]
+                field_values = [value > 0 for value in field_values]
             elif place.kind == "number":
-                given = [float(value) for value in given]
+                field_values = [float(value) for value in field_values]
             if place.indices is None:
-                fields[place.field] = given[0]
+                fields[place.field] = field_values[0]
                 continue
             elements = list(fields.get(place.field, ()))
             elements += [0.0] * (max(place.indices) + 1 - len(elements))
-            for index, value in zip(place.indices, given, strict=True):
+            for index, value in zip(place.indices, field_values, strict=True):
                 elements[index] = value
             fields[place.field] = tuple(elements)
         if self._kind is Estimate:
@@ -311,10 +317,10 @@ class _FormationWriter:
 
     def outputs(self, agent: FmuAgent, t_ns: int, values: Sequence[Sequence[Any]]) -> list[Output]:
         c_dot = [0.0] * len(self._formation.names)
-        for link, own in zip(self.links, values, strict=True):
-            for index, value in zip(link.place.indices or (), own, strict=True):
+        for link, output_values in zip(self.links, values, strict=True):
+            for index, value in zip(link.place.indices or (), output_values, strict=True):
                 c_dot[index] = float(value)
-        return agent.motion(t_ns, self._formation, c_dot)
+        return agent.motion_commands(t_ns, self._formation, c_dot)
 
 
 def _writers(
@@ -332,19 +338,21 @@ def _writers(
 def _period_ns(model: FmuModel, period_s: float | None, info: Info) -> int:
     """Return the communication step [ns]; raise a RunError if the FMU or the gate period does not permit it."""
     gate_s = info.gate_ns / 1e9
-    wanted_s = period_s if period_s is not None else model.step_s
+    requested_s = period_s if period_s is not None else model.step_s
     if model.is_step_fixed and period_s is not None and not math.isclose(period_s, model.step_s or 0.0):
         raise RunError(f"--period is {period_s:g} s; {model.path} accepts only {model.step_s:g} s, by its description")
-    if wanted_s is None:
+    if requested_s is None:
         return info.gate_ns
-    gates = round(wanted_s / gate_s)
-    if gates >= 1 and math.isclose(gates * gate_s, wanted_s, rel_tol=1e-9):
+    gates = round(requested_s / gate_s)
+    if gates >= 1 and math.isclose(gates * gate_s, requested_s, rel_tol=1e-9):
         return gates * info.gate_ns
     if period_s is not None or model.is_step_fixed:
-        what = (
-            f"--period is {wanted_s:g} s" if period_s is not None else f"{model.path}: its fixed step is {wanted_s:g} s"
+        subject = (
+            f"--period is {requested_s:g} s"
+            if period_s is not None
+            else f"{model.path}: its fixed step is {requested_s:g} s"
         )
-        raise RunError(f"{what}; must be a multiple of the gate, {gate_s:g} s (time.gate_ms of the scenario)")
+        raise RunError(f"{subject}; must be a multiple of the gate, {gate_s:g} s (time.gate_ms of the scenario)")
     return info.gate_ns
 
 

@@ -28,8 +28,9 @@ from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.fmu.model import FmuModel, Kind, Unit, Variable
 
 MODES = ("takeoff", "land", "emergency", "reset")
-NUMBERED = ("value", "desired", "desired_rate")  # fields of a cluster state with one number per cluster variable
-FORMATION = {"c": False, "c_dot": True}  # cluster quantities that no message carries; True: an output of the FMU
+PER_VARIABLE_FIELDS = ("value", "desired", "desired_rate")  # of a cluster state: one number per cluster variable
+# Cluster quantities that no message carries; True: an output of the FMU
+FORMATION_QUANTITIES = {"c": False, "c_dot": True}
 OWN_FIELDS = ("t_ns", "seq", "source", "frame")  # fields that the agent fills in
 # Units by suffix of the field name: unit name, exponents of BASE_UNITS, factor to SI units
 RAD, PER_S = (0, 0, 0, 0, 0, 0, 0, 1), (0, 0, -1, 0, 0, 0, 0, 1)
@@ -46,7 +47,7 @@ UNITS = {
     "_ns": Unit("ns", (0, 0, 1, 0, 0, 0, 0, 0), 1e-9),
 }
 # The kinds of value that a receiver of each kind accepts
-TAKES: dict[Kind, tuple[Kind, ...]] = {
+ACCEPTED_KINDS: dict[Kind, tuple[Kind, ...]] = {
     "number": ("number", "integer", "boolean"),
     "integer": ("integer", "boolean"),
     "boolean": ("boolean",),
@@ -69,7 +70,7 @@ class Place(NamedTuple):
 
     @property
     def unit(self) -> Unit | None:
-        return next((unit for end, unit in UNITS.items() if self.field.endswith(end)), None)
+        return next((unit for suffix, unit in UNITS.items() if self.field.endswith(suffix)), None)
 
     def read(self, message: Any) -> list[Any] | None:
         """Return the values of this place in a message; None if the message omits them."""
@@ -113,36 +114,41 @@ def mapping_of(
     Raises:
         RunError: a text is invalid; the error quotes it and states what was found and what is allowed.
     """
-    found = FmuMapping([], [], [])
+    mapping = FmuMapping([], [], [])
     places = _Places(info, drone, cluster_names)
     for text in texts:
-        name, equals, where = (part.strip() for part in text.partition("="))
-        if not equals or not name or not where:
+        name, equals, place_text = (part.strip() for part in text.partition("="))
+        if not equals or not name or not place_text:
             raise RunError(f"--map is {text!r}; must be NAME=PLACE, such as vx=velocity_m_s.0")
         variable = model.variable(name)
         if variable.causality not in ("input", "output"):
             hint = "; set it with --param" if variable.causality == "parameter" else ""
             raise RunError(f"--map {text}: {name} is a {variable.causality}; must be an input or an output{hint}")
         is_output = variable.causality == "output"
-        place = places.parse(where, is_output, f"--map {text}")
+        place = places.parse(place_text, is_output, f"--map {text}")
         if place.size != variable.size:
-            raise RunError(f"--map {text}: {name} has {variable.size} values, {where} has {place.size}; must be equal")
-        gives, takes = (variable.kind, place.kind) if is_output else (place.kind, variable.kind)
-        if gives not in TAKES[takes] and not (is_output and takes == "boolean" and gives != "text"):
             raise RunError(
-                f"--map {text}: {name} is {variable.type}, {where} is {place.kind}; {gives} cannot become {takes}"
+                f"--map {text}: {name} has {variable.size} values, {place_text} has {place.size}; must be equal"
+            )
+        sender_kind, receiver_kind = (variable.kind, place.kind) if is_output else (place.kind, variable.kind)
+        if sender_kind not in ACCEPTED_KINDS[receiver_kind] and not (
+            is_output and receiver_kind == "boolean" and sender_kind != "text"
+        ):
+            raise RunError(
+                f"--map {text}: {name} is {variable.type}, {place_text} is {place.kind}; "
+                f"{sender_kind} cannot become {receiver_kind}"
             )
         convert, note = _conversion(variable, place, is_output)
         if note:
-            found.notes.append(f"{name}={where}: {note}")
-        (found.outputs if is_output else found.inputs).append(MappedVariable(variable, place, convert))
-    _check_once(found)
-    return found
+            mapping.notes.append(f"{name}={place_text}: {note}")
+        (mapping.outputs if is_output else mapping.inputs).append(MappedVariable(variable, place, convert))
+    _check_unique(mapping)
+    return mapping
 
 
-def _check_once(found: FmuMapping) -> None:
+def _check_unique(mapping: FmuMapping) -> None:
     mapped: dict[tuple[str, str, int | None], str] = {}
-    for variable, place, _ in found.outputs:
+    for variable, place, _ in mapping.outputs:
         for index in place.indices or (None,):
             target = (place.key, place.field, index)
             if target in mapped:
@@ -151,7 +157,7 @@ def _check_once(found: FmuMapping) -> None:
                 )
             mapped[target] = variable.name
     inputs: set[str] = set()
-    for variable, place, _ in found.inputs:
+    for variable, place, _ in mapping.inputs:
         if variable.name in inputs:
             raise RunError(f"--map {variable.name}={place.text}: {variable.name} is mapped twice; must be mapped once")
         inputs.add(variable.name)
@@ -166,31 +172,33 @@ class _Places:
         self._drone = drone
         self._cluster_names = cluster_names
 
-    def parse(self, text: str, is_output: bool, where: str) -> Place:
+    def parse(self, text: str, is_output: bool, context: str) -> Place:
         whose, _, rest = text.rpartition("/")
         first, *path = rest.split(".")
-        if whose in self._clusters and FORMATION.get(first) is is_output:
+        if whose in self._clusters and FORMATION_QUANTITIES.get(first) is is_output:
             names = self._cluster_names(whose)
-            return self._elements_at(text, f"cluster/{whose}/{first}", first, path, "number", names, where)
+            return self._elements_at(text, f"cluster/{whose}/{first}", first, path, "number", names, context)
         if whose in self._clusters:
             key = f"cluster/{whose}/{first}"
         elif whose in self._drones or not whose:
             drone = whose or self._drone
             if drone is None:
                 known = ", ".join([*self._drones, *self._clusters])
-                raise RunError(f"{where}: names no drone, and --drone is not given; must begin with one of {known}")
-            found = self._drone_key(drone, first, is_output)
-            if found is None:
+                raise RunError(f"{context}: names no drone, and --drone is not given; must begin with one of {known}")
+            message_key = self._drone_key(drone, first, is_output)
+            if message_key is None:
                 path.insert(0, first)
-            key = found or (keys.command(drone, "velocity") if is_output else keys.estimate(drone))
+            key = message_key or (keys.command(drone, "velocity") if is_output else keys.estimate(drone))
         else:
             key = f"{whose}/{first}"
         kind, thing, _ = keys.parts(key)
         known = {"drone": self._drones, "cluster": self._clusters}.get(kind)
         if known is not None and thing not in known:
             hint = suggestion(thing, known)
-            raise RunError(f"{where}: there is no {kind} {thing!r}; {hint}must be one of {', '.join(known) or 'none'}")
-        return self._field(text, key, path, is_output, where)
+            raise RunError(
+                f"{context}: there is no {kind} {thing!r}; {hint}must be one of {', '.join(known) or 'none'}"
+            )
+        return self._field(text, key, path, is_output, context)
 
     def _drone_key(self, drone: str, leaf: str, is_output: bool) -> str | None:
         if is_output:
@@ -199,117 +207,117 @@ class _Places:
             candidates = [f"drone/{drone}/{leaf}", keys.sensor(drone, leaf)]
         return next((key for key in candidates if messages.type_of(key) is not None), None)
 
-    def _field(self, text: str, key: str, path: list[str], is_output: bool, where: str) -> Place:
-        kind = self._message(key, is_output, where)
+    def _field(self, text: str, key: str, path: list[str], is_output: bool, context: str) -> Place:
+        kind = self._message(key, is_output, context)
         name, *rest = path or [""]
         if kind is flight_messages.Mode and is_output:
             if name not in MODES or rest:
-                raise RunError(f"{where}: mode is {name!r}; must be one of {', '.join(MODES)}")
+                raise RunError(f"{context}: mode is {name!r}; must be one of {', '.join(MODES)}")
             return Place(text, key, name, None, "boolean")
         kinds = {each.name: each.type for each in _fields(kind) if not is_output or each.name not in OWN_FIELDS}
         if name not in kinds:
             hint = suggestion(name, kinds)
-            raise RunError(f"{where}: {key} has no field {name!r}; {hint}must be one of {', '.join(kinds)}")
-        described = kinds[name]
-        if isinstance(described, msgspec.inspect.UnionType):
-            some = [each for each in described.types if not isinstance(each, msgspec.inspect.NoneType)]
-            described = some[0] if len(some) == 1 else described
-        value = _kind(described)
-        if value is not None:
+            raise RunError(f"{context}: {key} has no field {name!r}; {hint}must be one of {', '.join(kinds)}")
+        field_type = kinds[name]
+        if isinstance(field_type, msgspec.inspect.UnionType):
+            non_null_types = [each for each in field_type.types if not isinstance(each, msgspec.inspect.NoneType)]
+            field_type = non_null_types[0] if len(non_null_types) == 1 else field_type
+        value_kind = _kind(field_type)
+        if value_kind is not None:
             if rest:
-                raise RunError(f"{where}: {name} is a single value; has no element {'.'.join(rest)}")
-            return Place(text, key, name, None, value)
-        element, names = self._elements(key, name, described)
-        if element is None:
-            raise RunError(f"{where}: {name} of {key} has no fixed set of values; map another field")
-        return self._elements_at(text, key, name, rest, element, names, where)
+                raise RunError(f"{context}: {name} is a single value; has no element {'.'.join(rest)}")
+            return Place(text, key, name, None, value_kind)
+        element_kind, names = self._elements(key, name, field_type)
+        if element_kind is None:
+            raise RunError(f"{context}: {name} of {key} has no fixed set of values; map another field")
+        return self._elements_at(text, key, name, rest, element_kind, names, context)
 
     def _elements_at(
-        self, text: str, key: str, field: str, rest: list[str], kind: Kind, names: Sequence[str], where: str
+        self, text: str, key: str, field: str, rest: list[str], kind: Kind, names: Sequence[str], context: str
     ) -> Place:
         """Return the place of all elements of a field, or of the one whose name or number is in `rest`."""
         if not rest:
             return Place(text, key, field, tuple(range(len(names))), kind)
-        wanted = ".".join(rest)  # the names of a group's variables contain a dot
-        index = next((i for i, each in enumerate(names) if wanted in (each, str(i))), None)
+        element_name = ".".join(rest)  # the names of a group's variables contain a dot
+        index = next((i for i, each in enumerate(names) if element_name in (each, str(i))), None)
         if index is None:
-            hint = suggestion(wanted, names) if names[0] != "0" else ""
+            hint = suggestion(element_name, names) if names[0] != "0" else ""
             allowed = f"0 to {len(names) - 1}" if names[0] == "0" else f"one of {', '.join(names)}"
-            raise RunError(f"{where}: {wanted!r} is not an element of {field}; {hint}must be {allowed}")
+            raise RunError(f"{context}: {element_name!r} is not an element of {field}; {hint}must be {allowed}")
         return Place(text, key, field, (index,), kind)
 
-    def _message(self, key: str, is_output: bool, where: str) -> type[Struct]:
+    def _message(self, key: str, is_output: bool, context: str) -> type[Struct]:
         kind = messages.type_of(key)
         if is_output:
             try:
                 kind = messages.output_type(key)
             except DecodeError as error:
-                raise RunError(f"{where}: {error}") from error
+                raise RunError(f"{context}: {error}") from error
             if kind not in (*messages.COMMANDS, flight_messages.Estimate):
                 allowed = ", ".join([*map(keys.leaf, messages.COMMANDS.values()), "estimate"])
-                raise RunError(f"{where}: {kind.__name__} cannot be an output of an FMU; must be one of {allowed}")
+                raise RunError(f"{context}: {kind.__name__} cannot be an output of an FMU; must be one of {allowed}")
         if kind is None:
             hint = "must be an estimate, truth, a sensor, or the state of a cluster"
-            raise RunError(f"{where}: {key} is not a key of the contract; {hint}; see docs/protocol.md")
+            raise RunError(f"{context}: {key} is not a key of the contract; {hint}; see docs/protocol.md")
         return kind
 
-    def _elements(self, key: str, field: str, described: Any) -> tuple[Kind | None, Sequence[str]]:
+    def _elements(self, key: str, field: str, field_type: Any) -> tuple[Kind | None, Sequence[str]]:
         """Return the kind and names of a field's elements; the kind is None if it or the number of elements varies."""
         _, thing, _ = keys.parts(key)
-        if isinstance(described, msgspec.inspect.TupleType):
-            kinds: set[Kind | None] = {_kind(each) for each in described.item_types}
-            return (kinds.pop() if len(kinds) == 1 else None), _numbered(len(described.item_types))
-        if not isinstance(described, msgspec.inspect.VarTupleType):
+        if isinstance(field_type, msgspec.inspect.TupleType):
+            kinds: set[Kind | None] = {_kind(each) for each in field_type.item_types}
+            return (kinds.pop() if len(kinds) == 1 else None), _index_names(len(field_type.item_types))
+        if not isinstance(field_type, msgspec.inspect.VarTupleType):
             return None, ()
-        element = _kind(described.item_type)
-        if messages.type_of(key) is flight_messages.ClusterState and field in NUMBERED:
-            return element, self._cluster_names(thing)
+        element_kind = _kind(field_type.item_type)
+        if messages.type_of(key) is flight_messages.ClusterState and field in PER_VARIABLE_FIELDS:
+            return element_kind, self._cluster_names(thing)
         if field in ("speed_rad_s", "rotor_rad_s"):
-            return element, _numbered(len(self._drones[thing].rotors))
-        if described.min_length is not None and described.min_length == described.max_length:
-            return element, _numbered(described.min_length)
+            return element_kind, _index_names(len(self._drones[thing].rotors))
+        if field_type.min_length is not None and field_type.min_length == field_type.max_length:
+            return element_kind, _index_names(field_type.min_length)
         return None, ()
 
 
-def _numbered(count: int) -> Sequence[str]:
+def _index_names(count: int) -> Sequence[str]:
     return [str(i) for i in range(count)]
 
 
 def _fields(kind: type[Struct]) -> Sequence[msgspec.inspect.Field]:
-    described = msgspec.inspect.type_info(kind)
-    assert isinstance(described, msgspec.inspect.StructType)
-    return described.fields
+    struct_type = msgspec.inspect.type_info(kind)
+    assert isinstance(struct_type, msgspec.inspect.StructType)
+    return struct_type.fields
 
 
-def _kind(described: Any) -> Kind | None:
-    if isinstance(described, msgspec.inspect.FloatType):
+def _kind(field_type: Any) -> Kind | None:
+    if isinstance(field_type, msgspec.inspect.FloatType):
         return "number"
-    if isinstance(described, msgspec.inspect.IntType):
+    if isinstance(field_type, msgspec.inspect.IntType):
         return "integer"
-    if isinstance(described, msgspec.inspect.BoolType):
+    if isinstance(field_type, msgspec.inspect.BoolType):
         return "boolean"
-    if isinstance(described, msgspec.inspect.StrType | msgspec.inspect.LiteralType):
+    if isinstance(field_type, msgspec.inspect.StrType | msgspec.inspect.LiteralType):
         return "text"
     return None
 
 
 def _conversion(variable: Variable, place: Place, is_output: bool) -> tuple[Callable[[float], float] | None, str]:
     """Return the conversion of values (or None), and a note on units that differ or cannot be compared (or "")."""
-    theirs, ours = variable.unit, place.unit
-    if theirs is None or ours is None or theirs.name == ours.name or place.kind != "number":
+    variable_unit, field_unit = variable.unit, place.unit
+    if variable_unit is None or field_unit is None or variable_unit.name == field_unit.name or place.kind != "number":
         return None, ""
-    found = f"{variable.name} is in {theirs.name}, {place.field} in {ours.name}"
-    if theirs.exponents is None:
-        return None, f"{found}, not compared, since the FMU does not define its unit; values are passed unchanged"
-    assert ours.exponents is not None
-    if theirs.exponents[:-1] != ours.exponents[:-1]:  # many tools omit the exponent of rad
-        return None, f"{found}, a different quantity; values are passed unchanged"
-    if (theirs.factor, theirs.offset) == (ours.factor, ours.offset):
+    description = f"{variable.name} is in {variable_unit.name}, {place.field} in {field_unit.name}"
+    if variable_unit.exponents is None:
+        return None, f"{description}, not compared, since the FMU does not define its unit; values are passed unchanged"
+    assert field_unit.exponents is not None
+    if variable_unit.exponents[:-1] != field_unit.exponents[:-1]:  # many tools omit the exponent of rad
+        return None, f"{description}, a different quantity; values are passed unchanged"
+    if (variable_unit.factor, variable_unit.offset) == (field_unit.factor, field_unit.offset):
         return None, ""
-    own, factor, offset = ours.factor, theirs.factor, theirs.offset
+    field_factor, factor, offset = field_unit.factor, variable_unit.factor, variable_unit.offset
     if is_output:
-        return lambda value: (value * factor + offset) / own, f"{found}; converted"
-    return lambda value: (value * own - offset) / factor, f"{found}; converted"
+        return lambda value: (value * factor + offset) / field_factor, f"{description}; converted"
+    return lambda value: (value * field_factor - offset) / factor, f"{description}; converted"
 
 
 class Formation:
@@ -323,10 +331,10 @@ class Formation:
     """
 
     def __init__(self, scenario: Scenario, cluster: str) -> None:
-        of = scenario.cluster(cluster)
-        self.cluster, self.drones = cluster, of.drones
+        config = scenario.cluster(cluster)
+        self.cluster, self.drones = cluster, config.drones
         try:
-            self._space = scenario_space(scenario, of)
+            self._space = scenario_space(scenario, config)
         except ValueError as error:
             raise RunError(f"cluster {cluster}: {error}") from error
         self.names: Sequence[str] = self._space.names

@@ -98,7 +98,7 @@ class FmuModel:
         version: FMI version, 2 or 3.
         step_s: suggested communication step [s]; None if the FMU suggests none.
         is_step_fixed: whether the FMU accepts no other step.
-        restores: whether the state of an instance can be saved as bytes and restored.
+        can_restore: whether the state of an instance can be saved as bytes and restored.
 
     Raises:
         RunError: the file is not an FMU for co-simulation with FMI 2 or 3, or has no library for this machine.
@@ -106,22 +106,24 @@ class FmuModel:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.description: Any = _described(path)
+        self.description: Any = _read_description(path)
         self.version = int(self.description.fmiVersion.partition(".")[0])
-        about = self.description.coSimulation
+        co_simulation = self.description.coSimulation
         folder = fmpy.platform if self.version == 2 else fmpy.platform_tuple
-        self.library = f"binaries/{folder}/{about.modelIdentifier}{fmpy.sharedLibraryExtension}"
+        self.library = f"binaries/{folder}/{co_simulation.modelIdentifier}{fmpy.sharedLibraryExtension}"
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
         if self.library not in names:
-            has = {name.split("/")[1] for name in names if name.startswith("binaries/") and name.count("/") == 2}
-            listed = ", ".join(sorted(has)) or "none"
-            raise RunError(f"{path}: has no library for {folder}, only for {listed}; export it for this machine")
+            platforms = {name.split("/")[1] for name in names if name.startswith("binaries/") and name.count("/") == 2}
+            platforms_text = ", ".join(sorted(platforms)) or "none"
+            raise RunError(
+                f"{path}: has no library for {folder}, only for {platforms_text}; export it for this machine"
+            )
         experiment = self.description.defaultExperiment
-        fixed_s = about.fixedInternalStepSize
-        self.step_s = fixed_s if fixed_s is not None else _number(experiment.stepSize) if experiment else None
-        self.is_step_fixed = self.step_s is not None and not about.canHandleVariableCommunicationStepSize
-        self.restores = about.canGetAndSetFMUstate and about.canSerializeFMUstate
+        fixed_step_s = co_simulation.fixedInternalStepSize
+        self.step_s = fixed_step_s if fixed_step_s is not None else _number(experiment.stepSize) if experiment else None
+        self.is_step_fixed = self.step_s is not None and not co_simulation.canHandleVariableCommunicationStepSize
+        self.can_restore = co_simulation.canGetAndSetFMUstate and co_simulation.canSerializeFMUstate
         units = {unit.name: _unit(unit) for unit in self.description.unitDefinitions}
         types = TYPES[self.version]
         self._unsupported: dict[str, str] = {}  # unsupported types, by variable name
@@ -149,9 +151,9 @@ class FmuModel:
         Raises:
             RunError: the FMU has no such variable, or its type is not supported.
         """
-        found = self.variables.get(name)
-        if found is not None:
-            return found
+        variable = self.variables.get(name)
+        if variable is not None:
+            return variable
         first = next((i for i in (0, 1) if f"{name}[{i}]" in self.variables), None)
         if first is not None:
             elements = []
@@ -163,11 +165,11 @@ class FmuModel:
             allowed = ", ".join(TYPES[self.version])
             raise RunError(f"{self.path}: {name} is of type {self._unsupported[name]}; must be one of {allowed}")
         ports = [each.name for each in self.variables.values() if each.causality in ("input", "output")]
-        known = ports or [*self.variables]
-        more = f" and {len(known) - NAMED_MAX} more" if len(known) > NAMED_MAX else ""
+        candidates = ports or [*self.variables]
+        more = f" and {len(candidates) - NAMED_MAX} more" if len(candidates) > NAMED_MAX else ""
         hint = suggestion(name, self.variables)
         raise RunError(
-            f"{self.path}: has no variable {name!r}; {hint}must be one of {', '.join(known[:NAMED_MAX])}{more}"
+            f"{self.path}: has no variable {name!r}; {hint}must be one of {', '.join(candidates[:NAMED_MAX])}{more}"
         )
 
 
@@ -187,7 +189,7 @@ class FmuInstance:
         self._log = FmuLog(model.path.name, say, log)
         try:
             status = model.path.stat()
-            folder = _unpacked(model.path.resolve(), status.st_mtime_ns, status.st_size)
+            folder = _unpacked_folder(model.path.resolve(), status.st_mtime_ns, status.st_size)
             description = model.description
             identity = {
                 "guid": description.guid if model.version == 2 else description.instantiationToken,
@@ -196,25 +198,25 @@ class FmuInstance:
                 "instanceName": name,
             }
             if model.version == 2:
-                self._unit: Any = FMU2Slave(**identity)
-                self._unit.instantiate(callbacks=self._log.callbacks(), loggingOn=True)
+                self._instance: Any = FMU2Slave(**identity)
+                self._instance.instantiate(callbacks=self._log.callbacks(), loggingOn=True)
             else:
-                self._unit = FMU3Slave(**identity, libraryPath=str(folder / model.library))
-                self._unit.instantiate(loggingOn=True, logMessage=self._log.take_3)
+                self._instance = FMU3Slave(**identity, libraryPath=str(folder / model.library))
+                self._instance.instantiate(loggingOn=True, logMessage=self._log.log_fmi3)
         except Exception as error:  # FMPy raises bare exceptions, and a library that the FMU needs may be missing
-            raise RunError(f"{model.path}: cannot be started: {self._explained(reason_of(error))}") from error
-        self._finalizer = weakref.finalize(self, _free, self._unit, model.version)
+            raise RunError(f"{model.path}: cannot be started: {self._with_log_lines(reason_of(error))}") from error
+        self._finalizer = weakref.finalize(self, _free, self._instance, model.version)
         self._finalizer.atexit = False  # at exit, an interpreter embedded in the library may be gone
 
     def start(self, t_s: float, inputs: Inputs) -> None:
         """Initialise the FMU at simulated time t_s with the inputs at that time."""
         if self.model.version == 2:
-            self._call(self._unit.setupExperiment, startTime=t_s)
-            self._call(self._unit.enterInitializationMode)
+            self._call(self._instance.setupExperiment, startTime=t_s)
+            self._call(self._instance.enterInitializationMode)
         else:
-            self._call(self._unit.enterInitializationMode, startTime=t_s)
+            self._call(self._instance.enterInitializationMode, startTime=t_s)
         self._call(self._write, inputs)
-        self._call(self._unit.exitInitializationMode)
+        self._call(self._instance.exitInitializationMode)
 
     def write(self, inputs: Inputs) -> None:
         """Set inputs or, before the start, parameters."""
@@ -222,16 +224,16 @@ class FmuInstance:
 
     def step(self, t_s: float, step_s: float) -> None:
         """Advance by step_s from simulated time t_s; raise a UserCodeError if the FMU ends the simulation."""
-        result = self._call(self._unit.doStep, t_s, step_s)
+        result = self._call(self._instance.doStep, t_s, step_s)
         if result is not None and result[1]:
-            raise UserCodeError(self._explained(f"{self.model.path}: requests the end of the simulation"))
+            raise UserCodeError(self._with_log_lines(f"{self.model.path}: requests the end of the simulation"))
 
     def read(self, variables: Sequence[Variable]) -> list[list[Any]]:
         """Return each variable's values, as float, int, bool or str."""
         return self._call(self._read, variables)
 
     def state(self) -> bytes:
-        """Return the serialised state; only if the model `restores`."""
+        """Return the serialised state; only if the model `can_restore`."""
         return self._call(self._state)
 
     def restore(self, state: bytes) -> None:
@@ -245,49 +247,49 @@ class FmuInstance:
             references += variable.references
             all_values += values
         for call, (references, all_values) in grouped.items():
-            getattr(self._unit, f"set{call}")(references, all_values)
+            getattr(self._instance, f"set{call}")(references, all_values)
 
     def _read(self, variables: Sequence[Variable]) -> list[list[Any]]:
         grouped: dict[str, list[Variable]] = {}
         for variable in variables:
             grouped.setdefault(variable.call, []).append(variable)
         values: dict[str, list[Any]] = {}
-        for call, of_call in grouped.items():
-            references = [reference for variable in of_call for reference in variable.references]
-            size = () if self.model.version == 2 or call == "String" else (sum(each.size for each in of_call),)
-            found = getattr(self._unit, f"get{call}")(references, *size)
-            begin = 0
-            for variable in of_call:
-                own = found[begin : begin + variable.size]
-                begin += variable.size
-                values[variable.name] = [_plain(value, variable.kind) for value in own]
+        for call, call_variables in grouped.items():
+            references = [reference for variable in call_variables for reference in variable.references]
+            size = () if self.model.version == 2 or call == "String" else (sum(each.size for each in call_variables),)
+            results = getattr(self._instance, f"get{call}")(references, *size)
+            start = 0
+            for variable in call_variables:
+                variable_values = results[start : start + variable.size]
+                start += variable.size
+                values[variable.name] = [_plain(value, variable.kind) for value in variable_values]
         return [values[variable.name] for variable in variables]
 
     def _state(self) -> bytes:
-        handle = self._unit.getFMUState()
+        handle = self._instance.getFMUState()
         try:
-            return self._unit.serializeFMUState(handle)
+            return self._instance.serializeFMUState(handle)
         finally:
-            self._unit.freeFMUState(handle)
+            self._instance.freeFMUState(handle)
 
     def _restore(self, state: bytes) -> None:
-        handle = self._unit.deserializeFMUState(state)
+        handle = self._instance.deserializeFMUState(state)
         try:
-            self._unit.setFMUState(handle)
+            self._instance.setFMUState(handle)
         finally:
-            self._unit.freeFMUState(handle)
+            self._instance.freeFMUState(handle)
 
-    def _call(self, function: Callable[..., Any], *arguments: Any, **more: Any) -> Any:
+    def _call(self, function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
         try:
-            return function(*arguments, **more)
+            return function(*arguments, **keywords)
         except FMICallException as error:
             if error.status == FATAL:
                 self._finalizer.detach()  # no function of the FMU may be called any more (FMI 3.0.2, 2.1.3)
             label = LABELS[error.status] if error.status in range(len(LABELS)) else f"status {error.status}"
             text = f"{self.model.path}: {error.function} returns {label}"
-            raise UserCodeError(self._explained(text)) from error
+            raise UserCodeError(self._with_log_lines(text)) from error
 
-    def _explained(self, text: str) -> str:
+    def _with_log_lines(self, text: str) -> str:
         lines = "; ".join(self._log.lines)
         return f"{text}; its last log lines: {lines}" if lines else text
 
@@ -302,20 +304,20 @@ class FmuLog:
     def callbacks(self) -> Any:
         """Return the callback functions for an FMU of FMI 2."""
         callbacks = fmi2CallbackFunctions()
-        callbacks.logger = fmi2CallbackLoggerTYPE(self._take_2)
+        callbacks.logger = fmi2CallbackLoggerTYPE(self._log_fmi2)
         callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
         callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
         addLoggerProxy(byref(callbacks))
         return callbacks
 
-    def _take_2(self, _component: Any, _instance: bytes, status: int, _category: bytes, text: bytes) -> None:
-        self._take(status, text)
+    def _log_fmi2(self, _component: Any, _instance: bytes, status: int, _category: bytes, text: bytes) -> None:
+        self._log_line(status, text)
 
-    def take_3(self, _environment: Any, status: int, _category: bytes, text: bytes) -> None:
+    def log_fmi3(self, _environment: Any, status: int, _category: bytes, text: bytes) -> None:
         """Receive a log line; this is the log callback for an FMU of FMI 3."""
-        self._take(status, text)
+        self._log_line(status, text)
 
-    def _take(self, status: int, text: bytes | None) -> None:
+    def _log_line(self, status: int, text: bytes | None) -> None:
         line = " ".join((text or b"").decode(errors="replace").split())
         if status >= WARNING:
             self.lines.append(line)
@@ -324,7 +326,7 @@ class FmuLog:
             self._say(f"{self._name}: {label}: {line}")
 
 
-def _described(path: Path) -> Any:
+def _read_description(path: Path) -> Any:
     try:
         with zipfile.ZipFile(path) as archive:
             if "modelDescription.xml" not in archive.namelist():
@@ -367,16 +369,16 @@ def _plain(value: Any, kind: Kind) -> Any:
 
 
 @cache
-def _unpacked(path: Path, _mtime_ns: int, _size: int) -> Path:
+def _unpacked_folder(path: Path, _mtime_ns: int, _size: int) -> Path:
     """Return the folder of the unpacked FMU, shared by all its instances in this process until the file changes."""
     folder = temporary_folder("fmu-")
     fmpy.extract(path, folder)
     return folder
 
 
-def _free(unit: Any, version: int) -> None:
+def _free(instance: Any, version: int) -> None:
     """Free an instance; its library stays loaded, since a library with an embedded interpreter cannot be unloaded."""
     with suppress(Exception):  # the FMU may have failed already
-        unit.terminate()
+        instance.terminate()
     with suppress(Exception):
-        getattr(unit, f"fmi{version}FreeInstance")(unit.component)
+        getattr(instance, f"fmi{version}FreeInstance")(instance.component)

@@ -48,15 +48,15 @@ SYSTEM, COMPONENT = 245, 191  # ids of this driver; the component is MAV_COMP_ID
 HEARTBEAT_NS = 1_000_000_000  # https://mavlink.io/en/services/heartbeat.html
 TIMESYNC_NS = 500_000_000  # design choice: ten round trips within the window of the clock offset
 REQUEST_NS = 3_000_000_000  # time after which a missing stream is requested again: three periods of the slowest one
-STRANGERS_MAX = 256  # other systems reported, each only once
-CLIMBED = 0.85  # fraction of the take-off height that counts as reached; allows for errors of the reported height
+SENDERS_REPORTED_MAX = 256  # other systems reported, each only once
+CLIMBED_FRACTION = 0.85  # fraction of the take-off height that counts as reached; allows for errors of the reports
 REPEAT_NS = 1_000_000_000  # period of repeated commands; ample, since an autopilot answers within about 0.1 s
 KILL_REPEAT_NS = 200_000_000  # shorter than REPEAT_NS, since this is the one command that must not be lost
 SETPOINT_NS = 40_000_000  # 25 Hz; PX4 treats setpoints at less than 2 Hz as lost
-CHANGED_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period, in which one command arrives
-STREAMED_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
+CHANGE_INTERVAL_NS = 15_000_000  # minimum spacing of changed setpoints; below the gate period (one command each)
+STREAM_DURATION_NS = 600_000_000  # PX4 requires more than 0.5 s of setpoints before OFFBOARD
 VELOCITY_AND_YAW_RATE = 0xFFF & ~(TypeMask.VX | TypeMask.VY | TypeMask.VZ | TypeMask.FORCE | TypeMask.YAW_RATE)
-HERE = (
+NO_POSITION = (
     0.0,
     0.0,
     0.0,
@@ -154,14 +154,14 @@ class AutopilotSession(VehicleSession):
         self._newest_ns: dict[type, int] = {}
         self._requested_ns: dict[type, int] = {}
         self._heartbeat_ns = self._timesync_ns = -HEARTBEAT_NS
-        self._strangers: set[tuple[int, int]] = set()
+        self._reported_senders: set[tuple[int, int]] = set()
         self._ground_m: float | None = None
         self._action: Action = "none"
-        self._taken_over = False
-        self._answers: list[Any] = []
+        self._was_taken_over = False
+        self._replies: list[Any] = []
 
     @classmethod
-    def of_run(
+    def from_run(
         cls,
         info: Info,
         scenario: Scenario,
@@ -182,7 +182,7 @@ class AutopilotSession(VehicleSession):
                 self._loss.add(received.seq)
                 self._received_ns = now_ns
                 self._newest_ns[type(received.message)] = now_ns
-                self._take(received.message, now_ns)
+                self._process(received.message, now_ns)
 
     def _is_vehicle(self, received: Received) -> bool:
         """Return whether a message is from the vehicle; the first heartbeat from a known autopilot identifies it."""
@@ -190,23 +190,23 @@ class AutopilotSession(VehicleSession):
         address = received.system_id, received.component_id
         if self._autopilot is not None and address == self._autopilot.address:
             return True
-        wanted = self._autopilot is None and self._system in (0, received.system_id)
-        if wanted and isinstance(message, dialect.Heartbeat) and message.autopilot in CONTROL:
+        may_identify = self._autopilot is None and self._system in (0, received.system_id)
+        if may_identify and isinstance(message, dialect.Heartbeat) and message.autopilot in CONTROL:
             self._autopilot = AutopilotState(address, CONTROL[message.autopilot])
             return True
         system = self._autopilot.address[0] if self._autopilot else self._system
         if system not in (0, received.system_id):
             self._refused += 1
-            if address not in self._strangers and len(self._strangers) < STRANGERS_MAX:
-                self._strangers.add(address)
+            if address not in self._reported_senders and len(self._reported_senders) < SENDERS_REPORTED_MAX:
+                self._reported_senders.add(address)
                 self.texts.append(f"messages from system {address[0]}, component {address[1]}, are ignored")
         return False
 
-    def _take(self, message: Any, now_ns: int) -> None:
+    def _process(self, message: Any, now_ns: int) -> None:
         assert self._autopilot is not None
         match message:
             case dialect.Timesync(tc1=0):
-                self._answers = [dialect.Timesync(tc1=now_ns, ts1=message.ts1)]
+                self._replies = [dialect.Timesync(tc1=now_ns, ts1=message.ts1)]
             case dialect.Timesync():
                 if 0 <= now_ns - message.ts1 < HEARTBEAT_NS:
                     self._telemetry.add_round_trip(now_ns - message.ts1, now_ns)
@@ -217,11 +217,11 @@ class AutopilotSession(VehicleSession):
             case _:
                 self._autopilot.receive(message)
                 self._telemetry.receive(message, now_ns)
-                taken_over = self._autopilot.is_taken_over(self._action == "land")
-                if taken_over != self._taken_over:
-                    self._taken_over = taken_over
-                    what = "another program or pilot has control" if taken_over else "control has been given back"
-                    self.texts.append(f"{what} (mode {self._autopilot.custom_mode:#x})")
+                is_taken_over = self._autopilot.is_taken_over(self._action == "land")
+                if is_taken_over != self._was_taken_over:
+                    self._was_taken_over = is_taken_over
+                    change = "another program or pilot has control" if is_taken_over else "control has been given back"
+                    self.texts.append(f"{change} (mode {self._autopilot.custom_mode:#x})")
 
     # To the vehicle
 
@@ -231,8 +231,8 @@ class AutopilotSession(VehicleSession):
             yield 0, self._link.pack(message)
 
     def _messages(self, now_ns: int, demand: Demand) -> Iterator[Any]:
-        yield from self._answers
-        self._answers = []
+        yield from self._replies
+        self._replies = []
         if now_ns - self._heartbeat_ns >= HEARTBEAT_NS:
             self._heartbeat_ns = now_ns
             if self._signing:
@@ -275,7 +275,7 @@ class AutopilotSession(VehicleSession):
             self._ground_m = height_m
         if self._ground_m is None:
             return True  # it was in the air when this driver started
-        if height_m - self._ground_m >= CLIMBED * self._takeoff_height_m:
+        if height_m - self._ground_m >= CLIMBED_FRACTION * self._takeoff_height_m:
             self._ground_m = None
         return self._ground_m is None
 
@@ -307,14 +307,14 @@ class AutopilotState:
             case dialect.GlobalPositionInt():
                 self.sea_height_m = message.alt / 1e3
 
-    def is_taken_over(self, lands: bool) -> bool:
+    def is_taken_over(self, is_landing: bool) -> bool:
         """Return whether another controller, usually the pilot, has changed the mode in flight.
 
         Args:
-            lands: whether this driver is landing the vehicle.
+            is_landing: whether this driver is landing the vehicle.
         """
         control, mode = self.control, self.custom_mode
-        own = mode in (control.custom_mode, *control.own) or (lands and mode == control.landing)
+        own = mode in (control.custom_mode, *control.own) or (is_landing and mode == control.landing)
         return self.armed and self.landed in (LandedState.IN_AIR, LandedState.LANDING) and not own
 
     @property
@@ -325,12 +325,12 @@ class AutopilotState:
         """Return a command to the vehicle; `parameters` are its first ones, and the others are 0."""
         return dialect.CommandLong(*self.address, number, 0, *parameters)
 
-    def state(self, flies: bool, climbed: bool) -> DroneState:
+    def state(self, is_flying: bool, has_climbed: bool) -> DroneState:
         """Return the vehicle's state in terms of the contract.
 
         Args:
-            flies: whether the vehicle is following a setpoint.
-            climbed: whether it has reached its take-off height.
+            is_flying: whether the vehicle is following a setpoint.
+            has_climbed: whether it has reached its take-off height.
         """
         if self._terminated:
             return "emergency"
@@ -338,9 +338,9 @@ class AutopilotState:
             return "landed"
         if self.landed == LandedState.LANDING:
             return "landing"
-        if self.landed == LandedState.TAKEOFF or not climbed:
+        if self.landed == LandedState.TAKEOFF or not has_climbed:
             return "taking_off"
-        return "flying" if flies else "hovering"
+        return "flying" if is_flying else "hovering"
 
 
 class DemandSequence:
@@ -369,7 +369,7 @@ class DemandSequence:
             case "hold" | "fly":
                 yield from self._fly(now_ns, demand, autopilot)
             case "land" if autopilot.landed not in (LandedState.LANDING, LandedState.ON_GROUND):
-                yield from self._repeat("land", now_ns, autopilot.command(Cmd.NAV_LAND, *HERE, 0.0))
+                yield from self._repeat("land", now_ns, autopilot.command(Cmd.NAV_LAND, *NO_POSITION, 0.0))
             case "kill":
                 kill = autopilot.command(Cmd.COMPONENT_ARM_DISARM, 0, dialect.FORCE)
                 yield from self._repeat("kill", now_ns, kill, KILL_REPEAT_NS if autopilot.armed else REPEAT_NS)
@@ -384,17 +384,17 @@ class DemandSequence:
         elif autopilot.landed == LandedState.ON_GROUND:
             # ArduPilot's height is above home, PX4's above sea level.
             height_m = (0.0 if takes_off else autopilot.sea_height_m) + self._takeoff_height_m
-            yield from self._repeat("take off", now_ns, autopilot.command(Cmd.NAV_TAKEOFF, *HERE, height_m))
+            yield from self._repeat("take off", now_ns, autopilot.command(Cmd.NAV_TAKEOFF, *NO_POSITION, height_m))
 
     def _fly(self, now_ns: int, demand: Demand, autopilot: AutopilotState) -> Iterator[Any]:
         """Yield the setpoint that is due, and the command to enter the mode that accepts setpoints."""
         age_ns = now_ns - self._setpoint_ns
-        if age_ns > STREAMED_NS:
+        if age_ns > STREAM_DURATION_NS:
             self._stream_ns = now_ns
-        if age_ns >= (CHANGED_NS if demand != self._setpoint else SETPOINT_NS):
+        if age_ns >= (CHANGE_INTERVAL_NS if demand != self._setpoint else SETPOINT_NS):
             self._setpoint, self._setpoint_ns = demand, now_ns
-            flies = demand.action == "fly"
-            vx, vy, vz = ned(demand.velocity_m_s if flies else ZERO_VECTOR)
+            is_flying = demand.action == "fly"
+            vx, vy, vz = ned(demand.velocity_m_s if is_flying else ZERO_VECTOR)
             yield dialect.SetPositionTargetLocalNed(
                 0,
                 *autopilot.address,
@@ -403,10 +403,10 @@ class DemandSequence:
                 vx=vx,
                 vy=vy,
                 vz=vz,
-                yaw_rate=-demand.yaw_rate_rad_s if flies else 0.0,
+                yaw_rate=-demand.yaw_rate_rad_s if is_flying else 0.0,
             )
-        streamed = now_ns - self._stream_ns >= STREAMED_NS
-        if streamed and autopilot.landed == LandedState.IN_AIR and not autopilot.is_controlled:
+        has_streamed = now_ns - self._stream_ns >= STREAM_DURATION_NS
+        if has_streamed and autopilot.landed == LandedState.IN_AIR and not autopilot.is_controlled:
             yield from self._enter_mode(now_ns, autopilot)
 
     def _enter_mode(self, now_ns: int, autopilot: AutopilotState) -> Iterator[Any]:
@@ -461,8 +461,8 @@ class TelemetryReadings(AircraftReadings):
             case dialect.LocalPositionNed():
                 self._on_position(m, now_ns)
             case dialect.GpsGlobalOrigin() if not self.has_origin:
-                place = m.latitude / 1e7, m.longitude / 1e7, m.altitude / 1e3
-                x, y, z = geodetic_to_enu(place, self._origin).tolist()
+                geodetic = m.latitude / 1e7, m.longitude / 1e7, m.altitude / 1e3
+                x, y, z = geodetic_to_enu(geodetic, self._origin).tolist()
                 self._local_origin_m = (x, y, z)
                 self.has_origin = True
             case dialect.SysStatus() if m.battery_remaining >= 0:  # -1: unknown
@@ -517,11 +517,11 @@ class TelemetryReadings(AircraftReadings):
             self.read_pressure(taken_ns, pressure_pa, self.pose.position_m[2] if self.pose else 0.0)
 
     def _on_gps(self, m: Any, now_ns: int) -> None:
-        place = m.lat / 1e7, m.lon / 1e7, (m.alt_ellipsoid or m.alt) / 1e3
-        if (place, m.time_usec) == self._fix:
+        geodetic = m.lat / 1e7, m.lon / 1e7, (m.alt_ellipsoid or m.alt) / 1e3
+        if (geodetic, m.time_usec) == self._fix:
             return
-        self._fix = place, m.time_usec
+        self._fix = geodetic, m.time_usec
         sigma_m = m.h_acc / 1e3 or (DOP_M * m.eph / 100.0 if m.eph != dialect.UINT16_UNKNOWN else 0.0)
         course = math.radians(m.cog / 100.0)
-        values = self.gps_values(place, m.vel / 100.0, course, sigma_m, min(m.fix_type, 3), m.satellites_visible)
+        values = self.gps_values(geodetic, m.vel / 100.0, course, sigma_m, min(m.fix_type, 3), m.satellites_visible)
         self.read("gps", self._since_1970(m, now_ns), *values)

@@ -200,7 +200,7 @@ ALL_MISSION_TYPES = 255
 DEGREES, LOCAL_M = 1e-7, 1e-4  # units of x and y in messages that carry them as integers
 INT32_UNKNOWN = 2**31 - 1  # INT32_MAX, which stands for "unknown" in 32-bit integer fields
 UINT16_UNKNOWN = 65535  # UINT16_MAX, likewise in unsigned 16-bit fields
-_S = math.sqrt(0.5)
+_SQRT_HALF = math.sqrt(0.5)
 _TARGET = "target_system,target_component:B"
 _GOAL = "vx,vy,vz:f[m/s] afx,afy,afz:f[m/s/s] yaw:f[rad] yaw_rate:f[rad/s]"
 _IMU = "xacc,yacc,zacc:h[mG] xgyro,ygyro,zgyro:h[mrad/s] xmag,ymag,zmag:h[mgauss]"
@@ -431,7 +431,7 @@ def attitude_ned(q_WB: Quaternion) -> Quaternion:
     """
     w, x, y, z = q_WB
     w, x, y, z = -x, w, z, -y
-    q = -_S * (x + y), _S * (w + z), _S * (w - z), _S * (y - x)
+    q = -_SQRT_HALF * (x + y), _SQRT_HALF * (w + z), _SQRT_HALF * (w - z), _SQRT_HALF * (y - x)
     return q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
 
 
@@ -455,9 +455,9 @@ def to_int(value: float, unit: float) -> int:
     return round(value / unit) if math.isfinite(value) else INT32_UNKNOWN
 
 
-def global_ints(place: Vector) -> tuple[int, int, int]:
+def global_ints(geodetic: Vector) -> tuple[int, int, int]:
     """Return latitude [deg], longitude [deg] and height [m] as integers [1e-7 deg, 1e-7 deg, mm]."""
-    return round(1e7 * place[0]), round(1e7 * place[1]), round(1000 * place[2])
+    return round(1e7 * geodetic[0]), round(1e7 * geodetic[1]), round(1000 * geodetic[2])
 
 
 def int16(value: float) -> int:
@@ -476,7 +476,7 @@ HASH_BYTES = 6  # the leading bytes of a SHA-256 digest
 LINK_ID = b"\0"  # link id in all signatures
 TICKS_PER_S = 100_000  # timestamps are in units of 10 us
 EPOCH_S = 1_420_070_400  # 2015-01-01, the epoch of timestamps, in seconds since 1970
-BEHIND_MAX = 6_000_000  # ticks (one minute): maximum lag of a new stream's first timestamp
+TIMESTAMP_LAG_MAX = 6_000_000  # ticks (one minute): maximum lag of a new stream's first timestamp
 TIMESTAMP_MAX = 2**48 - 1
 STREAMS_MAX = 4096  # streams remembered; only holders of the key can start one
 Version = Literal[1, 2]
@@ -513,8 +513,8 @@ class Signing:
     def sign(self, frame: bytes) -> bytes:
         """Return the signature to append to a frame, given from its header to its checksum."""
         self.timestamp += 1
-        head = LINK_ID + self.timestamp.to_bytes(6, "little")
-        return head + self._hash(frame + head)
+        prefix = LINK_ID + self.timestamp.to_bytes(6, "little")
+        return prefix + self._hash(frame + prefix)
 
     def refusal(self, frame: bytes, signature: bytes, system_id: int, component_id: int) -> str | None:
         """Return why a signed frame is rejected, `bad_signature` or `replayed`; None if it is accepted."""
@@ -522,9 +522,9 @@ class Signing:
             return "bad_signature"
         stream = system_id, component_id, signature[0]
         timestamp = int.from_bytes(signature[1:7], "little")
-        known = self._streams.get(stream)
-        oldest = self.timestamp - BEHIND_MAX if known is None else known + 1
-        if timestamp < oldest or (known is None and len(self._streams) >= STREAMS_MAX):
+        last = self._streams.get(stream)
+        oldest = self.timestamp - TIMESTAMP_LAG_MAX if last is None else last + 1
+        if timestamp < oldest or (last is None and len(self._streams) >= STREAMS_MAX):
             return "replayed"
         self._streams[stream] = timestamp
         self.timestamp = max(self.timestamp, timestamp)
@@ -560,8 +560,8 @@ class Link:
             body = bytes((len(payload), seq)) + self._address + bytes([layout.id]) + payload
             return b"\xfe" + body + _crc(body, layout)
         payload = payload.rstrip(b"\0") or b"\0"  # trailing zeros are dropped, but one byte must remain
-        head = bytes((len(payload), SIGNED if self._signing else 0, 0, seq))
-        body = head + self._address + layout.id.to_bytes(3, "little") + payload
+        header = bytes((len(payload), SIGNED if self._signing else 0, 0, seq))
+        body = header + self._address + layout.id.to_bytes(3, "little") + payload
         frame = b"\xfd" + body + _crc(body, layout)
         return frame + self._signing.sign(frame) if self._signing else frame
 
@@ -596,20 +596,20 @@ class Parser:
     def _next_magic(self, data: bytes, start: int) -> int | None:
         if start < len(data) and data[start] in (MAGIC_1, MAGIC_2):
             return start
-        places = [place for place in (data.find(b"\xfd", start), data.find(b"\xfe", start)) if place >= 0]
-        self.refused["noise"] += (min(places) if places else len(data)) - start
-        return min(places) if places else None
+        positions = [position for position in (data.find(b"\xfd", start), data.find(b"\xfe", start)) if position >= 0]
+        self.refused["noise"] += (min(positions) if positions else len(data)) - start
+        return min(positions) if positions else None
 
     def _accept(self, data: bytes, begin: int, end: int) -> Received | str:
         """Return the message in a complete frame, or the reason for refusing it."""
-        is_2 = data[begin] == MAGIC_2
-        flags = data[begin + 2] if is_2 else 0
-        at = begin + (4 if is_2 else 2)  # index of the sequence number; sender and message id follow
-        payload_at = begin + (HEADER_2 if is_2 else HEADER_1)
-        payload_end = payload_at + data[begin + 1]
+        is_version_2 = data[begin] == MAGIC_2
+        flags = data[begin + 2] if is_version_2 else 0
+        seq_index = begin + (4 if is_version_2 else 2)  # index of the sequence number; sender and message id follow
+        payload_start = begin + (HEADER_2 if is_version_2 else HEADER_1)
+        payload_end = payload_start + data[begin + 1]
         signed_end = payload_end + CHECKSUM_BYTES
-        sender = data[at + 1], data[at + 2]
-        layout = BY_ID.get(int.from_bytes(data[at + 3 : payload_at], "little"))
+        sender = data[seq_index + 1], data[seq_index + 2]
+        layout = BY_ID.get(int.from_bytes(data[seq_index + 3 : payload_start], "little"))
         if layout is None:
             return "unknown"
         if _crc(data[begin + 1 : payload_end], layout) != data[payload_end:signed_end]:
@@ -621,16 +621,16 @@ class Parser:
                 return "unsigned"
             if refusal := self._signing.refusal(data[begin:signed_end], data[signed_end:end], *sender):
                 return refusal
-        return Received(layout.unpack(data[payload_at:payload_end]), *sender, data[at], bool(flags & SIGNED))
+        return Received(layout.unpack(data[payload_start:payload_end]), *sender, data[seq_index], bool(flags & SIGNED))
 
 
 def _frame_end(data: bytes, begin: int) -> int | None:
     """Return the end index of the frame that starts at `begin`; None if the frame is incomplete."""
-    is_2 = data[begin] == MAGIC_2
-    header = HEADER_2 if is_2 else HEADER_1
+    is_version_2 = data[begin] == MAGIC_2
+    header = HEADER_2 if is_version_2 else HEADER_1
     if begin + header + CHECKSUM_BYTES > len(data):
         return None
-    signature = SIGNATURE_BYTES if is_2 and data[begin + 2] & SIGNED else 0
+    signature = SIGNATURE_BYTES if is_version_2 and data[begin + 2] & SIGNED else 0
     end = begin + header + data[begin + 1] + CHECKSUM_BYTES + signature
     return end if end <= len(data) else None
 

@@ -32,15 +32,15 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender
 from zsim_bridges.vehicle_links.server import Say, TrafficIntake, VehicleServer
 from zsim_bridges.web import is_loopback
 
-ANSWER_S = 1.0  # wall time to wait for an answer from the world
+REPLY_TIMEOUT_S = 1.0  # wall time to wait for an answer from the world
 TICK_S = 0.1  # wall time between checks of what is due by wall time
-SWITCH_S = 5e-4  # s; thread switch interval, so that a setpoint does not wait for a gate; Python's default is 5 ms
+SWITCH_INTERVAL_S = 5e-4  # thread switch interval, so that setpoints do not wait for a gate; Python's default is 5 ms
 SYSTEM_IDS = 254  # 255 is the ground station's by convention
 DATAGRAM_MAX = 1400  # bytes; fits into an Ethernet frame
 READ_MAX = 65_536  # bytes
 READS_MAX = 64  # datagrams read at once, before other tasks run
-LEARNT_MAX = 8  # programs on this machine that one port remembers at once
-SILENT_S = 30.0  # wall time after which a silent program is forgotten
+LEARNT_PEERS_MAX = 8  # programs on this machine that one port remembers at once
+PEER_TIMEOUT_S = 30.0  # wall time after which a silent program is forgotten
 REASONS = {
     "bad_crc": "a frame with a wrong checksum",
     "unknown": "a message that is not in the dialect",
@@ -93,26 +93,28 @@ class MavlinkServer(VehicleServer):
     def __init__(self, link: Session, info: Info, observer: Participant, say: Say, options: MavlinkOptions) -> None:
         super().__init__(link, info, observer, say, options)
         self._signing = Signing(options.key) if options.key else None
-        self._counted: Counter[str] = Counter()
+        self._refused_counts: Counter[str] = Counter()
         self._requests = ThreadPoolExecutor(1)  # requests are sent one at a time
         drones = scenario_file.from_text(info.scenario).drones
         first = options.first_system_id
         if first + len(drones) - 1 > SYSTEM_IDS:
             allowed = f"MAVLink has {SYSTEM_IDS} system ids, of which --first-system-id is {first}"
             raise RunError(f"{observer.name}: the run has {len(drones)} drones; {allowed}")
-        self._served = {drone.name: self._offer(i, drone) for i, drone in enumerate(drones)}
+        self._served = {drone.name: self._make_vehicle(i, drone) for i, drone in enumerate(drones)}
         self._routes: dict[str, tuple[str, str]] = {}  # drone and message name, by key
         for drone in self._served:
             names = {keys.sensor(drone, name): name for name in keys.SENSORS}
             names |= {keys.truth(drone): "truth", keys.estimate(drone): "estimate", keys.status(drone): "status"}
             self._routes |= {key: (drone, name) for key, name in names.items()}
 
-    def _offer(self, index: int, drone: Drone) -> "ServedVehicle":
+    def _make_vehicle(self, index: int, drone: Drone) -> "ServedVehicle":
         options, system_id, source = self.options, self.options.first_system_id + index, self.observer.name
         # 64 bits by which programs recognise a vehicle, unique across runs
         unique_id = int.from_bytes(hashlib.sha256(f"{self.info.run_id}/{drone.name}".encode()).digest()[:8])
-        shown = Options(system_id, PERSONALITIES[options.autopilot], options.level, source, unique_id)
-        vehicle = MavlinkVehicle(drone, self.info.origin, CommandSender(drone.name, source, self.link.put), shown)
+        vehicle_options = Options(system_id, PERSONALITIES[options.autopilot], options.level, source, unique_id)
+        vehicle = MavlinkVehicle(
+            drone, self.info.origin, CommandSender(drone.name, source, self.link.put), vehicle_options
+        )
 
         def on_received(received: Received) -> None:
             vehicle.on_message(received, time.monotonic_ns())
@@ -127,40 +129,40 @@ class MavlinkServer(VehicleServer):
         return served
 
     async def open(self, stack: contextlib.AsyncExitStack) -> None:
-        sys.setswitchinterval(SWITCH_S)
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         options, last = self.options, len(self._served) - 1
         for served in self._served.values():
             for port in served.ports:
                 stack.callback(port.close)
                 port.open()
         stack.callback(self._requests.shutdown, wait=False, cancel_futures=True)
-        for what, (host, port), local, step in (
+        for purpose, (host, port), local, step in (
             ("ground station", options.gcs, options.gcs_local, 0),
             ("programs", options.api, options.api_local, last),
         ):
-            to = f"{port} to {port + step}" if step else f"{port}"
-            own = f"{local} to {local + last}" if last else f"{local}"
-            self.say(f"{what}: UDP {host}:{to}, from {options.listen}:{own}")
-        stack.callback(asyncio.create_task(self._tick_always()).cancel)
+            remote_ports = f"{port} to {port + step}" if step else f"{port}"
+            local_ports = f"{local} to {local + last}" if last else f"{local}"
+            self.say(f"{purpose}: UDP {host}:{remote_ports}, from {options.listen}:{local_ports}")
+        stack.callback(asyncio.create_task(self._tick_forever()).cancel)
 
     async def on_arrivals(self, intake: TrafficIntake) -> None:
         """Process what has arrived, but only the newest message on each of a drone's keys."""
         newest: dict[str, bytes] = {}
-        for arrived in intake.arrivals():
-            for key, payload in arrived:
+        for batch in intake.arrivals():
+            for key, payload in batch:
                 if key in self._routes:
                     newest[key] = payload
                 else:
                     self.on_run(key, payload)
-        at_gate: dict[str, ServedVehicle] = {}
+        updated: dict[str, ServedVehicle] = {}
         for key, payload in newest.items():
             message = self.try_decode(key, payload)
             if message is not None:
                 drone, name = self._routes[key]
                 self._served[drone].vehicle.state.update(name, message)
                 if name == "status":
-                    at_gate[drone] = self._served[drone]
-        for served in at_gate.values():
+                    updated[drone] = self._served[drone]
+        for served in updated.values():
             served.vehicle.step()
             self.report_mission(served.vehicle)
             served.flush()
@@ -170,14 +172,14 @@ class MavlinkServer(VehicleServer):
         """Report the progress of a mission to the world, for the run's record; gates do not wait for this."""
         for report in vehicle.flight.mission.reports:
             args = {"drone": vehicle.name, **report._asdict()}
-            self._requests.submit(self.link.request, keys.CONTROL, "mission", self.observer.name, args, ANSWER_S)
+            self._requests.submit(self.link.request, keys.CONTROL, "mission", self.observer.name, args, REPLY_TIMEOUT_S)
         vehicle.flight.mission.reports.clear()
 
     def on_event(self, event: Event) -> None:
         for served in self._served.values():
             served.vehicle.watch.on_event(event)
 
-    async def _tick_always(self) -> None:
+    async def _tick_forever(self) -> None:
         while True:
             if self._signing:
                 self._signing.advance(time.time())
@@ -185,12 +187,12 @@ class MavlinkServer(VehicleServer):
                 served.vehicle.tick(time.monotonic_ns())
                 served.flush()
                 for reason, count in served.refused().items():
-                    mark = f"{drone} {reason}"
-                    before = self._counted[mark]
-                    if count and not before:
+                    counter_key = f"{drone} {reason}"
+                    previous = self._refused_counts[counter_key]
+                    if count and not previous:
                         self.say(f"{drone}: {REASONS[reason]}; counted from now on")
-                    self._counted[mark] = count
-                    self.observer.health.refused += count - before
+                    self._refused_counts[counter_key] = count
+                    self.observer.health.refused += count - previous
             await asyncio.sleep(TICK_S)
 
 
@@ -247,9 +249,13 @@ class VehiclePort:
             self._socket.bind(local)
         except OSError as error:
             self._socket.close()
-            taken = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by a process, or by the system
-            other = "other ports with --gcs-local and --api-local" if taken else "an address of this host with --listen"
-            raise RunError(f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror}); give {other}") from error
+            is_unavailable = error.errno in (errno.EADDRINUSE, errno.EACCES)  # by a process, or by the system
+            advice = (
+                "other ports with --gcs-local and --api-local"
+                if is_unavailable
+                else "an address of this host with --listen"
+            )
+            raise RunError(f"UDP {local[0]}:{local[1]} cannot be opened ({error.strerror}); give {advice}") from error
         self._on_received = on_received
         self.peers = Peers(peer)
         self.parser = Parser(signing)
@@ -297,13 +303,15 @@ class Peers:
         """Return whether datagrams from an address are accepted; programs on this machine become peers."""
         if address == self._configured:
             return True
-        known = address in self._learnt
-        if not is_loopback(address[0]) or (not known and len(self._learnt) >= LEARNT_MAX):
+        is_known = address in self._learnt
+        if not is_loopback(address[0]) or (not is_known and len(self._learnt) >= LEARNT_PEERS_MAX):
             self.refused += 1
             return False
         self._learnt[address] = wall_s
         return True
 
     def addresses(self, wall_s: float) -> list[Address]:
-        self._learnt = {address: last_s for address, last_s in self._learnt.items() if wall_s - last_s <= SILENT_S}
+        self._learnt = {
+            address: last_s for address, last_s in self._learnt.items() if wall_s - last_s <= PEER_TIMEOUT_S
+        }
         return [self._configured, *self._learnt]

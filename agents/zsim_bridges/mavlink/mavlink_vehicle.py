@@ -43,7 +43,7 @@ from zsim_bridges.mavlink.mission import (
     PlanItem,
     item_fault,
     item_of,
-    place_of,
+    position_of,
 )
 from zsim_bridges.mavlink.personality import FenceAction, FlightMode, Parameters, Personality, Setting, px4_mode
 from zsim_bridges.mavlink.telemetry import (
@@ -57,27 +57,31 @@ from zsim_bridges.mavlink.telemetry import (
     mission_current,
 )
 from zsim_bridges.mavlink.vehicle_flight import Flight, Report
-from zsim_bridges.mavlink.vehicle_state import NOWHERE, Target, TiltTarget, VehicleState, is_place
+from zsim_bridges.mavlink.vehicle_state import NO_POSITION, Target, TiltTarget, VehicleState, is_valid_position
 from zsim_bridges.vehicle_links.drone_link import CommandSender
 
-ALONG_HEADING = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)
-FROM_HERE = (MavFrame.LOCAL_OFFSET_NED, *ALONG_HEADING)
+HEADING_FRAMES = (MavFrame.BODY_NED, MavFrame.BODY_OFFSET_NED, MavFrame.BODY_FRD)
+OFFSET_FRAMES = (MavFrame.LOCAL_OFFSET_NED, *HEADING_FRAMES)
 HOVER_THRUST = 0.5  # thrust of a setpoint, in [0, 1], that carries the weight; PX4's MPC_THR_HOVER
 YAW_RATE_MAX_RAD_S = math.radians(60.0)  # MPC_YAWRAUTO_MAX
 SPEED_MAX_M_S = 1e3  # m/s; faster setpoints are refused, since no vehicle here flies that fast
 Setpoint = Target | TiltTarget
 TEXT_MAX = 50  # characters in a STATUSTEXT
 REFUSED_MAX = 100  # refusal reasons remembered, so that each is reported only once
-DO_GO_TO = 2  # value of MISSION_ITEM.current with which older ArduPilot clients send the vehicle there at once
+GUIDED_ITEM = 2  # value of MISSION_ITEM.current with which older ArduPilot clients send the vehicle there at once
 HEARTBEAT_NS = 1_000_000_000  # heartbeat period [ns of wall time]
-STICK = 1000.0  # full deflection in MANUAL_CONTROL
-STICKS_UNUSED = 32767
+STICK_FULL_SCALE = 1000.0  # full deflection in MANUAL_CONTROL
+STICK_UNUSED = 32767
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 AUTOPILOT_VERSION = dialect.LAYOUTS[dialect.AutopilotVersion].id
 HOME_POSITION = dialect.LAYOUTS[dialect.HomePosition].id
-SPEEDS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # by SPEED_TYPE; all other types set the horizontal speed
-FAULTS = {"fault": "", "fault_end": " is over", "fault_clear": " cleared"}
-MODE_OF = {FenceAction.HOLD: FlightMode.HOLD, FenceAction.RETURN: FlightMode.RETURN, FenceAction.LAND: FlightMode.LAND}
+SPEED_SETTINGS: dict[int, Setting] = {2: "up_m_s", 3: "down_m_s"}  # by SPEED_TYPE; others set the horizontal speed
+FAULT_SUFFIXES = {"fault": "", "fault_end": " is over", "fault_clear": " cleared"}
+FENCE_MODES = {
+    FenceAction.HOLD: FlightMode.HOLD,
+    FenceAction.RETURN: FlightMode.RETURN,
+    FenceAction.LAND: FlightMode.LAND,
+}
 Point = tuple[float, float]
 
 
@@ -99,19 +103,19 @@ class Request(NamedTuple):
     frame: int
 
     @classmethod
-    def of(cls, message: dialect.CommandLong | dialect.CommandInt) -> "Request":
+    def from_message(cls, message: dialect.CommandLong | dialect.CommandInt) -> "Request":
         m, frame = message, 0
-        place: tuple[float, float, float]
+        position: tuple[float, float, float]
         if isinstance(m, dialect.CommandLong):
-            place = m.param5, m.param6, m.param7
+            position = m.param5, m.param6, m.param7
         else:
             frame, unit = m.frame, dialect.LOCAL_M if m.frame in LOCAL else DEGREES
-            place = from_int(m.x, unit), from_int(m.y, unit), m.z
-        return cls(m.command, (m.param1, m.param2, m.param3, m.param4, *place), frame)
+            position = from_int(m.x, unit), from_int(m.y, unit), m.z
+        return cls(m.command, (m.param1, m.param2, m.param3, m.param4, *position), frame)
 
-    def integer(self, place: int) -> int:
-        """Return parameter `place` (from 0) truncated to an integer; -1 if not finite, negative, or 2**31 or more."""
-        value = self.params[place]
+    def integer(self, index: int) -> int:
+        """Return parameter `index` (from 0) truncated to an integer; -1 if not finite, negative, or 2**31 or more."""
+        value = self.params[index]
         return int(value) if math.isfinite(value) and 0 <= value < 2**31 else -1
 
 
@@ -126,26 +130,26 @@ class MavlinkVehicle:
     def __init__(self, drone: Drone, origin: Origin, sender: CommandSender, options: Options) -> None:
         self.name = drone.name
         self._options = options
-        self._personality = person = options.personality
+        self._personality = personality = options.personality
         source = options.source
         self.outbox: list[WireMessage] = []
         self.state = VehicleState(drone, origin)
-        self._parameters = Parameters(person, drone, options.system_id)
+        self._parameters = Parameters(personality, drone, options.system_id)
         limits = limits_of(drone, G_M_S2)
         limits = limits._replace(yaw_rate_rad_s=min(limits.yaw_rate_rad_s, YAW_RATE_MAX_RAD_S))
         course = Course(limits, drone.reference or Piloted())
-        self.flight = Flight(source, person, self._parameters, self.state, sender, course, self.report)
-        self._source = TelemetrySource(drone, self.state, self.flight, person)
+        self.flight = Flight(source, personality, self._parameters, self.state, sender, course, self.report)
+        self._source = TelemetrySource(drone, self.state, self.flight, personality)
         self.watch = DroneWatch(drone.name, source, self._source, self._parameters, self.report)
         self._telemetry = Telemetry(self._source, options.level)
-        self._missions = MissionProtocol(self._send, self._on_mission, None if person.is_px4 else self._home_item)
+        self._missions = MissionProtocol(self._send, self._on_mission, None if personality.is_px4 else self._home_item)
         self._heartbeat_ns: int | None = None
         self._weight_n = drone.mass_kg * G_M_S2
         self._refused: set[str] = set()
 
     def _home_item(self) -> PlanItem:
-        place = self.state.to_global(self.state.home_or_here_m)
-        return PlanItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), *place)
+        position = self.state.to_global(self.state.home_or_current_m)
+        return PlanItem(MavFrame.GLOBAL, Cmd.NAV_WAYPOINT, (0.0, 0.0, 0.0, 0.0), *position)
 
     def _send(self, message: WireMessage) -> None:
         """Send a message to all clients; reads `outbox` on each call, since `take` replaces the list."""
@@ -162,7 +166,7 @@ class MavlinkVehicle:
 
     def step(self) -> None:
         """Carry out what is due at a gate, once the state has been updated."""
-        self.watch.look()
+        self.watch.check()
         self.flight.step()
         self.outbox += map(dialect.MissionItemReached, self.flight.mission.reached)
         self.flight.mission.reached.clear()
@@ -184,7 +188,7 @@ class MavlinkVehicle:
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         if system not in (0, self._options.system_id) or component not in (0, dialect.COMPONENT_AUTOPILOT):
             return
-        if isinstance(message, dialect.MissionItem | dialect.MissionItemInt) and message.current == DO_GO_TO:
+        if isinstance(message, dialect.MissionItem | dialect.MissionItemInt) and message.current == GUIDED_ITEM:
             self._go_to(message, sender)
         elif not self._missions.on_message(message, sender, wall_ns):
             self._dispatch(message, sender)
@@ -192,7 +196,7 @@ class MavlinkVehicle:
     def _dispatch(self, message: WireMessage, sender: Address) -> None:
         match message:
             case dialect.CommandLong() | dialect.CommandInt():
-                refusal = self._carry_out(Request.of(message))
+                refusal = self._carry_out(Request.from_message(message))
                 result = Result.DENIED if isinstance(refusal, str) else refusal or Result.ACCEPTED
                 self._send(dialect.CommandAck(message.command, result, 0, 0, *sender))
                 self._deny(refusal if isinstance(refusal, str) else None)
@@ -212,10 +216,10 @@ class MavlinkVehicle:
             case dialect.ParamRequestRead():
                 self._send_parameter(message.param_id, message.param_index, sender)
             case dialect.ParamSet():
-                self._deny(self._parameters.put(message.param_id, self._parameters.decoded(message)))
+                self._deny(self._parameters.put(message.param_id, self._parameters.decode_value(message)))
                 self._send_parameter(message.param_id, -1, sender)
             case dialect.RequestDataStream():
-                self._telemetry.put_stream(message.req_stream_id, message.req_message_rate * message.start_stop)
+                self._telemetry.set_stream(message.req_stream_id, message.req_message_rate * message.start_stop)
             case dialect.MissionSetCurrent():
                 if not self.flight.mission.set_current(message.seq):
                     self._deny(f"no item {message.seq}")
@@ -268,12 +272,12 @@ class MavlinkVehicle:
             case Cmd.DO_CHANGE_SPEED:
                 if not math.isfinite(second) or second <= 0.0:
                     return f"a speed of {second} m/s"
-                return parameters.put_setting(SPEEDS.get(request.integer(0), "speed_m_s"), second)
+                return parameters.put_setting(SPEED_SETTINGS.get(request.integer(0), "speed_m_s"), second)
             case Cmd.DO_SET_HOME:
-                place = state.position_m if first == 1.0 else _place(state, request)
-                if place is None:
+                position = state.position_m if first == 1.0 else _requested_position(state, request)
+                if position is None:
                     return "no place for home"
-                state.home_m = place
+                state.home_m = position
                 return self._send_message(HOME_POSITION)
             case Cmd.DO_FLIGHTTERMINATION:
                 if first > 0.5:
@@ -298,7 +302,7 @@ class MavlinkVehicle:
             case Cmd.SET_MESSAGE_INTERVAL:
                 if not math.isfinite(second):
                     return f"an interval of {second} us"
-                is_sent = self._telemetry.put_interval(request.integer(0), second)
+                is_sent = self._telemetry.set_interval(request.integer(0), second)
                 return None if is_sent else Result.UNSUPPORTED
             case Cmd.GET_MESSAGE_INTERVAL:
                 message_id = request.integer(0)
@@ -312,19 +316,19 @@ class MavlinkVehicle:
         if not math.isfinite(altitude_m) or (is_px4 and altitude_m == 0.0):
             altitude_m = self._parameters["takeoff_altitude_m"]
         elif is_px4:  # PX4's altitude is above sea level
-            altitude_m -= state.to_global(state.home_or_here_m)[2]
+            altitude_m -= state.to_global(state.home_or_current_m)[2]
         if not 0.0 < altitude_m <= 10_000.0:
             return f"take-off to {altitude_m:.1f} m above home"
         return self.flight.take_off(altitude_m)
 
     def _reposition(self, request: Request) -> str | None:
         speed_m_s, _, _, yaw = request.params[:4]
-        place = _place(self.state, request)
-        if place is None:
+        position = _requested_position(self.state, request)
+        if position is None:
             return "no place to go to"
         yaw_rad = yaw_ned(yaw) if math.isfinite(yaw) else None
         speed = speed_m_s if math.isfinite(speed_m_s) and speed_m_s > 0 else None
-        return self.flight.go_to(Target(place, yaw_rad=yaw_rad, speed_m_s=speed))
+        return self.flight.go_to(Target(position, yaw_rad=yaw_rad, speed_m_s=speed))
 
     def _turn(self, request: Request) -> str | None:
         """Turn to a heading [deg from north], or by an angle in a given direction, and hold the position."""
@@ -357,11 +361,11 @@ class MavlinkVehicle:
     def _steer(self, message: dialect.ManualControl) -> None:
         sticks = (message.x, message.y, message.z - 500, message.r)
         forward, right, up, turn = (
-            0.0 if stick == STICKS_UNUSED else max(-1.0, min(1.0, stick / STICK)) for stick in sticks
+            0.0 if stick == STICK_UNUSED else max(-1.0, min(1.0, stick / STICK_FULL_SCALE)) for stick in sticks
         )
         speeds = self._parameters.speeds
-        level, climb = speeds.horizontal_m_s, min(speeds.up_m_s, speeds.down_m_s)
-        velocity = (level * forward, -level * right, 2.0 * climb * up)
+        horizontal, climb = speeds.horizontal_m_s, min(speeds.up_m_s, speeds.down_m_s)
+        velocity = (horizontal * forward, -horizontal * right, 2.0 * climb * up)
         self.flight.steer_by_sticks(Target(velocity_m_s=velocity, yaw_rate_rad_s=-turn, along_heading=True))
 
     def _send_parameter(self, param_id: str, index: int, sender: Address) -> None:
@@ -374,7 +378,7 @@ class MavlinkVehicle:
     def _go_to(self, message: dialect.MissionItem | dialect.MissionItemInt, sender: Address) -> None:
         item = item_of(message)
         fault = item_fault(item, dialect.MISSION)
-        reason = "no place to go to" if fault else self.flight.go_to(Target(place_of(item, self.state)))
+        reason = "no place to go to" if fault else self.flight.go_to(Target(position_of(item, self.state)))
         self._deny(reason)
         self._send(dialect.MissionAck(*sender, type=fault or (1 if reason else 0)))
 
@@ -397,47 +401,47 @@ class MavlinkVehicle:
         )
 
 
-def _place(state: VehicleState, request: Request) -> Vector | None:
+def _requested_position(state: VehicleState, request: Request) -> Vector | None:
     """Return a command's position in W, None if invalid; the vehicle's own coordinates replace non-finite ones."""
     params, frame = request.params, request.frame
     item = PlanItem(frame, request.command, params[:4], *params[4:])
     if frame not in FRAMES or (abs(item.x) > 180.0 and frame not in LOCAL):
         return None
-    own = state.position_m
+    current = state.position_m
     if not math.isfinite(item.z):
         if frame in LOCAL:
-            item = item._replace(z=-own[2] if frame == MavFrame.LOCAL_NED else own[2])
+            item = item._replace(z=-current[2] if frame == MavFrame.LOCAL_NED else current[2])
         else:
-            item = item._replace(z=state.to_global(own)[2], frame=ABSOLUTE[0])
-    place = place_of(item, state)
-    return place if is_place(place) else None
+            item = item._replace(z=state.to_global(current)[2], frame=ABSOLUTE[0])
+    position = position_of(item, state)
+    return position if is_valid_position(position) else None
 
 
 def from_local(message: dialect.SetPositionTargetLocalNed, state: VehicleState) -> Setpoint | str:
-    frame, place = message.coordinate_frame, (message.x, message.y, message.z)
+    frame, offset = message.coordinate_frame, (message.x, message.y, message.z)
     if frame == MavFrame.LOCAL_NED:
-        return _target(message, ned(place), False, state)
-    if frame not in FROM_HERE:
+        return _target(message, ned(offset), False, state)
+    if frame not in OFFSET_FRAMES:
         return f"unsupported frame {frame} of a local setpoint"
-    along_heading = frame in ALONG_HEADING
-    x, y, z = turned_about_up(dialect.frd(place), state.yaw_rad) if along_heading else ned(place)
-    own_x, own_y, own_z = state.position_m
-    return _target(message, (own_x + x, own_y + y, own_z + z), along_heading, state)
+    along_heading = frame in HEADING_FRAMES
+    x, y, z = turned_about_up(dialect.frd(offset), state.yaw_rad) if along_heading else ned(offset)
+    current_x, current_y, current_z = state.position_m
+    return _target(message, (current_x + x, current_y + y, current_z + z), along_heading, state)
 
 
 def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState) -> Setpoint | str:
     if message.coordinate_frame not in (*ABSOLUTE, *RELATIVE):
         return f"unsupported frame {message.coordinate_frame} of a global setpoint"
-    own = state.to_global(state.position_m)
+    current_global = state.to_global(state.position_m)
     height_m = message.alt
     if message.coordinate_frame in RELATIVE:
-        height_m += state.to_global(state.home_or_here_m)[2]
+        height_m += state.to_global(state.home_or_current_m)[2]
     given = from_int(message.lat_int, DEGREES), from_int(message.lon_int, DEGREES), height_m
-    known = [value if math.isfinite(value) else here for value, here in zip(given, own, strict=True)]
+    known = [value if math.isfinite(value) else current for value, current in zip(given, current_global, strict=True)]
     x, y, z = state.to_local(known[0], known[1], known[2])
     latitude_deg, longitude_deg, _ = given
-    place = x if math.isfinite(longitude_deg) else math.nan, y if math.isfinite(latitude_deg) else math.nan
-    return _target(message, (*place, z if math.isfinite(height_m) else math.nan), False, state)
+    horizontal = x if math.isfinite(longitude_deg) else math.nan, y if math.isfinite(latitude_deg) else math.nan
+    return _target(message, (*horizontal, z if math.isfinite(height_m) else math.nan), False, state)
 
 
 def _target(
@@ -453,19 +457,19 @@ def _target(
     bits = (TypeMask.VX, TypeMask.VY, TypeMask.VZ)
     given = (message.vx, message.vy, message.vz)
     known = [not mask & bit and math.isfinite(v) for v, bit in zip(given, bits, strict=True)]
-    if position == NOWHERE and not any(known):
+    if position == NO_POSITION and not any(known):
         return "a setpoint has neither position nor velocity"
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
     if any(known):
         vx, vy, vz = (v if is_known else 0.0 for v, is_known in zip(given, known, strict=True))
         velocity_m_s = dialect.frd((vx, vy, vz)) if along_heading else ned((vx, vy, vz))
-    if not is_place(position) or not all(abs(v) < SPEED_MAX_M_S for v in velocity_m_s):
+    if not is_valid_position(position) or not all(abs(v) < SPEED_MAX_M_S for v in velocity_m_s):
         return "a setpoint is out of bounds"
-    along = along_heading and position == NOWHERE
-    if along_heading and not along and any(known):
+    is_along_heading = along_heading and position == NO_POSITION
+    if along_heading and not is_along_heading and any(known):
         velocity_m_s = turned_about_up(velocity_m_s, state.yaw_rad)
     yaw, yaw_rate = _yaw(mask, message.yaw, message.yaw_rate, message.coordinate_frame, state)
-    return Target(position, velocity_m_s, yaw, yaw_rate, along)
+    return Target(position, velocity_m_s, yaw, yaw_rate, is_along_heading)
 
 
 def _yaw(mask: TypeMask, yaw: float, yaw_rate: float, frame: int, state: VehicleState) -> tuple[float | None, float]:
@@ -503,13 +507,15 @@ class DroneWatch:
 
     Args:
         source: name of this process; refusals of its commands are reported.
-        seen: state and flight of the drone; fence breaches are recorded in it.
+        telemetry_source: state and flight of the drone; fence breaches are recorded in it.
     """
 
-    def __init__(self, drone: str, source: str, seen: TelemetrySource, parameters: Parameters, report: Report) -> None:
+    def __init__(
+        self, drone: str, source: str, telemetry_source: TelemetrySource, parameters: Parameters, report: Report
+    ) -> None:
         self._drone = drone
-        self._own = source
-        self._seen = seen
+        self._source_name = source
+        self._telemetry_source = telemetry_source
         self._parameters = parameters
         self._report = report
         self._shapes: list[Circle | Polygon] = []
@@ -517,23 +523,23 @@ class DroneWatch:
         self._was_low = False
 
     def load_fence(self, items: Sequence[PlanItem]) -> None:
-        self._shapes = fence_shapes(items, self._seen.state)
+        self._shapes = fence_shapes(items, self._telemetry_source.state)
 
     def on_event(self, event: Event) -> None:
         """Report an event that concerns the drone."""
-        if event.kind in FAULTS and event.data.get("target") == self._drone:
+        if event.kind in FAULT_SUFFIXES and event.data.get("target") == self._drone:
             severity = Severity.CRITICAL if event.kind == "fault" else Severity.NOTICE
-            self._report(severity, f"Fault {event.data.get('kind')}{FAULTS[event.kind]}")
+            self._report(severity, f"Fault {event.data.get('kind')}{FAULT_SUFFIXES[event.kind]}")
         elif event.kind == "collision" and self._drone in (pair := (event.subject, event.data.get("other"))):
             self._report(Severity.CRITICAL, f"Collision with {pair[1] if pair[0] == self._drone else pair[0]}")
-        elif event.kind == "refused" and event.source == self._own and f"/{self._drone}/" in event.subject:
-            is_overtaken = not event.subject.endswith("/mode") and self._seen.flight.target is None
+        elif event.kind == "refused" and event.source == self._source_name and f"/{self._drone}/" in event.subject:
+            is_overtaken = not event.subject.endswith("/mode") and self._telemetry_source.flight.target is None
             if not is_overtaken:  # a setpoint refused because a landing had begun is not worth reporting
                 self._report(Severity.WARNING, f"Refused: {event.data.get('reason', event.text)}")
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Report what has changed since the last gate, and act on a breach of the fence."""
-        state = self._seen.state
+        state = self._telemetry_source.state
         failed = set(state.failed_sensors())
         for name in sorted(failed - self._failed):
             self._report(Severity.CRITICAL, f"{name.upper()} lost")
@@ -541,29 +547,31 @@ class DroneWatch:
             self._report(Severity.INFO, f"{name.upper()} back")
         self._failed = failed
         if state.is_battery_low and not self._was_low:
-            self._report(Severity.CRITICAL, f"Low battery: {self._seen.battery_percent:.0f} %")
+            self._report(Severity.CRITICAL, f"Low battery: {self._telemetry_source.battery_percent:.0f} %")
         self._was_low = state.is_battery_low
-        seen, action = self._seen, self._parameters.fence_action
+        telemetry_source, action = self._telemetry_source, self._parameters.fence_action
         if action is FenceAction.NONE or not state.is_steerable:
-            seen.breach = BREACH_NONE
+            telemetry_source.breach = BREACH_NONE
             return
         breach = self._breach(state.position_m)
-        if breach and not seen.breach:
-            seen.breaches += 1
-            seen.breach_ns = state.t_ns
+        if breach and not telemetry_source.breach:
+            telemetry_source.breaches += 1
+            telemetry_source.breach_ns = state.t_ns
             self._report(Severity.CRITICAL, f"Geofence breached: {action.name.lower()}")
-            if action in MODE_OF and not seen.flight.foreign_commander:
-                seen.flight.mission.abort("it left its geofence", failsafe=True)
-                seen.flight.set_mode(MODE_OF[action])
-        seen.breach = breach
+            if action in FENCE_MODES and not telemetry_source.flight.foreign_commander:
+                telemetry_source.flight.mission.abort("it left its geofence", failsafe=True)
+                telemetry_source.flight.set_mode(FENCE_MODES[action])
+        telemetry_source.breach = breach
 
     def _breach(self, position_m: Vector) -> int:
-        (x, y, z), (home_x, home_y, home_z) = position_m, self._seen.state.home_or_here_m
+        (x, y, z), (home_x, home_y, home_z) = position_m, self._telemetry_source.state.home_or_current_m
         ceiling_m, radius_m = self._parameters["fence_altitude_m"], self._parameters["fence_radius_m"]
         if ceiling_m > 0 and z - home_z > ceiling_m:
             return BREACH_ALTITUDE
-        near = radius_m <= 0 or math.hypot(x - home_x, y - home_y) <= radius_m
-        return BREACH_NONE if near and all(shape.allows(x, y) for shape in self._shapes) else BREACH_BOUNDARY
+        is_within_radius = radius_m <= 0 or math.hypot(x - home_x, y - home_y) <= radius_m
+        return (
+            BREACH_NONE if is_within_radius and all(shape.allows(x, y) for shape in self._shapes) else BREACH_BOUNDARY
+        )
 
 
 class Circle(NamedTuple):
@@ -585,11 +593,11 @@ class Polygon(NamedTuple):
 
     def allows(self, x: float, y: float) -> bool:
         """Return whether a point is permitted, by the parity of the edges crossed to the east of it."""
-        crossed = False
+        is_inside = False
         for (x1, y1), (x2, y2) in zip(self.corners_m, (*self.corners_m[1:], self.corners_m[0]), strict=True):
             if (y1 > y) != (y2 > y) and x < x1 + (x2 - x1) * (y - y1) / (y2 - y1):
-                crossed = not crossed
-        return crossed == self.inside
+                is_inside = not is_inside
+        return is_inside == self.inside
 
 
 def fence_shapes(items: Sequence[PlanItem], state: VehicleState) -> list[Circle | Polygon]:
@@ -597,7 +605,7 @@ def fence_shapes(items: Sequence[PlanItem], state: VehicleState) -> list[Circle 
     shapes: list[Circle | Polygon] = []
     corners: list[Point] = []
     for item in items:
-        x, y, _ = place_of(item, state)
+        x, y, _ = position_of(item, state)
         if item.command in (Cmd.FENCE_CIRCLE_INCLUSION, Cmd.FENCE_CIRCLE_EXCLUSION):
             shapes.append(Circle((x, y), item.params[0], item.command == Cmd.FENCE_CIRCLE_INCLUSION))
         elif item.command in (Cmd.FENCE_POLYGON_INCLUSION, Cmd.FENCE_POLYGON_EXCLUSION):

@@ -13,7 +13,7 @@ from zsim.math.rotation import Vector
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import FENCE, MISSION, Cmd, MavFrame, MissionResult
 from zsim_bridges.mavlink.personality import Parameters
-from zsim_bridges.mavlink.vehicle_state import Target, VehicleState, is_place
+from zsim_bridges.mavlink.vehicle_state import Target, VehicleState, is_valid_position
 
 JUMPS_MAX = 1000  # items skipped in succession before a mission counts as an endless loop of jumps
 ABSOLUTE = (MavFrame.GLOBAL, MavFrame.GLOBAL_INT)
@@ -52,7 +52,7 @@ class PlanItem(NamedTuple):
     autocontinue: bool = True
 
     @property
-    def has_place(self) -> bool:
+    def has_position(self) -> bool:
         """Whether the item has a horizontal position, for which a non-zero x or y is enough."""
         return any(math.isfinite(value) and value for value in (self.x, self.y))
 
@@ -80,20 +80,20 @@ class MissionStep(NamedTuple):
     z_m: float = 0.0
 
 
-def place_of(item: PlanItem, state: VehicleState) -> Vector:
+def position_of(item: PlanItem, state: VehicleState) -> Vector:
     """Return the position of an item in W [m]; the vehicle's x or y replaces one that is not given."""
-    own_x, own_y, _ = state.position_m
+    current_x, current_y, _ = state.position_m
     z = item.z if math.isfinite(item.z) else 0.0
     if item.frame in LOCAL:
         x, y, up = dialect.ned((item.x, item.y, z)) if item.frame == MavFrame.LOCAL_NED else (item.x, item.y, z)
-        return x if math.isfinite(x) else own_x, y if math.isfinite(y) else own_y, up
-    height_m = z if item.frame in ABSOLUTE else state.to_global(state.home_or_here_m)[2] + z
+        return x if math.isfinite(x) else current_x, y if math.isfinite(y) else current_y, up
+    height_m = z if item.frame in ABSOLUTE else state.to_global(state.home_or_current_m)[2] + z
     latitude_deg, longitude_deg, _ = state.to_global(state.position_m)
-    if item.has_place:
+    if item.has_position:
         latitude_deg = item.x if math.isfinite(item.x) else latitude_deg
         longitude_deg = item.y if math.isfinite(item.y) else longitude_deg
         return state.to_local(latitude_deg, longitude_deg, height_m)
-    return own_x, own_y, state.to_local(latitude_deg, longitude_deg, height_m)[2]
+    return current_x, current_y, state.to_local(latitude_deg, longitude_deg, height_m)[2]
 
 
 class Mission:
@@ -117,8 +117,8 @@ class Mission:
         self.reports: list[MissionReport] = []
         self._reported: int | None = None  # items done at the last report; None while the mission is not being flown
         self._index = 0
-        self._since_ns: int | None = None  # simulated time at which the vehicle reached the current item
-        self._waits_at: Vector = (0.0, 0.0, 0.0)  # position held during a delay [m; W]
+        self._reached_ns: int | None = None  # simulated time at which the vehicle reached the current item
+        self._delay_position: Vector = (0.0, 0.0, 0.0)  # position held during a delay [m; W]
         self._speed_m_s: float | None = None
         self._jumps: dict[int, int] = {}  # jumps left, by item index
         self.has_climbed = False
@@ -186,7 +186,7 @@ class Mission:
     def takeoff_height_m(self, state: VehicleState) -> float | None:
         """Return the height z in W to which the mission takes off; None if the current item is not a take-off."""
         item = self._item
-        return place_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
+        return position_of(item, state)[2] if item and item.command == Cmd.NAV_TAKEOFF else None
 
     def step(self, state: VehicleState, parameters: Parameters) -> MissionStep:
         """Return the current action, skipping completed items."""
@@ -205,43 +205,43 @@ class Mission:
             case Cmd.DO_CHANGE_SPEED:
                 self._speed_m_s = item.params[1] if item.params[1] > 0 else self._speed_m_s
             case Cmd.DO_JUMP:
-                left = self._jumps.setdefault(self._index, int(max(-1.0, min(1e6, item.params[1]))))
+                remaining = self._jumps.setdefault(self._index, int(max(-1.0, min(1e6, item.params[1]))))
                 index = int(max(0.0, min(1e6, item.params[0]))) - self.first
-                if left and 0 <= index < len(self.items):
-                    self._jumps[self._index] = left - 1 if left > 0 else left
+                if remaining and 0 <= index < len(self.items):
+                    self._jumps[self._index] = remaining - 1 if remaining > 0 else remaining
                     self._enter(index)
                     return None
             case Cmd.NAV_TAKEOFF:
                 if not self.has_climbed:
-                    return MissionStep("climb", z_m=place_of(item, state)[2])
+                    return MissionStep("climb", z_m=position_of(item, state)[2])
             case Cmd.NAV_RETURN_TO_LAUNCH:
                 return MissionStep("return")
             case Cmd.NAV_LAND:
                 return self._land(item, state, parameters)
             case Cmd.NAV_DELAY:
-                if self._since_ns is None:
-                    self._waits_at = state.position_m
-                return self._wait(Target(self._waits_at), item.params[0], state)
+                if self._reached_ns is None:
+                    self._delay_position = state.position_m
+                return self._wait(Target(self._delay_position), item.params[0], state)
             case _:
                 return self._visit(item, state, parameters)
         self._enter(self._index + 1)
         return None
 
     def _land(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep:
-        if not item.has_place or self._since_ns is not None:
+        if not item.has_position or self._reached_ns is not None:
             return MissionStep("land")
-        x, y, _ = place_of(item, state)
+        x, y, _ = position_of(item, state)
         target = Target((x, y, None), speed_m_s=self._speed_m_s)
         if target.distance_m(state.position_m) < parameters["acceptance_m"]:
-            self._since_ns = state.t_ns
+            self._reached_ns = state.t_ns
             return MissionStep("land")
         return MissionStep("fly", target)
 
     def _visit(self, item: PlanItem, state: VehicleState, parameters: Parameters) -> MissionStep | None:
         yaw_deg = item.params[3]
         yaw = dialect.yaw_ned(math.radians(yaw_deg)) if self._turns and math.isfinite(yaw_deg) else None
-        target = Target(place_of(item, state), yaw_rad=yaw, speed_m_s=self._speed_m_s)
-        if self._since_ns is None:
+        target = Target(position_of(item, state), yaw_rad=yaw, speed_m_s=self._speed_m_s)
+        if self._reached_ns is None:
             radius_m = item.params[1] if item.command == Cmd.NAV_WAYPOINT and item.params[1] > 0 else None
             if target.distance_m(state.position_m) > (radius_m or parameters["acceptance_m"]):
                 return MissionStep("fly", target)
@@ -251,15 +251,15 @@ class Mission:
 
     def _wait(self, target: Target, stay_s: float, state: VehicleState) -> MissionStep | None:
         """Stay for some time; 0 and NaN mean no delay."""
-        if self._since_ns is None:
-            self._since_ns = state.t_ns
-        if (state.t_ns - self._since_ns) * 1e-9 < stay_s:
+        if self._reached_ns is None:
+            self._reached_ns = state.t_ns
+        if (state.t_ns - self._reached_ns) * 1e-9 < stay_s:
             return MissionStep("fly", target)
         self._enter(self._index + 1)
         return None
 
     def _enter(self, index: int) -> None:
-        self._index, self._since_ns, self.has_climbed = index, None, False
+        self._index, self._reached_ns, self.has_climbed = index, None, False
 
 
 @dataclass(slots=True)
@@ -268,7 +268,7 @@ class _Upload:
     type: int
     count: int
     items: list[PlanItem] = field(default_factory=list)
-    asked_ns: int = 0
+    requested_ns: int = 0
     tries: int = 0
 
 
@@ -276,20 +276,20 @@ class MissionProtocol:
     """The item transfers of one vehicle.
 
     Args:
-        loaded: called with the type and the items of a complete upload, or with no items after a removal.
-        home: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which
+        on_loaded: called with the type and the items of a complete upload, or with no items after a removal.
+        home_item: returns item 0 of ArduPilot's missions; None for PX4, whose item 0 is the first waypoint, and which
             requests items in the form MISSION_ITEM_INT first.
     """
 
     def __init__(
         self,
         send: Callable[[dialect.WireMessage], None],
-        loaded: Callable[[int, list[PlanItem]], None],
-        home: Callable[[], PlanItem] | None,
+        on_loaded: Callable[[int, list[PlanItem]], None],
+        home_item: Callable[[], PlanItem] | None,
     ) -> None:
         self._send = send
-        self._loaded = loaded
-        self._home = home
+        self._on_loaded = on_loaded
+        self._home_item = home_item
         self._items: dict[int, list[PlanItem]] = {}
         self._upload: _Upload | None = None
 
@@ -310,7 +310,7 @@ class MissionProtocol:
             case dialect.MissionItemInt() | dialect.MissionItem():
                 upload = self._upload
                 if upload is not None and upload.sender == sender and message.seq == len(upload.items):
-                    self._take_item(upload, message, wall_ns)  # other items are repetitions, or were not requested
+                    self._accept_item(upload, message, wall_ns)  # other items are repetitions, or were not requested
             case dialect.MissionRequestList(mission_type=type_):
                 self._send(dialect.MissionCount(*sender, count=len(self._stored(type_)), mission_type=type_))
             case dialect.MissionRequestInt() | dialect.MissionRequest():
@@ -323,12 +323,12 @@ class MissionProtocol:
                 if isinstance(message, dialect.MissionRequestInt):
                     unit = dialect.LOCAL_M if item.frame in LOCAL else dialect.DEGREES
                     kind, x, y = dialect.MissionItemInt, dialect.to_int(item.x, unit), dialect.to_int(item.y, unit)
-                begin = *sender, message.seq, item.frame, item.command, 0, int(item.autocontinue)
-                self._send(kind(*begin, *item.params, x, y, item.z, message.mission_type))
+                leading_fields = *sender, message.seq, item.frame, item.command, 0, int(item.autocontinue)
+                self._send(kind(*leading_fields, *item.params, x, y, item.z, message.mission_type))
             case dialect.MissionClearAll(mission_type=type_):
                 for each in (MISSION, FENCE) if type_ == dialect.ALL_MISSION_TYPES else (type_,):
                     self._items[each] = []
-                    self._loaded(each, [])
+                    self._on_loaded(each, [])
                 self._acknowledge(sender, type_, MissionResult.ACCEPTED)
             case dialect.MissionAck():
                 pass
@@ -339,7 +339,7 @@ class MissionProtocol:
     def tick(self, wall_ns: int) -> None:
         """Request a missing item again, or cancel the upload after TRIES_MAX repetitions."""
         upload = self._upload
-        if upload is None or wall_ns - upload.asked_ns < RETRY_NS:
+        if upload is None or wall_ns - upload.requested_ns < RETRY_NS:
             return
         upload.tries += 1
         if upload.tries > TRIES_MAX:
@@ -348,14 +348,16 @@ class MissionProtocol:
             self._request(upload, wall_ns)
 
     def _request(self, upload: _Upload, wall_ns: int) -> None:
-        upload.asked_ns = wall_ns
-        as_int = (self._home is None) != bool(upload.tries % 2)  # some clients support only one of the two
+        upload.requested_ns = wall_ns
+        as_int = (self._home_item is None) != bool(upload.tries % 2)  # some clients support only one of the two
         kind = dialect.MissionRequestInt if as_int else dialect.MissionRequest
         self._send(kind(*upload.sender, seq=len(upload.items), mission_type=upload.type))
 
-    def _take_item(self, upload: _Upload, message: dialect.MissionItemInt | dialect.MissionItem, wall_ns: int) -> None:
+    def _accept_item(
+        self, upload: _Upload, message: dialect.MissionItemInt | dialect.MissionItem, wall_ns: int
+    ) -> None:
         item = item_of(message)
-        is_home = upload.type == MISSION and self._home is not None and message.seq == 0
+        is_home = upload.type == MISSION and self._home_item is not None and message.seq == 0
         fault = None if is_home else item_fault(item, upload.type)
         if fault is not None:
             self._end(upload, fault)
@@ -368,9 +370,9 @@ class MissionProtocol:
             self._request(upload, wall_ns)
 
     def _finish(self, upload: _Upload) -> None:
-        items = upload.items[1:] if self._home and upload.type == MISSION else upload.items
+        items = upload.items[1:] if self._home_item and upload.type == MISSION else upload.items
         self._items[upload.type] = items
-        self._loaded(upload.type, items)
+        self._on_loaded(upload.type, items)
         self._end(upload, MissionResult.ACCEPTED)
 
     def _end(self, upload: _Upload, result: MissionResult) -> None:
@@ -383,7 +385,7 @@ class MissionProtocol:
     def _stored(self, type_: int) -> list[PlanItem]:
         """Return all items of a type, including ArduPilot's item 0."""
         items = self._items.get(type_, [])
-        return [self._home(), *items] if self._home and type_ == MISSION else items
+        return [self._home_item(), *items] if self._home_item and type_ == MISSION else items
 
 
 def item_of(message: dialect.MissionItemInt | dialect.MissionItem) -> PlanItem:
@@ -401,11 +403,11 @@ def item_fault(item: PlanItem, type_: int) -> MissionResult | None:
         return MissionResult.UNSUPPORTED
     if item.frame not in FRAMES:
         return MissionResult.UNSUPPORTED_FRAME
-    is_whole = item.has_place and math.isfinite(item.x) and math.isfinite(item.y)
+    has_full_position = item.has_position and math.isfinite(item.x) and math.isfinite(item.y)
     z = 0.0 if math.isnan(item.z) and item.command == Cmd.NAV_LAND else item.z
     x, y = (0.0 if math.isnan(value) else value for value in (item.x, item.y))  # NaN: not given
     if item.frame in LOCAL:
-        is_good = is_place((x, y, z))
+        is_valid = is_valid_position((x, y, z))
     else:
-        is_good = is_place((None, None, z)) and abs(x) <= 90.0 and abs(y) <= 180.0
-    return None if is_good and (type_ != FENCE or is_whole) else MissionResult.INVALID
+        is_valid = is_valid_position((None, None, z)) and abs(x) <= 90.0 and abs(y) <= 180.0
+    return None if is_valid and (type_ != FENCE or has_full_position) else MissionResult.INVALID

@@ -24,8 +24,8 @@ FlightMode = Enum("FlightMode", "MANUAL ALTITUDE POSITION HOLD BRAKE TAKEOFF LAN
 """The modes of both autopilots, under common names."""
 
 
-BY_STICKS = (FlightMode.MANUAL, FlightMode.ALTITUDE, FlightMode.POSITION)
-HOLDING = (*BY_STICKS, FlightMode.HOLD, FlightMode.BRAKE)
+MANUAL_MODES = (FlightMode.MANUAL, FlightMode.ALTITUDE, FlightMode.POSITION)
+HOLD_MODES = (*MANUAL_MODES, FlightMode.HOLD, FlightMode.BRAKE)
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
@@ -106,13 +106,13 @@ class ParameterSpec(NamedTuple):
 
 def _px4(drone: Drone, system_id: int) -> list[ParameterSpec]:
     limits = drone.limits
-    level, climb, altitude = limits.horizontal_speed_m_s, limits.vertical_speed_m_s, limits.altitude_m
+    horizontal, climb, altitude = limits.horizontal_speed_m_s, limits.vertical_speed_m_s, limits.altitude_m
     return [
         ParameterSpec("SYS_AUTOSTART", INT, 4001, 0, 9999999, fixed=True),  # generic quadcopter
         ParameterSpec("MAV_SYS_ID", INT, system_id, 1, 255, fixed=True),
         ParameterSpec("MAV_TYPE", INT, 2, 0, 45, fixed=True),
-        ParameterSpec("MPC_XY_VEL_MAX", REAL, level, 0.1, level, "speed_m_s"),
-        ParameterSpec("MPC_XY_CRUISE", REAL, level, 0.1, level),
+        ParameterSpec("MPC_XY_VEL_MAX", REAL, horizontal, 0.1, horizontal, "speed_m_s"),
+        ParameterSpec("MPC_XY_CRUISE", REAL, horizontal, 0.1, horizontal),
         ParameterSpec("MPC_Z_VEL_MAX_UP", REAL, climb, 0.1, climb, "up_m_s"),
         ParameterSpec("MPC_Z_VEL_MAX_DN", REAL, climb, 0.1, climb, "down_m_s"),
         ParameterSpec("MPC_THR_HOVER", REAL, 0.5, 0.5, 0.5, fixed=True),
@@ -130,13 +130,13 @@ def _px4(drone: Drone, system_id: int) -> list[ParameterSpec]:
 
 def _copter(drone: Drone, system_id: int) -> list[ParameterSpec]:
     limits = drone.limits
-    level, climb = limits.horizontal_speed_m_s / CM, limits.vertical_speed_m_s / CM
+    horizontal, climb = limits.horizontal_speed_m_s / CM, limits.vertical_speed_m_s / CM
     altitude = limits.altitude_m / CM
     return [
         ParameterSpec("SYSID_THISMAV", SHORT, system_id, 1, 255, fixed=True),
         ParameterSpec("FRAME_CLASS", BYTE, 1, 0, 17, fixed=True),  # quad
         ParameterSpec("FRAME_TYPE", BYTE, 1, 0, 18, fixed=True),  # x
-        ParameterSpec("WPNAV_SPEED", REAL, level, 10.0, level, "speed_m_s", CM),
+        ParameterSpec("WPNAV_SPEED", REAL, horizontal, 10.0, horizontal, "speed_m_s", CM),
         ParameterSpec("WPNAV_SPEED_UP", REAL, climb, 10.0, climb, "up_m_s", CM),
         ParameterSpec("WPNAV_SPEED_DN", REAL, climb, 10.0, climb, "down_m_s", CM),
         ParameterSpec("WPNAV_RADIUS", REAL, 100.0, 5.0, 1000.0, "acceptance_m", CM),
@@ -181,7 +181,7 @@ PERSONALITIES = {
         Autopilot.ARDUPILOTMEGA, COPTER_MODES, FlightMode.MANUAL, _copter, COPTER_FENCE, False, (4, 5, 7, 255)
     ),
 }
-_INTEGERS = {
+_INTEGER_FORMATS = {
     ParamType.UINT8: "<B3x",
     ParamType.INT8: "<b3x",
     ParamType.UINT16: "<H2x",
@@ -245,18 +245,18 @@ class Parameters:
     def message(self, name: str) -> dialect.ParamValue:
         type_, value = self._specs[name].type, self.values[name]
         if self._is_bytewise(type_):
-            (value,) = struct.unpack("<f", struct.pack(_INTEGERS[type_], int(value)))
+            (value,) = struct.unpack("<f", struct.pack(_INTEGER_FORMATS[type_], int(value)))
         return dialect.ParamValue(name, value, type_, len(self._names), self._names.index(name))
 
-    def decoded(self, message: dialect.ParamSet) -> float:
+    def decode_value(self, message: dialect.ParamSet) -> float:
         """Decode the value in a message by the parameter's type, or by the message's for an unknown parameter."""
         spec = self._specs.get(message.param_id)
         type_ = spec.type if spec else message.param_type
         if not self._is_bytewise(type_):
             return message.param_value
-        (value,) = struct.unpack(_INTEGERS[ParamType(type_)], struct.pack("<f", message.param_value))
+        (value,) = struct.unpack(_INTEGER_FORMATS[ParamType(type_)], struct.pack("<f", message.param_value))
         return float(value)
 
     def _is_bytewise(self, type_: int) -> bool:
         """Return whether values of a type are sent as the bytes of an integer in a float field."""
-        return self._personality.is_px4 and type_ in _INTEGERS
+        return self._personality.is_px4 and type_ in _INTEGER_FORMATS

@@ -28,7 +28,7 @@ from zsim_bridges.mavlink.dialect import (
     int16,
     ned,
 )
-from zsim_bridges.mavlink.personality import BY_STICKS, FlightMode, Personality
+from zsim_bridges.mavlink.personality import MANUAL_MODES, FlightMode, Personality
 from zsim_bridges.mavlink.vehicle_flight import Flight
 from zsim_bridges.mavlink.vehicle_state import ALL_HEALTHY, Target, VehicleState
 
@@ -112,17 +112,19 @@ class TelemetrySource:
 
 def heartbeat(s: TelemetrySource) -> WireMessage:
     flight, modes = s.flight, s.personality.modes
-    base = BaseMode.CUSTOM | BaseMode.STABILIZE
-    base |= BaseMode.MANUAL_INPUT if flight.mode in BY_STICKS else BaseMode.GUIDED | BaseMode.AUTO
+    base_mode = BaseMode.CUSTOM | BaseMode.STABILIZE
+    base_mode |= BaseMode.MANUAL_INPUT if flight.mode in MANUAL_MODES else BaseMode.GUIDED | BaseMode.AUTO
     if flight.is_armed:
-        base |= BaseMode.ARMED
+        base_mode |= BaseMode.ARMED
     status = SystemStatus.ACTIVE if flight.is_armed else SystemStatus.STANDBY
     if s.state.state == "emergency":
         status = SystemStatus.EMERGENCY
     elif s.state.is_airborne and (s.state.is_battery_low or s.breach):
         status = SystemStatus.CRITICAL
-    custom = modes[FlightMode.MISSION if flight.foreign_commander else flight.mode]
-    return dialect.Heartbeat(dialect.TYPE_QUADROTOR, s.personality.autopilot, base, custom, status, MAVLINK_VERSION)
+    custom_mode = modes[FlightMode.MISSION if flight.foreign_commander else flight.mode]
+    return dialect.Heartbeat(
+        dialect.TYPE_QUADROTOR, s.personality.autopilot, base_mode, custom_mode, status, MAVLINK_VERSION
+    )
 
 
 def sys_status(s: TelemetrySource) -> WireMessage:
@@ -190,8 +192,8 @@ def home_position(s: TelemetrySource) -> WireMessage | None:
     home_m = s.state.home_m
     if home_m is None:
         return None
-    place = global_ints(s.state.to_global(home_m))
-    return dialect.HomePosition(*place, *ned(home_m), (1.0, 0.0, 0.0, 0.0), time_usec=s.boot_us)
+    geodetic = global_ints(s.state.to_global(home_m))
+    return dialect.HomePosition(*geodetic, *ned(home_m), (1.0, 0.0, 0.0, 0.0), time_usec=s.boot_us)
 
 
 def position_target_local_ned(s: TelemetrySource) -> WireMessage | None:
@@ -233,7 +235,7 @@ def distance_sensor(s: TelemetrySource) -> WireMessage | None:
 def odometry(s: TelemetrySource) -> WireMessage:
     w, x, y, z = s.state.q_WB
     forward, left, up = frames.rotate((w, -x, -y, -z), s.state.velocity_m_s).tolist()
-    level, height = (sigma * sigma for sigma in s.state.sigma_m)
+    horizontal, vertical = (sigma * sigma for sigma in s.state.sigma_m)
     return dialect.Odometry(
         s.boot_us,
         MavFrame.LOCAL_NED,
@@ -242,7 +244,7 @@ def odometry(s: TelemetrySource) -> WireMessage:
         dialect.attitude_ned(s.state.q_WB),
         *frd((forward, left, up)),
         *frd(s.state.rate_rad_s),
-        (level, *(0.0,) * 5, level, *(0.0,) * 4, height, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN),
+        (horizontal, *(0.0,) * 5, horizontal, *(0.0,) * 4, vertical, *(0.0,) * 3, NAN, 0.0, 0.0, NAN, 0.0, NAN),
         (NAN, *(0.0,) * 20),
         estimator_type=3,  # MAV_ESTIMATOR_TYPE_GPS_INS
     )
@@ -285,9 +287,9 @@ def _estimator_flags(s: TelemetrySource) -> int:
 
 
 def estimator_status(s: TelemetrySource) -> WireMessage:
-    level, up = s.state.sigma_m
+    horizontal, vertical = s.state.sigma_m
     flags = _estimator_flags(s)
-    return dialect.EstimatorStatus(s.boot_us, flags, pos_horiz_accuracy=level, pos_vert_accuracy=up)
+    return dialect.EstimatorStatus(s.boot_us, flags, pos_horiz_accuracy=horizontal, pos_vert_accuracy=vertical)
 
 
 def _milli_readings(s: TelemetrySource) -> tuple[int, ...] | None:
@@ -394,7 +396,7 @@ STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM; conten
     12: (dialect.SystemTime, dialect.EkfStatusReport, dialect.DistanceSensor, dialect.BatteryStatus, dialect.Vibration),
 }
 ALL_STREAMS = 0
-BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in ROWS}
+MESSAGE_TYPES_BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in ROWS}
 
 
 class Telemetry:
@@ -409,62 +411,62 @@ class Telemetry:
             rates = row.px4 if source.personality.is_px4 else row.ardupilot
             if rates:
                 self._defaults[kind] = rates[1 if level == "full" else 0]
-                self._put(kind, self._defaults[kind])
+                self._set_rate(kind, self._defaults[kind])
 
-    def _put(self, kind: type[WireMessage], rate_hz: float) -> None:
+    def _set_rate(self, kind: type[WireMessage], rate_hz: float) -> None:
         if rate_hz <= 0:
             self._interval_ns.pop(kind, None)
             return
-        most_hz = IMU_RATE_MAX_HZ if kind is dialect.HighresImu else RATE_MAX_HZ
-        self._interval_ns[kind] = round(SECOND_NS / min(rate_hz, most_hz))
+        max_hz = IMU_RATE_MAX_HZ if kind is dialect.HighresImu else RATE_MAX_HZ
+        self._interval_ns[kind] = round(SECOND_NS / min(rate_hz, max_hz))
         self._due_ns[kind] = 0
 
     def due(self, t_ns: int) -> list[WireMessage]:
         self._source.advance()
-        arrived = self._source.state.take_arrived()
+        new_samples = self._source.state.take_new_samples()
         messages: list[WireMessage] = []
         for kind, interval_ns in self._interval_ns.items():
             due_ns, delay_ns, sensor = self._due_ns[kind], 0, ROWS[kind].sensor
             if sensor is not None:  # wait for a sample, at most two intervals
-                delay_ns = -interval_ns // 2 if arrived.get(sensor) else 2 * interval_ns
+                delay_ns = -interval_ns // 2 if new_samples.get(sensor) else 2 * interval_ns
             if t_ns >= due_ns + delay_ns:
                 self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
                 message = ROWS[kind].build(self._source)
                 if message is not None:
                     if kind is dialect.HighresImu and interval_ns < GATE_NS:  # every sample since the last gate
-                        messages += map(_inertial, arrived.get("imu", ())[:-1])
+                        messages += map(_inertial, new_samples.get("imu", ())[:-1])
                     messages.append(message)
         return messages
 
     def build(self, message_id: int) -> WireMessage | None:
         """Return the current message; None if this vehicle does not send it."""
-        kind = BY_ID.get(message_id)
+        kind = MESSAGE_TYPES_BY_ID.get(message_id)
         self._source.advance()
         return ROWS[kind].build(self._source) if kind else None
 
-    def put_interval(self, message_id: int, interval_us: float) -> bool:
+    def set_interval(self, message_id: int, interval_us: float) -> bool:
         """Set the interval of a message (-1: never, 0: the default); return False if this vehicle does not send it."""
-        kind = BY_ID.get(message_id)
+        kind = MESSAGE_TYPES_BY_ID.get(message_id)
         if kind is None:
             return False
         if kind is not dialect.Heartbeat:
             default_hz = self._defaults.get(kind, 0.0)
-            self._put(kind, default_hz if interval_us == 0 else max(0.0, 1e6 / interval_us))
+            self._set_rate(kind, default_hz if interval_us == 0 else max(0.0, 1e6 / interval_us))
         return True
 
     def interval_us(self, message_id: int) -> int:
         """Return the interval of a message; -1 if it is off, 0 if this vehicle has no such message."""
-        kind = BY_ID.get(message_id)
+        kind = MESSAGE_TYPES_BY_ID.get(message_id)
         if kind is None:
             return 0
         if kind is dialect.Heartbeat:
             return 1_000_000
         return self._interval_ns[kind] // 1000 if kind in self._interval_ns else -1
 
-    def put_stream(self, stream: int, rate_hz: float) -> None:
+    def set_stream(self, stream: int, rate_hz: float) -> None:
         """Set the rate of a group of messages, as in the deprecated REQUEST_DATA_STREAM."""
         for number, kinds in STREAMS.items():
             if stream in (ALL_STREAMS, number):
                 for kind in kinds:
                     if kind in self._defaults:
-                        self._put(kind, rate_hz)
+                        self._set_rate(kind, rate_hz)

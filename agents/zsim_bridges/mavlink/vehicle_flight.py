@@ -12,16 +12,16 @@ from zsim.math.rotation import Vector
 from zsim_agents.references.cruise import Course, Cruise
 from zsim_bridges.mavlink.dialect import Severity
 from zsim_bridges.mavlink.mission import Mission
-from zsim_bridges.mavlink.personality import HOLDING, FlightMode, Parameters, Personality
-from zsim_bridges.mavlink.vehicle_state import NOWHERE, Target, TiltTarget, VehicleState
+from zsim_bridges.mavlink.personality import HOLD_MODES, FlightMode, Parameters, Personality
+from zsim_bridges.mavlink.vehicle_state import NO_POSITION, Target, TiltTarget, VehicleState
 from zsim_bridges.vehicle_links.drone_link import REPEAT_NS, CommandSender, ModeName
 
-OVER_ON_GROUND = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN, FlightMode.MISSION)
+GROUND_ENDING_MODES = (FlightMode.TAKEOFF, FlightMode.LAND, FlightMode.RETURN, FlightMode.MISSION)
 Report = Callable[[Severity, str], None]
-ANSWER_NS = 1_000_000_000  # ns within which the drone should begin a requested take-off or landing
-ARRIVED_M = 0.3  # m; a climb ends this close to its target height
+RESPONSE_TIMEOUT_NS = 1_000_000_000  # ns within which the drone should begin a requested take-off or landing
+CLIMB_TOLERANCE_M = 0.3  # m; a climb ends this close to its target height
 STEP_NS = 40_000_000  # ns; the guidance law is evaluated 25 times a second
-BURST = 500  # commands in one burst: half as many as the world records from a source outside the lockstep
+BURST_MAX = 500  # commands in one burst: half as many as the world records from a source outside the lockstep
 
 
 class Flight:
@@ -51,7 +51,7 @@ class Flight:
         self._armed_ns = 0
         self._setpoint_ns: int | None = None  # simulated time of the newest setpoint from a client
         self._return_stage = 0
-        self._mission_returns = False  # whether the return under way is an item of the mission
+        self._is_mission_return = False  # whether the return under way is an item of the mission
         self.mode = personality.first_mode
         self.mission = Mission(first=0 if personality.is_px4 else 1, turns=personality.is_px4)
 
@@ -95,7 +95,7 @@ class Flight:
         """Disarm the vehicle; if forced, even in the air, where the rotors stop at once."""
         if not self._state.is_airborne:
             if self._is_armed:
-                self._stand("Disarmed")
+                self._end_flight("Disarmed")
             return None
         if force:
             self.terminate()
@@ -105,7 +105,7 @@ class Flight:
         """Stop the rotors at once, regardless of the commander."""
         self.mission.abort("a client stopped its rotors", failsafe=False)
         self._control.send_mode("emergency")
-        self._stand("Emergency: rotors stopped")
+        self._end_flight("Emergency: rotors stopped")
 
     def reboot(self) -> str | None:
         """Restart, which is possible only on the ground; this ends an emergency."""
@@ -113,7 +113,7 @@ class Flight:
             return "in flight"
         if self._state.state == "emergency":
             self._control.send_mode("reset")
-        self._stand("Rebooted")
+        self._end_flight("Rebooted")
         self.mode = self._personality.first_mode
         return None
 
@@ -128,7 +128,7 @@ class Flight:
         if has_mode:
             self.mode = FlightMode.TAKEOFF
         self._is_armed = True
-        self._control.climb(self._state.home_or_here_m[2] + altitude_m)
+        self._control.climb(self._state.home_or_current_m[2] + altitude_m)
         return None
 
     def set_mode(self, mode: FlightMode) -> str | None:
@@ -158,13 +158,15 @@ class Flight:
             self._control.hold(target)
             if isinstance(target, Target) and self._is_armed and not self._state.is_airborne:
                 z = target.position_m[2]  # only a target above the vehicle starts a take-off
-                if target.velocity_m_s[2] > 0.0 or (z is not None and z > self._state.position_m[2] + ARRIVED_M):
-                    self._control.ask("takeoff")
+                if target.velocity_m_s[2] > 0.0 or (
+                    z is not None and z > self._state.position_m[2] + CLIMB_TOLERANCE_M
+                ):
+                    self._control.request("takeoff")
         return reason
 
     def steer_by_sticks(self, target: Target) -> None:
         """Follow a joystick, in the modes that otherwise hold the position."""
-        if self.mode in HOLDING and self._state.is_steerable and self._is_armed and not self.refusal():
+        if self.mode in HOLD_MODES and self._state.is_steerable and self._is_armed and not self.refusal():
             self._setpoint_ns = self._state.t_ns
             self._control.hold(target)
 
@@ -180,14 +182,14 @@ class Flight:
     def step(self) -> None:
         self._control.advance()
         self.mission.note_progress()
-        if self.mode is not FlightMode.MISSION and not (self.mode is FlightMode.RETURN and self._mission_returns):
+        if self.mode is not FlightMode.MISSION and not (self.mode is FlightMode.RETURN and self._is_mission_return):
             self.mission.abort(f"a client chose {self.mode.name}", failsafe=False)
         self._follow_drone()
         if self.foreign_commander:
             self._control.release()
         elif self._state.is_steerable and self._is_armed:
-            if self._control.asked and self._control.asked[0] == "takeoff":
-                self._control.asked = None
+            if self._control.pending_mode and self._control.pending_mode[0] == "takeoff":
+                self._control.pending_mode = None
             self._fly()
             self._control.send_due()
         elif self._control.is_takeoff_overdue():
@@ -196,26 +198,26 @@ class Flight:
             self.mission.abort("the drone refused the take-off", failsafe=True)
 
     def _follow_drone(self) -> None:
-        state, airborne = self._state.state, self._state.is_airborne
+        state, is_airborne = self._state.state, self._state.is_airborne
         if state == "emergency":
             self.mission.abort("its rotors were stopped", failsafe=True)
             self._control.release()
             self._is_armed = False
-        elif self._was_airborne and not airborne:
+        elif self._was_airborne and not is_airborne:
             if self.mission.is_landing:
                 self.mission.finish()
             else:
                 self.mission.abort("it landed by itself", failsafe=True)
-            self._stand("Landed; disarmed")
-        elif self._is_armed and not airborne and self._control.asked is None:
+            self._end_flight("Landed; disarmed")
+        elif self._is_armed and not is_airborne and self._control.pending_mode is None:
             delay_s = self._parameters["disarm_s"]
             if delay_s > 0 and self._state.t_ns - self._armed_ns > delay_s * 1e9:
                 self.mission.abort("no take-off", failsafe=True)
-                self._stand("Disarmed: no take-off")
-        if state == "landing" and self.mode not in OVER_ON_GROUND:
+                self._end_flight("Disarmed: no take-off")
+        if state == "landing" and self.mode not in GROUND_ENDING_MODES:
             self._control.release()
             self.mode = FlightMode.LAND
-        self._was_airborne = airborne
+        self._was_airborne = is_airborne
 
     def _fly(self) -> None:
         if self._control.climb_to_m is not None:
@@ -229,7 +231,7 @@ class Flight:
         elif self.mode is FlightMode.RETURN:
             self._fly_home()
         elif self.mode is FlightMode.LAND:
-            self._control.ask("land")
+            self._control.request("land")
         elif self._is_stream_silent() and self.target is not None:  # ArduPilot keeps a position without a stream
             if self.mode is FlightMode.OFFBOARD and self._personality.is_px4:
                 self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
@@ -241,12 +243,12 @@ class Flight:
         step = self.mission.step(self._state, self._parameters)
         match step.action:
             case "land":
-                self._control.ask("land")
+                self._control.request("land")
             case "climb":
                 self._control.climb(step.z_m)
             case "return":
                 self._enter(FlightMode.RETURN)
-                self._mission_returns = True
+                self._is_mission_return = True
             case "fly" if step.target != self.target:
                 self._control.hold(step.target)
             case "over":
@@ -256,7 +258,7 @@ class Flight:
 
     def _fly_home(self) -> None:
         """Climb to the return height, fly home, and land."""
-        home_x, home_y, home_z = self._state.home_or_here_m
+        home_x, home_y, home_z = self._state.home_or_current_m
         x, y, z = self._state.position_m
         target = self.target
         if self._return_stage == 0:
@@ -266,7 +268,7 @@ class Flight:
             self._return_stage = 2
             self._control.hold(Target((home_x, home_y, target.position_m[2])))
         elif self._return_stage == 2 and (target is None or self._control.has_arrived()):
-            self._control.ask("land")
+            self._control.request("land")
 
     def _is_stream_silent(self) -> bool:
         silence_ns = self._parameters["stream_s"] * 1e9
@@ -283,14 +285,14 @@ class Flight:
             return "no mission"
         if mode is FlightMode.TAKEOFF:
             return self.take_off(self._parameters["takeoff_altitude_m"])
-        self.mode, self._mission_returns, self._return_stage = mode, False, 0
+        self.mode, self._is_mission_return, self._return_stage = mode, False, 0
         if self._state.is_airborne:
             self._is_armed = True
             if mode is FlightMode.MISSION:
                 self.mission.start()
             if mode is FlightMode.LAND:
-                self._control.ask("land")
-            elif mode in HOLDING or (mode is FlightMode.OFFBOARD and not needs_stream):
+                self._control.request("land")
+            elif mode in HOLD_MODES or (mode is FlightMode.OFFBOARD and not needs_stream):
                 self._control.hold_here()
             else:
                 self._control.climb_to_m = None
@@ -301,13 +303,13 @@ class Flight:
     def _begin_mission_on_ground(self) -> None:
         self.mission.start()
         z_m = self.mission.takeoff_height_m(self._state)
-        takeoff_m = self._state.home_or_here_m[2] + self._parameters["takeoff_altitude_m"]
+        takeoff_m = self._state.home_or_current_m[2] + self._parameters["takeoff_altitude_m"]
         self._control.climb(takeoff_m if z_m is None else z_m)
 
-    def _stand(self, text: str) -> None:
+    def _end_flight(self, text: str) -> None:
         self._control.release()
         self._is_armed = False
-        if self.mode in OVER_ON_GROUND or (self.mode is FlightMode.OFFBOARD and self._personality.is_px4):
+        if self.mode in GROUND_ENDING_MODES or (self.mode is FlightMode.OFFBOARD and self._personality.is_px4):
             self.mode = self._personality.first_mode
         self._report(Severity.INFO, text)
 
@@ -321,7 +323,7 @@ class FlightControl:
     Attributes:
         target: target being held; None while nothing is sent.
         climb_to_m: z in W at which the climb under way ends; None without a climb.
-        asked: mode that the firmware has yet to enter, and when it was requested.
+        pending_mode: mode that the firmware has yet to enter, and when it was requested.
     """
 
     def __init__(self, parameters: Parameters, state: VehicleState, sender: CommandSender, course: Course) -> None:
@@ -329,16 +331,16 @@ class FlightControl:
         self._state = state
         self._sender = sender
         self._course = course
-        self._asked: tuple[Target, Cruise] | None = None  # target and speeds that the course follows
+        self._course_request: tuple[Target, Cruise] | None = None  # target and speeds that the course follows
         self.target: Target | TiltTarget | None = None
         self.climb_to_m: float | None = None
-        self.asked: tuple[Literal["takeoff", "land"], int] | None = None
+        self.pending_mode: tuple[Literal["takeoff", "land"], int] | None = None
         self._is_pending = False  # whether a new target could not be sent at once
-        self._allowed = BURST
+        self._allowance = BURST_MAX
         self._sent_ns = 0
 
     def advance(self) -> None:
-        self._allowed = min(BURST, self._allowed + 1)
+        self._allowance = min(BURST_MAX, self._allowance + 1)
 
     @property
     def is_moving(self) -> bool:
@@ -352,7 +354,7 @@ class FlightControl:
         """Hold a target from now on, and send it at once, unless a climb under way has to end first."""
         self.target = target
         if self._state.is_steerable and self.climb_to_m is None:
-            self._is_pending = self._allowed <= BURST // 10  # the rest is reserved for repetitions
+            self._is_pending = self._allowance <= BURST_MAX // 10  # the rest is reserved for repetitions
             if not self._is_pending:
                 self._send()
 
@@ -366,7 +368,7 @@ class FlightControl:
         """Climb or take off vertically to z in W."""
         self.target, self.climb_to_m = None, z_m
         if not self._state.is_airborne:
-            self.ask("takeoff")
+            self.request("takeoff")
 
     def continue_climb(self) -> bool:
         """Continue a climb; return whether it has just ended."""
@@ -376,35 +378,39 @@ class FlightControl:
         if self.target is None:
             x, y, _ = self._state.position_m
             self.target = Target((x, y, z_m))
-        if abs(self._state.position_m[2] - z_m) >= ARRIVED_M:
+        if abs(self._state.position_m[2] - z_m) >= CLIMB_TOLERANCE_M:
             return False
         self.climb_to_m = None
         return True
 
-    def ask(self, mode: Literal["takeoff", "land"]) -> None:
+    def request(self, mode: Literal["takeoff", "land"]) -> None:
         """Request a mode from the firmware; the request is repeated only if the firmware does not respond."""
-        if self.asked is None or self.asked[0] != mode or self._state.t_ns - self.asked[1] > ANSWER_NS:
-            self.asked = mode, self._state.t_ns
+        if (
+            self.pending_mode is None
+            or self.pending_mode[0] != mode
+            or self._state.t_ns - self.pending_mode[1] > RESPONSE_TIMEOUT_NS
+        ):
+            self.pending_mode = mode, self._state.t_ns
             if mode == "land":
-                self._let_go()
+                self._clear_target()
             self.send_mode(mode)
 
     def send_mode(self, mode: ModeName) -> None:
-        self._allowed -= 1
+        self._allowance -= 1
         self._sender.mode(self._state.t_ns, mode)
 
     def is_takeoff_overdue(self) -> bool:
         """Return whether the drone is still on the ground although a take-off was requested."""
-        if self.asked is None or self.asked[0] != "takeoff" or self._state.is_airborne:
+        if self.pending_mode is None or self.pending_mode[0] != "takeoff" or self._state.is_airborne:
             return False
-        return self._state.t_ns - self.asked[1] > ANSWER_NS
+        return self._state.t_ns - self.pending_mode[1] > RESPONSE_TIMEOUT_NS
 
     def release(self) -> None:
-        self.asked = None
-        self._let_go()
+        self.pending_mode = None
+        self._clear_target()
 
-    def _let_go(self) -> None:
-        self.target = self.climb_to_m = self._asked = None
+    def _clear_target(self) -> None:
+        self.target = self.climb_to_m = self._course_request = None
         self._course.leave()
 
     def has_arrived(self) -> bool:
@@ -413,7 +419,7 @@ class FlightControl:
 
     def send_due(self) -> None:
         age_ns = self._state.t_ns - self._sent_ns
-        if isinstance(self.target, Target) and self.target.position_m != NOWHERE:
+        if isinstance(self.target, Target) and self.target.position_m != NO_POSITION:
             is_due = age_ns >= STEP_NS
         else:
             is_due = self.target is not None and (age_ns >= REPEAT_NS or self._is_pending)
@@ -423,25 +429,25 @@ class FlightControl:
     def _send(self) -> None:
         target, t_ns = self.target, self._state.t_ns
         self._sent_ns, self._is_pending = t_ns, False
-        self._allowed -= 1
+        self._allowance -= 1
         if isinstance(target, Target):
             frame = "heading" if target.along_heading else "world"
             self._sender.velocity(t_ns, *self._velocity(target), frame)
         elif target is not None:
-            self._asked = None
+            self._course_request = None
             self._course.leave()
             self._sender.attitude(t_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)
 
     def _velocity(self, target: Target) -> tuple[Vector, float]:
         """Return the velocity [m/s], in the axes of the target, and the yaw rate [rad/s] that lead to the target."""
-        speeds, (t_s, here, moving) = self._parameters.speeds, self._motion()
-        level = min(target.speed_m_s or math.inf, speeds.horizontal_m_s)
-        asked = target, speeds._replace(horizontal_m_s=level)
-        if asked != self._asked:
+        speeds, (t_s, position, rates) = self._parameters.speeds, self._motion()
+        horizontal_m_s = min(target.speed_m_s or math.inf, speeds.horizontal_m_s)
+        course_request = target, speeds._replace(horizontal_m_s=horizontal_m_s)
+        if course_request != self._course_request:
             goal, rate = (*target.position_m, target.yaw_rad), (*target.velocity_m_s, target.yaw_rate_rad_s)
-            self._course.send(goal, t_s, here, moving, rate, asked[1])
-            self._asked = asked
-        return self._course.velocity(t_s, here, moving)
+            self._course.send(goal, t_s, position, rates, rate, course_request[1])
+            self._course_request = course_request
+        return self._course.velocity(t_s, position, rates)
 
     def _motion(self) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
         """Return simulated time [s], position and heading, and their rates; the yaw rate counts as 0."""

@@ -17,9 +17,9 @@ from zsim_bridges.mavlink.dialect import SensorBit
 from zsim_bridges.vehicle_links.drone_link import has_attitude
 
 ESTIMATE_AGE_MAX_NS = 500_000_000  # ns; an older estimate is not used
-SAMPLES_MISSED = 5  # periods without a sample after which a sensor counts as failed
+MISSED_SAMPLES_MAX = 5  # periods without a sample after which a sensor counts as failed
 LOW_BATTERY_PERCENT = 20.0  # above BAT_CRIT_THR and the like, so that the pilot is warned before these act
-OFF_THE_GROUND = ("taking_off", "hovering", "flying", "landing")
+AIRBORNE_STATES = ("taking_off", "hovering", "flying", "landing")
 SENSORS = {
     "imu": SensorBit.GYRO | SensorBit.ACCEL,
     "mag": SensorBit.MAG,
@@ -29,9 +29,9 @@ SENSORS = {
     "flow": SensorBit.FLOW,
 }
 ALL_HEALTHY = SensorBit(sum(SensorBit))
-PLACE_MAX_M = 1e6  # m; positions beyond this are refused
+POSITION_MAX_M = 1e6  # m; positions beyond this are refused
 Axes = tuple[float | None, float | None, float | None]
-NOWHERE: Axes = (None, None, None)
+NO_POSITION: Axes = (None, None, None)
 
 
 class VehicleState:
@@ -56,13 +56,13 @@ class VehicleState:
         self.is_estimated = False
         self.sigma_m = (0.0, 0.0)
         self.samples: dict[str, Any] = {}
-        self._arrived: dict[str, list[Any]] = {}
+        self._new_samples: dict[str, list[Any]] = {}
         self.home_m: Vector | None = None
         self.origin = (origin.latitude_deg, origin.longitude_deg, origin.height_m)
         self._anchor = anchor(*self.origin)
         self._estimate_ns = -ESTIMATE_AGE_MAX_NS - 1
         self._silence_max_ns = {
-            name: round(1e9 * SAMPLES_MISSED / getattr(drone.sensors, name).rate_hz) for name in SENSORS
+            name: round(1e9 * MISSED_SAMPLES_MAX / getattr(drone.sensors, name).rate_hz) for name in SENSORS
         }
 
     def update(self, name: str, message: Any) -> None:
@@ -85,21 +85,21 @@ class VehicleState:
                     self.position_m, self.velocity_m_s = message.position_m, message.velocity_m_s
                     self.q_WB = message.orientation_wxyz
                     variances = message.covariance
-                    level, up = max(0.0, variances[0] + variances[7]), max(0.0, variances[14])
-                    self.sigma_m = math.sqrt(level / 2.0), math.sqrt(up)
+                    horizontal, vertical = max(0.0, variances[0] + variances[7]), max(0.0, variances[14])
+                    self.sigma_m = math.sqrt(horizontal / 2.0), math.sqrt(vertical)
             case _:
                 self.samples[name] = message
-                self._arrived.setdefault(name, []).append(message)
+                self._new_samples.setdefault(name, []).append(message)
                 if isinstance(message, messages.Imu):
                     self.rate_rad_s = message.gyro_rad_s
 
-    def take_arrived(self) -> dict[str, list[Any]]:
-        arrived, self._arrived = self._arrived, {}
-        return arrived
+    def take_new_samples(self) -> dict[str, list[Any]]:
+        samples, self._new_samples = self._new_samples, {}
+        return samples
 
     @property
     def is_airborne(self) -> bool:
-        return self.status is not None and self.status.state in OFF_THE_GROUND
+        return self.status is not None and self.status.state in AIRBORNE_STATES
 
     @property
     def is_steerable(self) -> bool:
@@ -138,8 +138,8 @@ class VehicleState:
 
     def to_global(self, position_m: Vector) -> Vector:
         """Return latitude [deg], longitude [deg] and ellipsoidal height [m] of a point in W."""
-        (place,) = geodetic(np.array([position_m]), *self._anchor).tolist()
-        return place[0], place[1], place[2]
+        (geodetic_point,) = geodetic(np.array([position_m]), *self._anchor).tolist()
+        return geodetic_point[0], geodetic_point[1], geodetic_point[2]
 
     def to_local(self, latitude_deg: float, longitude_deg: float, height_m: float) -> Vector:
         """Return the position in W [m] of a geodetic point."""
@@ -147,14 +147,14 @@ class VehicleState:
         return x, y, z
 
     @property
-    def home_or_here_m(self) -> Vector:
+    def home_or_current_m(self) -> Vector:
         """Home in W; the current position until home is known."""
         return self.home_m or self.position_m
 
     @property
     def altitude_m(self) -> float:
         """Height above home."""
-        return self.position_m[2] - self.home_or_here_m[2]
+        return self.position_m[2] - self.home_or_current_m[2]
 
     @property
     def rpy_ned_rad(self) -> Vector:
@@ -175,7 +175,7 @@ class Target(NamedTuple):
         speed_m_s: limit of the horizontal speed; None for the vehicle's own.
     """
 
-    position_m: Axes = NOWHERE
+    position_m: Axes = NO_POSITION
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
     yaw_rad: float | None = None
     yaw_rate_rad_s: float = 0.0
@@ -195,5 +195,5 @@ class TiltTarget(NamedTuple):
     yaw_rate_rad_s: float
 
 
-def is_place(position_m: Axes) -> bool:
-    return all(p is None or (math.isfinite(p) and abs(p) < PLACE_MAX_M) for p in position_m)
+def is_valid_position(position_m: Axes) -> bool:
+    return all(p is None or (math.isfinite(p) and abs(p) < POSITION_MAX_M) for p in position_m)

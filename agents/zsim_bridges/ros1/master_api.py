@@ -15,13 +15,13 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from zsim.errors import RunError
 
-TIMEOUT_S = 3.0  # time limit of one call
+CALL_TIMEOUT_S = 3.0  # time limit of one call
 BODY_MAX = 1_000_000  # size limit of a request [bytes]
-DONE = 1  # code of a successful answer
+SUCCESS = 1  # code of a successful answer
 DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's default
 DEFAULT_PORT = 11311
 CHECK_S = 1.0  # wall time between checks that the master still has the registration
-UNREGISTER_S = 2.0  # time limit for unregistering
+UNREGISTER_TIMEOUT_S = 2.0  # time limit for unregistering
 
 
 class ApiError(Exception):
@@ -35,7 +35,7 @@ CALL_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error, ExpatErr
 class _Transport(xmlrpc.client.Transport):
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
-        connection.timeout = TIMEOUT_S
+        connection.timeout = CALL_TIMEOUT_S
         return connection
 
 
@@ -50,7 +50,7 @@ def call_api(uri: str, method: str, *arguments: Any) -> Any:
     if not isinstance(answer, list) or len(answer) != 3:
         raise ApiError(f"{uri}: {method} answers no [code, text, value]")
     code, text, value = answer
-    if code != DONE:
+    if code != SUCCESS:
         raise ApiError(f"{uri}: {method}: {text}")
     return value
 
@@ -154,15 +154,15 @@ class Registration:
     def close(self) -> None:
         """Unregister, if the master can be reached."""
         self._closed.set()
-        self._thread.join(2 * TIMEOUT_S)
+        self._thread.join(2 * CALL_TIMEOUT_S)
         if not self._may_be_registered:
             return
-        entry, until_s = self._entry, time.monotonic() + UNREGISTER_S
+        entry, deadline_s = self._entry, time.monotonic() + UNREGISTER_TIMEOUT_S
         calls = [("unregisterService", service, entry.service_uri) for service in entry.services]
         calls += [("unregisterSubscriber", topic, entry.slave_uri) for topic, _ in entry.subscribed]
         calls += [("unregisterPublisher", topic, entry.slave_uri) for topic, _ in entry.published]
         for call in calls:
-            if time.monotonic() > until_s:
+            if time.monotonic() > deadline_s:
                 return
             try:
                 self._call(*call)
@@ -172,18 +172,18 @@ class Registration:
                 return  # the master is gone, and its registrations with it
 
     def _run(self) -> None:
-        since_s, next_say_s = time.monotonic(), 0.0
+        last_success_s, next_report_s = time.monotonic(), 0.0
         while not self._closed.is_set():
             try:
                 self._registered = self._registered and self._is_registered()
                 if not self._registered and not self._closed.is_set():
                     self._register()
-                since_s, next_say_s = time.monotonic(), 0.0
+                last_success_s, next_report_s = time.monotonic(), 0.0
             except CALL_ERRORS as error:
                 self._registered = False
-                waited_s = time.monotonic() - since_s
-                if waited_s >= next_say_s:
-                    next_say_s = max(2 * next_say_s, 1.0)
+                waited_s = time.monotonic() - last_success_s
+                if waited_s >= next_report_s:
+                    next_report_s = max(2 * next_report_s, 1.0)
                     self._say(f"waiting for a ROS master on {self._uri} ({waited_s:.0f} s): {error}")
             self._closed.wait(CHECK_S)
 
@@ -206,9 +206,9 @@ class Registration:
         for topic, kind in entry.subscribed:
             self._on_publishers(topic, self._call("registerSubscriber", topic, kind, entry.slave_uri))
         self._registered = True
-        again = "registered again" if self._was_registered else "registered"
+        status_text = "registered again" if self._was_registered else "registered"
         self._was_registered = True
-        self._say(f"{entry.caller}: {again} with the ROS master on {self._uri}")
+        self._say(f"{entry.caller}: {status_text} with the ROS master on {self._uri}")
 
     def _call(self, method: str, *arguments: Any) -> Any:
         return call_api(self._uri, method, self._entry.caller, *arguments)

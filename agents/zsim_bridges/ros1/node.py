@@ -25,13 +25,13 @@ from zsim_bridges.ros1.master_api import GraphEntry, Registration
 
 Answer = list[Any]
 OK, ERROR, REFUSED = 1, -1, 0
-EVERYWHERE, LOOPBACK = "0.0.0.0", "127.0.0.1"
+ALL_INTERFACES, LOOPBACK = "0.0.0.0", "127.0.0.1"
 STOP_POLL_S = 0.1  # period at which the XML-RPC server checks for its shutdown
 RETRY_S, RETRY_MAX_S = 0.5, 8.0  # first and longest pause between attempts to reach a publisher; it doubles each time
 DONE, FAILED = b"\x01", b"\x00"  # first byte of a service's response
 HEADER_MAX = 1_000_000  # bytes; the definitions of the largest messages take about 10 000
 FRAME_MAX = 1_000_000  # bytes; other nodes send only commands, which are short
-HANDSHAKE_S = 10.0  # time limit for connecting, and for the arrival of a header
+HANDSHAKE_TIMEOUT_S = 10.0  # time limit for connecting, and for the arrival of a header
 ANY_TYPE = "*"  # md5sum of a node that accepts any type
 CONNECTION_ERRORS = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
 """Errors that end a connection: the peer is gone or silent, or does not speak TCPROS."""
@@ -70,24 +70,24 @@ class Ros1Node:
         """Subscribe to a topic, before `running`. `callback` raises ValueError for a message that it refuses."""
         self.subscribed[topic] = SubscribedTopic(topic_type_of(topic, kind), self.name, callback, self._say)
 
-    def serve(self, name: str, act: Callable[[], str | None]) -> None:
-        """Offer a std_srvs/Empty service, before `running`. `act` returns why it failed, None if it succeeded."""
-        self.services[name] = EmptyService(EMPTY_SERVICE._replace(name=name), act)
+    def serve(self, name: str, action: Callable[[], str | None]) -> None:
+        """Offer a std_srvs/Empty service, before `running`. `action` returns why it failed, None if it succeeded."""
+        self.services[name] = EmptyService(EMPTY_SERVICE._replace(name=name), action)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Take part in the ROS graph while the context is open."""
         loop = asyncio.get_running_loop()
 
-        def update_publishers(topic: str, uris: list[str], only: bool = True) -> None:
+        def update_publishers(topic: str, uris: list[str], is_complete: bool = True) -> None:
             with contextlib.suppress(RuntimeError):  # raised if the loop is closed
-                loop.call_soon_threadsafe(self.subscribed[topic].update, uris, only)
+                loop.call_soon_threadsafe(self.subscribed[topic].update, uris, is_complete)
 
-        local = self.host == "localhost" or self.host.startswith("127.")
-        bound = LOOPBACK if local else EVERYWHERE
-        server = await asyncio.start_server(self._on_connection, bound, 0)
+        is_local = self.host == "localhost" or self.host.startswith("127.")
+        bind_address = LOOPBACK if is_local else ALL_INTERFACES
+        server = await asyncio.start_server(self._on_connection, bind_address, 0)
         port: int = server.sockets[0].getsockname()[1]
-        api = master_api.XmlRpcServer(bound, SlaveApi(self, port, update_publishers))
+        api = master_api.XmlRpcServer(bind_address, SlaveApi(self, port, update_publishers))
         threading.Thread(target=api.serve_forever, args=(STOP_POLL_S,), name="slave API", daemon=True).start()
         entry = GraphEntry(
             self.name,
@@ -128,9 +128,9 @@ class Ros1Node:
         try:
             with contextlib.suppress(*CONNECTION_ERRORS):
                 header = await read_header(reader)
-                by_name = self.services if "service" in header else self.published
+                endpoints = self.services if "service" in header else self.published
                 name = header.get("service") or header.get("topic", "")
-                endpoint = by_name.get(name)
+                endpoint = endpoints.get(name)
                 if endpoint is None:
                     refusal = f"[{self.name}] has no topic or service [{name[:200]}]"
                 else:
@@ -179,7 +179,11 @@ class SlaveApi:
         """Return all connections, each as number, peer, direction, transport, topic, and whether it is up."""
         links = [(link.caller, "o", topic) for topic, p in self._node.published.items() for link in list(p.links)]
         links += [(uri, "i", topic) for topic, s in self._node.subscribed.items() for uri in list(s.connected)]
-        return [OK, "", [[n, other, way, "TCPROS", topic, True] for n, (other, way, topic) in enumerate(links)]]
+        return [
+            OK,
+            "",
+            [[n, peer, direction, "TCPROS", topic, True] for n, (peer, direction, topic) in enumerate(links)],
+        ]
 
     def getBusStats(self, caller: str) -> Answer:
         """Return the bytes sent per topic, and for each connection its number, bytes, messages, and whether it is up.
@@ -223,11 +227,11 @@ class PublishedTopic:
         self.links: list[SubscriberLink] = []
         self.sent = 0
 
-    def publish(self, make: Callable[[int], Any]) -> None:
-        """Send what `make` returns for a sequence number; `make` is called only if there are subscribers."""
+    def publish(self, make_message: Callable[[int], Any]) -> None:
+        """Send what `make_message` returns for a sequence number; it is called only if there are subscribers."""
         if not self.links:
             return
-        framed = frame(serialize(self.topic_type.type, make(self.sent)))
+        framed = frame(serialize(self.topic_type.type, make_message(self.sent)))
         self.sent += 1
         for link in self.links:
             link.put(framed)
@@ -253,7 +257,7 @@ class SubscriberLink:
     def __init__(self, writer: StreamWriter, caller: str, queue_size: int) -> None:
         self._writer = writer
         self._queue: deque[bytes] = deque(maxlen=queue_size)
-        self._news = asyncio.Event()
+        self._message_queued = asyncio.Event()
         self.caller = caller
         self.sent = 0
         self.lost = 0
@@ -261,14 +265,14 @@ class SubscriberLink:
     def put(self, framed: bytes) -> None:
         self.lost += len(self._queue) == self._queue.maxlen
         self._queue.append(framed)
-        self._news.set()
+        self._message_queued.set()
 
     async def run(self) -> None:
         """Send queued messages until the connection ends."""
         with contextlib.suppress(*CONNECTION_ERRORS):
             while True:
-                await self._news.wait()
-                self._news.clear()
+                await self._message_queued.wait()
+                self._message_queued.clear()
                 while self._queue:
                     framed = self._queue.popleft()
                     self._writer.write(framed)
@@ -277,11 +281,11 @@ class SubscriberLink:
 
 
 class EmptyService:
-    """A service of type std_srvs/Empty; `act` returns why a request failed, None if it succeeded."""
+    """A service of type std_srvs/Empty; `action` returns why a request failed, None if it succeeded."""
 
-    def __init__(self, topic_type: "TopicType", act: Callable[[], str | None]) -> None:
+    def __init__(self, topic_type: "TopicType", action: Callable[[], str | None]) -> None:
         self.topic_type = topic_type
-        self.act = act
+        self.action = action
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
         """Serve a client with a matching header until it disconnects; `caller` is this node's name."""
@@ -293,7 +297,7 @@ class EmptyService:
         expects_request = header.get("probe") != "1"
         while expects_request:
             request = await read_frame(reader)
-            reason = f"the request has {len(request)} bytes; must have none" if request else self.act()
+            reason = f"the request has {len(request)} bytes; must have none" if request else self.action()
             writer.write(FAILED + frame(reason.encode()) if reason else DONE + frame(b""))
             await writer.drain()
             expects_request = header.get("persistent") == "1"
@@ -317,21 +321,21 @@ class SubscribedTopic:
         self.callback = callback
         self._caller = caller
         self._say = say
-        self._wanted: set[str] = set()
+        self._publishers: set[str] = set()
         self._tasks: dict[str, Task[None]] = {}
         self._reported: set[str] = set()
         self.connected: dict[str, str] = {}
 
-    def update(self, publishers: Iterable[str], only: bool = True) -> None:
-        """Follow publishers, given by the URIs of their slave APIs: `only` these, or these in addition.
+    def update(self, publishers: Iterable[str], is_complete: bool = True) -> None:
+        """Follow publishers, given by the URIs of their slave APIs: only these if `is_complete`, otherwise these too.
 
         Messages that a publisher sent before it left the graph may still be in transit, so its connection is read to
         the end.
         """
-        self._wanted = set(publishers) | (set() if only else self._wanted)
-        for uri in self._wanted - set(self._tasks):
+        self._publishers = set(publishers) | (set() if is_complete else self._publishers)
+        for uri in self._publishers - set(self._tasks):
             self._tasks[uri] = asyncio.create_task(self._follow(uri))
-        for uri in set(self._tasks) - self._wanted - set(self.connected):
+        for uri in set(self._tasks) - self._publishers - set(self.connected):
             self._tasks.pop(uri).cancel()
 
     async def close(self) -> None:
@@ -342,7 +346,7 @@ class SubscribedTopic:
 
     async def _follow(self, uri: str) -> None:
         pause_s = RETRY_S
-        while uri in self._wanted:
+        while uri in self._publishers:
             try:
                 async with self._connection(uri) as reader:
                     pause_s = RETRY_S
@@ -356,7 +360,7 @@ class SubscribedTopic:
                 self._report_once(uri, str(error))
                 return
             except (*CONNECTION_ERRORS, *master_api.CALL_ERRORS):
-                if uri in self._wanted:
+                if uri in self._publishers:
                     await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, RETRY_MAX_S)
         del self._tasks[uri]
@@ -368,7 +372,7 @@ class SubscribedTopic:
         protocol, host, port = await asyncio.to_thread(master_api.call_api, uri, "requestTopic", *arguments)
         if protocol != "TCPROS":
             raise RefusedError(f"protocol is {str(protocol)[:20]!r}; must be TCPROS")
-        reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), HANDSHAKE_S)
+        reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), HANDSHAKE_TIMEOUT_S)
         try:
             configure(writer, True)
             writer.write(encode_header(subscriber_header(self.topic_type, self._caller)))
@@ -416,10 +420,10 @@ def decode_header(body: bytes) -> dict[str, str]:
     fields: dict[str, str] = {}
     start = 0
     while start < len(body):
-        first = start + _LENGTH.size
-        if first > len(body) or (end := first + _LENGTH.unpack_from(body, start)[0]) > len(body):
+        field_start = start + _LENGTH.size
+        if field_start > len(body) or (end := field_start + _LENGTH.unpack_from(body, start)[0]) > len(body):
             raise ValueError("a field is longer than the header")
-        key, separator, value = body[first:end].decode(errors="replace").partition("=")
+        key, separator, value = body[field_start:end].decode(errors="replace").partition("=")
         if not separator:
             raise ValueError(f"a field is {key[:40]!r}; must be key=value")
         fields[key] = value
@@ -480,14 +484,14 @@ async def read_header(reader: StreamReader) -> dict[str, str]:
         ValueError: the header is malformed.
         TimeoutError: it does not arrive within HANDSHAKE_S.
     """
-    return decode_header(await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_S))
+    return decode_header(await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_TIMEOUT_S))
 
 
 def configure(writer: StreamWriter, nodelay: bool) -> None:
     """Set whether small messages are sent at once, and enable keep-alives to detect a host that is gone."""
-    raw: socket.socket = writer.get_extra_info("socket")
-    raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, nodelay)
-    raw.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock: socket.socket = writer.get_extra_info("socket")
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, nodelay)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
 
 NAVDATA = """

@@ -43,13 +43,13 @@ NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags recognise
     **{f"tags_{what}": np.zeros(0, np.uint32) for what in ("type", "xc", "yc", "width", "height")},
     **{f"tags_{what}": np.zeros(0, np.float32) for what in ("orientation", "distance")},
 }
-UNKNOWN = np.zeros(9)
+UNKNOWN_COVARIANCE = np.zeros(9)
 DRIVER_QUEUE = 200  # messages, as in the driver's publishers
 CAMERA_QUEUE = 10  # images, as in the driver's image publishers
-QUEUE = 100  # messages, in all other publishers
+DEFAULT_QUEUE = 100  # messages, in all other publishers
 NEARLY_ZERO = 1e-6  # magnitude below which a component of cmd_vel counts as zero; the driver's _EPS
-COMMANDABLE = ("taking_off", *AIRBORNE)
-Part = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
+COMMANDABLE_STATES = ("taking_off", *AIRBORNE)
+FramePose = tuple[str, Vector, Quaternion]  # frame of a part, and its pose in the body
 Navdata = message_class("ardrone_autonomy/Navdata")
 
 
@@ -95,14 +95,16 @@ class Ros1Bridge(PictureServer):
     def __init__(self, link: Session, info: Info, observer: Participant, node: Ros1Node, say: Say) -> None:
         super().__init__(link, info, observer, say, options=None)
         self._node = node
-        drone_of: dict[str, str] = {}
+        drone_by_name: dict[str, str] = {}
         for drone in info.drones:
             name = ros1_name(drone.name)
-            if name in drone_of:
-                raise RunError(f"drones {drone_of[name]!r} and {drone.name!r} are both {name!r} in ROS; rename one")
-            drone_of[name] = drone.name
-        self._clock = node.publish("/clock", "rosgraph_msgs/Clock", QUEUE)
-        tf = node.publish("/tf", "tf2_msgs/TFMessage", QUEUE * len(info.drones))
+            if name in drone_by_name:
+                raise RunError(
+                    f"drones {drone_by_name[name]!r} and {drone.name!r} are both {name!r} in ROS; rename one"
+                )
+            drone_by_name[name] = drone.name
+        self._clock = node.publish("/clock", "rosgraph_msgs/Clock", DEFAULT_QUEUE)
+        tf = node.publish("/tf", "tf2_msgs/TFMessage", DEFAULT_QUEUE * len(info.drones))
         drones = scenario_file.from_text(info.scenario).drones
         self._drones = {drone.name: DroneTopics(node, drone, observer.name, link.put, tf) for drone in drones}
 
@@ -113,7 +115,9 @@ class Ros1Bridge(PictureServer):
         await stack.enter_async_context(self._node.running())
 
     def wanted_pictures(self) -> list[str]:
-        return [keys.camera(name, camera) for name, drone in self._drones.items() for camera in drone.cameras.wanted()]
+        return [
+            keys.camera(name, camera) for name, drone in self._drones.items() for camera in drone.cameras.subscribed()
+        ]
 
     def on_picture(self, key: str, payload: bytes) -> None:
         self.forward(key, payload)
@@ -131,7 +135,7 @@ class Ros1Bridge(PictureServer):
             if isinstance(message, CameraImage):
                 drone.cameras.publish(keys.leaf(key), message)
             elif isinstance(message, CameraInfo):
-                drone.cameras.learn(leaf.split("/")[1], message)
+                drone.cameras.store_info(leaf.split("/")[1], message)
             elif message is not None:
                 try:
                     drone.publish(message)
@@ -178,8 +182,8 @@ class DroneTopics:
         self._imu = node.publish(f"/{name}/ardrone/imu", "sensor_msgs/Imu", DRIVER_QUEUE)
         self._mag = node.publish(f"/{name}/ardrone/mag", "geometry_msgs/Vector3Stamped", DRIVER_QUEUE)
         self._odometry = node.publish(f"/{name}/ardrone/odometry", "nav_msgs/Odometry", DRIVER_QUEUE)
-        self._fix = node.publish(f"/{name}/fix", "sensor_msgs/NavSatFix", QUEUE)
-        self._truth = node.publish(f"/{name}/ground_truth/state", "nav_msgs/Odometry", QUEUE)
+        self._fix = node.publish(f"/{name}/fix", "sensor_msgs/NavSatFix", DEFAULT_QUEUE)
+        self._truth = node.publish(f"/{name}/ground_truth/state", "nav_msgs/Odometry", DEFAULT_QUEUE)
         self._tf = tf
         node.subscribe(f"/{name}/cmd_vel", "geometry_msgs/Twist", commands.on_cmd_vel)
         node.subscribe(f"/{name}/ardrone/takeoff", "std_msgs/Empty", lambda _: commands.send_mode("takeoff"))
@@ -236,7 +240,7 @@ class DriverCommands:
             ValueError: a component is not finite.
         """
         tilt = tilt_of(twist)
-        if self._status is not None and self._status.state in COMMANDABLE:
+        if self._status is not None and self._status.state in COMMANDABLE_STATES:
             self._tilt, self._sent_ns = tilt, None
 
     def reset(self) -> None:
@@ -250,10 +254,10 @@ class DriverCommands:
 
     def on_status(self, status: flight_messages.Status) -> None:
         self._status = status
-        if status.state not in COMMANDABLE:
+        if status.state not in COMMANDABLE_STATES:
             self._tilt = None
-        late = self._sent_ns is None or status.t_ns - self._sent_ns >= REPEAT_NS
-        if self._tilt is not None and late and status.state in AIRBORNE:
+        is_due = self._sent_ns is None or status.t_ns - self._sent_ns >= REPEAT_NS
+        if self._tilt is not None and is_due and status.state in AIRBORNE:
             self._sent_ns = status.t_ns
             self._sender.tilt(status.t_ns, *self._tilt)
 
@@ -274,8 +278,8 @@ def tilt_of(twist: Any) -> TiltCommand:
     values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
     if not all(map(math.isfinite, values)):
         raise ValueError(f"cmd_vel is {values}; must be finite")
-    shares = (min(1.0, max(-1.0, share)) for share in (linear.x, linear.y, linear.z, angular.z))
-    return TiltCommand(*shares, hover=all(abs(value) < NEARLY_ZERO for value in values))
+    fractions = (min(1.0, max(-1.0, fraction)) for fraction in (linear.x, linear.y, linear.z, angular.z))
+    return TiltCommand(*fractions, hover=all(abs(value) < NEARLY_ZERO for value in values))
 
 
 class CameraTopics:
@@ -294,8 +298,8 @@ class CameraTopics:
             )
 
         self._name = name
-        self._own = {camera: publishers(f"/{name}/ardrone/{camera}") for camera in CAMERAS}
-        self._of_active = publishers(f"/{name}/ardrone")
+        self._camera_topics = {camera: publishers(f"/{name}/ardrone/{camera}") for camera in CAMERAS}
+        self._active_topics = publishers(f"/{name}/ardrone")
         self._infos: dict[str, CameraInfo] = {}
         self.active = CAMERAS[0]
         node.serve(f"/{name}/ardrone/togglecam", self._toggle)
@@ -304,24 +308,28 @@ class CameraTopics:
         self.active = CAMERAS[(CAMERAS.index(self.active) + 1) % len(CAMERAS)]
 
     def _topics(self, camera: str) -> list[tuple[PublishedTopic, PublishedTopic]]:
-        return [self._own[camera], self._of_active] if camera == self.active else [self._own[camera]]
+        return (
+            [self._camera_topics[camera], self._active_topics]
+            if camera == self.active
+            else [self._camera_topics[camera]]
+        )
 
-    def wanted(self) -> Iterator[str]:
+    def subscribed(self) -> Iterator[str]:
         for camera in CAMERAS:
             if any(image.links or info.links for image, info in self._topics(camera)):
                 yield camera
 
-    def learn(self, camera: str, info: CameraInfo) -> None:
+    def store_info(self, camera: str, info: CameraInfo) -> None:
         self._infos[camera] = info
 
     def publish(self, camera: str, image: CameraImage) -> None:
         frame, info = camera_frame(self._name, camera), self._infos.get(camera)
-        for of_images, of_infos in self._topics(camera):
-            of_images.publish(lambda seq: ros.compressed_image(header(seq, image.t_sample_ns, frame), image))
+        for image_topic, info_topic in self._topics(camera):
+            image_topic.publish(lambda seq: ros.compressed_image(header(seq, image.t_sample_ns, frame), image))
             if info is not None:
-                of_infos.publish(partial(camera_info, info=info, t_ns=image.t_sample_ns, frame=frame))
+                info_topic.publish(partial(camera_info, info=info, t_ns=image.t_sample_ns, frame=frame))
 
-    def poses(self) -> list[Part]:
+    def poses(self) -> list[FramePose]:
         """Return frame, position and orientation in the body of each camera whose calibration is known."""
         return [
             (camera_frame(self._name, camera), info.position_m, info.orientation_wxyz)
@@ -366,7 +374,12 @@ def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
 
 def imu(seq: int, sample: messages.Imu, attitude: Quaternion, frames: DriverFrames) -> Any:
     """Return ardrone/imu: attitude, rate and specific force in B, the latter (0, 0, 9.8) m/s^2 at rest."""
-    return ros.imu(header(seq, sample.t_sample_ns, frames.base), sample, attitude, (UNKNOWN, UNKNOWN, UNKNOWN))
+    return ros.imu(
+        header(seq, sample.t_sample_ns, frames.base),
+        sample,
+        attitude,
+        (UNKNOWN_COVARIANCE, UNKNOWN_COVARIANCE, UNKNOWN_COVARIANCE),
+    )
 
 
 def mag(seq: int, sample: messages.Mag, frames: DriverFrames) -> Any:
@@ -388,19 +401,21 @@ def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     assert state.status is not None
     velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
     rate = state.imu.gyro_rad_s if state.imu else (0.0, 0.0, 0.0)
-    head = header(seq, state.status.t_ns, frames.odom)
-    return ros.odometry(head, frames.base, ros.pose(state.position_m, state.attitude), ros.twist(velocity, rate))
+    stamped_header = header(seq, state.status.t_ns, frames.odom)
+    return ros.odometry(
+        stamped_header, frames.base, ros.pose(state.position_m, state.attitude), ros.twist(velocity, rate)
+    )
 
 
 def ground_truth(seq: int, truth: flight_messages.Truth, frames: DriverFrames) -> Any:
     """Return the true state like Gazebo's p3d plugin, used by hector_quadrotor and tum_simulator: all of it in W."""
     q = truth.orientation_wxyz
     rate = rotations.rotate(q, truth.angular_velocity_rad_s).tolist()
-    head = header(seq, truth.t_ns, WORLD)
-    return ros.odometry(head, frames.base, ros.pose(truth.position_m, q), ros.twist(truth.velocity_m_s, rate))
+    stamped_header = header(seq, truth.t_ns, WORLD)
+    return ros.odometry(stamped_header, frames.base, ros.pose(truth.position_m, q), ros.twist(truth.velocity_m_s, rate))
 
 
-def transforms(seq: int, state: OnboardState, frames: DriverFrames, parts: Sequence[Part] = ()) -> Any:
+def transforms(seq: int, state: OnboardState, frames: DriverFrames, parts: Sequence[FramePose] = ()) -> Any:
     """Return a drone's `/tf`: odom to base as integrated, world to odom if estimated, and base to its parts."""
     assert state.status is not None
     t_ns = state.status.t_ns

@@ -24,30 +24,30 @@ from rosbags.typesys.store import Typestore
 from zsim.transport.session import Query, RawSample, Session
 
 CDR = "application/cdr"
-_OTHERS = re.compile(r"[^a-z0-9]+")  # each run becomes one underscore, since ROS reserves double ones
+_INVALID_CHARACTERS = re.compile(r"[^a-z0-9]+")  # each run becomes one underscore, since ROS reserves double ones
 TOKEN_SPACE = "@ros2_lv"  # prefix of all tokens; `**` does not match it
 TOKEN_PARTS = 13  # parts of an endpoint's token
 GID_BYTES = 16
-_HEAD = struct.Struct("<qqB")  # sequence number, wall time [ns], length of the gid
-ATTACHMENT_BYTES = _HEAD.size + GID_BYTES
+_ATTACHMENT_HEADER = struct.Struct("<qqB")  # sequence number, wall time [ns], length of the gid
+ATTACHMENT_BYTES = _ATTACHMENT_HEADER.size + GID_BYTES
 
 
-def ros_name(name: str, what: str) -> str:
+def ros_name(name: str, prefix: str) -> str:
     """Return the nearest name valid in ROS: `quad-1.a` becomes `quad_1_a`, and a drone `7` becomes `drone_7`."""
-    bare = _OTHERS.sub("_", name)
-    return f"{what}_{bare}" if bare[0].isdigit() else bare
+    valid_name = _INVALID_CHARACTERS.sub("_", name)
+    return f"{prefix}_{valid_name}" if valid_name[0].isdigit() else valid_name
 
 
-def ros_names(names: Iterable[str], what: str) -> dict[str, str]:
+def ros_names(names: Iterable[str], prefix: str) -> dict[str, str]:
     """Return the ROS name of each name; where several would be equal, the later ones get a number."""
-    ros_name_of: dict[str, str] = {}
+    chosen_names: dict[str, str] = {}
     for name in names:
-        first = chosen = ros_name(name, what)
+        base_name = unique_name = ros_name(name, prefix)
         number = 2
-        while chosen in ros_name_of.values():
-            chosen, number = f"{first.rstrip('_')}_{number}", number + 1
-        ros_name_of[name] = chosen
-    return ros_name_of
+        while unique_name in chosen_names.values():
+            unique_name, number = f"{base_name.rstrip('_')}_{number}", number + 1
+        chosen_names[name] = unique_name
+    return chosen_names
 
 
 class Qos(NamedTuple):
@@ -141,7 +141,7 @@ class Attachment(NamedTuple):
     gid: bytes
 
     def packed(self) -> bytes:
-        return _HEAD.pack(self.sequence, self.wall_ns, GID_BYTES) + self.gid
+        return _ATTACHMENT_HEADER.pack(self.sequence, self.wall_ns, GID_BYTES) + self.gid
 
 
 def attachment_of(data: bytes) -> Attachment:
@@ -150,10 +150,10 @@ def attachment_of(data: bytes) -> Attachment:
     Raises:
         ValueError: the data are not an attachment of rmw_zenoh.
     """
-    if len(data) != ATTACHMENT_BYTES or data[_HEAD.size - 1] != GID_BYTES:
+    if len(data) != ATTACHMENT_BYTES or data[_ATTACHMENT_HEADER.size - 1] != GID_BYTES:
         raise ValueError(f"the attachment has {len(data)} bytes; must have {ATTACHMENT_BYTES}, of rmw_zenoh >= 0.2.4")
-    sequence, wall_ns, _ = _HEAD.unpack_from(data)
-    return Attachment(sequence, wall_ns, data[_HEAD.size :])
+    sequence, wall_ns, _ = _ATTACHMENT_HEADER.unpack_from(data)
+    return Attachment(sequence, wall_ns, data[_ATTACHMENT_HEADER.size :])
 
 
 class RosContext:
@@ -234,9 +234,9 @@ class Ros2Node:
         context.link.declare_queryable(key, reply, complete=True)
         context.link.declare_token(token)
 
-    def _endpoint(self, how: str, name: str, kind: str, qos: Qos) -> tuple[str, str]:
+    def _endpoint(self, endpoint_kind: str, name: str, kind: str, qos: Qos) -> tuple[str, str]:
         """Return the key and the token of a new endpoint."""
-        endpoint = Endpoint(how, name, dds_name(kind), type_hash(kind))
+        endpoint = Endpoint(endpoint_kind, name, dds_name(kind), type_hash(kind))
         token = endpoint_token(self._identity, next(self._context.numbers), endpoint, qos)
         return data_key(self._context.domain, *endpoint[1:]), token
 
@@ -251,7 +251,7 @@ class Publisher:
         self._sent = 0
         self.key = key
         if qos.transient_local:  # later subscribers also receive the last message
-            self._write = lambda payload, attached: context.link.put_cached(key, payload, CDR, attached)
+            self._write = lambda payload, attachment: context.link.put_cached(key, payload, CDR, attachment)
         else:
             self._write = context.link.declare_publisher(key, CDR)
 
@@ -369,12 +369,12 @@ for _name, _texts in SERVICES.items():
 
 def message_class(name: str) -> Any:
     """Return the class of a type, named like `sensor_msgs/msg/Imu` or `std_srvs/srv/Trigger_Response`."""
-    return _store.types[_stored(name)]
+    return _store.types[_rosbags_name(name)]
 
 
 def encode(message: Any, name: str) -> bytes:
     """Return a message in little-endian CDR."""
-    return bytes(_store.serialize_cdr(message, _stored(name), little_endian=True))
+    return bytes(_store.serialize_cdr(message, _rosbags_name(name), little_endian=True))
 
 
 def decode(payload: bytes, name: str) -> Any:
@@ -384,10 +384,10 @@ def decode(payload: bytes, name: str) -> Any:
         ValueError: the payload is not a CDR encoding of this type.
     """
     try:
-        return _store.deserialize_cdr(payload, _stored(name))
+        return _store.deserialize_cdr(payload, _rosbags_name(name))
     except (SerdeError, ValueError, IndexError, MemoryError, OverflowError) as error:
-        why = str(error) or type(error).__name__
-        raise ValueError(f"{len(payload)} bytes are not a CDR encoding of {name} ({why})") from error
+        reason = str(error) or type(error).__name__
+        raise ValueError(f"{len(payload)} bytes are not a CDR encoding of {name} ({reason})") from error
 
 
 @cache
@@ -408,7 +408,7 @@ def type_hash(name: str) -> str:
     store.fielddefs.update(get_types_from_msg(SERVICE_EVENT_INFO, "service_msgs/msg/ServiceEventInfo"))
     request, response, event = f"{name}_Request", f"{name}_Response", f"{name}_Event"
     for part in (request, response):
-        store.fielddefs[part] = _store.fielddefs[_stored(part)]
+        store.fielddefs[part] = _store.fielddefs[_rosbags_name(part)]
     event_fields = [
         ("info", reference("service_msgs/msg/ServiceEventInfo")),
         ("request", (Nodetype.SEQUENCE, (reference(request), 1))),
@@ -421,6 +421,6 @@ def type_hash(name: str) -> str:
 
 
 @cache
-def _stored(name: str) -> str:
+def _rosbags_name(name: str) -> str:
     """Return rosbags' name of a type; rosbags stores requests and responses as messages."""
     return name.replace("/srv/", "/srv/msg/")

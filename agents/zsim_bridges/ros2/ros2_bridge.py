@@ -30,9 +30,9 @@ from zsim_bridges.vehicle_links.drone_link import CommandSender, ModeName
 
 NODE = "zsim"
 POLL_S = 0.1  # period of checks for a stop request
-STATUS_S = 1.0  # time limit for reading a drone's state
-ATTEMPT_S = 1.0  # time limit of one attempt to connect to the ROS router
-LAST_S = 1.0  # time limit for reading a last value; the world answers within milliseconds
+STATUS_TIMEOUT_S = 1.0  # time limit for reading a drone's state
+CONNECT_TIMEOUT_S = 1.0  # time limit of one attempt to connect to the ROS router
+LAST_VALUE_TIMEOUT_S = 1.0  # time limit for reading a last value; the world answers within milliseconds
 SAMPLES_MAX = 2000  # samples waiting to be converted, about a tenth of a second of work
 EMPTY, TRIGGER = "std_msgs/msg/Empty", "std_srvs/srv/Trigger"
 CLUSTER_SERVICES = ("takeoff", "engage", "hold", "rejoin", "land")
@@ -71,21 +71,23 @@ def serve(
     bridge = Ros2Bridge(link, info, observer, say, wall_ns)
     with ExitStack() as stack, closing(bridge):
         ros_link = link.unprefixed() if network.router is None else None
-        entered = False
+        is_advertised = False
         while not observer.end_reason and not stopped():
             if ros_link is None:
                 assert network.router is not None
                 try:
                     ros_link = stack.enter_context(
-                        connection.connect(network.router, "", wait_s=ATTEMPT_S, reader=True, identity=network.identity)
+                        connection.connect(
+                            network.router, "", wait_s=CONNECT_TIMEOUT_S, reader=True, identity=network.identity
+                        )
                     )
                 except NoListenerError:
-                    waits = f"no router of ROS on {network.router} yet, waiting for it; start rmw_zenohd there"
-                    bridge.report_once("router", waits)
-            if ros_link is not None and not entered:
+                    waiting_text = f"no router of ROS on {network.router} yet, waiting for it; start rmw_zenohd there"
+                    bridge.report_once("router", waiting_text)
+            if ros_link is not None and not is_advertised:
                 bridge.advertise_run(RosContext(ros_link, network.domain, wall_ns, bridge.count_refused))
                 say(f"{observer.name}: ROS domain {network.domain} by {network.router or 'the hub of the world'}")
-                entered = True
+                is_advertised = True
             bridge.process(POLL_S)
 
 
@@ -112,9 +114,9 @@ class Ros2Bridge:
     def _on_clock(self, sample: RawSample) -> None:
         self._queue.add_task(partial(self._observer.update_clock, sample.payload))
 
-    def process(self, within_s: float) -> None:
-        """Execute queued tasks and convert samples; wait for the first up to `within_s`."""
-        tasks, queued = self._queue.pop_all(within_s)
+    def process(self, timeout_s: float) -> None:
+        """Execute queued tasks and convert samples; wait for the first up to `timeout_s`."""
+        tasks, queued = self._queue.pop_all(timeout_s)
         start_ns = self._wall_ns()
         for task in tasks:
             task()
@@ -128,8 +130,8 @@ class Ros2Bridge:
 
     def close(self) -> None:
         self._sources.close()
-        for close in self._cleanups:
-            close()
+        for cleanup in self._cleanups:
+            cleanup()
 
     def count_refused(self, name: str, reason: str) -> None:
         """Count a refused message, and report it once per name; callable from any thread."""
@@ -168,8 +170,8 @@ class Ros2Bridge:
                 "land": (EMPTY, partial(commands.send_mode, "land")),
                 "reset": (EMPTY, commands.toggle_emergency),
             }
-            for leaf, (kind, act) in callbacks.items():
-                callback = partial(act, drone)
+            for leaf, (kind, command) in callbacks.items():
+                callback = partial(command, drone)
                 self._cleanups.append(node.subscription(f"/{name}/{leaf}", kind, rmw_zenoh.DEFAULT, callback))
             release = partial(commands.request, keys.CONTROL, "release", {"drone": drone})
             node.service(f"/{name}/release", TRIGGER, release)
@@ -179,16 +181,18 @@ class Ros2Bridge:
             for op in CLUSTER_SERVICES:
                 answer = partial(commands.request, keys.cluster_control(cluster), op, {})
                 node.service(f"/cluster/{name}/{op}", TRIGGER, answer)
-        context.on_subscription(lambda token, alive: self._queue.add_task(partial(self._on_subscription, token, alive)))
-        for own, name in {**names, **self.names.clusters}.items():
-            if own != name:
-                self.report_once(own, f"{own} is called {name} in ROS, which does not allow this name")
+        context.on_subscription(
+            lambda token, is_alive: self._queue.add_task(partial(self._on_subscription, token, is_alive))
+        )
+        for original, name in {**names, **self.names.clusters}.items():
+            if original != name:
+                self.report_once(original, f"{original} is called {name} in ROS, which does not allow this name")
 
     def _advertise(self, node: Ros2Node, run_topics: Iterator[Topic]) -> None:
         for topic in run_topics:
             self._publications[topic.name] = BridgedTopic(topic, node.publisher(topic.name, topic.kind, topic.qos))
 
-    def _on_subscription(self, token: str, alive: bool) -> None:
+    def _on_subscription(self, token: str, is_alive: bool) -> None:
         """Start or stop reading a topic's sources as ROS nodes subscribe or unsubscribe."""
         endpoint = rmw_zenoh.endpoint_of(token)
         publication = self._publications.get(endpoint.name) if endpoint else None
@@ -199,7 +203,7 @@ class Ros2Bridge:
             self.report_once(token, f"{endpoint.name}: a subscriber expects {endpoint.type_name}; it is {kind}")
             return
         readers, had_readers = publication.readers, bool(publication.readers)
-        readers.add(token) if alive else readers.discard(token)
+        readers.add(token) if is_alive else readers.discard(token)
         if bool(readers) != had_readers:
             (self._sources.add if readers else self._sources.remove)(publication)
 
@@ -220,12 +224,12 @@ class RosCommands:
         Raises:
             ValueError: a component is not finite.
         """
-        linear, turn = twist.linear, twist.angular.z
+        linear, yaw_rate = twist.linear, twist.angular.z
         v = float(linear.x), float(linear.y), float(linear.z)
-        if not all(map(math.isfinite, (*v, turn))):
-            raise ValueError(f"the velocity is {(*v, turn)}; must be finite")
+        if not all(map(math.isfinite, (*v, yaw_rate))):
+            raise ValueError(f"the velocity is {(*v, yaw_rate)}; must be finite")
         with self._lock:
-            self._senders[drone].velocity(self._observer.now_ns, v, float(turn), "heading")
+            self._senders[drone].velocity(self._observer.now_ns, v, float(yaw_rate), "heading")
 
     def send_mode(self, mode: ModeName, drone: str, _: Any = None) -> None:
         with self._lock:
@@ -238,7 +242,7 @@ class RosCommands:
             ValueError: the drone's state is unknown.
         """
         key = keys.status(drone)
-        sample = next(iter(self._link.get(key, timeout_s=STATUS_S)), None)
+        sample = next(iter(self._link.get(key, timeout_s=STATUS_TIMEOUT_S)), None)
         if sample is None:
             raise ValueError(f"the state of {drone} is not known: the world does not answer")
         try:
@@ -260,27 +264,27 @@ class CallbackQueue:
         self._limit = limit
         self._tasks: list[QueuedTask] = []
         self._samples: deque[tuple[str, bytes]] = deque()
-        self._arrived = threading.Condition()
+        self._condition = threading.Condition()
         self.dropped = 0
 
-    def add_task(self, act: QueuedTask) -> None:
-        with self._arrived:
-            self._tasks.append(act)
-            self._arrived.notify()
+    def add_task(self, task: QueuedTask) -> None:
+        with self._condition:
+            self._tasks.append(task)
+            self._condition.notify()
 
     def add_sample(self, key: str, payload: bytes) -> None:
-        with self._arrived:
+        with self._condition:
             if len(self._samples) >= self._limit:
                 self._samples.popleft()
                 self.dropped += 1
             self._samples.append((key, payload))
-            self._arrived.notify()
+            self._condition.notify()
 
-    def pop_all(self, within_s: float) -> tuple[list[QueuedTask], list[tuple[str, bytes]]]:
-        """Return all tasks and samples, waiting up to `within_s` for the first."""
-        with self._arrived:
+    def pop_all(self, timeout_s: float) -> tuple[list[QueuedTask], list[tuple[str, bytes]]]:
+        """Return all tasks and samples, waiting up to `timeout_s` for the first."""
+        with self._condition:
             if not self._tasks and not self._samples:
-                self._arrived.wait(within_s)
+                self._condition.wait(timeout_s)
             tasks, samples = self._tasks, list(self._samples)
             self._tasks = []
             self._samples.clear()
@@ -309,15 +313,17 @@ class SourceSubscriptions:
 
     Args:
         refuse: called with a key or topic, and the reason why a message cannot be converted.
-        prompt: whether estimates and cluster states are converted on arrival, rather than with the next clock: waking
-            up for each costs more than converting it, and only in realtime does a gate take long.
+        is_prompt: whether estimates and cluster states are converted on arrival, rather than with the next clock:
+            waking up for each costs more than converting it, and only in realtime does a gate take long.
     """
 
-    def __init__(self, link: Session, queue: CallbackQueue, refuse: Callable[[str, str], None], prompt: bool) -> None:
+    def __init__(
+        self, link: Session, queue: CallbackQueue, refuse: Callable[[str, str], None], is_prompt: bool
+    ) -> None:
         self._link = link
         self._queue = queue
         self._refuse = refuse
-        self._prompt = prompt
+        self._is_prompt = is_prompt
         self._by_key: dict[str, SourceSubscription] = {}
         self.dropped = 0
 
@@ -329,11 +335,11 @@ class SourceSubscriptions:
 
     def _open_source(self, key: str) -> SourceSubscription:
         """Subscribe to a key. The world's messages have arrived when its clock does; others arrive at any time."""
-        if self._prompt and keys.leaf(key) in ("estimate", "state"):
+        if self._is_prompt and keys.leaf(key) in ("estimate", "state"):
             return SourceSubscription([], self._link.declare_subscriber(key, self._on_sample))
         subscription = self._link.subscribe(key)
         if messages.type_of(key) is CameraInfo:  # published only once, before this subscription
-            for sample in self._link.get(key, timeout_s=LAST_S):
+            for sample in self._link.get(key, timeout_s=LAST_VALUE_TIMEOUT_S):
                 self._queue.add_sample(sample.key, sample.payload)
         return SourceSubscription([], subscription.undeclare, subscription)
 
@@ -359,14 +365,14 @@ class SourceSubscriptions:
 
         If there are too many polled samples of a key, only the newest are converted.
         """
-        arrived = list(queued)
+        received = list(queued)
         for source in self._by_key.values():
             if source.polled:
                 samples = list(source.polled.drain())
                 self.dropped += max(0, len(samples) - SAMPLES_MAX)
-                arrived += samples[-SAMPLES_MAX:]
+                received += samples[-SAMPLES_MAX:]
         decoded: list[tuple[str, Any]] = []
-        for key, payload in arrived:
+        for key, payload in received:
             if key in self._by_key:
                 try:
                     decoded.append((key, messages.decode(key, payload)))
@@ -381,4 +387,4 @@ class SourceSubscriptions:
                         publication.publisher.publish(converted)
                 except (ValueError, OverflowError, struct.error) as error:  # numbers out of range for the ROS type
                     self._refuse(publication.topic.name, f"{key} does not fit it ({error})")
-        return len(arrived)
+        return len(received)

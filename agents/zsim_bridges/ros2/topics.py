@@ -38,7 +38,7 @@ from zsim_bridges.ros_messages import NS_PER_S
 MAP = "map"
 DRIVER = "ardrone"  # namespace of ardrone_autonomy's topics and services
 # A sonar looks along -z of its sensor frame, a ROS range finder along x: rotation by 90 deg about y.
-_ALONG_BEAM = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+_BEAM_ROTATION = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 TESLA_PER_UT = 1e-6
 NO_ATTITUDE = np.array([-1.0, *[0.0] * 8])  # covariance that marks a sensor_msgs/Imu without an attitude
 ULTRASOUND = 0  # sensor_msgs/Range
@@ -99,14 +99,14 @@ def run_topics(names: RosNames) -> Iterator[Topic]:
         return ros.TFMessage([ros.transform(head, child, position, q)])
 
     yield Topic("/clock", "rosgraph_msgs/msg/Clock", CLOCK, (keys.CLOCK,), lambda _, m: ros.Clock(stamp(m.t_ns)))
-    moving = (*map(keys.estimate, names.drones), *map(keys.cluster_state, names.clusters))
-    yield Topic("/tf", "tf2_msgs/msg/TFMessage", TF, moving, moving_frame)
+    moving_sources = (*map(keys.estimate, names.drones), *map(keys.cluster_state, names.clusters))
+    yield Topic("/tf", "tf2_msgs/msg/TFMessage", TF, moving_sources, moving_frame)
 
 
 def static_transforms(drone: str, sensors: Sensors) -> Iterator[Any]:
     """Yield a drone's fixed frames as TransformStamped: its odom in map, its sensors in its body."""
 
-    def in_body(frame: str, position_m: Vector3, q: np.ndarray) -> Any:
+    def body_transform(frame: str, position_m: Vector3, q: np.ndarray) -> Any:
         return ros.transform(header(0, base(drone)), frame, position_m, _quaternion(q))
 
     def rotation(mount: Mount) -> np.ndarray:
@@ -116,13 +116,13 @@ def static_transforms(drone: str, sensors: Sensors) -> Iterator[Any]:
     yield ros.transform(header(0, MAP), odom(drone), ZERO, LEVEL)
     for kind in ("imu", "gps", "mag", "baro"):
         mount: Mount = getattr(sensors, kind).mount
-        yield in_body(f"{drone}/{kind}_link", mount.position_m, rotation(mount))
-    beam = quaternion_multiply(rotation(sensors.sonar.mount), _ALONG_BEAM)
-    yield in_body(f"{drone}/sonar_link", sensors.sonar.mount.position_m, beam)
+        yield body_transform(f"{drone}/{kind}_link", mount.position_m, rotation(mount))
+    beam = quaternion_multiply(rotation(sensors.sonar.mount), _BEAM_ROTATION)
+    yield body_transform(f"{drone}/sonar_link", sensors.sonar.mount.position_m, beam)
     for name, camera in sensors.cameras().items():
         p_BK, R_BK = camera_pose(camera)
         x, y, z = p_BK.tolist()
-        yield in_body(camera_frame(drone, name), (x, y, z), quaternion_from_matrix(R_BK))
+        yield body_transform(camera_frame(drone, name), (x, y, z), quaternion_from_matrix(R_BK))
 
 
 def _quaternion(q: np.ndarray) -> Quaternion:
@@ -133,12 +133,12 @@ def _quaternion(q: np.ndarray) -> Quaternion:
 def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
     """Yield a drone's topics; `name` is its name in ROS, `sensors` give the limits and errors of its sensors."""
     imu, mag, sonar = sensors.imu, sensors.mag, sensors.sonar
-    of_rate = ros.diagonal(np.radians(1.0) ** 2 * variance(imu.gyro_deg_s, imu.rate_hz))
-    of_force = ros.diagonal(variance(imu.accel_m_s2, imu.rate_hz))
-    of_field = ros.diagonal(TESLA_PER_UT**2 * variance(mag.field_ut, mag.rate_hz))
-    of_range = variance(sonar.range_m, sonar.rate_hz)
+    rate_covariance = ros.diagonal(np.radians(1.0) ** 2 * variance(imu.gyro_deg_s, imu.rate_hz))
+    force_covariance = ros.diagonal(variance(imu.accel_m_s2, imu.rate_hz))
+    field_covariance = ros.diagonal(TESLA_PER_UT**2 * variance(mag.field_ut, mag.rate_hz))
+    range_variance = variance(sonar.range_m, sonar.rate_hz)
 
-    def of_sensor(
+    def sensor_topic(
         leaf: str, kind: str, sensor: str, convert: Callable[[Any, Any], Any], frame: str | None = None
     ) -> Topic:
         """Return the topic of one sensor; `convert` takes a header and a sample."""
@@ -146,29 +146,29 @@ def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
         source = (keys.sensor(drone, sensor),)
         return Topic(f"/{name}/{leaf}", kind, SENSOR, source, lambda _, m: convert(header(m.t_sample_ns, frame), m))
 
-    yield of_sensor(
+    yield sensor_topic(
         "imu", "sensor_msgs/msg/Imu", "imu",
-        lambda head, m: ros.imu(head, m, LEVEL, (NO_ATTITUDE, of_rate, of_force)),
+        lambda head, m: ros.imu(head, m, LEVEL, (NO_ATTITUDE, rate_covariance, force_covariance)),
     )  # fmt: skip
-    yield of_sensor("fix", "sensor_msgs/msg/NavSatFix", "gps", lambda head, m: ros.fix(head, m, bool(m.fix)))
-    yield of_sensor(
+    yield sensor_topic("fix", "sensor_msgs/msg/NavSatFix", "gps", lambda head, m: ros.fix(head, m, bool(m.fix)))
+    yield sensor_topic(
         "fix_velocity", "geometry_msgs/msg/TwistStamped", "gps",  # velocity in ENU
         lambda head, m: ros2_jazzy.geometry_msgs__msg__TwistStamped(head, ros.twist(m.velocity_m_s, ZERO)), MAP,
     )  # fmt: skip
-    yield of_sensor(
+    yield sensor_topic(
         "mag", "sensor_msgs/msg/MagneticField", "mag",
         lambda head, m: ros2_jazzy.sensor_msgs__msg__MagneticField(
-            head, ros.Vector3(*(TESLA_PER_UT * each for each in m.field_ut)), of_field
+            head, ros.Vector3(*(TESLA_PER_UT * each for each in m.field_ut)), field_covariance
         ),
     )  # fmt: skip
-    yield of_sensor(
+    yield sensor_topic(
         "pressure", "sensor_msgs/msg/FluidPressure", "baro",
         lambda head, m: ros2_jazzy.sensor_msgs__msg__FluidPressure(head, m.pressure_pa, 0.0),
     )  # fmt: skip
-    yield of_sensor(
+    yield sensor_topic(
         "range", "sensor_msgs/msg/Range", "sonar",  # +Inf without an echo (REP-117)
         lambda head, m: ros2_jazzy.sensor_msgs__msg__Range(
-            head, ULTRASOUND, BEAM_RAD, sonar.min_m, sonar.max_m, m.range_m if m.valid else math.inf, of_range
+            head, ULTRASOUND, BEAM_RAD, sonar.min_m, sonar.max_m, m.range_m if m.valid else math.inf, range_variance
         ),
     )  # fmt: skip
 
@@ -179,10 +179,12 @@ def drone_topics(drone: str, name: str, sensors: Sensors) -> Iterator[Topic]:
         f"/{name}/ground_truth", "nav_msgs/msg/Odometry", DEFAULT, (keys.truth(drone),),
         lambda _, m: true_odometry(m, base(name)),
     )  # fmt: skip
-    battery_at = OnChange(lambda status: battery(status, base(name)))
-    state = OnChange(lambda status: ros2_jazzy.std_msgs__msg__String(status.state), lambda status: status.state)
-    yield Topic(f"/{name}/battery", "sensor_msgs/msg/BatteryState", DEFAULT, (status,), battery_at.update)
-    yield Topic(f"/{name}/state", "std_msgs/msg/String", DEFAULT, (status,), state.update)
+    battery_on_change = OnChange(lambda status: battery(status, base(name)))
+    state_on_change = OnChange(
+        lambda status: ros2_jazzy.std_msgs__msg__String(status.state), lambda status: status.state
+    )
+    yield Topic(f"/{name}/battery", "sensor_msgs/msg/BatteryState", DEFAULT, (status,), battery_on_change.update)
+    yield Topic(f"/{name}/state", "std_msgs/msg/String", DEFAULT, (status,), state_on_change.update)
     summary = NavdataSummary(base(name))
     sources = (*(keys.sensor(drone, kind) for kind in keys.SENSORS if kind != "gps"), estimate, status)
     yield Topic(f"/{name}/navdata", "zsim_msgs/msg/Navdata", SENSOR, sources, summary.update)
@@ -221,22 +223,22 @@ class OdometryTopic:
     def __init__(self, frame: str, child: str) -> None:
         self._frame = frame
         self._child = child
-        self._before: Estimate | None = None
+        self._previous: Estimate | None = None
 
     def update(self, _: str, message: Estimate) -> Any:
         """Return the ROS message, with the twist in the body; the heading is the only angle with a variance."""
-        before, self._before = self._before, message
+        previous, self._previous = self._previous, message
         q = message.orientation_wxyz
-        dt_ns = message.t_ns - before.t_ns if before else 0
-        rate = ros.mean_rate(before.orientation_wxyz, q, dt_ns / NS_PER_S) if before and dt_ns > 0 else ZERO
+        dt_ns = message.t_ns - previous.t_ns if previous else 0
+        rate = ros.mean_rate(previous.orientation_wxyz, q, dt_ns / NS_PER_S) if previous and dt_ns > 0 else ZERO
         P = np.array(message.covariance).reshape(6, 6)
         R = rotation_matrix(q)
-        of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
-        of_pose[:3, :3], of_pose[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
-        of_twist[:3, :3] = R.T @ P[3:, 3:] @ R
+        pose_covariance, twist_covariance = np.zeros((6, 6)), np.zeros((6, 6))
+        pose_covariance[:3, :3], pose_covariance[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
+        twist_covariance[:3, :3] = R.T @ P[3:, 3:] @ R
         head, pose = header(message.t_ns, self._frame), ros.pose(message.position_m, q)
         twist = ros.twist(into_body(q, message.velocity_m_s), rate)
-        return ros.odometry(head, self._child, pose, twist, of_pose.ravel(), of_twist.ravel())
+        return ros.odometry(head, self._child, pose, twist, pose_covariance.ravel(), twist_covariance.ravel())
 
 
 class OnChange:
@@ -363,8 +365,8 @@ def cluster_topics(cluster: str, name: str) -> Iterator[Topic]:
         )
 
     def pose(_: str, message: ClusterState) -> Any:
-        placed = ros.pose(*cluster_pose(message))
-        return ros2_jazzy.geometry_msgs__msg__PoseStamped(header(message.t_ns, MAP), placed)
+        frame_pose = ros.pose(*cluster_pose(message))
+        return ros2_jazzy.geometry_msgs__msg__PoseStamped(header(message.t_ns, MAP), frame_pose)
 
     yield Topic(f"/cluster/{name}/state", "zsim_msgs/msg/ClusterState", DEFAULT, source, state)
     yield Topic(f"/cluster/{name}/pose", "geometry_msgs/msg/PoseStamped", DEFAULT, source, pose)

@@ -1,8 +1,8 @@
 classdef Conversation < handle
     % CONVERSATION Requests and answers on a gateway's stream, and the messages in between.
     %
-    % Only one request is pending at a time; it waits for its answer. In between, values, gates and news of the run may
-    % arrive: values are queued until they are taken, `gate`, `left` and `begun` show the rest.
+    % Only one request is pending at a time. While it waits for its answer, values, gates and news of the run may
+    % arrive. Values are queued until they are taken; `gate`, `left` and `begun` show the rest.
 
     properties (SetAccess = private)
         gate = []  % the gate that has arrived and is not answered yet: t_s, t_ns, inputs
@@ -21,7 +21,7 @@ classdef Conversation < handle
 
     properties (Constant, Access = private)
         QUEUE_MAX = 100000  % maximum number of queued values; five minutes of a drone's sensors
-        FOREVER_S = 1e9  % timeout for a gate, because simulated time may stop for as long as it likes
+        FOREVER_S = 1e9  % timeout for a gate, since simulated time may stop indefinitely
     end
 
     methods
@@ -90,7 +90,7 @@ classdef Conversation < handle
             talk.begun = false;
         end
 
-        % A seat in the lockstep
+        % The lockstep
 
         function answer = sit(talk, fields)
             % SIT Join the lockstep; the first gate may arrive at any time from then on.

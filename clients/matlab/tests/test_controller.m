@@ -1,5 +1,5 @@
 function test_controller()
-    % TEST_CONTROLLER cluster_step flies ideal drones to its target; no value is NaN, and no size changes.
+    % TEST_CONTROLLER Test that cluster_step flies ideal drones to its target, without NaN or a change of size.
     here = fileparts(mfilename('fullpath'));
     addpath(fullfile(here, '..', '..', '..', 'examples', 'matlab'));
     params = triad.params();

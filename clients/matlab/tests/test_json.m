@@ -1,5 +1,5 @@
 function test_json()
-    % TEST_JSON JSON has the form that the gateway expects, and values the form that MATLAB users expect.
+    % TEST_JSON Test that JSON has the form that the gateway expects, and values the form that users expect.
     assert(strcmp(zsim.encode(struct('velocity_m_s', [1 0 0])), '{"velocity_m_s":[1,0,0]}'));
     assert(strcmp(zsim.encode({'only'}), '["only"]'));
     assert(strcmp(zsim.encode({1}), '[1]'));

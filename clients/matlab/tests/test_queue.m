@@ -1,5 +1,5 @@
 function test_queue()
-    % TEST_QUEUE Items leave the queue in the order in which they were added, across its blocks.
+    % TEST_QUEUE Test that items leave the queue in the order in which they were added, across its blocks.
     queue = zsim.Queue();
     rand('state', 4);  %#ok<RAND>
     added = 0;

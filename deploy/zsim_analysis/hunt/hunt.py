@@ -32,9 +32,9 @@ from zsim.output_folder import held_folder
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
-from zsim_analysis.hunt.requirements import BROKEN, Margin, Requirement, figures_of, worst
-from zsim_analysis.hunt.shrink import Shrinker, causes_of, only
-from zsim_analysis.hunt.space import LAG, WIND, Case, HuntSpace, Strategy
+from zsim_analysis.hunt.requirements import BROKEN, Margin, Requirement, quantities_of, worst
+from zsim_analysis.hunt.shrink import Shrinker, causes_of, reduced_to
+from zsim_analysis.hunt.space import PENDING_MAX, WIND, Case, HuntSpace, Strategy
 from zsim_analysis.report import indented_json
 from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS, text_of
@@ -175,17 +175,17 @@ def hunt(request: HuntRequest) -> Hunted:
         for name in (SCENARIO, BUNDLE):
             (request.out / name).unlink(missing_ok=True)
         current = _Hunt(request, space, texts, requirements)
-        hunted = Hunted(request, space, current.run(), current.flown)
+        hunted = Hunted(request, space, current.run(), current.results)
         write(hunted)
     return hunted
 
 
-def _with_functions(given: Sequence[str], document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
+def _with_functions(requirements: Sequence[str], document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return requirements as comparisons, and the document with their functions as metrics."""
     texts, report = [], dict(document.get("report") or {})
     metrics = report.get("metrics") or []
     names = [metrics] if isinstance(metrics, str) else list(metrics)
-    for text in given:
+    for text in requirements:
         module, colon, function = text.partition(":")
         if colon and function.isidentifier() and all(part.isidentifier() for part in module.strip().split(".")):
             names += [] if text.strip() in names else [text.strip()]
@@ -211,26 +211,26 @@ def _requirements(texts: Sequence[str]) -> list[Requirement]:
 _requirement = lru_cache(maxsize=64)(Requirement)
 
 
-def judged(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
+def judge_flight(requirements: Sequence[str], twin: Scenario | None, summary: RunSummary, row: Row) -> dict[str, Any]:
     """Return the margins of a flight, or why they cannot be computed; called in the process that flew it.
 
     `twin` is the same flight with no process dying, with which it is compared bit by bit; None if no process dies.
     """
     columns = {name: row[name] for name in row if name in FIXED or name.startswith((METRIC, "clusters."))}
-    figures = {**columns, **dict(figures_of(msgspec.to_builtins(summary)))}
+    quantities = {**columns, **dict(quantities_of(msgspec.to_builtins(summary)))}
     parsed = [_requirement(text) for text in requirements]
     names = [name for each in parsed for name in each.names]
     if SAME_BITS in names:
-        same = twin is None
+        is_identical = twin is None
         if twin is not None:
-            flown, diverged = fly_scenario(twin)
-            same = not diverged and summarise(flown, [], Path()).truth_sha256 == summary.truth_sha256
-        figures[SAME_BITS] = same
+            twin_flight, diverged = fly_scenario(twin)
+            is_identical = not diverged and summarise(twin_flight, [], Path()).truth_sha256 == summary.truth_sha256
+        quantities[SAME_BITS] = is_identical
     if row.get("metrics_failure"):  # missing metrics are unknown, not wrong
-        figures = {**{name: None for name in names if name.startswith(METRIC)}, **figures}
-    faults = [fault for each in parsed for fault in each.faults(figures)]
+        quantities = {**{name: None for name in names if name.startswith(METRIC)}, **quantities}
+    faults = [fault for each in parsed for fault in each.faults(quantities)]
     try:
-        return {"faults": faults, "margins": [] if faults else [tuple(each.margin(figures)) for each in parsed]}
+        return {"faults": faults, "margins": [] if faults else [tuple(each.margin(quantities)) for each in parsed]}
     except ScenarioError as error:
         return {"faults": error.faults, "margins": []}
 
@@ -243,7 +243,7 @@ class _Hunt:
         self._texts, self._requirements = tuple(texts), requirements
         self._strategy = Strategy(space, request.seed)
         self._screen = HuntScreen(request, self._strategy)
-        self.flown: list[HuntFlight] = []
+        self.results: list[HuntFlight] = []
         self._scales: list[float] = []  # absolute margins of the flight without faults, by requirement
         self._stages: Counter[str] = Counter()
         self._spent_s: defaultdict[str, float] = defaultdict(float)
@@ -257,19 +257,19 @@ class _Hunt:
         violation: Violation | None = None
         interrupted = False
         with self._screen as screen:
-            kinds = f"{len(self._space.kinds)} kinds of faults, {self._space.most} in a flight"
+            kinds = f"{len(self._space.kinds)} kinds of faults, {self._space.faults_max} in a flight"
             screen.say(f"{self._request.source}: {kinds}, into {self._request.out}")
             pool = ProcessPool(self._request.workers or cores(), screen.say)
             try:
                 with closing(pool.rows(self._tasks())) as self._flying:
-                    found = self._timed(SEARCH, self._search)
-                    if found:
+                    violating = self._timed(SEARCH, self._search)
+                    if violating:
                         verdict = "violated"
-                        least = found.case
-                        violation = self._violation(found, least, [])
-                        for least in self._shrunk(found):
-                            violation = self._violation(found, least, [])
-                        violation = self._timed(RECORD, partial(self._recorded, found, least))
+                        smallest_case = violating.case
+                        violation = self._violation(violating, smallest_case, [])
+                        for smallest_case in self._shrunk(violating):
+                            violation = self._violation(violating, smallest_case, [])
+                        violation = self._timed(RECORD, partial(self._recorded, violating, smallest_case))
                     self._done = True
             except KeyboardInterrupt:
                 interrupted, verdict = True, verdict if violation else "interrupted"
@@ -277,7 +277,7 @@ class _Hunt:
         stages = [Stage(name, self._stages[name], round(self._spent_s[name], 2)) for name in self._spent_s]
         coverage = self._strategy.coverage
         tried = [Tried(size, coverage.tried(size), len(sets)) for size, sets in coverage.possible.items()]
-        searched = [each for each in self.flown if each.stage == SEARCH]
+        searched = [each for each in self.results if each.stage == SEARCH]
         values = [[each.margins[i].value for each in searched] for i in range(len(self._requirements))]
         return HuntSummary(
             scenario=self._request.source,
@@ -285,7 +285,7 @@ class _Hunt:
             seed=self._request.seed,
             verdict=verdict,
             interrupted=interrupted,
-            flights=len(self.flown),
+            flights=len(self.results),
             wall_s=round(time.monotonic() - began_s, 2),
             stages=stages,
             coverage=tried,
@@ -321,7 +321,7 @@ class _Hunt:
                 record=str(record.absolute()) if record else None,
                 open_run=self._request.open_run,
                 processes=self._request.processes if deadly else None,
-                judge=partial(judged, self._texts, self._space.scenario(twin) if deadly else None),
+                judge=partial(judge_flight, self._texts, self._space.scenario(twin) if deadly else None),
             )
         )
         return number
@@ -336,18 +336,20 @@ class _Hunt:
         if row.get("faults"):
             raise ScenarioError(row["faults"])
         failure = row["failure"]
-        lost = Margin(False, BROKEN, None, failure or "")
-        margins = [Margin(*each) for each in row["margins"]] if not failure else [lost for _ in self._requirements]
+        failed_margin = Margin(False, BROKEN, None, failure or "")
+        margins = (
+            [Margin(*each) for each in row["margins"]] if not failure else [failed_margin for _ in self._requirements]
+        )
         if not self._scales:
             self._scales = [abs(each.value) if each.value else 1.0 for each in margins]
         margins = [
             each if each.value is None else each._replace(share=each.value / scale)
             for each, scale in zip(margins, self._scales, strict=True)
         ]
-        flown = HuntFlight(len(self.flown), stage, case, margins, failure, row["truth_sha256"], row["shortfall"])
+        result = HuntFlight(len(self.results), stage, case, margins, failure, row["truth_sha256"], row["shortfall"])
         self._stages[stage] += 1
-        self.flown.append(flown)
-        return flown
+        self.results.append(result)
+        return result
 
     def _fly(self, cases: Sequence[Case], stage: str) -> list[HuntFlight | None]:
         """Fly cases in parallel; return None for a case that cannot be flown."""
@@ -366,11 +368,15 @@ class _Hunt:
         flights, budget_s = self._request.flights, self._request.budget_s
         until_s = None if budget_s is None else time.monotonic() + budget_s
         pending: deque[int] = deque()
-        drawn = misses = 0
+        drawn_count = misses = 0
         try:
             while True:
-                while len(pending) < LAG and (flights is None or drawn < flights) and (drawn == 0 or self.flown):
-                    drawn += 1
+                while (
+                    len(pending) < PENDING_MAX
+                    and (flights is None or drawn_count < flights)
+                    and (drawn_count == 0 or self.results)
+                ):
+                    drawn_count += 1
                     try:
                         pending.append(self._submit(self._strategy.draw(), SEARCH))
                     except ScenarioError:  # e.g. a normally distributed value beyond the limits of its field
@@ -379,68 +385,68 @@ class _Hunt:
                             raise
                         continue
                     misses = 0
-                    if drawn == 1:
+                    if drawn_count == 1:
                         break  # the flight without faults shows whether all quantities exist
                 if not pending or (until_s is not None and time.monotonic() >= until_s):
                     return None
-                flown = self._result(pending.popleft())
-                self._strategy.learn(flown.case, flown.worst)
-                self._screen.margin = min(self._screen.margin, flown.worst.share)
-                if not flown.holds:
-                    return flown
+                result = self._result(pending.popleft())
+                self._strategy.learn(result.case, result.worst)
+                self._screen.margin = min(self._screen.margin, result.worst.share)
+                if not result.holds:
+                    return result
         finally:
             self._waiting.clear()
 
-    def _shrunk(self, found: HuntFlight) -> Iterator[Case]:
-        which = found.margins.index(found.worst)
+    def _shrink(self, found: HuntFlight) -> Iterator[Case]:
+        index = found.margins.index(found.worst)
         is_unknown, failed = bool(found.worst.unknown), found.failure is not None
 
-        known: dict[bytes, bool] = {}  # results of the cases flown so far
+        outcomes: dict[bytes, bool] = {}  # results of the cases flown so far
 
-        def breaks(cases: Sequence[Case], stage: str) -> list[bool]:
+        def violates(cases: Sequence[Case], stage: str) -> list[bool]:
             self._screen.stage = stage
             names = [msgspec.json.encode(case) for case in cases]
-            new = {name: case for name, case in zip(names, cases, strict=True) if name not in known}
-            flown = self._timed(stage, lambda: self._fly([*new.values()], stage))
-            known.update({name: alike(each) for name, each in zip(new, flown, strict=True)})
-            return [known[name] for name in names]
+            new = {name: case for name, case in zip(names, cases, strict=True) if name not in outcomes}
+            result = self._timed(stage, lambda: self._fly([*new.values()], stage))
+            outcomes.update({name: is_same_violation(each) for name, each in zip(new, result, strict=True)})
+            return [outcomes[name] for name in names]
 
-        def alike(flown: HuntFlight | None) -> bool:
-            if flown is None or (flown.failure is not None) != failed:
+        def is_same_violation(result: HuntFlight | None) -> bool:
+            if result is None or (result.failure is not None) != failed:
                 return False
-            margin = flown.margins[which]
+            margin = result.margins[index]
             return not margin.holds and bool(margin.unknown) == is_unknown
 
-        what = found.worst.unknown or f"margin {found.worst.value:.3g}"
-        self._screen.say(f"flight {found.number} breaks {self._requirements[which].text} ({what}); shrinking it")
-        yield from Shrinker(self._space, breaks).shrink(found.case)
+        margin_text = found.worst.unknown or f"margin {found.worst.value:.3g}"
+        self._screen.say(f"flight {found.number} breaks {self._requirements[index].text} ({margin_text}); shrinking it")
+        yield from Shrinker(self._space, violates).shrink(found.case)
 
     def _violation(
         self, found: HuntFlight, case: Case, causes: list[CauseFound], flown: HuntFlight | None = None
     ) -> Violation:
-        which, last = found.margins.index(found.worst), flown or found
+        index, result = found.margins.index(found.worst), flown or found
         return Violation(
-            requirement=self._requirements[which].text,
+            requirement=self._requirements[index].text,
             number=found.number,
             found=found.case,
             shrunk=case,
-            margin=last.margins[which].value,
-            unknown=last.margins[which].unknown,
+            margin=result.margins[index].value,
+            unknown=result.margins[index].unknown,
             causes=causes,
             options=self._space.options(case),
             truth_sha256=flown.truth_sha256 if flown else None,
         )
 
-    def _recorded(self, found: HuntFlight, case: Case) -> Violation:
+    def _record_violation(self, found: HuntFlight, case: Case) -> Violation:
         """Fly the shrunk case for its record, and further cases that show the effect of each cause."""
-        which, causes = found.margins.index(found.worst), causes_of(case)
+        index, causes = found.margins.index(found.worst), causes_of(case)
         self._screen.stage = RECORD
-        place = self._request.out / VIOLATION
-        number = self._submit(case, RECORD, place)
-        without = self._fly([only(case, [other for other in causes if other != each]) for each in causes], CAUSE)
-        alone = self._fly([only(case, [each]) for each in causes], CAUSE)
+        record_path = self._request.out / VIOLATION
+        number = self._submit(case, RECORD, record_path)
+        without = self._fly([reduced_to(case, [other for other in causes if other != each]) for each in causes], CAUSE)
+        alone = self._fly([reduced_to(case, [each]) for each in causes], CAUSE)
         table = [
-            CauseFound(cause_text(case, each), *(one and one.margins[which].value for one in two))
+            CauseFound(cause_text(case, each), *(one and one.margins[index].value for one in two))
             for each, *two in zip(causes, without, alone, strict=True)
         ]
         return self._violation(found, case, table, self._result(number))
@@ -448,8 +454,8 @@ class _Hunt:
 
 def cause_text(case: Case, cause: tuple[str, int | str]) -> str:
     """Format a cause as on the command line."""
-    kind, which = cause
-    return f"{which}={text_of(case.values[str(which)])}" if kind == "value" else fault_text(case.faults[int(which)])
+    kind, key = cause
+    return f"{key}={text_of(case.values[str(key)])}" if kind == "value" else fault_text(case.faults[int(key)])
 
 
 def fault_text(fault: Mapping[str, Any]) -> str:

@@ -90,24 +90,24 @@ def _margins(summary: HuntSummary, searched: Sequence[HuntFlight]) -> style.Repo
 
 
 def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> style.ReportFigure:
-    least = np.full((len(kinds), len(kinds)), np.nan)
-    counts = np.zeros_like(least)
+    min_shares = np.full((len(kinds), len(kinds)), np.nan)
+    counts = np.zeros_like(min_shares)
     for each in searched:
-        places = [kinds.index(kind) for kind in each.case.kinds]
-        for a, b in (*combinations(places, 2), *((place, place) for place in places)):
+        indices = [kinds.index(kind) for kind in each.case.kinds]
+        for a, b in (*combinations(indices, 2), *((index, index) for index in indices)):
             row, column = max(a, b), min(a, b)
-            least[row, column] = np.nanmin([least[row, column], each.worst.share])
+            min_shares[row, column] = np.nanmin([min_shares[row, column], each.worst.share])
             counts[row, column] += 1
     side = min(style.PAGE_IN, 1.6 + 0.33 * len(kinds))
     figure = style.new_figure(side + 0.6, side)
     axes = figure.subplots()
-    image = axes.imshow(100 * least, cmap="viridis", vmin=-100, vmax=100)
+    image = axes.imshow(100 * min_shares, cmap="viridis", vmin=-100, vmax=100)
     axes.set_xticks(
         range(len(kinds)), [kind.replace("_", " ") for kind in kinds], rotation=90, fontsize=style.PAPER_PT - 1
     )
     axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds], fontsize=style.PAPER_PT - 1)
     for row, column in zip(*np.nonzero(counts), strict=True):
-        colour = "black" if least[row, column] > 0 else "white"
+        colour = "black" if min_shares[row, column] > 0 else "white"
         text = f"{counts[row, column]:.0f}"
         axes.text(column, row, text, ha="center", va="center", fontsize=style.PAPER_PT - 2, color=colour)
     bar = figure.colorbar(image, shrink=0.7)
@@ -125,20 +125,22 @@ def _pairs(kinds: Sequence[str], searched: Sequence[HuntFlight]) -> style.Report
 
 def page(hunted: Hunted, searched: Sequence[HuntFlight], pictures: Sequence[Picture]) -> str:
     summary, space = hunted.summary, hunted.space
-    found = summary.violation
+    violation = summary.violation
     return rendered(
         "hunt.html.j2",
         pictures,
         "zsim_analysis.hunt",
         summary=summary,
         facts=facts(hunted.request, summary),
-        found=[cause_text(found.found, each) for each in causes_of(found.found)] if found else [],
-        faults=[fault_text(fault) for fault in found.shrunk.faults] if found else [],
+        found=[cause_text(violation.found, each) for each in causes_of(violation.found)] if violation else [],
+        faults=[fault_text(fault) for fault in violation.shrunk.faults] if violation else [],
         command=command(hunted),
         record=f"{VIOLATION}/report.html",
         number=number,
         kinds=[kind_row(space.kinds[name], searched) for name in space.kinds],
-        causes=[(each.text, number(each.without), number(each.alone)) for each in found.causes] if found else [],
+        causes=[(each.text, number(each.without), number(each.alone)) for each in violation.causes]
+        if violation
+        else [],
         stages=[(each.name, each.flights, f"{each.wall_s:.1f}") for each in summary.stages],
     )
 
@@ -158,16 +160,16 @@ def facts(request: HuntRequest, summary: HuntSummary) -> list[tuple[str, str]]:
 
 def kind_row(space: KindSpace, searched: Sequence[HuntFlight]) -> list[str]:
     """Return a kind, how often it was flown, its smallest margin, and the flights per quarter of each range."""
-    flown = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
-    least = min((each.worst.share for each, _ in flown), default=None)
-    targets = {fault["target"] for _, fault in flown}
-    parts = [f"{len(targets)} of {len(space.knobs['target'].choices)} targets"] if flown else []
+    matching = [(each, fault) for each in searched for fault in each.case.faults if fault["kind"] == space.name]
+    min_share = min((each.worst.share for each, _ in matching), default=None)
+    targets = {fault["target"] for _, fault in matching}
+    parts = [f"{len(targets)} of {len(space.knobs['target'].choices)} targets"] if matching else []
     for name, knob in space.knobs.items():
-        if flown and knob.shape != "choice":
-            places = [knob.place(fault[name]) for _, fault in flown if fault.get(name) is not None]
-            quarters = np.histogram(places, QUARTERS, (0.0, 1.0))[0]
+        if matching and knob.shape != "choice":
+            positions = [knob.position(fault[name]) for _, fault in matching if fault.get(name) is not None]
+            quarters = np.histogram(positions, QUARTERS, (0.0, 1.0))[0]
             parts.append(f"{name} {'/'.join(map(str, quarters))}")
-    return [space.name, str(len(flown)), "–" if least is None else f"{least:.0%}", ", ".join(parts)]
+    return [space.name, str(len(matching)), "–" if min_share is None else f"{min_share:.0%}", ", ".join(parts)]
 
 
 def number(value: float | None) -> str:
@@ -176,9 +178,13 @@ def number(value: float | None) -> str:
 
 def command(hunted: Hunted) -> str:
     """Return the command that repeats the violation; empty if nothing was violated."""
-    request, found = hunted.request, hunted.summary.violation
-    sets = [word for change in request.changed for word in ("--set", change)]
-    return shlex.join(["zsim", "run", request.source, *sets, *found.options, "--in-process"]) if found else ""
+    request, violation = hunted.request, hunted.summary.violation
+    set_options = [word for change in request.changed for word in ("--set", change)]
+    return (
+        shlex.join(["zsim", "run", request.source, *set_options, *violation.options, "--in-process"])
+        if violation
+        else ""
+    )
 
 
 def terminal_text(hunted: Hunted) -> Group:

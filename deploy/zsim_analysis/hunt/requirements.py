@@ -65,22 +65,22 @@ class Requirement:
         try:
             self._tree = ast.parse(self.text, mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            place = f" at character {error.offset}" if isinstance(error, SyntaxError) and error.offset else ""
-            raise self._fault(f"cannot be read{place}; must be {SYNTAX}") from None
+            location = f" at character {error.offset}" if isinstance(error, SyntaxError) and error.offset else ""
+            raise self._fault(f"cannot be read{location}; must be {SYNTAX}") from None
         self._check(self._tree, as_truth=True)
         self.names = tuple(dict.fromkeys(self._names(self._tree)))
 
-    def margin(self, figures: Mapping[str, Any]) -> Margin:
+    def margin(self, quantities: Mapping[str, Any]) -> Margin:
         """Return the margin in a flight, given its quantities by path.
 
         Raises:
             ScenarioError: the requirement names a quantity that no flight has, or compares a text with a number.
         """
-        return self._margin(self._tree, figures)
+        return self._margin(self._tree, quantities)
 
-    def faults(self, figures: Mapping[str, Any]) -> list[str]:
+    def faults(self, quantities: Mapping[str, Any]) -> list[str]:
         """Return a line for each name that is no quantity of a flight, with the most similar quantity."""
-        unknown = [self._unknown(name, figures) for name in self.names if name not in figures]
+        unknown = [self._unknown(name, quantities) for name in self.names if name not in quantities]
         return [fault for text in unknown for fault in self._fault(text).faults]
 
     # Parsing
@@ -130,19 +130,19 @@ class Requirement:
 
     # Margin
 
-    def _margin(self, node: ast.AST, figures: Mapping[str, Any]) -> Margin:
+    def _margin(self, node: ast.AST, quantities: Mapping[str, Any]) -> Margin:
         if isinstance(node, ast.BoolOp):
-            parts = [self._margin(each, figures) for each in node.values]
+            parts = [self._margin(each, quantities) for each in node.values]
             pick = min if isinstance(node.op, ast.And) else max
             return pick(parts, key=lambda part: (part.holds, part.share))
         if isinstance(node, ast.UnaryOp):
-            return ~self._margin(node.operand, figures)
+            return ~self._margin(node.operand, quantities)
         if isinstance(node, ast.Compare):
-            sides = [self._figure(each, figures) for each in (node.left, *node.comparators)]
+            sides = [self._figure(each, quantities) for each in (node.left, *node.comparators)]
             pairs = zip(node.ops, sides, sides[1:], strict=False)
             parts = [self._compared(_COMPARES[type(op)], *two) for op, *two in pairs]
             return min(parts, key=lambda part: (part.holds, part.share))
-        value = self._figure(node, figures)
+        value = self._figure(node, quantities)
         if isinstance(value, Unknown):
             return Margin(False, BROKEN, None, value.name)
         if not isinstance(value, bool):
@@ -164,16 +164,16 @@ class Requirement:
         holds = value > 0 or (value == 0 and op in (">=", "<=", "=="))
         return Margin(holds, value / max(abs(left), abs(right), TINY), value)
 
-    def _figure(self, node: ast.AST, figures: Mapping[str, Any]) -> Any:
+    def _quantity(self, node: ast.AST, quantities: Mapping[str, Any]) -> Any:
         """Return the value of a node: a number, a text or a truth value, or `Unknown`."""
         if isinstance(node, ast.Constant):
             return node.value
         if path := path_of(node):
-            if path not in figures:
-                raise self._fault(self._unknown(path, figures))
-            value = figures[path]
+            if path not in quantities:
+                raise self._fault(self._unknown(path, quantities))
+            value = quantities[path]
             return Unknown(path) if value is None else value
-        values = [self._figure(each, figures) for each in _operands(node)]
+        values = [self._figure(each, quantities) for each in _operands(node)]
         if lacking := next((each for each in values if isinstance(each, Unknown)), None):
             return lacking
         if text := next((each for each in values if isinstance(each, str)), None):
@@ -185,11 +185,11 @@ class Requirement:
         assert isinstance(node, ast.BinOp)
         return _ARITHMETIC[type(node.op)](*values)
 
-    def _unknown(self, name: str, figures: Mapping[str, Any]) -> str:
-        below = sorted(each for each in figures if each.startswith(f"{name}."))
-        among = below or sorted(figures, key=lambda each: (each.count("."), each))
+    def _unknown(self, name: str, quantities: Mapping[str, Any]) -> str:
+        below = sorted(each for each in quantities if each.startswith(f"{name}."))
+        among = below or sorted(quantities, key=lambda each: (each.count("."), each))
         names = f"{', '.join(among[:NAMES_SHOWN])}{', …' if len(among) > NAMES_SHOWN else ''}"
-        return f"has {name}, which no flight has; {suggestion(name, figures)}allowed: {names}"
+        return f"has {name}, which no flight has; {suggestion(name, quantities)}allowed: {names}"
 
 
 class Unknown(NamedTuple):
@@ -216,11 +216,11 @@ def path_of(node: ast.AST) -> str:
     return ""
 
 
-def figures_of(document: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def quantities_of(document: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield path and value of every number, text, truth value and None of a summary, except in lists."""
     if isinstance(document, Mapping):
         for name, value in document.items():
-            yield from figures_of(value, f"{prefix}.{name}" if prefix else str(name))
+            yield from quantities_of(value, f"{prefix}.{name}" if prefix else str(name))
     elif prefix and (document is None or isinstance(document, bool | int | float | str)):
         yield prefix, document
 

@@ -41,135 +41,142 @@ class Shrinker:
 
     def shrink(self, case: Case) -> Iterator[Case]:
         """Yield the case after each stage."""
-        case = self.fewest(case)
+        case = self.fewest_causes(case)
         yield case
-        case = self.smallest(case)
+        case = self.smallest_values(case)
         yield case
-        yield self.shortest(case)
+        yield self.shortest_flight(case)
 
     # Causes
 
-    def fewest(self, case: Case) -> Case:
+    def fewest_causes(self, case: Case) -> Case:
         """Return the case reduced to the fewest causes that still violate the requirement."""
         causes = causes_of(case)
         while len(causes) > SUBSETS_MAX:
-            without = [[*causes[:place], *causes[place + 1 :]] for place in range(len(causes))]
-            broken = self._breaks([only(case, each) for each in without], CAUSES)
-            if not any(broken):
+            reduced = [[*causes[:index], *causes[index + 1 :]] for index in range(len(causes))]
+            violates = self._breaks([reduced_to(case, each) for each in reduced], CAUSES)
+            if not any(violates):
                 break
-            causes = without[broken.index(True)]
+            causes = reduced[violates.index(True)]
         for size in range(len(causes) if len(causes) <= SUBSETS_MAX else 0):
-            sets = [list(each) for each in combinations(causes, size)]
-            broken = self._breaks([only(case, each) for each in sets], CAUSES)
-            if any(broken):
-                causes = sets[broken.index(True)]
+            subsets = [list(each) for each in combinations(causes, size)]
+            violates = self._breaks([reduced_to(case, each) for each in subsets], CAUSES)
+            if any(violates):
+                causes = subsets[violates.index(True)]
                 break
-        return only(case, causes)
+        return reduced_to(case, causes)
 
     # Numbers
 
-    def smallest(self, case: Case) -> Case:
+    def smallest_values(self, case: Case) -> Case:
         """Return the case with every number as mild as possible while still violating the requirement."""
         for _ in range(PASSES):
-            before = case
-            for place in range(len(case.faults)):
-                case = self._smallest_fault(case, place)
+            previous = case
+            for index in range(len(case.faults)):
+                case = self._smallest_fault(case, index)
             for path, value in case.values.items():
-                own = self._space_value(path)
-                if _is_number(value) and _is_number(own):
-                    case = self._bisected(
-                        lambda x, path=path, case=case: replace(case, values={**case.values, path: x}), value, own, case
+                base_value = self._space_value(path)
+                if _is_number(value) and _is_number(base_value):
+                    case = self._bisect(
+                        lambda x, path=path, case=case: replace(case, values={**case.values, path: x}),
+                        value,
+                        base_value,
+                        case,
                     )
-            if case == before:
+            if case == previous:
                 break
         return case
 
-    def _smallest_fault(self, case: Case, place: int) -> Case:
-        space = self._space.kinds[case.faults[place]["kind"]]
+    def _smallest_fault(self, case: Case, index: int) -> Case:
+        space = self._space.kinds[case.faults[index]["kind"]]
         mildest = {p.name: p.mildest for p in space.kind.parameters if p.shape in ("number", "vector")}
         for name in ["for_s", *mildest]:
-            value = case.faults[place].get(name)
+            value = case.faults[index].get(name)
             if isinstance(value, list):
-                case = self._fewest_axes(case, place, name)
-                vector = np.array(case.faults[place][name], float)
+                case = self._fewest_axes(case, index, name)
+                vector = np.array(case.faults[index][name], float)
                 size = float(np.linalg.norm(vector))
                 if size > 0:
-                    case = self._bisected(lambda x: _set(case, place, name, _scaled(vector, x / size)), size, 0.0, case)  # noqa: B023
+                    case = self._bisect(lambda x: _set(case, index, name, _scaled(vector, x / size)), size, 0.0, case)  # noqa: B023
             elif isinstance(value, int | float) and _is_number(value):
-                case = self._bisected(
-                    lambda x, case=case, name=name: _set(case, place, name, x), value, mildest.get(name, 0.0), case
+                case = self._bisect(
+                    lambda x, case=case, name=name: _set(case, index, name, x), value, mildest.get(name, 0.0), case
                 )
         return case
 
-    def _fewest_axes(self, case: Case, place: int, name: str) -> Case:
+    def _fewest_axes(self, case: Case, index: int, name: str) -> Case:
         """Return the case with as many components of a vector at 0 as possible, starting with the smallest."""
         while True:
-            vector = case.faults[place][name]
+            vector = case.faults[index][name]
             axes = sorted((abs(x), axis) for axis, x in enumerate(vector) if x)
-            tried = [
-                _set(case, place, name, [0.0 if i == axis else x for i, x in enumerate(vector)]) for _, axis in axes
+            candidates = [
+                _set(case, index, name, [0.0 if i == axis else x for i, x in enumerate(vector)]) for _, axis in axes
             ]
-            broken = self._breaks(tried, NUMBERS) if len(tried) > 1 else []
-            if not any(broken):
+            violates = self._breaks(candidates, NUMBERS) if len(candidates) > 1 else []
+            if not any(violates):
                 return case
-            case = tried[broken.index(True)]
+            case = candidates[violates.index(True)]
 
-    def _bisected(self, case_of: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
+    def _bisect(self, case_of: Callable[[float], Case], value: float, mildest: float, case: Case) -> Case:
         """Return the case with the number closest to `mildest` that still violates, with few digits if possible."""
         low, high = 0.0, 1.0  # interval between the mildest number (0) and the one that violates (1)
         for _ in range(ROUNDS):
             shares = [low + share * (high - low) for share in SHARES]
-            broken = self._breaks([case_of(_between(mildest, value, share)) for share in shares], NUMBERS)
-            first = broken.index(True) if any(broken) else len(shares)
+            violates = self._breaks([case_of(_between(mildest, value, share)) for share in shares], NUMBERS)
+            first = violates.index(True) if any(violates) else len(shares)
             low, high = [low, *shares][first], [*shares, high][first]
-        found = case_of(_between(mildest, value, high)) if high < 1.0 else case
+        result = case_of(_between(mildest, value, high)) if high < 1.0 else case
         number = _between(mildest, value, high)
-        short = [case_of(each) for digits in (1, 2) if (each := _outward(number, mildest, value, digits)) is not None]
-        broken = self._breaks(short, NUMBERS) if short else []
-        return short[broken.index(True)] if any(broken) else found
+        rounded = [case_of(each) for digits in (1, 2) if (each := _outward(number, mildest, value, digits)) is not None]
+        violates = self._breaks(rounded, NUMBERS) if rounded else []
+        return rounded[violates.index(True)] if any(violates) else result
 
     def _space_value(self, path: str) -> Any:
         """Return the scenario's value of a field; None if it has none."""
         value: Any = msgspec.to_builtins(self._space.base)
         for step in steps_of(path, self._space.document):
             if isinstance(value, list):
-                named = [each for each in value if isinstance(each, Mapping) and each.get("name") == step]
-                value = named[0] if named else value[int(step)] if step.isdigit() and int(step) < len(value) else None
+                matching = [each for each in value if isinstance(each, Mapping) and each.get("name") == step]
+                value = (
+                    matching[0] if matching else value[int(step)] if step.isdigit() and int(step) < len(value) else None
+                )
             else:
                 value = value.get(step) if isinstance(value, Mapping) else None
         return value
 
     # Duration
 
-    def shortest(self, case: Case) -> Case:
+    def shortest_flight(self, case: Case) -> Case:
         """Return the case with the shortest flight that violates the requirement, but would not without its causes."""
         if not case.faults:
             return case
-        length = case.duration_s or self._space.base.duration_s
-        begun = max((fault.get("at_s", 0.0) for fault in case.faults), default=0.0)
-        least = max(begun, SHORTEST_S)
-        case = self._shorter(lambda x: replace(case, duration_s=x), least, length, case)
-        first = min(fault.get("at_s", 0.0) for fault in case.faults)
-        length = case.duration_s or length
-        late = case
+        length_s = case.duration_s or self._space.base.duration_s
+        last_fault_s = max((fault.get("at_s", 0.0) for fault in case.faults), default=0.0)
+        shortest_s = max(last_fault_s, SHORTEST_S)
+        case = self._shorten(lambda x: replace(case, duration_s=x), shortest_s, length_s, case)
+        first_fault_s = min(fault.get("at_s", 0.0) for fault in case.faults)
+        length_s = case.duration_s or length_s
+        unshifted = case
 
         def earlier(by_s: float) -> Case:  # the same case, with all faults earlier
-            faults = tuple({**each, "at_s": _round(each["at_s"] - by_s)} for each in late.faults)
-            return replace(late, faults=faults, duration_s=_round(length - by_s))
+            faults = tuple({**each, "at_s": _round(each["at_s"] - by_s)} for each in unshifted.faults)
+            return replace(unshifted, faults=faults, duration_s=_round(length_s - by_s))
 
-        if first > 0 and all("at_s" in each for each in late.faults):
-            case = self._shorter(lambda x: earlier(length - x), max(length - first, SHORTEST_S), length, case)
+        if first_fault_s > 0 and all("at_s" in each for each in unshifted.faults):
+            case = self._shorten(
+                lambda x: earlier(length_s - x), max(length_s - first_fault_s, SHORTEST_S), length_s, case
+            )
         return case
 
-    def _shorter(self, case_of: Callable[[float], Case], least: float, most: float, case: Case) -> Case:
+    def _shorten(self, case_of: Callable[[float], Case], low_s: float, high_s: float, case: Case) -> Case:
         for _ in range(ROUNDS):
-            lengths = [_round(least + share * (most - least)) for share in SHARES]
-            tried = [case_of(each) for each in lengths]
-            broken = self._breaks(tried, DURATION)
-            good = (place for place, each in enumerate(tried) if broken[place] and self._holds_idle(each))
-            first = next(good, len(tried))
-            case = tried[first] if first < len(tried) else case
-            least, most = [least, *lengths][first], [*lengths, most][first]
+            lengths_s = [_round(low_s + share * (high_s - low_s)) for share in SHARES]
+            candidates = [case_of(each) for each in lengths_s]
+            violates = self._breaks(candidates, DURATION)
+            acceptable = (index for index, each in enumerate(candidates) if violates[index] and self._holds_idle(each))
+            first = next(acceptable, len(candidates))
+            case = candidates[first] if first < len(candidates) else case
+            low_s, high_s = [low_s, *lengths_s][first], [*lengths_s, high_s][first]
         return case
 
     def _holds_idle(self, case: Case) -> bool:
@@ -177,18 +184,18 @@ class Shrinker:
 
 
 def causes_of(case: Case) -> list[Cause]:
-    return [*(("fault", place) for place in range(len(case.faults))), *(("value", path) for path in case.values)]
+    return [*(("fault", index) for index in range(len(case.faults))), *(("value", path) for path in case.values)]
 
 
-def only(case: Case, causes: Sequence[Cause]) -> Case:
+def reduced_to(case: Case, causes: Sequence[Cause]) -> Case:
     """Return a case reduced to the given causes."""
-    faults = tuple(fault for place, fault in enumerate(case.faults) if ("fault", place) in causes)
+    faults = tuple(fault for index, fault in enumerate(case.faults) if ("fault", index) in causes)
     return replace(case, faults=faults, values={p: v for p, v in case.values.items() if ("value", p) in causes})
 
 
-def _set(case: Case, place: int, name: str, value: Any) -> Case:
+def _set(case: Case, index: int, name: str, value: Any) -> Case:
     faults = list(case.faults)
-    faults[place] = {**faults[place], name: value}
+    faults[index] = {**faults[index], name: value}
     return replace(case, faults=tuple(faults))
 
 
@@ -213,8 +220,8 @@ def _outward(number: float, mildest: float, value: float, digits: int) -> float 
     unit = 10.0 ** (math.floor(math.log10(abs(number))) - digits + 1)
     steps = number / unit
     rounded = math.ceil(steps - 1e-9) if value > mildest else math.floor(steps + 1e-9)
-    found = _round(rounded * unit, digits + 1)
-    return found if min(mildest, value) <= found <= max(mildest, value) and found != number else None
+    result = _round(rounded * unit, digits + 1)
+    return result if min(mildest, value) <= result <= max(mildest, value) and result != number else None
 
 
 def _is_number(value: Any) -> bool:

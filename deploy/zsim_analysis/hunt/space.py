@@ -45,15 +45,17 @@ OPTION = "--fault"
 SYNTAX = "a kind and NAME=LOW..HIGH or NAME=VALUE, as in 'gust velocity_m_s=1..6 for_s=2..8'"
 WIND = "environment.wind.gust_m_s=uniform(0, 2)"  # default of --vary; design choice
 LARGE, SMALL_SHARE, LARGE_SHARE = 1000.0, 1e-5, 1e-2  # design choice; see the module docstring
-LEAST_S = 0.5  # shortest duration of a fault; design choice: shorter ones would last only a few samples
+FAULT_MIN_S = 0.5  # shortest duration of a fault; design choice: shorter ones would last only a few samples
 DECADES = 30.0  # ratio of the ends of a range from which on all decades are equally likely
 ONE_WAY_SHARE = 1 / 3  # probability that a flag of a fault is set; design choice
 DIGITS = 4  # significant digits of drawn numbers, so that their texts represent them exactly
 _RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
-LAG = 32  # most pending flights; design choice: more than a machine's processes
+PENDING_MAX = 32  # most pending flights; design choice: more than a machine's processes
 TRIES = 24  # random sets of kinds, of which the one with the most untried combinations is flown
 STEPS = (0.3, 0.1, 0.03)  # standard deviations of moves, as shares of a range; design choice
-AGAIN = 0.25  # probability of an untried combination in place of a neighbour, and of a random one if all are tried
+EXPLORATION_PROBABILITY = (
+    0.25  # probability of an untried combination in place of a neighbour, and of a random one if all are tried
+)
 
 
 class Case(Struct, frozen=True):
@@ -87,14 +89,14 @@ class Knob(Struct, frozen=True):
     def draw(self, rng: Generator) -> Any:
         if self.shape == "choice":
             return self.choices[int(rng.choice(len(self.choices), p=self.weights or None))]
-        return self._of(self._magnitude(rng.uniform()), _direction(rng, self.shape))
+        return self._compose(self._magnitude(rng.uniform()), _direction(rng, self.shape))
 
     def near(self, value: Any, rng: Generator, step: float) -> Any:
         """Return a value moved by a normal draw with a deviation of `step` of the range; for a choice, a new draw."""
         if self.shape == "choice" or value is None:
             return self.draw(rng)
-        place = self.place(value) + step * rng.normal()
-        place = abs(place) if place < 1 else 2 - place  # reflected at the ends
+        position = self.position(value) + step * rng.normal()
+        position = abs(position) if position < 1 else 2 - position  # reflected at the ends
         size = float(np.linalg.norm(value))
         direction = np.asarray(value, float) / size if size > 0 else _direction(rng, self.shape)
         if self.shape == "vector":
@@ -102,9 +104,9 @@ class Knob(Struct, frozen=True):
             direction = direction / np.linalg.norm(direction)
         elif self.shape == "signed" and rng.uniform() < step:
             direction = -direction
-        return self._of(self._magnitude(float(np.clip(place, 0.0, 1.0))), direction)
+        return self._compose(self._magnitude(float(np.clip(position, 0.0, 1.0))), direction)
 
-    def place(self, value: Any) -> float:
+    def position(self, value: Any) -> float:
         """Return the position of a value within its range, from 0 to 1."""
         size = float(np.linalg.norm(value)) if self.shape != "number" else float(value)
         if self.high <= self.low:
@@ -121,7 +123,7 @@ class Knob(Struct, frozen=True):
             return self.low * (self.high / self.low) ** share
         return self.low + share * (self.high - self.low)
 
-    def _of(self, size: float, direction: Any) -> Any:
+    def _compose(self, size: float, direction: Any) -> Any:
         low, high = _rounded(self.low), _rounded(self.high)
         size = min(max(_rounded(size), low), high) if self.shape != "vector" else size
         if self.shape == "vector":
@@ -174,7 +176,7 @@ class HuntSpace:
         rules: texts of `--fault`, each a kind with narrower ranges; empty: all kinds except deaths of processes.
         without: kinds that are not drawn.
         vary: texts of `--vary`; seeds are always drawn.
-        most: largest number of faults in one flight.
+        faults_max: largest number of faults in one flight.
 
     Raises:
         ScenarioError: the arguments or the scenario are invalid; one line per fault.
@@ -187,7 +189,7 @@ class HuntSpace:
         rules: Sequence[str] = (),
         without: Sequence[str] = (),
         vary: Sequence[str] = (WIND,),
-        most: int = 3,
+        faults_max: int = 3,
     ) -> None:
         self.document, self.source = dict(document), source
         self.base = scenario_file.resolve(copy.deepcopy(self.document), source)
@@ -198,7 +200,7 @@ class HuntSpace:
         if faults:
             raise ScenarioError(faults)
         self._check_ends(rules)
-        self.most = min(most, len(self.kinds))
+        self.faults_max = min(faults_max, len(self.kinds))
 
     def scenario(self, case: Case) -> Scenario:
         """Return the resolved scenario of a flight; raise ScenarioError if it cannot be flown."""
@@ -221,14 +223,14 @@ class HuntSpace:
 
     def options(self, case: Case) -> list[str]:
         """Return the differences between a flight and the scenario, as options of `zsim run`."""
-        words = ["--seed", str(case.seed)]
+        arguments = ["--seed", str(case.seed)]
         if case.duration_s is not None:
-            words += ["--duration", f"{case.duration_s:g}"]
+            arguments += ["--duration", f"{case.duration_s:g}"]
         for path, value in case.values.items():
-            words += ["--set", f"{path}={text_of(value)}"]
+            arguments += ["--set", f"{path}={text_of(value)}"]
         if case.faults:
-            words += ["--set", f"faults={text_of([*(self.document.get('faults') or []), *case.faults])}"]
-        return words
+            arguments += ["--set", f"faults={text_of([*(self.document.get('faults') or []), *case.faults])}"]
+        return arguments
 
     # Draws
 
@@ -248,8 +250,8 @@ class HuntSpace:
         axis = self.fields[path]
         if isinstance(axis, Grid):
             return axis.values[int(rng.integers(len(axis.values)))]
-        drawn = rng.uniform(axis.first, axis.second) if axis.kind == "uniform" else rng.normal(axis.first, axis.second)
-        return _rounded(float(drawn))
+        value = rng.uniform(axis.first, axis.second) if axis.kind == "uniform" else rng.normal(axis.first, axis.second)
+        return _rounded(float(value))
 
     def draw_seed(self, rng: Generator) -> int:
         return int(rng.integers(SEEDS))
@@ -259,8 +261,10 @@ class HuntSpace:
         scenario = self.base
         if kind.strikes == "drone":
             simulated = [drone for drone in scenario.drones if not drone.is_external]
-            has = [drone.name for drone in simulated if not kind.sensor or kind.sensor in sensor_names(drone.sensors)]
-            return tuple(has)
+            suitable = [
+                drone.name for drone in simulated if not kind.sensor or kind.sensor in sensor_names(drone.sensors)
+            ]
+            return tuple(suitable)
         if kind.strikes == "link":
             return tuple(links_of(scenario))
         if kind.strikes == "radio":
@@ -269,33 +273,33 @@ class HuntSpace:
 
     def _kinds(self, rules: Sequence[str], without: Sequence[str], faults: list[str]) -> dict[str, KindSpace]:
         known = kinds_of(declarations(self.base.drones))
-        given: dict[str, dict[str, Any]] = {}
+        narrowed: dict[str, dict[str, Any]] = {}
         for text in rules:
             try:
-                kind, *words = shlex.split(text) or [""]
+                kind, *tokens = shlex.split(text) or [""]
             except ValueError as error:
                 faults.append(f"{OPTION} {show(text)}: {error}; must be {SYNTAX}")
                 continue
             if kind not in known:
                 faults.append(f"{OPTION} {show(text)}: {unknown_kind(kind, known)}")
                 continue
-            knobs = given.setdefault(kind, {})
-            for word in words:
-                name, equals, value = word.partition("=")
+            knobs = narrowed.setdefault(kind, {})
+            for token in tokens:
+                name, equals, value = token.partition("=")
                 if not equals or name == "kind":
-                    faults.append(f"{OPTION} {show(text)}: has {show(word)}; must be {SYNTAX}")
+                    faults.append(f"{OPTION} {show(text)}: has {show(token)}; must be {SYNTAX}")
                     continue
                 try:
                     knobs[name] = _given(name, value, known[kind])
                 except ValueError as error:
                     faults.append(f"{OPTION} {show(text)}: {name} {error}")
         faults += [f"--without {show(each)}: {unknown_kind(each, known)}" for each in without if each not in known]
-        names = given or {name: {} for name, kind in known.items() if kind.strikes != "process"}
+        names = narrowed or {name: {} for name, kind in known.items() if kind.strikes != "process"}
         kinds = {}
         for name, knobs in names.items():
             kind = known[name]
             has_target = "target" in knobs or self.targets_of(kind)
-            if name in given and not has_target:
+            if name in narrowed and not has_target:
                 faults.append(f"{OPTION} {show(name)}: has no target in this scenario; must be a kind with one")
             if name not in without and has_target:
                 kinds[name] = KindSpace(name, kind, self._knobs(kind) | knobs)
@@ -306,15 +310,15 @@ class HuntSpace:
         knobs = [Knob("target", shape="choice", choices=self.targets_of(kind))]
         knobs.append(Knob("at_s", 0.0, _rounded(length_s * (1 - 1e-3))))
         if kind.lasts != "once":
-            knobs.append(Knob("for_s", min(LEAST_S, length_s / 2), length_s / 2))
+            knobs.append(Knob("for_s", min(FAULT_MIN_S, length_s / 2), length_s / 2))
         knobs += [knob for p in kind.parameters if (knob := _knob_of(p))]
         return {knob.name: knob for knob in knobs}
 
     def _check_ends(self, rules: Sequence[str]) -> None:
         """Raise ScenarioError for invalid values, checking both ends of every range and each listed value."""
         for path, axis in self.fields.items():
-            both = (axis.first, axis.second) if isinstance(axis, Draw) else axis.values
-            for value in both if isinstance(axis, Grid) or axis.kind == "uniform" else both[:1]:
+            limits = (axis.first, axis.second) if isinstance(axis, Draw) else axis.values
+            for value in limits if isinstance(axis, Grid) or axis.kind == "uniform" else limits[:1]:
                 try:
                     self.scenario(Case(self.base.seed, {path: value}))
                 except ScenarioError as error:
@@ -334,9 +338,9 @@ class HuntSpace:
                 self.scenario(Case(self.base.seed, faults=tuple(ends[start : start + 2])))
             except ScenarioError as error:
                 text = next((rule for rule in rules if rule.split()[:1] == [owners[start]]), owners[start])
-                own = len(self.document.get("faults") or [])
-                place = re.compile(rf"^.*?faults\[(?:{own}|{own + 1})\]\.?")
-                lines = dict.fromkeys(place.sub("", fault) for fault in error.faults)
+                own_count = len(self.document.get("faults") or [])
+                fault_prefix = re.compile(rf"^.*?faults\[(?:{own_count}|{own_count + 1})\]\.?")
+                lines = dict.fromkeys(fault_prefix.sub("", fault) for fault in error.faults)
                 raise ScenarioError([f"{OPTION} {show(text)}: {line}" for line in lines]) from error
 
 
@@ -403,9 +407,9 @@ class Elite(NamedTuple):
 class Coverage:
     """The combinations of kinds of faults that have been flown."""
 
-    def __init__(self, kinds: Sequence[str], most: int) -> None:
+    def __init__(self, kinds: Sequence[str], faults_max: int) -> None:
         self.kinds = sorted(kinds)
-        self.possible = {size: list(combinations(self.kinds, size)) for size in range(1, min(most, 3) + 1)}
+        self.possible = {size: list(combinations(self.kinds, size)) for size in range(1, min(faults_max, 3) + 1)}
         self.untried = {size: set(sets) for size, sets in self.possible.items()}
         self._order = {size: list(sets) for size, sets in self.possible.items()}
 
@@ -416,7 +420,7 @@ class Coverage:
     def tried(self, size: int) -> int:
         return len(self.possible[size]) - len(self.untried[size])
 
-    def next(self, rng: Generator, most: int) -> tuple[str, ...] | None:
+    def next(self, rng: Generator, faults_max: int) -> tuple[str, ...] | None:
         """Return kinds for a flight, with untried combinations among them; None if all have been tried."""
         size = next((size for size in self.untried if self.untried[size]), None)
         if size is None:
@@ -426,9 +430,11 @@ class Coverage:
         for _ in range(TRIES):
             chosen = list(order[int(rng.integers(len(order)))])
             others = [kind for kind in self.kinds if kind not in chosen]
-            more = min(most - len(chosen), len(others))
+            extra_count = min(faults_max - len(chosen), len(others))
             chosen = (
-                sorted([*chosen, *(str(each) for each in rng.choice(others, more, replace=False))]) if more else chosen
+                sorted([*chosen, *(str(each) for each in rng.choice(others, extra_count, replace=False))])
+                if extra_count
+                else chosen
             )
             count = sum(each in self.untried[size] for each in combinations(chosen, size))
             best = max(best, (count, tuple(chosen)))
@@ -440,23 +446,27 @@ class Strategy:
 
     def __init__(self, space: HuntSpace, seed: int) -> None:
         self.space, self.seed = space, seed
-        self._planned = Coverage(list(space.kinds), space.most)
-        self.coverage = Coverage(list(space.kinds), space.most)  # combinations in finished flights
+        self._planned = Coverage(list(space.kinds), space.faults_max)
+        self.coverage = Coverage(list(space.kinds), space.faults_max)  # combinations in finished flights
         self.elites: dict[tuple[str, ...], Elite] = {}
-        self._drawn = 0
+        self._drawn_count = 0
 
     def draw(self) -> Case:
         """Return the next flight; the first one has no faults."""
-        rng = stream(self.seed, f"hunt/{self._drawn}")
-        explores = self._drawn % 2 == 1 or not self.elites
-        first, self._drawn = self._drawn == 0, self._drawn + 1
-        if first:
+        rng = stream(self.seed, f"hunt/{self._drawn_count}")
+        explores = self._drawn_count % 2 == 1 or not self.elites
+        is_first, self._drawn_count = self._drawn_count == 0, self._drawn_count + 1
+        if is_first:
             return Case(self.space.base.seed)
-        if explores or rng.uniform() < AGAIN:
-            kinds = self._planned.next(rng, self.space.most)
-            if kinds is None and (rng.uniform() < AGAIN or not self.elites):
+        if explores or rng.uniform() < EXPLORATION_PROBABILITY:
+            kinds = self._planned.next(rng, self.space.faults_max)
+            if kinds is None and (rng.uniform() < EXPLORATION_PROBABILITY or not self.elites):
                 names = list(self.space.kinds)
-                kinds = tuple(str(each) for each in rng.choice(names, self.space.most, replace=False)) if names else ()
+                kinds = (
+                    tuple(str(each) for each in rng.choice(names, self.space.faults_max, replace=False))
+                    if names
+                    else ()
+                )
             if kinds is not None:
                 self._planned.add(tuple(sorted(kinds)))
                 faults = tuple(self.space.kinds[kind].draw(rng) for kind in kinds)
@@ -469,8 +479,8 @@ class Strategy:
     def learn(self, case: Case, margin: Margin) -> None:
         """Record the margin of a flight."""
         self.coverage.add(case.kinds)
-        known = self.elites.get(case.kinds)
-        if case.faults and (known is None or (margin.share < known.margin.share)):
+        best = self.elites.get(case.kinds)
+        if case.faults and (best is None or (margin.share < best.margin.share)):
             self.elites[case.kinds] = Elite(margin, case)
 
     def _near(self, rng: Generator) -> Case:
@@ -478,18 +488,18 @@ class Strategy:
         ranked = sorted(self.elites.values(), key=lambda elite: (elite.margin.share, elite.case.kinds))
         parent = self._pick(ranked, rng)
         faults, kinds = list(parent.faults), self.space.kinds
-        place, how = int(rng.integers(len(faults))), rng.uniform()
-        if how < 0.25 and len(ranked) > 1:  # add a fault of another elite, replacing one if there are too many
+        index, move = int(rng.integers(len(faults))), rng.uniform()
+        if move < 0.25 and len(ranked) > 1:  # add a fault of another elite, replacing one if there are too many
             other = self._pick(ranked, rng)
             fault = other.faults[int(rng.integers(len(other.faults)))]
-            faults = faults if len(faults) < self.space.most else [*faults[:place], *faults[place + 1 :]]
+            faults = faults if len(faults) < self.space.faults_max else [*faults[:index], *faults[index + 1 :]]
             faults = [*(each for each in faults if each["kind"] != fault["kind"]), fault]
-        elif how < 0.4:
+        elif move < 0.4:
             names = sorted(set(kinds) - set(parent.kinds)) or list(kinds)
-            faults[place] = kinds[str(rng.choice(names))].draw(rng)
+            faults[index] = kinds[str(rng.choice(names))].draw(rng)
         else:
             step = float(rng.choice(STEPS))
-            faults[place] = kinds[faults[place]["kind"]].near(faults[place], rng, step)
+            faults[index] = kinds[faults[index]["kind"]].near(faults[index], rng, step)
         values = {
             path: self.space.draw_value(path, rng) if rng.uniform() < 0.2 else value
             for path, value in parent.values.items()

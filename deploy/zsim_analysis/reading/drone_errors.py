@@ -52,14 +52,22 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, EstimateErrors]:
     step = 1 + sum(len(each.t_ns) for each in flight.estimates.values()) // ESTIMATES_MAX
     errors = {}
     for track in flight.tracks:
-        if track.external or (own := flight.estimates.get(track.name)) is None:
+        if track.external or (estimates := flight.estimates.get(track.name)) is None:
             continue
-        t_ns, there, here = np.intersect1d(track.t_ns[::step], own.t_ns, assume_unique=True, return_indices=True)
-        there = there * step
-        position, velocity = own.p_W[here] - track.p_W[there], own.v_W[here] - track.truth[there, 3:6]
-        yaw, covariance = wrap_angle(own.yaw[here] - track.yaw[there]), own.covariance[here]
+        t_ns, truth_rows, estimate_rows = np.intersect1d(
+            track.t_ns[::step], estimates.t_ns, assume_unique=True, return_indices=True
+        )
+        truth_rows = truth_rows * step
+        position, velocity = (
+            estimates.p_W[estimate_rows] - track.p_W[truth_rows],
+            estimates.v_W[estimate_rows] - track.truth[truth_rows, 3:6],
+        )
+        yaw, covariance = (
+            wrap_angle(estimates.yaw[estimate_rows] - track.yaw[truth_rows]),
+            estimates.covariance[estimate_rows],
+        )
         variances = np.diagonal(covariance, axis1=1, axis2=2)[:, :3]
-        sigma = np.column_stack([np.sqrt(np.maximum(variances, 0.0)), own.yaw_sigma[here]])
+        sigma = np.column_stack([np.sqrt(np.maximum(variances, 0.0)), estimates.yaw_sigma[estimate_rows]])
         squares = nees(np.hstack([position, velocity]), covariance)
         if len(t_ns):
             errors[track.name] = EstimateErrors(t_ns / 1e9, np.column_stack([position, yaw]), sigma, squares)
@@ -97,28 +105,30 @@ def reference_errors(flight: RecordedFlight) -> dict[str, ReferenceErrors]:
     """Return the errors of every drone that has both truth and a reference on record."""
     errors = {}
     for track in flight.tracks:
-        if track.external or (own := flight.references.get(track.name)) is None:
+        if track.external or (references := flight.references.get(track.name)) is None:
             continue
-        flown = np.isin(own.phases, FLOWN)
-        t_ns, there, here = np.intersect1d(track.t_ns, own.t_ns[flown], assume_unique=True, return_indices=True)
-        place = own.place[flown][here]
-        yaw = wrap_angle(track.yaw[there] - place[:, 3])
-        error = np.column_stack([track.p_W[there] - place[:, :3], yaw])
-        on_path = np.array(own.phases)[flown][here] == "path"
+        is_flown = np.isin(references.phases, FLOWN)
+        t_ns, truth_rows, reference_rows = np.intersect1d(
+            track.t_ns, references.t_ns[is_flown], assume_unique=True, return_indices=True
+        )
+        pose = references.place[is_flown][reference_rows]
+        yaw = wrap_angle(track.yaw[truth_rows] - pose[:, 3])
+        error = np.column_stack([track.p_W[truth_rows] - pose[:, :3], yaw])
+        on_path = np.array(references.phases)[is_flown][reference_rows] == "path"
         if len(t_ns):
-            errors[track.name] = ReferenceErrors(t_ns / 1e9, error, place[:, :3], on_path)
+            errors[track.name] = ReferenceErrors(t_ns / 1e9, error, pose[:, :3], on_path)
     return errors
 
 
 def tracking_of(errors: ReferenceErrors, window_s: tuple[float, float]) -> Tracking:
     rows = (errors.t_s >= window_s[0]) & (errors.t_s <= window_s[1])
-    off = np.linalg.norm(errors.error[:, :3], axis=1)
+    offset_m = np.linalg.norm(errors.error[:, :3], axis=1)
 
     def rms(values: Array) -> float | None:
         return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
-    greatest = float(off[rows].max()) if rows.any() else None
-    return Tracking(rms(off[rows]), greatest, rms(errors.error[rows, 3]), rms(off[rows & errors.on_path]))
+    max_offset_m = float(offset_m[rows].max()) if rows.any() else None
+    return Tracking(rms(offset_m[rows]), max_offset_m, rms(errors.error[rows, 3]), rms(offset_m[rows & errors.on_path]))
 
 
 def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
@@ -132,14 +142,16 @@ def velocity_responses(flight: RecordedFlight) -> dict[str, VelocityResponse]:
     for track in flight.tracks:
         if track.external or (commands := flight.commands.get(track.name)) is None:
             continue
-        t_ns, there, here = np.intersect1d(track.t_ns, commands.t_ns, assume_unique=True, return_indices=True)
-        c, s = np.cos(track.yaw[there]), np.sin(track.yaw[there])
-        flown = np.column_stack([in_heading(track.truth[there, 3:6]), track.yaw_rate[there]])
-        velocity = commands.velocity[here]
-        turned = np.where(commands.in_W[here][:, None], in_heading(velocity), velocity)
+        t_ns, truth_rows, command_rows = np.intersect1d(
+            track.t_ns, commands.t_ns, assume_unique=True, return_indices=True
+        )
+        c, s = np.cos(track.yaw[truth_rows]), np.sin(track.yaw[truth_rows])
+        measured = np.column_stack([in_heading(track.truth[truth_rows, 3:6]), track.yaw_rate[truth_rows]])
+        velocity = commands.velocity[command_rows]
+        heading_velocity = np.where(commands.in_W[command_rows][:, None], in_heading(velocity), velocity)
         if len(t_ns):
-            commanded = np.column_stack([turned, commands.yaw_rate[here]])
-            responses[track.name] = VelocityResponse(t_ns / 1e9, commanded, flown)
+            commanded = np.column_stack([heading_velocity, commands.yaw_rate[command_rows]])
+            responses[track.name] = VelocityResponse(t_ns / 1e9, commanded, measured)
     return responses
 
 
@@ -163,19 +175,19 @@ class Separations(NamedTuple):
 def distances(flight: RecordedFlight, pairs_max: int) -> Distances | None:
     """Return the distances between simulated drones, by pair if at most `pairs_max`; None for fewer than two drones."""
     tracks = [track for track in flight.tracks if len(track.t_ns) and not track.external]
-    t_ns, places = common_instants(tracks)
+    t_ns, indices = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):
         return None
     rows = np.unique(np.linspace(0, len(t_ns) - 1, INSTANTS).astype(int))
-    p_W = np.stack([track.p_W[place[rows]] for track, place in zip(tracks, places, strict=True)], axis=1)
+    p_W = np.stack([track.p_W[index[rows]] for track, index in zip(tracks, indices, strict=True)], axis=1)
     nearest = np.full(p_W.shape[:2], np.inf)
     between, pairs = [], []
     for i, j in combinations(range(len(tracks)), 2):
-        apart = np.linalg.norm(p_W[:, i] - p_W[:, j], axis=1)
-        nearest[:, i] = np.minimum(nearest[:, i], apart)
-        nearest[:, j] = np.minimum(nearest[:, j], apart)
+        distance_m = np.linalg.norm(p_W[:, i] - p_W[:, j], axis=1)
+        nearest[:, i] = np.minimum(nearest[:, i], distance_m)
+        nearest[:, j] = np.minimum(nearest[:, j], distance_m)
         if len(tracks) * (len(tracks) - 1) // 2 <= pairs_max:
-            between.append(apart)
+            between.append(distance_m)
             pairs.append((tracks[i].name, tracks[j].name))
     columns = np.column_stack(between) if between else np.zeros((len(rows), 0))
     return Distances(t_ns[rows] / 1e9, tuple(pairs), columns, nearest)

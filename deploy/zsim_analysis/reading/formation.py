@@ -85,13 +85,13 @@ class Formation:
         statistics = {}
         for i, name in enumerate(self.names):
             est, true = self.est_error[rows, i], self.true_error[rows, i]
-            both = np.isfinite(est) & np.isfinite(true)
+            is_finite = np.isfinite(est) & np.isfinite(true)
             moments: list[float | None] = []
-            for error in (est[both] if both.any() else est[np.isfinite(est)], true[both]):
-                known = (
+            for error in (est[is_finite] if is_finite.any() else est[np.isfinite(est)], true[is_finite]):
+                statistics_of_error = (
                     [float(error.std()), float(np.sqrt(np.mean(error**2))), float(error.mean())] if len(error) else []
                 )
-                moments += known or [None] * 3
+                moments += statistics_of_error or [None] * 3
             statistics[name] = ParameterErrors(*moments)
         return statistics
 
@@ -130,7 +130,7 @@ def formation(states: ClusterStates, tracks: list[Track], scenario: Scenario | N
         ordered = [by_name[name] for name in order.split() if name in by_name]
         true[rows] = _true(space, ordered if len(ordered) == len(members) else members, states.t_ns[rows])
     est_error, true_error = (
-        np.array([space.difference(*pair) for pair in zip(to, desired, strict=True)]) for to in (value, true)
+        np.array([space.difference(*pair) for pair in zip(actual, desired, strict=True)]) for actual in (value, true)
     )
     t_s, drones, names = states.t_ns / 1e9, states.drones, states.names
     return Formation(states.name, drones, names, t_s, desired, value, true, est_error, true_error, states.phases)
@@ -141,10 +141,10 @@ def _true(space: ClusterSpace, members: list[Track], wanted_ns: Times) -> Array:
     true = np.full((len(wanted_ns), space.size), np.nan)
     if len(members) < space.n or any(track.external for track in members):
         return true
-    t_ns, places = common_instants(members)
+    t_ns, indices = common_instants(members)
     _, rows, common = np.intersect1d(wanted_ns, t_ns, assume_unique=True, return_indices=True)
-    p_W = np.stack([track.p_W[place[common]] for track, place in zip(members, places, strict=True)], axis=1)
-    yaw = np.stack([track.yaw[place[common]] for track, place in zip(members, places, strict=True)], axis=1)
+    p_W = np.stack([track.p_W[index[common]] for track, index in zip(members, indices, strict=True)], axis=1)
+    yaw = np.stack([track.yaw[index[common]] for track, index in zip(members, indices, strict=True)], axis=1)
     for row, position, heading in zip(rows, p_W, yaw, strict=True):
         try:
             true[row] = space.forward(position, heading)
@@ -169,16 +169,16 @@ def min_separation_m(tracks: list[Track]) -> float | None:
     If no status ever shows two drones in the air, all samples count. None if there are fewer than two drones.
     """
     simulated = [track for track in tracks if not track.external]  # their truth has more samples
-    each = (_least_m(tracks), _least_m(simulated) if len(simulated) < len(tracks) else None)
-    return min((least for least in each if least is not None), default=None)
+    each = (_min_distance_m(tracks), _min_distance_m(simulated) if len(simulated) < len(tracks) else None)
+    return min((distance_m for distance_m in each if distance_m is not None), default=None)
 
 
-def _least_m(tracks: list[Track]) -> float | None:
+def _min_distance_m(tracks: list[Track]) -> float | None:
     tracks = [track for track in tracks if len(track.t_ns)]
-    t_ns, places = common_instants(tracks)
+    t_ns, indices = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):
         return None
-    p_W = np.stack([track.p_W[place] for track, place in zip(tracks, places, strict=True)], axis=1)
+    p_W = np.stack([track.p_W[index] for track, index in zip(tracks, indices, strict=True)], axis=1)
     flying = np.zeros(p_W.shape[:2], bool)
     for column, track in zip(flying.T, tracks, strict=True):
         if track.states:
@@ -186,14 +186,14 @@ def _least_m(tracks: list[Track]) -> float | None:
             column[:] = np.array([state != "landed" for state in track.states], bool)[np.maximum(latest, 0)]
     if (flying.sum(axis=1) < 2).all():
         flying[:] = True
-    least = np.inf
+    min_m = np.inf
     for start in range(0, len(t_ns), BLOCK):
-        at, aloft = p_W[start : start + BLOCK], flying[start : start + BLOCK]
+        block, aloft = p_W[start : start + BLOCK], flying[start : start + BLOCK]
         for i in range(len(tracks) - 1):
-            distance = np.linalg.norm(at[:, i + 1 :] - at[:, i : i + 1], axis=2)
-            both = aloft[:, i + 1 :] & aloft[:, i : i + 1]
-            least = min(least, float(distance[both].min(initial=np.inf)))
-    return least if np.isfinite(least) else None
+            distance = np.linalg.norm(block[:, i + 1 :] - block[:, i : i + 1], axis=2)
+            both_aloft = aloft[:, i + 1 :] & aloft[:, i : i + 1]
+            min_m = min(min_m, float(distance[both_aloft].min(initial=np.inf)))
+    return min_m if np.isfinite(min_m) else None
 
 
 class GoalErrors(NamedTuple):

@@ -181,13 +181,13 @@ def _graph(
 ) -> tuple[NDArray[np.float64], bool]:
     """Return the reception probability of drone j at drone i, (N, N), and whether the graph is strongly connected."""
     matrix = np.zeros((drones, drones))
-    chances = reception or [(1.0,) * len(heard) for heard in hears]
-    for i, row in enumerate(zip(hears[:drones], chances[:drones], strict=False)):
-        for j, chance in zip(*row, strict=False):
+    probabilities = reception or [(1.0,) * len(senders) for senders in hears]
+    for i, row in enumerate(zip(hears[:drones], probabilities[:drones], strict=False)):
+        for j, probability in zip(*row, strict=False):
             if j < drones:
-                matrix[i, j] = chance
-    parts, _ = connected_components(csr_array(matrix >= CONNECTS), directed=True, connection="strong")
-    return matrix, parts == 1
+                matrix[i, j] = probability
+    components, _ = connected_components(csr_array(matrix >= CONNECTS), directed=True, connection="strong")
+    return matrix, components == 1
 
 
 @dataclass
@@ -241,16 +241,16 @@ def read_flight(path: Path, answers: bool = False, motion: bool = True) -> Recor
     """
     with RecordReader(path) as reader:
         flight = FlightReader(answers)
-        wanted = [key for key in reader.topics() if flight.handler(key)]
+        report_keys = [key for key in reader.topics() if flight.handler(key)]
         if motion:
-            for message in reader.messages(wanted, by_time=False):
+            for message in reader.messages(report_keys, by_time=False):
                 flight.add(message.key, message.payload, message.wall_ns)
-            whole = completeness(reader)
+            record_completeness = completeness(reader)
         else:
-            sampled = {key for key in wanted if keys.leaf(key) in ("truth", "status", "reference")}
-            others = {key for key in wanted if keys.parts(key)[0] != "drone"}
-            whole = completeness(reader, others, sampled, flight.add)
-        recorded = flight.flight(sum(reader.topics().values()), whole)
+            sampled = {key for key in report_keys if keys.leaf(key) in ("truth", "status", "reference")}
+            unsampled = {key for key in report_keys if keys.parts(key)[0] != "drone"}
+            record_completeness = completeness(reader, unsampled, sampled, flight.add)
+        recorded = flight.flight(sum(reader.topics().values()), record_completeness)
         search_modules(path, recorded.info)
         return recorded
 
@@ -353,7 +353,7 @@ class FlightReader:
     def handler(self, key: str) -> _Handler | None:
         """Return a decoder of a key's messages and a function that stores them; None for keys that no report needs."""
         if key not in self._handlers:
-            group, _, what = keys.parts(key)
+            group, _, leaf = keys.parts(key)
             kinds: dict[str, tuple[type[Struct], Callable[[str, Any], None]]] = {
                 keys.INFO: (Info, lambda _, message: self._infos.append(message)),
                 keys.RADIO: (RadioLinks, lambda _, message: self._radio.append(message)),
@@ -369,7 +369,7 @@ class FlightReader:
             if self._answers:
                 kinds["drone/estimate"] = (_Estimate, self._add_estimate)
                 kinds["drone/cmd/velocity"] = (_Velocity, self._add_command)
-            kind, store = kinds.get(f"{group}/{what}" if what else key, (None, None))
+            kind, store = kinds.get(f"{group}/{leaf}" if leaf else key, (None, None))
             self._handlers[key] = (msgspec.msgpack.Decoder(kind), store) if kind and store else None
         return self._handlers[key]
 
@@ -482,8 +482,8 @@ class FlightReader:
             names, known_drones = self._members.get(name, ((), ()))
             value, desired = np.split(values, 2, axis=1)
             phases, reasons = [phase for phase, _, _ in texts], [reason for _, reason, _ in texts]
-            about = (phases, reasons, self._requests[name], [order for _, _, order in texts])
-            clusters.append(ClusterStates(name, drones or known_drones, names, t_ns, value, desired, *about))
+            state_texts = (phases, reasons, self._requests[name], [order for _, _, order in texts])
+            clusters.append(ClusterStates(name, drones or known_drones, names, t_ns, value, desired, *state_texts))
         estimates = {}
         for drone, rows in self._estimates.items():
             t_ns, values, _ = rows.by_time()
@@ -491,8 +491,8 @@ class FlightReader:
             estimates[drone] = DroneEstimates(t_ns, p_W, v_W, yaw[:, 0], sigma[:, 0], covariance.reshape(-1, 6, 6))
         references = {}
         for drone, rows in self._references.items():
-            t_ns, place, texts = rows.by_time()
-            references[drone] = DroneReferences(t_ns, place, [phase for (phase,) in texts])
+            t_ns, pose, texts = rows.by_time()
+            references[drone] = DroneReferences(t_ns, pose, [phase for (phase,) in texts])
         scenario = scenario_of(info)
         radio = scenario.radio_of_agents if scenario else None
         return RecordedFlight(
@@ -508,31 +508,31 @@ class FlightReader:
             undecoded=self._undecoded,
             began_ns=self._first_wall_ns,
             estimates=estimates,
-            commands=self._flown_commands(),
+            commands=self._obeyed_commands(),
             others=dict(self._others),
             radio=RadioHistory(self._radio, len(tracks), radio.loss if radio else 0.0) if self._radio else None,
             references=references,
         )
 
-    def _flown_commands(self) -> dict[str, VelocityCommands]:
+    def _obeyed_commands(self) -> dict[str, VelocityCommands]:
         """Return the commands that each drone obeyed, by time.
 
         A command was obeyed if the latest status names its source as commander, or if the latest status names no
         commander and the next one names none or this source.
         """
-        kept: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
+        by_drone: defaultdict[str, list[tuple[Times, np.ndarray]]] = defaultdict(list)
         for (drone, source), rows in self._commands.items():
             t_ns, values, _ = rows.by_time()
             if commanders := self._commanders[drone]:
-                place = np.searchsorted(np.array([t for t, _ in commanders]), t_ns, side="right") - 1
-                named = np.array([name for _, name in commanders])
-                now, following = named[np.maximum(place, 0)], named[np.minimum(place + 1, len(named) - 1)]
-                obeyed = (now == source) | ((now == "") & np.isin(following, ("", source)))
+                index = np.searchsorted(np.array([t for t, _ in commanders]), t_ns, side="right") - 1
+                names = np.array([name for _, name in commanders])
+                current, subsequent = names[np.maximum(index, 0)], names[np.minimum(index + 1, len(names) - 1)]
+                obeyed = (current == source) | ((current == "") & np.isin(subsequent, ("", source)))
                 t_ns, values = t_ns[obeyed], values[obeyed]
-            kept[drone].append((t_ns, values))
-        flown = {}
-        for drone, parts in kept.items():
-            t_ns, first = np.unique(np.concatenate([times for times, _ in parts]), return_index=True)
-            values = np.concatenate([values for _, values in parts])[first].astype(np.float64)
-            flown[drone] = VelocityCommands(t_ns, values[:, :3], values[:, 3], values[:, 4] > 0)
-        return flown
+            by_drone[drone].append((t_ns, values))
+        obeyed_commands = {}
+        for drone, parts in by_drone.items():
+            t_ns, unique_rows = np.unique(np.concatenate([times for times, _ in parts]), return_index=True)
+            values = np.concatenate([values for _, values in parts])[unique_rows].astype(np.float64)
+            obeyed_commands[drone] = VelocityCommands(t_ns, values[:, :3], values[:, 3], values[:, 4] > 0)
+        return obeyed_commands

@@ -47,7 +47,7 @@ class RecordedRun(NamedTuple):
 
 
 @contextmanager
-def open_run(place: Path) -> Iterator[RecordedRun]:
+def open_run(run_path: Path) -> Iterator[RecordedRun]:
     """Open the record of a run, given its folder or the record file.
 
     Raises:
@@ -55,7 +55,7 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
         RecordError: the file is not a record, or has no world/info.
         ScenarioError: this version cannot read the scenario.
     """
-    with RecordReader(record_at(place)) as reader:
+    with RecordReader(record_at(run_path)) as reader:
         recorded = reader.last(keys.INFO)
         if recorded is None:
             raise RecordError(f"{reader.path}: has no world/info, so its run is unknown")
@@ -120,10 +120,12 @@ def command_age_ms(path: Path) -> dict[str, float] | None:
     reported its own statistics. None if no command on record answers a status.
     """
     with RecordReader(path) as reader:
-        wanted = {k for k in reader.topics() if keys.leaf(k) in ("status", "velocity") and not keys.is_accepted(k)}
+        selected_keys = {
+            k for k in reader.topics() if keys.leaf(k) in ("status", "velocity") and not keys.is_accepted(k)
+        }
         status_wall_ns: dict[tuple[str, int], int] = {}
         ages_ns = []
-        for message in reader.messages(wanted, by_time=False):
+        for message in reader.messages(selected_keys, by_time=False):
             instant = (keys.thing(message.key), message.t_ns)
             if keys.leaf(message.key) == "status":
                 status_wall_ns[instant] = message.wall_ns
@@ -150,16 +152,16 @@ class DriverLink(Struct, frozen=True):
     refused: int  # number of datagrams that were malformed or from another sender, over all consecutive drivers
 
     def __str__(self) -> str:
-        figures = (
+        values = (
             ("loss {:.1f} %", self.loss_mean_percent),
             ("at most {:.1f} %", self.loss_max_percent),
             ("age at most {:.0f} ms", self.age_max_ms),
             ("round trip {:.0f} ms", self.round_trip_ms),
         )
-        known = [text.format(value) for text, value in figures if value is not None]
+        parts = [text.format(value) for text, value in values if value is not None]
         lost = f"lost {self.lost} times, for {self.lost_s:.1f} s" if self.lost else "never lost"
         refused = [f"{self.refused} messages refused"] if self.refused else []
-        return ", ".join([self.peer, *known, lost, *refused])
+        return ", ".join([self.peer, *parts, lost, *refused])
 
 
 def driver_links(path: Path) -> dict[str, DriverLink]:
@@ -224,10 +226,10 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
 
     Processes that announce no fingerprint, or serve names that are not agents of the scenario, are left out.
     """
-    known = set(agents_of(scenario)) if scenario.drones else set()
+    expected = set(agents_of(scenario)) if scenario.drones else set()
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
-    ours = [(name, j) for name, j in joins if j.version and j.fingerprint and {name, *j.serves} <= known]
-    processes = [AgentProcess(name, (*join.serves, name)) for name, join in dict(ours).items()]
+    agent_joins = [(name, j) for name, j in joins if j.version and j.fingerprint and {name, *j.serves} <= expected]
+    processes = [AgentProcess(name, (*join.serves, name)) for name, join in dict(agent_joins).items()]
     roles = [*agent_roles(scenario)]
     processes.sort(key=lambda process: (roles.index(process.name.partition(".")[0]), process.name))
     names = frozenset(name for process in processes for name in process.members)
@@ -237,7 +239,7 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
         processes=() if why_not else tuple(processes),
         why_not=why_not,
         requests=(*_read(reader, "cluster/*/request"), *_read(reader, "drone/*/request")),
-        fingerprints=frozenset(join.fingerprint for _, join in ours),
+        fingerprints=frozenset(join.fingerprint for _, join in agent_joins),
         truth_sha256=next((e.data.get("truth_sha256") for e in reversed(events) if e.kind == "end"), None),
         failure=next((event.text for event in events if _ends_by_failure(event, names)), ""),
     )
@@ -254,19 +256,19 @@ def _why_not(
     if any(fault.get("kind") == PROCESS_KILL for fault in scenario.faults):
         return f"a {PROCESS_KILL} was planned"
     for event in events:
-        at, is_ours = f"at {event.t_ns / 1e9:.2f} s", event.subject in names
+        at_time, is_agent = f"at {event.t_ns / 1e9:.2f} s", event.subject in names
         if event.kind == "end" or _ends_by_failure(event, names):
             break
-        if event.kind in ABSENCES and is_ours:
-            return f"{event.kind} of {event.subject} {at}"
-        if event.kind == "outputs_missing" and is_ours:
-            return f"outputs of {event.subject} were lost {at}"
-        if event.kind == "join" and is_ours and event.data.get("from_ns", 0):
-            return f"{event.subject} joined {at}, after the start"
+        if event.kind in ABSENCES and is_agent:
+            return f"{event.kind} of {event.subject} {at_time}"
+        if event.kind == "outputs_missing" and is_agent:
+            return f"outputs of {event.subject} were lost {at_time}"
+        if event.kind == "join" and is_agent and event.data.get("from_ns", 0):
+            return f"{event.subject} joined {at_time}, after the start"
         is_fault = event.kind == "control" and event.data.get("ok") and event.subject == "fault_add"
         fault = event.data.get("args") if is_fault else None
         if isinstance(fault, dict) and fault.get("kind") == PROCESS_KILL:
-            return f"a {PROCESS_KILL} was requested {at}"
+            return f"a {PROCESS_KILL} was requested {at_time}"
     return ""
 
 
@@ -277,8 +279,8 @@ def _ends_by_failure(event: run_messages.Event, names: frozenset[str]) -> bool:
 
 def _read(reader: RecordReader, expression: str) -> Iterator[tuple[str, Any]]:
     """Yield the valid messages on a key expression, with their keys, in the order of the record."""
-    wanted = [key for key in reader.topics() if keys.matches(expression, key)]
-    for recorded in reader.messages(wanted, by_time=False):
+    matching_keys = [key for key in reader.topics() if keys.matches(expression, key)]
+    for recorded in reader.messages(matching_keys, by_time=False):
         if (message := decode_or_none(recorded)) is not None:
             yield recorded.key, message
 
@@ -294,21 +296,21 @@ class GateInputs(NamedTuple):
 def gates(reader: RecordReader, drones: list[str]) -> Iterator[GateInputs]:
     """Yield the inputs and truth of each gate for which a record has truth."""
     truth_keys = {keys.truth(drone): drone for drone in drones}
-    wanted = {keys.CLOCK, keys.EVENT, *truth_keys}
+    gate_keys = {keys.CLOCK, keys.EVENT, *truth_keys}
     for key in reader.topics():
-        kind, _, what = keys.parts(key)
+        kind, _, leaf = keys.parts(key)
         if kind == "process":
-            is_input = what in ("join", "done", "bye")
+            is_input = leaf in ("join", "done", "bye")
         else:
-            is_detection = kind == "drone" and what == keys.SIGHTINGS
+            is_detection = kind == "drone" and leaf == keys.SIGHTINGS
             is_input = is_detection or is_answer(key)
         if is_input:
-            wanted.add(key)
-    wanted &= reader.topics().keys()
+            gate_keys.add(key)
+    gate_keys &= reader.topics().keys()
     inputs: list[Recorded] = []
     truth: dict[str, bytes] = {}
     last_ns = -1
-    for recorded in reader.messages(wanted, by_time=False):
+    for recorded in reader.messages(gate_keys, by_time=False):
         if recorded.key in truth_keys:
             truth[truth_keys[recorded.key]] = recorded.payload
         elif recorded.key != keys.CLOCK:
@@ -334,15 +336,15 @@ class OutputHashes:
 
     def __init__(self, until_ns: int) -> None:
         self._until_ns = until_ns
-        self._of: dict[str, hashlib._Hash] = {}
+        self._hashes: dict[str, hashlib._Hash] = {}
 
     def add(self, key: str, t_ns: int, content: bytes) -> None:
         """Add an output, as `content_of` returns it, in the order of publication for each key."""
         if t_ns <= self._until_ns:
-            self._of.setdefault(key, hashlib.sha256()).update(len(content).to_bytes(4, "little") + content)
+            self._hashes.setdefault(key, hashlib.sha256()).update(len(content).to_bytes(4, "little") + content)
 
     def hexdigests(self) -> dict[str, str]:
-        return {key: digest.hexdigest() for key, digest in sorted(self._of.items())}
+        return {key: digest.hexdigest() for key, digest in sorted(self._hashes.items())}
 
 
 class GateDigests:
@@ -354,17 +356,17 @@ class GateDigests:
 
     def add(self, key: str, t_ns: int, payload: bytes) -> None:
         if t_ns <= self._until_ns:
-            at = self._sums.setdefault(t_ns, {})
-            at[key] = at.get(key, 0) + zlib.crc32(payload) & 0xFFFFFFFF
+            sums = self._sums.setdefault(t_ns, {})
+            sums[key] = sums.get(key, 0) + zlib.crc32(payload) & 0xFFFFFFFF
 
     def csv(self) -> bytes:
         """Return a CSV table: `t_ns`, then a column for each key with 8 hexadecimal digits, or empty."""
-        names = sorted({key for at in self._sums.values() for key in at})
+        names = sorted({key for sums in self._sums.values() for key in sums})
         file = io.StringIO()
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["t_ns", *names])
-        for t_ns, at in sorted(self._sums.items()):
-            writer.writerow([t_ns, *(f"{at[name]:08x}" if name in at else "" for name in names)])
+        for t_ns, sums in sorted(self._sums.items()):
+            writer.writerow([t_ns, *(f"{sums[name]:08x}" if name in sums else "" for name in names)])
         return file.getvalue().encode()
 
 

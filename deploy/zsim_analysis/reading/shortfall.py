@@ -79,8 +79,8 @@ def verdict(record: Path) -> Verdict:
 def shortfalls(flight: RecordedFlight, window_s: tuple[float, float]) -> list[Shortfall]:
     """Return the shortfalls of a flight, failures first; empty if it followed its plan."""
     lines = [*_incidents(flight), *_collisions_and_missions(flight)]
-    lines += [line for states in flight.clusters for line in _of_cluster(states, flight, window_s)]
-    lines += [line for drone in flight.references for line in _of_reference(drone, flight)]
+    lines += [line for states in flight.clusters for line in _cluster_shortfalls(states, flight, window_s)]
+    lines += [line for drone in flight.references for line in _reference_shortfalls(drone, flight)]
     lines += [*_overrides(flight), *_processes(flight)]
     if not flight.completeness.complete:
         text = f"the record is {flight.completeness}"
@@ -208,39 +208,41 @@ def _refusal_before(event: Event, flight: RecordedFlight) -> str:
 
 
 def _incident_text(event: Event, refused: str) -> str:
-    at, data = f"at {seconds_text(event.t_ns / 1e9)} s", event.data
+    at_time, data = f"at {seconds_text(event.t_ns / 1e9)} s", event.data
     match event.kind:
         case "emergency" if data.get("cause") == "command":
-            whose = "operator's emergency" if event.source.startswith(CONSOLE) else "emergency"
-            return f"ended by: {whose} {at} ({event.source})"
+            emergency = "operator's emergency" if event.source.startswith(CONSOLE) else "emergency"
+            return f"ended by: {emergency} {at_time} ({event.source})"
         case "emergency":
             cause = "its driver reported it" if data.get("cause") == "driver" else "tilted too far"
-            return f"emergency {at} ({cause})"
+            return f"emergency {at_time} ({cause})"
         case "impact":
-            return f"hit {data.get('other', 'something')} at {data.get('speed_m_s', 0.0):.1f} m/s {at}"
+            return f"hit {data.get('other', 'something')} at {data.get('speed_m_s', 0.0):.1f} m/s {at_time}"
         case "landing":
             charge = data.get("charge_percent")
-            why = f"no command from {data.get('commander') or 'its commander'} took effect{refused and f'; {refused}'}"
-            return f"landed by itself {at} ({why if charge is None else f'{charge:.1f} % of charge left'})"
+            cause_text = (
+                f"no command from {data.get('commander') or 'its commander'} took effect{refused and f'; {refused}'}"
+            )
+            return f"landed by itself {at_time} ({cause_text if charge is None else f'{charge:.1f} % of charge left'})"
         case "touchdown":
-            return f"touched {data.get('other', 'something')} in flight {at}"
+            return f"touched {data.get('other', 'something')} in flight {at_time}"
         case "flip":
-            return f"upside down {at}"
+            return f"upside down {at_time}"
         case _:
-            return f"no charge left {at}"
+            return f"no charge left {at_time}"
 
 
-def _active_faults(drone: str, at: tuple[int, int], flight: RecordedFlight) -> str:
+def _active_faults(drone: str, instant: tuple[int, int], flight: RecordedFlight) -> str:
     """Describe the faults of a drone or the world that were active at an event, given as (t_ns, sequence number)."""
     active: dict[object, str] = {}
     for each in flight.events:
-        if (each.t_ns, each.seq) > at:
+        if (each.t_ns, each.seq) > instant:
             break
         if each.kind == "fault" and each.data.get("target") in (drone, "world"):
             source = each.data.get("source") or "somebody"
-            whose = "the scenario's" if source == "scenario" else f"{source}'s"
+            owner = "the scenario's" if source == "scenario" else f"{source}'s"
             since = seconds_text(each.t_ns / 1e9)
-            active[each.data.get("id")] = f"{whose} fault {each.data.get('kind')} since {since} s"
+            active[each.data.get("id")] = f"{owner} fault {each.data.get('kind')} since {since} s"
         elif each.kind in ("fault_end", "fault_clear"):
             active.pop(each.data.get("id"), None)
     return f"; {', '.join(active.values())}" if active else ""
@@ -256,15 +258,15 @@ def _collisions_and_missions(flight: RecordedFlight) -> Iterator[Shortfall]:
         if event.kind == "collision":
             pairs.setdefault(frozenset((event.subject, event.data.get("other"))), []).append(event)
     for first, *others in pairs.values():
-        t_s, more = first.t_ns / 1e9, f" ({1 + len(others)} contacts in all)" if others else ""
+        t_s, contacts = first.t_ns / 1e9, f" ({1 + len(others)} contacts in all)" if others else ""
         pair = f"{first.subject}, {first.data.get('other', 'something')}"
-        yield Shortfall("collision", pair, t_s, f"{first.text} at {seconds_text(t_s)} s{more}", True)
+        yield Shortfall("collision", pair, t_s, f"{first.text} at {seconds_text(t_s)} s{contacts}", True)
     newest = {event.subject: event for event in flight.events if event.kind == "mission"}
     for drone, event in newest.items():
         data, t_s = event.data, event.t_ns / 1e9
         if data.get("state") != "finished":
-            why = f"{data.get('reason')}, at {seconds_text(t_s)} s" if data.get("reason") else "the run ended"
-            text = f"{drone}: flew {data.get('done')} of {data.get('items')} mission items; {why}"
+            reason = f"{data.get('reason')}, at {seconds_text(t_s)} s" if data.get("reason") else "the run ended"
+            text = f"{drone}: flew {data.get('done')} of {data.get('items')} mission items; {reason}"
             yield Shortfall("mission", drone, t_s, text, bool(data.get("failsafe")))
 
 
@@ -275,8 +277,8 @@ def _overrides(flight: RecordedFlight) -> Iterator[Shortfall]:
     }
     for drone in sorted(members):
         if parts := list(_interventions(drone, flight)):
-            more = f" (and {len(parts) - 1} more)" if len(parts) > 1 else ""
-            yield Shortfall("override", drone, parts[0].from_ns / 1e9, f"{drone}: {parts[0].text}{more}", False)
+            further = f" (and {len(parts) - 1} more)" if len(parts) > 1 else ""
+            yield Shortfall("override", drone, parts[0].from_ns / 1e9, f"{drone}: {parts[0].text}{further}", False)
 
 
 class _Intervention(NamedTuple):
@@ -292,12 +294,12 @@ class _Intervention(NamedTuple):
 
 def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention]:
     """Yield the interventions in the flight of a drone, by time."""
-    own = [event for event in flight.events if event.subject == drone]
-    for place, event in enumerate(own):
+    drone_events = [event for event in flight.events if event.subject == drone]
+    for index, event in enumerate(drone_events):
         if event.source.startswith(CONTROLLER):
             continue
         if event.kind == "commander":
-            ends = (each.t_ns for each in own[place + 1 :] if each.kind in ("commander", "release"))
+            ends = (each.t_ns for each in drone_events[index + 1 :] if each.kind in ("commander", "release"))
             until_ns = next(ends, flight.last_ns)
             text = f"flown by {event.source} from {span_text((event.t_ns / 1e9, until_ns / 1e9))}"
             yield _Intervention(event.t_ns, until_ns, text)
@@ -306,14 +308,14 @@ def _interventions(drone: str, flight: RecordedFlight) -> Iterator[_Intervention
             yield _Intervention(event.t_ns, flight.last_ns, text)
 
 
-def _of_reference(drone: str, flight: RecordedFlight) -> Iterator[Shortfall]:
+def _reference_shortfalls(drone: str, flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield a shortfall if a drone did not fly its reference, or strayed from it."""
-    own = flight.references[drone]
+    references = flight.references[drone]
     track = next((each for each in flight.tracks if each.name == drone), None)
-    flown = np.isin(own.phases, FLOWN)
+    is_flown = np.isin(references.phases, FLOWN)
     piloted = flight.scenario.piloted() if flight.scenario else {}
     takeoff_s, end_s = piloted[drone].takeoff_s if drone in piloted else 0.0, flight.last_ns / 1e9
-    if not flown.any():
+    if not is_flown.any():
         if end_s - takeoff_s >= ENGAGES_S:
             state = track.states[-1] if track and track.states else "unknown"
             text = f"{drone}: did not take off by its reference at {seconds_text(takeoff_s)} s; it is {state}"
@@ -321,19 +323,23 @@ def _of_reference(drone: str, flight: RecordedFlight) -> Iterator[Shortfall]:
         return
     if track is None or track.external:
         return
-    _, rows = np.unique(own.t_ns // SECOND_NS, return_index=True)  # one per second, as `verdict` reads them
-    rows = rows[flown[rows]]
-    t_ns, at, mine = np.intersect1d(own.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
-    away_m = np.linalg.norm(track.p_W[mine] - own.place[rows][at, :3], axis=1)
-    for act in _interventions(drone, flight):
-        away_m[act.covers(t_ns)] = 0.0
+    _, rows = np.unique(references.t_ns // SECOND_NS, return_index=True)  # one per second, as `verdict` reads them
+    rows = rows[is_flown[rows]]
+    t_ns, reference_rows, track_rows = np.intersect1d(
+        references.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True
+    )
+    away_m = np.linalg.norm(track.p_W[track_rows] - references.place[rows][reference_rows, :3], axis=1)
+    for intervention in _interventions(drone, flight):
+        away_m[intervention.covers(t_ns)] = 0.0
     yield from _far(drone, t_ns, away_m, "its reference", flight)
 
 
 # Formations
 
 
-def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[float, float]) -> Iterator[Shortfall]:
+def _cluster_shortfalls(
+    states: ClusterStates, flight: RecordedFlight, window_s: tuple[float, float]
+) -> Iterator[Shortfall]:
     if not states.phases:
         return
     cluster = cluster_of(flight.scenario, states.name)
@@ -348,20 +354,22 @@ def _of_cluster(states: ClusterStates, flight: RecordedFlight, window_s: tuple[f
         elif takeoff_s >= end_s:
             yield _line(states, "early", end_s, f"the run ended before its take-off at {seconds_text(takeoff_s)} s")
         elif end_s - takeoff_s < ENGAGES_S:
-            after = seconds_text(end_s - takeoff_s)
-            yield _line(states, "early", end_s, f"never engaged; the run ended {after} s after its take-off, {phase}")
+            delay_text = seconds_text(end_s - takeoff_s)
+            yield _line(
+                states, "early", end_s, f"never engaged; the run ended {delay_text} s after its take-off, {phase}"
+            )
         else:
-            why = f": {states.reasons[-1]}" if states.reasons[-1] else ""
-            yield _line(states, "engagement", takeoff_s, f"never engaged, {phase} to the end{why}", True)
+            reason = f": {states.reasons[-1]}" if states.reasons[-1] else ""
+            yield _line(states, "engagement", takeoff_s, f"never engaged, {phase} to the end{reason}", True)
         return
     if flight.scenario and cluster:
         yield from _strayed(states, flight, flight.scenario, cluster)
-    yield from _held(states, flight)
+    yield from _hold_shortfalls(states, flight)
     requests = [each for each in states.requests if each.ok and each.op in LEADS]
     if requests and takeoff_s is not None:
         first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in requests[:3])
-        more = f" and {len(requests) - 3} more" if len(requests) > 3 else ""
-        yield _line(states, "request", requests[0].t_ns / 1e9, f"requested: {first}{more}")
+        further = f" and {len(requests) - 3} more" if len(requests) > 3 else ""
+        yield _line(states, "request", requests[0].t_ns / 1e9, f"requested: {first}{further}")
     if flight.scenario and cluster and plan and takeoff_s is not None:
         for step, due_s in (("trajectory", plan.trajectory and plan.trajectory.start_s), ("landing", plan.land_s)):
             if due_s is not None and due_s >= end_s:
@@ -380,21 +388,25 @@ def _line(states: ClusterStates, kind: str, t_s: float, text: str, fails: bool =
 
 def _refused(states: ClusterStates) -> Iterator[Shortfall]:
     """Yield the steps of the plan that were refused until the end, or until the landing that dropped them."""
-    begun: tuple[str, float] | None = None
+    refused_since: tuple[str, float] | None = None
     was_engaged = False
-    for place, note in enumerate(states.reasons):
-        step = waiting_step(note)
-        engaged = states.phases[place] in ("engaged", "held")
+    for index, reason in enumerate(states.reasons):
+        step = waiting_step(reason)
+        engaged = states.phases[index] in ("engaged", "held")
         was_engaged = was_engaged or engaged
         if step is None:
-            begun = None
+            refused_since = None
             continue
-        op, why = step
-        begun = begun if begun and begun[0] == op else (op, float(states.t_ns[place]) / 1e9)
-        last = place + 1 == len(states.reasons)
-        flown = engaged or (was_engaged and states.phases[place] == "assembling")  # also while the formation changes
-        if flown and (last or states.phases[place + 1] == "landing"):
-            yield _line(states, "plan", begun[1], f"the {op} of the plan was refused to the end: {why}", True)
+        op, cause = step
+        refused_since = (
+            refused_since if refused_since and refused_since[0] == op else (op, float(states.t_ns[index]) / 1e9)
+        )
+        is_last = index + 1 == len(states.reasons)
+        was_flying = engaged or (
+            was_engaged and states.phases[index] == "assembling"
+        )  # also while the formation changes
+        if was_flying and (is_last or states.phases[index + 1] == "landing"):
+            yield _line(states, "plan", refused_since[1], f"the {op} of the plan was refused to the end: {cause}", True)
 
 
 def _strayed(
@@ -409,32 +421,36 @@ def _strayed(
     rows = _sampled(states, np.flatnonzero(engaged & settled), SECOND_NS)
     try:
         space = scenario_space(scenario, cluster)
-        places_W = np.array([space.inverse(c)[0] for c in states.desired[rows]] if space.names == states.names else [])
+        positions_W = np.array(
+            [space.inverse(c)[0] for c in states.desired[rows]] if space.names == states.names else []
+        )
     except (*REFUSALS, ValueError):
         return
     tracks = {track.name: track for track in flight.tracks if not track.external}
-    for drone in states.drones if len(places_W) else ():
+    for drone in states.drones if len(positions_W) else ():
         if (track := tracks.get(drone)) is None:
             continue
-        t_ns, at, mine = np.intersect1d(states.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True)
-        robots = np.array([states.robot_of(row, drone) for row in rows[at].tolist()], np.intp)
-        away_m = np.linalg.norm(track.p_W[mine] - places_W[at, robots], axis=1)
-        for act in _interventions(drone, flight):
-            away_m[act.covers(t_ns)] = 0.0
+        t_ns, state_rows, track_rows = np.intersect1d(
+            states.t_ns[rows], track.t_ns, assume_unique=True, return_indices=True
+        )
+        robots = np.array([states.robot_of(row, drone) for row in rows[state_rows].tolist()], np.intp)
+        away_m = np.linalg.norm(track.p_W[track_rows] - positions_W[state_rows, robots], axis=1)
+        for intervention in _interventions(drone, flight):
+            away_m[intervention.covers(t_ns)] = 0.0
         yield from _far(drone, t_ns, away_m, "its place in the formation", flight)
 
 
-def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, what: str, flight: RecordedFlight) -> Iterator[Shortfall]:
-    """Yield a shortfall if a drone was far off for STRAYED_S; `away_m` are its distances from `what` once a second."""
+def _far(drone: str, t_ns: NDArray[np.int64], away_m: Array, goal: str, flight: RecordedFlight) -> Iterator[Shortfall]:
+    """Yield a shortfall if a drone was far off for STRAYED_S; `away_m` are its distances from `goal` once a second."""
     stretches = np.split(np.arange(len(t_ns)), np.flatnonzero(np.diff(away_m > STRAYED_M)) + 1)
-    long = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
-    if long:
-        from_ns, most_m = int(t_ns[long[0][0]]), max(float(away_m[each].max()) for each in long)
-        text = f"{drone}: up to {most_m:.0f} m from {what}, from {from_ns / 1e9:.0f} s on"
+    strayed = [each for each in stretches if len(each) >= STRAYED_S and away_m[each[0]] > STRAYED_M]
+    if strayed:
+        from_ns, max_m = int(t_ns[strayed[0][0]]), max(float(away_m[each].max()) for each in strayed)
+        text = f"{drone}: up to {max_m:.0f} m from {goal}, from {from_ns / 1e9:.0f} s on"
         yield Shortfall("strayed", drone, from_ns / 1e9, f"{text}{_active_faults(drone, (from_ns, 0), flight)}", True)
 
 
-def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
+def _hold_shortfalls(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
     """Yield the total time that a formation was held after its engagement, except on request.
 
     Holds during interventions in the flight of its drones are reported, but are not failures.
@@ -444,12 +460,12 @@ def _held(states: ClusterStates, flight: RecordedFlight) -> Iterator[Shortfall]:
     rows = rows[[HELD_ON_REQUEST not in states.reasons[row] for row in rows]] if len(rows) else rows
     if not len(rows):
         return
-    t_ns, nexts = states.t_ns[rows], np.minimum(rows + 1, len(phases) - 1)
-    lengths_s = (states.t_ns[nexts] - t_ns) / 1e9
+    t_ns, next_rows = states.t_ns[rows], np.minimum(rows + 1, len(phases) - 1)
+    lengths_s = (states.t_ns[next_rows] - t_ns) / 1e9
     by_others = np.zeros(len(rows), bool)
-    for act in (act for drone in states.drones for act in _interventions(drone, flight)):
-        by_others |= act.covers(t_ns)
-    span_s = (float(t_ns[0]) / 1e9, float(states.t_ns[nexts[-1]]) / 1e9)
+    for intervention in (intervention for drone in states.drones for intervention in _interventions(drone, flight)):
+        by_others |= intervention.covers(t_ns)
+    span_s = (float(t_ns[0]) / 1e9, float(states.t_ns[next_rows[-1]]) / 1e9)
     length = seconds_text(float(lengths_s.sum()))
     text = f"held for {length} s, from {span_text(span_s)}: {states.reasons[rows[0]]}"
     if by_others.any():
@@ -473,15 +489,15 @@ class PlannedReference(NamedTuple):
     start_s: float
     entries: NDArray[np.intp]
 
-    def flown(self, states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def follows(self, states: ClusterStates, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return a mask of the `rows` of `states` in which the engaged formation followed the reference."""
-        on = np.zeros(len(rows), bool)
+        is_followed = np.zeros(len(rows), bool)
         for i, row in enumerate(rows.tolist()):
             if states.phases[row] == "engaged":
                 value = self.reference.value(float(states.t_ns[row] / 1e9 - self.start_s))[0]
-                off = self.space.difference(states.desired[row], value)
-                on[i] = np.abs(off[self.entries]).max(initial=0.0) <= SAME
-        return on
+                deviation = self.space.difference(states.desired[row], value)
+                is_followed[i] = np.abs(deviation[self.entries]).max(initial=0.0) <= SAME
+        return is_followed
 
 
 def _planned(states: ClusterStates, scenario: Scenario, cluster: Cluster, takeoff_s: float) -> PlannedReference | None:
@@ -501,8 +517,11 @@ def _planned(states: ClusterStates, scenario: Scenario, cluster: Cluster, takeof
                 reference = Hold(base)
             else:
                 reference, start_s = step.trajectory(space, base), step.start_s or 0.0
-                named = [step.expressions, *(w["values"] for w in step.waypoints if isinstance(w["values"], Mapping))]
-                names.update(dict.fromkeys(str(name) for each in named for name in each))
+                name_groups = [
+                    step.expressions,
+                    *(w["values"] for w in step.waypoints if isinstance(w["values"], Mapping)),
+                ]
+                names.update(dict.fromkeys(str(name) for each in name_groups for name in each))
         entries = np.array(sorted({variable_of(space, name, "").entry for name in names}), np.intp)
     except (*REFUSALS, ValueError, NotTrustedError):
         return None
@@ -520,44 +539,48 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
         text = f"the run ended at {seconds_text(run_s)} of {seconds_text(duration_s)} s of its trajectory"
         yield _line(states, "early", run_s + planned.start_s, text)
     rows = _sampled(states, np.flatnonzero((t_s >= 0.0) & (t_s <= due_s)))
-    at_s, on = t_s[rows], planned.flown(states, rows)
-    refusals = _waits(states, "trajectory", planned.start_s)
+    at_s, is_followed = t_s[rows], planned.follows(states, rows)
+    refusals = _refusal_text(states, "trajectory", planned.start_s)
     begin_s = 0.0
-    if duration_s is None and on.any() and not refusals:
-        begin_s = float(at_s[on][0])  # an endless trajectory is joined in motion once the formation reaches it
-    flown_s = float(np.diff(np.r_[at_s, due_s])[on].sum())
+    if duration_s is None and is_followed.any() and not refusals:
+        begin_s = float(at_s[is_followed][0])  # an endless trajectory is joined in motion once the formation reaches it
+    flown_s = float(np.diff(np.r_[at_s, due_s])[is_followed].sum())
     if due_s - begin_s - flown_s <= LATE_MAX_S:
         return
-    of = f"{seconds_text(due_s)} s"
-    if not on.any():
-        text = f"none of the {of} of its trajectory was flown"
+    due = f"{seconds_text(due_s)} s"
+    if not is_followed.any():
+        text = f"none of the {due} of its trajectory was flown"
     else:
-        stretches = np.split(at_s[on], np.flatnonzero(np.diff(at_s[on]) > 2 * SAMPLE_NS / 1e9) + 1)
+        stretches = np.split(at_s[is_followed], np.flatnonzero(np.diff(at_s[is_followed]) > 2 * SAMPLE_NS / 1e9) + 1)
         longest = max(stretches, key=len)
         span_s = (float(longest[0]), min(float(longest[-1]) + SAMPLE_NS / 1e9, due_s))
-        parted = flown_s - (span_s[1] - span_s[0]) > LATE_MAX_S
-        length = f"for {seconds_text(round(flown_s, 1))} s in all, at the longest " if parted else ""
-        text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {of}"
-    led = any(each.ok and each.op in LEADS and each.t_ns / 1e9 < planned.start_s + due_s for each in states.requests)
-    yield _line(states, "plan", planned.start_s, f"{text}{refusals}", not led)
+        is_interrupted = flown_s - (span_s[1] - span_s[0]) > LATE_MAX_S
+        length = f"for {seconds_text(round(flown_s, 1))} s in all, at the longest " if is_interrupted else ""
+        text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {due}"
+    was_overridden = any(
+        each.ok and each.op in LEADS and each.t_ns / 1e9 < planned.start_s + due_s for each in states.requests
+    )
+    yield _line(states, "plan", planned.start_s, f"{text}{refusals}", not was_overridden)
 
 
 def _target_reached(states: ClusterStates, planned: PlannedReference, plan: ClusterPlan) -> Iterator[Shortfall]:
     """Yield a shortfall if the reference reached the plan's target late, or the formation landed first."""
     engaged_ns = states.t_ns[states.phases.index("engaged")]
     rows = _sampled(states, np.flatnonzero(states.t_ns >= engaged_ns))
-    on = planned.flown(states, rows)
-    led, engaged_s = any(each.ok and each.op in LEADS for each in states.requests), float(engaged_ns) / 1e9
-    if not on.any():
+    is_followed = planned.follows(states, rows)
+    was_overridden, engaged_s = any(each.ok and each.op in LEADS for each in states.requests), float(engaged_ns) / 1e9
+    if not is_followed.any():
         if states.phases[-1] in ("landing", "idle"):
-            yield _line(states, "plan", engaged_s, "it landed before it was at its target", not led)
+            yield _line(states, "plan", engaged_s, "it landed before it was at its target", not was_overridden)
     elif plan.target_over_s is not None:
         due_s = engaged_s + plan.target_over_s
-        late_s = float(states.t_ns[rows[on]][0]) / 1e9 - due_s
+        late_s = float(states.t_ns[rows[is_followed]][0]) / 1e9 - due_s
         if late_s > LATE_MAX_S:
-            late = seconds_text(round(late_s, 1))
-            text = f"its reference was at the target {late} s after it was due{_waits(states, 'target', 0.0)}"
-            yield _line(states, "plan", due_s, text, not led)
+            late_text = seconds_text(round(late_s, 1))
+            text = (
+                f"its reference was at the target {late_text} s after it was due{_refusal_text(states, 'target', 0.0)}"
+            )
+            yield _line(states, "plan", due_s, text, not was_overridden)
 
 
 def _sampled(states: ClusterStates, rows: NDArray[np.intp], every_ns: int = SAMPLE_NS) -> NDArray[np.intp]:
@@ -565,26 +588,26 @@ def _sampled(states: ClusterStates, rows: NDArray[np.intp], every_ns: int = SAMP
     return rows[np.unique(states.t_ns[rows] // every_ns, return_index=True)[1]]
 
 
-def _waits(states: ClusterStates, op: str, from_s: float) -> str:
+def _refusal_text(states: ClusterStates, op: str, from_s: float) -> str:
     """Describe when a step of the plan was refused after from_s, and why at first; empty if it was not."""
     rows = np.flatnonzero(states.t_ns / 1e9 >= from_s).tolist()
     steps = [(row, waiting_step(states.reasons[row])) for row in rows if states.phases[row] == "engaged"]
-    found = [(row, step[1]) for row, step in steps if step and step[0] == op]
-    if not found:
+    refusals = [(row, step[1]) for row, step in steps if step and step[0] == op]
+    if not refusals:
         return ""
-    first, last = (float(states.t_ns[found[place][0]]) / 1e9 for place in (0, -1))
-    return f"; it was refused from {span_text((first, last))}: {found[0][1]}"
+    first, last = (float(states.t_ns[refusals[index][0]]) / 1e9 for index in (0, -1))
+    return f"; it was refused from {span_text((first, last))}: {refusals[0][1]}"
 
 
 def _outside(states: ClusterStates, window_s: tuple[float, float]) -> Iterator[Shortfall]:
     """Yield a shortfall if the formation was not engaged throughout the window."""
     t_s = states.t_ns / 1e9
     shares = phase_shares(t_s, states.phases, window_s)
-    others = {phase: share for phase, share in shares.items() if phase != "engaged"}
-    if others:
-        rest = ", ".join(f"{phase} {percent_text(share)} %" for phase, share in others.items())
-        part = f"engaged in {percent_text(shares.get('engaged', 0.0))} % of the window only ({rest})"
-        text = part if "engaged" in shares else f"never engaged within the window ({rest})"
+    not_engaged = {phase: share for phase, share in shares.items() if phase != "engaged"}
+    if not_engaged:
+        other_phases = ", ".join(f"{phase} {percent_text(share)} %" for phase, share in not_engaged.items())
+        part = f"engaged in {percent_text(shares.get('engaged', 0.0))} % of the window only ({other_phases})"
+        text = part if "engaged" in shares else f"never engaged within the window ({other_phases})"
         rows = np.flatnonzero((t_s >= window_s[0]) & (t_s <= window_s[1])).tolist()
         first = next(row for row in rows if states.phases[row] != "engaged")
         yield _line(states, "window", float(t_s[first]), text)

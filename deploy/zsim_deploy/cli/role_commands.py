@@ -570,7 +570,7 @@ def drive_mavlink(
     channel = udp_channel(address, local_port)
     check_host(channel.host)
     key = read_key(signing_key) if signing_key else None
-    make_session = partial(AutopilotSession.of_run, channel=channel, system=system, key=key)
+    make_session = partial(AutopilotSession.from_run, channel=channel, system=system, key=key)
     serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)
 
 
@@ -597,7 +597,7 @@ def drive_ardrone(
 
     options = DriverOptions(drone, *bounds, position(origin) if origin else None, yaw)
     check_host(aircraft_host(address))
-    make_session = partial(AircraftSession.of_run, host=address, ultrasound=ultrasound)
+    make_session = partial(AircraftSession.from_run, host=address, ultrasound=ultrasound)
     serve_as("driver", "", partial(drive, options=options, make_session=make_session), reach, drone)
 
 

@@ -108,7 +108,7 @@ def run(
         agents = [AgentSpec.parse(shlex.split(each) or [""]) for each in agent or ()]
         if agents:
             scenario = with_own_agents(scenario, [each.name for each in agents])
-        own = tuple(tuple(each.words()) for each in agents)
+        own = tuple(tuple(each.arguments()) for each in agents)
         how = {"in_process": in_process, "agents": own, "hosted": hosted, "insecure": insecure, "listen": listen}
         launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()), **how)
         options = RunOptions(scenario, Path(), launch, [name for name in order.split(",") if name])

@@ -161,7 +161,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
                 ["agent", *reach, "--", name] if role in scenario.own_agents else [role, *reach, "--", thing]
             )
     for agent in options.agents():
-        commands[agent.name] = ["agent", "--name", agent.name, *reach, "--", *agent.words()]
+        commands[agent.name] = ["agent", "--name", agent.name, *reach, "--", *agent.arguments()]
     if options.console:
         commands[CONSOLE] = ["console", "--name", CONSOLE, "--folder", str(options.out), *reach]
     for role, name, drones in options.camera_children():

@@ -4,8 +4,8 @@ function [v_cmd_W, yaw_rate, integral, factor, guarded] = law(c, p_W, v_W, c_des
     %   c_dot_cmd = c_dot_des + k (c_des - c) + I,    I' = k_i (c_des - c),    r_dot = J^-1(c) c_dot_cmd
     %
     % The command is then saturated by one factor for all robots, which keeps its direction in cluster space, and
-    % corrected by a guard of the distances between robots (triad.hold_apart). The integral is updated only while neither
-    % changes the command.
+    % corrected by a guard of the distances between robots (triad.hold_apart). The integral is updated only while
+    % neither changes the command.
     %
     %   c, c_des, c_dot_des, integral  12 x 1;  p_W, v_W  3 x 3, one robot per row, estimates [m, m/s]
     %   v_cmd_W  3 x 3 [m/s, W];  yaw_rate  3 x 1 [rad/s];  factor  of the saturation

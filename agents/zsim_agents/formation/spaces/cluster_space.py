@@ -131,8 +131,8 @@ class ClusterSpace(ABC):
     def specimen(self, apart_m: float) -> Array:
         """Return c (4n,) of a level formation with robots at least a given distance apart, for rehearsals."""
         radius_m = self.n * apart_m
-        turns = np.arange(self.n) * (TAU / self.n)
-        x, y = (el.elementwise(of)(turns) for of in (el.cos, el.sin))
+        angles = np.arange(self.n) * (TAU / self.n)
+        x, y = (el.elementwise(function)(angles) for function in (el.cos, el.sin))
         p_W = radius_m * np.column_stack((x, y, np.ones(self.n)))
         return self.forward(p_W, np.zeros(self.n))
 
@@ -170,9 +170,9 @@ class ClusterSpace(ABC):
         """Return c (4n,), or a table (m, 4n) of such rows, with the angles that wrap brought into [-pi, pi]."""
         if c.ndim > 1:
             return c - self.period * np.rint(c / TAU)
-        near = np.empty(self.size)
-        put_wrapped(c, self.period, near)
-        return near
+        wrapped_c = np.empty(self.size)
+        put_wrapped(c, self.period, wrapped_c)
+        return wrapped_c
 
     def index(self, name: str) -> int:
         """Return the index of a variable in c; ValueError: the name is unknown."""
@@ -192,8 +192,8 @@ def checked(space: ClusterSpace) -> ClusterSpace:
         "spread": ((),),
         "motion": ((size,),),
     }
-    for method, wanted in shapes.items():
-        setattr(space, method, _checked(getattr(space, method), f"{plugin.full_name(type(space))}.{method}", wanted))
+    for method, expected in shapes.items():
+        setattr(space, method, _checked(getattr(space, method), f"{plugin.full_name(type(space))}.{method}", expected))
     return space
 
 
@@ -211,9 +211,9 @@ def _checked(method: Callable[..., Any], name: str, shapes: tuple[tuple[int, ...
             raise UserCodeError(f"{name} returns {found}; must be {allowed}")
         for array in arrays:
             if not np.isfinite(array).all() and all(np.isfinite(argument).all() for argument in arguments):
-                place = np.argwhere(~np.isfinite(array))[0].tolist()
-                at = f" at {place}" if place else ""
-                raise UserCodeError(f"{name} returns {array[tuple(place)]}{at}; must be finite")
+                index = np.argwhere(~np.isfinite(array))[0].tolist()
+                position = f" at {index}" if index else ""
+                raise UserCodeError(f"{name} returns {array[tuple(index)]}{position}; must be finite")
         return tuple(arrays) if len(arrays) > 1 else arrays[0] if arrays[0].ndim else float(arrays[0])
 
     return call
@@ -226,23 +226,23 @@ def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Arr
 
 
 @portable
-def put_wrapped(c: Array, period: Array, near: Array) -> None:
+def put_wrapped(c: Array, period: Array, out: Array) -> None:
     """Write c with each variable wrapped to half a period about zero; a period of 0 means no wrapping."""
     for k in range(c.size):
-        near[k] = c[k] - period[k] * np.rint(c[k] / TAU)
+        out[k] = c[k] - period[k] * np.rint(c[k] / TAU)
 
 
 @portable
 def closest_pair(p_W: Array) -> tuple[float, int, int]:
     """Return the minimum distance [m] between two of the positions (n, 3), and the indices of that pair."""
-    least, first, second = math.inf, 0, 1
+    min_distance, first, second = math.inf, 0, 1
     for i in range(p_W.shape[0]):
         for j in range(i + 1, p_W.shape[0]):
             x, y, z = p_W[j, 0] - p_W[i, 0], p_W[j, 1] - p_W[i, 1], p_W[j, 2] - p_W[i, 2]
             distance = math.sqrt(x * x + y * y + z * z)
-            if distance < least:
-                least, first, second = distance, i, j
-    return least, first, second
+            if distance < min_distance:
+                min_distance, first, second = distance, i, j
+    return min_distance, first, second
 
 
 def numbered(stem: str, robots: Iterable[int]) -> list[str]:
@@ -306,8 +306,8 @@ def centroid(p_W: Array) -> Vector:
 @portable
 def pitch_yaw(x_W: Vector) -> tuple[float, float]:
     """Return pitch and yaw of a frame from its x axis in W."""
-    flat = math.sqrt(x_W[0] * x_W[0] + x_W[1] * x_W[1])
-    return el.atan2(-x_W[2], flat), el.atan2(x_W[1], x_W[0])
+    horizontal = math.sqrt(x_W[0] * x_W[0] + x_W[1] * x_W[1])
+    return el.atan2(-x_W[2], horizontal), el.atan2(x_W[1], x_W[0])
 
 
 @portable

@@ -23,7 +23,7 @@ from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, chec
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 from zsim_agents.formation.spaces.triad_cluster import PairCluster, TriadCluster
 
-Places = NDArray[np.intp]
+Indices = NDArray[np.intp]
 BODY = ("x_c", "y_c", "z_c", "yaw")  # variables of a group that describe a robot of the parent
 
 
@@ -88,16 +88,16 @@ class _Group(NamedTuple):
         robots, rows: indices of the group's robots, and of their entries in r, four each.
         body, rest: indices of BODY and of all other variables in the group's own c.
         own: indices of these other variables in the c of the complete cluster.
-        at: indices of the group's body in the r of the parent.
+        parent_rows: indices of the group's body in the r of the parent.
     """
 
     space: ClusterSpace
     robots: slice
     rows: slice
-    body: Places
-    rest: Places
+    body: Indices
+    rest: Indices
     own: slice
-    at: slice
+    parent_rows: slice
 
 
 class NestedCluster(ClusterSpace):
@@ -118,11 +118,11 @@ class NestedCluster(ClusterSpace):
             body = np.array([space.index(variable) for variable in BODY])
             rest = np.setdiff1d(np.arange(space.size), body)
             own = slice(len(names), len(names) + len(rest))
-            after = robots + space.n
-            rows, at = slice(4 * robots, 4 * after), slice(4 * k, 4 * k + 4)
-            self._groups.append(_Group(space, slice(robots, after), rows, body, rest, own, at))
+            end = robots + space.n
+            rows, parent_rows = slice(4 * robots, 4 * end), slice(4 * k, 4 * k + 4)
+            self._groups.append(_Group(space, slice(robots, end), rows, body, rest, own, parent_rows))
             names += [f"{name}.{space.names[i]}" for i in rest]
-            robots = after
+            robots = end
         super().__init__(robots, names, "minimum of the spreads of the parent and its groups")
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
@@ -145,38 +145,40 @@ class NestedCluster(ClusterSpace):
         for k, group in enumerate(self._groups):
             own = group.space.jacobian(p_W[group.robots], yaw[group.robots])
             bodies[k] = group.space.forward(p_W[group.robots], yaw[group.robots])[group.body]
-            J[group.own, group.rows], body[group.at, group.rows] = own[group.rest], own[group.body]
+            J[group.own, group.rows], body[group.parent_rows, group.rows] = own[group.rest], own[group.body]
         J[: self.parent.size] = product(self.parent.jacobian(bodies[:, :3].copy(), bodies[:, 3].copy()), body)
         return J
 
     def inverse_jacobian(self, c: Array) -> Array:
         J_inv = np.zeros((self.size, self.size))
         parent, *parts = self.parts(c)
-        moved = self.parent.inverse_jacobian(parent)
+        parent_motion = self.parent.inverse_jacobian(parent)
         for group, own in zip(self._groups, parts, strict=True):
-            of_own = group.space.inverse_jacobian(own)
-            J_inv[group.rows, : self.parent.size] = product(of_own[:, group.body], moved[group.at])
-            J_inv[group.rows, group.own] = of_own[:, group.rest]
+            own_inverse = group.space.inverse_jacobian(own)
+            J_inv[group.rows, : self.parent.size] = product(
+                own_inverse[:, group.body], parent_motion[group.parent_rows]
+            )
+            J_inv[group.rows, group.own] = own_inverse[:, group.rest]
         return J_inv
 
     def motion(self, c: Array, c_dot: Array) -> Array:
         r_dot = np.empty(self.size)
         parent, *parts = self.parts(c)
-        moved = self.parent.motion(parent, c_dot[: self.parent.size])
+        parent_motion = self.parent.motion(parent, c_dot[: self.parent.size])
         for group, own in zip(self._groups, parts, strict=True):
             own_dot = np.empty(group.space.size)
-            own_dot[group.body], own_dot[group.rest] = moved[group.at], c_dot[group.own]
+            own_dot[group.body], own_dot[group.rest] = parent_motion[group.parent_rows], c_dot[group.own]
             r_dot[group.rows] = group.space.motion(own, own_dot)
         return r_dot
 
     def specimen(self, apart_m: float) -> Array:
         c = np.zeros(self.size)
-        widest_m = apart_m
+        separation_m = apart_m
         for group in self._groups:
             own = group.space.specimen(apart_m)
             c[group.own] = own[group.rest]
-            widest_m = max(widest_m, 2.0 * float(np.ptp(group.space.inverse(own)[0], axis=0).max()))
-        c[: self.parent.size] = self.parent.specimen(widest_m)
+            separation_m = max(separation_m, 2.0 * float(np.ptp(group.space.inverse(own)[0], axis=0).max()))
+        c[: self.parent.size] = self.parent.specimen(separation_m)
         return c
 
     def parts(self, c: Array) -> list[Array]:

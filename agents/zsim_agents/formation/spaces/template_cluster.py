@@ -63,7 +63,7 @@ class TemplateCluster(ClusterSpace):
             raise ValueError(f"template: {n} positions; allowed: 3 or more")
         self.modes_C = shape_modes(self.t_C)
         self._modes = self.modes_C.reshape(3 * n, 3 * n - 6)
-        self._gathered = np.ascontiguousarray(self._modes.T) / n  # N^T / n, the inverse of N on its span
+        self._modes_inverse = np.ascontiguousarray(self._modes.T) / n  # N^T / n, the inverse of N on its span
         self._inertia = inertia(product(self.t_C.T, self.t_C))
         self._reach_m = math.sqrt(n * float(eigen(self._inertia)[0][0]))
         names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
@@ -76,25 +76,25 @@ class TemplateCluster(ClusterSpace):
         return cls(places_m)
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
-        centre_W, b_C, R_WC = self._fitted(p_W)
+        centre_W, b_C, R_WC = self._fit(p_W)
         c = np.empty(self.size)
         c[:3] = centre_W
         c[3:6] = euler_angles(R_WC)
         c[6 : self._shape] = yaw - c[5]
         c[6 : self._shape] -= TAU * np.rint(c[6 : self._shape] / TAU)
-        c[self._shape :] = product(self._gathered, (b_C - self.t_C).ravel())
+        c[self._shape :] = product(self._modes_inverse, (b_C - self.t_C).ravel())
         return c
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
         yaw = c[5] + c[6 : self._shape]
-        return c[:3] + product(self._places_C(c), rotation_of(c).T), yaw - TAU * np.rint(yaw / TAU)
+        return c[:3] + product(self._points_C(c), rotation_of(c).T), yaw - TAU * np.rint(yaw / TAU)
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         """Return J, from w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
 
         With b_i = R^T (P_i - C), this follows from sum of t_i x b_i = 0, the condition for R to be the best fit.
         """
-        _, b_C, R_WC = self._fitted(p_W)
+        _, b_C, R_WC = self._fit(p_W)
         n = self.n
         arms = np.array([product(skew(t), R_WC.T) for t in self.t_C]).transpose(1, 0, 2)  # (3, n, 3), for t_i x R^T v_i
         turn = solve(inertia(product(b_C.T, self.t_C)), arms.reshape(3, 3 * n)).reshape(3, n, 3)
@@ -108,15 +108,15 @@ class TemplateCluster(ClusterSpace):
         J[3:6, :, :3] = product(euler_rates(roll, pitch), turn.reshape(3, 3 * n)).reshape(3, n, 3)
         J[6 : self._shape, :, 3] = np.eye(n)
         J[6 : self._shape] -= J[5]
-        J[self._shape :, :, :3] = product(self._gathered, moved_C.reshape(3 * n, 3 * n)).reshape(-1, n, 3)
+        J[self._shape :, :, :3] = product(self._modes_inverse, moved_C.reshape(3 * n, 3 * n)).reshape(-1, n, 3)
         return J.reshape(self.size, self.size)
 
     def inverse_jacobian(self, c: Array) -> Array:
-        R_WC, place_C = rotation_of(c), self._places_C(c)
+        R_WC, points_C = rotation_of(c), self._points_C(c)
         J_inv = np.zeros((self.n, 4, self.size))
         J_inv[:, :3, :3] = np.eye(3)
         for k, axis_C in enumerate(euler_axes_of(c), start=3):
-            J_inv[:, :3, k] = product(product(place_C, skew(axis_C).T), R_WC.T)
+            J_inv[:, :3, k] = product(product(points_C, skew(axis_C).T), R_WC.T)
         modes_W = [product(R_WC, mode_C) for mode_C in self.modes_C]
         J_inv[:, :3, self._shape :] = modes_W
         J_inv[:, 3, 5] = 1.0
@@ -125,7 +125,7 @@ class TemplateCluster(ClusterSpace):
 
     def motion(self, c: Array, c_dot: Array) -> Array:
         w_WC_C = product(euler_axes_of(c).T, c_dot[3:6])
-        v_C = product(self._places_C(c), skew(w_WC_C).T) + product(self._modes, c_dot[self._shape :]).reshape(self.n, 3)
+        v_C = product(self._points_C(c), skew(w_WC_C).T) + product(self._modes, c_dot[self._shape :]).reshape(self.n, 3)
         r_dot = np.empty((self.n, 4))
         r_dot[:, :3] = c_dot[:3] + product(v_C, rotation_of(c).T)
         r_dot[:, 3] = c_dot[5] + c_dot[6 : self._shape]
@@ -136,7 +136,7 @@ class TemplateCluster(ClusterSpace):
         distance = np.linalg.norm(self.t_C[:, None] - self.t_C, axis=2)[np.triu_indices(self.n, 1)].min()
         radius_m = math.sqrt(float((self.t_C**2).sum()) / self.n)
         c[self._shape] = radius_m * max(apart_m / max(float(distance), LENGTH_MIN_M) - 1.0, 0.0)
-        c[2] = float(np.abs(self._places_C(c)).max()) + apart_m
+        c[2] = float(np.abs(self._points_C(c)).max()) + apart_m
         return c
 
     def spread(self, c: Array) -> float:
@@ -145,7 +145,7 @@ class TemplateCluster(ClusterSpace):
         It is the minimum eigenvalue of M (see `jacobian`) over the square root of n times that of the template: exact
         for the template at any scale, and zero where another rotation fits equally well.
         """
-        S = product(self._places_C(c).T, self.t_C)
+        S = product(self._points_C(c).T, self.t_C)
         return float(eigen(inertia((S + S.T) / 2))[0][0]) / self._reach_m
 
     def condition(self, c: Array) -> float:
@@ -155,26 +155,26 @@ class TemplateCluster(ClusterSpace):
         from the centroid is scaled down to 4 m. w_k and the centroid are orthonormal in these weights, which leaves a
         7 x 7 matrix of turns, the three directions of w coupled to them, and the mean of phi.
         """
-        place_C = self._places_C(c)
-        scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
+        points_C = self._points_C(c)
+        scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(points_C, axis=1).max()), LENGTH_MIN_M))
         axes = euler_axes_of(c).T
         squared = scale * scale
-        M = squared * product(axes.T, inertia(product(place_C.T, self.t_C)).T)  # template scaled likewise
+        M = squared * product(axes.T, inertia(product(points_C.T, self.t_C)).T)  # template scaled likewise
         stiff = solve(squared * self._inertia, M.T)
-        whole = squared * product(product(axes.T, inertia(product(place_C.T, place_C))), axes)
+        turn_block = squared * product(product(axes.T, inertia(product(points_C.T, points_C))), axes)
         G = np.eye(7)
-        G[TURN, TURN] = whole / self.n
+        G[TURN, TURN] = turn_block / self.n
         G[2, 2] += 1.0  # a turn in yaw turns every heading
-        G[TURN, BEND] = _root(whole - product(M, stiff), self.n)
+        G[TURN, BEND] = _root(turn_block - product(M, stiff), self.n)
         G[BEND, TURN] = G[TURN, BEND].T
         G[HEADING, 2] = G[2, HEADING] = 1.0
         values = eigen(G)[0]
         return math.sqrt(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
-    def _places_C(self, c: Array) -> Array:  # positions relative to the centroid, (n, 3) [m]
+    def _points_C(self, c: Array) -> Array:  # positions relative to the centroid, (n, 3) [m]
         return self.t_C + product(self._modes, c[self._shape :]).reshape(self.n, 3)
 
-    def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
+    def _fit(self, p_W: Array) -> tuple[Array, Array, Array]:
         """Return the centroid (3,), the positions relative to it in C (n, 3), and R_WC (3, 3)."""
         centre_W = np.add.reduce(p_W, axis=0) / self.n
         b_W = p_W - centre_W
@@ -223,8 +223,8 @@ def rotation_of_quaternion(q: Array) -> Array:
     return array_of(matrix((q[0], q[1], q[2], q[3])))
 
 
-def centred(places: ArrayLike) -> Array:
-    p = np.array(places, dtype=float).reshape(-1, 3)
+def centred(positions: ArrayLike) -> Array:
+    p = np.array(positions, dtype=float).reshape(-1, 3)
     return p - p.mean(axis=0)
 
 
@@ -256,18 +256,18 @@ def shape_modes(t: Array) -> Array:
     return np.sqrt(n) * np.array(basis).T.reshape(n, 3, 3 * n - 6)
 
 
-def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
-    """Return directions (n, 3) as unit vectors (3n,), orthogonal to `done` and each other; omit dependent ones."""
+def _orthonormal(directions: list[Array], given: list[Array]) -> list[Array]:
+    """Return directions (n, 3) as unit vectors (3n,), orthogonal to `given` and each other; omit dependent ones."""
     basis: list[Array] = []
     for direction in directions:
         v = direction.ravel()
         size = el.length(v.tolist())
         for _ in range(2):  # the second pass removes the rounding errors of the first
-            earlier = np.array([*done, *basis])
+            earlier = np.array([*given, *basis])
             v = v - product(earlier.T, product(earlier, v)) if len(earlier) else v
-        left = el.length(v.tolist())
-        if size > 0.0 and left > INDEPENDENT_MIN * size:
-            basis.append(v / left)
+        remainder = el.length(v.tolist())
+        if size > 0.0 and remainder > INDEPENDENT_MIN * size:
+            basis.append(v / remainder)
     return basis
 
 

@@ -112,7 +112,7 @@ class TriadCluster(ClusterSpace):
 def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
     """Write c (4n,) and return whether the robots define a frame; without one, nothing is written."""
     n = yaw.size
-    at = 6 + n  # index of p in c
+    p_index = 6 + n  # index of p in c
     p_1 = row(p_W, 0)
     d2, d3 = subtract(row(p_W, 1), p_1), subtract(row(p_W, 2), p_1)
     x, y, z, h, area = triad_axes(d2, d3)
@@ -123,9 +123,9 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
     c[4], c[5] = pitch_yaw(x)
     for i in range(n):
         c[6 + i] = wrap_angle(yaw[i] - c[5])
-    c[at], c[at + 1], c[at + 2] = norm(d2), norm(d3), el.atan2(area, dot(d2, d3))
+    c[p_index], c[p_index + 1], c[p_index + 2] = norm(d2), norm(d3), el.atan2(area, dot(d2, d3))
     for k in range(3, n):
-        first = at + 3 * (k - 2)
+        first = p_index + 3 * (k - 2)
         c[first], c[first + 1], c[first + 2] = spherical(product((x, y, z), subtract(row(p_W, k), p_1)))
     return True
 
@@ -134,7 +134,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
 def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
     """Write positions (n, 3) and headings (n,), and return whether they are valid, i.e. the shape has an extent."""
     n = c.size // 4
-    put_places_C(c, p_W)
+    put_positions_C(c, p_W)
     R_WC = matrix_from_rpy(c[3], c[4], c[5])
     for i in range(n):
         d_W = product(R_WC, row(p_W, i))
@@ -154,13 +154,13 @@ def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
     n = c.size // 4
     if not has_direction(c):
         return False
-    R_WC, axes_C, place_C = matrix_from_rpy(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), np.empty((n, 3))
-    put_places_C(c, place_C)
+    R_WC, axes_C, positions_C = matrix_from_rpy(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), np.empty((n, 3))
+    put_positions_C(c, positions_C)
     for i in range(n):
         first = 4 * i
         for k in range(3):
             J_inv[first + k, k] = 1.0
-            put(J_inv, first, 3 + k, product(R_WC, cross(axes_C[k], row(place_C, i))))
+            put(J_inv, first, 3 + k, product(R_WC, cross(axes_C[k], row(positions_C, i))))
         J_inv[first + 3, 5] = J_inv[first + 3, 6 + i] = 1.0
     put_shape_rates(J_inv, c, R_WC)
     return True
@@ -169,13 +169,13 @@ def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
 @portable
 def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
     n = c.size // 4
-    at = 6 + n
-    triangle_C = triangle_rates(c[at], c[at + 1], c[at + 2])
+    p_index = 6 + n
+    triangle_C = triangle_rates(c[p_index], c[p_index + 1], c[p_index + 2])
     for robot in range(1, 3):
         for k in range(3):
-            add_rate(J_inv, robot, at + k, product(R_WC, triangle_C[robot - 1][k]))
+            add_rate(J_inv, robot, p_index + k, product(R_WC, triangle_C[robot - 1][k]))
     for robot in range(3, n):
-        first = at + 3 * (robot - 2)
+        first = p_index + 3 * (robot - 2)
         rates_C = spherical_rates(c[first], c[first + 1], c[first + 2])
         for k in range(3):
             add_rate(J_inv, robot, first + k, product(R_WC, rates_C[k]))
@@ -186,19 +186,19 @@ def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
     """Add the motion of one robot per unit of a variable; all robots move back by the mean to keep the centroid."""
     n = J_inv.shape[0] // 4
     for k in range(3):
-        back = rate_W[k] / n
+        mean_rate = rate_W[k] / n
         for i in range(n):
-            J_inv[4 * i + k, column] -= back
+            J_inv[4 * i + k, column] -= mean_rate
         J_inv[4 * robot + k, column] += rate_W[k]
 
 
 @portable
 def triad_spread(c: Array) -> float:
-    at = 6 + c.size // 4
-    least = el.sin(c[at + 2]) * min(c[at], c[at + 1])
-    for first in range(at + 3, c.size, 3):
-        least = min(least, c[first] * el.cos(c[first + 2]))
-    return least
+    p_index = 6 + c.size // 4
+    min_spread = el.sin(c[p_index + 2]) * min(c[p_index], c[p_index + 1])
+    for first in range(p_index + 3, c.size, 3):
+        min_spread = min(min_spread, c[first] * el.cos(c[first + 2]))
+    return min_spread
 
 
 @portable
@@ -212,37 +212,37 @@ def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, f
     normal = cross(d2, d3)
     h, area = norm(m), norm(normal)
     if not (h > LENGTH_MIN_M and area > LENGTH_MIN_M * h):  # also true for NaN
-        none = (0.0, 0.0, 0.0)
-        return none, none, none, 0.0, 0.0
+        zero = (0.0, 0.0, 0.0)
+        return zero, zero, zero, 0.0, 0.0
     x = (-m[0] / h, -m[1] / h, -m[2] / h)
     z = (normal[0] / area, normal[1] / area, normal[2] / area)
     return x, cross(z, x), z, h, area
 
 
 @portable
-def put_places_C(c: Array, place: Array) -> None:
+def put_positions_C(c: Array, positions: Array) -> None:
     """Write the positions of the robots relative to the centroid, (n, 3) [m; C]."""
     n = c.size // 4
-    at = 6 + n
-    p, q = c[at], c[at + 1]
-    ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[at + 2])
-    place[:3] = 0.0  # positions relative to robot 1 until the centroid is subtracted
-    place[1, 0], place[1, 1] = -p * ca2, p * sa2
-    place[2, 0], place[2, 1] = -q * ca3, -q * sa3
+    p_index = 6 + n
+    p, q = c[p_index], c[p_index + 1]
+    ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[p_index + 2])
+    positions[:3] = 0.0  # positions relative to robot 1 until the centroid is subtracted
+    positions[1, 0], positions[1, 1] = -p * ca2, p * sa2
+    positions[2, 0], positions[2, 1] = -q * ca3, -q * sa3
     for k in range(3, n):
-        first = at + 3 * (k - 2)
-        place[k, 0], place[k, 1], place[k, 2] = spherical_place(c[first], c[first + 1], c[first + 2])
-    centre = centroid(place)
+        first = p_index + 3 * (k - 2)
+        positions[k, 0], positions[k, 1], positions[k, 2] = spherical_position(c[first], c[first + 1], c[first + 2])
+    centre = centroid(positions)
     for i in range(n):
         for k in range(3):
-            place[i, k] -= centre[k]
+            positions[i, k] -= centre[k]
 
 
 @portable
 def has_direction(c: Array) -> bool:
     """Return whether the midpoint of robots 2 and 3 is distinct from robot 1."""
-    at = 6 + c.size // 4
-    return split_beta(c[at], c[at + 1], c[at + 2])[4] > 0.0
+    p_index = 6 + c.size // 4
+    return split_beta(c[p_index], c[p_index + 1], c[p_index + 2])[4] > 0.0
 
 
 @portable
@@ -263,29 +263,29 @@ def triangle_rates(p: float, q: float, beta: float) -> tuple[Matrix, Matrix]:
     """Return the derivatives of P2 - P1 in C with respect to p, q and beta, then those of P3 - P1."""
     ca2, sa2, ca3, sa3, h = split_beta(p, q, beta)
     by_p, by_q = -sa2 / h, sa3 / h  # derivatives of the angle to robot 2; that to robot 3 turns the other way
-    of_2 = (
+    rates_2 = (
         (-ca2 + p * sa2 * by_p, sa2 + p * ca2 * by_p, 0.0),
         (p * sa2 * by_q, p * ca2 * by_q, 0.0),
         (p * sa2 * q * ca3 / h, p * ca2 * q * ca3 / h, 0.0),
     )
-    of_3 = (
+    rates_3 = (
         (-q * sa3 * by_p, q * ca3 * by_p, 0.0),
         (-ca3 - q * sa3 * by_q, -sa3 + q * ca3 * by_q, 0.0),
         (q * sa3 * p * ca2 / h, -q * ca3 * p * ca2 / h, 0.0),
     )
-    return of_2, of_3
+    return rates_2, rates_3
 
 
 @portable
 def spherical(d_C: Vector) -> Vector:
-    flat = math.sqrt(d_C[0] * d_C[0] + d_C[1] * d_C[1])
-    return norm(d_C), el.atan2(d_C[1], d_C[0]), el.atan2(d_C[2], flat)
+    horizontal = math.sqrt(d_C[0] * d_C[0] + d_C[1] * d_C[1])
+    return norm(d_C), el.atan2(d_C[1], d_C[0]), el.atan2(d_C[2], horizontal)
 
 
 @portable
-def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
-    flat = rho * el.cos(elevation)
-    return flat * el.cos(azimuth), flat * el.sin(azimuth), rho * el.sin(elevation)
+def spherical_position(rho: float, azimuth: float, elevation: float) -> Vector:
+    horizontal = rho * el.cos(elevation)
+    return horizontal * el.cos(azimuth), horizontal * el.sin(azimuth), rho * el.sin(elevation)
 
 
 @portable
@@ -304,8 +304,8 @@ def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
     p, q = el.length(d2_W), el.length(d3_W)
     u2, u3 = d2_W / p, d3_W / q
     t2, t3 = np.cross(z_W, u2) / p, np.cross(z_W, u3) / q
-    none = np.zeros(3)
-    return np.array([[-u2, u2, none], [-u3, none, u3], [t2 - t3, -t2, t3]])
+    zero = np.zeros(3)
+    return np.array([[-u2, u2, zero], [-u3, zero, u3], [t2 - t3, -t2, t3]])
 
 
 def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
@@ -314,11 +314,11 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
     In C the robot moves relative to robot 1 at R_WC^T (v_k - v_1) - w_WC_C x d_C.
     """
     x, y, z = d_C.tolist()
-    flat, rho = el.hypot(x, y), el.hypot(x, y, z)
-    if not flat > LENGTH_MIN_M:
+    horizontal, rho = el.hypot(x, y), el.hypot(x, y, z)
+    if not horizontal > LENGTH_MIN_M:
         raise SingularClusterError(f"robot {k + 1} is on the z axis through robot 1: it has no azimuth")
     rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # orthogonal rows of lengths 1, flat and rho
-    gradient = rates_C / np.array([(1.0,), (flat * flat,), (rho * rho,)])
+    gradient = rates_C / np.array([(1.0,), (horizontal * horizontal,), (rho * rho,)])
     motion_C = linear.product([(0, -z, y), (z, 0, -x), (-y, x, 0)], rate.reshape(3, -1)).reshape(rate.shape)
     motion_C[:, k] += R_WC.T
     motion_C[:, 0] -= R_WC.T

@@ -1,5 +1,5 @@
 #!/bin/sh
-# sh secrets.sh CERTS: makes the Secrets from the folder of `zsim certs init`; this file contains none of them.
+# sh secrets.sh CERTS: creates the Secrets from the folder of `zsim certs init`. This file contains no secrets.
 set -eu
 certs=$${1:?"usage: sh secrets.sh CERTS, the folder of zsim certs init"}
 put() {

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zsim.scenario.scenario import Piloted
-from zsim_agents.references.cruise import LOST_M, Axes, Course, Cruise, velocity_towards
+from zsim_agents.references.cruise import DEVIATION_MAX_M, Axes, Course, Cruise, velocity_towards
 from zsim_agents.references.path import SHARE, PathLimits
 
 LIMITS = PathLimits(5.0, 1.0, 1.0, 2.5)
@@ -63,7 +63,7 @@ def test_a_displaced_drone_replans_from_where_it_is() -> None:
     drone = Follower()
     drone.send(0.0, 20.0, 0.0, None)
     drone.fly(3.0)
-    drone.here[0] += LOST_M + 0.1
+    drone.here[0] += DEVIATION_MAX_M + 0.1
     flown = drone.fly(0.5)
     assert abs(flown[0, 0]) < 0.2  # it does not hurry back to its former course
     drone.fly(12.0)

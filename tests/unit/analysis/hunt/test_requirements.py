@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from refused import has_terms
 
 from zsim.errors import ScenarioError
-from zsim_analysis.hunt.requirements import BROKEN, LENGTH_MAX, Requirement, figures_of
+from zsim_analysis.hunt.requirements import BROKEN, LENGTH_MAX, Requirement, quantities_of
 
 FIGURES: dict[str, Any] = {
     "min_separation_m": 2.0,
@@ -91,4 +91,4 @@ def test_all_unknown_names_are_reported_at_once() -> None:
 
 def test_figures_of_a_summary_are_its_scalar_values_by_path() -> None:
     summary = {"a": {"b": 1.5, "c": None}, "d": "text", "e": [1, 2], "f": True}
-    assert dict(figures_of(summary)) == {"a.b": 1.5, "a.c": None, "d": "text", "f": True}
+    assert dict(quantities_of(summary)) == {"a.b": 1.5, "a.c": None, "d": "text", "f": True}

@@ -18,7 +18,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Truth
 from zsim.contract.run_messages import Clock, ClusterRequest, Event
 from zsim_agents.formation.flight_check import HELD_ON_REQUEST
-from zsim_agents.formation.flight_plan import WAITS
+from zsim_agents.formation.flight_plan import WAITING
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import WaypointTrajectory
 from zsim_analysis.reading.formation import formations_of
@@ -74,11 +74,11 @@ def engaged(t_s: float) -> dict[str, Any]:
 
 def refused(t_s: float) -> dict[str, Any]:
     """Return the state of a cluster that hovers because its trajectory is refused."""
-    return {"phase": "engaged", "reason": f"the guard parts a and b; trajectory{WAITS}too fast" if t_s > 5 else ""}
+    return {"phase": "engaged", "reason": f"the guard parts a and b; trajectory{WAITING}too fast" if t_s > 5 else ""}
 
 
 def assembling(t_s: float) -> dict[str, Any]:
-    return {"phase": "assembling", "reason": f"engage{WAITS}drone2 is flying"}
+    return {"phase": "assembling", "reason": f"engage{WAITING}drone2 is flying"}
 
 
 def engaged_between(start_s: float, end_s: float) -> State:
@@ -95,7 +95,7 @@ def guarded(t_s: float) -> dict[str, Any]:
 
 
 def waits_for_time(t_s: float) -> dict[str, Any]:
-    return {"phase": "engaged", "reason": f"target{WAITS}over_s is 4 s" if t_s < 9 else ""}
+    return {"phase": "engaged", "reason": f"target{WAITING}over_s is 4 s" if t_s < 9 else ""}
 
 
 def dropped(t_s: float) -> dict[str, Any]:
@@ -122,7 +122,7 @@ def along(from_s: float, to_s: float = 30.0) -> State:
 
     def state(t_s: float) -> dict[str, Any]:
         led = from_s <= t_s <= to_s
-        reason = "" if led or t_s < 10 or t_s > to_s else f"trajectory{WAITS}a robot moves at 2.88 of its limits"
+        reason = "" if led or t_s < 10 or t_s > to_s else f"trajectory{WAITING}a robot moves at 2.88 of its limits"
         return {"phase": "engaged", "desired": tuple(way.value(t_s - 10.0)[0] if led else at_target), "reason": reason}
 
     return state

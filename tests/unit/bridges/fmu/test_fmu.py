@@ -125,7 +125,7 @@ def test_elements_of_an_array_of_fmi_2_are_mapped_together(everything: Path) -> 
     sim = flight(Fmu(everything, "drone1", {**MAP, "p": "truth.position_m"}))
     sim.run(5.0)
     agent = next(agent for agent in sim._flight.agents if agent.name == "fmu.drone1")
-    read = agent._unit.read([FmuModel(everything).variable("p")])[0]  # type: ignore[attr-defined]
+    read = agent._instance.read([FmuModel(everything).variable("p")])[0]  # type: ignore[attr-defined]
     assert read == list(agent._latest[keys.truth("drone1")].position_m)  # type: ignore[attr-defined]
 
 
@@ -143,7 +143,7 @@ variable("vx", 0.0, O, unit="km/h")
     assert {round(command.velocity_m_s[0], 12) for command in sent} == {1.0}
     agent = next(agent for agent in sim._flight.agents if agent.name == "fmu.drone1")
     variables_of = FmuModel(path).variables
-    unit: Any = agent._unit  # type: ignore[attr-defined]
+    unit: Any = agent._instance  # type: ignore[attr-defined]
     (yaw,), (height,) = unit.read([variables_of["yaw"], variables_of["height"]])
     estimate: Any = agent._latest[keys.estimate("drone1")]  # type: ignore[attr-defined]
     assert abs(math.radians(yaw) - estimate.yaw_rad) < 1e-12

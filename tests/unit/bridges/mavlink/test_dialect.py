@@ -14,9 +14,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
 from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import (
-    BEHIND_MAX,
     BY_ID,
     EPOCH_S,
+    TIMESTAMP_LAG_MAX,
     Link,
     MessageLayout,
     Parser,
@@ -126,7 +126,7 @@ def test_only_a_correctly_signed_frame_is_accepted_and_only_once() -> None:
 def test_a_stream_with_a_time_stamp_over_a_minute_old_is_refused() -> None:
     receiver, sender = Signing(KEY), Signing(KEY)
     receiver.advance(EPOCH_S + 3600.0)
-    sender.timestamp = receiver.timestamp - BEHIND_MAX - 2
+    sender.timestamp = receiver.timestamp - TIMESTAMP_LAG_MAX - 2
     parser, link = Parser(receiver), Link(1, 1, sender)
     assert parser.feed(link.pack(HEARTBEAT)) == []
     assert len(parser.feed(link.pack(HEARTBEAT))) == 1

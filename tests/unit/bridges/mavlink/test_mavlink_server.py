@@ -19,8 +19,8 @@ from zsim_bridges.mavlink import dialect
 from zsim_bridges.mavlink.dialect import Link, Parser, Received
 from zsim_bridges.mavlink.mavlink_server import (
     DATAGRAM_MAX,
-    LEARNT_MAX,
-    SILENT_S,
+    LEARNT_PEERS_MAX,
+    PEER_TIMEOUT_S,
     MavlinkOptions,
     MavlinkServer,
     Peers,
@@ -45,12 +45,12 @@ def test_off_loopback_only_the_configured_peer_is_obeyed() -> None:
 
 def test_programs_on_this_machine_become_peers_until_they_are_silent() -> None:
     peers = Peers(GCS)
-    for i in range(LEARNT_MAX):
+    for i in range(LEARNT_PEERS_MAX):
         assert peers.accepts(("127.0.0.1", 5000 + i), 0.0)
     assert not peers.accepts(("127.0.0.1", 6000), 0.0)
-    assert len(peers.addresses(1.0)) == 1 + LEARNT_MAX
-    assert peers.accepts(("127.0.0.1", 5000), SILENT_S)
-    assert peers.addresses(SILENT_S + 1.0) == [GCS, ("127.0.0.1", 5000)]
+    assert len(peers.addresses(1.0)) == 1 + LEARNT_PEERS_MAX
+    assert peers.accepts(("127.0.0.1", 5000), PEER_TIMEOUT_S)
+    assert peers.addresses(PEER_TIMEOUT_S + 1.0) == [GCS, ("127.0.0.1", 5000)]
 
 
 @pytest.fixture

@@ -205,7 +205,7 @@ def test_togglecam_switches_the_active_camera_back_and_forth() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
     for _ in range(2):
-        assert drone.node.services["/quad_1/ardrone/togglecam"].act() is None
+        assert drone.node.services["/quad_1/ardrone/togglecam"].action() is None
         for camera in ("front", "bottom"):
             drone.topics.cameras.publish(camera, image(0))
     frames = [message.header.frame_id for message in subscribers[ACTIVE.format(IMAGE)].ros_messages]
@@ -215,7 +215,7 @@ def test_togglecam_switches_the_active_camera_back_and_forth() -> None:
 def test_camera_info_comes_with_each_picture_and_its_stamp() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
-    drone.topics.cameras.learn("front", info())
+    drone.topics.cameras.store_info("front", info())
     for number in (1, 2):
         drone.topics.cameras.publish("front", image(number * GATE_NS))
     got = subscribers[OWN.format("front", INFO)].ros_messages
@@ -230,7 +230,7 @@ def test_camera_info_comes_with_each_picture_and_its_stamp() -> None:
 def test_the_cameras_are_in_the_frame_tree() -> None:
     drone = Drone()
     tf = drone.subscriber("/tf")
-    drone.topics.cameras.learn("front", info())
+    drone.topics.cameras.store_info("front", info())
     drone.deliver(status(0))
     (found,) = [t for t in tf.ros_messages[0].transforms if t.child_frame_id == "quad_1/ardrone_base_frontcam"]
     assert found.header.frame_id == "quad_1/ardrone_base_link"

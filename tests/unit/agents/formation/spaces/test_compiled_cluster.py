@@ -175,7 +175,7 @@ def test_checks_of_estimates_are_identical_when_compiled(both, n):
         out = ~((np.abs(c) < 1e6) & (bounds[:, 0] < c) & (c < bounds[:, 1]))
         assert outside[0] == (int(np.argmax(out)) if out.any() else -1)
     check = both[0].flight_check
-    assert found == {check.VALID, check.STALE, check.NOT_FINITE, check.UNCERTAIN, check.TURNED}
+    assert found == {check.VALID, check.STALE, check.NOT_FINITE, check.POSITION_UNCERTAIN, check.HEADING_UNCERTAIN}
 
 
 FLIGHT = """
