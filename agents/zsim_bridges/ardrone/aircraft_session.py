@@ -146,7 +146,7 @@ class AircraftSession(VehicleSession):
         demo = packet.options.get(DEMO)
         if demo is not None:
             self._battery = float(min(100, demo.battery_percent))
-            self._state = STATES.get(demo.ctrl_state >> 16, "landed")
+            self._state = STATES.get(demo.ctrl_state >> 16, "flying" if StateBit.FLYING in packet.state else "landed")
         elif StateBit.FLYING not in packet.state:  # without options, such as a bootstrap packet after a restart
             self._state = "landed"
         if StateBit.EMERGENCY in packet.state:

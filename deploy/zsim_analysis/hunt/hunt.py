@@ -39,7 +39,7 @@ from zsim_analysis.report import indented_json
 from zsim_analysis.report.summary import RunSummary, summarise
 from zsim_analysis.sweep.design import METRICS, text_of
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
-from zsim_analysis.sweep.sweep import SweepScreen, span
+from zsim_analysis.sweep.sweep import SweepScreen, duration_text
 from zsim_analysis.sweep.sweep_run import FIXED, METRIC, Row, Task, fly_scenario
 
 PLAN, TABLE, SCENARIO, VIOLATION = "hunt.json", "flights.csv", "violation.yaml", "violation"
@@ -525,5 +525,5 @@ class HuntScreen(SweepScreen):
         if self.margin < float("inf"):
             text += f"  least margin {self.margin:.0%}"
         if self.stage == SEARCH and self._request.budget_s is not None:
-            text += f"  {span(max(0.0, self._request.budget_s - elapsed_s))} to go"
+            text += f"  {duration_text(max(0.0, self._request.budget_s - elapsed_s))} to go"
         return text

@@ -53,9 +53,8 @@ _RANGE = re.compile(r"\s*([-+0-9.eE]+?)\.\.([-+0-9.eE]+)\s*")
 PENDING_MAX = 32  # most pending flights; design choice: more than a machine's processes
 TRIES = 24  # random sets of kinds, of which the one with the most untried combinations is flown
 STEPS = (0.3, 0.1, 0.03)  # standard deviations of moves, as shares of a range; design choice
-EXPLORATION_PROBABILITY = (
-    0.25  # probability of an untried combination in place of a neighbour, and of a random one if all are tried
-)
+# probability of an untried combination in place of a neighbour, and of a random one if all are tried
+EXPLORATION_PROBABILITY = 0.25
 
 
 class Case(Struct, frozen=True):

@@ -78,16 +78,16 @@ def compare(
         RecordError: a run has no record, or its record contains no truth of any drone.
         ReportError: a run is given twice, or the page cannot be written or would replace something else.
     """
-    places = [directory.resolve() for directory in directories]
+    paths = [directory.resolve() for directory in directories]
     for number, directory in enumerate(directories):
-        if places[number] in places[:number]:
+        if paths[number] in paths[:number]:
             raise ReportError(f"{directory}: is given twice; must be given once")
-    if out.exists() and MARK not in _head(out):
+    if out.exists() and MARK not in _first_bytes(out):
         raise ReportError(f"{out}: exists and is not a comparison of runs; give --out another path")
     runs = []
     for name, directory in zip(run_names(directories), directories, strict=True):
-        judged = judge(directory / RECORD, lambda text, name=name: progress(f"{name}: {text}"))
-        runs.append(ComparedRun(name, directory, *judged))
+        results = judge(directory / RECORD, lambda text, name=name: progress(f"{name}: {text}"))
+        runs.append(ComparedRun(name, directory, *results))
     write_page(out, comparison_figures(runs), partial(comparison_page, runs), progress, formats)
     return runs
 
@@ -95,17 +95,17 @@ def compare(
 def comparison_path(directories: Sequence[Path]) -> Path:
     """Return the default path of a comparison: beside the first run, with a name that no other comparison has."""
     names = [name.replace("/", "-") for name in run_names(directories)]
-    more = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
-    stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{more}"
-    folder, own = directories[0].resolve().parent, runs_id(directories).encode()
+    further = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
+    stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{further}"
+    folder, identifier = directories[0].resolve().parent, runs_id(directories).encode()
     path, number = folder / f"{stem}.html", 1
-    while MARK in (head := _head(path)) and own not in head:
+    while MARK in (start := _first_bytes(path)) and identifier not in start:
         number += 1
         path = folder / f"{stem}-{number}.html"
     return path
 
 
-def _head(page: Path) -> bytes:
+def _first_bytes(page: Path) -> bytes:
     """Return the first bytes of a file, empty if it does not exist."""
     if not page.is_file():
         return b""
@@ -130,8 +130,8 @@ def run_names(directories: Sequence[Path]) -> list[str]:
 def runs_id(directories: Sequence[Path]) -> str:
     """Return an identifier of these runs in this order; it stays the same if their folders are moved together."""
     paths = [directory.resolve() for directory in directories]
-    places = "\0".join(relpath(path, paths[0].parent) for path in paths)
-    return sha256(places.encode(errors="surrogateescape")).hexdigest()[:16]
+    relative_paths = "\0".join(relpath(path, paths[0].parent) for path in paths)
+    return sha256(relative_paths.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
 def comparison_page(runs: Sequence[ComparedRun], pictures: Sequence[Picture]) -> str:
@@ -182,8 +182,8 @@ def statistics_rows(runs: Sequence[ComparedRun], cluster: str) -> list[Compariso
     """Return a row per variable of a cluster, with a cell for each of the STATISTICS of each run."""
     rows = []
     for name in parameters(runs, cluster):
-        judged = [run.summary.clusters.get(cluster) for run in runs]
-        errors = [each.errors.get(name) if each else None for each in judged]
+        clusters_of_runs = [run.summary.clusters.get(cluster) for run in runs]
+        errors = [each.errors.get(name) if each else None for each in clusters_of_runs]
         values = [getattr(each, statistic, None) for each in errors for statistic in STATISTICS.values()]
         cells = tuple(ABSENT if value is None else f"{value:.4f}" for value in values)
         rows.append(ComparisonRow(f"{name} ({unit(name)})", cells))
@@ -254,16 +254,16 @@ def notes(runs: Sequence[ComparedRun]) -> list[str]:
     return [*lines, *(f"{run.name}: {note}" for run in runs for note in run.summary.notes)]
 
 
-def _missing(what: str, there: Mapping[str, Sequence[str]]) -> list[str]:
+def _missing(kind: str, present: Mapping[str, Sequence[str]]) -> list[str]:
     """Return a line for each set of drones or clusters that only some runs have."""
     groups: dict[tuple[str, ...], list[str]] = {}
-    for name in dict.fromkeys(name for names in there.values() for name in names):
-        having = tuple(run for run, names in there.items() if name in names)
-        if len(having) < len(there):
-            groups.setdefault(having, []).append(name)
+    for name in dict.fromkeys(name for names in present.values() for name in names):
+        owners = tuple(run for run, names in present.items() if name in names)
+        if len(owners) < len(present):
+            groups.setdefault(owners, []).append(name)
     return [
-        f"{what}{'s' * (len(names) > 1)} {_listed(names)}: in {_listed(having)} only."
-        for having, names in groups.items()
+        f"{kind}{'s' * (len(names) > 1)} {_listed(names)}: in {_listed(owners)} only."
+        for owners, names in groups.items()
     ]
 
 
@@ -274,7 +274,7 @@ def _listed(names: Sequence[str]) -> str:
 # Figures
 
 COLUMNS = 3  # most runs in a row of a figure
-ROOM = 0.03  # margin beyond the largest RMS, as a share of the axis, so that its mark is not cut off
+MARGIN_SHARE = 0.03  # margin beyond the largest RMS, as a share of the axis, so that its mark is not cut off
 ROWS_MAX = 24  # most parameters in one figure: those of 6 drones
 DESIRED: dict[str, Any] = {"color": style.BLACK, "lw": 1.0, "ls": (0, (1, 2)), "zorder": 6}
 LANE_IN = 0.24  # height of a run's lane of marks
@@ -292,8 +292,8 @@ def clusters(runs: Iterable[ComparedRun]) -> list[str]:
 
 def parameters(runs: Iterable[ComparedRun], cluster: str) -> list[str]:
     """Return the variables of a cluster that any run has."""
-    judged = (run.summary.clusters.get(cluster) for run in runs)
-    return list(dict.fromkeys(name for each in judged if each for name in each.errors))
+    summaries = (run.summary.clusters.get(cluster) for run in runs)
+    return list(dict.fromkeys(name for each in summaries if each for name in each.errors))
 
 
 class RunStyle(NamedTuple):
@@ -316,14 +316,14 @@ STYLES = (
 
 def run_style(index: int) -> RunStyle:
     """Return the style of a run; from the seventh run on, colours repeat with other dashes."""
-    repeats, place = divmod(index, len(STYLES))
-    return STYLES[place]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
+    repeats, position = divmod(index, len(STYLES))
+    return STYLES[position]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
 
 
 def comparison_figures(runs: Sequence[ComparedRun]) -> Iterator[style.ReportFigure]:
     """Yield the figures for which the records have data."""
     for cluster in clusters(runs):
-        yield from _of_cluster(runs, cluster)
+        yield from _cluster_figures(runs, cluster)
     if any(len(track.t_ns) for run in runs for track in run.flight.tracks):
         yield style.ReportFigure(
             "plan_view.png",
@@ -345,7 +345,7 @@ def _across(runs: Sequence[ComparedRun]) -> int:
     return -(-len(runs) // rows)
 
 
-def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[style.ReportFigure]:
+def _cluster_figures(runs: Sequence[ComparedRun], cluster: str) -> Iterator[style.ReportFigure]:
     names = parameters(runs, cluster)
     paper = all(
         flies_paper_test(run.flight, cluster) and not style.time_marks(run.flight).has(style.TAKE_OVER) for run in runs
@@ -367,11 +367,11 @@ def _of_cluster(runs: Sequence[ComparedRun], cluster: str) -> Iterator[style.Rep
                 "Runs side by side; each row has one scale, set by the windows (shaded), so larger errors leave it.",
                 _draw_errors(some, runs, cluster, names[:ROWS_MAX]),
             )
-    for file, number, what, group in parameter_groups(names):
+    for file, number, group_name, group in parameter_groups(names):
         if shown := group[:ROWS_MAX]:
             yield style.ReportFigure(
                 f"{file}_{cluster}.png",
-                f"{what}{numbered(number, paper)}{suffix}",
+                f"{group_name}{numbered(number, paper)}{suffix}",
                 f"(a) True and (b) measured (from the estimates) {', '.join(shown)}; dotted: desired. "
                 "Above: each run's marks.",
                 _draw_parameters(runs, cluster, shown),
@@ -388,16 +388,16 @@ def _draw_rms(runs: Sequence[ComparedRun], cluster: str, names: Sequence[str]) -
         style.dress(axes)
         lane = 1.0 / (len(runs) + 1)
         for i, run in enumerate(runs):
-            judged, look = run.summary.clusters.get(cluster), run_style(i)
+            summary, look = run.summary.clusters.get(cluster), run_style(i)
             for row, name in enumerate(group):
-                errors = judged.errors.get(name) if judged else None
+                errors = summary.errors.get(name) if summary else None
                 y = row + (i - (len(runs) - 1) / 2) * lane
                 for value, face in ((errors and errors.true_rms, look.color), (errors and errors.est_rms, "white")):
                     if value is not None:
                         axes.plot(value, y, look.marker, color=look.color, mfc=face, ms=7, zorder=3, clip_on=False)
         axes.set_yticks(range(len(group)), [style.label(name) for name in group])
         axes.set_ylim(len(group) - 0.5, -0.5)
-        axes.margins(x=ROOM)
+        axes.margins(x=MARGIN_SHARE)
         axes.set_xlim(left=0)
         for row in range(1, len(group)):
             axes.axhline(row - 0.5, color=style.GRID, lw=0.6, zorder=1)
@@ -462,7 +462,7 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
     for name, (true_axes, measured_axes) in zip(names, grid, strict=True):
         style.dress(true_axes, style.label(name))
         style.dress(measured_axes)
-        drawn: list[Array] = []
+        curve_values: list[Array] = []
         for i, run in enumerate(runs):
             formation = run.formation(cluster)
             if formation is None or name not in formation.names:
@@ -474,16 +474,16 @@ def _draw_parameters(runs: Sequence[ComparedRun], cluster: str, names: Sequence[
             for axes in (true_axes, measured_axes):
                 style.line(axes, formation.t_s, np.where(formation.engaged, desired, np.nan), **DESIRED)
             since = formation.since_engaged
-            drawn += [true, measured[since], desired[since]]
-        if drawn:
-            style.scale(true_axes, *drawn)
-        for place, each in enumerate(marks):  # take-off, engagement and collisions, in the colour of the run
+            curve_values += [true, measured[since], desired[since]]
+        if curve_values:
+            style.scale(true_axes, *curve_values)
+        for index, each in enumerate(marks):  # take-off, engagement and collisions, in the colour of the run
             for kind, t_s in each.points:
                 dashes = {"take-off": ":", "engagement": "-."}.get(kind, "-")
                 for axes in (true_axes, measured_axes):
-                    axes.axvline(t_s, color=run_style(place).color, lw=0.9, ls=dashes, alpha=0.7, zorder=1.5)
+                    axes.axvline(t_s, color=run_style(index).color, lw=0.9, ls=dashes, alpha=0.7, zorder=1.5)
     for axes, title in zip(lanes, ("true", "measured (estimates)"), strict=True):
-        _draw_lanes(axes, marks, named=axes is lanes[0])
+        _draw_lanes(axes, marks, show_names=axes is lanes[0])
         axes.set_title(title, fontsize=style.PAPER_PT)
     style.letter_panels(lanes)
     first = grid[0][0]
@@ -509,23 +509,23 @@ class RunMarks(NamedTuple):
     points: list[tuple[str, float]]
 
 
-def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], named: bool) -> None:
+def _draw_lanes(lanes: Axes, marks: Sequence[RunMarks], show_names: bool) -> None:
     """Draw a lane for each run, the first at the top: bars for bands, markers for instantaneous events."""
-    for place, run in enumerate(marks):
-        colour = run_style(place).color
-        lanes.axhline(place, color=EMPTY, lw=1.0, zorder=1)
+    for lane, run in enumerate(marks):
+        colour = run_style(lane).color
+        lanes.axhline(lane, color=EMPTY, lw=1.0, zorder=1)
         for band in run.marks.bands:
             face, hatch = FAULT_FACE if band.kind == style.FAULT else FACE, HATCHES.get(band.kind, "")
             span, look = (band.from_s, band.to_s - band.from_s), {"edgecolor": colour, "lw": 0.8, "zorder": 2}
-            lanes.broken_barh([span], (place - 0.36, 0.72), facecolor=(colour, face), hatch=hatch, **look)
+            lanes.broken_barh([span], (lane - 0.36, 0.72), facecolor=(colour, face), hatch=hatch, **look)
         for kind, t_s in run.points:
-            lanes.plot([t_s], [place], POINTS[kind], color=colour, ms=8, mec="white", mew=0.8, zorder=4, clip_on=False)
+            lanes.plot([t_s], [lane], POINTS[kind], color=colour, ms=8, mec="white", mew=0.8, zorder=4, clip_on=False)
     lanes.set_ylim(len(marks) - 0.5, -0.5)
-    short = [each.name if len(each.name) <= NAME_MAX else f"…{each.name[1 - NAME_MAX :]}" for each in marks]
-    lanes.set_yticks(range(len(marks)), short)
-    for place, text in enumerate(lanes.get_yticklabels()):
-        text.set_color(run_style(place).color)
-    lanes.tick_params(axis="y", length=0, labelsize=style.PAPER_PT - 1, labelleft=named)
+    labels = [each.name if len(each.name) <= NAME_MAX else f"…{each.name[1 - NAME_MAX :]}" for each in marks]
+    lanes.set_yticks(range(len(marks)), labels)
+    for lane, text in enumerate(lanes.get_yticklabels()):
+        text.set_color(run_style(lane).color)
+    lanes.tick_params(axis="y", length=0, labelsize=style.PAPER_PT - 1, labelleft=show_names)
     lanes.tick_params(axis="x", length=0, labelbottom=False)
     lanes.spines[:].set_visible(False)
 
@@ -575,14 +575,14 @@ def _draw_drones(runs: Sequence[ComparedRun]) -> Figure:
             axes.set_axis_on()
             style.dress(axes, quantity if column == 0 and quantity != "state" else "")
         panels[0].set_title(run.label, fontsize=style.PAPER_PT)
-        draw_drone_panels(panels, run.flight.tracks, colours, named=0)
+        draw_drone_panels(panels, run.flight.tracks, colours, named_count=0)
         panels[-1].tick_params(labelbottom=True)
         style.draw_marks(panels, style.time_marks(run.flight, run.formations[0] if run.formations else None))
     style.letter_panels([grid[3 * (index // across), index % across] for index in range(len(runs))])
     for kind in (0, 2):  # all runs have the same range of altitude and of charge
-        drawn = [each for each in grid[kind::3].flat if each.lines]
-        limits = [each.get_ylim() for each in drawn]
-        for each in drawn:
+        non_empty = [each for each in grid[kind::3].flat if each.lines]
+        limits = [each.get_ylim() for each in non_empty]
+        for each in non_empty:
             each.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
     name_states(figure, [track for run in runs for track in run.flight.tracks])
     _name_drones(figure, grid[0, 0], colours)
@@ -596,7 +596,7 @@ def _drone_colours(runs: Sequence[ComparedRun]) -> dict[str, str]:
 
 def _name_drones(figure: Figure, axes: Axes, colours: Mapping[str, str]) -> None:
     """Add the drones to the legend; of many drones, only the first and the last."""
-    named = list(colours.items())
-    for name, colour in named if len(named) <= NAMED_MAX else (named[0], named[-1]):
+    items = list(colours.items())
+    for name, colour in items if len(items) <= NAMED_MAX else (items[0], items[-1]):
         axes.plot([], [], color=colour, lw=1.1, label=name)
     style.legend_above(figure, axes)

@@ -113,11 +113,11 @@ def scale(axes: Axes, *values: Array, pad: float = 0.06) -> None:
 
 def padded_range(samples: Array, share: float) -> tuple[float, float] | None:
     """Return the range of the finite samples, padded at each end by `share` of it; None if empty or a single value."""
-    known = samples[np.isfinite(samples)]
-    if not len(known) or known.max() <= known.min():
+    finite = samples[np.isfinite(samples)]
+    if not len(finite) or finite.max() <= finite.min():
         return None
-    room = share * (known.max() - known.min())
-    return float(known.min() - room), float(known.max() + room)
+    padding = share * (finite.max() - finite.min())
+    return float(finite.min() - padding), float(finite.max() + padding)
 
 
 def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
@@ -134,9 +134,9 @@ def thinned(x: Array, y: Array) -> tuple[Array, Array]:
     bins = np.full((len(starts), size), np.nan)
     bins.flat[: len(x)] = y
     unknown = np.isnan(bins)  # picked only in bins without a known value
-    least, greatest = (np.where(unknown, worst, bins) for worst in (np.inf, -np.inf))
-    kept = np.unique((starts + least.argmin(axis=1), starts + greatest.argmax(axis=1)))
-    return x[kept], y[kept]
+    minima, maxima = (np.where(unknown, fill, bins) for fill in (np.inf, -np.inf))
+    indices = np.unique((starts + minima.argmin(axis=1), starts + maxima.argmax(axis=1)))
+    return x[indices], y[indices]
 
 
 def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
@@ -144,19 +144,19 @@ def draw_spread(axes: Axes, t_s: Array, values: Array, colour: str) -> None:
 
     t_s (K,) is simulated time, values (K, N) are NaN where unknown.
     """
-    known = np.isfinite(values).any(axis=1)
-    t_s, values = t_s[known], values[known]
+    is_known = np.isfinite(values).any(axis=1)
+    t_s, values = t_s[is_known], values[is_known]
     if not len(t_s):
         return
     step = -(-len(t_s) // SPREAD_INSTANTS)
-    at, starts = t_s[::step], np.arange(0, len(values), step)
+    sampled_s, starts = t_s[::step], np.arange(0, len(values), step)
     low, middle, high = np.nanpercentile(values[::step], SPREAD, axis=1)
-    least = np.minimum.reduceat(np.nanmin(values, axis=1), starts)
-    greatest = np.maximum.reduceat(np.nanmax(values, axis=1), starts)
-    axes.fill_between(at, low, high, color=colour, alpha=0.25, lw=0, zorder=2, label="5 to 95 %")
-    axes.plot(at, middle, color=colour, lw=1.0, zorder=3, label="median")
-    axes.plot(at, least, color=colour, lw=0.4, alpha=0.7, zorder=2, label="least and greatest")
-    axes.plot(at, greatest, color=colour, lw=0.4, alpha=0.7, zorder=2)
+    minima = np.minimum.reduceat(np.nanmin(values, axis=1), starts)
+    maxima = np.maximum.reduceat(np.nanmax(values, axis=1), starts)
+    axes.fill_between(sampled_s, low, high, color=colour, alpha=0.25, lw=0, zorder=2, label="5 to 95 %")
+    axes.plot(sampled_s, middle, color=colour, lw=1.0, zorder=3, label="median")
+    axes.plot(sampled_s, minima, color=colour, lw=0.4, alpha=0.7, zorder=2, label="least and greatest")
+    axes.plot(sampled_s, maxima, color=colour, lw=0.4, alpha=0.7, zorder=2)
 
 
 def letter_panels(panels: Iterable[Axes]) -> None:
@@ -164,13 +164,13 @@ def letter_panels(panels: Iterable[Axes]) -> None:
     panels = list(panels)
     for number, axes in enumerate(panels if len(panels) > 1 else ()):
         letters = chr(ord("a") + number % 26) * (1 + number // 26)
-        place = "center" if axes.get_title() else "left"
-        title = axes.get_title(loc=place)
+        alignment = "center" if axes.get_title() else "left"
+        title = axes.get_title(loc=alignment)
         look: Any = {"fontsize": PAPER_PT, "pad": LETTER_PAD_PT}
         if title:
-            axes.set_title(f"({letters}) {title}", loc=place, **look)
+            axes.set_title(f"({letters}) {title}", loc=alignment, **look)
         else:
-            axes.set_title(f"({letters})", loc=place, ha="right", **look)  # left of other text above the axes
+            axes.set_title(f"({letters})", loc=alignment, ha="right", **look)  # left of other text above the axes
 
 
 def finish(figure: Figure, lettered: Iterable[Axes], grid: Any, legend_columns: int) -> None:
@@ -183,25 +183,27 @@ def finish(figure: Figure, lettered: Iterable[Axes], grid: Any, legend_columns: 
 
 def legend_above(figure: Figure, axes: Axes, columns: int = 8) -> None:
     """Put a legend above a figure, with every name of all axes once, those of `axes` first."""
-    named: dict[str, Any] = {}
+    handles_by_name: dict[str, Any] = {}
     for each in (axes, *figure.axes):
         for handle, name in zip(*each.get_legend_handles_labels(), strict=True):
-            named.setdefault(name, handle)
-    if named:
-        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, named))) * PAPER_PT / 72  # inches
-        columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)), len(named))
+            handles_by_name.setdefault(name, handle)
+    if handles_by_name:
+        longest = (ENTRY_EMS + LETTER_EMS * max(map(len, handles_by_name))) * PAPER_PT / 72  # inches
+        columns = min(columns, max(1, int(figure.get_size_inches()[0] / longest)), len(handles_by_name))
         look: Any = {"frameon": False, "fontsize": PAPER_PT, "columnspacing": 1.2, "handlelength": 1.6}
-        figure.legend(list(named.values()), list(named), loc="outside upper center", ncols=columns, **look)
+        figure.legend(
+            list(handles_by_name.values()), list(handles_by_name), loc="outside upper center", ncols=columns, **look
+        )
 
 
-def mark_figure(figure: Figure, head: str, reason: str, colour: str) -> None:
+def mark_figure(figure: Figure, heading: str, reason: str, colour: str) -> None:
     """Write a warning about the flight above a complete figure, which grows by the warning's height.
 
     `head` is the first line; `reason` is wrapped below it, and cut off after MARK_LINES lines.
     """
     width_in, height_in = figure.get_size_inches()
     letters = int(72 * width_in / (MARK_EMS * PAPER_PT))
-    lines = [head, *wrap(reason, letters, max_lines=MARK_LINES, placeholder=" …")]
+    lines = [heading, *wrap(reason, letters, max_lines=MARK_LINES, placeholder=" …")]
     total_in = height_in + len(lines) * LINE_EMS * PAPER_PT / 72 + MARK_PAD_IN
     mark = figure.suptitle("\n".join(lines), va="top", color=colour, fontsize=PAPER_PT, fontweight="bold")
     mark.set_y(1 - MARK_PAD_IN / total_in)
@@ -275,11 +277,11 @@ def time_marks(flight: RecordedFlight, formation: Formation | None = None) -> Ti
 def _faults(flight: RecordedFlight) -> Iterator[Band]:
     """Yield the injected faults; those without an end last until the end of the flight."""
     ends = {event.data.get("id"): event.t_ns for event in flight.events if event.kind in ("fault_end", "fault_clear")}
-    for place, event in enumerate(flight.events):
+    for index, event in enumerate(flight.events):
         if event.kind == "fault":
             end_ns = ends.get(event.data.get("id"))
             if end_ns is None and event.data.get("kind") == PROCESS_KILL:  # until the process takes part again
-                later = (each for each in flight.events[place + 1 :] if each.subject == event.subject)
+                later = (each for each in flight.events[index + 1 :] if each.subject == event.subject)
                 if back := next((each for each in later if each.kind in ADMISSIONS), None):
                     done_ns = back.data.get("done_ns", back.t_ns)  # last gate that its predecessor completed
                     is_known = isinstance(done_ns, int)
@@ -306,10 +308,10 @@ def _take_overs(flight: RecordedFlight) -> Iterator[Band]:
         yield Band(TAKE_OVER, begun_ns / 1e9, flight.last_ns / 1e9)
 
 
-def draw_marks(axes: Iterable[Axes], marks: TimeMarks, whole: bool = True) -> None:
-    """Draw marks into time axes that already contain their data; with `whole`, extend the axes to the whole run."""
+def draw_marks(axes: Iterable[Axes], marks: TimeMarks, extend: bool = True) -> None:
+    """Draw marks into time axes that already contain their data; with `extend`, extend the axes to the whole run."""
     for each in axes:
-        if whole and marks.span_s:
+        if extend and marks.span_s:
             each.update_datalim([(t_s, 0.0) for t_s in marks.span_s], updatey=False)
             each.autoscale_view(scaley=False)
         low, high = each.dataLim.intervalx

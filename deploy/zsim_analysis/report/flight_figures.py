@@ -71,12 +71,12 @@ def draw_errors(
     names = list(formation.names)
     if len(names) > ROWS_MAX:
         names = [name for name in (*POSITION, *ORIENTATION) if name in formation.names]
-    others = _by_unit(name for name in formation.names if name not in names)
-    count, columns = len(names) + len(others), 3 if goal else 2
+    grouped = _by_unit(name for name in formation.names if name not in names)
+    count, columns = len(names) + len(grouped), 3 if goal else 2
     figure = style.new_figure(style.PAGE_IN, 0.8 + min(0.62 * count, ROWS_IN))
     grid = figure.subplots(count, columns, squeeze=False, sharex="col")
     rows = formation.within(window_s)
-    every = np.ones(len(rows), bool)
+    all_rows = np.ones(len(rows), bool)
     for name, axes in zip(names, grid, strict=False):
         i = formation.column(name)
         if goal and np.isfinite(goal.goal[i]):  # on an axis that includes the truth during the climb
@@ -84,14 +84,14 @@ def draw_errors(
             style.scale(axes[0], goal.true[:, i], goal.est[formation.since_engaged, i])
         elif goal:
             _draw_no_goal(axes[0])
-        draw_error(axes[-2], formation, name, every)
+        draw_error(axes[-2], formation, name, all_rows)
         draw_error(axes[-1], formation, name, rows)
         _write_statistics(axes[-1], formation, i, formation.judged(window_s))
         axes[0].set_ylabel(style.label(name), fontsize=style.PAPER_PT)
-    for (measure, members), axes in zip(others.items(), grid[len(names) :], strict=True):
+    for (measure, members), axes in zip(grouped.items(), grid[len(names) :], strict=True):
         if goal:
             _draw_no_goal(axes[0])
-        _draw_others(axes[-2], formation, members, every)
+        _draw_others(axes[-2], formation, members, all_rows)
         _draw_others(axes[-1], formation, members, rows)
         axes[0].set_ylabel(f"{len(members)} others\n({measure})", fontsize=style.PAPER_PT)
     titles = ("against the final goal", "against the reference", f"the same, {span_text(window_s)}")
@@ -101,7 +101,7 @@ def draw_errors(
         style.shade_window(axes, window_s)
     for column in grid.T[:-1]:
         style.draw_marks(column, marks)
-    style.draw_marks(grid[:, -1], marks, whole=False)
+    style.draw_marks(grid[:, -1], marks, extend=False)
     style.finish(figure, grid[0], grid, 6)
     return figure
 
@@ -149,10 +149,10 @@ def _write_statistics(axes: Axes, formation: Formation, i: int, rows: np.ndarray
     """Write standard deviations and means beside the axes, in the colours of their lines."""
     missing = "no data" if rows.any() else "not\nengaged"
     for y, error, colour in ((0.75, formation.est_error, style.AMBER), (0.25, formation.true_error, style.BLUE)):
-        known = error[rows, i][np.isfinite(error[rows, i])]
-        text = f"std {known.std():.3g}\nmean {known.mean():+.2g}" if len(known) else missing
-        place = {"transform": axes.transAxes, "fontsize": style.PAPER_PT - 1.5, "va": "center", "linespacing": 1.0}
-        axes.text(1.03, y, text, color=colour, **place)
+        finite = error[rows, i][np.isfinite(error[rows, i])]
+        text = f"std {finite.std():.3g}\nmean {finite.mean():+.2g}" if len(finite) else missing
+        text_style = {"transform": axes.transAxes, "fontsize": style.PAPER_PT - 1.5, "va": "center", "linespacing": 1.0}
+        axes.text(1.03, y, text, color=colour, **text_style)
 
 
 def draw_parameters(formation: Formation, names: Sequence[str], marks: style.TimeMarks) -> Figure:
@@ -160,16 +160,16 @@ def draw_parameters(formation: Formation, names: Sequence[str], marks: style.Tim
 
     If there are too many, the figure shows those whose desired value moves most, and the true errors of all.
     """
-    shown, others, since = list(names), dict[str, list[str]](), formation.since_engaged
+    shown, grouped, since = list(names), dict[str, list[str]](), formation.since_engaged
     if len(names) > ROWS_MAX:
         spans = {}
         for name in names:
             desired = formation.desired[since, formation.column(name)]
-            known = desired[np.isfinite(desired)]
-            spans[name] = float(np.ptp(known)) if len(known) else 0.0
-        most = sorted(spans, key=lambda name: -spans[name])[:MOVED_MAX]
-        shown, others = [name for name in names if name in most], _by_unit(names)
-    count = max(1, len(shown) + len(others))
+            finite = desired[np.isfinite(desired)]
+            spans[name] = float(np.ptp(finite)) if len(finite) else 0.0
+        most_moved = sorted(spans, key=lambda name: -spans[name])[:MOVED_MAX]
+        shown, grouped = [name for name in names if name in most_moved], _by_unit(names)
+    count = max(1, len(shown) + len(grouped))
     figure = style.new_figure(style.COLUMN_IN, 0.75 + min(ROW_IN * count, ROWS_IN))
     grid = figure.subplots(count, 1, squeeze=False, sharex=True)
     panels = grid[:, 0]
@@ -180,10 +180,10 @@ def draw_parameters(formation: Formation, names: Sequence[str], marks: style.Tim
         style.line(axes, formation.t_s, measured, label="measured", **style.MEASURED)
         style.line(axes, formation.t_s, desired, label="desired", **style.DESIRED)
         style.scale(axes, true, measured[since], desired[since])
-    for (measure, members), axes in zip(others.items(), panels[len(shown) :], strict=False):
+    for (measure, members), axes in zip(grouped.items(), panels[len(shown) :], strict=False):
         _draw_others(axes, formation, members, since)
         axes.set_ylabel(f"errors of\nall {len(members)} ({measure})", fontsize=style.PAPER_PT)
-    style.draw_marks(panels[: len(shown) + len(others)], marks)
+    style.draw_marks(panels[: len(shown) + len(grouped)], marks)
     style.finish(figure, panels, grid, 3)
     return figure
 
@@ -196,16 +196,16 @@ def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
     """
     i = formation.column(name)
     desired = formation.desired[:, i].copy()
-    known = np.isfinite(desired)
-    angle = unit(name) == "rad" and known.any()
-    since = known & formation.since_engaged
+    is_known = np.isfinite(desired)
+    angle = unit(name) == "rad" and is_known.any()
+    is_engaged = is_known & formation.since_engaged
     if angle:
-        desired[since] = np.unwrap(desired[since])
+        desired[is_engaged] = np.unwrap(desired[is_engaged])
     lines = desired, desired + formation.est_error[:, i], desired + formation.true_error[:, i]
     if angle:
-        before, first = known & ~since, desired[since][0] if since.any() else 0.0
+        is_before, first_value = is_known & ~is_engaged, desired[is_engaged][0] if is_engaged.any() else 0.0
         for each in lines:
-            each[before] -= 2 * np.pi * np.round((each[before] - first) / (2 * np.pi))
+            each[is_before] -= 2 * np.pi * np.round((each[is_before] - first_value) / (2 * np.pi))
     return lines
 
 
@@ -227,9 +227,9 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
     axes.margins(ROOM)
     draw_obstacles(axes, flight.scenario)
     colours = drone_colours(len(flight.tracks))
-    few = len(flight.tracks) <= NAMED_MAX
+    shows_names = len(flight.tracks) <= NAMED_MAX
     for i, (track, colour) in enumerate(zip(flight.tracks, colours, strict=True)):
-        draw_path(axes, track, colour, named=few or i in (0, len(colours) - 1))
+        draw_path(axes, track, colour, named=shows_names or i in (0, len(colours) - 1))
     for formation in formations:
         if "x_c" in formation.names and len(formation.t_s):
             desired = np.where(formation.engaged[:, None], formation.desired, np.nan)
@@ -252,13 +252,13 @@ def draw_obstacles(axes: Axes, scenario: Scenario | None) -> None:
     for number, obstacle in enumerate(scenario.environment.obstacles if scenario else ()):
         row = row_of(obstacle)
         x, y, a = row[CENTRE], row[CENTRE + 1], row[HALF]
-        named = {**look, "label": None if number else "obstacle"}
+        labelled = {**look, "label": None if number else "obstacle"}
         if row[SHAPE] != BOX:
-            axes.add_patch(Circle((x, y), a, **named))
+            axes.add_patch(Circle((x, y), a, **labelled))
         else:
             b, angle = row[HALF + 1], math.degrees(math.atan2(row[SINE], row[COSINE]))
             corner = (x - a, y - b)
-            axes.add_patch(Rectangle(corner, 2 * a, 2 * b, angle=angle, rotation_point="center", **named))
+            axes.add_patch(Rectangle(corner, 2 * a, 2 * b, angle=angle, rotation_point="center", **labelled))
 
 
 def _draw_surface(axes: Axes, surface: Surface, label: str | None) -> None:
@@ -267,10 +267,10 @@ def _draw_surface(axes: Axes, surface: Surface, label: str | None) -> None:
     corners = corners[np.argsort(corners[..., 2].max(axis=1), kind="stable")]
     heights = corners[..., 2].mean(axis=1)
     look: dict[str, Any] = {"cmap": "Greys", "edgecolors": "face", "lw": 0.3, "zorder": 1.2, "rasterized": True}
-    drawn = PolyCollection(list(corners[..., :2]), array=heights, **look)
+    triangles = PolyCollection(list(corners[..., :2]), array=heights, **look)
     low, high = corners[..., 2].min(), corners[..., 2].max()
-    drawn.set_clim(low - 0.4 * max(high - low, 0.1), high + 0.8 * max(high - low, 0.1))  # never white, never black
-    axes.add_collection(drawn, autolim=False)
+    triangles.set_clim(low - 0.4 * max(high - low, 0.1), high + 0.8 * max(high - low, 0.1))  # never white, never black
+    axes.add_collection(triangles, autolim=False)
     if label:
         axes.add_patch(Rectangle((np.nan, np.nan), 1, 1, facecolor="#8c959f", label=label))
 
@@ -290,26 +290,26 @@ def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
     """Draw the outlines of a formation with their times, skipping outlines that would overlap."""
     members = [track for name in formation.drones for track in tracks if track.name == name]
-    t_ns, places = common_instants(members)
+    t_ns, indices = common_instants(members)
     if not len(t_ns):
         return
-    paths_W = np.stack([track.p_W[place, :2] for track, place in zip(members, places, strict=True)], axis=1)
-    drawn: list[Array] = []
+    paths_W = np.stack([track.p_W[index, :2] for track, index in zip(members, indices, strict=True)], axis=1)
+    outlines: list[Array] = []
     for k in np.linspace(len(t_ns) - 1, 0, OUTLINES).astype(int):
         p_W = paths_W[k]
         centre = p_W.mean(axis=0)
         size = np.linalg.norm(p_W - centre, axis=1).max()
-        if any(np.linalg.norm(p_W - other, axis=1).max() <= APART * size for other in drawn):
+        if any(np.linalg.norm(p_W - other, axis=1).max() <= APART * size for other in outlines):
             continue
         ring = p_W
         if len(p_W) > RING_MAX:
             with suppress(QhullError):  # collinear
                 ring = p_W[ConvexHull(p_W).vertices]
-        name = None if drawn else f"{formation.name}, at times"
-        drawn.append(p_W)
+        name = None if outlines else f"{formation.name}, at times"
+        outlines.append(p_W)
         axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=style.DARK, lw=0.7, zorder=4, label=name)
-        out = p_W[0] - centre
-        offset = 9 * out / max(float(np.linalg.norm(out)), 1e-9)
+        direction = p_W[0] - centre
+        offset = 9 * direction / max(float(np.linalg.norm(direction)), 1e-9)
         look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "center", "fontsize": SMALL_PT}
         look["bbox"] = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}
         axes.annotate(f"{t_ns[k] / 1e9:.0f} s", p_W[0], xytext=offset, zorder=6, **look)
@@ -346,7 +346,7 @@ def draw_drones(flight: RecordedFlight, marks: style.TimeMarks) -> Figure:
     figure.align_ylabels()
     style.legend_above(figure, panels[0], columns=3)
     if count > NAMED_MAX:  # the colours change gradually from the first drone to the last
-        ends = [list(colours.items())[place] for place in (0, -1)]
+        ends = [list(colours.items())[index] for index in (0, -1)]
         handles = [Line2D([], [], color=colour, lw=1.5, label=name) for name, colour in ends]
         look: dict[str, Any] = {"fontsize": style.PAPER_PT - 1, "title_fontsize": style.PAPER_PT - 1, "frameon": False}
         panels[0].legend(handles=handles, loc="best", title="from … to", **look)
@@ -358,11 +358,13 @@ def drone_panel_heights(count: int) -> tuple[float, float, float]:
     return 3.0, 0.5 + min(0.28 * count, LANES_IN), 2.0
 
 
-def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], colours: Mapping[str, str], named: int) -> None:
-    """Draw drones into the axes of DRONE_PANELS; the legend names the first `named`."""
+def draw_drone_panels(
+    panels: Sequence[Axes], tracks: Sequence[Track], colours: Mapping[str, str], named_count: int
+) -> None:
+    """Draw drones into the axes of DRONE_PANELS; the legend names the first `named_count`."""
     altitude, state, battery = panels
     for lane, track in enumerate(tracks):
-        look = {"color": colours[track.name], "lw": 0.9, "label": track.name if lane < named else None}
+        look = {"color": colours[track.name], "lw": 0.9, "label": track.name if lane < named_count else None}
         style.line(altitude, track.t_ns / 1e9, track.p_W[:, 2], **look)
         style.line(battery, track.status_t_ns / 1e9, track.battery_percent, **look)
         if track.states:
@@ -411,31 +413,33 @@ def draw_estimates(
     grid = figure.subplots(len(ERRORS) + 1, len(errors), squeeze=False, sharex=True, sharey="row")
     for (name, each), column in zip(errors.items(), grid.T, strict=True):
         rows = _rows(each, window_s)
-        inside, known = each.share_inside(rows), each.nees[rows][np.isfinite(each.nees[rows])]
+        inside, finite_nees = each.share_inside(rows), each.nees[rows][np.isfinite(each.nees[rows])]
         for i, axes in enumerate(column[:-1]):
             style.dress(axes)
-            at, half = style.thinned(each.t_s, drone_errors.SIGMAS * each.sigma[:, i])
+            bin_s, half = style.thinned(each.t_s, drone_errors.SIGMAS * each.sigma[:, i])
             band = f"±{drone_errors.SIGMAS:g}σ as stated"
-            axes.fill_between(at, -half, half, color=BAND_GREY, alpha=0.45, lw=0, zorder=1, label=band)
+            axes.fill_between(bin_s, -half, half, color=BAND_GREY, alpha=0.45, lw=0, zorder=1, label=band)
             axes.axhline(0, color=style.BLACK, lw=0.5, zorder=1)
             look: dict[str, Any] = {"color": colours[name], "lw": 0.6, "zorder": 3, "label": "estimate − truth"}
             style.line(axes, each.t_s, each.error[:, i], **look)
         _draw_nees(column[-1], each.t_s, each.nees, colours[name])
         notes = [f"{100 * share:.0f} % in {drone_errors.SIGMAS:g}σ" for share in inside]
-        notes.append(f"mean {known.mean():.3g}, of {drone_errors.DEGREES}" if len(known) else "P is singular")
+        notes.append(
+            f"mean {finite_nees.mean():.3g}, of {drone_errors.DEGREES}" if len(finite_nees) else "P is singular"
+        )
         column[0].set_title(name, loc="left", fontsize=style.PAPER_PT)
         for axes, note in zip(column, notes, strict=True):  # above the axes, where it covers no data
             axes.set_title(note, loc="right", fontsize=SMALL_PT, pad=2.0)
         style.draw_marks(column, marks)
     since_s = -np.inf if marks.engaged_s is None else marks.engaged_s  # large initial sigmas may leave the axes
     for i, row in enumerate(grid[:-1]):
-        reach = 0.0
+        limit = 0.0
         for each in errors.values():
             rows = each.t_s >= since_s
-            seen = np.maximum(np.abs(each.error[rows, i]), drone_errors.SIGMAS * each.sigma[rows, i])
-            reach = max(reach, float(np.nanmax(seen, initial=0.0)))
-        if reach > 0:
-            row[0].set_ylim(-1.05 * reach, 1.05 * reach)
+            extent = np.maximum(np.abs(each.error[rows, i]), drone_errors.SIGMAS * each.sigma[rows, i])
+            limit = max(limit, float(np.nanmax(extent, initial=0.0)))
+        if limit > 0:
+            row[0].set_ylim(-1.05 * limit, 1.05 * limit)
     for axes, quantity in zip(grid[:, 0], (*ERRORS, "NEES"), strict=True):
         axes.set_ylabel(quantity, fontsize=style.PAPER_PT)
     style.finish(figure, grid[0], grid, 7)
@@ -448,10 +452,10 @@ def _rows(errors: drone_errors.EstimateErrors, window_s: tuple[float, float]) ->
     return rows if rows.any() else np.ones(len(rows), bool)
 
 
-def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, of: int = 1) -> None:
-    """Draw NEES, or its mean over `of` drones, with the 95 % range of a consistent estimator."""
+def _draw_nees(axes: Axes, t_s: Array, nees: Array, colour: str, drone_count: int = 1) -> None:
+    """Draw NEES, or its mean over `drone_count` drones, with the 95 % range of a consistent estimator."""
     style.dress(axes)
-    low, high = (float(chdtri(of * drone_errors.DEGREES, share)) / of for share in (0.975, 0.025))
+    low, high = (float(chdtri(drone_count * drone_errors.DEGREES, share)) / drone_count for share in (0.975, 0.025))
     axes.axhspan(low, high, zorder=0.6, label=CONSISTENT, fc="none", ec=BAND_GREY, hatch="////", lw=0.0)
     style.line(axes, t_s, np.maximum(nees, FLOOR), color=colour, lw=0.6, zorder=3)
     axes.set_yscale("log")
@@ -466,19 +470,19 @@ def _draw_many_estimates(
 ) -> Figure:
     """Draw position error and mean NEES over time, and the statistics of each drone within the window."""
     t_s = reduce(np.intersect1d, (each.t_s for each in errors.values()))  # times at which all drones have an estimate
-    places = [np.searchsorted(each.t_s, t_s) for each in errors.values()]
-    pairs = list(zip(errors.values(), places, strict=True))
+    indices = [np.searchsorted(each.t_s, t_s) for each in errors.values()]
+    pairs = list(zip(errors.values(), indices, strict=True))
     distance = np.column_stack(
-        [np.linalg.norm(each.error[place][:, drone_errors.POSITION], axis=1) for each, place in pairs]
+        [np.linalg.norm(each.error[index][:, drone_errors.POSITION], axis=1) for each, index in pairs]
     )
-    nees = np.column_stack([each.nees[place] for each, place in pairs]).mean(axis=1)
+    nees = np.column_stack([each.nees[index] for each, index in pairs]).mean(axis=1)
     figure = style.new_figure(style.PAGE_IN, 3.6)
     grid = figure.subplots(2, 2, width_ratios=(1.3, 1), sharex="col")
     style.dress(grid[0, 0], "position error (m)")
     style.draw_spread(grid[0, 0], t_s, distance, style.BLUE)
-    judged = t_s >= (marks.engaged_s or 0.0)  # earlier, the initial noise would set the scale
-    grid[0, 0].set_ylim(0.0, 1.1 * float(np.max(distance[judged], initial=0.0)) or None)
-    _draw_nees(grid[1, 0], t_s, nees, style.BLUE, of=len(errors))
+    is_engaged = t_s >= (marks.engaged_s or 0.0)  # earlier, the initial noise would set the scale
+    grid[0, 0].set_ylim(0.0, 1.1 * float(np.max(distance[is_engaged], initial=0.0)) or None)
+    _draw_nees(grid[1, 0], t_s, nees, style.BLUE, drone_count=len(errors))
     grid[1, 0].set_yscale("linear")
     grid[1, 0].set_ylabel(f"NEES, mean of {len(errors)}", fontsize=style.PAPER_PT)
     style.draw_marks(grid[:, 0], marks)
@@ -491,11 +495,11 @@ def _draw_many_estimates(
             np.mean(np.sum(part[rows][:, drone_errors.POSITION] ** 2, axis=1)) for part in (each.error, each.sigma)
         )
         statistics.append((*map(np.sqrt, squares), each.share_inside(rows)[list(drone_errors.POSITION)].mean()))
-    rms, stated, inside = np.array(statistics).T
+    rms, stated_rms, inside = np.array(statistics).T
     upper, lower = grid[:, 1]
     style.dress(upper, "RMS (m)")
     upper.scatter(numbers, rms, clip_on=False, **look)
-    upper.plot(numbers, stated, "_", color=style.BLACK, ms=5, zorder=2, label="σ as stated", clip_on=False)
+    upper.plot(numbers, stated_rms, "_", color=style.BLACK, ms=5, zorder=2, label="σ as stated", clip_on=False)
     upper.set_ylim(bottom=0)
     upper.set_title("each drone, within the window", fontsize=style.PAPER_PT)
     style.dress(lower, f"x, y, z in {drone_errors.SIGMAS:g}σ (%)")
@@ -530,8 +534,8 @@ def draw_velocities(
         gaps = np.diff(each.t_s, prepend=each.t_s[0]) > GAP_S
         for i, axes in enumerate(column):
             style.dress(axes, VELOCITIES[i] if axes is grid[i, 0] else "")
-            flown, commanded = (np.where(gaps, np.nan, values[:, i]) for values in (each.flown, each.commanded))
-            style.line(axes, each.t_s, flown, color=colours[name], lw=0.6, zorder=3, label="flown")
+            measured, commanded = (np.where(gaps, np.nan, values[:, i]) for values in (each.flown, each.commanded))
+            style.line(axes, each.t_s, measured, color=colours[name], lw=0.6, zorder=3, label="flown")
             style.line(axes, each.t_s, commanded, color=style.BLACK, lw=1.0, zorder=2, label="commanded")
         style.draw_marks(column, marks)
     style.finish(figure, grid[0], grid, 7)
@@ -615,8 +619,8 @@ def draw_distances(
     ):
         if distance_m:
             axes.axhline(distance_m, color=colour, lw=0.8, ls=dashes, zorder=1.8)
-            place = {"ha": "right", "va": "bottom", "transform": axes.get_yaxis_transform(), "zorder": 7}
-            axes.text(0.995, distance_m, f"{name}: {distance_m:.2g} m", color=colour, fontsize=SMALL_PT, **place)
+            text_style = {"ha": "right", "va": "bottom", "transform": axes.get_yaxis_transform(), "zorder": 7}
+            axes.text(0.995, distance_m, f"{name}: {distance_m:.2g} m", color=colour, fontsize=SMALL_PT, **text_style)
     style.label_time([axes])
     style.legend_above(figure, axes, columns=3)
     return figure
@@ -653,8 +657,8 @@ def draw_radio(radio: RadioHistory, names: Sequence[str], marks: style.TimeMarks
     if len(names) > EACH_MAX:
         style.draw_spread(axes, t_s, radio.heard, style.BLUE)
     else:
-        for name, colour, heard in zip(names, drone_colours(len(names)), radio.heard.T, strict=True):
-            style.line(axes, t_s, heard, color=colour, lw=1.0, label=name)
+        for name, colour, received in zip(names, drone_colours(len(names)), radio.heard.T, strict=True):
+            style.line(axes, t_s, received, color=colour, lw=1.0, label=name)
     if not radio.connected.all():
         axes.fill_between(
             t_s, 0, 1, where=~radio.connected, transform=axes.get_xaxis_transform(), color=style.GREY, alpha=0.3, lw=0,

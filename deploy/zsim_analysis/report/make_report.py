@@ -86,7 +86,7 @@ def make_report(
 
 def figures(flight: RecordedFlight, formations: Sequence[Formation], summary: RunSummary) -> Iterator[ReportFigure]:
     """Yield the figures for which the record has data, with a mark if the flight has shortfalls."""
-    return (marked(each, summary) for each in planned_figures(flight, formations, summary.window_s))
+    return (draw_marked(each, summary) for each in planned_figures(flight, formations, summary.window_s))
 
 
 class PlannedFigure(NamedTuple):
@@ -98,14 +98,14 @@ class PlannedFigure(NamedTuple):
     draw: Callable[[], Figure]
 
 
-def marked(planned: PlannedFigure, summary: RunSummary) -> ReportFigure:
+def draw_marked(planned: PlannedFigure, summary: RunSummary) -> ReportFigure:
     """Draw a figure, with a mark if the flight has shortfalls."""
     drawing = planned.draw()
     if summary.shortfalls:
-        found = [each.text for each in summary.shortfalls if each.fails or summary.as_planned]
-        more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        head, colour = ("Note", DARK) if summary.as_planned else ("Not as planned", VERMILION)
-        mark_figure(drawing, f"{head}{more}", found[0], colour)
+        texts = [each.text for each in summary.shortfalls if each.fails or summary.as_planned]
+        further = f" (and {len(texts) - 1} more)" if len(texts) > 1 else ""
+        heading, colour = ("Note", DARK) if summary.as_planned else ("Not as planned", VERMILION)
+        mark_figure(drawing, f"{heading}{further}", texts[0], colour)
     return ReportFigure(planned.name, planned.title, planned.caption, drawing)
 
 
@@ -114,7 +114,7 @@ def planned_figures(
 ) -> Iterator[PlannedFigure]:
     """Yield the figures for which the record has data."""
     for i, formation in enumerate(formations):  # figures of the first cluster have no suffix
-        yield from _of_cluster(flight, formation, window_s, f"_{formation.name}" if i else "")
+        yield from _cluster_figures(flight, formation, window_s, f"_{formation.name}" if i else "")
     marks = time_marks(flight, formations[0] if formations else None)
     colours = colours_of([track.name for track in flight.tracks])
     has_truth = any(len(track.t_ns) for track in flight.tracks)
@@ -126,21 +126,25 @@ def planned_figures(
             "the formation at several simulated times.",
             partial(draw_plan, flight, formations),
         )
-    if apart := distances(flight, PAIRS_MAX):
-        what = "each pair of drones" if apart.pairs else "each drone to the nearest other: median, 5 to 95 %, extremes"
+    if separation := distances(flight, PAIRS_MAX):
+        pairing = (
+            "each pair of drones"
+            if separation.pairs
+            else "each drone to the nearest other: median, 5 to 95 %, extremes"
+        )
         yield PlannedFigure(
             "distances.png",
             "Distances between drones",
-            f"True distance of {what}; below the upper line the controller's separation guard acts.",
-            partial(draw_distances, apart, separations(flight), colours, marks),
+            f"True distance of {pairing}; below the upper line the controller's separation guard acts.",
+            partial(draw_distances, separation, separations(flight), colours, marks),
         )
-    if off := reference_errors(flight):
+    if tracking_errors := reference_errors(flight):
         yield PlannedFigure(
             "references.png",
             "Errors against the drones' references",
             "Truth − reference of each drone that flies on its own, while in the air: thick on its path, thin while "
             "approaching it or holding a position. For many drones: median, 5 to 95 % and extremes.",
-            partial(draw_references, off, colours, marks),
+            partial(draw_references, tracking_errors, colours, marks),
         )
     if flight.radio:
         yield PlannedFigure(
@@ -178,7 +182,7 @@ def planned_figures(
         )
 
 
-def _of_cluster(
+def _cluster_figures(
     flight: RecordedFlight, formation: Formation, window_s: tuple[float, float], suffix: str
 ) -> Iterator[PlannedFigure]:
     marks, goal = time_marks(flight, formation), goal_errors(formation, flight.scenario)
@@ -192,11 +196,11 @@ def _of_cluster(
         f"statistics, on an axis of its own. {large}{REFERENCE}",
         partial(draw_errors, formation, window_s, marks, goal),
     )
-    for file, number, what, names in parameter_groups(formation.names):
+    for file, number, group_name, names in parameter_groups(formation.names):
         shown = ", ".join(names) if len(names) <= ROWS_MAX else f"those of {len(names)} variables that move most"
         yield PlannedFigure(
             f"{file}{suffix}.png",
-            f"{what}{numbered(number, paper)}",
+            f"{group_name}{numbered(number, paper)}",
             f"Desired, measured (from the estimates) and true {shown}.",
             partial(draw_parameters, formation, names, marks),
         )
@@ -235,18 +239,18 @@ def facts(summary: RunSummary) -> list[tuple[str, str]]:
     separation, radio, nearest = summary.min_separation_m, summary.radio, summary.obstacle_distance_m
     versions = dict.fromkeys(version for name, version in summary.versions.items() if name != "report")
     kinds, misses = {each.kind for each in summary.shortfalls}, "not known"
-    but_for = {
+    exceptions = {
         "as far as the run went": "early" in kinds,
         "except for what others requested or flew": bool(kinds & {"override", "request"}),
         "except for a short hold": "held" in kinds,
     }
-    planned = ", ".join(part for part, holds in but_for.items() if holds) or "yes"
-    begun = [event for event in summary.events if event.kind == "fault"]
-    faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in begun[:FAULTS_MAX]]
-    faults += [f"{len(begun) - FAULTS_MAX} more"] if len(begun) > FAULTS_MAX else []
+    planned = ", ".join(part for part, holds in exceptions.items() if holds) or "yes"
+    injected = [event for event in summary.events if event.kind == "fault"]
+    faults = [f"{event.text.removesuffix(' begins')} at {seconds_text(event.t_s)} s" for event in injected[:FAULTS_MAX]]
+    faults += [f"{len(injected) - FAULTS_MAX} more"] if len(injected) > FAULTS_MAX else []
     if summary.deadline_misses is not None:
-        by = ", ".join(f"{name} {count}" for name, count in summary.deadline_misses_by.items() if count)
-        misses = f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by})' if by else ''}"
+        by_process = ", ".join(f"{name} {count}" for name, count in summary.deadline_misses_by.items() if count)
+        misses = f"{summary.deadline_misses} of {summary.deadlines or 0}{f' ({by_process})' if by_process else ''}"
     return [
         ("Scenario", f"{summary.scenario or 'not known'}, seed {seed}"),
         ("Changed", changed_text(summary.changed)),

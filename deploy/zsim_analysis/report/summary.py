@@ -162,8 +162,8 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     end, info = flight.end or {}, flight.info
     facts = _record_facts(flight, end.get("last_ns", flight.last_ns))
     window_s, window_note = window_of(flight)
-    short = shortfalls(flight, window_s)
-    as_planned = not any(each.fails for each in short)
+    shortfall_lines = shortfalls(flight, window_s)
+    as_planned = not any(each.fails for each in shortfall_lines)
     clusters = {
         f.name: ClusterErrors(
             f.drones,
@@ -177,15 +177,15 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
     ended = str(end.get("reason", "ended"))
     if not flight.end:  # a record without an end event does not show which process died
-        at, cut = f"{flight.last_ns / 1e9:.2f} s", not flight.completeness.closed
-        ended = f"the record {'was cut after' if cut else 'ends here at'} {at}: no end is on record"
+        end_text, is_cut = f"{flight.last_ns / 1e9:.2f} s", not flight.completeness.closed
+        ended = f"the record {'was cut after' if is_cut else 'ends here at'} {end_text}: no end is on record"
     lines: list[EventLine] = []
-    kept, left_out = Counter[str](), Counter[str]()
+    kept_counts, omitted = Counter[str](), Counter[str]()
     for event in flight.events:
-        if kept[event.kind] >= EVENTS_PER_KIND or len(lines) >= EVENTS_MAX:
-            left_out[event.kind] += 1
+        if kept_counts[event.kind] >= EVENTS_PER_KIND or len(lines) >= EVENTS_MAX:
+            omitted[event.kind] += 1
         else:
-            kept[event.kind] += 1
+            kept_counts[event.kind] += 1
             lines.append(EventLine(event.t_ns / 1e9, event.kind, event.source, event.subject, event.text))
     participant = ("name", "role", "host", "pid", "incarnations", "left")
     began = datetime.fromtimestamp(flight.began_ns // 10**9, UTC).isoformat() if flight.began_ns else None
@@ -207,7 +207,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         sim_s=end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9),
         ended=ended,
         as_planned=as_planned,
-        shortfalls=short,
+        shortfalls=shortfall_lines,
         deadlines=end.get("deadlines"),
         deadline_misses=end.get("deadline_misses"),
         deadline_misses_by=end.get("deadline_misses_by", {}),
@@ -223,7 +223,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         radio=flight.radio.summary(window_s) if flight.radio else None,
         paper_table_1=PAPER_TABLE_1,
         events=lines,
-        events_left_out=dict(left_out),
+        events_left_out=dict(omitted),
         participants=[{name: getattr(each, name) for name in participant} for each in flight.processes],
         truth_sha256=end.get("truth_sha256", facts.truth_sha256),
         record=facts,
@@ -305,9 +305,9 @@ def _notes(
     if not flight.clusters and not flight.references:
         yield "The scenario has no cluster: there is no table of errors."
     own = flight.info.fingerprint if flight.info else ""
-    if others := [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]:
+    if other_processes := [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]:
         text = "computed with other code than the world (fingerprint); the same bits are not guaranteed."
-        yield f"{', '.join(others)} {text}"
+        yield f"{', '.join(other_processes)} {text}"
 
 
 # Tables of errors; that of a large formation begins with groups of parameters
@@ -411,18 +411,18 @@ def terminal_text(summary: RunSummary) -> Group:
 
 def table(summary: RunSummary, cluster: str) -> FittedTable:
     """Return the errors of one cluster for the terminal; for Test 1, beside the paper's Table I."""
-    judged = summary.clusters[cluster]
-    content = error_table(judged)
+    errors = summary.clusters[cluster]
+    content = error_table(errors)
     title = f"Formation errors of {cluster} from {span_text(summary.window_s)}"
-    beside = ", beside Table I of the paper" if judged.paper_std else ""
+    comparison = ", beside Table I of the paper" if errors.paper_std else ""
     mark = "" if summary.as_planned else f" ({NOT_AS_PLANNED})"
     caption = "est. = estimate − desired, true = truth − desired"
-    if judged.part:
-        caption += f"; {judged.part}"
+    if errors.part:
+        caption += f"; {errors.part}"
     if content.rest:
         caption += f"; all {len(content.rest.rows)} parameters: report.html, summary.json"
     columns = [{**COLUMNS, **GROUP_COLUMNS}[column][0] for column in content.columns]
-    return FittedTable(columns, content.rows, f"{title}{beside}{mark}", caption, lines=HEAVY_HEAD)
+    return FittedTable(columns, content.rows, f"{title}{comparison}{mark}", caption, lines=HEAVY_HEAD)
 
 
 # The paper's printed values, and which flights are comparable with them, judged by their scenarios
@@ -526,14 +526,14 @@ def _is_along_equation_4(plan: ClusterPlan) -> bool:
 def _is_printed(drone: Drone) -> bool:
     """Return whether a drone is an unmodified AR.Drone with the paper's sensor noise and no detector."""
     sensors = drone.sensors
-    plain = Drone(name=drone.name, position_m=drone.position_m, yaw_deg=drone.yaw_deg, sensors=sensors)
-    more = sensors.own is not UNSET or sensors.sightings is not UNSET
-    over = AS_PRINTED if sensors.as_printed else {}
+    unmodified = Drone(name=drone.name, position_m=drone.position_m, yaw_deg=drone.yaw_deg, sensors=sensors)
+    has_extras = sensors.own is not UNSET or sensors.sightings is not UNSET
+    overrides = AS_PRINTED if sensors.as_printed else {}
     printed = {
-        name: msgspec.convert({**section, **over.get(name, {})}, STOCK[name].settings)
+        name: msgspec.convert({**section, **overrides.get(name, {})}, STOCK[name].settings)
         for name, section in PRESETS["paper"].items()
     }
-    return drone == plain and not more and {name: getattr(sensors, name) for name in STOCK} == printed
+    return drone == unmodified and not has_extras and {name: getattr(sensors, name) for name in STOCK} == printed
 
 
 def _is_led(cluster: Cluster) -> bool:
@@ -546,5 +546,5 @@ def _is_led(cluster: Cluster) -> bool:
         target = named_values(space, plan.target, "target", np.full(len(space.names), np.inf))
     except (TrajectoryError, ExpressionError):
         return False  # the target was refused in flight
-    wanted = [TEST_1_TARGET.get(name, np.nan) for name in space.names]
-    return all(abs(target[k] - value) <= TOLERANCE for k, value in enumerate(wanted) if not np.isnan(value))
+    expected = [TEST_1_TARGET.get(name, np.nan) for name in space.names]
+    return all(abs(target[k] - value) <= TOLERANCE for k, value in enumerate(expected) if not np.isnan(value))

@@ -71,9 +71,9 @@ class DaskPool:
         self._is_lent = not isinstance(cluster, str)
         if self._is_lent:
             self._client = _checked(cluster)
-            self._at, self._where = self._client.scheduler.address, "client"
+            self._address, self._origin = self._client.scheduler.address, "client"
             return
-        self._at, self._where = cluster, f"--dask {cluster}"
+        self._address, self._origin = cluster, f"--dask {cluster}"
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors that end the sweep are raised
 
         async def connect_once() -> None:
@@ -84,7 +84,7 @@ class DaskPool:
             self._client: Any = Client(cluster, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise RunError(f"{self._where}: no scheduler ({reason}); start `dask scheduler` there") from error
+            raise RunError(f"{self._origin}: no scheduler ({reason}); start `dask scheduler` there") from error
 
     def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
         """Yield the rows of tasks as they finish; when closed, the cluster drops the rest.
@@ -108,27 +108,27 @@ class DaskPool:
                         except CancelledError:
                             raise
                         except Exception as error:  # raised by `fly` if every further run would fail as well
-                            raise RunError(f"{self._where}: {reason_of(error)}") from error
+                            raise RunError(f"{self._origin}: {reason_of(error)}") from error
                         yield row
                         self._fill(flying, pending, tasks)
                 finally:
                     if self._is_lent and pending:
                         self._client.cancel(list(pending))
         except (OSError, CancelledError) as error:  # broken links are OSErrors, too
-            raise RunError(f"{self._where}: the cluster is gone; the same command continues") from error
+            raise RunError(f"{self._origin}: the cluster is gone; the same command continues") from error
 
     def _prepare(self) -> None:
         """Wait for workers, check that they have this version of zsim, and send them the user's modules."""
         if not self._client.nthreads():
-            self._say(f"waiting for workers at {self._at}; start `dask worker {self._at}` on every host")
+            self._say(f"waiting for workers at {self._address}; start `dask worker {self._address}` on every host")
             self._client.wait_for_workers(1)
         versions = self._client.run(_version, on_error="return")
         for worker, version in versions.items():
             if version != __version__:
-                present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
-                raise RunError(f"{self._where}: worker {worker} has {present}; must have zsim {__version__}")
+                found = f"zsim {version}" if isinstance(version, str) else reason_of(version)
+                raise RunError(f"{self._origin}: worker {worker} has {found}; must have zsim {__version__}")
         self._client.register_plugin(UserCode(self._modules, plugin.folders()))
-        self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._at}")
+        self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
 
     def _fill(self, flying: Any, pending: dict[Any, Task], tasks: Iterator[Task]) -> None:
         """Submit tasks up to AHEAD per thread of the cluster; new workers may join at any time."""
@@ -144,9 +144,9 @@ class DaskPool:
 def _checked(client: Any) -> Any:
     """Return `client` if it is a connected synchronous Client; raise RunError otherwise."""
     if not isinstance(client, Client) or client.asynchronous or client.status != "running":
-        found = "that is closed" if isinstance(client, Client) and client.status != "running" else "asynchronous"
-        shown = f"a Client {found}" if isinstance(client, Client) else show(str(type(client).__name__))
-        raise RunError(f"client is {shown}; must be a distributed.Client that is connected and not asynchronous")
+        fault = "that is closed" if isinstance(client, Client) and client.status != "running" else "asynchronous"
+        description = f"a Client {fault}" if isinstance(client, Client) else show(str(type(client).__name__))
+        raise RunError(f"client is {description}; must be a distributed.Client that is connected and not asynchronous")
     return client
 
 

@@ -114,20 +114,22 @@ class Grid(Struct, frozen=True):
     def names(self) -> list[str]:
         """Abbreviated values; those with equal abbreviations are shown by their differing part, or numbered."""
         texts = [f"{value:g}" if isinstance(value, float) else text_of(value) for value in self.values]
-        generated = {place: without_made(text) for place, text in enumerate(texts) if text.startswith(plugin.MADE)}
+        generated = {index: without_made(text) for index, text in enumerate(texts) if text.startswith(plugin.MADE)}
         names = [*map(_cut, distinct(texts, generated))]
-        for short in [name for name, often in Counter(names).items() if often > 1]:
-            alike = [place for place, name in enumerate(names) if name == short]
-            texts = parts = [text_of(self.values[place]) for place in alike]
+        for abbreviated in [name for name, frequency in Counter(names).items() if frequency > 1]:
+            indices = [index for index, name in enumerate(names) if name == abbreviated]
+            texts = parts = [text_of(self.values[index]) for index in indices]
             if any(len(text) > SHOWN_MAX for text in texts):  # show them from the first word that differs
                 letters = enumerate(zip(*texts, strict=False))
-                common = next((place for place, each in letters if len(set(each)) > 1), min(map(len, texts)))
+                common = next(
+                    (index for index, letters_at in letters if len(set(letters_at)) > 1), min(map(len, texts))
+                )
                 start = max(texts[0].rfind(mark, 0, common) for mark in " ,[{:") + 1
                 parts = [_cut(f"…{text[start:]}" if start else text) for text in texts]
-            others = {name for name in names if name != short}
+            others = {name for name in names if name != abbreviated}
             is_distinct = len({*parts, *others}) == len(parts) + len(others)
-            for place, part in zip(alike, parts, strict=True):
-                names[place] = part if is_distinct else f"{short} ({place + 1})"
+            for index, part in zip(indices, parts, strict=True):
+                names[index] = part if is_distinct else f"{abbreviated} ({index + 1})"
         return names
 
 
@@ -217,13 +219,13 @@ def distinct(texts: Sequence[str], generated: Mapping[int, str]) -> list[str]:
 
     Classes that one function creates all have the same name.
     """
-    found = [*texts]
-    known = {text for place, text in enumerate(texts) if place not in generated}
-    for place, name in generated.items():
+    result = [*texts]
+    used = {text for index, text in enumerate(texts) if index not in generated}
+    for index, name in generated.items():
         numbered = (f"{name}-{number}" if number > 1 else name for number in count(1))
-        found[place] = next(each for each in numbered if each not in known)
-        known.add(found[place])
-    return found
+        result[index] = next(each for each in numbered if each not in used)
+        used.add(result[index])
+    return result
 
 
 def _cut(text: str) -> str:
@@ -289,30 +291,33 @@ class SweepDesign:
     def point(self, run: int) -> int:
         return run % self.points
 
-    def at(self, point: int) -> dict[str, Any]:
+    def point_values(self, point: int) -> dict[str, Any]:
         """Return the values of a point by path; the last axis changes fastest."""
-        return {grid.path: grid.values[place] for grid, place in self._places(point)}
+        return {grid.path: grid.values[index] for grid, index in self._indices(point)}
 
     def names(self, point: int) -> dict[str, str]:
-        return {grid.path: self._names[grid.path][place] for grid, place in self._places(point)}
+        return {grid.path: self._names[grid.path][index] for grid, index in self._indices(point)}
 
-    def _places(self, point: int) -> list[tuple[Grid, int]]:
-        places = []
+    def _indices(self, point: int) -> list[tuple[Grid, int]]:
+        indices = []
         for grid in reversed(self._grids):
-            point, place = divmod(point, len(grid.values))
-            places.append((grid, place))
-        return places[::-1]
+            point, index = divmod(point, len(grid.values))
+            indices.append((grid, index))
+        return indices[::-1]
 
     def values(self, run: int) -> dict[str, Any]:
         """Return the values that a run sets, by path, in the order of the axes."""
-        at, draw = self.at(self.point(run)), run // self.points if self.paired else run
-        return {axis.path: at[axis.path] if axis.path in at else self._drawn[axis.path][draw] for axis in self.axes}
+        point_values, draw_index = self.point_values(self.point(run)), run // self.points if self.paired else run
+        return {
+            axis.path: point_values[axis.path] if axis.path in point_values else self._drawn[axis.path][draw_index]
+            for axis in self.axes
+        }
 
     @cached_property
     def _drawn(self) -> dict[str, list[Any]]:
-        drawn = [axis for axis in self.axes if not isinstance(axis, Grid)]
+        drawn_axes = [axis for axis in self.axes if not isinstance(axis, Grid)]
         count = -(-self.plan.runs // self.points) if self.paired else self.plan.runs
-        return {axis.path: axis.draw(self.seed, count) for axis in drawn}
+        return {axis.path: axis.draw(self.seed, count) for axis in drawn_axes}
 
     def scenario(self, run: int) -> Scenario:
         """Return the resolved scenario of a run, which flies in lockstep.
@@ -342,10 +347,10 @@ class SweepDesign:
         check_alone(scenario)
         return scenario
 
-    def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:
+    def faults(self, progress: Callable[[int, int], None] = lambda run, total: None) -> list[str]:
         """Return the faults of all combinations: of each point of the grid, or of each run if values are drawn."""
-        drawn = any(isinstance(axis, Draw) for axis in self.axes)
-        checked = self.plan.runs if drawn else min(self.plan.runs, self.points)
+        is_drawn = any(isinstance(axis, Draw) for axis in self.axes)
+        checked = self.plan.runs if is_drawn else min(self.plan.runs, self.points)
         runs_of: dict[str, tuple[str, list[int]]] = {}
         for run in range(checked):
             progress(run, checked)
@@ -374,7 +379,7 @@ def make_plan(
     vary: list[str],
     runs: int | None,
     records: bool = False,
-    progress: Callable[[int, int], None] = lambda run, of: None,
+    progress: Callable[[int, int], None] = lambda run, total: None,
     earlier_faults: Sequence[str] = (),
     changed: Sequence[str] | None = None,
 ) -> SweepPlan:
@@ -400,13 +405,13 @@ def make_plan(
             vary_faults.append(f"--vary {_shown(text)}: {error}")
     faults = [*earlier_faults, *vary_faults]
     source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may contain any bytes
-    sets = None if changed is None else tuple(changed)
+    set_texts = None if changed is None else tuple(changed)
     texts = tuple(fields.values())
-    plan = SweepPlan(source=source, document=document, vary=texts, runs=runs or 1, records=records, changed=sets)
+    plan = SweepPlan(source=source, document=document, vary=texts, runs=runs or 1, records=records, changed=set_texts)
     if not runs:
         design = SweepDesign(plan)
-        given = len(design.seeds.values) if design.seeds else 0
-        plan = msgspec.structs.replace(plan, runs=design.points * max(given, 1))
+        seed_count = len(design.seeds.values) if design.seeds else 0
+        plan = msgspec.structs.replace(plan, runs=design.points * max(seed_count, 1))
     design = SweepDesign(plan)
     faults += _count_faults(design, all_known=not vary_faults)
     if plan.runs <= RUNS_MAX:

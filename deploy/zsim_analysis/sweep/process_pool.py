@@ -88,11 +88,11 @@ def _bare_start() -> Iterator[None]:
 class WorkerProcess:
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self.link, far = context.Pipe()
-        self.process = context.Process(target=work, args=(far,), name="zsim-sweep", daemon=True)
+        self.link, worker_end = context.Pipe()
+        self.process = context.Process(target=work, args=(worker_end,), name="zsim-sweep", daemon=True)
         with _bare_start():
             self.process.start()
-        far.close()  # so that `recv` fails once the process is dead
+        worker_end.close()  # so that `recv` fails once the process is dead
         self.ready = False
         self.task: Task | None = None
 
@@ -130,7 +130,7 @@ class ProcessPool:
         self._count = count
         self._say = say
         self._workers: dict[Connection, WorkerProcess] = {}
-        self._again: deque[Task] = deque()
+        self._retries: deque[Task] = deque()
         self._deaths: Counter[int] = Counter()
         self._deaths_at_start = 0
 
@@ -163,7 +163,7 @@ class ProcessPool:
     def _hand_out(self, tasks: Iterator[Task | None]) -> None:
         """Give each idle worker a task, or stop it if no task is left."""
         for worker in [each for each in self._workers.values() if each.ready and each.task is None]:
-            task = self._again.popleft() if self._again else next(tasks, _END)
+            task = self._retries.popleft() if self._retries else next(tasks, _END)
             if isinstance(task, str):
                 del self._workers[worker.link]
                 worker.stop()
@@ -199,7 +199,7 @@ class ProcessPool:
         self._deaths[run] += 1
         if self._deaths[run] < DEATHS_MAX:
             self._say(f"the worker of run {run} died ({worker.cause()}); another worker repeats it")
-            self._again.append(worker.task)
+            self._retries.append(worker.task)
         else:
             from zsim_analysis.sweep.sweep_run import failed_row
 

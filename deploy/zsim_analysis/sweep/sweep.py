@@ -74,8 +74,8 @@ def sweep(request: SweepRequest) -> list[Row]:
         missing = [run for run in range(plan.runs) if run not in done]
         with SweepScreen(plan.runs, len(done), request.console) as screen:
             points = folder.design.points
-            over = f" over {points} combinations" if points > 1 else ""
-            screen.say(f"{plan.source}: {plan.runs} runs{over}, into {folder.path}")
+            extent = f" over {points} combinations" if points > 1 else ""
+            screen.say(f"{plan.source}: {plan.runs} runs{extent}, into {folder.path}")
             if done:
                 screen.say(f"{len(done)} of them {'is' if len(done) == 1 else 'are'} already done")
             try:
@@ -136,7 +136,7 @@ class SweepScreen:
     ) -> None:
         self.console = console or Console(stderr=True)
         self._total = total
-        self._before = self._done = done
+        self._done_at_start = self._done = done
         self._failed = 0
         self._unmeasured = 0
         self._now_s = now_s
@@ -161,7 +161,7 @@ class SweepScreen:
             self._live.stop()
         elif self._cell:
             self._cell.update(self.line())
-        elif self._done > self._before:
+        elif self._done > self._done_at_start:
             self.say(self.line())
 
     def say(self, text: str) -> None:
@@ -179,30 +179,30 @@ class SweepScreen:
         """Report a run without the user's metrics; only the first UNMEASURED_MAX are reported."""
         self._unmeasured += 1
         if self._unmeasured <= UNMEASURED_MAX:
-            more = "; further ones are in the table" if self._unmeasured == UNMEASURED_MAX else ""
-            self.say(f"run {run}: {reason}{more}")
+            hint = "; further ones are in the table" if self._unmeasured == UNMEASURED_MAX else ""
+            self.say(f"run {run}: {reason}{hint}")
 
     def line(self) -> str:
         """Return a text on the finished runs, the runs per hour since the start, and the time left at that rate."""
         filled = int(BAR * self._done / self._total)
         text = f"{'█' * filled}{'░' * (BAR - filled)} {self._done} / {self._total} runs"
-        flown, elapsed_s = self._done - self._before, self._now_s() - self._start_s
-        if flown and elapsed_s > 0:
-            text += f"  {3600 * flown / elapsed_s:,.0f} runs/h"
+        finished, elapsed_s = self._done - self._done_at_start, self._now_s() - self._start_s
+        if finished and elapsed_s > 0:
+            text += f"  {3600 * finished / elapsed_s:,.0f} runs/h"
             if self._done < self._total:
-                text += f"  {span((self._total - self._done) * elapsed_s / flown)} to go"
+                text += f"  {duration_text((self._total - self._done) * elapsed_s / finished)} to go"
         elif self._done < self._total:
-            text += f"  the first runs are flying, {span(elapsed_s)}"
+            text += f"  the first runs are flying, {duration_text(elapsed_s)}"
         return text + (f"  {self._failed} failed" if self._failed else "")
 
 
-def span(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Format a duration: to the second below one hour, otherwise to the minute."""
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, remainder = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
         return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+    return f"{minutes} min {remainder:02d} s" if minutes else f"{remainder} s"
 
 
 # The folder
@@ -380,8 +380,8 @@ def _schema(rows: Sequence[Row], axes: Sequence[Axis]) -> pa.Schema:
             kinds = {float}
         if axis.path != SEED:
             varied.append((axis.path, _TYPES.get(kinds.pop()) if len(kinds) == 1 else None))
-    known = {*FIXED, *(path for path, _ in varied)}
-    errors = {name: (name, pa.float64()) for row in rows for name in row if name not in known}
+    own_columns = {*FIXED, *(path for path, _ in varied)}
+    errors = {name: (name, pa.float64()) for row in rows for name in row if name not in own_columns}
     fields = [*fixed[:3], *varied, *fixed[3:], *errors.values()]
     mixed = {b"encoding": b"json"}
     return pa.schema([pa.field(name, kind or pa.string(), metadata=None if kind else mixed) for name, kind in fields])

@@ -67,31 +67,31 @@ def figures(results: SweepResults) -> Iterator[style.ReportFigure]:
         printed = results.paper_std.get(each.name)
         std.append(Panel(f"{prefix}.est_std", each.labelled(f"{estimated} ({unit(each.name)})"), printed))
     own, rms, std = (
-        [panel for panel in panels if len(finite(results.flown(panel.column)))] for panels in (own, rms, std)
+        [panel for panel in panels if len(finite(results.planned_values(panel.column)))] for panels in (own, rms, std)
     )
     windows_s = results.windows_s()
     window = f" ({span_text(windows_s)})" if windows_s else ""
-    more = ""
+    hint = ""
     if results.design.points > POINTS_MAX and not GridAxis(results.design).field:
-        more = f" The first {POINTS_MAX} points are shown; the tables have all."
-    beside = ", compared with the paper" if results.paper_std else ""
-    for name, title, what, panels in (
+        hint = f" The first {POINTS_MAX} points are shown; the tables have all."
+    comparison = ", compared with the paper" if results.paper_std else ""
+    for name, title, caption, panels in (
         ("metrics", "Your own metrics", f"What {results.metrics_function} returned for each run.", own),
         ("true_rms", "How well the formation was flown", f"RMS of truth − desired within the window{window}.", rms),
         (
             "est_std",
-            f"Standard deviations as the controller sees them{beside}",
+            f"Standard deviations as the controller sees them{comparison}",
             f"Standard deviation of estimate − desired within the window{window}.",
             std,
         ),
     ):
         if panels:
-            yield style.ReportFigure(f"{name}.png", title, f"{what}{more}", _draw_panels(results, panels))
+            yield style.ReportFigure(f"{name}.png", title, f"{caption}{hint}", _draw_panels(results, panels))
     yield style.ReportFigure(
         "safety.png",
         "How the runs ended, and how close the drones came to each other",
         "(a) Share of runs that ended well and, of these, shares flown as planned and without a collision, "
-        f"with exact intervals. (b) Minimum true distance between two drones in the air.{more}",
+        f"with exact intervals. (b) Minimum true distance between two drones in the air.{hint}",
         _draw_safety(results),
     )
     for i, path in enumerate(results.drawn if own or rms else ()):
@@ -110,7 +110,7 @@ def _draw_panels(results: SweepResults, panels: Sequence[Panel]) -> Figure:
     figure, grid = _panel_grid(len(panels), across, 2.0 if axis and axis.is_turned else 1.8)
     beyond = [draw_distribution(axes, results, panel, axis) for axes, panel in zip(grid, panels, strict=True)]
     paper = any(panel.printed is not None for panel in panels)
-    _name(figure, grid[0], results, axis, any(beyond), paper)
+    _add_legend(figure, grid[0], results, axis, any(beyond), paper)
     return figure
 
 
@@ -127,24 +127,24 @@ def _panel_grid(count: int, across: int, row_in: float) -> tuple[Figure, Any]:
 def _draw_safety(results: SweepResults) -> Figure:
     """Draw the shares of runs that ended well, and the minimum separations if there are any."""
     axis = GridAxis(results.design) if results.design.points > 1 else None
-    has_separations = len(finite(results.flown(SEPARATION))) > 0
+    has_separations = len(finite(results.planned_values(SEPARATION))) > 0
     figure = style.new_figure(style.PAGE_IN if has_separations else style.COLUMN_IN, 3.0)
-    axes, *others = figure.subplots(1, 1 + has_separations, squeeze=False).ravel()
+    axes, *separation_axes = figure.subplots(1, 1 + has_separations, squeeze=False).ravel()
     style.dress(axes, "share of runs")
-    places = axis.places if axis else {0: Place(0.0, (-0.12, 0.12))}
+    positions = axis.positions if axis else {0: PointPosition(0.0, (-0.12, 0.12))}
     counts = (results.ended_well, partial(results.count, "as_planned"), results.without_collision)
-    for side, ((name, mark, own), counted) in enumerate(zip(SHARES, counts, strict=True), -1):
-        for point, place in places.items():
-            tint = axis.colour(place) if axis and len(axis.series) > 1 else own
-            count, of = counted(point)
-            if of:
-                share = share_interval(count, of)
+    for side, ((name, mark, share_colour), count_of) in enumerate(zip(SHARES, counts, strict=True), -1):
+        for point, position in positions.items():
+            tint = axis.colour(position) if axis and len(axis.series) > 1 else share_colour
+            count, total = count_of(point)
+            if total:
+                share = share_interval(count, total)
                 ends = [[share.value - share.low], [share.high - share.value]]
-                x = place.x + 0.5 * side * (place.room[1] - place.room[0])
+                x = position.x + 0.5 * side * (position.room[1] - position.room[0])
                 look: dict[str, Any] = {"color": tint, "mfc": "white" if side >= 0 else tint}
                 axes.errorbar([x], [share.value], yerr=ends, fmt=mark, ms=5, lw=1.4, capsize=4, **look)
-        shown = style.GREY if axis and len(axis.series) > 1 else own  # colours then distinguish the series
-        axes.plot([], [], mark, color=shown, mfc="white" if side >= 0 else shown, ms=5, label=name)
+        colour = style.GREY if axis and len(axis.series) > 1 else share_colour  # colours then distinguish the series
+        axes.plot([], [], mark, color=colour, mfc="white" if side >= 0 else colour, ms=5, label=name)
     axes.set_ylim(-0.03, 1.03)
     if axis:
         axis.dress(axes)
@@ -153,13 +153,13 @@ def _draw_safety(results: SweepResults) -> Figure:
         axes.set_xticks([])
         axes.set_xlim(-0.8, 0.8)
     separation = Panel(SEPARATION, "least separation (m)")
-    beyond = any(draw_distribution(each, results, separation, axis) for each in others)
-    style.letter_panels([axes, *others])
-    _name(figure, axes, results, axis, beyond, means=has_separations)
+    beyond = any(draw_distribution(each, results, separation, axis) for each in separation_axes)
+    style.letter_panels([axes, *separation_axes])
+    _add_legend(figure, axes, results, axis, beyond, means=has_separations)
     return figure
 
 
-def _name(
+def _add_legend(
     figure: Figure,
     axes: Axes,
     results: SweepResults,
@@ -189,8 +189,8 @@ def _name(
     if paper:
         axes.plot([], [], color=style.AMBER, ls="--", lw=1.2, label=TABLE_I)
     if axis and len(axis.series) > 1:
-        for place in {place.series: place for place in axis.places.values()}.values():
-            axes.plot([], [], color=axis.colour(place), lw=3, label=axis.series[place.series])
+        for position in {position.series: position for position in axis.positions.values()}.values():
+            axes.plot([], [], color=axis.colour(position), lw=3, label=axis.series[position.series])
     style.legend_above(figure, axes, LEGEND_COLUMNS)
     if never and not axis:
         style.mark_figure(figure, NEVER_AS_PLANNED, "", MARK)  # no run followed its plan
@@ -204,10 +204,10 @@ def most_runs(results: SweepResults) -> int:
 def mean_label(results: SweepResults) -> str:
     """Return the legend entry of the means, with the number of runs (called seeds if only these vary)."""
     counts = {results.ended_well(point)[0] for point in range(results.design.points)} - {0}
-    many = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
-    what = "runs" if results.drawn or not results.has_seeds else "seeds"
-    shown = f"mean and {100 * LEVEL:g} % interval" if max(counts, default=0) >= RUNS_MIN else "mean"
-    return f"{shown} of {many} {what[:-1] if counts == {1} else what}"
+    count_range = " to ".join(f"{count}" for count in sorted({min(counts), max(counts)})) if counts else "no"
+    noun = "runs" if results.drawn or not results.has_seeds else "seeds"
+    statistic = f"mean and {100 * LEVEL:g} % interval" if max(counts, default=0) >= RUNS_MIN else "mean"
+    return f"{statistic} of {count_range} {noun[:-1] if counts == {1} else noun}"
 
 
 def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> Figure:
@@ -217,7 +217,7 @@ def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> F
     for axes, panel in zip(grid, panels, strict=True):
         style.dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
         axes.set_xlabel(wrapped(str(field_name(path)), LEVEL_LETTERS), fontsize=style.PAPER_PT)
-        y = results.flown(panel.column)
+        y = results.planned_values(panel.column)
         axes.plot(x, y, ".", color=style.BLUE, ms=4, alpha=0.45, mew=0, zorder=2, clip_on=False)
         means = [DrawnMean(middle, mean_interval(samples)) for middle, samples in slices(x, y)]
         for each in means:
@@ -237,10 +237,10 @@ def _draw_slices(results: SweepResults, path: str, panels: Sequence[Panel]) -> F
 
 def slices(x: Samples, y: Samples) -> Sequence[tuple[float, Samples]]:
     """Sort runs by x into SLICES groups of nearly equal size; return mean x and all y of each group of two or more."""
-    both = np.isfinite(x) & np.isfinite(y)
-    order = np.argsort(x[both], kind="stable")
+    is_finite = np.isfinite(x) & np.isfinite(y)
+    order = np.argsort(x[is_finite], kind="stable")
     groups = [part for part in np.array_split(order, SLICES) if len(part) >= 2]
-    return [(float(x[both][part].mean()), y[both][part]) for part in groups]
+    return [(float(x[is_finite][part].mean()), y[is_finite][part]) for part in groups]
 
 
 def wrapped(text: str, letters: int) -> str:
@@ -249,12 +249,12 @@ def wrapped(text: str, letters: int) -> str:
     for each in text.split("\n"):
         line = ""
         for word in each.split():
-            longer = f"{line} {word}".strip()
-            if line and len(FORMULA.sub("xx", longer)) > letters:
+            candidate = f"{line} {word}".strip()
+            if line and len(FORMULA.sub("xx", candidate)) > letters:
                 lines.append(line)
                 line = word
             else:
-                line = longer
+                line = candidate
         lines.append(line)
     return "\n".join(lines)
 
@@ -271,33 +271,37 @@ def draw_distribution(axes: Axes, results: SweepResults, panel: Panel, axis: "Gr
     if axis is None:
         style.dress(axes)
         axes.set_xlabel(wrapped(panel.label, LEVEL_LETTERS), fontsize=style.PAPER_PT)
-        samples = finite(results.flown(panel.column))
+        samples = finite(results.planned_values(panel.column))
         count = count_text(len(samples), results.ended_well(0)[0])
         axes.text(0.98, 0.9, count, transform=axes.transAxes, ha="right", fontsize=style.PAPER_PT - 1, zorder=6)
         return _draw_histogram(axes, samples, panel.printed)
     style.dress(axes, wrapped(panel.label, UPRIGHT_LETTERS))
-    drawn: list[tuple[Place, DrawnMean]] = []
-    for point, place in axis.places.items():
-        if len(samples := finite(results.flown(panel.column, point))):
-            mean = _draw_point(axes, samples, place, axis)
-            drawn.append((place, mean))
+    drawn_means: list[tuple[PointPosition, DrawnMean]] = []
+    for point, position in axis.positions.items():
+        if len(samples := finite(results.planned_values(panel.column, point))):
+            mean = _draw_point(axes, samples, position, axis)
+            drawn_means.append((position, mean))
             if count := count_text(len(samples), results.ended_well(point)[0]):
                 look: dict[str, Any] = {"fontsize": style.PAPER_PT - 1, "color": mean.colour, "zorder": 6}
                 offset: dict[str, Any] = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
                 axes.annotate(count, (mean.x, mean.mean.value), **look, **offset)
     for series in range(len(axis.series) if axis.field else 0):  # one line per combination of the other fields
-        own = sorted((each for place, each in drawn if place.series == series), key=lambda each: each.x)
-        if own:
-            values = [each.mean.value for each in own]
-            axes.plot([each.x for each in own], values, color=own[0].colour, lw=1.0, alpha=0.7, zorder=4)
+        series_means = sorted(
+            (each for position, each in drawn_means if position.series == series), key=lambda each: each.x
+        )
+        if series_means:
+            values = [each.mean.value for each in series_means]
+            axes.plot(
+                [each.x for each in series_means], values, color=series_means[0].colour, lw=1.0, alpha=0.7, zorder=4
+            )
     axis.dress(axes)
     axis.mark(axes, results.never_as_planned())
-    style.scale(axes, finite(results.flown(panel.column)), pad=MEAN_ROOM)
+    style.scale(axes, finite(results.planned_values(panel.column)), pad=MEAN_ROOM)
     if panel.printed is not None:
         low, high = axes.get_ylim()
         axes.set_ylim(*_with_printed(low, high, panel.printed))
         axes.axhline(panel.printed, color=style.AMBER, ls="--", lw=1.2, zorder=4)
-    return mark_beyond(axes, [mean for _, mean in drawn])
+    return mark_beyond(axes, [mean for _, mean in drawn_means])
 
 
 def _draw_histogram(axes: Axes, samples: Samples, printed: float | None) -> bool:
@@ -324,23 +328,23 @@ def _with_printed(low: float, high: float, value: float) -> tuple[float, float]:
     return min(low, value - room), max(high, value + room)
 
 
-def _draw_point(axes: Axes, samples: Samples, place: "Place", axis: "GridAxis") -> "DrawnMean":
+def _draw_point(axes: Axes, samples: Samples, position: "PointPosition", axis: "GridAxis") -> "DrawnMean":
     """Draw the runs of a point and their mean; return the mean."""
-    colour = axis.colour(place)
+    colour = axis.colour(position)
     if not axis.field and len(samples) > 1:
         line = {"color": style.BLUE, "lw": 1.0}
         box = {"facecolor": "#0072b226", "edgecolor": style.BLUE, "lw": 1.0}
         look: dict[str, Any] = {"boxprops": box, "medianprops": {"color": style.BLUE, "lw": 1.6}}
         look |= {"whiskerprops": line, "capprops": line, "patch_artist": True, "showfliers": False}
-        axes.boxplot([samples], positions=[place.x], widths=0.5, zorder=2, manage_ticks=False, **look)
+        axes.boxplot([samples], positions=[position.x], widths=0.5, zorder=2, manage_ticks=False, **look)
     dots = samples[:: max(1, -(-len(samples) // DOTS_MAX))]
     shares = ((np.arange(len(dots)) + 0.5) * GOLDEN + 0.5 * (1 - GOLDEN)) % 1
-    low, high = place.room
+    low, high = position.room
     size = 7 if len(dots) < 30 else 4
     if len(samples) > 1:  # a single run is drawn as the mean
         spread = low + shares * (high - low)
         axes.plot(spread, dots, ".", color=colour, ms=size, alpha=0.45, mew=0, zorder=3, clip_on=False)
-    mean_x = place.x if axis.field or len(samples) == 1 else place.x + 0.36  # beside the box
+    mean_x = position.x if axis.field or len(samples) == 1 else position.x + 0.36  # beside the box
     mean = DrawnMean(mean_x, mean_interval(samples), style.VERMILION if len(axis.series) == 1 else colour)
     mean.draw(axes)
     return mean
@@ -368,15 +372,15 @@ class DrawnMean(Struct, frozen=True):
 def mark_beyond(axes: Axes, means: Sequence[DrawnMean], along: Literal["x", "y"] = "y") -> bool:
     """Mark intervals that extend beyond the ends of an axis; return whether any does."""
     low, high = axes.get_xlim() if along == "x" else axes.get_ylim()
-    found = False
+    is_any_beyond = False
     for each in means:
         beyond = ((each.mean.low < low, low), (each.mean.high > high, high))
         for (is_beyond, end), mark in zip(beyond, BEYOND[along], strict=True):
             if is_beyond:
                 x, y = (end, each.x) if along == "x" else (each.x, end)
                 axes.plot([x], [y], mark, color=each.colour, ms=7, mec="white", mew=0.6, clip_on=False, zorder=7)
-                found = True
-    return found
+                is_any_beyond = True
+    return is_any_beyond
 
 
 # The x axis of a grid
@@ -392,7 +396,7 @@ GROUP_MAX = 0.3  # largest share of the axis range for the combinations at one v
 TICKS_MAX = 8  # maximum number of labelled values on an axis; if there are more values, only every n-th is labelled
 
 
-class Place(Struct, frozen=True):
+class PointPosition(Struct, frozen=True):
     """The position at which a point of the grid is drawn."""
 
     x: float  # centre of the point
@@ -406,29 +410,29 @@ class GridAxis:
     Attributes:
         field: path of the field on the axis; None if the points stand side by side.
         series: labels of the combinations of the other fields; [""] if there are no other fields.
-        places: position of each point, by its number.
+        positions: position of each point, by its number.
     """
 
     def __init__(self, design: SweepDesign) -> None:
-        self._paths = list(design.at(0))
+        self._paths = list(design.point_values(0))
         self._names = [design.names(point) for point in range(design.points)]
         self.field, self._is_logarithmic = None, False
         self._numbers: list[float] = []
         self.series = [""]
-        self.places: dict[int, Place] = {}
+        self.positions: dict[int, PointPosition] = {}
         grids = [axis for axis in design.axes if isinstance(axis, Grid) and len(axis.values) > 1]
         numeric = [grid for grid in grids if all(type(value) in (int, float) for value in grid.values)]
-        chosen = max(numeric, key=lambda grid: len(grid.values), default=None)
-        if chosen and design.points <= len(chosen.values) * len(SERIES):
-            self._place_on_numbers(design, chosen.path)
+        longest = max(numeric, key=lambda grid: len(grid.values), default=None)
+        if longest and design.points <= len(longest.values) * len(SERIES):
+            self._place_on_numbers(design, longest.path)
         else:
             for point in range(min(design.points, POINTS_MAX)):
-                self.places[point] = Place(float(point), (point - 0.18, point + 0.18))
+                self.positions[point] = PointPosition(float(point), (point - 0.18, point + 0.18))
         self._labels = [" · ".join(names.values()) for names in self._names[:POINTS_MAX]]
 
     def _place_on_numbers(self, design: SweepDesign, field: str) -> None:
         self.field = field
-        self._numbers = [float(design.at(point)[field]) for point in range(design.points)]
+        self._numbers = [float(design.point_values(point)[field]) for point in range(design.points)]
         values = sorted(set(self._numbers))
         if values[0] > 0 and values[-1] >= DECADES_MIN * values[0]:  # values over several decades, most of them small
             steps = np.diff(values)
@@ -446,16 +450,16 @@ class GridAxis:
             series = self.series.index(combination)
             left = number - width / 2 + series * each
             x, low, high = (float(self._value(left + share * each)) for share in (0.5, 0.15, 0.85))
-            self.places[point] = Place(x, (low, high), series)
+            self.positions[point] = PointPosition(x, (low, high), series)
 
     def _space(self, values: Any) -> Any:
         return np.log10(values) if self._is_logarithmic else values
 
-    def _value(self, places: Any) -> Any:
-        return 10.0**places if self._is_logarithmic else places
+    def _value(self, positions: Any) -> Any:
+        return 10.0**positions if self._is_logarithmic else positions
 
-    def colour(self, place: Place) -> str:
-        return SERIES[place.series]
+    def colour(self, position: PointPosition) -> str:
+        return SERIES[position.series]
 
     @property
     def is_turned(self) -> bool:
@@ -464,8 +468,8 @@ class GridAxis:
 
     def mark(self, axes: Axes, points: Sequence[int]) -> None:
         look: dict[str, Any] = {"color": MARK, "ms": 6, "mew": 1.6, "clip_on": False}
-        for place in (self.places[point] for point in points if point in self.places):
-            axes.plot([place.x], [ABOVE], "x", transform=axes.get_xaxis_transform(), **look)
+        for position in (self.positions[point] for point in points if point in self.positions):
+            axes.plot([position.x], [ABOVE], "x", transform=axes.get_xaxis_transform(), **look)
 
     def dress(self, axes: Axes) -> None:
         if self.field:
@@ -475,15 +479,15 @@ class GridAxis:
                 axes.xaxis.set_minor_locator(NullLocator())
             ticks = sorted(names)[:: -(-len(names) // TICKS_MAX)]
             axes.set_xticks(ticks, [names[tick] for tick in ticks])
-            rooms = [end for place in self.places.values() for end in place.room]
+            rooms = [end for position in self.positions.values() for end in position.room]
             low, high = (float(self._space(np.array(end))) for end in (min(rooms), max(rooms)))
             axes.set_xlim(*(float(self._value(end)) for end in (low - 0.03 * (high - low), high + 0.03 * (high - low))))
         else:
             turned = self.is_turned
             look: dict[str, Any] = {"rotation": 45, "ha": "right"} if turned else {"rotation": 0, "ha": "center"}
-            axes.set_xticks(range(len(self.places)), self._labels, **look)
+            axes.set_xticks(range(len(self.positions)), self._labels, **look)
             axes.grid(False, axis="x")
-            axes.set_xlim(-0.6, len(self.places) - 0.2)
+            axes.set_xlim(-0.6, len(self.positions) - 0.2)
             axes.tick_params(axis="x", labelsize=style.PAPER_PT - 1.5 if turned else style.PAPER_PT - 1)
         names = [self.field] if self.field else self._paths
         axes.set_xlabel(

@@ -101,9 +101,9 @@ def page(summary: SweepSummary, pictures: Sequence[Picture]) -> str:
         parameters=list(names),
         errors=_blocks(points, axes, _table(points, errors, _mean)),
         metrics=_blocks(points, axes, _table(points, own, _mean)),
-        differences=_blocks(differing_points, axes, _table(differing_points, differing(summary), _difference)),
+        differences=_blocks(differing_points, axes, _table(differing_points, compared_columns(summary), _difference)),
         reference=heading_of(summary.points[0]),
-        without_data=without_data(summary),
+        without_data=missing_data_text(summary),
         left_out=len(summary.flown) - len(points),
         window=windows_of(summary),
         paper_column=PAPER_COLUMN,
@@ -127,13 +127,13 @@ def heading_of(point: GridPoint) -> str:
     return ", ".join(field_name(path).at(value) for path, value in point.names.items()) or point.label
 
 
-def differing(summary: SweepSummary) -> dict[str, str]:
+def compared_columns(summary: SweepSummary) -> dict[str, str]:
     """Return the titles of the columns that have paired differences, by column, the user's metrics first."""
     errors = {f"{prefix}.true_rms": f"RMS of {each.titled}" for prefix, each in summary.parameters.items()}
     own = {column: str(field_name(column)) for column in summary.metrics}
     titles = {**own, **errors, SEPARATION: "separation (m)", OBSTACLE_DISTANCE: "from obstacles (m)"}
-    known = {column for point in summary.points for column in point.differences}
-    return {column: title for column, title in titles.items() if column in known}
+    compared = {column for point in summary.points for column in point.differences}
+    return {column: title for column, title in titles.items() if column in compared}
 
 
 def _blocks(
@@ -199,16 +199,16 @@ def notes(summary: SweepSummary) -> list[str]:
     return lines
 
 
-def without_data(summary: SweepSummary) -> str:
+def missing_data_text(summary: SweepSummary) -> str:
     """Return a sentence that names the quantities missing from every run; empty if there are none."""
     errors = {each.titled: prefix for prefix, each in summary.parameters.items()}
     own = {str(field_name(column)): column for column in summary.metrics}
-    known = summary.known | {column.rpartition(".")[0] for column in summary.known}
+    available = summary.known | {column.rpartition(".")[0] for column in summary.known}
     parts = []
-    for what, columns in (("formation errors", errors), (OWN, own)):
-        names = [name for name, column in columns.items() if column not in known]
+    for kind, columns in (("formation errors", errors), (OWN, own)):
+        names = [name for name, column in columns.items() if column not in available]
         if names:
-            parts.append(what if len(names) == len(columns) else f"{what} of {', '.join(names)}")
+            parts.append(kind if len(names) == len(columns) else f"{kind} of {', '.join(names)}")
     return f"No run has {' or '.join(parts)}; these appear in no table or figure." if parts else ""
 
 
@@ -235,9 +235,9 @@ def overview(point: GridPoint, brief: bool = False) -> list[str]:
     well, planned, no_collision = shares
     excluded = f"{point.excluded} excluded" if point.excluded else ""
     engaged = "–" if point.engaged is None else str(point.engaged)
-    least = "–" if point.least_separation_m is None else f"{point.least_separation_m:.2f}"
+    min_separation = "–" if point.least_separation_m is None else f"{point.least_separation_m:.2f}"
     separation = _mean(point, SEPARATION, ".2f", brief)
-    return [str(point.runs), well, _noted(planned, excluded), engaged, no_collision, separation, least]
+    return [str(point.runs), well, _with_note(planned, excluded), engaged, no_collision, separation, min_separation]
 
 
 def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False) -> str:
@@ -246,8 +246,8 @@ def _mean(point: GridPoint, column: str, form: str = ".4f", brief: bool = False)
     if spread is None:
         return "–"
     if brief:
-        return _noted(f"{spread.mean.value:{form}}", point.count(column).replace(" ", ""))
-    return _noted(_spread(spread, form), point.count(column))
+        return _with_note(f"{spread.mean.value:{form}}", point.count(column).replace(" ", ""))
+    return _with_note(_spread(spread, form), point.count(column))
 
 
 def _difference(point: GridPoint, column: str, brief: bool = False) -> str:
@@ -256,7 +256,7 @@ def _difference(point: GridPoint, column: str, brief: bool = False) -> str:
     if spread is None:
         return "–"
     if not brief:
-        return _noted(_spread(spread, ".4f"), f"n = {spread.runs}")
+        return _with_note(_spread(spread, ".4f"), f"n = {spread.runs}")
     if spread.samples:  # too few for an interval
         return ", ".join(f"{each:+.3g}" for each in spread.samples)
     return f"{spread.mean.value:+.3g} ± {spread.mean.high - spread.mean.value:.2g} (n={spread.runs})"
@@ -270,7 +270,7 @@ def _spread(spread: Distribution, form: str) -> str:
     return f"{spread.mean.value:{form}}" + (f" ± {half:{form}}" if np.isfinite(half) else "")
 
 
-def _noted(text: str, note: str) -> str:
+def _with_note(text: str, note: str) -> str:
     return f"{text} ({note})" if note else text
 
 
@@ -310,7 +310,7 @@ class TerminalText(Struct, frozen=True):
         for table in terminal_tables(self.summary):
             if table.heads:
                 yield from _fitted(table, self.summary, options.max_width)
-        if missing := without_data(self.summary):
+        if missing := missing_data_text(self.summary):
             yield cell(missing)
 
 
@@ -319,19 +319,19 @@ def terminal_tables(summary: SweepSummary) -> list[PointTable]:
     points, level = summary.flown[:TERMINAL_POINTS_MAX], f"{100 * summary.level:g} %"
     own = {column: str(field_name(column)) for column in summary.metrics if column in summary.known}
     columns = {f"{prefix}.true_rms": each for prefix, each in summary.parameters.items()}
-    flown = {column: each for column, each in columns.items() if column in summary.known}
-    cluster = next((each.cluster for each in flown.values()), None)
+    available = {column: each for column, each in columns.items() if column in summary.known}
+    cluster = next((each.cluster for each in available.values()), None)
     # the first parameters of the first cluster, without headings (phi_…): for Test 1, those of the paper
-    shown = [(column, each.name) for column, each in flown.items() if each.cluster == cluster]
-    errors = dict([(column, name) for column, name in shown if not name.startswith("phi_")][:ERRORS_MAX])
+    candidates = [(column, each.name) for column, each in available.items() if each.cluster == cluster]
+    errors = dict([(column, name) for column, name in candidates if not name.startswith("phi_")][:ERRORS_MAX])
     compared = {  # differences of the user's metrics if there are any, otherwise of the errors
         column: title
-        for column, title in differing(summary).items()
+        for column, title in compared_columns(summary).items()
         if column in summary.metrics or (not summary.metrics and column in errors)
     }
     cluster = cluster if errors else None
-    of = f" of {cluster}" if cluster else ""
-    title = f"RMS of truth − desired{of} from {windows_of(summary)}, means over the runs as planned"
+    of_cluster = f" of {cluster}" if cluster else ""
+    title = f"RMS of truth − desired{of_cluster} from {windows_of(summary)}, means over the runs as planned"
     title_own = "Your own metrics, means over the runs as planned"
     title_pairs = f"Differences from {heading_of(summary.points[0])} of runs with the same seed"
     caption_pairs = f"means ± half of the {level} interval, of n pairs; if pairs are few, each difference is listed\n"
@@ -356,20 +356,20 @@ def _fitted(table: PointTable, summary: SweepSummary, width: int) -> Iterator[Te
     cells = zip(*table.rows, strict=True) if table.rows else [()] * len(table.heads)
     columns = [TerminalColumn(head, tuple(each)) for head, each in zip(table.heads, cells, strict=True)]
     yield cell(table.title)
-    for part in _parted(columns, width + EDGE - sum(column.width for column in axes)):
+    for part in _split_columns(columns, width + EDGE - sum(column.width for column in axes)):
         grid = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
-        for place, column in enumerate([*axes, *part]):
-            justify = "left" if place < len(axes) else "right"
+        for index, column in enumerate([*axes, *part]):
+            justify = "left" if index < len(axes) else "right"
             grid.add_column(cell("\n".join(column.lines)), justify=justify, vertical="bottom", no_wrap=True)
         for row in zip(*(column.cells for column in [*axes, *part]), strict=True):
             grid.add_row(*map(cell, row))
         yield grid
-    left_out = len(summary.flown) - TERMINAL_POINTS_MAX
-    more = f"{left_out} more points are in the report. " if left_out > 0 else ""
-    yield cell(f"{more}{table.caption}".strip())
+    omitted = len(summary.flown) - TERMINAL_POINTS_MAX
+    hint = f"{omitted} more points are in the report. " if omitted > 0 else ""
+    yield cell(f"{hint}{table.caption}".strip())
 
 
-def _parted(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
+def _split_columns(columns: Sequence[TerminalColumn], room: int) -> list[Sequence[TerminalColumn]]:
     """Split columns into the fewest parts of similar size that each fit `room` characters, or are a single column."""
     for count in range(1, len(columns) + 1):
         ends = np.linspace(0, len(columns), count + 1).round().astype(int).tolist()

@@ -106,7 +106,7 @@ class RunResult(Struct, frozen=True, kw_only=True):
 
 
 # columns that are fields of the run's summary
-OF_SUMMARY = ("ended", "truth_sha256", "sim_s", "wall_s", "real_time_factor", "min_separation_m", "as_planned",
+SUMMARY_FIELDS = ("ended", "truth_sha256", "sim_s", "wall_s", "real_time_factor", "min_separation_m", "as_planned",
               "window_note", "date")  # fmt: skip
 FIXED = {field.name: field.type for field in msgspec.structs.fields(RunResult)}
 
@@ -141,7 +141,7 @@ def fly(task: Task) -> Row:
             return fly(replace(task, record=str(folder / "run")))
         finally:
             rmtree(folder, ignore_errors=True)
-    where: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
+    origin: Row = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
         if task.processes:
             folder = Path(task.record or "")
@@ -157,7 +157,7 @@ def fly(task: Task) -> Row:
     except (RecordError, OSError):
         raise
     except Exception as error:  # any type, since the scenario caused it
-        return failed_row(task, reason_of(error), **where)
+        return failed_row(task, reason_of(error), **origin)
     engaged = engaged_s(formations, summary.window_s)
     clusters = [cluster.name for cluster in task.scenario.clusters]
     shares = {name: each.engaged_share for name, each in summary.clusters.items()}
@@ -176,23 +176,23 @@ def fly(task: Task) -> Row:
         metrics_failure=metrics_failure,
         window_from_s=summary.window_s[0],
         window_to_s=summary.window_s[1],
-        **{name: getattr(summary, name) for name in OF_SUMMARY},
-        **where,
+        **{name: getattr(summary, name) for name in SUMMARY_FIELDS},
+        **origin,
     )
     columns: dict[str, float | None] = {engaged_column(name): engaged.get(name) for name in clusters}
     for i, (name, cluster) in enumerate([] if diverged else summary.clusters.items()):
         # Errors by their paths in summary.json: None for a cluster that was not engaged, and for a flight that was
         # not as planned, since errors of drones that stay on the ground, hover or fall are not comparable.
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
-        counts = summary.as_planned and engaged[name] is not None
+        is_comparable = summary.as_planned and engaged[name] is not None
         for parameter, errors in cluster.errors.items():
             for statistic, value in msgspec.structs.asdict(errors).items():
-                columns[f"{prefix}.{parameter}.{statistic}"] = value if counts else None
+                columns[f"{prefix}.{parameter}.{statistic}"] = value if is_comparable else None
     for name, tracking in [] if diverged else summary.tracking.items():
         for statistic, value in msgspec.structs.asdict(tracking).items():
             columns[f"tracking.{name}.{statistic}"] = value if summary.as_planned else None
-    more = task.more(flight) if task.more and not diverged else {}
-    row = make_row(result, task.varied, {**columns, **metrics, **more})
+    extra_columns = task.more(flight) if task.more and not diverged else {}
+    row = make_row(result, task.varied, {**columns, **metrics, **extra_columns})
     return {**row, **task.judge(summary, row)} if task.judge and not diverged else row
 
 
@@ -206,9 +206,9 @@ def fly_scenario(
     flight, cpu = InProcessFlight(scenario), _CpuTime()
     reader = FlightReader(answers or bool(scenario.report.metric_names))
     flight.run([reader, cpu, writer] if writer else [reader, cpu])
-    flown = reader.flight()
-    flown.cpu_s = cpu.spent_s
-    return flown, flight.world.failure
+    recorded = reader.flight()
+    recorded.cpu_s = cpu.spent_s
+    return recorded, flight.world.failure
 
 
 class _CpuTime:
@@ -285,14 +285,14 @@ def metrics_of(task: Task, flight: RecordedFlight) -> tuple[dict[str, float | No
         return task.open_run(Path(task.record or ""))
 
     for name in task.scenario.report.metric_names:
-        found, failure = _metrics_of(name, run if task.open_run and _takes_run(name) else lambda: flight)
-        if twice := found.keys() & metrics.keys():
-            returned = min(twice).removeprefix(METRIC)
+        results, failure = _metrics_of(name, run if task.open_run and _takes_run(name) else lambda: flight)
+        if repeated := results.keys() & metrics.keys():
+            returned = min(repeated).removeprefix(METRIC)
             failures.append(f"{METRICS} {name}: returned {returned}, which another function also returns")
         elif failure:
             failures.append(failure)
         else:
-            metrics.update(found)
+            metrics.update(results)
     return metrics, "; ".join(failures) or None
 
 
@@ -305,17 +305,17 @@ def _takes_run(name: str) -> bool:
     return next(iter(arguments), FLIGHT) != FLIGHT
 
 
-def _metrics_of(name: str, given: Callable[[], Any]) -> tuple[dict[str, float | None], str | None]:
+def _metrics_of(name: str, argument: Callable[[], Any]) -> tuple[dict[str, float | None], str | None]:
     try:
-        returned = plugin.load_function(name, METRICS)(given())
-        named = returned if isinstance(returned, Mapping) else {name.partition(":")[2]: returned}
-        if len(named) > METRICS_MAX:
-            raise ReportError(f"returned {len(named)} numbers; must be at most {METRICS_MAX}")
+        returned = plugin.load_function(name, METRICS)(argument())
+        results = returned if isinstance(returned, Mapping) else {name.partition(":")[2]: returned}
+        if len(results) > METRICS_MAX:
+            raise ReportError(f"returned {len(results)} numbers; must be at most {METRICS_MAX}")
         metrics: dict[str, float | None] = {}
-        for key, value in named.items():
+        for key, value in results.items():
             if not (isinstance(key, str) and _NAME.fullmatch(key)):
-                must = "must be a letter and up to 63 letters, digits and _"
-                raise ReportError(f"returned the name {show(key)}; {must}")
+                rule = "must be a letter and up to 63 letters, digits and _"
+                raise ReportError(f"returned the name {show(key)}; {rule}")
             if value is not None and not isinstance(value, Real):
                 kind = show(str(type(value).__name__))
                 raise ReportError(f"returned {kind} for {key}; must be a number or None")

@@ -28,7 +28,7 @@ LEVEL = 0.95  # confidence level of all intervals
 RUNS_MIN = 5  # minimum number of runs for an interval; design choice: that of 2 runs is 13 times their difference
 SEPARATION = "min_separation_m"
 OBSTACLE_DISTANCE = "min_obstacle_distance_m"
-_FIGURE = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1
+_NUMBER = re.compile(r"(?<![\w.])\d[\d.]*")  # a number in a text, but not in a name such as drone1
 _COLUMN = re.compile(r"(?:clusters\.(.+?)\.)?errors\.(.+)")  # groups: the cluster's name, the parameter's name
 
 
@@ -53,15 +53,15 @@ def mean_interval(samples: Samples) -> ConfidenceInterval:
     return ConfidenceInterval(middle, middle - half, middle + half)
 
 
-def share_interval(count: int, of: int) -> ConfidenceInterval:
+def share_interval(count: int, total: int) -> ConfidenceInterval:
     """Return count / of with the exact interval of Clopper and Pearson (Biometrika 26, 1934); of > 0.
 
     The coverage is at least LEVEL for every share and number of runs.
     """
     tail = (1 - LEVEL) / 2
-    low = float(betaincinv(count, of - count + 1, tail)) if count else 0.0
-    high = float(betaincinv(count + 1, of - count, 1 - tail)) if count < of else 1.0
-    return ConfidenceInterval(count / of, low, high)
+    low = float(betaincinv(count, total - count + 1, tail)) if count else 0.0
+    high = float(betaincinv(count + 1, total - count, 1 - tail)) if count < total else 1.0
+    return ConfidenceInterval(count / total, low, high)
 
 
 class Distribution(Struct, frozen=True):
@@ -80,22 +80,22 @@ class Distribution(Struct, frozen=True):
 
 def distribution(samples: Samples) -> Distribution | None:
     """Return the distribution of the finite values among samples (n,); None if there are none."""
-    known = finite(samples)
-    if not len(known):
+    values = finite(samples)
+    if not len(values):
         return None
-    std = float(np.std(known, ddof=1)) if len(known) > 1 else math.nan
-    p5, median, p95, least, greatest = map(float, (*np.percentile(known, [5, 50, 95]), known.min(), known.max()))
-    few = tuple(known.tolist()) if len(known) < RUNS_MIN else ()
-    return Distribution(len(known), mean_interval(known), std, p5, median, p95, least, greatest, few)
+    std = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+    p5, median, p95, minimum, maximum = map(float, (*np.percentile(values, [5, 50, 95]), values.min(), values.max()))
+    few_values = tuple(values.tolist()) if len(values) < RUNS_MIN else ()
+    return Distribution(len(values), mean_interval(values), std, p5, median, p95, minimum, maximum, few_values)
 
 
 def finite(samples: Samples) -> Samples:
     return samples[np.isfinite(samples)]
 
 
-def count_text(count: int, of: int) -> str:
+def count_text(count: int, total: int) -> str:
     """Return the number of runs behind a mean as text; empty if these are all runs."""
-    return f"n = {count}" if count < of else ""
+    return f"n = {count}" if count < total else ""
 
 
 class FormationParameter(Struct, frozen=True):
@@ -121,9 +121,9 @@ def parameters(columns: Iterable[str], clusters: Sequence[str]) -> dict[str, For
     """
     prefixes = dict.fromkeys(column.rpartition(".")[0] for column in columns)
     matches = {each: match for each in prefixes if (match := _COLUMN.fullmatch(each))}
-    others = {match[1] for match in matches.values()}
-    first = "/".join(name for name in clusters if name not in others) if len(clusters) > 1 else None
-    return {each: FormationParameter(match[2], match[1] or first) for each, match in matches.items()}
+    other_clusters = {match[1] for match in matches.values()}
+    first_cluster = "/".join(name for name in clusters if name not in other_clusters) if len(clusters) > 1 else None
+    return {each: FormationParameter(match[2], match[1] or first_cluster) for each, match in matches.items()}
 
 
 class GridPoint(Struct, frozen=True):
@@ -203,15 +203,15 @@ class SweepResults:
         self.points = np.array([row["point"] for row in rows], np.int64)
         self.well = np.array([row["failure"] is None for row in rows], bool)
         columns = dict.fromkeys(name for row in rows for name in row if name not in FIXED)
-        of_clusters = [name for name in columns if name.startswith(("errors.", "clusters."))]
-        self.errors = [name for name in of_clusters if name.endswith(tuple(STATISTICS.values()))]
+        cluster_columns = [name for name in columns if name.startswith(("errors.", "clusters."))]
+        self.errors = [name for name in cluster_columns if name.endswith(tuple(STATISTICS.values()))]
         prefix, suffix = engaged_column(" ").split(" ")
-        engaged = [name for name in of_clusters if name.startswith(prefix) and name.endswith(suffix)]
+        engaged = [name for name in cluster_columns if name.startswith(prefix) and name.endswith(suffix)]
         self.parameters = parameters(self.errors, [name[len(prefix) : -len(suffix)] for name in engaged])
         self.metrics = [name for name in columns if name.startswith(METRIC)]
         report = design.plan.document.get("report")
-        named = (report.get("metrics") or ()) if isinstance(report, Mapping) else ()
-        names = [named] if isinstance(named, str) else named
+        functions = (report.get("metrics") or ()) if isinstance(report, Mapping) else ()
+        names = [functions] if isinstance(functions, str) else functions
         self.metrics_function = " and ".join(map(without_made, names))  # with its module unless that was generated
         self.has_seeds = design.seeds is not None
         self.drawn = [axis.path for axis in design.axes if isinstance(axis, Draw)]
@@ -224,23 +224,27 @@ class SweepResults:
 
     def values(self, column: str, point: int | None = None) -> Samples:
         """Return a column for the runs that ended well, at one point or at all; NaN where unknown."""
-        chosen = self.well if point is None else self.well & (self.points == point)
-        cells = [row.get(column) for row, is_chosen in zip(self.rows, chosen, strict=True) if is_chosen]
+        selection = self.well if point is None else self.well & (self.points == point)
+        cells = [row.get(column) for row, is_selected in zip(self.rows, selection, strict=True) if is_selected]
         return np.array([np.nan if cell is None else cell for cell in cells], np.float64)
 
-    def flown(self, column: str, point: int | None = None) -> Samples:
+    def planned_values(self, column: str, point: int | None = None) -> Samples:
         """Return `values` with NaN for runs that did not follow their plan, which would bias the statistics."""
         return np.where(self.values("as_planned", point) == 0, np.nan, self.values(column, point))
 
     def differences(self, column: str, point: int) -> Samples:
-        """Return value − value at the first point for each pair of runs with equal seeds that are both in `flown`.
+        """Return value − value at the first point for each pair of runs with equal seeds, both in `planned_values`.
 
         Empty at the first point, and if seeds are not paired.
         """
         if not self.design.paired or point == 0:
             return np.zeros(0)
-        first, own = (dict(zip(self.values("run", at), self.flown(column, at), strict=True)) for at in (0, point))
-        return finite(np.array([value - first.get(run - point, np.nan) for run, value in own.items()], np.float64))
+        at_first, at_point = (
+            dict(zip(self.values("run", at), self.planned_values(column, at), strict=True)) for at in (0, point)
+        )
+        return finite(
+            np.array([value - at_first.get(run - point, np.nan) for run, value in at_point.items()], np.float64)
+        )
 
     def ended_well(self, point: int) -> tuple[int, int]:
         """Return how many runs of a point ended well, and how many are finished."""
@@ -261,16 +265,16 @@ class SweepResults:
         """Return the points with finished runs of which none ended well and followed its plan."""
         points = []
         for point in range(self.design.points):
-            (well, runs), (planned, of) = self.ended_well(point), self.count("as_planned", point)
-            if runs and not planned and (of or not well):  # runs without a cluster are not judged
+            (well, runs), (planned, judged_count) = self.ended_well(point), self.count("as_planned", point)
+            if runs and not planned and (judged_count or not well):  # runs without a cluster are not judged
                 points.append(point)
         return points
 
     def windows_s(self) -> tuple[float, float] | None:
         """Return the earliest start and the latest end of the judged windows [s]; None if no run has one."""
         start, end = (self.values(f"window_{side}_s") for side in ("from", "to"))
-        known = np.isfinite(start) & np.isfinite(end)
-        return (float(start[known].min()), float(end[known].max())) if known.any() else None
+        is_known = np.isfinite(start) & np.isfinite(end)
+        return (float(start[is_known].min()), float(end[is_known].max())) if is_known.any() else None
 
     def summary(self) -> SweepSummary:
         def texts(rows: Iterable[Row], column: str) -> list[str]:
@@ -279,11 +283,11 @@ class SweepResults:
         def counted(texts: Iterable[str]) -> dict[str, int]:
             """Count texts, most frequent first; texts that differ only in numbers count as the first of them."""
             first: dict[str, str] = {}
-            return dict(Counter(first.setdefault(_FIGURE.sub("#", text), text) for text in texts).most_common())
+            return dict(Counter(first.setdefault(_NUMBER.sub("#", text), text) for text in texts).most_common())
 
         plan, rows = self.design.plan, self.rows
         well = [row for row, is_well in zip(rows, self.well, strict=True) if is_well]
-        engaged, of = self.count("engaged")
+        engaged, clustered = self.count("engaged")
         dates = sorted(row["date"] for row in rows if row.get("date"))
         return SweepSummary(
             scenario=str(plan.document["name"]),
@@ -294,7 +298,7 @@ class SweepResults:
             runs=plan.runs,
             finished=len(rows),
             failed=dict(Counter(texts(rows, "failure")).most_common()),
-            not_engaged=of - engaged,
+            not_engaged=clustered - engaged,
             not_as_planned=counted(texts(well, "shortfall")),
             judged_unengaged=sum(row.get("engaged_throughout") is False for row in well),
             window_notes=counted(texts(well, "window_note")),
@@ -313,7 +317,7 @@ class SweepResults:
 
     def _point(self, point: int) -> GridPoint:
         well, runs = self.ended_well(point)
-        engaged, of = self.count("engaged", point)
+        engaged, clustered = self.count("engaged", point)
         planned, judged = self.count("as_planned", point)
         columns = (SEPARATION, OBSTACLE_DISTANCE, *self.errors, *self.metrics)
         rms = (each for each in self.errors if each.endswith(".true_rms"))
@@ -321,15 +325,15 @@ class SweepResults:
         names = self.design.names(point)
         return GridPoint(
             label=" · ".join(names.values()) or "all runs",
-            values=self.design.at(point),
+            values=self.design.point_values(point),
             names=names,
             runs=runs,
             ended_well=share_interval(well, runs) if runs else None,
             without_collision=share_interval(*self.without_collision(point)) if well else None,
-            engaged=engaged if of else None,
+            engaged=engaged if clustered else None,
             as_planned=share_interval(planned, judged) if judged else None,
             excluded=judged - planned,
-            spreads={column: each for column in columns if (each := distribution(self.flown(column, point)))},
+            spreads={column: each for column in columns if (each := distribution(self.planned_values(column, point)))},
             least_separation_m=min(finite(self.values(SEPARATION, point)).tolist(), default=None),
             differences={
                 column: each for column in compared if (each := distribution(self.differences(column, point)))
@@ -345,7 +349,7 @@ UNITS = {  # units by name suffix, longer suffixes first
     "_deg": "deg", "_rad": "rad", "_mah": "mAh", "_px": "px", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT",
     "_m": "m", "_s": "s",
 }  # fmt: skip
-OF_CHANNEL = {  # units of noise parameters, relative to the unit of their channel; see zsim.sensors
+CHANNEL_UNITS = {  # units of noise parameters, relative to the unit of their channel; see zsim.sensors
     "noise": "", "density": "/√Hz", "bias": "", "bias_walk": "/√s", "bias_instability": "", "quantum": "",
 }  # fmt: skip
 SECTIONS = ("environment", "sensors", "drones", "clusters", "agents", "metrics")  # omitted from names of fields
@@ -353,8 +357,8 @@ WORDS = {
     "gps": "GPS", "imu": "IMU", "mag": "magnetometer", "baro": "barometer", "accel": "accelerometer",
     "gyro": "gyroscope", "takeoff": "take-off",
 }  # fmt: skip
-OF_VARIABLES = ("target", "values", "expressions")  # maps in a plan, keyed by the variables of its cluster
-OF_CLASS = ("parameters", "law_parameters", "space_parameters")  # likewise omitted from field names
+VARIABLE_SECTIONS = ("target", "values", "expressions")  # maps in a plan, keyed by the variables of its cluster
+CLASS_SECTIONS = ("parameters", "law_parameters", "space_parameters")  # likewise omitted from field names
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # as in zsim.scenario.overrides
 
 
@@ -378,18 +382,20 @@ def field_name(path: str) -> FieldName:
     For example, sensors.gps.position_m.noise is the "GPS position noise" in m.
     """
     steps: list[str] = [word or bracket for word, bracket in _STEP.findall(path)] or [path]
-    kept = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
-    kept = [step for step in kept[:-1] if step not in OF_CLASS] + kept[-1:]
-    kept = [f"{steps[0].removesuffix('s')} {kept[0]}", *kept[1:]] if kept[0].isdigit() else kept
-    parted: list[tuple[str, str]] = []  # words and unit of each step of the path
-    for step in kept:
+    path_steps = steps[1:] if steps[0] in SECTIONS and len(steps) > (1 if steps[0] == "metrics" else 2) else steps
+    path_steps = [step for step in path_steps[:-1] if step not in CLASS_SECTIONS] + path_steps[-1:]
+    path_steps = (
+        [f"{steps[0].removesuffix('s')} {path_steps[0]}", *path_steps[1:]] if path_steps[0].isdigit() else path_steps
+    )
+    named_steps: list[tuple[str, str]] = []  # words and unit of each step of the path
+    for step in path_steps:
         end = next((end for end in UNITS if step.endswith(end) and step != end), "")
         words = " ".join(WORDS.get(word, word) for word in step.removesuffix(end).split("_"))
-        parted.append((words, UNITS.get(end, "")))
-    if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in OF_VARIABLES:
+        named_steps.append((words, UNITS.get(end, "")))
+    if steps[0] == "clusters" and "plan" in steps[2:-2] and steps[-2] in VARIABLE_SECTIONS:
         name = steps[-1]  # a variable; angles are in rad unless the name ends in _deg
-        parted[-1] = (name[:-4], "deg") if name.endswith("_deg") else (name, unit(name))
-    measure = parted[-1][1]
-    if kept[-1] in OF_CHANNEL and len(kept) > 1 and parted[-2][1]:
-        measure = parted[-2][1] + OF_CHANNEL[kept[-1]]
-    return FieldName(" ".join(words for words, _ in parted), measure)
+        named_steps[-1] = (name[:-4], "deg") if name.endswith("_deg") else (name, unit(name))
+    measure = named_steps[-1][1]
+    if path_steps[-1] in CHANNEL_UNITS and len(path_steps) > 1 and named_steps[-2][1]:
+        measure = named_steps[-2][1] + CHANNEL_UNITS[path_steps[-1]]
+    return FieldName(" ".join(words for words, _ in named_steps), measure)

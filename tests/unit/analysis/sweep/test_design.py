@@ -92,7 +92,7 @@ def test_runs_are_distributed_evenly_over_all_combinations() -> None:
     flown = [(design.values(run)[GUST], design.values(run)["estimation.flow"]) for run in range(20)]
     assert flown[:6] == [(0, True), (0, False), (1, True), (1, False), (2, True), (2, False)]
     assert set(Counter(flown).values()) == {3, 4}
-    assert [design.at(point) for point in range(6)] == [
+    assert [design.point_values(point) for point in range(6)] == [
         {GUST: gust, "estimation.flow": flow} for gust in (0, 1, 2) for flow in (True, False)
     ]
     assert plan("wind.gust_m_s=0,1,2", "estimation.flow=true,false").runs == 6

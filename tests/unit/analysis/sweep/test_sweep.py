@@ -20,11 +20,11 @@ from zsim_analysis.sweep.sweep import (
     Journal,
     SweepFolder,
     SweepScreen,
+    duration_text,
     load,
     locked,
     read_journal,
     read_table,
-    span,
     write_table,
 )
 
@@ -146,4 +146,4 @@ def test_the_screen_shows_runs_per_hour_and_the_remaining_time() -> None:
     screen.finished(failed=True)
     assert has_terms(screen.line(), "42 / 100", "200 runs/h", "17 min 24 s", "1 failed")
     times = {0.4: "0 s", 59: "59 s", 61: "1 min 01 s", 3599: "59 min 59 s", 3600: "1 h 00 min", 90_060: "25 h 01 min"}
-    assert {s: span(s) for s in times} == times
+    assert {s: duration_text(s) for s in times} == times

@@ -20,7 +20,7 @@ from zsim_analysis.report import indented_json
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.sweep import locked, read_table
 from zsim_analysis.sweep.sweep_figures import BEYOND_AXIS, NEVER_AS_PLANNED, figures, slices
-from zsim_analysis.sweep.sweep_report import OVERVIEW, TerminalText, make_sweep_report, overview, without_data
+from zsim_analysis.sweep.sweep_report import OVERVIEW, TerminalText, make_sweep_report, missing_data_text, overview
 from zsim_analysis.sweep.sweep_run import Row
 from zsim_analysis.sweep.sweep_summary import SweepResults, field_name
 
@@ -359,7 +359,7 @@ def test_quantities_without_data_are_neither_in_tables_nor_in_figures(tmp_path: 
     assert has_terms(without_tags(page), "formation errors", "your own")
     text = terminal(of, rows, 200)
     assert "overshoot" not in text
-    assert without_data(judged(of, rows).summary()) in text
+    assert missing_data_text(judged(of, rows).summary()) in text
     of = plan("seed", "duration_s=1,2", runs=4)
     rows = [without_errors(of, run) if run % 2 else well(of, run) for run in range(4)]
     page, _ = report_of(tmp_path / "some", of, rows)
@@ -372,8 +372,8 @@ def test_quantities_without_data_have_no_panel() -> None:
     assert len(drawn(of, "true_rms", flown(of, **{"errors.y_c.true_rms": None})).axes) == 2
     assert len(drawn(of, "safety", min_separation_m=None).axes) == 1
     partly = [{**well(of, 0), "errors.y_c.true_rms": None, "errors.y_c.est_std": None}]
-    assert has_terms(without_data(judged(of, partly).summary()), "formation errors", "y_c (m)")
-    assert without_data(judged(of, [well(of, 0)]).summary()) == ""
+    assert has_terms(missing_data_text(judged(of, partly).summary()), "formation errors", "y_c (m)")
+    assert missing_data_text(judged(of, [well(of, 0)]).summary()) == ""
 
 
 # Tables
