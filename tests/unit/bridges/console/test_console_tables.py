@@ -138,7 +138,7 @@ def test_rows_are_sorted_and_filtered():
     assert {choice for choice, _ in FILTERED} == set(FILTERS)
 
 
-@pytest.mark.parametrize(("count", "order"), [(MANY_DRONES, "as in the scenario"), (MANY + 1, "worst first")])
+@pytest.mark.parametrize(("count", "order"), [(MANY_DRONES, "as in the scenario"), (MANY_DRONES + 1, "worst first")])
 def test_many_drones_are_sorted_worst_first_by_default(count: int, order: str):
     gui: Any = Gui()
     FleetTable(gui, [f"drone{i}" for i in range(count)], lambda: None)
