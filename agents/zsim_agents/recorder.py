@@ -35,7 +35,7 @@ JOIN_S = 1.0  # wall time after which a join is repeated if no event confirms it
 LEAD_MAX_NS = 4_000_000_000  # maximum lead of the world over the record on disk; the world's history covers 5 s
 DRAIN_S = 1.0  # time to wait for the byes of other processes after the clock has stopped
 STOP_DRAIN_S = 0.5  # time to wait for the end of the run after a requested stop, since both may be stopped together
-CLOCK_TIMEOUT_S = 1.5  # time without a clock after which one was missed: even a paused world sends one per second
+QUIET_S = 1.5  # time without a clock after which one was missed: even a paused world sends one per second
 
 REPLAY_S = 5.0  # timeout of queries, which a hub answers within milliseconds
 FLUSH_NS = 1_000_000_000  # simulated time between writes to disk
@@ -156,7 +156,7 @@ class Recorder:
             if self._is_another_run():  # first, since received messages may be later than missed ones
                 return ANOTHER_RUN
             self._write_arrived(arrived)
-            if self._silent_since_s is not None and time.monotonic() - self._silent_since_s > CLOCK_TIMEOUT_S:
+            if self._silent_since_s is not None and time.monotonic() - self._silent_since_s > QUIET_S:
                 # the last messages, such as the end of the run, were published before the link was restored
                 self._silent_since_s, self._must_fetch = None, False
                 self._fetch_missed()
@@ -185,7 +185,7 @@ class Recorder:
         self._participant.done(t_ns)
 
     def _join(self, again: bool = False) -> None:
-        """Join, so that the world is at most SLACK_NS ahead of the record on disk from now on."""
+        """Join, so that the world is at most LEAD_MAX_NS ahead of the record on disk from now on."""
         self._participant.join(again)
         self._joined_s = time.monotonic()
         self._flush()

@@ -10,17 +10,19 @@ interrupted runs and of replays are all treated the same.
 """
 
 import html
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import msgspec
 import numpy as np
 from msgspec import UNSET
+from numpy.typing import NDArray
 
 from zsim.contract import keys
-from zsim.contract.messages import Info
+from zsim.contract.messages import REFUSALS, Info
 from zsim.contract.run_messages import Event
 from zsim.errors import RecordError, RunError, what_is_missing
 from zsim.output_folder import RECORD, record_at
@@ -28,25 +30,6 @@ from zsim.record import RecordReader
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import suggestion
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.reading.drone_errors import EstimateErrors, estimate_errors
-from zsim_analysis.reading.formation import Formation, ParameterErrors, cluster_of
-from zsim_analysis.reading.recorded_flight import RecordedFlight
-from zsim_analysis.reading.recorded_run import decode_or_none
-from zsim_analysis.reading.shortfall import Shortfall
-from zsim_analysis.report.summary import RunSummary, error_table, judge
-from zsim_api.scenarios import Scenario
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
-    from xarray import Dataset
-from collections.abc import Collection
-from typing import TYPE_CHECKING
-
-import msgspec
-from numpy.typing import NDArray
-
-from zsim.contract.messages import REFUSALS
 from zsim_analysis.export.columns import (
     DecodedMessages,
     Kind,
@@ -59,10 +42,18 @@ from zsim_analysis.export.columns import (
     json_text,
     subject,
 )
+from zsim_analysis.reading.drone_errors import EstimateErrors, estimate_errors
+from zsim_analysis.reading.formation import Formation, ParameterErrors, cluster_of
+from zsim_analysis.reading.recorded_flight import RecordedFlight
+from zsim_analysis.reading.recorded_run import decode_or_none
+from zsim_analysis.reading.shortfall import Shortfall
+from zsim_analysis.report.summary import RunSummary, error_table, judge
+from zsim_api.scenarios import Scenario
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pandas import DataFrame
-
+    from xarray import Dataset
 
 Table = dict[str, NDArray[Any]]  # columns of equal length (K,), ordered by simulated time
 INDEX = "t_s"

@@ -10,7 +10,7 @@ from zsim.contract.flight_messages import DroneState
 from zsim.scenario import scenario_file
 from zsim.schema.quantities import G_M_S2
 from zsim_bridges.ardrone import at_commands, navdata
-from zsim_bridges.ardrone.aircraft import Aircraft, Outlets
+from zsim_bridges.ardrone.aircraft import Aircraft, AircraftOutputs
 from zsim_bridges.ardrone.at_commands import Command
 from zsim_bridges.ardrone.navdata import Navdata
 
@@ -34,7 +34,7 @@ class PlayedAircraft:
         self.datagrams: list[bytes] = []
         self.control: list[bytes] = []
         self.refusals: list[str] = []
-        outlets = Outlets(
+        outlets = AircraftOutputs(
             lambda key, message: self.sent.append((key.removeprefix("drone/drone1/cmd/"), message)),
             lambda datagram, _: self.datagrams.append(datagram),
             self.control.append,

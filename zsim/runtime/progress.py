@@ -204,7 +204,7 @@ class Screen:
             return
         waiting = bool(line["waiting_for"])
         if (line["t_s"] >= self._next_plain_s or waiting) and text != self._last_plain:
-            self._next_plain_s = line["t_s"] + 10.0
+            self._next_plain_s = line["t_s"] + REPEATED_S
             self._last_plain = text
             self.say(text)
 

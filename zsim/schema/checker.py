@@ -225,7 +225,7 @@ def show(value: Any) -> str:
     except ValueError:
         text = "a number of more than 4300 digits"  # CPython refuses to convert it
     except RecursionError:
-        text = f"a {'map' if isinstance(value, dict) else 'list'} nested too deep"
+        text = f"a {'map' if isinstance(value, dict) else 'list'} nested too deeply"
     return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 3]}..."
 
 

@@ -61,13 +61,13 @@ def value(text: str) -> Any:
     try:
         return _Reader(text).document()
     except RecursionError:
-        raise ValueError("is nested too deep") from None
+        raise ValueError("is nested too deeply") from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"line {min(mark.line, text.count(chr(10))) + 1} " if mark else ""  # libyaml may count one too many
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
         if "nesting depth" in problem:  # PyYAML has its own limit since 6.0.4
-            raise ValueError("is nested too deep") from None
+            raise ValueError("is nested too deeply") from None
         raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
 

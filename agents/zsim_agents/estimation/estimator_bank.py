@@ -280,7 +280,7 @@ class ReaderTables(NamedTuple):
     """The layouts of a gate's messages, for compiled code, and buffers for one message."""
 
     program: Program
-    owner: Array  # drone and sensor of each key in the gate's table, or NOBODY twice, (keys, 2)
+    owner: Array  # drone and sensor of each key in the gate's table, or NO_DRONE twice, (keys, 2)
     ints: Array
     floats: Array
     bits: Array  # view of the floats as integers

@@ -277,7 +277,7 @@ def is_plausible(rows: Rows, sighting: Array) -> bool:
 
 @portable
 def identified_drone(rows: Rows, sighting: Array, hat_B: Vector, claimed: Array, HJ: Array, S: Array, y: Array) -> int:
-    """Return the drone whose hat was seen; NOBODY if no hat fits, or another hat could have been seen.
+    """Return the drone whose hat was seen; NO_DRONE if no hat fits, or another hat could have been seen.
 
     HJ, S and the innovation y, (3,), are filled for the returned drone; `claimed` marks drones whose hats have already
     been seen in the picture.

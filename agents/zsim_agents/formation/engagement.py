@@ -337,7 +337,7 @@ class Engagement:
         return self._output(gate, reason, command=command)
 
     def _update_fault(self, gate: GateInput) -> None:
-        """Set the fault of an engaged formation, or clear it after HEAL_S without a fault."""
+        """Set the fault of an engaged formation, or clear it after RECOVERY_S without a fault."""
         fault = self._rejoin_fault(gate) or self.check.flight_fault(gate)
         if not fault and not self._fault:  # the checks of a request cover only a limited time of the reference
             try:

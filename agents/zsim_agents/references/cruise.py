@@ -61,7 +61,7 @@ class Course:
     """The successive paths of a drone that may receive a new goal at any time.
 
     A new path starts in the current state of the previous one, or in the drone's own state if the drone has no path or
-    is more than LOST_M off it. An axis without a goal follows its rate; an axis with a goal and a rate tracks both
+    is more than DEVIATION_MAX_M off it. An axis without a goal follows its rate; one with a goal and a rate tracks both
     directly, without a path.
 
     Args:

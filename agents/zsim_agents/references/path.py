@@ -341,7 +341,7 @@ def figure_eight(length_m: float, width_m: float) -> Curve:
 
 
 class Laps:
-    """A curve flown for a number of laps of `period_s` each, from rest to rest; the ramps add RAMP periods in total.
+    """A curve flown for a number of laps of `period_s` each, from rest to rest; ramps add RAMP_SHARE periods in total.
 
     In the ramp at either end the angular rate is a quintic, so that acceleration and jerk are zero at the ends as well.
     """

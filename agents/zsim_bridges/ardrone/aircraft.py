@@ -58,7 +58,7 @@ CALIBRATION_YAW_RAD_S = 1.0  # yaw rate of a calibration: a full turn takes 6 s,
 ANIMATIONS_REFUSED = "flight animations are not simulated; on a real aircraft the firmware performs them"
 
 
-class Outlets(NamedTuple):
+class AircraftOutputs(NamedTuple):
     """Outputs of an aircraft: commands to the run, navdata to programs, bytes to the control port, and refusals."""
 
     put: Callable[[str, Any], None]
@@ -70,10 +70,10 @@ class Outlets(NamedTuple):
 class Aircraft:
     """One aircraft, controlled by pilots' programs; `gate_ns` is the resolution of arrival times."""
 
-    def __init__(self, drone: Drone, source: str, gate_ns: int, outlets: Outlets) -> None:
+    def __init__(self, drone: Drone, source: str, gate_ns: int, outputs: AircraftOutputs) -> None:
         self._name = drone.name
         self._gate_ns = gate_ns
-        self._outlets = outlets
+        self._outputs = outputs
         self._state = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount)
         limits = drone.limits
         maxima = {
@@ -89,12 +89,12 @@ class Aircraft:
             },
             {"general:ardrone_name": drone.name, "network:ssid_single_player": f"ardrone2_{drone.name}"},
         )
-        sender = CommandSender(drone.name, source, outlets.put)
+        sender = CommandSender(drone.name, source, outputs.put)
         self._setpoints = SetpointSender(sender, limits, self.configuration)
         self.pilot = Pilot(sender, self._setpoints, source, self._refuse)
         self._content = NavdataContent(self._state, drone.rotor_max_rad_s)
-        outputs = outlets.send_navdata, self._state_bits, self._ctrl_state, self._refuse
-        self._navdata = NavdataSender(self._content, self.configuration, *outputs)
+        navdata_outputs = outputs.send_navdata, self._state_bits, self._ctrl_state, self._refuse
+        self._navdata = NavdataSender(self._content, self.configuration, *navdata_outputs)
         self._has_camera = bool(drone.sensors.front_camera or drone.sensors.bottom_camera)
         self._now_ns = 0
         self._command_ns: int | None = None  # when the last AT command arrived
@@ -177,10 +177,10 @@ class Aircraft:
             case at_commands.Control(mode=at_commands.ACKNOWLEDGE):
                 self._ack = False
             case at_commands.Control(mode=at_commands.SEND_CONFIGURATION):
-                self._outlets.send_control(at_commands.format_configuration(self.configuration.all()))
+                self._outputs.send_control(at_commands.format_configuration(self.configuration.all()))
                 self._ack = True
             case at_commands.Control(mode=at_commands.SEND_CUSTOM_LIST):
-                self._outlets.send_control(at_commands.format_custom_list(self.configuration.custom_list()))
+                self._outputs.send_control(at_commands.format_custom_list(self.configuration.custom_list()))
                 self._ack = True
             case at_commands.Calibrate():
                 self.pilot.calibrate()
@@ -214,7 +214,7 @@ class Aircraft:
     # State
 
     def _refuse(self, reason: str) -> None:
-        self._outlets.refuse(f"{self._name}: {reason}")
+        self._outputs.refuse(f"{self._name}: {reason}")
 
     def _ctrl_state(self) -> int:
         major, minor = CONTROL_STATES[self.pilot.state], 0
@@ -238,7 +238,9 @@ class Aircraft:
         )
         state = sum((bit for bit, is_set in bits if is_set), ALWAYS_SET)  # `|` is slow for flags
         if self.pilot.state == "emergency":
-            state += StateBit.EMERGENCY + (StateBit.USER_EMERGENCY if self.pilot.stopped_by_pilot else StateBit.CUTOUT)
+            state += StateBit.EMERGENCY + (
+                StateBit.USER_EMERGENCY if self.pilot.was_stopped_by_pilot else StateBit.CUTOUT
+            )
             if float(rotations.rotation_matrix(self._state.attitude)[2, 2]) < CUTOUT_TILT_COSINE:
                 state += StateBit.ANGLES_OUT_OF_RANGE
         return state
@@ -271,7 +273,7 @@ class Pilot:
     Attributes:
         setpoint: the setpoint in force, or None.
         has_flown: whether this pilot has flown the drone since it last stood on the ground.
-        stopped_by_pilot: whether this pilot caused the emergency.
+        was_stopped_by_pilot: whether this pilot caused the emergency.
     """
 
     def __init__(
@@ -291,7 +293,7 @@ class Pilot:
         self._pilot_heading_rad: float | None = None  # the pilot's heading in the last PCMD_MAG
         self._calibration_end_ns: int | None = None  # when the calibration turn ends
         self.has_flown = False
-        self.stopped_by_pilot = False
+        self.was_stopped_by_pilot = False
 
     @property
     def is_calibrating(self) -> bool:
@@ -334,7 +336,7 @@ class Pilot:
         if not (is_take_off_edge or is_emergency_edge or (not ref.takes_off and self.state in IN_THE_AIR)):
             if not ref.takes_off and self._requested_mode == "takeoff":  # the take-off is withdrawn
                 if self._request_count:  # it has been requested already, so the drone must land
-                    self._sender.mode(self._now_ns, "land")
+                    self._sender.send_mode(self._now_ns, "land")
                 self._requested_mode = None
             return
         if self._is_refused("REF"):
@@ -394,7 +396,7 @@ class Pilot:
         if status.state == "emergency" and self._requested_mode == "takeoff":
             self._requested_mode = None
         if status.state != "emergency" and self._requested_mode != "emergency":
-            self.stopped_by_pilot = False
+            self.was_stopped_by_pilot = False
         if status.state in ("landed", "emergency", "landing"):
             self.setpoint = self._calibration_end_ns = None
         if status.state in ("landed", "emergency") and self._requested_mode != "takeoff":
@@ -410,7 +412,7 @@ class Pilot:
     def _request(self, mode: ModeName) -> None:
         self._requested_mode, self._request_count = mode, 0
         self.setpoint = self._calibration_end_ns = None
-        self.stopped_by_pilot = mode == "emergency"
+        self.was_stopped_by_pilot = mode == "emergency"
         self._repeat_request(mode)
 
     def _repeat_request(self, mode: ModeName) -> None:
@@ -431,7 +433,7 @@ class Pilot:
                 return
             self._requested_ns, self._request_count = self._now_ns, self._request_count + 1
             self.has_flown = self.has_flown or mode == "takeoff"
-            self._sender.mode(self._now_ns, mode)
+            self._sender.send_mode(self._now_ns, mode)
 
     def _follow(self, setpoint: TiltSetpoint) -> None:
         """Set the setpoint, and send it at once if it differs from the last one."""
@@ -486,7 +488,7 @@ class SetpointSender:
 
     def send(self, t_ns: int, setpoint: TiltSetpoint) -> None:
         if setpoint.hover:
-            self._sender.tilt(t_ns, 0.0, 0.0, 0.0, 0.0, hover=True)
+            self._sender.send_tilt(t_ns, 0.0, 0.0, 0.0, 0.0, hover=True)
             return
         number = self._configuration.number
         right, back = setpoint.right, setpoint.back
@@ -498,10 +500,12 @@ class SetpointSender:
         right, back = (clipped_fraction(el.tan(fraction * tilt_rad) / self._tilt_slope) for fraction in (right, back))
         climb_m_s = min(setpoint.up * number("control:control_vz_max") / 1e3, self._max_climb_m_s())
         yaw_left = clipped_fraction(-setpoint.clockwise * number("control:control_yaw") / self._yaw_rad_s)
-        self._sender.tilt(t_ns, -back, -right, clipped_fraction(climb_m_s / self._climb_m_s), yaw_left, hover=False)
+        self._sender.send_tilt(
+            t_ns, -back, -right, clipped_fraction(climb_m_s / self._climb_m_s), yaw_left, hover=False
+        )
 
     def send_turn(self, t_ns: int) -> None:
-        self._sender.velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
+        self._sender.send_velocity(t_ns, (0.0, 0.0, 0.0), -self._turn_rad_s)
 
     def _max_climb_m_s(self) -> float:
         """Return the maximum climb rate with which the drone stays below altitude_max."""

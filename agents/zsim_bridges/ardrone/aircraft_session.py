@@ -146,7 +146,7 @@ class AircraftSession(VehicleSession):
         demo = packet.options.get(DEMO)
         if demo is not None:
             self._battery = float(min(100, demo.battery_percent))
-            self._state = STATES.get(demo.ctrl_state >> 16, "landed")
+            self._state = STATES.get(demo.ctrl_state >> 16, "flying" if StateBit.FLYING in packet.state else "landed")
         elif StateBit.FLYING not in packet.state:  # without options, such as a bootstrap packet after a restart
             self._state = "landed"
         if StateBit.EMERGENCY in packet.state:
@@ -160,8 +160,8 @@ class AircraftSession(VehicleSession):
         if silent_ns >= REQUEST_NS:
             self._requested_ns = now_ns
             yield NAVDATA, navdata.REQUEST_UNICAST
-        emergency = StateBit.EMERGENCY in self._state_bits
-        flight = self._commands.advance(now_ns, demand, emergency, self._navdata.pose)
+        is_emergency = StateBit.EMERGENCY in self._state_bits
+        flight = self._commands.advance(now_ns, demand, is_emergency, self._navdata.pose)
         datagram = b""
         for command in [*self._setup_commands(now_ns), *flight]:
             self._sequence += 1
@@ -173,17 +173,17 @@ class AircraftSession(VehicleSession):
         """Yield what the set-up needs next; an entry's acknowledgement is cleared before the next entry is sent."""
         if self._received_ns is None:
             return
-        acknowledged = StateBit.COMMAND_ACK in self._state_bits
+        is_acknowledged = StateBit.COMMAND_ACK in self._state_bits
         if now_ns - self._watchdog_ns >= WATCHDOG_NS:
             self._watchdog_ns = now_ns
             yield ResetWatchdog(0)
-        if acknowledged and now_ns - self._cleared_ns >= REQUEST_NS:
+        if is_acknowledged and now_ns - self._cleared_ns >= REQUEST_NS:
             self._cleared_ns = now_ns
             if self._sent is not None:
                 self._pending.popleft()
                 self._sent = None
             yield Control(0, at_commands.ACKNOWLEDGE)
-        elif not acknowledged and self._pending and (self._sent is None or now_ns - self._config_ns >= CONFIG_NS):
+        elif not is_acknowledged and self._pending and (self._sent is None or now_ns - self._config_ns >= CONFIG_NS):
             self._config_ns, self._sent = now_ns, self._pending[0]
             yield self._pending[0]
 
@@ -205,8 +205,8 @@ class FlightCommands:
         self._last: Demand | None = None
         self._pulse_start_ns = -PULSE_INTERVAL_NS  # when the emergency bit last rose
 
-    def advance(self, now_ns: int, demand: Demand, emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
-        """Yield the commands that are due; `emergency` states whether the aircraft is in an emergency."""
+    def advance(self, now_ns: int, demand: Demand, is_emergency: bool, pose: AircraftPose | None) -> Iterator[Command]:
+        """Yield the commands that are due; `is_emergency` states whether the aircraft is in an emergency."""
         if now_ns - self._sent_ns < (PERIOD_NS if demand == self._last else CHANGE_INTERVAL_NS):
             return
         self._last, self._sent_ns = demand, now_ns
@@ -214,13 +214,13 @@ class FlightCommands:
             case "none":
                 return
             case "kill":
-                yield self._emergency_ref(now_ns, is_due=not emergency)
+                yield self._emergency_ref(now_ns, is_due=not is_emergency)
             case "land":
                 yield at_commands.ref(0, takes_off=False)
                 yield HOVER
             case "reset":
-                yield self._emergency_ref(now_ns, is_due=emergency)
-            case _ if emergency:
+                yield self._emergency_ref(now_ns, is_due=is_emergency)
+            case _ if is_emergency:
                 return
             case _:
                 yield at_commands.ref(0, takes_off=True)
@@ -340,15 +340,15 @@ class NavdataReadings(AircraftReadings):
             mx = m[0] * math.cos(pitch) + mz * math.sin(pitch)
             self._align(yaw, self._north_rad - math.atan2(my, mx), dt_s)
         yaw += self._yaw_offset_rad or 0.0
-        own = _frd_to_flu((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
-        velocity = turned_about_up(own, yaw)
+        body_velocity = _frd_to_flu((demo.vx_mm_s / 1e3, demo.vy_mm_s / 1e3, demo.vz_mm_s / 1e3))
+        velocity = turned_about_up(body_velocity, yaw)
         if 0.0 < dt_s < GAP_S_MAX:
             self._x, self._y = self._x + dt_s * velocity[0], self._y + dt_s * velocity[1]
         w, x, y, z = quaternion_from_rpy((roll, pitch, yaw)).tolist()
         position = self._x, self._y, self._ground_m + max(0, demo.altitude_mm) / 1e3
         rate = self._last["imu"][1] if "imu" in self._last else ZERO_VECTOR
         self.pose = AircraftPose(taken_ns, position, velocity, (w, x, y, z), rate)
-        self.read("flow", taken_ns, own, 1.0)
+        self.read("flow", taken_ns, body_velocity, 1.0)
 
     def _align(self, yaw: float, magnetic: float, dt_s: float) -> None:
         """Let the heading slowly follow the magnetometer, unless the initial heading was given."""

@@ -24,7 +24,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Drone
 from zsim.transport.session import Session
 from zsim_bridges.ardrone import at_commands, navdata, video
-from zsim_bridges.ardrone.aircraft import Aircraft, Outlets
+from zsim_bridges.ardrone.aircraft import Aircraft, AircraftOutputs
 from zsim_bridges.ardrone.video import VideoEncoder, VideoFrame, pave_header
 from zsim_bridges.vehicle_links import drone_link
 from zsim_bridges.vehicle_links.server import PictureServer, Say
@@ -99,7 +99,7 @@ class ArdroneServer(PictureServer):
                 self.say(line)
             self.say(f"{name} is an AR.Drone 2.0 at {drone.address}")
 
-    def wanted_pictures(self) -> Iterator[str]:
+    def watched_cameras(self) -> Iterator[str]:
         for name, drone in self._drones.items():
             if drone.video.is_watched:
                 if self._has_encoder:
@@ -150,8 +150,8 @@ class DroneServer:
         commands = DatagramPort(peers, lambda datagram, _: self.aircraft.on_at(datagram), self._refuse)
         self._authentication = DatagramPort(peers, self._on_auth_request, self._refuse)
         self._control = StreamPort(peers, read_until_end, self._refuse)
-        outlets = Outlets(server.link.put, self._navdata.send, self._control.broadcast, server.refuse)
-        self.aircraft = Aircraft(drone, server.observer.name, server.info.gate_ns, outlets)
+        outputs = AircraftOutputs(server.link.put, self._navdata.send, self._control.broadcast, server.refuse)
+        self.aircraft = Aircraft(drone, server.observer.name, server.info.gate_ns, outputs)
         self.video = VideoServer(peers, self._refuse)
         version = FileServer(address, peers, VERSION_FILES, self._refuse)
         self._files = FileServer(address, peers, {}, self._refuse).port
@@ -450,17 +450,17 @@ class AllowedHosts:
         RunError: the address is not a loopback address, and no host is named.
     """
 
-    def __init__(self, address: str, named: frozenset[str]) -> None:
+    def __init__(self, address: str, allowed_hosts: frozenset[str]) -> None:
         self._is_loopback = ipaddress.IPv4Address(address).is_loopback
-        self._named = named
-        if not self._is_loopback and not named:
+        self._allowed_hosts = allowed_hosts
+        if not self._is_loopback and not allowed_hosts:
             raise RunError(
                 f"{address} can be reached by every host on its network, and an AR.Drone has no password; "
                 "give --peer HOST, the host to obey, or an address 127.x.y.z"
             )
 
     def allow(self, host: str) -> bool:
-        return self._is_loopback or host in self._named
+        return self._is_loopback or host in self._allowed_hosts
 
 
 def drone_addresses(text: str, drones: Sequence[str]) -> dict[str, str]:

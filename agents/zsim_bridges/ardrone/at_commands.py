@@ -233,8 +233,8 @@ def _value(name: str, type_: type, argument: int | str) -> Any:
         return argument
     elif type_ is float and -(2**31) <= argument < 2**31 and math.isfinite(value := bits_to_float(argument)):
         return value
-    needed = f"{_TYPE_NAMES[type_]}, finite, of 32 bits"
-    raise _RefusalError(f"{name} has the argument {str(argument)[:20]!r}; must be {needed}")
+    requirement = f"{_TYPE_NAMES[type_]}, finite, of 32 bits"
+    raise _RefusalError(f"{name} has the argument {str(argument)[:20]!r}; must be {requirement}")
 
 
 def _quoted(part: bytes) -> str:

@@ -27,7 +27,7 @@ from zsim_bridges.console.run_forms import (
     FleetForm,
     OrderButton,
     RunForm,
-    offered,
+    offered_refusals,
     refusal_lines,
     set_refusals,
 )
@@ -42,7 +42,7 @@ SWITCHES = {
     "estimates": "Estimates: 2σ ellipsoids (contain 74 % in 3-D)",
     "trails": "Trails",
 }
-MANY = 12  # number of drones that fit on a page; if there are more, the worst come first by default
+MANY_DRONES = 12  # number of drones that fit on a page; if there are more, the worst come first by default
 FILTER_MAX = 80  # maximum length of the filter's text
 SEVERITIES = ("red", "amber", None)
 SORTINGS: dict[str, Callable[[DroneRow], tuple[float, ...]]] = {
@@ -69,7 +69,7 @@ DRONE_MODES = {
     "emergency": "Emergency",
     "reset": "Reset",
 }  # `return`, to the start, is not a mode of the firmware
-IN_CONTROL = ("takeoff", "return", "reset")  # modes that need control; any page may land or stop a drone
+MODES_NEEDING_CONTROL = ("takeoff", "return", "reset")  # modes that need control; any page may land or stop a drone
 DRONE_ICONS = {"takeoff": viser.Icon.PLANE_DEPARTURE, "return": viser.Icon.HOME, "reset": viser.Icon.REFRESH}
 
 
@@ -134,9 +134,9 @@ class ConsolePage:
         with tabs.add_tab("Run"):
             with self._part(gui, RUN):
                 self.run_form = RunForm(gui, self._client, run.info.rate)
-            for what, label in SWITCHES.items():
+            for layer, label in SWITCHES.items():
                 switch = gui.add_checkbox(label, True)
-                switch.on_update(lambda _, what=what, switch=switch: show(what, switch.value))
+                switch.on_update(lambda _, layer=layer, switch=switch: show(layer, switch.value))
             lengths = {f"the last {length_s:g} s": length_s for length_s in TRAILS_S}
             trail = gui.add_dropdown("trails of", list(lengths), initial_value=f"the last {TRAIL_S:g} s")
             trail.on_update(lambda _: choose_trail(lengths[trail.value]))
@@ -302,14 +302,14 @@ class PageForms:
         shared, gui, client_id = self._shared, page.gui, page.client_id
         self._desk.open(client_id)
 
-        def may(drone: str, use: bool) -> str:
+        def control_refusal(drone: str, use: bool) -> str:
             part = self._part_of(drone)
             return self._desk.use(client_id, part) if use else self._desk.refusal(client_id, part)
 
         with shared.control_folder:
             control = ControlForm(gui, self._desk, client_id, shared.parts)
         with shared.drone_folder:
-            drone = DroneForm(gui, self._client, self._names, may, self._request_return)
+            drone = DroneForm(gui, self._client, self._names, control_refusal, self._request_return)
             instruments = gui.add_html("")
             fleet = FleetTable(gui, self._names, lambda: drone.select(fleet.selected))
         with shared.figure_folder:
@@ -338,8 +338,8 @@ class DroneForm:
     """The mode buttons on one page, for one drone or for all selected ones.
 
     Args:
-        may: returns why this page may not let a drone take off, return or reset; empty if it may. If the second
-            argument is true, the page takes control first.
+        control_refusal: returns why this page may not let a drone take off, return or reset; empty if it may. If the
+            second argument is true, the page takes control first.
         request_return: returns drones to their starts, and lands them.
     """
 
@@ -348,19 +348,21 @@ class DroneForm:
         gui: viser.GuiApi,
         client: CommandClient,
         names: Sequence[str],
-        may: Callable[[str, bool], str] = lambda *_: "",
+        control_refusal: Callable[[str, bool], str] = lambda *_: "",
         request_return: Callable[[Sequence[str]], None] = lambda _: None,
     ) -> None:
         self._client = client
-        self._may = may
+        self._control_refusal = control_refusal
         self._request_return = request_return
         self._choice = gui.add_dropdown("drone", list(names))
         self._selected: list[str] = []
         self._buttons: dict[str, Any] = {}
         for mode, label in DRONE_MODES.items():
             if mode in ORDERS:
-                held = mode == "emergency"
-                self._buttons[mode] = OrderButton(gui, f"{label} {self._subject}", mode, self._order, held=held)
+                needs_hold = mode == "emergency"
+                self._buttons[mode] = OrderButton(
+                    gui, f"{label} {self._subject}", mode, self._order_target, needs_hold=needs_hold
+                )
                 continue
             button = gui.add_button(f"{label} {self._subject}", icon=DRONE_ICONS[mode], color="gray")
             button.on_click(lambda _, mode=mode: self._request(mode))
@@ -379,7 +381,7 @@ class DroneForm:
         return self._selected or [self.chosen]
 
     @property
-    def _order(self) -> dict[str, str]:
+    def _order_target(self) -> dict[str, str]:
         return {"drone": ",".join(self.targets)}
 
     @property
@@ -397,22 +399,23 @@ class DroneForm:
     def refresh(self, run: RunCondition) -> None:
         """Disable the buttons whose commands all of the drones would refuse."""
         self._run = run
-        refusals = [offered(run, partial(drone_refusals, drone=drone)) for drone in self.targets]
+        refusals = [offered_refusals(run, partial(drone_refusals, drone=drone)) for drone in self.targets]
         for drone, each in zip(self.targets, refusals, strict=True):
-            for mode in IN_CONTROL:
-                each[mode] = each[mode] or self._may(drone, False)
+            for mode in MODES_NEEDING_CONTROL:
+                each[mode] = each[mode] or self._control_refusal(drone, False)
         common = {mode: refusals[0][mode] if all(each[mode] for each in refusals) else "" for mode in DRONE_MODES}
         set_refusals(self._buttons, common)
         landed = {d: run.checks.get(d, ()) for d in self.targets if run.drones.get(d) == "landed"}
         checks = {drone: found for drone, found in landed.items() if found}
-        shown = preflight_lines(checks) if checks and not run.grounded() else ""
+        shown = preflight_lines(checks) if checks and not run.flight_refusal() else ""
         self._reasons.content = refusal_lines(DRONE_MODES, common) + shown
 
     def _request(self, mode: str) -> None:
         """Request an operation that needs control, from all drones that would not refuse it."""
-        able = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
-        drones = able or self.targets  # if all would refuse, the answers state why, unless the condition has changed
-        drones = [drone for drone in drones if not self._may(drone, True)]
+        accepting = [drone for drone in self.targets if not drone_refusals(self._run, drone)[mode]]
+        # If all would refuse, the answers state why, unless the condition has changed.
+        drones = accepting or self.targets
+        drones = [drone for drone in drones if not self._control_refusal(drone, True)]
         if not drones:
             return
         if mode == "return":
@@ -424,21 +427,21 @@ class DroneForm:
         for mode, button in self._buttons.items():
             label = f"{DRONE_MODES[mode]} {self._subject}"
             if isinstance(button, OrderButton):
-                button.rename(label, self._order)
+                button.rename(label, self._order_target)
             else:
                 button.label = label
         self.refresh(self._run)
 
 
 class FleetTable:
-    """The table of drones on one page; `changed` is called when the selection changes."""
+    """The table of drones on one page; `on_change` is called when the selection changes."""
 
-    def __init__(self, gui: viser.GuiApi, names: Sequence[str], changed: Callable[[], None]) -> None:
+    def __init__(self, gui: viser.GuiApi, names: Sequence[str], on_change: Callable[[], None]) -> None:
         self._names = tuple(names)
-        self._changed = changed
+        self._on_change = on_change
         self._selected: frozenset[str] = frozenset()
         self._shown: tuple[str, ...] = self._names
-        orders, are_many = list(SORTINGS), len(names) > MANY
+        orders, are_many = list(SORTINGS), len(names) > MANY_DRONES
         with gui.add_folder("Sort, filter, select", expand_by_default=are_many):
             self._order = gui.add_dropdown("sort by", orders, initial_value=orders[are_many])
             self._choice = gui.add_dropdown("show", list(FILTERS))
@@ -467,7 +470,7 @@ class FleetTable:
 
     def _select(self, names: frozenset[str]) -> None:
         self._selected = names
-        self._changed()
+        self._on_change()
 
 
 def filtered_rows(

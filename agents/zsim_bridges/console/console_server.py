@@ -221,8 +221,8 @@ class RunPage:
 
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
         self.orders = OrderBook(
-            self._client, info.run_id, self._members, self._names, self._monitor.unflyable, lambda: observer.now_ns,
-            lambda: self._time_monitor.silent_s, self.views.external,
+            self._client, info.run_id, self._members, self._names, self._monitor.flight_refusal,
+            lambda: observer.now_ns, lambda: self._time_monitor.silent_s, self.views.external,
         )  # fmt: skip
         self.views.on_own_event = self.orders.on_event
         self.record = RecordPlayer(self._client, self._time_monitor, run.is_replay, len(self._names))

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from zsim.contract.run_messages import INCIDENTS
 from zsim_bridges.console.run_condition import (
-    LATE_MS,
+    LAG_MAX_MS,
+    LINK_AGE_MAX_MS,
     LINK_LOSS_PERCENT,
-    LINK_OLD_MS,
     LINK_SILENT_S,
     LOST,
     Check,
@@ -73,10 +73,10 @@ class DroneRow(NamedTuple):
         """How bad the drone's link, or its estimator's lag, is: 1 at the alarm threshold, infinite without a link."""
         drone = self.drone
         if not drone.is_external:
-            return (drone.lag_ms or 0.0) / LATE_MS
+            return (drone.lag_ms or 0.0) / LAG_MAX_MS
         if drone.link_age_s is None or drone.link_age_s > LINK_SILENT_S or drone.link_state == "lost":
             return math.inf
-        return max((drone.link_age_ms or 0.0) / LINK_OLD_MS, (drone.link_loss_percent or 0.0) / LINK_LOSS_PERCENT)
+        return max((drone.link_age_ms or 0.0) / LINK_AGE_MAX_MS, (drone.link_loss_percent or 0.0) / LINK_LOSS_PERCENT)
 
 
 class TableRows:
@@ -205,7 +205,7 @@ def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, c
     mark = f" data-zsim-drone='{label}'{' data-zsim-chosen' if chosen else ''}"
 
     lag = "no estimate" if drone.lag_ms is None else f"lag {drone.lag_ms:.0f} ms"
-    lag_colour = AMBER if drone.lag_ms is not None and drone.lag_ms > LATE_MS else "inherit"
+    lag_colour = AMBER if drone.lag_ms is not None and drone.lag_ms > LAG_MAX_MS else "inherit"
     who = f"{escape(drone.commander or 'nobody')} · {_coloured(lag, lag_colour)} · GPS {escape(row.gps)}"
     if figures is not None and figures.obstacle_m is not None:
         who += f" · {figures.obstacle_m:.1f} m from an obstacle"

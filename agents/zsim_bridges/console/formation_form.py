@@ -30,7 +30,7 @@ from zsim_bridges.console.run_forms import (
     OrderButton,
     assign,
     limits_line,
-    offered,
+    offered_refusals,
     range_refusal,
     refusal_lines,
     set_refusals,
@@ -39,7 +39,7 @@ from zsim_bridges.console.run_forms import (
 PREVIEW_STYLE = "font-size:12px;line-height:1.3;padding:2px 10px;color:#d9480f"
 REST_S = 1.0  # wall; sliders must rest this long before their values are sent, since people type slowly
 STILL_S = 2.0  # wall; if a formation's goal has not changed for this long, a moved slider shows the goal again
-OVER_MAX_S = 3600.0  # simulated; maximum duration of a move that controllers accept
+MOVE_DURATION_MAX_S = 3600.0  # simulated; maximum duration of a move that controllers accept
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Rejoin": "rejoin", "Land": "land"}
 SAFE = ("hold", "land")  # operations that need no control
 RETURN = "Return"  # the formation flies above the middle of its drones' starts, and lands there
@@ -58,15 +58,15 @@ EXPRESSIONS = "x_c = 5 + 3*cos(0.1*t)\nyaw = 90 + 6*t"
 WAYPOINTS = "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6"
 EXPRESSION_UNITS = "t in seconds, lengths in metres, angles in degrees as on the sliders; sin and cos are of radians"
 WAYPOINT_UNITS = "seconds from the start, lengths in metres, angles in degrees as on the sliders"
-SIDEWAYS_M = 50.0  # horizontal range around the drones' starts; design choice: as far as a page shows a formation well
+HORIZONTAL_RANGE_M = 50.0  # range around the drones' starts; design choice: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # range of heights; design choice: clear of the ground, and within sight
 SIDE_MAX_M = 20.0  # maximum side of a formation that a slider offers
 DISPLACEMENT_M = 5.0  # maximum displacement of a robot from its position in a template that a slider offers
 TILT_MAX_DEG = 29.0  # maximum tilt of a formation; controllers accept less than 30 (flight_check.py)
-CORNER_DEG = 10.0  # minimum angle at a corner; at 0 and 180 degrees the robots are collinear
+CORNER_MIN_DEG = 10.0  # minimum angle at a corner; at 0 and 180 degrees the robots are collinear
 DIGITS = 6  # decimal digits of a displayed value: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}
-SHOWN_MAX = 16  # up to this number, all variables have sliders; otherwise only those of the entire formation
+SLIDERS_MAX = 16  # up to this number, all variables have sliders; otherwise only those of the entire formation
 WAYPOINT_STEP_S = 20.0  # time from the first to the second prefilled waypoint
 PREFILLED = ("x_c", "y_c", "z_c", "yaw")  # variables in prefilled waypoints, if a formation has them
 
@@ -124,22 +124,22 @@ class FormationForm:
                 button.on_click(lambda _, op=op: client.request_cluster(cluster.name, op))
         self.safe = [self._controls[op] for op in SAFE]
         if {"x_c", "y_c"} <= set(space.names):
-            back = gui.add_button(RETURN, icon=viser.Icon.HOME, color="gray")
-            back.on_click(lambda _: request_return(cluster.name))
-            self._controls["return"] = back
+            return_button = gui.add_button(RETURN, icon=viser.Icon.HOME, color="gray")
+            return_button.on_click(lambda _: request_return(cluster.name))
+            self._controls["return"] = return_button
         self._reasons = gui.add_html("")
         self._checks = gui.add_html("")
         self._others: list[tuple[str, Any]] = []  # further controls, with the operation that each requests
         hint = "Duration of a move; 0: as fast as the robots' limits allow"
-        self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
-        gui.add_html(limits_line(f"over: 0 to {OVER_MAX_S:g} s"))
+        self._duration = gui.add_number("over [s]", 0.0, min=0.0, max=MOVE_DURATION_MAX_S, step=0.5, hint=hint)
+        gui.add_html(limits_line(f"over: 0 to {MOVE_DURATION_MAX_S:g} s"))
         hint = "Preview the path of a target or trajectory, and confirm it before it is flown"
-        self._first = gui.add_checkbox("Preview first", False, hint=hint)
+        self._preview_first = gui.add_checkbox("Preview first", False, hint=hint)
         self._preview_text = gui.add_html("", visible=False)
-        self._fly_it = gui.add_button("Fly the preview", icon=viser.Icon.PLAYER_PLAY, color="blue", visible=False)
-        self._fly_it.on_click(lambda _: self._end_preview(fly=True))
-        self._discard = gui.add_button("Discard the preview", color="gray", visible=False)
-        self._discard.on_click(lambda _: self._end_preview(fly=False))
+        self._fly_button = gui.add_button("Fly the preview", icon=viser.Icon.PLAYER_PLAY, color="blue", visible=False)
+        self._fly_button.on_click(lambda _: self._end_preview(fly=True))
+        self._discard_button = gui.add_button("Discard the preview", color="gray", visible=False)
+        self._discard_button.on_click(lambda _: self._end_preview(fly=False))
         shown = primary_variables(space.names)
         self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
         if len(shown) < space.size:
@@ -149,7 +149,7 @@ class FormationForm:
     def offer(self, run: RunCondition) -> None:
         """Disable what the controller would refuse, and show the reason; sliders still show the formation's state."""
         name = self._cluster.name
-        refusals = offered(run, partial(formation_refusals, cluster=name))
+        refusals = offered_refusals(run, partial(formation_refusals, cluster=name))
         refusals["return"] = refusals["target"]  # a return begins with a target
         set_refusals(self._controls, refusals)
         for op, control in self._others:
@@ -161,7 +161,7 @@ class FormationForm:
         self._reasons.content = refusal_lines(shown, refusals)
         landed = [each for each in self._cluster.drones if each in run.checks and run.drones.get(each) == "landed"]
         checks = {drone: run.checks[drone] for drone in landed}
-        self._checks.content = preflight_lines(checks) if checks and not run.grounded() else ""
+        self._checks.content = preflight_lines(checks) if checks and not run.flight_refusal() else ""
 
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
         """Let sliders that were not moved, and waypoints that were not edited, follow the formation."""
@@ -171,7 +171,7 @@ class FormationForm:
         before, self._shown = self._shown, tuple(shown)
         if not self._edited:
             ranges, written = list(self._ranges.values()), self._written
-            if self._shown == before or written is None or is_apart(self._shown, written, ranges):
+            if self._shown == before or written is None or differs_by_step(self._shown, written, ranges):
                 self._prefill()
         for name, slider in self._sliders.items():
             slider.follow(shown[self._space.index(name)], wall_s)
@@ -188,21 +188,23 @@ class FormationForm:
 
     def request_target(self, shown: dict[str, float]) -> bool:
         """Request values in the units of the page; return whether they are within their ranges."""
-        over_s = float(self._over.value)
-        found = [self._ranges[name].refusal(value) for name, value in shown.items()]
-        refusals = [each for each in (*found, range_refusal("over", over_s, 0.0, OVER_MAX_S, "s")) if each]
+        duration_s = float(self._duration.value)
+        range_refusals = [self._ranges[name].refusal(value) for name, value in shown.items()]
+        refusals = [
+            each for each in (*range_refusals, range_refusal("over", duration_s, 0.0, MOVE_DURATION_MAX_S, "s")) if each
+        ]
         if refusals and shown:
             self._report(RequestOutcome(f"{self._cluster.name}: target", "; ".join(refusals)))
             return False
         values = {name: self._ranges[name].to_si(value) for name, value in shown.items()}
-        lasting: dict[str, Any] = {"over_s": over_s} if over_s > 0 else {}
+        duration_args: dict[str, Any] = {"over_s": duration_s} if duration_s > 0 else {}
         text = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
-        self._request(_Flight("target", text, {"values": values, **lasting}))
+        self._request(_Flight("target", text, {"values": values, **duration_args}))
         return True
 
     def _request(self, flight: _Flight) -> None:
         """Request a flight, or preview it first."""
-        if not self._first.value or self._shown is None:
+        if not self._preview_first.value or self._shown is None:
             self._end_preview(fly=False)
             self._send(flight)
             return
@@ -210,28 +212,28 @@ class FormationForm:
         if op == "target" and self._previewed is not None and self._previewed.op == op:  # extend the preview
             shown = f"{self._previewed.shown}, {shown}"
             args = {**args, "values": {**self._previewed.args["values"], **args["values"]}}
-        apart_m = self._cluster.gains.separation_min_m
+        separation_min_m = self._cluster.gains.separation_min_m
         try:
-            preview = preview_of(self._space, op, args, np.array(self._shown), apart_m)
+            preview = preview_of(self._space, op, args, np.array(self._shown), separation_min_m)
         except PreviewError as error:
             self._report(RequestOutcome(f"{self._cluster.name}: {op}", str(error)))
             return
         self._previewed = _Flight(op, shown, args)
         self._show_preview(preview)
         self._preview_text.content = f"<div style='{PREVIEW_STYLE}'>{escape(f'{op} {shown}: {preview.text}')}</div>"
-        self._preview_text.visible = self._fly_it.visible = self._discard.visible = True
+        self._preview_text.visible = self._fly_button.visible = self._discard_button.visible = True
 
     def _end_preview(self, fly: bool) -> None:
         previewed, self._previewed = self._previewed, None
         if previewed is None:
             return
-        self._preview_text.visible = self._fly_it.visible = self._discard.visible = False
+        self._preview_text.visible = self._fly_button.visible = self._discard_button.visible = False
         self._show_preview(None)
         if fly:
             self._send(previewed)
 
     def _send(self, flight: _Flight) -> None:
-        self._client.request_cluster(self._cluster.name, flight.op, shown=flight.shown, **flight.args)
+        self._client.request_cluster(self._cluster.name, flight.op, args_text=flight.shown, **flight.args)
 
     def _other_button(self, gui: viser.GuiApi, op: str, label: str, act: Callable[[], Any]) -> None:
         button = gui.add_button(label)
@@ -260,10 +262,12 @@ class FormationForm:
         add = partial(self._other_button, gui, "trajectory")
         with gui.add_folder("Trajectory", expand_by_default=False):
             if planned is not None:
-                flown: dict[str, Any] = {"expressions": planned.expressions, "constants": planned.constants}
+                trajectory_args: dict[str, Any] = {"expressions": planned.expressions, "constants": planned.constants}
                 if planned.waypoints:
-                    flown = {"waypoints": [{"at_s": each.at_s, "values": each.values} for each in planned.waypoints]}
-                add("Fly the scenario's", lambda: self._fly(lambda: flown))
+                    trajectory_args = {
+                        "waypoints": [{"at_s": each.at_s, "values": each.values} for each in planned.waypoints]
+                    }
+                add("Fly the scenario's", lambda: self._fly(lambda: trajectory_args))
             gui.add_markdown(f"<sub>{EXPRESSION_UNITS}</sub>")
             text = gui.add_text("expressions [m, deg]", EXPRESSIONS, multiline=True)
             add("Fly the expressions", lambda: self._fly(lambda: parse_expressions(text.value, names, angles)))
@@ -341,12 +345,12 @@ class VariableSlider:
         assign(self._slider, label=self._range.label_of(goal))
 
     def _is_held(self, goal: float, wall_s: float) -> bool:
-        kept = self._held
-        if kept is None:
+        held = self._held
+        if held is None:
             return False
-        if goal != kept.goal:
-            self._held = kept._replace(goal=goal, since_s=wall_s)
-        elif goal == kept.value or wall_s - kept.since_s > STILL_S:
+        if goal != held.goal:
+            self._held = held._replace(goal=goal, since_s=wall_s)
+        elif goal == held.value or wall_s - held.since_s > STILL_S:
             self._held = None
         return self._held is not None
 
@@ -390,13 +394,13 @@ class SliderRange(NamedTuple):
         """
         shown = self.in_unit(value)
         rounded = round(round(shown / self.step) * self.step, DIGITS)
-        within = min(max(rounded, self.low), self.high)
-        return within if abs(shown - within) <= self.step / 2.0 else rounded
+        clamped = min(max(rounded, self.low), self.high)
+        return clamped if abs(shown - clamped) <= self.step / 2.0 else rounded
 
     def label_of(self, value: float) -> str:
         """Return the label, with the value [m, rad] if that is out of range."""
-        shown, slack = self.in_unit(value), self.step / 2.0
-        if self.low - slack <= shown <= self.high + slack:
+        shown, tolerance = self.in_unit(value), self.step / 2.0
+        if self.low - tolerance <= shown <= self.high + tolerance:
             return self.label
         return f"{self.name} = {shown:.1f} {self.unit}: out of range"
 
@@ -415,30 +419,30 @@ def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> 
     """Return the ranges of all variables of a formation, in the space's order."""
     drones = [scenario.drone(name) for name in cluster.drones]
     x, y = (round(sum(drone.position_m[axis] for drone in drones) / len(drones)) for axis in range(2))
-    apart_m = max(cluster.gains.separation_min_m, STEPS["m"])
-    side = (apart_m, max(SIDE_MAX_M, 2.0 * apart_m))
+    separation_min_m = max(cluster.gains.separation_min_m, STEPS["m"])
+    side = (separation_min_m, max(SIDE_MAX_M, 2.0 * separation_min_m))
     bounds = {
-        "x_c": (x - SIDEWAYS_M, x + SIDEWAYS_M),
-        "y_c": (y - SIDEWAYS_M, y + SIDEWAYS_M),
+        "x_c": (x - HORIZONTAL_RANGE_M, x + HORIZONTAL_RANGE_M),
+        "y_c": (y - HORIZONTAL_RANGE_M, y + HORIZONTAL_RANGE_M),
         "z_c": height_range_m(drones),
         **dict.fromkeys(("p", "q", "rho"), side),
         **dict.fromkeys(("roll", "pitch", "elevation"), (-TILT_MAX_DEG, TILT_MAX_DEG)),
-        "beta": (CORNER_DEG, 180.0 - CORNER_DEG),
+        "beta": (CORNER_MIN_DEG, 180.0 - CORNER_MIN_DEG),
     }
     ranges = []
     for name in space.names:
-        shown_in = shown_unit(name)
-        default = (-180.0, 180.0) if shown_in == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
+        unit = shown_unit(name)
+        default = (-180.0, 180.0) if unit == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
         stem = name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
         low, high = bounds.get(name) or bounds.get(stem) or default
-        ranges.append(SliderRange(name, shown_in, float(low), float(high), STEPS[shown_in]))
+        ranges.append(SliderRange(name, unit, float(low), float(high), STEPS[unit]))
     return ranges
 
 
 def primary_variables(names: Sequence[str]) -> list[str]:
-    """Return the variables with sliders: all if there are at most SHOWN_MAX, otherwise those of the whole formation."""
+    """Return the variables with sliders: all, up to SLIDERS_MAX; otherwise those of the whole formation."""
     primary = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
-    return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in primary]
+    return list(names) if len(names) <= SLIDERS_MAX else [name for name in names if name in primary]
 
 
 def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] = ()) -> dict[str, Any]:
@@ -454,8 +458,8 @@ def parse_expressions(text: str, names: Sequence[str], angles: Collection[str] =
     by_variable: dict[str, str] = {}
     constants: dict[str, float] = {}
     for number, line in _lines(text):
-        name, sign, value = (part.strip() for part in line.partition("="))
-        if not sign or not name or not value:
+        name, equals, value = (part.strip() for part in line.partition("="))
+        if not equals or not name or not value:
             allowed = "VARIABLE = EXPRESSION, such as x_c = 5*cos(0.1*t)"
             raise InputError(f"line {number} is {line[:40]!r}; must be {allowed}")
         variable = name.removesuffix(DEGREES)
@@ -481,13 +485,15 @@ def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, A
     """
     points = []
     for number, line in _lines(text):
-        at, colon, rest = line.partition(":")
-        pairs = [(name.strip(), sign, value) for name, sign, value in (pair.partition("=") for pair in rest.split(","))]
-        if not colon or not all(name and sign for name, sign, _ in pairs):
+        time_text, colon, rest = line.partition(":")
+        pairs = [
+            (name.strip(), equals, value) for name, equals, value in (pair.partition("=") for pair in rest.split(","))
+        ]
+        if not colon or not all(name and equals for name, equals, _ in pairs):
             raise InputError(f"line {number} is {line[:40]!r}; must be SECONDS: VARIABLE = VALUE, VARIABLE = VALUE, …")
         shown = {name: _number(value, f"line {number}: {name}") for name, _, value in pairs}
         values = {name: ranges[name].to_si(value) if name in ranges else value for name, value in shown.items()}
-        points.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
+        points.append({"at_s": _number(time_text, f"line {number}: the time"), "values": values})
     if not points:
         raise InputError("waypoints are empty; must have at least one line SECONDS: VARIABLE = VALUE")
     return {"waypoints": points}
@@ -496,21 +502,21 @@ def parse_waypoints(text: str, ranges: Mapping[str, SliderRange]) -> dict[str, A
 def waypoints_from(value: Sequence[float], ranges: Sequence[SliderRange]) -> str:
     """Return two waypoints at the present values of a formation's variables, in the units of the page."""
     pairs = [
-        f"{each.name} = {round(each.in_unit(here), 2):g}"
-        for each, here in zip(ranges, value, strict=True)
+        f"{each.name} = {round(each.in_unit(present), 2):g}"
+        for each, present in zip(ranges, value, strict=True)
         if each.name in PREFILLED
     ]
     return "\n".join(f"{at_s:g}: {', '.join(pairs)}" for at_s in (0.0, WAYPOINT_STEP_S))
 
 
-def is_apart(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
+def differs_by_step(value: Sequence[float], other: Sequence[float], ranges: Sequence[SliderRange]) -> bool:
     """Return whether the prefilled waypoints at two states of a formation differ by more than a step.
 
     If smaller differences counted, the text would change with every estimate.
     """
     return any(
-        abs(round(each.in_unit(here - there), 2)) > each.step
-        for each, here, there in zip(ranges, value, other, strict=True)
+        abs(round(each.in_unit(first - second), 2)) > each.step
+        for each, first, second in zip(ranges, value, other, strict=True)
         if each.name in PREFILLED
     )
 
@@ -521,8 +527,8 @@ def _lines(text: str) -> list[tuple[int, str]]:
     return [(number, line.strip()) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
 
 
-def _number(text: str, what: str) -> float:
+def _number(text: str, label: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"{what} is {text.strip()[:40]!r}; must be a number") from None
+        raise InputError(f"{label} is {text.strip()[:40]!r}; must be a number") from None

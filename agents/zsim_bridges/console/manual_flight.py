@@ -26,7 +26,7 @@ from zsim.vehicles.vehicle import Limits
 from zsim_agents.references.cruise import Course, Cruise
 from zsim_agents.references.flight import limits_of
 from zsim_bridges.console.console_page import PageForms
-from zsim_bridges.console.formation_form import SIDEWAYS_M, height_range_m
+from zsim_bridges.console.formation_form import HORIZONTAL_RANGE_M, height_range_m
 from zsim_bridges.console.orders import CommandClient, NoAnswer
 from zsim_bridges.console.picture import PLAN_DIGITS, plan_formations, plan_positions, surroundings
 from zsim_bridges.console.run_monitor import RunMonitor
@@ -34,20 +34,20 @@ from zsim_bridges.console.scene import RunScene
 
 PERIOD_S = 0.05  # wall; period of commands: at 5 × real time, two in the 0.5 s simulated after which firmware hovers
 STALE_S = 0.5  # wall; the drone of a page that is silent for longer hovers; equal to the firmware's limit of silence
-GONE_S = 5.0  # wall; time after which the drone of a lost page is released, unless the page has been reloaded
+PAGE_TIMEOUT_S = 5.0  # wall; time after which the drone of a lost page is released, unless the page has been reloaded
 REPEAT_S = 1.0  # wall; time after which an unanswered request for a drone is repeated
 SETTLED_S = 1.5  # wall; time after which a view must show who has acquired a drone; views arrive 20 times a second
 RATE_MAX = 5.0  # × real time; at a higher rate nobody can fly manually, and the firmware mistakes pauses for silence
 CLIMB_SHARE = 0.5  # ratio of climb to horizontal speed; design choice: height is harder to judge on a page
 YAW_RATE_RAD_S = math.radians(45.0)  # design choice: a full turn in 8 s
 SPEED_M_S = 1.5  # speed towards a waypoint; design choice: that of the paper's formations
-NEAR_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one
+WAYPOINT_REACHED_M = 0.5  # distance from a waypoint at which a drone proceeds to the next one
 WAYPOINTS_MAX = 50  # maximum number per drone; design choice: more would no longer be manual flight
 BRAKE_S = 1.0  # time constant of braking before the fence; design choice: three times the lag of the velocity loop
 ABOVE_START_M = 0.5  # horizontal distance from its start at which a drone lands; design choice: the size of a hull
 OVER_STARTS_M = 0.5  # distance from the middle of its drones' starts at which a formation lands
 OVERRULED_M = 1.0  # a returning formation counts as sent elsewhere when its goal recedes by more than this
-MIDDLE = ("x_c", "y_c")  # the variables of a formation that a return sets
+CENTRE_VARIABLES = ("x_c", "y_c")  # the variables of a formation that a return sets
 Point = tuple[float, float]  # x, y [m; W]
 
 
@@ -70,17 +70,17 @@ class DronePose(NamedTuple):
     t_s: float = 0.0
 
 
-class FlownVelocity(NamedTuple):
+class VelocityCommand(NamedTuple):
     """A velocity command in the heading frame."""
 
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
     yaw_rate_rad_s: float = 0.0
 
 
-HOVER = FlownVelocity()
+HOVER = VelocityCommand()
 
 
-class DroneSight(NamedTuple):
+class DroneStatus(NamedTuple):
     """What the console knows of a drone: its firmware's state (empty before the first view), commander and estimate."""
 
     state: str = ""
@@ -88,12 +88,12 @@ class DroneSight(NamedTuple):
     pose: DronePose | None = None
 
 
-class RunSight(NamedTuple):
+class RunStatus(NamedTuple):
     """The part of a run's state that matters to manual flight."""
 
-    off: str = ""  # why nothing can be flown; otherwise empty
+    refusal: str = ""  # why nothing can be flown; otherwise empty
     rate: float = 1.0  # simulated seconds per wall second, as measured
-    paused: bool = False
+    is_paused: bool = False
     silence: str = ""  # description of a silent world, which does not prevent a request for a drone
 
 
@@ -123,7 +123,7 @@ class Geofence(NamedTuple):
                 return f"{axis} is {value:.1f} m, outside the geofence: {low:g} to {high:g} m"
         return ""
 
-    def within(self, velocity_W: Vector, p_W: Vector) -> Vector:
+    def limit_velocity(self, velocity_W: Vector, p_W: Vector) -> Vector:
         """Return a demanded velocity [m/s], slowed down so that a drone at `p_W` [m] comes to rest at the fence.
 
         Braking begins BRAKE_S before the fence would be reached; a drone outside the fence may return.
@@ -138,23 +138,23 @@ class Geofence(NamedTuple):
 def geofence_of(scenario: Scenario) -> Geofence:
     xs, ys, _ = zip(*(drone.position_m for drone in scenario.drones), strict=True)
     low_m, top_m = height_range_m(scenario.drones)
-    corner_m = (round(min(xs)) - SIDEWAYS_M, round(min(ys)) - SIDEWAYS_M, low_m)
-    return Geofence(corner_m, (round(max(xs)) + SIDEWAYS_M, round(max(ys)) + SIDEWAYS_M, top_m))
+    corner_m = (round(min(xs)) - HORIZONTAL_RANGE_M, round(min(ys)) - HORIZONTAL_RANGE_M, low_m)
+    return Geofence(corner_m, (round(max(xs)) + HORIZONTAL_RANGE_M, round(max(ys)) + HORIZONTAL_RANGE_M, top_m))
 
 
-def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofence) -> FlownVelocity:
+def stick_velocity(stick: Stick, pose: DronePose, limits: Limits, fence: Geofence) -> VelocityCommand:
     """Return the velocity that a stick demands, within the drone's limits and the fence."""
     speed = min(max(stick.speed_m_s, 0.0), limits.horizontal_speed_m_s)
     deflection = max(1.0, el.hypot(stick.forward, stick.left))
     climb = stick.up * min(CLIMB_SHARE * speed, limits.vertical_speed_m_s)
-    wanted = (stick.forward / deflection * speed, stick.left / deflection * speed, climb)
+    demanded = (stick.forward / deflection * speed, stick.left / deflection * speed, climb)
     yaw_rate = stick.turn * min(YAW_RATE_RAD_S, math.radians(limits.yaw_rate_deg_s))
-    return FlownVelocity(_fenced(turned_about_up(wanted, pose.yaw_rad), pose, fence), yaw_rate)
+    return VelocityCommand(_fenced(turned_about_up(demanded, pose.yaw_rad), pose, fence), yaw_rate)
 
 
 def _fenced(velocity_W: Vector, pose: DronePose, fence: Geofence) -> Vector:
     """Convert a velocity from W to the heading frame, slowed down so that it does not lead out of the fence."""
-    return turned_about_up(fence.within(velocity_W, pose.p_W), -pose.yaw_rad)
+    return turned_about_up(fence.limit_velocity(velocity_W, pose.p_W), -pose.yaw_rad)
 
 
 def _too_fast(rate: float) -> str:
@@ -168,7 +168,7 @@ class _Flight:
 
     drone: str
     modes: int  # number of modes requested of the drone so far; a further one ends the flight
-    begun_s: float  # when the page requested it
+    started_s: float  # when the page requested it
     seen_s: float  # when the page last sent something
     id: str = ""  # id of the page's request
     owned_s: float | None = None  # when the world granted it; None before
@@ -176,7 +176,7 @@ class _Flight:
     stick: Stick | None = None  # present deflection; None: hover, or fly to `waypoints_W`
     waypoints_W: tuple[Vector, ...] = ()  # the drone's destinations, in order
     sent_W: Vector | None = None  # waypoint to which the drone's course leads, or None
-    lost: bool = False  # whether the page's connection is gone
+    is_lost: bool = False  # whether the page's connection is gone
     requested_s: float = 0.0  # when the drone was last requested from the world
     is_requested: bool = False  # whether the world's answer is outstanding
 
@@ -197,8 +197,8 @@ class ManualFlight:
         courses: Mapping[str, Course],
         fence: Geofence,
         gate_s: float,
-        sight_of: Callable[[str], DroneSight],
-        run_sight: Callable[[], RunSight],
+        drone_status: Callable[[str], DroneStatus],
+        run_status: Callable[[], RunStatus],
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._client = client
@@ -207,12 +207,12 @@ class ManualFlight:
         self._courses = courses
         self._fence = fence
         self._gate_s = gate_s
-        self._sight_of = sight_of
-        self._run_sight = run_sight
+        self._drone_status = drone_status
+        self._run_status = run_status
         self._wall_s = wall_s
         self._lock = threading.RLock()
         self._flights: dict[Any, _Flight] = {}
-        self._texts: dict[Any, FlightAnswer] = {}  # by page: why it does not, or no longer, fly a drone
+        self._last_answers: dict[Any, FlightAnswer] = {}  # by page: why it does not, or no longer, fly a drone
         self._released: dict[str, float] = {}  # by released drone: when to check its release [s; wall]
         self._ticked_s = wall_s()
         self._wake = threading.Event()  # set when something must be sent at once
@@ -238,30 +238,34 @@ class ManualFlight:
             thread.join(STALE_S)
             for page in list(self._flights):
                 self.leave(page)
-            self._give_back(self._wall_s())
+            self._release_drones(self._wall_s())
 
-    def take(self, page: Any, drone: str, over: bool, request: str = "") -> FlightAnswer:
-        """Acquire a drone for a page; with `over`, even from its present commander, by the priority of operators.
+    def take(self, page: Any, drone: str, take_over: bool, request: str = "") -> FlightAnswer:
+        """Acquire a drone for a page; with `take_over`, even from its present commander, by the priority of operators.
 
         A request repeated with the same id is carried out once; a page that has reconnected keeps its drone.
         """
         with self._lock:
-            if request and self._texts.get(page, FlightAnswer()).id == request:
-                return self._texts[page]
-            known = next((key for key, flight in self._flights.items() if request and flight.id == request), None)
-            if known is not None:
-                flight = self._flights[page] = self._flights.pop(known)
-                flight.seen_s, flight.lost = self._wall_s(), False
+            if request and self._last_answers.get(page, FlightAnswer()).id == request:
+                return self._last_answers[page]
+            previous_page = next(
+                (key for key, flight in self._flights.items() if request and flight.id == request), None
+            )
+            if previous_page is not None:
+                flight = self._flights[page] = self._flights.pop(previous_page)
+                flight.seen_s, flight.is_lost = self._wall_s(), False
                 return self.answer(page)
             if page in self._flights:
                 self.leave(page)
-            self._texts.pop(page, None)
-            refusal, who = self._take_refusal(drone), self._sight_of(drone).commander
-            may_be_over = not refusal and not over and who not in (None, self._name)
-            if refusal or may_be_over:
-                text = refusal or f"{drone} is flown by {who}"
-                self._texts[page] = FlightAnswer(drone, text=text, over=may_be_over, commander=who or "", id=request)
-                return self._texts[page]
+            self._last_answers.pop(page, None)
+            refusal, commander = self._take_refusal(drone), self._drone_status(drone).commander
+            can_take_over = not refusal and not take_over and commander not in (None, self._name)
+            if refusal or can_take_over:
+                text = refusal or f"{drone} is flown by {commander}"
+                self._last_answers[page] = FlightAnswer(
+                    drone, text=text, over=can_take_over, commander=commander or "", id=request
+                )
+                return self._last_answers[page]
             now_s = self._wall_s()
             flight = _Flight(drone, self._client.modes_requested(drone), now_s, now_s, request)
             self._flights[page] = flight
@@ -270,7 +274,7 @@ class ManualFlight:
 
     def _request(self, flight: _Flight) -> None:
         flight.requested_s, flight.is_requested = self._wall_s(), True
-        self._client.take(flight.drone, partial(self._on_taken, flight))
+        self._client.take(flight.drone, partial(self._on_acquired, flight))
 
     def steer(self, page: Any, stick: Stick | None) -> FlightAnswer:
         """Fly the page's drone by a stick; None: the dead-man key is released, so hover, or continue to a waypoint."""
@@ -284,27 +288,27 @@ class ManualFlight:
                 flight.stick, flight.seen_s = stick, self._wall_s()
         return self.answer(page)
 
-    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None, then: bool = False) -> FlightAnswer:
+    def go(self, page: Any, x_m: float, y_m: float, z_m: float | None = None, append: bool = False) -> FlightAnswer:
         """Fly the page's drone to a point [m; W], at the drone's present height unless `z_m` is given.
 
         Args:
-            then: append the point to the present waypoints instead of replacing them.
+            append: append the point to the present waypoints instead of replacing them.
         """
         with self._lock:
             flight = self._flights.get(page)
             if flight is None:
                 return self.answer(page)._replace(text="no drone is flown from this page; take one first")
-            pose, refusal = self._sight_of(flight.drone).pose, self._fence.refusal(x_m, y_m)
+            pose, refusal = self._drone_status(flight.drone).pose, self._fence.refusal(x_m, y_m)
             if refusal or pose is None:
                 return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
             waypoint = x_m, y_m, pose.p_W[2] if z_m is None else z_m
-            before = flight.waypoints_W if then else ()
+            before = flight.waypoints_W if append else ()
             flight.stick, flight.seen_s = None, self._wall_s()
             if before[-1:] != (waypoint,):  # a page repeats an unconfirmed request
                 flight.waypoints_W = (*before[: WAYPOINTS_MAX - 1], waypoint)
         return self.answer(page)
 
-    def is_on_way(self, page: Any) -> bool:
+    def has_waypoints(self, page: Any) -> bool:
         with self._lock:
             flight = self._flights.get(page)
             return flight is not None and bool(flight.waypoints_W)
@@ -316,29 +320,29 @@ class ManualFlight:
             if flight is not None:
                 self._released[flight.drone] = -math.inf
                 self._wake.set()
-                if not flight.lost:
-                    self._texts[page] = FlightAnswer(flight.drone, text=text, id=flight.id)
+                if not flight.is_lost:
+                    self._last_answers[page] = FlightAnswer(flight.drone, text=text, id=flight.id)
         return self.answer(page)
 
     def lose(self, page: Any) -> None:
-        """Record that a page's connection is lost: its drone hovers at once, and is released after GONE_S."""
+        """Record that a page's connection is lost: its drone hovers at once, and is released after PAGE_TIMEOUT_S."""
         with self._lock:
             flight = self._flights.get(page)
-            self._texts.pop(page, None)
+            self._last_answers.pop(page, None)
             if flight is not None:
-                flight.stick, flight.waypoints_W, flight.lost = None, (), True
+                flight.stick, flight.waypoints_W, flight.is_lost = None, (), True
                 self._send_soon(flight)
 
     def answer(self, page: Any) -> FlightAnswer:
         with self._lock:
             flight = self._flights.get(page)
             if flight is None:
-                return self._texts.get(page, FlightAnswer())
+                return self._last_answers.get(page, FlightAnswer())
             if flight.owned_s is None:
-                silence = self._run_sight().silence
-                text = f"requested {self._wall_s() - flight.begun_s:.1f} s ago, not confirmed"
+                silence = self._run_status().silence
+                text = f"requested {self._wall_s() - flight.started_s:.1f} s ago, not confirmed"
                 return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
-            if self._sight_of(flight.drone).pose is None:
+            if self._drone_status(flight.drone).pose is None:
                 text = f"hovers: no estimate of {flight.drone}"
             elif flight.waypoints_W:
                 text = "goes to {:.1f}, {:.1f} m at z = {:.1f} m".format(*flight.waypoints_W[0])
@@ -352,9 +356,9 @@ class ManualFlight:
 
         All commands and releases are sent from here, in one thread: no command may follow a newer one or a release.
         """
-        wall_s, run = self._wall_s(), self._run_sight()
+        wall_s, run = self._wall_s(), self._run_status()
         stalled_s, self._ticked_s = wall_s - self._ticked_s, wall_s
-        stall = f"the console stood still for {stalled_s:.0f} s" if stalled_s > GONE_S else ""
+        stall = f"the console stood still for {stalled_s:.0f} s" if stalled_s > PAGE_TIMEOUT_S else ""
         period_s = max(PERIOD_S * 0.9, self._gate_s / max(run.rate, 1e-3))  # a slow run has few gates a second
         for page, flight in list(self._flights.items()):
             reason = stall or self._end_reason(flight, run, wall_s)
@@ -363,32 +367,32 @@ class ManualFlight:
             elif flight.owned_s is None:
                 if not flight.is_requested and not run.silence and wall_s - flight.requested_s >= REPEAT_S:
                     self._request(flight)
-            elif not run.paused and wall_s - flight.sent_s >= period_s:
+            elif not run.is_paused and wall_s - flight.sent_s >= period_s:
                 flight.sent_s = wall_s
-                flown = self._velocity(flight, wall_s)
-                self._client.send_velocity(flight.drone, flown.velocity_m_s, flown.yaw_rate_rad_s)
-        self._give_back(wall_s)
+                command = self._velocity(flight, wall_s)
+                self._client.send_velocity(flight.drone, command.velocity_m_s, command.yaw_rate_rad_s)
+        self._release_drones(wall_s)
 
-    def _give_back(self, wall_s: float) -> None:
+    def _release_drones(self, wall_s: float) -> None:
         """Release drones, and again if a command accepted after the release made the console their commander."""
         with self._lock:
             due = [drone for drone, at_s in self._released.items() if wall_s >= at_s]
-            flown = {flight.drone for flight in self._flights.values()}
+            flown_drones = {flight.drone for flight in self._flights.values()}
             for drone in due:
                 first = self._released.pop(drone) == -math.inf
-                if drone not in flown and (first or self._sight_of(drone).commander == self._name):
+                if drone not in flown_drones and (first or self._drone_status(drone).commander == self._name):
                     self._released[drone] = wall_s + SETTLED_S
-                    self._client.give_back(drone)
+                    self._client.release_drone(drone)
 
     def _take_refusal(self, drone: str) -> str:
-        run, sight = self._run_sight(), self._sight_of(drone)
+        run, status = self._run_status(), self._drone_status(drone)
         if drone not in self._limits:
             return f"drone is {drone!r}; must be one of the run's"
         if any(flight.drone == drone for flight in self._flights.values()):
             return f"{drone} is flown from another page"
-        return run.off or _too_fast(run.rate) or state_refusal(drone, sight.state or "unseen", "velocity") or ""
+        return run.refusal or _too_fast(run.rate) or state_refusal(drone, status.state or "unseen", "velocity") or ""
 
-    def _on_taken(self, flight: _Flight, refusal: str) -> None:
+    def _on_acquired(self, flight: _Flight, refusal: str) -> None:
         with self._lock:
             flight.is_requested = False
             page = next((key for key, each in self._flights.items() if each is flight), None)
@@ -399,44 +403,44 @@ class ManualFlight:
                 return  # `tick` requests it again
             elif refusal:
                 del self._flights[page]
-                if not flight.lost:
-                    self._texts[page] = FlightAnswer(flight.drone, text=refusal, id=flight.id)
+                if not flight.is_lost:
+                    self._last_answers[page] = FlightAnswer(flight.drone, text=refusal, id=flight.id)
             else:
                 flight.owned_s = self._wall_s()
 
-    def _end_reason(self, flight: _Flight, run: RunSight, wall_s: float) -> str:
-        drone, sight = flight.drone, self._sight_of(flight.drone)
-        if wall_s - flight.seen_s > GONE_S:
+    def _end_reason(self, flight: _Flight, run: RunStatus, wall_s: float) -> str:
+        drone, status = flight.drone, self._drone_status(flight.drone)
+        if wall_s - flight.seen_s > PAGE_TIMEOUT_S:
             return "the page was silent"
         if self._client.modes_requested(drone) != flight.modes:
             return f"another mode of {drone} was requested"
-        if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and sight.commander != self._name:
-            return f"{drone} is flown by {sight.commander or 'nobody'} now"
-        off = run.off or (run.silence if flight.owned_s is not None else "")
-        return off or _too_fast(run.rate / 2.0) or state_refusal(drone, sight.state, "velocity") or ""
+        if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and status.commander != self._name:
+            return f"{drone} is flown by {status.commander or 'nobody'} now"
+        refusal = run.refusal or (run.silence if flight.owned_s is not None else "")
+        return refusal or _too_fast(run.rate / 2.0) or state_refusal(drone, status.state, "velocity") or ""
 
-    def _velocity(self, flight: _Flight, wall_s: float) -> FlownVelocity:
-        pose, limits, stick = self._sight_of(flight.drone).pose, self._limits[flight.drone], flight.stick
+    def _velocity(self, flight: _Flight, wall_s: float) -> VelocityCommand:
+        pose, limits, stick = self._drone_status(flight.drone).pose, self._limits[flight.drone], flight.stick
         waypoint = self._next_waypoint(flight, pose) if stick is None else None
         if wall_s - flight.seen_s > STALE_S or pose is None:
             waypoint = stick = None
-        before, flight.sent_W = flight.sent_W, waypoint
+        previous, flight.sent_W = flight.sent_W, waypoint
         if pose is None or waypoint is None:
             return HOVER if pose is None or stick is None else stick_velocity(stick, pose, limits, self._fence)
-        course, here, moving = self._courses[flight.drone], (*pose.p_W, pose.yaw_rad), (*pose.v_W, 0.0)
-        if before is None:
+        course, position, velocity = self._courses[flight.drone], (*pose.p_W, pose.yaw_rad), (*pose.v_W, 0.0)
+        if previous is None:
             course.leave()  # otherwise it would continue from the end of the previous flight to a waypoint
-        if waypoint != before:
+        if waypoint != previous:
             climb_m_s = CLIMB_SHARE * min(SPEED_M_S, limits.horizontal_speed_m_s)
-            course.send((*waypoint, None), pose.t_s, here, moving, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
-        velocity_W, turn = course.velocity(pose.t_s, here, moving)
-        return FlownVelocity(_fenced(velocity_W, pose, self._fence), turn)
+            course.send((*waypoint, None), pose.t_s, position, velocity, speeds=Cruise(SPEED_M_S, climb_m_s, climb_m_s))
+        velocity_W, turn = course.velocity(pose.t_s, position, velocity)
+        return VelocityCommand(_fenced(velocity_W, pose, self._fence), turn)
 
     def _next_waypoint(self, flight: _Flight, pose: DronePose | None) -> Vector | None:
         """Return the drone's next waypoint after dropping the one that it has reached, unless that is the last."""
         with self._lock:
             waypoints = flight.waypoints_W
-            if pose is not None and len(waypoints) > 1 and el.distance(pose.p_W, waypoints[0]) <= NEAR_M:
+            if pose is not None and len(waypoints) > 1 and el.distance(pose.p_W, waypoints[0]) <= WAYPOINT_REACHED_M:
                 waypoints = flight.waypoints_W = waypoints[1:]
             return next(iter(waypoints), None)
 
@@ -475,11 +479,13 @@ class PageFlying:
             drone.name: Course(limits_of(drone, gravity_m_s2), drone.reference or Piloted())
             for drone in run.scenario.drones
         }
-        self.control = ManualFlight(client, name, limits, courses, fence, gate_s, self._sight, self._run_sight)
-        self.returns = ReturnFlights(run.scenario, client, self.control, self._sight, lambda: views.clusters, note)
+        self.control = ManualFlight(client, name, limits, courses, fence, gate_s, self._drone_status, self._run_status)
+        self.returns = ReturnFlights(
+            run.scenario, client, self.control, self._drone_status, lambda: views.clusters, note
+        )
 
-    def plan(self, client_id: int | None, whole: bool) -> dict[str, Any]:
-        """Return the plan view as plain data; with `whole`, including the constant part and the past trails."""
+    def plan(self, client_id: int | None, complete: bool) -> dict[str, Any]:
+        """Return the plan view as plain data; with `complete`, including the constant part and the past trails."""
         drones, chosen = self._scene.drones, self.pages.chosen(client_id)
         if drones is None:
             return {"t_s": None, "chosen": chosen}
@@ -494,28 +500,28 @@ class PageFlying:
             "trail_s": self._scene.trails.length_s,
             "trails_number": self._scene.trails.number,
         }
-        if not whole:
+        if not complete:
             return shown
         return {**shown, **self._surroundings, "trails": self._scene.trails.lines(drones.t_ns / 1e9, drones.p_W)}
 
-    def _sight(self, drone: str) -> DroneSight:
+    def _drone_status(self, drone: str) -> DroneStatus:
         view = self._views.drones
-        seen = next((each for each in view.drones if each.name == drone), None) if view else None
-        if seen is None:
-            return DroneSight()
+        drone_view = next((each for each in view.drones if each.name == drone), None) if view else None
+        if drone_view is None:
+            return DroneStatus()
         received = self._views.estimates().get(drone)
         pose = None
         if received is not None and received.fresh:
             estimate = received.estimate
             t_s = received.t_ns * 1e-9
             pose = DronePose(estimate.position_m, estimate.yaw_rad, estimate.velocity_m_s, t_s)
-        return DroneSight(seen.state, seen.commander, pose)
+        return DroneStatus(drone_view.state, drone_view.commander, pose)
 
-    def _run_sight(self) -> RunSight:
+    def _run_status(self) -> RunStatus:
         clock, run = self._monitor.time_monitor.clock, self._monitor.now()
-        silence, off = run.off() if run.silent_s else "", run._replace(silent_s=0.0).grounded()
+        silence, refusal = run.outage() if run.silent_s else "", run._replace(silent_s=0.0).flight_refusal()
         is_paused = clock is not None and clock.state != "running"
-        return RunSight(off, clock.rate if clock else 1.0, is_paused, "" if off else silence)
+        return RunStatus(refusal, clock.rate if clock else 1.0, is_paused, "" if refusal else silence)
 
 
 class ReturningDrone(NamedTuple):
@@ -538,28 +544,28 @@ class ReturnFlights:
         scenario: Scenario,
         client: CommandClient,
         control: ManualFlight,
-        sight_of: Callable[[str], DroneSight],
+        status_of: Callable[[str], DroneStatus],
         clusters: Callable[[], Mapping[str, ViewCluster]],
         note: Callable[[str, str], None] = lambda subject, why: None,
     ) -> None:
         self._client = client
         self._control = control
-        self._sight_of = sight_of
+        self._status_of = status_of
         self._clusters = clusters
         self._note = note
         self._lock = threading.Lock()
         self.starts: dict[str, Point] = {each.name: each.position_m[:2] for each in scenario.drones}
-        self.middles: dict[str, Point] = {}
+        self.centres: dict[str, Point] = {}
         for cluster in scenario.clusters:
             x_m, y_m = np.mean([self.starts[name] for name in cluster.drones], axis=0).tolist()
-            self.middles[cluster.name] = (round(x_m, 2), round(y_m, 2))
+            self.centres[cluster.name] = (round(x_m, 2), round(y_m, 2))
         self._drones: set[str] = set()
         self._formations: dict[str, _ReturningFormation] = {}
 
     def request_drones(self, drones: Sequence[str]) -> None:
         """Take over each drone, fly it above its start at its present height, and land it there."""
         for drone in drones:
-            answer = self._control.take(ReturningDrone(drone), drone, over=True)
+            answer = self._control.take(ReturningDrone(drone), drone, take_over=True)
             if answer.state == "none":
                 self._note(drone, answer.text)
                 continue
@@ -568,7 +574,7 @@ class ReturnFlights:
 
     def request_formation(self, cluster: str) -> None:
         """Move a formation, in its present shape, above the middle of its drones' starts, and land it there."""
-        values = dict(zip(MIDDLE, self.middles[cluster], strict=True))
+        values = dict(zip(CENTRE_VARIABLES, self.centres[cluster], strict=True))
         self._client.request_cluster(cluster, "target", values=values)
         with self._lock:
             self._formations[cluster] = _ReturningFormation(self._client.cluster_requests[cluster])
@@ -593,7 +599,7 @@ class ReturnFlights:
 
     def _continue_drone(self, drone: str) -> bool:
         """Send a drone to its start, or land it if it is above; return whether it is still returning."""
-        key, pose = ReturningDrone(drone), self._sight_of(drone).pose
+        key, pose = ReturningDrone(drone), self._status_of(drone).pose
         answer = self._control.steer(key, None)  # keeps the flight alive, as an open page does
         if answer.state == "none":
             self._note(drone, f"return of {drone} is over: {answer.text or 'it was released'}")
@@ -605,7 +611,7 @@ class ReturnFlights:
             self._control.leave(key)
             self._client.send_mode([drone], "land")
             return False
-        if not self._control.is_on_way(key):
+        if not self._control.has_waypoints(key):
             self._control.go(key, x_m, y_m)
         return True
 
@@ -618,12 +624,14 @@ class ReturnFlights:
             self._note(name, f"return of {name} is over: it is {view.phase}")
             return False
         desired, value = (dict(zip(view.names, c, strict=True)) for c in (view.desired, view.value))
-        goal_m, away_m = (math.dist([c[each] for each in MIDDLE], self.middles[name]) for c in (desired, value))
+        goal_m, distance_m = (
+            math.dist([c[each] for each in CENTRE_VARIABLES], self.centres[name]) for c in (desired, value)
+        )
         returning.nearest_m = min(returning.nearest_m, goal_m)
         if goal_m > returning.nearest_m + OVERRULED_M:
             self._note(name, f"return of {name} is over: it was sent elsewhere")
             return False
-        if max(goal_m, away_m) > OVER_STARTS_M:
+        if max(goal_m, distance_m) > OVER_STARTS_M:
             return True
         self._client.request_cluster(name, "land")
         return False

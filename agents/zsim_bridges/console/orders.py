@@ -35,10 +35,10 @@ THREADS_PER_POOL = 8  # pools are separate, since unanswered requests must not d
 ANSWER_TIMEOUT_S = 5.0  # the world and controllers normally answer within a gate
 EMERGENCY_TIMEOUT_S = 1.0  # for acquiring a drone that is to be stopped; then the mode is sent even without an answer
 ACCEPTANCE_TIMEOUT_S = 1.0  # for the world to accept a command, after which the drone is released
-OVERTAKEN = "superseded by a later emergency"
+SUPERSEDED = "superseded by a later emergency"
 Task = Callable[[], None]
 REPEAT_S = 1.0  # wall; an order without an effect for this long is sent again: the world answers within a gate
-KEPT = 200  # number of settled orders that are remembered: three minutes at one click a second
+ORDERS_KEPT = 200  # number of settled orders that are remembered: three minutes at one click a second
 SHOWN_S = 20.0  # wall; how long pages show a settled order
 NAME_MAX = 64  # maximum number of characters of an id or a name
 REASONS_MAX = 2  # maximum number of an order's targets for which reasons are shown
@@ -125,8 +125,8 @@ class CommandClient:
             ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"console-{kind}")
             for kind in ("request", "mode", "emergency", "release")
         ]
-        self._requests, modes, stops, self._releases = self._pools
-        self._queue = DroneQueue(modes, stops)
+        self._requests, mode_pool, emergency_pool, self._releases = self._pools
+        self._queue = DroneQueue(mode_pool, emergency_pool)
 
     def close(self) -> None:
         self._queue.close()
@@ -134,8 +134,8 @@ class CommandClient:
             pool.shutdown(wait=False, cancel_futures=True)
 
     def request_world(self, op: str, **args: Any) -> None:
-        what = RequestOutcome(f"{op} {arguments_text(args)}".strip(), "")
-        self._submit(self._requests.submit, what, self._request, keys.CONTROL, op, args)
+        outcome = RequestOutcome(f"{op} {arguments_text(args)}".strip(), "")
+        self._submit(self._requests.submit, outcome, self._request, keys.CONTROL, op, args)
 
     def seek(self, t_s: float, step: bool) -> None:
         """Move a replay to a simulated time; with `step`, also play one gate there, which a paused replay shows."""
@@ -165,25 +165,25 @@ class CommandClient:
     def past_views(self, from_s: float, to_s: float, every_s: float) -> list[PastInstant]:
         """Return the views in a replay's record, of one gate every `every_s`; empty if there is no answer."""
         args = {"from_s": from_s, "to_s": to_s, "every_s": every_s}
-        found: dict[int, PastInstant] = {}
+        instants: dict[int, PastInstant] = {}
         with suppress(ZsimError, LookupError, TypeError, ValueError):
             answer = self._link.request(keys.CONTROL, "views", self._name, args, ANSWER_TIMEOUT_S)
             for key, payload in answer.result if answer.ok else ():
                 view = messages.decode(key, payload)
                 if isinstance(view, ViewDrones):
-                    found[view.t_ns] = PastInstant(view, {}, {})
+                    instants[view.t_ns] = PastInstant(view, {}, {})
                 elif isinstance(view, ViewCluster):
-                    found[view.t_ns].clusters[key.rpartition("/")[2]] = view
+                    instants[view.t_ns].clusters[key.rpartition("/")[2]] = view
                 elif isinstance(view, ViewEstimates):
-                    found[view.t_ns].estimates.update({each.name: each for each in view.estimates})
-        return list(found.values())
+                    instants[view.t_ns].estimates.update({each.name: each for each in view.estimates})
+        return list(instants.values())
 
-    def request_cluster(self, cluster: str, op: str, shown: str = "", order: str = "", **args: Any) -> None:
-        """Request an operation of a formation's controller; `shown` describes the arguments as the page shows them."""
+    def request_cluster(self, cluster: str, op: str, args_text: str = "", order: str = "", **args: Any) -> None:
+        """Request an operation of a formation's controller; `args_text` describes its arguments on the page."""
         self.cluster_requests[cluster] += 1
-        text = f"{cluster}: {op} {shown or arguments_text(args)}".strip()
-        what = RequestOutcome(text, "", cluster, op, args, order)
-        self._submit(self._requests.submit, what, self._request, keys.cluster_control(cluster), op, args)
+        text = f"{cluster}: {op} {args_text or arguments_text(args)}".strip()
+        outcome = RequestOutcome(text, "", cluster, op, args, order)
+        self._submit(self._requests.submit, outcome, self._request, keys.cluster_control(cluster), op, args)
 
     def send_mode(self, drones: Sequence[str], mode: str, order: str = "") -> None:
         """Make drones take off, land, stop at once or leave the emergency, whoever commands them.
@@ -193,24 +193,24 @@ class CommandClient:
         """
         for drone in drones:
             self._modes[drone] += 1
-            what = RequestOutcome(f"{drone}: {mode}", "", drone, mode, order=order)
+            outcome = RequestOutcome(f"{drone}: {mode}", "", drone, mode, order=order)
             if mode == "emergency":
                 with self._lock:
                     self._emergencies[drone] += 1
-                self._submit(partial(self._queue.submit_urgent, drone), what, self._send_emergency, drone, mode)
+                self._submit(partial(self._queue.submit_urgent, drone), outcome, self._send_emergency, drone, mode)
             else:
-                turn, stops = partial(self._queue.submit, drone), self._emergencies[drone]
-                self._submit(turn, what, self._acquire_and_send, drone, mode, stops)
+                submit, emergencies = partial(self._queue.submit, drone), self._emergencies[drone]
+                self._submit(submit, outcome, self._acquire_and_send, drone, mode, emergencies)
 
     def modes_requested(self, drone: str) -> int:
         return self._modes[drone]
 
-    def take(self, drone: str, done: Callable[[str], None]) -> None:
-        """Acquire a drone with an operator's priority; `done` receives the reason for a refusal, or an empty text."""
+    def take(self, drone: str, on_done: Callable[[str], None]) -> None:
+        """Acquire a drone with an operator's priority; `on_done` receives the reason for a refusal, or an empty one."""
         with suppress(RuntimeError):  # closed; the run has ended
-            self._requests.submit(lambda: done(_refusal_of(self._acquire, drone, PRIORITY)))
+            self._requests.submit(lambda: on_done(_refusal_of(self._acquire, drone, PRIORITY)))
 
-    def give_back(self, drone: str) -> None:
+    def release_drone(self, drone: str) -> None:
         """Release a drone, which then hovers until another process flies it."""
         with suppress(RuntimeError):
             self._releases.submit(_refusal_of, self._request, keys.CONTROL, "release", {"drone": drone})
@@ -228,27 +228,27 @@ class CommandClient:
         return seq
 
     def _submit(
-        self, begin: Callable[[Callable[[], None]], Any], what: RequestOutcome, act: Callable[..., str], *args: Any
+        self, submit: Callable[[Callable[[], None]], Any], outcome: RequestOutcome, act: Callable[..., str], *args: Any
     ) -> None:
         def done() -> None:
             refusal = _refusal_of(act, *args)
-            self._report(what._replace(refusal=str(refusal), unanswered=isinstance(refusal, NoAnswer)))
+            self._report(outcome._replace(refusal=str(refusal), unanswered=isinstance(refusal, NoAnswer)))
 
         try:
-            begin(done)
+            submit(done)
         except RuntimeError:  # closed; a page of the run may still be open
-            self._report(what._replace(refusal="the run has ended"))
+            self._report(outcome._replace(refusal="the run has ended"))
 
     def _request(self, key: str, op: str, args: dict[str, Any], timeout_s: float = ANSWER_TIMEOUT_S) -> str:
         answer = self._link.request(key, op, self._name, args, timeout_s)
         refusal = "" if answer.ok else answer.error or "refused without a reason"
         return NoAnswer(refusal) if isinstance(answer, Unanswered) else refusal
 
-    def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
-        """Acquire a drone and send the mode, unless more than `stops` emergencies have been requested meanwhile."""
-        if self._emergencies[drone] > stops:
-            return OVERTAKEN
-        return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
+    def _acquire_and_send(self, drone: str, mode: str, emergencies: int) -> str:
+        """Acquire a drone and send the mode, unless more than `emergencies` have been requested meanwhile."""
+        if self._emergencies[drone] > emergencies:
+            return SUPERSEDED
+        return self._acquire(drone, PRIORITY) or self._send(drone, mode, emergencies)
 
     def _send_emergency(self, drone: str, mode: str) -> str:
         """Send the mode even if the drone could not be acquired: the world may accept it anyway."""
@@ -260,18 +260,18 @@ class CommandClient:
     def _acquire(self, drone: str, priority: int, timeout_s: float = ANSWER_TIMEOUT_S) -> str:
         return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority}, timeout_s)
 
-    def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
-        """Send a mode, unless more than `stops` emergencies have been requested; release the drone afterwards."""
-        before, now_ns = self._views.answered_commands(drone), self._now_ns()
+    def _send(self, drone: str, mode: str, emergencies: int | None = None) -> str:
+        """Send a mode, unless more than `emergencies` have been requested; release the drone afterwards."""
+        answered_before, now_ns = self._views.answered_commands(drone), self._now_ns()
         with self._lock:
-            overtaken = stops is not None and self._emergencies[drone] > stops
-            if not overtaken:
+            is_superseded = emergencies is not None and self._emergencies[drone] > emergencies
+            if not is_superseded:
                 key = keys.command(drone, "mode")
                 message = flight_messages.Mode(now_ns, self._next_seq(key), self._name, mode)  # type: ignore[arg-type]
                 self._link.put(key, message)
         with suppress(RuntimeError):  # closed: leaving a run releases all drones
-            self._releases.submit(self._release, drone, before)
-        return OVERTAKEN if overtaken else ""
+            self._releases.submit(self._release, drone, answered_before)
+        return SUPERSEDED if is_superseded else ""
 
     def _release(self, drone: str, before: int) -> None:
         """Release a drone once the world has answered the mode, which needs the operator's priority until then."""
@@ -388,7 +388,7 @@ class _Order:
     targets: dict[str, _Target]  # by name
     given_s: float  # when the order was given [s; wall]
     since_ns: int  # when the order was given [simulated]
-    over_s: float | None = None  # when the order was settled [s; wall]
+    settled_s: float | None = None  # when the order was settled [s; wall]
     confirmed_ns: int | None = None
     refusal: str = ""
     notified: set[str] = field(default_factory=set)  # targets with outcomes that operators were notified of
@@ -443,8 +443,8 @@ class OrderBook:
         with self._lock:
             order = self._orders.get(order_id)
             if order is None:
-                order = self._orders[order_id] = self._new(order_id, request)
-                for settled in [key for key, each in self._orders.items() if each.over_s is not None][:-KEPT]:
+                order = self._orders[order_id] = self._create_order(order_id, request)
+                for settled in [key for key, each in self._orders.items() if each.settled_s is not None][:-ORDERS_KEPT]:
                     del self._orders[settled]
                 if not order.refusal:
                     self._replace_earlier(order)
@@ -476,7 +476,7 @@ class OrderBook:
     def on_event(self, event: Event) -> None:
         subject = commanded_drone(event)
         with self._lock:
-            for order in self._open():
+            for order in self._open_orders():
                 target = order.targets.get(subject)
                 if target is None or not target.is_drone or target.state != "sent":
                     continue
@@ -498,43 +498,43 @@ class OrderBook:
         with self._lock:
             self._paused = paused
             ended, silent, wall_s = self._refusal(), self._silent_s() > 0.0, self._wall_s()
-            for order in self._open():
+            for order in self._open_orders():
                 for name, target in order.targets.items():
                     if target.state != "sent":
                         continue
                     # A formation's controller answers requests: its phase counts only after one had no answer.
                     has_effect = states.get(name) in _CARRIED_OUT[order.op] and (target.is_drone or target.attempts > 1)
-                    waits = target.busy or silent or (paused and target.accepted)
+                    must_wait = target.busy or silent or (paused and target.accepted)
                     if ended:
                         self._settle(order, target, "refused", ended)
                     elif t_ns > order.since_ns and has_effect:
                         self._settle(order, target, "confirmed", t_ns=t_ns)
                     elif target.is_drone and self._client.modes_requested(name) > target.modes:
                         self._settle(order, target, "replaced")
-                    elif not waits and wall_s - target.sent_s >= REPEAT_S:
+                    elif not must_wait and wall_s - target.sent_s >= REPEAT_S:
                         self._send(order, name)
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the orders that pages show, as plain data, the newest first."""
         wall_s = self._wall_s()
         with self._lock:
-            shown = [o for o in self._orders.values() if o.over_s is None or wall_s - o.over_s < SHOWN_S]
+            shown = [o for o in self._orders.values() if o.settled_s is None or wall_s - o.settled_s < SHOWN_S]
             return [self._row(order) for order in reversed(shown)]
 
-    def _open(self) -> list[_Order]:
-        return [order for order in self._orders.values() if order.over_s is None]
+    def _open_orders(self) -> list[_Order]:
+        return [order for order in self._orders.values() if order.settled_s is None]
 
-    def _new(self, order_id: str, request: OrderRequest) -> _Order:
+    def _create_order(self, order_id: str, request: OrderRequest) -> _Order:
         subject = request.drone or request.cluster
         if subject:
-            concerned = [subject]
+            target_names = [subject]
         elif request.op == "emergency":
-            concerned = list(self._drones)
+            target_names = list(self._drones)
         else:
-            led = {name for drones in self._members.values() for name in drones}
-            single = [] if request.op == "hold" else [name for name in self._drones if name not in led]
-            concerned = [*self._members, *single]
-        targets = {name: _Target(is_drone=name in self._drones) for name in concerned}
+            in_formations = {name for drones in self._members.values() for name in drones}
+            single = [] if request.op == "hold" else [name for name in self._drones if name not in in_formations]
+            target_names = [*self._members, *single]
+        targets = {name: _Target(is_drone=name in self._drones) for name in target_names}
         order = _Order(order_id, request.op, subject, targets, self._wall_s(), self._now_ns())
         order.refusal = self._refusal()
         if request.run and request.run != self._run_id:
@@ -544,18 +544,18 @@ class OrderBook:
         elif not targets:
             order.refusal = f"no drone or formation to {request.op}"
         if order.refusal:
-            order.over_s = order.given_s
+            order.settled_s = order.given_s
         return order
 
     def _replace_earlier(self, order: _Order) -> None:
         """Settle earlier orders for the same targets; an emergency also replaces those of formations that it stops."""
-        concerned = set(order.targets)
+        target_names = set(order.targets)
         if order.op == "emergency":
-            concerned |= {name for name, drones in self._members.items() if concerned.issuperset(drones)}
-        for earlier in self._open():
+            target_names |= {name for name, drones in self._members.items() if target_names.issuperset(drones)}
+        for earlier in self._open_orders():
             if earlier is order or (earlier.op == "emergency" and order.op != "emergency"):
                 continue
-            for name in concerned & set(earlier.targets):
+            for name in target_names & set(earlier.targets):
                 if earlier.targets[name].state == "sent":
                     self._settle(earlier, earlier.targets[name], "replaced")
 
@@ -572,16 +572,16 @@ class OrderBook:
     def _settle(self, order: _Order, target: _Target, state: OrderState, reason: str = "", t_ns: int = 0) -> None:
         target.state, target.reason = state, reason
         if all(each.state != "sent" for each in order.targets.values()):
-            order.over_s, order.confirmed_ns = self._wall_s(), t_ns or self._now_ns()
+            order.settled_s, order.confirmed_ns = self._wall_s(), t_ns or self._now_ns()
 
     def _row(self, order: _Order) -> dict[str, Any]:
-        found = {name: target for name, target in order.targets.items() if target.state == order.state}
-        reasons = [f"{name}: {target.reason}" for name, target in found.items() if target.reason]
-        more = [f"{len(reasons) - REASONS_MAX} more"] if len(reasons) > REASONS_MAX else []
-        reason, silent_s, wall_s = "; ".join([*reasons[:REASONS_MAX], *more]), self._silent_s(), self._wall_s()
+        targets = {name: target for name, target in order.targets.items() if target.state == order.state}
+        reasons = [f"{name}: {target.reason}" for name, target in targets.items() if target.reason]
+        omitted = [f"{len(reasons) - REASONS_MAX} more"] if len(reasons) > REASONS_MAX else []
+        reason, silent_s, wall_s = "; ".join([*reasons[:REASONS_MAX], *omitted]), self._silent_s(), self._wall_s()
         if order.state == "sent" and silent_s:
             reason = f"the world has not answered for {silent_s:.0f} s"
-        elif order.state == "sent" and self._paused and all(target.accepted for target in found.values()):
+        elif order.state == "sent" and self._paused and all(target.accepted for target in targets.values()):
             reason = "accepted by the world, which is paused"
         return {
             "id": order.id,
@@ -589,9 +589,9 @@ class OrderBook:
             "subject": order.subject,
             "state": order.state,
             "age_s": wall_s - order.given_s,
-            "over_s": None if order.over_s is None else wall_s - order.over_s,
+            "over_s": None if order.settled_s is None else wall_s - order.settled_s,
             "t_s": None if order.confirmed_ns is None else order.confirmed_ns / 1e9,
-            "waiting": list(found) if order.state == "sent" else [],
+            "waiting": list(targets) if order.state == "sent" else [],
             "reason": order.refusal or reason,
         }
 
@@ -613,10 +613,10 @@ class PendingRequests:
 
     def accept(self, subject: str, op: str, text: str, args: Mapping[str, Any]) -> bool:
         """Keep a request; return whether its completion can be observed."""
-        known = op in PHASES_DONE or op in STATES_DONE or (op == "target" and bool(args.get("values")))
-        if known:
+        is_observable = op in PHASES_DONE or op in STATES_DONE or (op == "target" and bool(args.get("values")))
+        if is_observable:
             self._pending[subject] = PendingRequest(subject, op, text, args.get("values", {}))
-        return known
+        return is_observable
 
     def pop_done(self, clusters: Mapping[str, ViewCluster], drones: Mapping[str, str]) -> list[PendingRequest]:
         done = [each for each in list(self._pending.values()) if _is_done(each, clusters, drones)]

@@ -29,9 +29,9 @@ from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 Severity = Literal["amber", "red"]
 BATTERY_LOW_PERCENT, BATTERY_EMPTY_PERCENT = 20.0, 10.0  # thresholds of amber and red; the AR.Drone warns at the first
 UPSIDE_DOWN_DEG = 90.0
-LATE_MS = 200.0  # an estimator's lag above which an alarm is raised: ten gates of 20 ms
+LAG_MAX_MS = 200.0  # an estimator's lag above which an alarm is raised: ten gates of 20 ms
 SIGMA_HIGH_M = 2.0  # σ of a position above which an alarm is raised: the largest distance between the paper's drones
-LINK_OLD_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # alarm thresholds; PX4 leaves offboard mode after the first
+LINK_AGE_MAX_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # alarm thresholds; PX4 leaves offboard mode after the first
 LOST = {
     "death": "dead",
     "no_show": "missing",
@@ -41,7 +41,7 @@ LOST = {
     "diverged": "diverged",
 }
 """Kinds of events that report the loss of a process or drone, with the names of the alarms."""
-BACK = frozenset({*ADMISSIONS, "silent_end", "leave"})  # kinds of events that end a loss; `drop` does not
+RETURN_KINDS = frozenset({*ADMISSIONS, "silent_end", "leave"})  # kinds of events that end a loss; `drop` does not
 OFF_REFERENCE_M = 2.0  # alarm threshold of a length's error: the smallest distance between the paper's drones
 FLOWN_PHASES = frozenset({"assembling", "engaged"})  # phases in which a formation's controller flies all of its drones
 
@@ -82,10 +82,10 @@ def battery_severity(percent: float) -> Severity | None:
 
 
 def drone_alarms(drone: DroneCondition) -> list[Alarm]:
-    found: list[Alarm] = []
+    alarms: list[Alarm] = []
 
     def add(severity: Severity, name: str, text: str = "") -> None:
-        found.append(Alarm(severity, drone.name, name, text))
+        alarms.append(Alarm(severity, drone.name, name, text))
 
     if drone.state == "emergency":
         add("red", "emergency", drone.failsafe or "rotors stopped")
@@ -97,18 +97,18 @@ def drone_alarms(drone: DroneCondition) -> list[Alarm]:
         add(severity, "battery", f"{drone.battery_percent:.0f} %")
     if drone.estimate_lost:
         add("red", "no estimate")
-    elif (drone.lag_ms or 0.0) > LATE_MS:
+    elif (drone.lag_ms or 0.0) > LAG_MAX_MS:
         add("amber", "estimate late", f"{drone.lag_ms:.0f} ms")
     if (drone.sigma_m or 0.0) > SIGMA_HIGH_M:
         add("amber", "sigma", f"{drone.sigma_m:.1f} m")
     if drone.link_state == "lost":
         add("red", "link lost")
-        return found
-    if (drone.link_age_ms or 0.0) > LINK_OLD_MS:
+        return alarms
+    if (drone.link_age_ms or 0.0) > LINK_AGE_MAX_MS:
         add("amber", "link old", f"{drone.link_age_ms:.0f} ms")
     if (drone.link_loss_percent or 0.0) > LINK_LOSS_PERCENT:
         add("amber", "link loss", f"{drone.link_loss_percent:.0f} %")
-    return found
+    return alarms
 
 
 def formation_alarms(
@@ -123,21 +123,21 @@ def formation_alarms(
         foreign: for each formation, the commanders of its drones other than its controller, by drone.
         views: newest view of each formation.
     """
-    found = []
+    alarms = []
     for name, (phase, reason) in phases.items():
         if TOO_NEAR in reason:
-            found.append(Alarm("red", name, "too near", reason))
+            alarms.append(Alarm("red", name, "too near", reason))
         elif phase == "held" and HELD_ON_REQUEST not in reason:
-            found.append(Alarm("amber", name, "held", reason))
+            alarms.append(Alarm("amber", name, "held", reason))
         if phase in FLOWN_PHASES and foreign.get(name):
-            found.append(Alarm("amber", name, "other commanders", foreign_text(foreign[name])))
-        if phase == "engaged" and (strayed := _strayed(views[name])):
-            found.append(Alarm("red", name, "off reference", strayed))
-    return found
+            alarms.append(Alarm("amber", name, "other commanders", foreign_text(foreign[name])))
+        if phase == "engaged" and (deviation := _largest_deviation(views[name])):
+            alarms.append(Alarm("red", name, "off reference", deviation))
+    return alarms
 
 
 def foreign_text(commanders: Mapping[str, str]) -> str:
-    return ", ".join(f"{drone} is flown by {who}" for drone, who in commanders.items())
+    return ", ".join(f"{drone} is flown by {commander}" for drone, commander in commanders.items())
 
 
 def foreign_commanders(
@@ -152,13 +152,17 @@ def foreign_commanders(
         commanders: commander of each drone.
         roles: roles of the known processes, by name.
     """
-    others = {drone: who for drone in members if (who := commanders.get(drone)) and who != controller}
+    others = {drone: commander for drone in members if (commander := commanders.get(drone)) and commander != controller}
     if any(commanders.get(drone) == controller for drone in members):
         return others
-    return {d: who for d, who in others.items() if roles.get(who, who.partition(".")[0]) == "console"}
+    return {
+        d: commander
+        for d, commander in others.items()
+        if roles.get(commander, commander.partition(".")[0]) == "console"
+    }
 
 
-def _strayed(view: ViewCluster) -> str:
+def _largest_deviation(view: ViewCluster) -> str:
     """Describe the length that deviates most from its reference in an engaged formation; empty if all are close."""
     errors = [
         (abs(value - desired), name, value, desired)
@@ -171,10 +175,10 @@ def _strayed(view: ViewCluster) -> str:
 
 def run_alarms(losses: Mapping[str, Event], active: Iterable[Fault], silent_s: float) -> list[Alarm]:
     """Return the alarms of lost processes, of active injected faults, and of a silent world."""
-    found = [Alarm("red", name, LOST[event.kind], event.text) for name, event in losses.items()]
+    alarms = [Alarm("red", name, LOST[event.kind], event.text) for name, event in losses.items()]
     if silent_s:
-        found.append(Alarm("red", "world", "silent", f"no answer for {silent_s:.0f} s"))
-    return found + [Alarm("amber", fault.target, fault.kind, parameters_text(fault)) for fault in active]
+        alarms.append(Alarm("red", "world", "silent", f"no answer for {silent_s:.0f} s"))
+    return alarms + [Alarm("amber", fault.target, fault.kind, parameters_text(fault)) for fault in active]
 
 
 def parameters_text(fault: Fault) -> str:
@@ -183,28 +187,28 @@ def parameters_text(fault: Fault) -> str:
 
 
 class Losses:
-    """Tracks which processes and drones are lost: `now` holds the newest event about each; thread-safe."""
+    """Tracks which processes and drones are lost: `current` holds the newest event about each; thread-safe."""
 
     def __init__(self) -> None:
-        self.now: dict[str, Event] = {}
+        self.current: dict[str, Event] = {}
 
     def note(self, event: Event) -> None:
         """Process an event: a process or drone may be lost, return, or be replaced."""
         is_false_join = event.kind == "no_show" and "incarnation" in event.data  # the process of that name is present
         if event.kind in LOST and not is_false_join:
-            self.now = {**self.now, event.subject: event}
-        elif event.kind in BACK:
+            self.current = {**self.current, event.subject: event}
+        elif event.kind in RETURN_KINDS:
             self._remove({event.subject, *map(str, event.data.get("serves") or ())})
 
     def note_health(self, name: str, health: Health) -> None:
         """Process a health message: a process with another host or pid than the lost one replaces it."""
-        lost = self.now.get(name)
+        lost = self.current.get(name)
         pid = None if lost is None else lost.data.get("pid")
         if lost is not None and pid and (lost.data.get("host"), pid) != (health.host, health.pid):
             self._remove({name})
 
     def _remove(self, names: set[str]) -> None:
-        self.now = {name: lost for name, lost in self.now.items() if name not in names}
+        self.current = {name: lost for name, lost in self.current.items() if name not in names}
 
 
 @dataclass
@@ -214,7 +218,7 @@ class _BoardEntry:
     alarm: Alarm
     since_s: float  # when it was last raised [s; wall]
     times: int = 1
-    over_s: float | None = None  # when it ended [s; wall]; None while it is active
+    ended_s: float | None = None  # when it ended [s; wall]; None while it is active
     acknowledged: bool = False
 
 
@@ -234,12 +238,12 @@ class AlarmBoard:
                     continue
                 if entry.alarm.severity != "red" or entry.acknowledged:
                     del self._entries[key]
-                elif entry.over_s is None:
-                    entry.over_s = wall_s
+                elif entry.ended_s is None:
+                    entry.ended_s = wall_s
             for key, alarm in now.items():
                 entry = self._entries.setdefault(key, _BoardEntry(alarm, wall_s))
-                if entry.over_s is not None:
-                    entry.since_s, entry.over_s, entry.times = wall_s, None, entry.times + 1
+                if entry.ended_s is not None:
+                    entry.since_s, entry.ended_s, entry.times = wall_s, None, entry.times + 1
                 if alarm.severity != entry.alarm.severity:
                     entry.acknowledged = False
                 entry.alarm = alarm
@@ -248,7 +252,7 @@ class AlarmBoard:
     def acknowledge(self) -> None:
         """Acknowledge all alarms and remove ended ones; an alarm that later turns red must be acknowledged again."""
         with self._lock:
-            self._entries = {key: each for key, each in self._entries.items() if each.over_s is None}
+            self._entries = {key: each for key, each in self._entries.items() if each.ended_s is None}
             for entry in self._entries.values():
                 entry.acknowledged = True
 
@@ -260,13 +264,13 @@ class AlarmBoard:
     def rows(self, wall_s: float) -> list[dict[str, object]]:
         """Return the alarms as plain data, red ones first, with how long each has been active or over [s; wall]."""
         with self._lock:
-            ordered = sorted(self._entries.values(), key=lambda each: _rank(each.alarm, each.over_s is not None))
+            ordered = sorted(self._entries.values(), key=lambda each: _rank(each.alarm, each.ended_s is not None))
             return [
                 {
                     **each.alarm._asdict(),
                     "for_s": wall_s - each.since_s,
                     "acknowledged": each.acknowledged,
-                    "over_s": None if each.over_s is None else wall_s - each.over_s,
+                    "over_s": None if each.ended_s is None else wall_s - each.ended_s,
                     "times": each.times,
                 }
                 for each in ordered
@@ -285,7 +289,7 @@ TILT_MAX_DEG = 30.0  # maximum tilt before take-off; design choice: above any sl
 LINK_SILENT_S = 3.0  # wall; drivers publish the state of a link once a second
 LIMITS = EngagementLimits()  # limits within which a formation's controller lets its drones take off
 AT_END = "the record is at its end; go back on the timeline"
-STANDS_S = 2.0  # wall; a running world that has waited for a process for longer is shown as waiting
+WAITING_SHOWN_S = 2.0  # wall; a running world that has waited for a process for longer is shown as waiting
 NO_RUN = {"t_s": 0.0, "replay": False, "age_s": 0.0, "alarms": []}
 Level = Literal["no run", "waiting", "running", "paused", "emergency", "silent", "ended"]
 
@@ -315,8 +319,8 @@ class ShownRun(NamedTuple):
 
 
 def single_drones(scenario: Scenario) -> list[str]:
-    led = {name for cluster in scenario.clusters for name in cluster.drones}
-    return [drone.name for drone in scenario.drones if drone.name not in led]
+    in_formations = {name for cluster in scenario.clusters for name in cluster.drones}
+    return [drone.name for drone in scenario.drones if drone.name not in in_formations]
 
 
 # Checks before a take-off
@@ -344,8 +348,8 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
         text = f"{percent:.0f} %; must be {BATTERY_EMPTY_PERCENT:.0f} % or more"
         checks.append(Check("battery", text, False, True))
     else:
-        low = percent < BATTERY_LOW_PERCENT
-        checks.append(Check("battery", f"{percent:.0f} %{'; low' if low else ''}", not low))
+        is_low = percent < BATTERY_LOW_PERCENT
+        checks.append(Check("battery", f"{percent:.0f} %{'; low' if is_low else ''}", not is_low))
     if tilt_deg > TILT_MAX_DEG:
         text = f"tilted by {tilt_deg:.0f}°; must be {TILT_MAX_DEG:.0f}° or less"
         checks.append(Check("upright", text, False, True))
@@ -361,7 +365,7 @@ def preflight_checks(drone: DroneCondition, in_formation: bool, foreign: str = "
     elif yaw_deg > yaw_max_deg:
         text = f"σ of heading is {yaw_deg:.0f}°; must be {yaw_max_deg:.0f}° or less"
         checks.append(Check("estimator", text, False, in_formation))
-    elif (drone.lag_ms or 0.0) > LATE_MS:
+    elif (drone.lag_ms or 0.0) > LAG_MAX_MS:
         checks.append(Check("estimator", f"{drone.lag_ms:.0f} ms late", False))
     else:
         checks.append(Check("estimator", f"σ {sigma_m:.2f} m"))
@@ -402,13 +406,13 @@ class RunCondition(NamedTuple):
             return "emergency"
         return "paused" if self.clock == "paused" else "running" if self.clock == "running" else "waiting"
 
-    def off(self) -> str:
+    def outage(self) -> str:
         if self.ended:
             return f"the run is over: {self.ended}"
         return f"the world has not answered for {self.silent_s:.0f} s" if self.silent_s else ""
 
-    def grounded(self) -> str:
-        return self.off() or ("a record is played back" if self.replayed else "")
+    def flight_refusal(self) -> str:
+        return self.outage() or ("a record is played back" if self.replayed else "")
 
     def all_down(self, names: Collection[str] | None = None) -> bool:
         """Return whether all drones seen so far, or the named ones, are on the ground."""
@@ -419,20 +423,21 @@ class RunCondition(NamedTuple):
 
 
 def run_refusals(run: RunCondition) -> dict[str, str]:
-    off, state = run.off(), run.clock or "unknown"
+    outage, state = run.outage(), run.clock or "unknown"
     running = "" if state == "running" else f"the run is {state}"
     paused = "" if state == "paused" else f"the run is {state}, not paused"
-    onward = off or paused or (AT_END if run.at_end else "")
-    return {"pause": off or running, "resume": onward, "step": onward, "rate": off, "seek": off}
+    resume = outage or paused or (AT_END if run.at_end else "")
+    return {"pause": outage or running, "resume": resume, "step": resume, "rate": outage, "seek": outage}
 
 
 def drone_refusals(run: RunCondition, drone: str) -> dict[str, str]:
     state = run.drones.get(drone)
     modes = ("takeoff", "land", "return", "emergency", "reset")
-    unseen = run.grounded() or ("" if state else f"{drone} has not been seen yet")
-    refused = {mode: unseen or state_refusal(drone, state or "", mode) or "" for mode in modes}
-    refused["takeoff"] = refused["takeoff"] or preflight_refusal(run, [drone])
-    return {**refused, "emergency": run.grounded()}  # whatever the drone's state, since the known one may be outdated
+    common = run.flight_refusal() or ("" if state else f"{drone} has not been seen yet")
+    refusals = {mode: common or state_refusal(drone, state or "", mode) or "" for mode in modes}
+    refusals["takeoff"] = refusals["takeoff"] or preflight_refusal(run, [drone])
+    # An emergency is possible whatever the drone's state, since the known one may be outdated.
+    return {**refusals, "emergency": run.flight_refusal()}
 
 
 def preflight_refusal(run: RunCondition, drones: Collection[str]) -> str:
@@ -454,33 +459,33 @@ def is_held_by_fault(run: RunCondition, cluster: str) -> bool:
 def formation_refusals(run: RunCondition, cluster: str) -> dict[str, str]:
     """Return why each operation of a formation would be refused, as far as its phase and its drones' states tell."""
     phase, reason = run.phases.get(cluster, ("", ""))
-    off = run.grounded() or ("" if phase else f"{cluster} has no controller yet")
-    flown = "" if phase == "engaged" else f"{cluster} is {_words(phase)}, not engaged"
+    grounding = run.flight_refusal() or ("" if phase else f"{cluster} has no controller yet")
+    not_engaged = "" if phase == "engaged" else f"{cluster} is {_phase_text(phase)}, not engaged"
     held = f"{cluster} is held: {reason}" if is_held_by_fault(run, cluster) else ""
-    steered = off or held or ("" if phase == "held" else flown)
+    steering = grounding or held or ("" if phase == "held" else not_engaged)
     if phase == "assembling":
         engage = "" if READY_TO_ENGAGE in reason else reason
     elif phase == "held" and not held:
         engage = ""
     else:
-        engage = f"{cluster} is {_words(phase)}; it engages when assembled, or when held on request"
+        engage = f"{cluster} is {_phase_text(phase)}; it engages when assembled, or when held on request"
     grounded = [name for name in run.members.get(cluster, ()) if run.drones.get(name) not in AIRBORNE]
     fault = reason if held else ""
     if not fault or REJOINING in fault:
         rejoin = f"{cluster} is {'rejoining' if fault else 'not held by a fault'}"
     elif grounded:
         state = run.drones.get(grounded[0]) or "not seen"
-        rejoin = f"{grounded[0]} is {_words(state)}; let it take off first"
+        rejoin = f"{grounded[0]} is {_phase_text(state)}; let it take off first"
     else:
         rejoin = ""
     return {
-        "takeoff": off or _takeoff_refusal(run, cluster, phase),
-        "engage": off or engage,
-        "hold": off or ("" if REJOINING in reason else held or flown),
-        "rejoin": off or rejoin,
-        "land": off or ("all drones are on the ground" if phase == "idle" and run.all_down() else ""),
-        "target": steered,
-        "trajectory": steered,
+        "takeoff": grounding or _takeoff_refusal(run, cluster, phase),
+        "engage": grounding or engage,
+        "hold": grounding or ("" if REJOINING in reason else held or not_engaged),
+        "rejoin": grounding or rejoin,
+        "land": grounding or ("all drones are on the ground" if phase == "idle" and run.all_down() else ""),
+        "target": steering,
+        "trajectory": steering,
     }
 
 
@@ -489,14 +494,14 @@ def _takeoff_refusal(run: RunCondition, cluster: str, phase: str) -> str:
     members = run.members.get(cluster, ())
     if phase != "idle":
         idle_first = "; Land makes it idle" if phase == "held" and run.all_down(members) else ""
-        return f"{cluster} is {_words(phase)}, not idle{idle_first}"
+        return f"{cluster} is {_phase_text(phase)}, not idle{idle_first}"
     states = {name: run.drones.get(name, "landed") for name in members}
     stopped = [name for name, state in states.items() if state == "emergency"]
     if stopped:
         return _reset_first(stopped)
     moving = [name for name, state in states.items() if state not in AIRBORNE | DOWN]
     if moving:
-        return f"{moving[0]} is {_words(states[moving[0]])}; it must be landed or in the air"
+        return f"{moving[0]} is {_phase_text(states[moving[0]])}; it must be landed or in the air"
     return preflight_refusal(run, members)
 
 
@@ -506,26 +511,26 @@ def _reset_first(stopped: Sequence[str]) -> str:
 
 def fleet_refusals(run: RunCondition, single: Collection[str] = ()) -> dict[str, str]:
     """Return why each operation on all drones would have no effect; `single` names the drones without a formation."""
-    off = run.grounded()
+    grounding = run.flight_refusal()
     in_air = not run.all_down() or any(phase not in ("idle", "landing") for phase, _ in run.phases.values())
     in_emergency = "emergency" in run.drones.values()
     refusals = {name: _takeoff_refusal(run, name, phase) for name, (phase, _) in run.phases.items()}
     landed = [name for name in single if run.drones.get(name) == "landed"]
-    unfit = [refusal for name in landed if (refusal := preflight_refusal(run, [name]))]
+    unready = [refusal for name in landed if (refusal := preflight_refusal(run, [name]))]
     takeoff = ""
-    if "" not in refusals.values() and len(landed) == len(unfit):  # no formation and no single drone can take off
+    if "" not in refusals.values() and len(landed) == len(unready):  # no formation and no single drone can take off
         stopped = [name for name in single if run.drones.get(name) == "emergency"]
         on_ground = [refusal for name, refusal in refusals.items() if run.all_down(run.members.get(name, ()))]
-        reasons = [*on_ground, *unfit, *([_reset_first(stopped)] if stopped else []), *refusals.values()]
+        reasons = [*on_ground, *unready, *([_reset_first(stopped)] if stopped else []), *refusals.values()]
         takeoff = reasons[0] if reasons else "no drone is on the ground"
     return {
-        "takeoff": off or takeoff,
-        "land": off or ("" if in_air else "all drones are on the ground"),
-        "reset": off or ("" if in_emergency else "no drone is in an emergency"),
+        "takeoff": grounding or takeoff,
+        "land": grounding or ("" if in_air else "all drones are on the ground"),
+        "reset": grounding or ("" if in_emergency else "no drone is in an emergency"),
     }
 
 
-def _words(phase: str) -> str:
+def _phase_text(phase: str) -> str:
     return phase.replace("_", " ")
 
 
@@ -552,7 +557,7 @@ def page_head(
         world: description of where the run is.
         record_s: times of the first and the last recorded gate of a replay [s].
     """
-    is_waiting = clock is not None and any(each.since_wall_s > STANDS_S for each in clock.waiting_for)
+    is_waiting = clock is not None and any(each.since_wall_s > WAITING_SHOWN_S for each in clock.waiting_for)
     level = "waiting" if run.level == "running" and is_waiting else run.level
     t_s = (t_ns or (clock.t_ns if clock else 0)) / 1e9
     if run.level == "ended":
@@ -562,18 +567,18 @@ def page_head(
         detail = f"the display shows the state at {t_s:.1f} s and may be outdated"
     else:
         state = "waiting" if run.clock == "running" and is_waiting else run.clock or "no clock yet"
-        pace = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""
-        title, detail = f"{state} {t_s:.1f} s{pace}", _waiting(clock, world)
+        rate_text = f" × {clock.rate:.1f}" if clock is not None and state == "running" else ""
+        title, detail = f"{state} {t_s:.1f} s{rate_text}", _waiting(clock, world)
         if run.replayed:
             from_s, to_s = record_s or (t_s, t_s)
             share = f" ({100.0 * min(1.0, max(0.0, t_s - from_s) / (to_s - from_s)):.0f} %)" if to_s > from_s else ""
-            title = f"REPLAY · {state} {t_s:.1f} of {to_s:.1f} s{share}{pace}"
+            title = f"REPLAY · {state} {t_s:.1f} of {to_s:.1f} s{share}{rate_text}"
         if run.level == "emergency":
             title = f"EMERGENCY · {title}"
     phases = run.phases if len(run.phases) <= 1 and not (run.ended or run.silent_s) else {}
-    formation = [f"{n}: {_words(p)}{f' – {reason}' if reason else ''}" for n, (p, reason) in phases.items()]
+    formation = [f"{n}: {_phase_text(p)}{f' – {reason}' if reason else ''}" for n, (p, reason) in phases.items()]
     lines = [name, "a record is played back" if run.replayed else "", detail, *formation]
-    refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.grounded()}
+    refusals = {"land": fleet_refusals(run, single)["land"], "emergency": run.flight_refusal()}
     common = {"t_s": t_ns / 1e9, "replay": run.replayed, "age_s": run.silent_s, "alarms": list(alarms)}
     return {"level": level, "title": title, "detail": " · ".join(filter(None, lines)), "refusals": refusals, **common}
 

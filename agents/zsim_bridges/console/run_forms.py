@@ -30,10 +30,10 @@ HELD_HINT = "hold for 0.6 s, with the pointer, Space or Enter"  # equal to HOLD_
 DURATION_MAX_S = 1e5  # maximum duration of a fault; longer than any run
 DURATION_S = 30.0  # initial value of a fault's duration
 FIXES_LOST_PERCENT = 100.0  # this and the following are initial values
-THRUST_LEFT_PERCENT = 70.0  # remaining thrust of a weak motor; with less, the drone could not be held level
+THRUST_REMAINING_PERCENT = 70.0  # remaining thrust of a weak motor; with less, the drone could not be held level
 GUST_M_S = 4.0  # about the strongest gust that the drones of a formation can withstand
 MESSAGES_LOST_PERCENT = 30.0
-STRIKES = {
+TARGET_TEXTS = {
     "drone": "a drone",
     "world": "the world, hence all drones",
     "link": "the messages between two processes A/B; a drone's radio is affected by the kind radio",
@@ -61,12 +61,12 @@ class RunForm:
             client.request_world("step", gates=int(count) if count == int(count) else count)
 
         step.on_click(lambda _: request_step())
-        wanted = gui.add_number(
+        rate_input = gui.add_number(
             "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="1 is real time; 0: as fast as possible"
         )
         gui.add_html(limits_line(f"rate: 0 to {RATE_MAX:g} × real time"))
         set_rate = gui.add_button("Set rate")
-        set_rate.on_click(lambda _: client.request_world("rate", value=float(wanted.value)))
+        set_rate.on_click(lambda _: client.request_world("rate", value=float(rate_input.value)))
         self._controls = {"pause": pause, "resume": resume, "step": step, "rate": set_rate}
         self._reasons = gui.add_html("")
 
@@ -143,30 +143,30 @@ class FaultForm:
         self._kinds = kinds_of(declarations(scenario.drones))
         self._drone = gui.add_dropdown("drone", [drone.name for drone in scenario.drones])
         hint = "0: until it is cleared"
-        self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=DURATION_MAX_S, step=1.0, hint=hint)
+        self._duration = gui.add_number("for [s]", DURATION_S, min=0.0, max=DURATION_MAX_S, step=1.0, hint=hint)
         gui.add_html(limits_line(f"for: 0 to {DURATION_MAX_S:g} s; {hint}"))
-        share: dict[str, Any] = {"min": 0.0, "max": 100.0, "step": 1.0}
+        percent_range: dict[str, Any] = {"min": 0.0, "max": 100.0, "step": 1.0}
 
         def add_button(label: str) -> None:
-            gui.add_button(label, color="orange").on_click(lambda _: self._add(*self._common()[label][:3]))
+            gui.add_button(label, color="orange").on_click(lambda _: self._add(*self._common_faults()[label][:3]))
 
-        self._fixes = gui.add_number("fixes lost [%]", FIXES_LOST_PERCENT, **share)
+        self._fixes = gui.add_number("fixes lost [%]", FIXES_LOST_PERCENT, **percent_range)
         add_button("GPS lost")
-        self._thrust = gui.add_number("thrust left [%]", THRUST_LEFT_PERCENT, **share)
+        self._thrust = gui.add_number("thrust left [%]", THRUST_REMAINING_PERCENT, **percent_range)
         add_button("Motor weak")
         self._gust = gui.add_number("gust [m/s]", GUST_M_S, min=-100.0, max=100.0, step=0.5, hint="to the east")
         add_button("Gust")
-        self._messages = gui.add_number("msgs lost [%]", MESSAGES_LOST_PERCENT, **share)
+        self._messages = gui.add_number("msgs lost [%]", MESSAGES_LOST_PERCENT, **percent_range)
         add_button("Messages lost")
         add_button("Kill estimator")
-        self._strikes = gui.add_html("")
+        self._effects = gui.add_html("")
         for control in (self._drone, self._fixes, self._thrust, self._gust, self._messages):
             control.on_update(lambda _: self._describe())
         self._describe()
         self._any_fault(gui)
         gui.add_button("Clear all faults", color="green").on_click(lambda _: client.request_world("fault_clear"))
 
-    def _common(self) -> dict[str, tuple[str, str, dict[str, Any], str]]:
+    def _common_faults(self) -> dict[str, tuple[str, str, dict[str, Any], str]]:
         """Return kind, target, parameters and description of each common fault, by its button's label."""
         drone = self._drone.value
         rotor = (self._rotors.get(drone) or ROTORS)[0]
@@ -174,27 +174,27 @@ class FaultForm:
             float(each.value) for each in (self._fixes, self._thrust, self._gust, self._messages)
         )
         link = f"world/estimator.{drone}"
-        weak = f"rotor {rotor} of {drone}: {thrust:g} % of its thrust is left"
-        lost = f"{messages:g} % of the messages between the processes {link.replace('/', ' and ')}; no radio"
+        weak_text = f"rotor {rotor} of {drone}: {thrust:g} % of its thrust is left"
+        lost_text = f"{messages:g} % of the messages between the processes {link.replace('/', ' and ')}; no radio"
         return {
             "GPS lost": ("gps_dropout", drone, {"probability": fixes / 100}, f"{fixes:g} % of the fixes of {drone}"),
-            "Motor weak": ("rotor_efficiency", drone, {"rotor": rotor, "value": thrust / 100}, weak),
+            "Motor weak": ("rotor_efficiency", drone, {"rotor": rotor, "value": thrust / 100}, weak_text),
             "Gust": ("gust", "world", {"velocity_m_s": [gust, 0.0, 0.0]}, f"all drones: {gust:g} m/s to the east"),
-            "Messages lost": ("link_loss", link, {"probability": messages / 100}, lost),
+            "Messages lost": ("link_loss", link, {"probability": messages / 100}, lost_text),
             "Kill estimator": (PROCESS_KILL, f"estimator.{drone}", {}, f"process estimator.{drone}, as with kill -9"),
         }
 
     def _describe(self) -> None:
-        lines = (f"<b>{escape(label)}</b>: {escape(each[3])}" for label, each in self._common().items())
-        self._strikes.content = f"<div style='{REASON_STYLE}'>{'<br>'.join(lines)}</div>"
+        lines = (f"<b>{escape(label)}</b>: {escape(each[3])}" for label, each in self._common_faults().items())
+        self._effects.content = f"<div style='{REASON_STYLE}'>{'<br>'.join(lines)}</div>"
 
     def _add(self, kind: str, target: str, parameters: Mapping[str, Any]) -> None:
-        lasts_s, lasts = float(self._for.value), self._kinds[kind].lasts != "once" and "for_s" not in parameters
-        refusal = range_refusal("for", lasts_s, 0.0, DURATION_MAX_S, "s") if lasts else None
+        duration_s, lasts = float(self._duration.value), self._kinds[kind].lasts != "once" and "for_s" not in parameters
+        refusal = range_refusal("for", duration_s, 0.0, DURATION_MAX_S, "s") if lasts else None
         if refusal:
             self._report(RequestOutcome(f"fault_add {kind} of {target}", refusal))
             return
-        duration = {"for_s": lasts_s} if lasts and lasts_s > 0 else {}
+        duration = {"for_s": duration_s} if lasts and duration_s > 0 else {}
         self._client.request_world("fault_add", kind=kind, target=target, **{**duration, **parameters})
 
     def _any_fault(self, gui: viser.GuiApi) -> None:
@@ -214,7 +214,7 @@ class FaultForm:
                     f"`{p.name}` {p.description}: {expected(p)}{'' if p in magnitudes else ' (may be left out)'}"
                     for p in chosen.parameters
                 ]
-                effect = f"{chosen.description}; affects {STRIKES[chosen.strikes]}."
+                effect = f"{chosen.description}; affects {TARGET_TEXTS[chosen.strikes]}."
                 help_.content = f"<sub>{effect} {'; '.join(lines)}</sub>"
                 estimator = f"estimator.{self._drone.value}"
                 targets = {"drone": self._drone.value, "link": f"world/{estimator}", "process": estimator}
@@ -242,16 +242,16 @@ def parse_fault(text: str, name: str, kind: FaultKind) -> dict[str, Any]:
     Raises:
         InputError: the text has another form, names a parameter that the kind does not have, or omits a magnitude.
     """
-    where = f"parameters are {text[:40]!r}"
+    prefix = f"parameters are {text[:40]!r}"
     try:
         values = typed_rest(text)
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from None
-    known = [p.name for p in kind.parameters]
+        raise InputError(f"{prefix}: {error}") from None
+    allowed_names = [p.name for p in kind.parameters]
     for given in values:
-        if given not in (*known, "at_s", "for_s"):
-            allowed = ", ".join([*(f"{each}=VALUE" for each in known), "--at", "--for"])
-            raise InputError(f"{where}; {given[:40]!r} is not known, allowed: {allowed}")
+        if given not in (*allowed_names, "at_s", "for_s"):
+            allowed = ", ".join([*(f"{each}=VALUE" for each in allowed_names), "--at", "--for"])
+            raise InputError(f"{prefix}; {given[:40]!r} is not known, allowed: {allowed}")
     missing = [f"{p.name} is missing; must be {expected(p)}" for p in unstated(kind, values)]
     if missing:
         raise InputError(f"{'; '.join(missing)} ({name})")
@@ -265,29 +265,31 @@ class OrderButton:
     """A button for an order, which its page repeats until it is confirmed; the button is HTML, not a control of viser.
 
     Args:
-        of: target of the order: {"drone": name}, with several names separated by commas, or {"cluster": name}.
-        held: whether the button must be held down for a while.
+        target: target of the order: {"drone": name}, with several names separated by commas, or {"cluster": name}.
+        needs_hold: whether the button must be held down for a while.
     """
 
     visible = True
 
-    def __init__(self, gui: viser.GuiApi, label: str, op: str, of: dict[str, str], *, held: bool = False) -> None:
-        self._label, self._op, self._of, self._held = label, op, of, held
-        self._hint = HELD_HINT if held else ""
+    def __init__(
+        self, gui: viser.GuiApi, label: str, op: str, target: dict[str, str], *, needs_hold: bool = False
+    ) -> None:
+        self._label, self._op, self._target, self._needs_hold = label, op, target, needs_hold
+        self._hint = HELD_HINT if needs_hold else ""
         self.disabled = False
         self._html = gui.add_html(self._content())
 
-    def rename(self, label: str, of: dict[str, str]) -> None:
-        self._label, self._of = label, of
+    def rename(self, label: str, target: dict[str, str]) -> None:
+        self._label, self._target = label, target
         assign(self._html, content=self._content())
 
     def lock(self, reason: str) -> None:
-        self.disabled, self._hint = bool(reason), reason or (HELD_HINT if self._held else "")
+        self.disabled, self._hint = bool(reason), reason or (HELD_HINT if self._needs_hold else "")
         assign(self._html, content=self._content())
 
     def _content(self) -> str:
-        data = {"data-zsim-order": self._op, **{f"data-{key}": name for key, name in self._of.items()}}
-        data |= {"title": self._hint, **({"data-zsim-hold": "1", "class": "stop"} if self._held else {})}
+        data = {"data-zsim-order": self._op, **{f"data-{key}": name for key, name in self._target.items()}}
+        data |= {"title": self._hint, **({"data-zsim-hold": "1", "class": "stop"} if self._needs_hold else {})}
         attributes = " ".join(f'{key}="{escape(value)}"' for key, value in data.items())
         off = " disabled" if self.disabled else ""
         return f'<div class="zsim-order"><button type="button" {attributes}{off}>{escape(self._label)}</button></div>'
@@ -301,8 +303,8 @@ def range_refusal(name: str, value: float, low: float, high: float, unit: str = 
     """Return why a typed number is refused, None if it is within its limits; numbers are never clipped to them."""
     if low <= value <= high:
         return None
-    in_unit = f" {unit}" if unit else ""
-    return f"{name} is {value:g}{in_unit}; must be from {low:g} to {high:g}{in_unit}"
+    unit_text = f" {unit}" if unit else ""
+    return f"{name} is {value:g}{unit_text}; must be from {low:g} to {high:g}{unit_text}"
 
 
 def assign(control: Any, **properties: Any) -> None:
@@ -326,7 +328,7 @@ def set_refusals(controls: Mapping[str, Any], refusals: Mapping[str, str]) -> No
             assign(control, disabled=bool(reason), hint=reason or None)
 
 
-def offered(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str, str]]) -> dict[str, str]:
+def offered_refusals(run: RunCondition, refusals_of: Callable[[RunCondition], Mapping[str, str]]) -> dict[str, str]:
     """Return the refusals; orders are also offered while the world is silent, and emergencies always."""
     orders = {op: reason for op, reason in refusals_of(run._replace(silent_s=0.0)).items() if op in ORDERS}
     if "emergency" in orders:

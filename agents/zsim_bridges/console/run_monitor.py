@@ -89,9 +89,9 @@ class RunMonitor:
     def end(self, reason: str) -> None:
         self._ended = self.views.end or reason
 
-    def unflyable(self) -> str:
+    def flight_refusal(self) -> str:
         """Return why nothing can be flown in this run any longer; a silent world does not count."""
-        return self.condition._replace(silent_s=0.0, ended=self._ended).grounded()
+        return self.condition._replace(silent_s=0.0, ended=self._ended).flight_refusal()
 
     def update(self, wall_s: float) -> list[PendingRequest]:
         """Update from the newest views; return the requests completed since the last update."""
@@ -126,12 +126,12 @@ class RunMonitor:
         )
         active, states = views.active_faults(), {name: phase for name, (phase, _) in phases.items()}
         wind_m_s = max((math.hypot(*each) for each in views.drones.wind_m_s), default=0.0) if views.drones else 0.0
-        self.fault_watch.update(list(views.begun), active, drones, states, views.losses.now, wind_m_s)
+        self.fault_watch.update(list(views.begun), active, drones, states, views.losses.current, wind_m_s)
         found: list[run_condition.Alarm] = []
         if views.drones is not None and not self._ended:
             found = [alarm for drone in drones.values() for alarm in run_condition.drone_alarms(drone)]
             found += run_condition.formation_alarms(phases, foreign, dict(views.clusters))
-            found += run_condition.run_alarms(views.losses.now, active, self.condition.silent_s)
+            found += run_condition.run_alarms(views.losses.current, active, self.condition.silent_s)
         self.board.update(found, wall_s)
         return self.pending.pop_done(views.clusters, self.condition.drones)
 
@@ -151,7 +151,7 @@ class RunMonitor:
             self.board.clear()
             self.fault_watch.clear()
             self.views.begun.clear()
-            self.views.losses.now, self.views.failsafes = {}, {}
+            self.views.losses.current, self.views.failsafes = {}, {}
         self._t_ns = t_ns
 
     def _reason(

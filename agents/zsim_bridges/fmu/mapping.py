@@ -115,7 +115,7 @@ def mapping_of(
         RunError: a text is invalid; the error quotes it and states what was found and what is allowed.
     """
     mapping = FmuMapping([], [], [])
-    places = _Places(info, drone, cluster_names)
+    parser = _PlaceParser(info, drone, cluster_names)
     for text in texts:
         name, equals, place_text = (part.strip() for part in text.partition("="))
         if not equals or not name or not place_text:
@@ -125,7 +125,7 @@ def mapping_of(
             hint = "; set it with --param" if variable.causality == "parameter" else ""
             raise RunError(f"--map {text}: {name} is a {variable.causality}; must be an input or an output{hint}")
         is_output = variable.causality == "output"
-        place = places.parse(place_text, is_output, f"--map {text}")
+        place = parser.parse(place_text, is_output, f"--map {text}")
         if place.size != variable.size:
             raise RunError(
                 f"--map {text}: {name} has {variable.size} values, {place_text} has {place.size}; must be equal"
@@ -163,7 +163,7 @@ def _check_unique(mapping: FmuMapping) -> None:
         inputs.add(variable.name)
 
 
-class _Places:
+class _PlaceParser:
     """Parses places, given the drones and clusters of a run."""
 
     def __init__(self, info: Info, drone: str | None, cluster_names: Callable[[str], Sequence[str]]) -> None:

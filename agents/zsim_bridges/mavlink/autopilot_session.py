@@ -294,14 +294,14 @@ class AutopilotState:
         self.custom_mode = 0
         self.landed: int = LandedState.UNDEFINED
         self.sea_height_m = 0.0
-        self._terminated = False
+        self._is_terminated = False
 
     def receive(self, message: Any) -> None:
         match message:
             case dialect.Heartbeat():
                 self.armed = bool(message.base_mode & dialect.BaseMode.ARMED)
                 self.custom_mode = message.custom_mode
-                self._terminated = message.system_status == dialect.SystemStatus.TERMINATED
+                self._is_terminated = message.system_status == dialect.SystemStatus.TERMINATED
             case dialect.ExtendedSysState():
                 self.landed = message.landed_state
             case dialect.GlobalPositionInt():
@@ -314,8 +314,8 @@ class AutopilotState:
             is_landing: whether this driver is landing the vehicle.
         """
         control, mode = self.control, self.custom_mode
-        own = mode in (control.custom_mode, *control.own) or (is_landing and mode == control.landing)
-        return self.armed and self.landed in (LandedState.IN_AIR, LandedState.LANDING) and not own
+        is_own_mode = mode in (control.custom_mode, *control.own) or (is_landing and mode == control.landing)
+        return self.armed and self.landed in (LandedState.IN_AIR, LandedState.LANDING) and not is_own_mode
 
     @property
     def is_controlled(self) -> bool:
@@ -332,7 +332,7 @@ class AutopilotState:
             is_flying: whether the vehicle is following a setpoint.
             has_climbed: whether it has reached its take-off height.
         """
-        if self._terminated:
+        if self._is_terminated:
             return "emergency"
         if not self.armed or self.landed in (LandedState.UNDEFINED, LandedState.ON_GROUND):
             return "landed"
@@ -489,8 +489,8 @@ class TelemetryReadings(AircraftReadings):
                 taken_ns = self._measured_flow_ns = self._since_1970(m, now_ns)
                 self.read("flow", taken_ns, (m.flow_comp_m_x, -m.flow_comp_m_y, self.climb_m_s), m.quality / 255.0)
             case dialect.DistanceSensor() if m.orientation == DOWNWARD:
-                valid = m.min_distance <= m.current_distance <= m.max_distance
-                self.read("sonar", self._since_boot(m, now_ns), m.current_distance / 100.0, valid)
+                is_valid = m.min_distance <= m.current_distance <= m.max_distance
+                self.read("sonar", self._since_boot(m, now_ns), m.current_distance / 100.0, is_valid)
 
     def _since_boot(self, m: Any, now_ns: int) -> int:
         return self.clock.taken_ns(m.time_boot_ms * 1_000_000, now_ns)

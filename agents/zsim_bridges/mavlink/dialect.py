@@ -202,10 +202,10 @@ INT32_UNKNOWN = 2**31 - 1  # INT32_MAX, which stands for "unknown" in 32-bit int
 UINT16_UNKNOWN = 65535  # UINT16_MAX, likewise in unsigned 16-bit fields
 _SQRT_HALF = math.sqrt(0.5)
 _TARGET = "target_system,target_component:B"
-_GOAL = "vx,vy,vz:f[m/s] afx,afy,afz:f[m/s/s] yaw:f[rad] yaw_rate:f[rad/s]"
+_SETPOINT = "vx,vy,vz:f[m/s] afx,afy,afz:f[m/s/s] yaw:f[rad] yaw_rate:f[rad/s]"
 _IMU = "xacc,yacc,zacc:h[mG] xgyro,ygyro,zgyro:h[mrad/s] xmag,ymag,zmag:h[mgauss]"
-_PLACE = "latitude,longitude:i[degE7] altitude:i[mm]"
-_HOME = f"{_PLACE} x,y,z:f[m] q:4f approach_x,approach_y,approach_z:f[m] | time_usec:Q[us]"
+_GEODETIC = "latitude,longitude:i[degE7] altitude:i[mm]"
+_HOME = f"{_GEODETIC} x,y,z:f[m] q:4f approach_x,approach_y,approach_z:f[m] | time_usec:Q[us]"
 _CHANNELS = [f"chan{i}_raw:H[us]" for i in range(1, 19)]
 _SERVOS = [f"servo{i}_raw:H[us]" for i in range(1, 17)]
 _PARAMS = "param1,param2,param3,param4:f"
@@ -274,21 +274,21 @@ _TABLE = f"""
 70 RC_CHANNELS_OVERRIDE {_TARGET} {" ".join(_CHANNELS[:8])} | {" ".join(_CHANNELS[8:])}
 82 SET_ATTITUDE_TARGET time_boot_ms:I[ms] {_TARGET} type_mask:B q:4f
     body_roll_rate,body_pitch_rate,body_yaw_rate:f[rad/s] thrust:f
-84 SET_POSITION_TARGET_LOCAL_NED time_boot_ms:I[ms] {_TARGET} coordinate_frame:B type_mask:H x,y,z:f[m] {_GOAL}
+84 SET_POSITION_TARGET_LOCAL_NED time_boot_ms:I[ms] {_TARGET} coordinate_frame:B type_mask:H x,y,z:f[m] {_SETPOINT}
 86 SET_POSITION_TARGET_GLOBAL_INT time_boot_ms:I[ms] {_TARGET} coordinate_frame:B type_mask:H
-    lat_int,lon_int:i[degE7] alt:f[m] {_GOAL}
+    lat_int,lon_int:i[degE7] alt:f[m] {_SETPOINT}
 144 FOLLOW_TARGET timestamp:Q[ms] est_capabilities:B lat,lon:i[degE7] alt:f[m] vel:3f[m/s] acc:3f[m/s/s] attitude_q:4f
     rates:3f position_cov:3f custom_state:Q
 
 # Places: origin, home, targets, fence, poses from outside
-48 SET_GPS_GLOBAL_ORIGIN target_system:B {_PLACE} | time_usec:Q[us]
-49 GPS_GLOBAL_ORIGIN {_PLACE} | time_usec:Q[us]
+48 SET_GPS_GLOBAL_ORIGIN target_system:B {_GEODETIC} | time_usec:Q[us]
+49 GPS_GLOBAL_ORIGIN {_GEODETIC} | time_usec:Q[us]
 62 NAV_CONTROLLER_OUTPUT nav_roll,nav_pitch:f[deg] nav_bearing,target_bearing:h[deg] wp_dist:H[m] alt_error:f[m]
     aspd_error:f[m/s] xtrack_error:f[m]
 83 ATTITUDE_TARGET time_boot_ms:I[ms] type_mask:B q:4f body_roll_rate,body_pitch_rate,body_yaw_rate:f[rad/s] thrust:f
-85 POSITION_TARGET_LOCAL_NED time_boot_ms:I[ms] coordinate_frame:B type_mask:H x,y,z:f[m] {_GOAL}
+85 POSITION_TARGET_LOCAL_NED time_boot_ms:I[ms] coordinate_frame:B type_mask:H x,y,z:f[m] {_SETPOINT}
 87 POSITION_TARGET_GLOBAL_INT time_boot_ms:I[ms] coordinate_frame:B type_mask:H
-    lat_int,lon_int:i[degE7] alt:f[m] {_GOAL}
+    lat_int,lon_int:i[degE7] alt:f[m] {_SETPOINT}
 102 VISION_POSITION_ESTIMATE usec:Q[us] x,y,z:f[m] roll,pitch,yaw:f[rad] | covariance:21f reset_counter:B
 138 ATT_POS_MOCAP time_usec:Q[us] q:4f x,y,z:f[m] | covariance:21f
 149 LANDING_TARGET time_usec:Q[us] target_num,frame:B angle_x,angle_y:f[rad] distance:f[m] size_x,size_y:f[rad]

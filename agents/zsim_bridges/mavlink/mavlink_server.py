@@ -177,7 +177,7 @@ class MavlinkServer(VehicleServer):
 
     def on_event(self, event: Event) -> None:
         for served in self._served.values():
-            served.vehicle.watch.on_event(event)
+            served.vehicle.monitor.on_event(event)
 
     async def _tick_forever(self) -> None:
         while True:

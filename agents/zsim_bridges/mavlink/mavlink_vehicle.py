@@ -123,7 +123,7 @@ class MavlinkVehicle:
     """One drone presented as a MAVLink vehicle.
 
     Attributes:
-        state: the drone's state, which the caller keeps up to date; watch: the caller notifies it of events.
+        state: the drone's state, which the caller keeps up to date; monitor: the caller notifies it of events.
         outbox: messages for the clients, until `take` returns them.
     """
 
@@ -140,7 +140,7 @@ class MavlinkVehicle:
         course = Course(limits, drone.reference or Piloted())
         self.flight = Flight(source, personality, self._parameters, self.state, sender, course, self.report)
         self._source = TelemetrySource(drone, self.state, self.flight, personality)
-        self.watch = DroneWatch(drone.name, source, self._source, self._parameters, self.report)
+        self.monitor = DroneMonitor(drone.name, source, self._source, self._parameters, self.report)
         self._telemetry = Telemetry(self._source, options.level)
         self._missions = MissionProtocol(self._send, self._on_mission, None if personality.is_px4 else self._home_item)
         self._heartbeat_ns: int | None = None
@@ -159,14 +159,14 @@ class MavlinkVehicle:
         self._send(dialect.Statustext(severity, text[:TEXT_MAX]))
 
     def take(self) -> list[WireMessage]:
-        taken, self.outbox = self.outbox, []
-        return taken
+        messages, self.outbox = self.outbox, []
+        return messages
 
     # From the drone
 
     def step(self) -> None:
         """Carry out what is due at a gate, once the state has been updated."""
-        self.watch.check()
+        self.monitor.check()
         self.flight.step()
         self.outbox += map(dialect.MissionItemReached, self.flight.mission.reached)
         self.flight.mission.reached.clear()
@@ -387,7 +387,7 @@ class MavlinkVehicle:
             self.flight.mission.abort("a client replaced it", failsafe=False)
             self.flight.mission.load(items)
         elif type_ == dialect.FENCE:
-            self.watch.load_fence(items)
+            self.monitor.load_fence(items)
 
     def _version(self) -> WireMessage:
         major, minor, patch, type_ = self._personality.version
@@ -436,10 +436,12 @@ def from_global(message: dialect.SetPositionTargetGlobalInt, state: VehicleState
     height_m = message.alt
     if message.coordinate_frame in RELATIVE:
         height_m += state.to_global(state.home_or_current_m)[2]
-    given = from_int(message.lat_int, DEGREES), from_int(message.lon_int, DEGREES), height_m
-    known = [value if math.isfinite(value) else current for value, current in zip(given, current_global, strict=True)]
-    x, y, z = state.to_local(known[0], known[1], known[2])
-    latitude_deg, longitude_deg, _ = given
+    requested = from_int(message.lat_int, DEGREES), from_int(message.lon_int, DEGREES), height_m
+    resolved = [
+        value if math.isfinite(value) else current for value, current in zip(requested, current_global, strict=True)
+    ]
+    x, y, z = state.to_local(resolved[0], resolved[1], resolved[2])
+    latitude_deg, longitude_deg, _ = requested
     horizontal = x if math.isfinite(longitude_deg) else math.nan, y if math.isfinite(latitude_deg) else math.nan
     return _target(message, (*horizontal, z if math.isfinite(height_m) else math.nan), False, state)
 
@@ -455,18 +457,18 @@ def _target(
     x, y, z = (None if mask & bit or not math.isfinite(p) else p for p, bit in zip(position_m, bits, strict=True))
     position = x, y, z
     bits = (TypeMask.VX, TypeMask.VY, TypeMask.VZ)
-    given = (message.vx, message.vy, message.vz)
-    known = [not mask & bit and math.isfinite(v) for v, bit in zip(given, bits, strict=True)]
-    if position == NO_POSITION and not any(known):
+    velocity = (message.vx, message.vy, message.vz)
+    given_axes = [not mask & bit and math.isfinite(v) for v, bit in zip(velocity, bits, strict=True)]
+    if position == NO_POSITION and not any(given_axes):
         return "a setpoint has neither position nor velocity"
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
-    if any(known):
-        vx, vy, vz = (v if is_known else 0.0 for v, is_known in zip(given, known, strict=True))
+    if any(given_axes):
+        vx, vy, vz = (v if is_axis_given else 0.0 for v, is_axis_given in zip(velocity, given_axes, strict=True))
         velocity_m_s = dialect.frd((vx, vy, vz)) if along_heading else ned((vx, vy, vz))
     if not is_valid_position(position) or not all(abs(v) < SPEED_MAX_M_S for v in velocity_m_s):
         return "a setpoint is out of bounds"
     is_along_heading = along_heading and position == NO_POSITION
-    if along_heading and not is_along_heading and any(known):
+    if along_heading and not is_along_heading and any(given_axes):
         velocity_m_s = turned_about_up(velocity_m_s, state.yaw_rad)
     yaw, yaw_rate = _yaw(mask, message.yaw, message.yaw_rate, message.coordinate_frame, state)
     return Target(position, velocity_m_s, yaw, yaw_rate, is_along_heading)
@@ -498,7 +500,7 @@ def from_attitude(message: dialect.SetAttitudeTarget, weight_n: float) -> Setpoi
     return TiltTarget(q_WB, weight_n * thrust / HOVER_THRUST, rate)
 
 
-class DroneWatch:
+class DroneMonitor:
     """Monitors one drone, reports changes, and acts on breaches of its fence.
 
     It reports sensor losses, a low battery, faults, refused commands and collisions. The fence consists of a circle

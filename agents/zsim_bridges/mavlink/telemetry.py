@@ -1,7 +1,7 @@
 """The telemetry of a vehicle: its messages, each built from the state at one gate, and their rates.
 
 A builder returns None if there is nothing to send or its sensor has failed. Messages that are due at the same gate are
-sent in the order of ROWS.
+sent in the order of TELEMETRY_ROWS.
 """
 
 import math
@@ -332,7 +332,7 @@ Rates = tuple[float, float]
 """Rates at the levels normal and full [Hz of simulated time]."""
 
 
-class Row(NamedTuple):
+class TelemetryRow(NamedTuple):
     """A message: its builder, its rates by autopilot (None: on request), and the sensor whose samples it awaits."""
 
     build: Builder
@@ -341,51 +341,51 @@ class Row(NamedTuple):
     sensor: str | None = None
 
 
-ROWS: dict[type[WireMessage], Row] = {
-    dialect.Heartbeat: Row(heartbeat),
-    dialect.SysStatus: Row(sys_status, (1.0, 5.0), (1.0, 5.0)),
-    dialect.SystemTime: Row(lambda s: dialect.SystemTime(time_boot_ms=s.boot_ms), (1.0, 1.0), (1.0, 1.0)),
-    dialect.Attitude: Row(
+TELEMETRY_ROWS: dict[type[WireMessage], TelemetryRow] = {
+    dialect.Heartbeat: TelemetryRow(heartbeat),
+    dialect.SysStatus: TelemetryRow(sys_status, (1.0, 5.0), (1.0, 5.0)),
+    dialect.SystemTime: TelemetryRow(lambda s: dialect.SystemTime(time_boot_ms=s.boot_ms), (1.0, 1.0), (1.0, 1.0)),
+    dialect.Attitude: TelemetryRow(
         lambda s: dialect.Attitude(s.boot_ms, *s.rpy_ned_rad, *frd(s.state.rate_rad_s)), (10.0, 50.0), (10.0, 50.0)
     ),
-    dialect.LocalPositionNed: Row(
+    dialect.LocalPositionNed: TelemetryRow(
         lambda s: dialect.LocalPositionNed(s.boot_ms, *s.position_ned_m, *s.velocity_ned_m_s),
         (10.0, 50.0),
         (10.0, 50.0),
     ),
-    dialect.GlobalPositionInt: Row(global_position_int, (5.0, 50.0), (5.0, 50.0)),
-    dialect.GpsRawInt: Row(gps_raw_int, (5.0, 5.0), (5.0, 5.0), "gps"),
-    dialect.VfrHud: Row(vfr_hud, (4.0, 20.0), (4.0, 20.0)),
-    dialect.BatteryStatus: Row(battery_status, (0.5, 1.0), (0.5, 1.0)),
-    dialect.ExtendedSysState: Row(
+    dialect.GlobalPositionInt: TelemetryRow(global_position_int, (5.0, 50.0), (5.0, 50.0)),
+    dialect.GpsRawInt: TelemetryRow(gps_raw_int, (5.0, 5.0), (5.0, 5.0), "gps"),
+    dialect.VfrHud: TelemetryRow(vfr_hud, (4.0, 20.0), (4.0, 20.0)),
+    dialect.BatteryStatus: TelemetryRow(battery_status, (0.5, 1.0), (0.5, 1.0)),
+    dialect.ExtendedSysState: TelemetryRow(
         lambda s: dialect.ExtendedSysState(0, LANDED_STATES[s.state.state]), (2.0, 5.0), (2.0, 5.0)
     ),
-    dialect.HomePosition: Row(home_position, (0.5, 1.0), (0.5, 1.0)),
-    dialect.GpsGlobalOrigin: Row(
+    dialect.HomePosition: TelemetryRow(home_position, (0.5, 1.0), (0.5, 1.0)),
+    dialect.GpsGlobalOrigin: TelemetryRow(
         lambda s: dialect.GpsGlobalOrigin(*global_ints(s.state.origin), s.boot_us), (0.2, 1.0), (0.2, 1.0)
     ),
-    dialect.PositionTargetLocalNed: Row(position_target_local_ned, (2.0, 10.0), (2.0, 10.0)),
-    dialect.MissionCurrent: Row(mission_current, (1.0, 1.0), (1.0, 1.0)),
-    dialect.DistanceSensor: Row(distance_sensor, (2.0, 10.0), (2.0, 10.0), "sonar"),
-    dialect.Vibration: Row(lambda s: dialect.Vibration(s.boot_us), (0.1, 1.0), (0.1, 1.0)),
-    dialect.AttitudeQuaternion: Row(
+    dialect.PositionTargetLocalNed: TelemetryRow(position_target_local_ned, (2.0, 10.0), (2.0, 10.0)),
+    dialect.MissionCurrent: TelemetryRow(mission_current, (1.0, 1.0), (1.0, 1.0)),
+    dialect.DistanceSensor: TelemetryRow(distance_sensor, (2.0, 10.0), (2.0, 10.0), "sonar"),
+    dialect.Vibration: TelemetryRow(lambda s: dialect.Vibration(s.boot_us), (0.1, 1.0), (0.1, 1.0)),
+    dialect.AttitudeQuaternion: TelemetryRow(
         lambda s: dialect.AttitudeQuaternion(s.boot_ms, *dialect.attitude_ned(s.state.q_WB), *frd(s.state.rate_rad_s)),
         (10.0, 50.0),
     ),
-    dialect.Odometry: Row(odometry, (0.0, 30.0)),
-    dialect.HighresImu: Row(highres_imu, (5.0, 50.0), None, "imu"),
-    dialect.Altitude: Row(altitude, (1.0, 10.0)),
-    dialect.EstimatorStatus: Row(estimator_status, (1.0, 5.0)),
-    dialect.RawImu: Row(raw_imu, None, (2.0, 50.0)),
-    dialect.ScaledImu: Row(scaled_imu, None, (0.0, 50.0)),
-    dialect.EkfStatusReport: Row(lambda s: dialect.EkfStatusReport(_estimator_flags(s)), None, (1.0, 10.0)),
-    dialect.FenceStatus: Row(
+    dialect.Odometry: TelemetryRow(odometry, (0.0, 30.0)),
+    dialect.HighresImu: TelemetryRow(highres_imu, (5.0, 50.0), None, "imu"),
+    dialect.Altitude: TelemetryRow(altitude, (1.0, 10.0)),
+    dialect.EstimatorStatus: TelemetryRow(estimator_status, (1.0, 5.0)),
+    dialect.RawImu: TelemetryRow(raw_imu, None, (2.0, 50.0)),
+    dialect.ScaledImu: TelemetryRow(scaled_imu, None, (0.0, 50.0)),
+    dialect.EkfStatusReport: TelemetryRow(lambda s: dialect.EkfStatusReport(_estimator_flags(s)), None, (1.0, 10.0)),
+    dialect.FenceStatus: TelemetryRow(
         lambda s: dialect.FenceStatus(int(s.breach != 0), min(s.breaches, 0xFFFF), s.breach, s.breach_ns // 1_000_000),
         None,
         (1.0, 2.0),
     ),
-    dialect.ScaledPressure: Row(scaled_pressure, (1.0, 5.0), (2.0, 10.0)),
-    dialect.OpticalFlow: Row(optical_flow, (0.0, 15.0), None, "flow"),
+    dialect.ScaledPressure: TelemetryRow(scaled_pressure, (1.0, 5.0), (2.0, 10.0)),
+    dialect.OpticalFlow: TelemetryRow(optical_flow, (0.0, 15.0), None, "flow"),
 }
 STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM; contents as in ArduCopter
     1: (dialect.RawImu, dialect.ScaledPressure, dialect.ScaledImu),
@@ -396,7 +396,7 @@ STREAMS: dict[int, tuple[type[WireMessage], ...]] = {  # MAV_DATA_STREAM; conten
     12: (dialect.SystemTime, dialect.EkfStatusReport, dialect.DistanceSensor, dialect.BatteryStatus, dialect.Vibration),
 }
 ALL_STREAMS = 0
-MESSAGE_TYPES_BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in ROWS}
+MESSAGE_TYPES_BY_ID = {dialect.LAYOUTS[kind].id: kind for kind in TELEMETRY_ROWS}
 
 
 class Telemetry:
@@ -407,7 +407,7 @@ class Telemetry:
         self._defaults: dict[type[WireMessage], float] = {}
         self._interval_ns: dict[type[WireMessage], int] = {}
         self._due_ns: dict[type[WireMessage], int] = {}
-        for kind, row in ROWS.items():
+        for kind, row in TELEMETRY_ROWS.items():
             rates = row.px4 if source.personality.is_px4 else row.ardupilot
             if rates:
                 self._defaults[kind] = rates[1 if level == "full" else 0]
@@ -426,12 +426,12 @@ class Telemetry:
         new_samples = self._source.state.take_new_samples()
         messages: list[WireMessage] = []
         for kind, interval_ns in self._interval_ns.items():
-            due_ns, delay_ns, sensor = self._due_ns[kind], 0, ROWS[kind].sensor
+            due_ns, delay_ns, sensor = self._due_ns[kind], 0, TELEMETRY_ROWS[kind].sensor
             if sensor is not None:  # wait for a sample, at most two intervals
                 delay_ns = -interval_ns // 2 if new_samples.get(sensor) else 2 * interval_ns
             if t_ns >= due_ns + delay_ns:
                 self._due_ns[kind] = max(due_ns + interval_ns, t_ns + interval_ns // 2)
-                message = ROWS[kind].build(self._source)
+                message = TELEMETRY_ROWS[kind].build(self._source)
                 if message is not None:
                     if kind is dialect.HighresImu and interval_ns < GATE_NS:  # every sample since the last gate
                         messages += map(_inertial, new_samples.get("imu", ())[:-1])
@@ -442,7 +442,7 @@ class Telemetry:
         """Return the current message; None if this vehicle does not send it."""
         kind = MESSAGE_TYPES_BY_ID.get(message_id)
         self._source.advance()
-        return ROWS[kind].build(self._source) if kind else None
+        return TELEMETRY_ROWS[kind].build(self._source) if kind else None
 
     def set_interval(self, message_id: int, interval_us: float) -> bool:
         """Set the interval of a message (-1: never, 0: the default); return False if this vehicle does not send it."""

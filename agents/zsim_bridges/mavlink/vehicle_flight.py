@@ -237,7 +237,7 @@ class Flight:
                 self._report(Severity.WARNING, "Offboard lost: no setpoints; holding")
                 self._enter(FlightMode.HOLD)
             elif self._control.is_moving:
-                self._control.hold_here()
+                self._control.hold_position()
 
     def _fly_mission(self) -> None:
         step = self.mission.step(self._state, self._parameters)
@@ -293,7 +293,7 @@ class Flight:
             if mode is FlightMode.LAND:
                 self._control.request("land")
             elif mode in HOLD_MODES or (mode is FlightMode.OFFBOARD and not needs_stream):
-                self._control.hold_here()
+                self._control.hold_position()
             else:
                 self._control.climb_to_m = None
         elif mode is FlightMode.MISSION and self._is_armed:
@@ -358,7 +358,7 @@ class FlightControl:
             if not self._is_pending:
                 self._send()
 
-    def hold_here(self) -> None:
+    def hold_position(self) -> None:
         """Come to rest, cancelling anything in progress."""
         self.climb_to_m = None
         if self._state.is_steerable:
@@ -397,7 +397,7 @@ class FlightControl:
 
     def send_mode(self, mode: ModeName) -> None:
         self._allowance -= 1
-        self._sender.mode(self._state.t_ns, mode)
+        self._sender.send_mode(self._state.t_ns, mode)
 
     def is_takeoff_overdue(self) -> bool:
         """Return whether the drone is still on the ground although a take-off was requested."""
@@ -432,11 +432,11 @@ class FlightControl:
         self._allowance -= 1
         if isinstance(target, Target):
             frame = "heading" if target.along_heading else "world"
-            self._sender.velocity(t_ns, *self._velocity(target), frame)
+            self._sender.send_velocity(t_ns, *self._velocity(target), frame)
         elif target is not None:
             self._course_request = None
             self._course.leave()
-            self._sender.attitude(t_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)
+            self._sender.send_attitude(t_ns, target.q_WB, target.thrust_n, target.yaw_rate_rad_s)
 
     def _velocity(self, target: Target) -> tuple[Vector, float]:
         """Return the velocity [m/s], in the axes of the target, and the yaw rate [rad/s] that lead to the target."""

@@ -184,7 +184,7 @@ class Target(NamedTuple):
 
     def distance_m(self, position_m: Vector) -> float:
         pairs = zip(self.position_m, position_m, strict=True)
-        return el.length((0.0 if p is None else p - own for p, own in pairs))
+        return el.length((0.0 if p is None else p - current for p, current in pairs))
 
 
 class TiltTarget(NamedTuple):

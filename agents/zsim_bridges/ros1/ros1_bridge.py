@@ -40,8 +40,8 @@ FIX_3D = 3  # fix type with a height, as in NMEA
 NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags recognised by a camera
     **dict.fromkeys(("temp", "wind_speed", "wind_angle", "wind_comp_angle", "tags_count"), 0),
     **dict.fromkeys(("motor1", "motor2", "motor3", "motor4"), 0),
-    **{f"tags_{what}": np.zeros(0, np.uint32) for what in ("type", "xc", "yc", "width", "height")},
-    **{f"tags_{what}": np.zeros(0, np.float32) for what in ("orientation", "distance")},
+    **{f"tags_{field}": np.zeros(0, np.uint32) for field in ("type", "xc", "yc", "width", "height")},
+    **{f"tags_{field}": np.zeros(0, np.float32) for field in ("orientation", "distance")},
 }
 UNKNOWN_COVARIANCE = np.zeros(9)
 DRIVER_QUEUE = 200  # messages, as in the driver's publishers
@@ -114,7 +114,7 @@ class Ros1Bridge(PictureServer):
         await super().open(stack)
         await stack.enter_async_context(self._node.running())
 
-    def wanted_pictures(self) -> list[str]:
+    def watched_cameras(self) -> list[str]:
         return [
             keys.camera(name, camera) for name, drone in self._drones.items() for camera in drone.cameras.subscribed()
         ]
@@ -259,10 +259,10 @@ class DriverCommands:
         is_due = self._sent_ns is None or status.t_ns - self._sent_ns >= REPEAT_NS
         if self._tilt is not None and is_due and status.state in AIRBORNE:
             self._sent_ns = status.t_ns
-            self._sender.tilt(status.t_ns, *self._tilt)
+            self._sender.send_tilt(status.t_ns, *self._tilt)
 
     def send_mode(self, mode: ModeName) -> None:
-        self._sender.mode(self._status.t_ns if self._status else 0, mode)
+        self._sender.send_mode(self._status.t_ns if self._status else 0, mode)
 
 
 def tilt_of(twist: Any) -> TiltCommand:

@@ -229,11 +229,11 @@ class RosCommands:
         if not all(map(math.isfinite, (*v, yaw_rate))):
             raise ValueError(f"the velocity is {(*v, yaw_rate)}; must be finite")
         with self._lock:
-            self._senders[drone].velocity(self._observer.now_ns, v, float(yaw_rate), "heading")
+            self._senders[drone].send_velocity(self._observer.now_ns, v, float(yaw_rate), "heading")
 
     def send_mode(self, mode: ModeName, drone: str, _: Any = None) -> None:
         with self._lock:
-            self._senders[drone].mode(self._observer.now_ns, mode)
+            self._senders[drone].send_mode(self._observer.now_ns, mode)
 
     def toggle_emergency(self, drone: str, _: Any) -> None:
         """Stop the rotors at once, or reset a drone whose rotors were stopped, like the aircraft's emergency button.

@@ -484,5 +484,5 @@ def check_run(info: Info, process: str, drone: str) -> None:
     if info.mode != "realtime":
         raise RunError(f"{process}: the run is in lockstep; a driver needs one that is started with --realtime")
     if process != f"{DRIVER}.{drone}":
-        needed = f"must be {DRIVER}.{drone}; give the certificate of that process"
-        raise RunError(f"{process}: the name of the driver of {drone} {needed}")
+        requirement = f"must be {DRIVER}.{drone}; give the certificate of that process"
+        raise RunError(f"{process}: the name of the driver of {drone} {requirement}")

@@ -32,10 +32,10 @@ class CommandSender:
         self._drone = drone
         self._seq: dict[str, int] = {}
 
-    def mode(self, t_ns: int, mode: ModeName) -> None:
+    def send_mode(self, t_ns: int, mode: ModeName) -> None:
         self._send("mode", flight_messages.Mode, t_ns, mode)
 
-    def velocity(
+    def send_velocity(
         self,
         t_ns: int,
         velocity_m_s: Sequence[float],
@@ -46,11 +46,11 @@ class CommandSender:
         x, y, z = velocity_m_s
         self._send("velocity", flight_messages.Velocity, t_ns, (x, y, z), yaw_rate_rad_s, frame)
 
-    def tilt(self, t_ns: int, forward: float, left: float, up: float, yaw_left: float, hover: bool) -> None:
+    def send_tilt(self, t_ns: int, forward: float, left: float, up: float, yaw_left: float, hover: bool) -> None:
         """Command the drone as an AR.Drone: by fractions of its limits in [-1, 1], or to hover."""
         self._send("ardrone", flight_messages.Ardrone, t_ns, forward, left, up, yaw_left, hover)
 
-    def attitude(self, t_ns: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float) -> None:
+    def send_attitude(self, t_ns: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float) -> None:
         """Command the tilt of an attitude, a thrust [N] and a yaw rate."""
         w, x, y, z = q_WB
         self._send("attitude", flight_messages.Attitude, t_ns, (w, x, y, z), thrust_n, yaw_rate_rad_s)

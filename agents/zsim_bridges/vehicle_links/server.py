@@ -86,9 +86,9 @@ class PictureIntake:
         self._queue: deque[RawSample] = deque(maxlen=IMAGES_QUEUED_MAX)
         self._undeclare: dict[str, Callable[[], None]] = {}
 
-    def follow(self, wanted: Iterable[str]) -> None:
+    def follow(self, followed_keys: Iterable[str]) -> None:
         """Subscribe to these keys, and unsubscribe from all others."""
-        keys = set(wanted)
+        keys = set(followed_keys)
         for key in keys - set(self._undeclare):
             try:
                 self._undeclare[key] = self._link.declare_subscriber(key, self._on_picture)
@@ -206,10 +206,10 @@ class PictureServer(VehicleServer):
                 if keys.is_status(key):  # a gate of a large fleet takes long; let clients' commands go first
                     await asyncio.sleep(0)
             await asyncio.sleep(0)
-        self._pictures.follow(self.wanted_pictures())
+        self._pictures.follow(self.watched_cameras())
 
     @abstractmethod
-    def wanted_pictures(self) -> Iterable[str]:
+    def watched_cameras(self) -> Iterable[str]:
         """Return the keys of the cameras that clients watch."""
 
     @abstractmethod

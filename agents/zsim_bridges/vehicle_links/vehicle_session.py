@@ -423,8 +423,8 @@ class AircraftReadings:
         self._pressure_count = 0
 
     def take(self) -> list[Reading]:
-        taken, self.readings = self.readings, []
-        return taken
+        readings, self.readings = self.readings, []
+        return readings
 
     def read(self, sensor: str, taken_ns: int, *values: Any) -> bool:
         """Add a reading if it differs from the last one, since aircraft repeat the last values of slow sensors."""

@@ -8,6 +8,7 @@ from fake_aircraft import FIELD_UT, STEP_NS, FakeAircraft
 
 from zsim.math.frames import heading
 from zsim_bridges.ardrone.aircraft_session import AircraftSession, NavdataReadings
+from zsim_bridges.ardrone.navdata import ControlState, StateBit
 from zsim_bridges.vehicle_links.vehicle_session import AircraftPose, Demand
 
 ORIGIN = (-34.603, -58.368, 25.0)
@@ -74,6 +75,15 @@ def test_the_aircraft_is_configured_again_after_a_restart():
     loop.run(5)
     assert len(loop.aircraft.config) == 8
     assert loop.session.state.received_ns == loop.now_ns
+
+
+def test_an_aircraft_in_an_unknown_state_is_on_the_ground_only_if_it_says_so():
+    loop = Loop()
+    loop.run(5)
+    for bits, state in ((StateBit.FLYING, "flying"), (0, "landed")):
+        loop.aircraft.state, loop.aircraft.bits = ControlState.TEST, bits
+        loop.run(0.1)
+        assert loop.session.state.state == state
 
 
 @pytest.mark.parametrize("yaw", [1.0, -2.5])

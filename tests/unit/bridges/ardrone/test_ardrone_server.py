@@ -171,10 +171,10 @@ def test_pictures_are_subscribed_to_if_encodable_else_the_extra_is_named(
 ):
     monkeypatch.setattr(ardrone_server, "find_spec", lambda _: object() if is_installed else None)
     server, lines = offered()
-    assert list(server.wanted_pictures()) == []  # nobody is connected
+    assert list(server.watched_cameras()) == []  # nobody is connected
     watcher: Any = object()
     server._drones["drone1"].video.port.writers.add(watcher)
-    wanted = [list(server.wanted_pictures()) for _ in range(2)]
+    wanted = [list(server.watched_cameras()) for _ in range(2)]
     assert wanted == ([[keys.camera("drone1", "front")]] * 2 if is_installed else [[], []])
     assert len(lines) == (0 if is_installed else 1)
     assert all(install_command(["video"]) in line for line in lines)

@@ -9,7 +9,7 @@ from refused import has_terms, without_tags
 
 from zsim.contract.run_messages import Event
 from zsim_bridges.console import console_tables
-from zsim_bridges.console.console_page import FILTERS, MANY, NO_ROW, SORTINGS, FleetTable, filtered_rows
+from zsim_bridges.console.console_page import FILTERS, MANY_DRONES, NO_ROW, SORTINGS, FleetTable, filtered_rows
 from zsim_bridges.console.console_tables import DroneRow, SensorRates, drone_table
 from zsim_bridges.console.run_condition import DroneCondition, drone_alarms
 from zsim_bridges.console.view_buffer import ALL, OWN, ROWS_KEPT, EventLog, EventRow, chosen_rows
@@ -138,7 +138,7 @@ def test_rows_are_sorted_and_filtered():
     assert {choice for choice, _ in FILTERED} == set(FILTERS)
 
 
-@pytest.mark.parametrize(("count", "order"), [(MANY, "as in the scenario"), (MANY + 1, "worst first")])
+@pytest.mark.parametrize(("count", "order"), [(MANY_DRONES, "as in the scenario"), (MANY_DRONES + 1, "worst first")])
 def test_many_drones_are_sorted_worst_first_by_default(count: int, order: str):
     gui: Any = Gui()
     FleetTable(gui, [f"drone{i}" for i in range(count)], lambda: None)

@@ -56,8 +56,8 @@ class FakeCommandClient:
     def request_world(self, op: str, **args: Any) -> None:
         self.asked.append(("world", op, args))
 
-    def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
-        self.shown.append(shown)
+    def request_cluster(self, cluster: str, op: str, args_text: str = "", **args: Any) -> None:
+        self.shown.append(args_text)
         self.asked.append((cluster, op, args))
 
     def send_mode(self, drones: list[str], mode: str) -> None:
@@ -256,7 +256,7 @@ def test_a_formation_form_enables_what_its_controller_would_grant(bench: Bench, 
     locked = {label for label in OPERATIONS if bench.gui.at[label].visible and bench.gui.at[label].disabled}
     assert locked == off
     assert all(bench.gui.at[label].hint for label in locked)
-    steered = run.off() == "" and not run.replayed and run.phases["main"] in STEERED
+    steered = run.outage() == "" and not run.replayed and run.phases["main"] in STEERED
     assert bench.gui.at["p [m]"].disabled is not steered
     flights = [bench.gui.at[label] for label in FLIGHTS]
     assert [bool(each.hint) for each in flights] == [each.disabled for each in flights] == [not steered] * len(FLIGHTS)
@@ -411,7 +411,7 @@ def test_a_common_fault_has_the_labelled_target_and_magnitude(
     kind, target, parameters = asked
     lasting = {} if kind == "process_kill" else {"for_s": DURATION_S}
     assert bench.client.asked == [("world", "fault_add", {"kind": kind, "target": target, **lasting, **parameters})]
-    told = without_tags(form._strikes.content.replace("<br>", "\n"))
+    told = without_tags(form._effects.content.replace("<br>", "\n"))
     struck = "drones" if target == "world" else target.rpartition("/")[2]
     assert has_terms(told, label, struck)
     assert has_terms(

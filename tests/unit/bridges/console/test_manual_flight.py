@@ -19,17 +19,17 @@ from zsim.vehicles.vehicle import Limits
 from zsim_agents.references.cruise import Course
 from zsim_agents.references.path import SHARE, PathLimits
 from zsim_bridges.console.manual_flight import (
-    GONE_S,
+    PAGE_TIMEOUT_S,
     PERIOD_S,
     SETTLED_S,
     STALE_S,
     DronePose,
-    DroneSight,
+    DroneStatus,
     FlightAnswer,
     Geofence,
     ManualFlight,
     ReturnFlights,
-    RunSight,
+    RunStatus,
     Stick,
     geofence_of,
     stick_velocity,
@@ -49,7 +49,7 @@ class Client:
     def __init__(self) -> None:
         self.sent: list[tuple[str, tuple[float, float, float]]] = []
         self.taken: list[str] = []
-        self.given_back: list[str] = []
+        self.released: list[str] = []
         self.refusal = ""
         self.waiting: list[Callable[[str], None]] | None = None
         self.modes = 0
@@ -61,8 +61,8 @@ class Client:
         else:
             self.waiting.append(done)
 
-    def give_back(self, drone: str) -> None:
-        self.given_back.append(drone)
+    def release_drone(self, drone: str) -> None:
+        self.released.append(drone)
 
     def send_velocity(self, drone: str, velocity_m_s: tuple[float, float, float], yaw_rate_rad_s: float) -> None:
         self.sent.append((drone, velocity_m_s))
@@ -77,9 +77,9 @@ class Cockpit:
     def __init__(self) -> None:
         self.client = Client()
         self.now_s = 100.0
-        self.run = RunSight()
+        self.run = RunStatus()
         pose = DronePose((0.0, 0.0, 5.0), 0.0)
-        self.sights = {name: DroneSight("hovering", None, pose) for name in ("drone1", "drone2")}
+        self.sights = {name: DroneStatus("hovering", None, pose) for name in ("drone1", "drone2")}
         limits = dict.fromkeys(self.sights, Limits())
         fence = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
         client: Any = self.client
@@ -88,7 +88,7 @@ class Cockpit:
             client, NAME, limits, courses, fence, 0.02, self.sight, lambda: self.run, lambda: self.now_s
         )
 
-    def sight(self, drone: str) -> DroneSight:
+    def sight(self, drone: str) -> DroneStatus:
         """Return the current sight of a drone."""
         seen = self.sights[drone]
         return seen if seen.pose is None else seen._replace(pose=seen.pose._replace(t_s=self.now_s))
@@ -105,7 +105,7 @@ class Cockpit:
         return [velocity for _, velocity in self.client.sent[before:]]
 
     def flying(self) -> "Cockpit":
-        assert self.control.take(PAGE, "drone2", over=False).state == "flying"
+        assert self.control.take(PAGE, "drone2", take_over=False).state == "flying"
         self.see("drone2", commander=NAME)
         return self
 
@@ -136,8 +136,8 @@ def test_the_drone_of_a_silent_page_hovers_and_is_released(flown: Cockpit):
     velocities = flown.after(STALE_S + 0.5)
     assert velocities[-1] == STILL
     assert velocities.count(STILL) == pytest.approx(10, abs=1)
-    flown.after(GONE_S)
-    assert flown.client.given_back == ["drone2"]
+    flown.after(PAGE_TIMEOUT_S)
+    assert flown.client.released == ["drone2"]
     assert flown.control.answer(PAGE).state == "none"
     assert flown.after(1.0) == []
 
@@ -153,24 +153,24 @@ def test_after_a_lost_connection_the_same_request_regains_the_drone(cockpit: Coc
     assert cockpit.control.take(OTHER, "drone2", False, "one").state == "flying"
     assert cockpit.control.answer(PAGE).state == "none"
     cockpit.control.lose(OTHER)
-    assert set(cockpit.after(GONE_S + 1.0)) == {STILL}
-    assert cockpit.client.given_back == ["drone2"]
+    assert set(cockpit.after(PAGE_TIMEOUT_S + 1.0)) == {STILL}
+    assert cockpit.client.released == ["drone2"]
 
 
 def test_a_drone_of_a_formation_must_be_taken_over_to_be_flown(cockpit: Cockpit):
     cockpit.see("drone2", commander="controller.main")
-    refused = cockpit.control.take(PAGE, "drone2", over=False)
+    refused = cockpit.control.take(PAGE, "drone2", take_over=False)
     assert (refused.state, refused.over) == ("none", True)
     assert has_terms(refused.text, "drone2", "controller.main")
     assert cockpit.client.taken == []
     assert cockpit.control.steer(PAGE, FORWARD).state == "none"
     assert cockpit.after(1.0) == []
     cockpit.client.refusal = "drone2: flown by 'console.2' with priority 10"
-    answer = cockpit.control.take(PAGE, "drone2", over=True)  # the world refuses it
+    answer = cockpit.control.take(PAGE, "drone2", take_over=True)  # the world refuses it
     assert (answer.state, answer.text) == ("none", cockpit.client.refusal)
     assert cockpit.after(1.0) == []
     cockpit.client.refusal = ""
-    assert cockpit.control.take(PAGE, "drone2", over=True).state == "flying"
+    assert cockpit.control.take(PAGE, "drone2", take_over=True).state == "flying"
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_a_drone_of_a_formation_must_be_taken_over_to_be_flown(cockpit: Cockpit)
     [
         ({"state": "landed"}, {}, ("drone2", "landed", "hovering")),
         ({"state": ""}, {}, ("drone2",)),
-        ({}, {"off": "a record is played back"}, ("record",)),
+        ({}, {"refusal": "a record is played back"}, ("record",)),
         ({}, {"rate": 12.0}, ("12.0", "5")),
     ],
     ids=["landed", "unseen", "replay", "too fast"],
@@ -187,8 +187,8 @@ def test_a_drone_that_cannot_be_flown_is_refused_with_the_reason(
     sight: dict, run: dict, terms: tuple[str, ...], cockpit: Cockpit
 ):
     cockpit.see("drone2", **sight)
-    cockpit.run = RunSight(**run)
-    answer = cockpit.control.take(PAGE, "drone2", over=True)
+    cockpit.run = RunStatus(**run)
+    answer = cockpit.control.take(PAGE, "drone2", take_over=True)
     assert (answer.state, answer.over) == ("none", False)
     assert has_terms(answer.text, *terms)
     assert cockpit.client.taken == []
@@ -211,7 +211,7 @@ def test_a_repeated_request_is_carried_out_once(cockpit: Cockpit):
 def test_a_request_is_repeated_once_a_silent_world_returns(cockpit: Cockpit):
     cockpit.client.waiting = []
     cockpit.control.take(PAGE, "drone2", True, "one")
-    cockpit.run = RunSight(silence="the world has not answered for 5 s")
+    cockpit.run = RunStatus(silence="the world has not answered for 5 s")
     cockpit.client.waiting.pop()(NoAnswer("no answer came within 5 s"))
     for _ in range(3):
         cockpit.after(2.0)
@@ -220,7 +220,7 @@ def test_a_request_is_repeated_once_a_silent_world_returns(cockpit: Cockpit):
     assert waits.state == "taking"
     assert has_terms(waits.text, "6.0 s", "not confirmed", "world", "5 s")
     assert cockpit.client.taken == ["drone2"]
-    cockpit.run = RunSight()
+    cockpit.run = RunStatus()
     cockpit.after(PERIOD_S)
     assert cockpit.client.taken == ["drone2"] * 2
     cockpit.client.waiting.pop()("")
@@ -236,21 +236,21 @@ def test_a_stall_of_the_console_is_given_as_the_reason_for_a_release(flown: Cock
 
 
 def test_a_drone_is_flown_from_one_page_and_a_page_flies_one_drone(flown: Cockpit):
-    assert has_terms(flown.control.take(OTHER, "drone2", over=True).text, "drone2", "another page")
-    assert flown.control.take(PAGE, "drone1", over=False).state == "flying"
+    assert has_terms(flown.control.take(OTHER, "drone2", take_over=True).text, "drone2", "another page")
+    assert flown.control.take(PAGE, "drone1", take_over=False).state == "flying"
     flown.control.tick()
-    assert flown.client.given_back == ["drone2"]
+    assert flown.client.released == ["drone2"]
 
 
 def test_a_drone_left_before_the_answer_is_released_again_after_it(cockpit: Cockpit):
     cockpit.client.waiting = []
-    assert cockpit.control.take(PAGE, "drone2", over=False).state == "taking"
+    assert cockpit.control.take(PAGE, "drone2", take_over=False).state == "taking"
     assert cockpit.after(0.5) == []
     cockpit.control.leave(PAGE)
     cockpit.control.tick()
     cockpit.client.waiting[0]("")
     cockpit.control.tick()
-    assert cockpit.client.given_back == ["drone2"] * 2
+    assert cockpit.client.released == ["drone2"] * 2
     assert cockpit.control.answer(PAGE).state == "none"
 
 
@@ -266,9 +266,9 @@ def test_the_end_of_a_flight_releases_the_drone_and_gives_the_reason(end: str, f
     elif end == "commander":
         flown.see("drone2", commander="console.2")
     else:
-        flown.run = RunSight(off="the world has not answered for 2 s")
+        flown.run = RunStatus(refusal="the world has not answered for 2 s")
     assert flown.after(2 * PERIOD_S) == []
-    assert flown.client.given_back == ["drone2"]
+    assert flown.client.released == ["drone2"]
     answer = flown.control.answer(PAGE)
     assert answer.state == "none"
     assert answer.text
@@ -278,18 +278,18 @@ def test_a_command_that_arrives_after_the_release_causes_another_release(flown: 
     """Commanding a free drone makes the sender its commander, and the world lands the drone of a silent commander."""
     flown.control.leave(PAGE)
     flown.after(PERIOD_S)
-    assert flown.client.given_back == ["drone2"]
+    assert flown.client.released == ["drone2"]
     flown.after(SETTLED_S + PERIOD_S)
-    assert flown.client.given_back == ["drone2"] * 2
+    assert flown.client.released == ["drone2"] * 2
     flown.see("drone2", commander=None)
     flown.after(3 * SETTLED_S)
-    assert flown.client.given_back == ["drone2"] * 2
+    assert flown.client.released == ["drone2"] * 2
 
 
 def test_a_paused_run_gets_no_commands_and_a_slow_one_a_command_per_gate(flown: Cockpit):
-    flown.run = RunSight(paused=True)
+    flown.run = RunStatus(is_paused=True)
     assert flown.after(1.0) == []
-    flown.run = RunSight(rate=0.1)  # one gate of 20 ms every 0.2 s
+    flown.run = RunStatus(rate=0.1)  # one gate of 20 ms every 0.2 s
     flown.control.steer(PAGE, None)
     assert 7 <= len(flown.after(2.0)) <= 10
 
@@ -319,8 +319,8 @@ def test_a_drone_flies_to_a_place_until_the_stick_is_used(flown: Cockpit):
 
 def test_places_are_visited_in_order_and_a_repeated_one_counts_once(flown: Cockpit):
     flown.control.go(PAGE, 10.0, 0.0, 5.0)
-    flown.control.go(PAGE, 10.0, 10.0, 5.0, then=True)
-    answer = flown.control.go(PAGE, 10.0, 10.0, 5.0, then=True)
+    flown.control.go(PAGE, 10.0, 10.0, 5.0, append=True)
+    answer = flown.control.go(PAGE, 10.0, 10.0, 5.0, append=True)
     assert (answer.goal, answer.then) == ((10.0, 0.0, 5.0), ((10.0, 10.0, 5.0),))
     assert flown.after(PERIOD_S)[0][1] == pytest.approx(0.0, abs=1e-9)
     flown.see("drone2", pose=DronePose((9.7, 0.0, 5.0), 0.0))
@@ -345,7 +345,7 @@ def test_a_place_outside_the_geofence_or_without_an_estimate_is_refused(flown: C
 def test_drones_are_released_when_the_run_is_left(flown: Cockpit):
     with flown.control.running():
         pass
-    assert flown.client.given_back == ["drone2"]
+    assert flown.client.released == ["drone2"]
 
 
 FENCE = Geofence((-50.0, -50.0, 1.0), (50.0, 50.0, 30.0))
@@ -406,15 +406,15 @@ class Returns:
         self.requests: Counter[str] = Counter()
         self.answer = FlightAnswer("drone1", "taking")
         self.is_sent = False
-        self.sight = DroneSight("flying", "console.1", DronePose((5.0, 5.0, 10.0), 0.0))
+        self.sight = DroneStatus("flying", "console.1", DronePose((5.0, 5.0, 10.0), 0.0))
         self.view = ViewCluster(0, 0, "engaged", NAMES, (5.0, -5.0, 15.0), (5.0, -5.0, 15.0), "")
         client: Any = SimpleNamespace(
             request_cluster=self._request, cluster_requests=self.requests,
             send_mode=lambda drones, mode: self.said.append((mode, drones)),
         )  # fmt: skip
         control: Any = SimpleNamespace(
-            take=lambda page, drone, over: self.answer, steer=lambda page, stick: self.answer,
-            leave=lambda page: self.said.append("leave"), go=self._go, is_on_way=lambda page: self.is_sent,
+            take=lambda page, drone, take_over: self.answer, steer=lambda page, stick: self.answer,
+            leave=lambda page: self.said.append("leave"), go=self._go, has_waypoints=lambda page: self.is_sent,
         )  # fmt: skip
         self.flights = ReturnFlights(
             SCENARIO,
@@ -455,7 +455,7 @@ def test_a_returning_drone_flies_above_its_start_and_lands_there(returns: Return
     returns.answer = FlightAnswer("drone1", "flying")
     assert returns.tick() == [("go", 0.0, 1.5)]
     assert returns.tick() == []
-    returns.sight = DroneSight("flying", "console.1", DronePose((0.2, 1.3, 10.0), 0.0))
+    returns.sight = DroneStatus("flying", "console.1", DronePose((0.2, 1.3, 10.0), 0.0))
     assert returns.tick() == ["leave", ("land", ["drone1"])]
     assert returns.tick() == []
     assert returns.notes == []
@@ -466,7 +466,7 @@ def test_a_returning_drone_taken_by_another_process_does_not_land(returns: Retur
     returns.answer = FlightAnswer("drone1", "none", "drone1 is flown by driver.x now")
     assert returns.tick() == []
     assert [subject for subject, _ in returns.notes] == ["drone1"]
-    returns.sight = DroneSight("flying", "driver.x", DronePose((0.0, 1.5, 10.0), 0.0))
+    returns.sight = DroneStatus("flying", "driver.x", DronePose((0.0, 1.5, 10.0), 0.0))
     assert returns.tick() == []
 
 

@@ -12,11 +12,11 @@ from refused import has_terms
 from zsim.contract.run_messages import ControlAnswer, Event
 from zsim.errors import SessionError
 from zsim_bridges.console.orders import (
-    OVERTAKEN,
     PRIORITY,
     PRIORITY_EMERGENCY,
     REPEAT_S,
     SHOWN_S,
+    SUPERSEDED,
     THREADS_PER_POOL,
     CommandClient,
     OrderBook,
@@ -444,8 +444,8 @@ def test_nothing_requested_before_an_emergency_is_sent_after_it(table: Table):
     table.client.send_mode(["drone1"], "emergency")
     assert table.outcome()[:2] == ("drone1: emergency", "")
     table.link.held[PRIORITY].set()
-    assert table.outcome()[:2] == ("drone1: takeoff", OVERTAKEN)
-    assert table.outcome()[:2] == ("drone1: land", OVERTAKEN)
+    assert table.outcome()[:2] == ("drone1: takeoff", SUPERSEDED)
+    assert table.outcome()[:2] == ("drone1: land", SUPERSEDED)
     assert table.link.modes == ["emergency"]
 
 

@@ -84,21 +84,21 @@ def test_an_acknowledged_alarm_that_becomes_red_is_new(board: AlarmBoard):
 
 
 @pytest.mark.parametrize("kind", sorted(run_condition.LOST))
-@pytest.mark.parametrize("back", sorted(run_condition.BACK))
+@pytest.mark.parametrize("back", sorted(run_condition.RETURN_KINDS))
 def test_a_lost_process_remains_lost_until_it_returns(kind: str, back: str, losses: Losses):
     losses.note(event(kind, "detector.main", host="lab", pid=7))
-    assert list(losses.now) == ["detector.main"]
+    assert list(losses.current) == ["detector.main"]
     losses.note(event("drop", "detector.main"))  # the run continues without it, but it is still dead
-    assert list(losses.now) == ["detector.main"]
+    assert list(losses.current) == ["detector.main"]
     losses.note(event(back, "detector.main"))
-    assert losses.now == {}
+    assert losses.current == {}
 
 
 def test_a_process_whose_work_another_has_taken_over_is_no_longer_lost(losses: Losses):
     for name in ("estimator.drone1", "estimator.drone2", "controller.main"):
         losses.note(event("death", name, host="lab", pid=7))
     losses.note(event("join", "estimator.main", serves=["estimator.drone1", "estimator.drone2"]))
-    assert list(losses.now) == ["controller.main"]
+    assert list(losses.current) == ["controller.main"]
 
 
 def test_a_process_that_publishes_its_health_is_no_longer_lost(losses: Losses):
@@ -106,14 +106,14 @@ def test_a_process_that_publishes_its_health_is_no_longer_lost(losses: Losses):
     losses.note(event("death", "estimator.drone1", host="lab", pid=7))
     health = Health(0, 0, "estimator", "lab", 7, {}, 0, 0, 0, 0)
     losses.note_health("estimator.drone1", health)  # published before its death, received after it
-    assert list(losses.now) == ["estimator.drone1"]
+    assert list(losses.current) == ["estimator.drone1"]
     losses.note_health("estimator.drone1", Health(0, 0, "estimator", "lab", 8, {}, 0, 0, 0, 0))
-    assert losses.now == {}
+    assert losses.current == {}
 
 
 def test_a_no_show_is_not_counted_as_lost(losses: Losses):
     losses.note(event("no_show", "estimator.drone1", host="lab", pid=9, incarnation=4))
-    assert losses.now == {}
+    assert losses.current == {}
 
 
 # Drones and formations

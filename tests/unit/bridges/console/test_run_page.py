@@ -143,17 +143,17 @@ def test_the_picture_rate_falls_with_many_drones_or_a_fast_run(drones: int, rate
 
 def test_the_plan_view_has_the_newest_positions_and_formations(seen: Seen):
     seen.draw(drones(*NAMES[:2]), cluster())
-    plan = seen.show.flying.plan(None, whole=True)
+    plan = seen.show.flying.plan(None, complete=True)
     assert [each and each[:2] for each in plan["drones"]] == [[0.0, 0.0], [4.0, 0.0], None]
     assert [(each["name"], each["drones"]) for each in plan["formations"]] == [(CLUSTER, [0, 1, 2])]
     assert (plan["names"], plan["t_s"]) == (list(NAMES), pytest.approx(0.02))
-    assert "names" not in seen.show.flying.plan(None, whole=False)
+    assert "names" not in seen.show.flying.plan(None, complete=False)
 
 
 def test_a_drone_is_acquired_from_a_page_and_released(seen: Seen):
     seen.draw(drones(*NAMES))
     flying = seen.show.flying.control
-    assert flying.take("page", NAMES[1], over=False).state in ("taking", "flying")
+    assert flying.take("page", NAMES[1], take_over=False).state in ("taking", "flying")
     flying.leave("page")
     seen.show.close()
     assert ("world/control", "acquire", {"drone": NAMES[1], "priority": 10}) in seen.link.asked

@@ -250,9 +250,9 @@ def test_the_cameras_are_in_the_frame_tree() -> None:
 )
 def test_a_camera_is_read_only_while_subscribed(topic: str, wanted: list[str]) -> None:
     bench = Bench()
-    assert bench.bridge.wanted_pictures() == []
+    assert bench.bridge.watched_cameras() == []
     Subscriber(bench.node, topic)
-    assert bench.bridge.wanted_pictures() == [keys.camera("quad-1", camera) for camera in wanted]
+    assert bench.bridge.watched_cameras() == [keys.camera("quad-1", camera) for camera in wanted]
 
 
 def test_pictures_are_received_only_while_wanted() -> None:
