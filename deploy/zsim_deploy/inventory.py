@@ -29,7 +29,7 @@ from zsim.scenario.roles import (
 from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, OnDeath, Scenario, Spec
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault, faults, first_lines
-from zsim_api.programs import filled
+from zsim_api.programs import fill_placeholders
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME
 
