@@ -545,7 +545,7 @@ def test_events_of_the_drone_and_a_low_battery_are_sent_as_status_texts() -> Non
         ("collision", "world", "drone2", {"other": "drone1"}),
         ("refused", "mavlink.main", "drone/drone1/cmd/mode", {"reason": "it is cold"}),
     ):
-        drone.vehicle.watch.on_event(Event(0, 0, kind, source, subject, "", data))
+        drone.vehicle.monitor.on_event(Event(0, 0, kind, source, subject, "", data))
     drone.battery_percent = 15.0
     drone.step(100)
     texts = ["Fault rotor_efficiency", "Collision with drone2", "Refused: it is cold", "Low battery: 15 %"]
