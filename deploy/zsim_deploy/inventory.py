@@ -29,7 +29,7 @@ from zsim.scenario.roles import (
 from zsim.scenario.scenario import DRONES_MAX, PROCESSES_MAX, Name, OnDeath, Scenario, Spec
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault, faults, first_lines
-from zsim_api.programs import filled
+from zsim_api.programs import fill_placeholders
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.arguments import REALTIME
 
@@ -377,7 +377,7 @@ def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
     if name not in scenario.own_programs:
         return ""
     values = {"endpoint": endpoint, "federation": scenario.federation, "name": name, "folder": "{folder}"}
-    return f": {shlex.join(filled(scenario.own_programs[name].command, values))}"
+    return f": {shlex.join(fill_placeholders(scenario.own_programs[name].command, values))}"
 
 
 def _is_known(name: str, scenario: Scenario) -> bool:

@@ -294,16 +294,16 @@ def sweep(
     from rich.console import Console
 
     from zsim_analysis.sweep.design import read_document
-    from zsim_api.sweeping import flown, planned
+    from zsim_api.sweeping import checked_plan, fly_plan
 
     document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
     changed = opt.changed_fields(set_, seed, duration)
     shown = Console(stderr=True)
-    plan = planned(scenario.name, document, vary or [], runs, keep_records, changed, shown, faults)
+    plan = checked_plan(scenario.name, document, vary or [], runs, keep_records, changed, shown, faults)
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        rows = flown(plan, folder, workers, dask, force)
+        rows = fly_plan(plan, folder, workers, dask, force)
     except KeyboardInterrupt:
         note(f"interrupted; the same command with --out {folder} continues; the table so far is in it")
         sys.exit(INTERRUPTED)

@@ -25,7 +25,7 @@ from typing import IO, Protocol
 from zsim.errors import printable
 from zsim.runtime.progress import SlowStart
 from zsim.scenario.scenario import Scenario
-from zsim_api.programs import Program, environment_of, filled
+from zsim_api.programs import Program, environment_of, fill_placeholders
 from zsim_api.run_folder import Launch
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.launch.supervisor import Outcome, RunProcess, end_text, last_line
@@ -390,7 +390,7 @@ def programs_of(
     return [
         ProgramProcess(
             name,
-            filled(scenario.own_programs[name].command, {**values, "name": name}),
+            fill_placeholders(scenario.own_programs[name].command, {**values, "name": name}),
             out / "logs",
             environment,
             folder,
