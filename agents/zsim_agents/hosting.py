@@ -175,8 +175,8 @@ class AgentSpec(NamedTuple):
                 settings[setting] = yaml_file.value(value)
             except ValueError as error:
                 raise RunError(f"setting {setting} of {named} {error}; must be a value in YAML") from error
-        made = plugin.load_any(named, "agent", Agent)
-        return cls(named, settings, keys.name(name or given or process_name(made)))
+        source = plugin.load_any(named, "agent", Agent)
+        return cls(named, settings, keys.name(name or given or process_name(source)))
 
     def arguments(self) -> list[str]:
         """Return the arguments from which `parse` creates this spec."""
@@ -188,10 +188,10 @@ class AgentSpec(NamedTuple):
         return own_agent(plugin.load_any(self.named, "agent", Agent), info, scenario, self.settings, self.name)
 
 
-def process_name(made: Agent | Callable[..., Agent]) -> str:
+def process_name(source: Agent | Callable[..., Agent]) -> str:
     """Return the process name of a user's agent, or of the one that a class or function will create."""
-    name = getattr(made, "name", None)
-    return name if isinstance(name, str) else default_name(type(made) if isinstance(made, Agent) else made)
+    name = getattr(source, "name", None)
+    return name if isinstance(name, str) else default_name(type(source) if isinstance(source, Agent) else source)
 
 
 def without_map(info: Info, scenario: Scenario) -> tuple[Info, Scenario]:
@@ -212,7 +212,7 @@ def with_own_agents(scenario: Scenario, names: Sequence[str]) -> Scenario:
 
 
 def own_agent(
-    made: Agent | Callable[..., Agent],
+    source: Agent | Callable[..., Agent],
     info: Info,
     scenario: Scenario,
     settings: Mapping[str, Any] = {},
@@ -222,7 +222,7 @@ def own_agent(
     """Return a user's agent, ready to join.
 
     Args:
-        made: the agent; or a class or function that creates it from `settings`, its parameters, and from `info`,
+        source: the agent; or a class or function that creates it from `settings`, its parameters, and from `info`,
             `scenario` and the name of its `drone` or `cluster`, if it takes arguments of these names.
         name: name of its process; empty for the agent's own name.
         per: "drone" or "cluster" for an agent of a single one, "run" for others.
@@ -232,19 +232,19 @@ def own_agent(
         RunError: the settings do not fit the arguments of the class or function, or it does not return an agent.
         DocumentError: the agent's parameters or messages are not allowed.
     """
-    if not isinstance(made, Agent):
-        if not callable(made):
-            raise RunError(f"agent is {show(made)}; must be a zsim.Agent, or a class or a function that makes one")
-        kind = f"{made.__module__}:{made.__qualname__}" if isinstance(made, type | FunctionType) else show(made)
+    if not isinstance(source, Agent):
+        if not callable(source):
+            raise RunError(f"agent is {show(source)}; must be a zsim.Agent, or a class or a function that makes one")
+        kind = f"{source.__module__}:{source.__qualname__}" if isinstance(source, type | FunctionType) else show(source)
         try:
-            accepted = signature(made)
+            accepted = signature(source)
         except ValueError as error:  # a partial whose arguments the class does not take
             raise RunError(f"{kind} cannot be made: {error}") from None
         given = {"info": info, "scenario": scenario, per: name.partition(".")[2]}
         given = {key: value for key, value in given.items() if key in accepted.parameters}
-        make: Callable[..., Agent] = made
-        if parameters.has_parameters(made):
-            make = parameters.bound(made, dict(settings), kind)
+        make: Callable[..., Agent] = source
+        if parameters.has_parameters(source):
+            make = parameters.bound(source, dict(settings), kind)
         else:
             given |= settings
         try:
@@ -252,17 +252,17 @@ def own_agent(
         except TypeError as error:
             raise RunError(f"{kind} takes {accepted}, and cannot be made: {error}") from None
         try:
-            made = make(**given)
+            source = make(**given)
         except plugin.RAISED as error:
             failure = plugin.user_code_error(error, "before the start")
             if failure is None:
                 raise
             raise failure from error
-        if not isinstance(made, Agent):
-            raise RunError(f"{kind} makes a {type(made).__name__}; must make a zsim.Agent")
-    register_messages(messages_of(type(made), plugin.full_name(type(made))))
-    made.bind(info, name, scenario.radio_of_agents)
-    return made
+        if not isinstance(source, Agent):
+            raise RunError(f"{kind} makes a {type(source).__name__}; must make a zsim.Agent")
+    register_messages(messages_of(type(source), plugin.full_name(type(source))))
+    source.bind(info, name, scenario.radio_of_agents)
+    return source
 
 
 def agent_class(role: str) -> Callable[..., Agent]:

@@ -49,13 +49,13 @@ class Assertions(ABC):
         where = f"{formation.name} from {window[0]:g} to {window[1]:g} s"
         if unknown := [name for name in rms if name not in formation.names]:
             raise RunError(f"{where}: has no variable {unknown[0]!r}; must be one of {', '.join(formation.names)}")
-        share, found, faults = formation.engaged_share(window), formation.errors(window), []
+        share, errors_by_name, faults = formation.engaged_share(window), formation.errors(window), []
         if window[1] > run.duration_s:
             faults.append(f"{where}: the run ended at {run.duration_s:g} s")
         elif share != 1.0:
             faults.append(f"{where}: was engaged {share or 0:.0%} of the time; must be all of it")
         for name, allowed in rms.items():
-            error = found[name].true_rms
+            error = errors_by_name[name].true_rms
             if error is None:
                 faults.append(f"{where}: true RMS of {name} is unknown")
             elif not error <= allowed:
@@ -63,9 +63,9 @@ class Assertions(ABC):
                     formation.judged(window), np.abs(formation.true_error[:, formation.column(name)]), 0.0
                 )
                 row = int(np.nanargmax(errors))
-                most = f"the largest error is {errors[row]:.3g}, at {formation.t_s[row]:.2f} s"
+                largest = f"the largest error is {errors[row]:.3g}, at {formation.t_s[row]:.2f} s"
                 faults.append(
-                    f"{where}: true RMS of {name} is {error:.3g} {unit(name)}; must be at most {allowed:g}; {most}"
+                    f"{where}: true RMS of {name} is {error:.3g} {unit(name)}; must be at most {allowed:g}; {largest}"
                 )
         if faults:
             raise AssertionError("\n".join([*faults, f"the record is {run.record}"]))
@@ -76,11 +76,11 @@ class Assertions(ABC):
         run = self.run()
         with RecordReader(run.record) as reader:
             events = [decode_or_none(recorded) for recorded in reader.messages([keys.EVENT])]
-        found = [event for event in events if isinstance(event, Event) and event.kind == "collision"]
-        if found:
-            lines = [f"{event.text}, at {event.t_ns / 1e9:.2f} s" for event in found[:NAMED_MAX]]
-            more = [f"and {len(found) - NAMED_MAX} more"] if len(found) > NAMED_MAX else []
-            raise AssertionError("\n".join([*lines, *more, f"the record is {run.record}"]))
+        collisions = [event for event in events if isinstance(event, Event) and event.kind == "collision"]
+        if collisions:
+            lines = [f"{event.text}, at {event.t_ns / 1e9:.2f} s" for event in collisions[:NAMED_MAX]]
+            omitted = [f"and {len(collisions) - NAMED_MAX} more"] if len(collisions) > NAMED_MAX else []
+            raise AssertionError("\n".join([*lines, *omitted, f"the record is {run.record}"]))
 
     def assert_same_bits(self, other: "Assertions | Run | str | Path") -> None:
         """Assert that the truth of another run is bit-identical to that of this run.
@@ -94,18 +94,20 @@ class Assertions(ABC):
         __tracebackhide__ = True
         from zsim_api.recorded import Run
 
-        ours = self.run()
-        theirs = other.run() if isinstance(other, Assertions) else other if isinstance(other, Run) else Run(other)
-        if ours.truth_sha256 != theirs.truth_sha256:
-            raise AssertionError(f"{_difference(ours, theirs)}\nthe records are {ours.record} and {theirs.record}")
+        own_run = self.run()
+        other_run = other.run() if isinstance(other, Assertions) else other if isinstance(other, Run) else Run(other)
+        if own_run.truth_sha256 != other_run.truth_sha256:
+            raise AssertionError(
+                f"{_difference(own_run, other_run)}\nthe records are {own_run.record} and {other_run.record}"
+            )
 
 
-def _difference(ours: "Run", theirs: "Run") -> str:
-    if ours.drones != theirs.drones:
-        return f"the drones are {', '.join(ours.drones)}; those of the other run are {', '.join(theirs.drones)}"
-    comparison = TruthComparison(ours.drones)
-    with RecordReader(ours.record) as one, RecordReader(theirs.record) as two:
-        for a, b in zip_longest(*(gates(reader, list(ours.drones)) for reader in (one, two))):
+def _difference(own_run: "Run", other_run: "Run") -> str:
+    if own_run.drones != other_run.drones:
+        return f"the drones are {', '.join(own_run.drones)}; those of the other run are {', '.join(other_run.drones)}"
+    comparison = TruthComparison(own_run.drones)
+    with RecordReader(own_run.record) as own_reader, RecordReader(other_run.record) as other_reader:
+        for a, b in zip_longest(*(gates(reader, list(own_run.drones)) for reader in (own_reader, other_reader))):
             if a is None:
                 return f"truth is the same until this run ends, before t = {b.t_ns / 1e9:.2f} s"
             if b is None:

@@ -76,11 +76,11 @@ def emergency() -> Mode:
     return Mode(*_UNSTAMPED, "emergency")
 
 
-def _finite(what: str, numbers: Sequence[float] | np.ndarray) -> tuple[float, ...]:
-    plain = tuple(map(float, numbers))
-    if not all(map(math.isfinite, plain)):
-        raise RunError(f"{what}: {', '.join(map(str, plain))} holds a number that is not finite; must be finite")
-    return plain
+def _finite(name: str, numbers: Sequence[float] | np.ndarray) -> tuple[float, ...]:
+    values = tuple(map(float, numbers))
+    if not all(map(math.isfinite, values)):
+        raise RunError(f"{name}: {', '.join(map(str, values))} holds a number that is not finite; must be finite")
+    return values
 
 
 class PilotedDrone:
@@ -117,11 +117,11 @@ class PilotedDrone:
             radius_m: distance from a position within which the drone turns towards the next one; None or 0: it rests at
                 each position.
         """
-        places = np.asarray(position_m, float)
-        where = "places_m" if places.ndim == 2 else "position_m"
-        given = {"yaw_deg": yaw_deg, "over_s": over_s, "speed_m_s": speed_m_s, "radius_m": radius_m}
-        asked = {where: places.tolist(), **{name: value for name, value in given.items() if value is not None}}
-        return float(self._ask(self._key, "goto", **asked)["until_s"])
+        positions_m = np.asarray(position_m, float)
+        field = "places_m" if positions_m.ndim == 2 else "position_m"
+        options = {"yaw_deg": yaw_deg, "over_s": over_s, "speed_m_s": speed_m_s, "radius_m": radius_m}
+        args = {field: positions_m.tolist(), **{name: value for name, value in options.items() if value is not None}}
+        return float(self._ask(self._key, "goto", **args)["until_s"])
 
     def follow(self, **path: Any) -> float | None:
         """Fly to the start of a path, then along it; return the simulated time of its end [s], None if it has no end.

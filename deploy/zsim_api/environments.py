@@ -38,9 +38,9 @@ def never(sim: Simulation, agent: str) -> bool:
 
 def collided(sim: Simulation, agent: str) -> bool:
     """End the episode of a drone that hits a drone, an obstacle or the ground, or of a cluster with such a drone."""
-    own = _drones(sim, agent)
+    drones = _drones(sim, agent)
     hits = (event for event in sim.events if event.kind in ("collision", "impact"))
-    return any(event.subject in own or event.data.get("other") in own for event in hits)
+    return any(event.subject in drones or event.data.get("other") in drones for event in hits)
 
 
 def flipped(sim: Simulation, agent: str) -> bool:
@@ -53,9 +53,9 @@ def far_away(distance_m: float) -> Ended:
     """Return a condition that ends an agent's episode once one of its drones is farther than this from its start."""
 
     def is_far(sim: Simulation, agent: str) -> bool:
-        places = [sim.names.index(drone) for drone in _drones(sim, agent)]
-        starts = np.array([sim.scenario.drones[i].position_m for i in places])
-        return bool((np.linalg.norm(sim.truth.position_m[places] - starts, axis=1) > distance_m).any())
+        indices = [sim.names.index(drone) for drone in _drones(sim, agent)]
+        starts = np.array([sim.scenario.drones[i].position_m for i in indices])
+        return bool((np.linalg.norm(sim.truth.position_m[indices] - starts, axis=1) > distance_m).any())
 
     return is_far
 
@@ -96,8 +96,8 @@ class _Episodes:
         self.action_spaces: dict[str, Box] = {}
         self.observation_spaces: dict[str, Box] = {}
         for agent in self.interface.agents:
-            size, acted = self.interface.size(agent), len(self.interface.bounds(agent)[0])
-            self.action_spaces[agent] = Box(-1.0, 1.0, (acted,), np.float32)
+            size, action_size = self.interface.size(agent), len(self.interface.bounds(agent)[0])
+            self.action_spaces[agent] = Box(-1.0, 1.0, (action_size,), np.float32)
             self.observation_spaces[agent] = Box(-FARTHEST, FARTHEST, (size,), np.float32)
 
     def begin(self, rng: np.random.Generator) -> dict[str, Floats]:
@@ -106,8 +106,8 @@ class _Episodes:
         Raises:
             RunError: the scenario ends before all drones are in the air.
         """
-        drawn = self._randomise(rng) if self._randomise else {}
-        self.sim.source = self.scenario.changed(seed=int(rng.integers(SEEDS)), set=drawn)
+        values = self._randomise(rng) if self._randomise else {}
+        self.sim.source = self.scenario.changed(seed=int(rng.integers(SEEDS)), set=values)
         self.sim.reset()
         while (commands := self.interface.begin(self.sim)) is not None:
             if self.sim.ended is not None:
@@ -176,12 +176,12 @@ class FormationEnv(ParallelEnv[str, Floats, Floats]):
     def step(self, actions: dict[str, Floats]) -> tuple[Any, Any, Any, Any, Any]:
         """Fly one step; return observations, rewards, terminations, truncations and infos by agent."""
         episodes, acting = self._episodes, self.agents
-        seen = episodes.step({agent: actions[agent] for agent in acting if agent in actions})
+        observed = episodes.step({agent: actions[agent] for agent in acting if agent in actions})
         is_over = self.sim.ended is not None
         rewards = {agent: episodes.reward(agent) for agent in acting}
         terminations = {agent: episodes.terminated(agent) for agent in acting}
         self.agents = [agent for agent in acting if not (terminations[agent] or is_over)]
-        observations, infos = {agent: seen[agent] for agent in acting}, {agent: episodes.info() for agent in acting}
+        observations, infos = {agent: observed[agent] for agent in acting}, {agent: episodes.info() for agent in acting}
         return observations, rewards, terminations, dict.fromkeys(acting, is_over), infos
 
     def render(self) -> None:
@@ -210,22 +210,22 @@ class FlightEnv(gymnasium.Env[Floats, Floats]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; the same seed gives a bit-identical one."""
         super().reset(seed=seed)
-        return self._joined(self._episodes.begin(self.np_random)), self._episodes.info()
+        return self._concatenate(self._episodes.begin(self.np_random)), self._episodes.info()
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Fly one step; the reward is the mean over agents, and any agent that terminates ends the episode."""
         parts = np.split(np.asarray(action), self._cuts)
-        seen = self._episodes.step(dict(zip(self._agents, parts, strict=True)))
+        observations = self._episodes.step(dict(zip(self._agents, parts, strict=True)))
         reward = sum(map(self._episodes.reward, self._agents)) / len(self._agents)
         is_terminated = any(self._episodes.terminated(agent) for agent in self._agents)
-        return self._joined(seen), reward, is_terminated, self.sim.ended is not None, self._episodes.info()
+        return self._concatenate(observations), reward, is_terminated, self.sim.ended is not None, self._episodes.info()
 
     def close(self) -> None:
         """End the flight."""
         self.sim.close()
 
-    def _joined(self, seen: Mapping[str, NDArray[np.float32]]) -> Floats:
-        return np.concatenate([seen[agent] for agent in self._agents])
+    def _concatenate(self, observations: Mapping[str, NDArray[np.float32]]) -> Floats:
+        return np.concatenate([observations[agent] for agent in self._agents])
 
 
 def parallel_env(scenario: AnyScenario, **settings: Any) -> FormationEnv:

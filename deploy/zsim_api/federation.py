@@ -42,7 +42,7 @@ from zsim_api import run_folder
 from zsim_api.assertions import Assertions
 from zsim_api.commands import PilotedDrone
 from zsim_api.flight import LAUNCHER, calling, command_of, raise_failure
-from zsim_api.programs import Program, environment_of, filled, search_path
+from zsim_api.programs import Program, environment_of, fill_placeholders, search_path
 from zsim_api.scenarios import AnyScenario, scenario_of
 
 if TYPE_CHECKING:
@@ -119,15 +119,15 @@ class Federation(Assertions):
         self._port = _reserved_port()
         self.endpoint = f"tcp/127.0.0.1:{self._port.getsockname()[1]}"
         self.name = str((set or {}).get("federation", f"test-{os.getpid()}-{self._port.getsockname()[1]}"))
-        started: list[tuple[str, list[str]]] = [_named(each) for each in programs]
+        named_programs: list[tuple[str, list[str]]] = [_split_program(each) for each in programs]
         try:
             source = scenario_of(scenario).changed(
                 seed=seed, duration_s=duration, set=set, law=law, estimator=estimator
             )
             own = [each for each in sequence_of_agents(agents) if not isinstance(each, str)]
-            named = [each for each in agents if isinstance(each, str)]
+            agent_texts = [each for each in agents if isinstance(each, str)]
             resolved, own_agents = calling(lambda: with_agents(source.resolved, own))
-            expected = [*expected_processes(resolved), *(name for name, _ in started if name), PROCESS]
+            expected = [*expected_processes(resolved), *(name for name, _ in named_programs if name), PROCESS]
             changed: dict[str, Any] = {"federation": self.name, "processes.expect": expected}
             changed["processes.on_death"] = {**resolved.processes.on_death, PROCESS: "drop"}
             source = source.with_(changed)
@@ -139,37 +139,39 @@ class Federation(Assertions):
             self._port.close()
             raise
         self._watch = _Watch()
-        self._known = {*expected, WORLD, RECORDER}
-        self._has_others = bool(named or options) or any(not name for name, _ in started)  # with unknown names
+        self._known_names = {*expected, WORLD, RECORDER}
+        self._has_others = bool(agent_texts or options) or any(
+            not name for name, _ in named_programs
+        )  # with unknown names
         self._clock: Clock | None = None
         self._pids: dict[str, int] = {}
         self._killed: dict[int, str] = {}
         self._link: Session | None = None
-        self._over = False
+        self._is_closed = False
         self._run: Run | None = None
-        words = [word for each in named for word in ("--agent", each)]
-        launched = ["--listen", self.endpoint, *words, *options]
+        arguments = [word for each in agent_texts for word in ("--agent", each)]
+        launched = ["--listen", self.endpoint, *arguments, *options]
         command, environment = command_of(source, own, [agent.name for agent in own_agents], launched, self.folder)
         environment["PYTHONPATH"] = search_path([*modules, environment["PYTHONPATH"]])
         self._launcher = Program(command, environment, logs / f"{LAUNCHER}.log")
         self._environment = environment | environment_of(self.endpoint, self.name)
         self._programs: dict[str, Program] = {}
         self._threads: list[threading.Thread] = []
-        self._follow(self._take_part)
-        self._follow(self._await_end, self._launcher)
-        for name, words in started:
-            self._start(name, words)
+        self._start_thread(self._take_part)
+        self._start_thread(self._await_end, self._launcher)
+        for name, arguments in named_programs:
+            self._start(name, arguments)
 
-    def _follow(self, what: Callable[..., None], *arguments: Program) -> None:
-        self._threads.append(threading.Thread(target=what, args=arguments, daemon=True))
+    def _start_thread(self, target: Callable[..., None], *arguments: Program) -> None:
+        self._threads.append(threading.Thread(target=target, args=arguments, daemon=True))
         self._threads[-1].start()
 
     def _start(self, name: str, words: Sequence[str]) -> None:
         label = name or f"program-{len(self._programs) + 1}"
         log = self.folder / run_folder.LOGS / f"{label}.log"
         values = {"endpoint": self.endpoint, "federation": self.name, "folder": str(self.folder), "name": label}
-        self._programs[label] = Program(filled(words, values), self._environment, log)
-        self._follow(self._await_end, self._programs[label])
+        self._programs[label] = Program(fill_placeholders(words, values), self._environment, log)
+        self._start_thread(self._await_end, self._programs[label])
 
     # Time
 
@@ -201,15 +203,15 @@ class Federation(Assertions):
         watch, until_s = self._watch, time.monotonic() + within_s
         with watch.news:
             watch.begin(condition)
-            while watch.wanted is condition and self._fault is None:
+            while watch.condition is condition and self._fault is None:
                 if not watch.news.wait(max(0.0, until_s - time.monotonic())):
                     break
-            waited, watch.wanted = watch.wanted is condition, None
+            is_waiting, watch.condition = watch.condition is condition, None
             if watch.raised is not None:
                 raise watch.raised
-            if not waited and watch.moment is not None:
+            if not is_waiting and watch.moment is not None:
                 return watch.moment
-        if self._watch.left:  # the launcher's log says why
+        if self._watch.has_left:  # the launcher's log says why
             self._launcher.wait(max(0.0, until_s - time.monotonic()))
         fault = self._fault or f"not reached within {within_s:g} s of wall time"
         raise RunFailedError(f"{self.folder.name}: waiting for {text} from {self.t_s:.2f} s on: {fault}")
@@ -276,8 +278,8 @@ class Federation(Assertions):
             RequestRefusedError: the fault was refused, for the reason given.
         """
         self._session(PATIENCE_S)
-        at = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
-        return self.ask(keys.CONTROL, "fault_add", **{**at, **fault})
+        start = {} if (ahead_s := self._watch.ahead_s) is None else {"at_s": round(self.t_s + ahead_s, 9)}
+        return self.ask(keys.CONTROL, "fault_add", **{**start, **fault})
 
     def kill(self, process: str, number: int = KILL, within_s: float = PATIENCE_S) -> int:
         """Send a signal to a process of the run, SIGKILL by default; return its process id.
@@ -301,7 +303,7 @@ class Federation(Assertions):
             if number not in HARMLESS:
                 self._killed[pid] = process
                 if process in self._programs:
-                    self._programs[process].asked = True
+                    self._programs[process].end_requested = True
         with suppress(ProcessLookupError):
             os.kill(pid, number)
         return pid
@@ -312,18 +314,18 @@ class Federation(Assertions):
         Raises:
             RunError: no program has this name, or it is still running.
         """
-        former = self._programs.get(program)
-        if former is None:
-            known = f"must be one of {', '.join(self._programs)}" if self._programs else "the flight has no programs"
-            raise RunError(f"start: program is {program!r}; {known}")
-        if former.wait(PROGRAM_END_S if former.asked else 0.0) is None:
+        previous = self._programs.get(program)
+        if previous is None:
+            hint = f"must be one of {', '.join(self._programs)}" if self._programs else "the flight has no programs"
+            raise RunError(f"start: program is {program!r}; {hint}")
+        if previous.wait(PROGRAM_END_S if previous.end_requested else 0.0) is None:
             raise RunError(f"start: {program} is running; must have ended")
-        former.close()
-        self._start(program, former.words)
+        previous.close()
+        self._start(program, previous.words)
 
     def _check_name(self, process: str, within_s: float) -> None:
         """Raise RunError unless a process of the run has, or is expected to have, the name."""
-        if process in self._known:
+        if process in self._known_names:
             return
         watch = self._watch
         with watch.news:
@@ -332,7 +334,7 @@ class Federation(Assertions):
             link = self._link
         for sample in link.get(keys.process("*", "join")) if link else ():  # processes that joined before this test
             self._take_process(sample)
-        allowed = sorted({*self._known, *self._pids} - {PROCESS})
+        allowed = sorted({*self._known_names, *self._pids} - {PROCESS})
         if process not in allowed:
             raise RunError(
                 f"kill: process is {process!r}; {suggestion(process, allowed)}must be one of {', '.join(allowed)}"
@@ -354,7 +356,7 @@ class Federation(Assertions):
 
     def close(self) -> None:
         """End all processes of the flight; the record contains everything up to that point."""
-        self._over = True
+        self._is_closed = True
         self._watch.finish()
         self._launcher.close()
         for program in self._programs.values():
@@ -380,24 +382,24 @@ class Federation(Assertions):
         if fault := self._program_fault():
             parts.append(fault)
         logs = {log.stem: log.read_text(errors="replace") for log in (self.folder / run_folder.LOGS).glob("*.log")}
-        failed = [name for name, program in self._programs.items() if program.code and not program.asked]
+        failed = [name for name, program in self._programs.items() if program.code and not program.end_requested]
         failed += ENDED.findall(logs.get(LAUNCHER, ""))
         detailed = [*dict.fromkeys((*failed, *(each.name for each in waiting), LAUNCHER))]
         for name in (*detailed, *sorted(logs.keys() - {*detailed})):
             lines = logs.get(name, "").splitlines()
-            shown = lines[-LAST_LINES:] if name in detailed else lines[-1:]
-            if shown and name in detailed:
-                before = f" (last {len(shown)} of {len(lines)} lines)" if len(shown) < len(lines) else ""
-                parts.append("\n".join([f"--- {name}.log{before}", *shown]))
-            elif shown:
-                parts.append(f"--- {name}.log, last of {len(lines)} lines: {shown[0]}")
+            last_lines = lines[-LAST_LINES:] if name in detailed else lines[-1:]
+            if last_lines and name in detailed:
+                note = f" (last {len(last_lines)} of {len(lines)} lines)" if len(last_lines) < len(lines) else ""
+                parts.append("\n".join([f"--- {name}.log{note}", *last_lines]))
+            elif last_lines:
+                parts.append(f"--- {name}.log, last of {len(lines)} lines: {last_lines[0]}")
         return "\n".join(parts)
 
     def _progress(self, clock: Clock | None, waiting: Sequence[Waiting]) -> str:
         if clock is None:
             return "no clock message of a world was received"
         lines = [f"  {each}" for each in holding_up(clock.state, waiting) or waiting]
-        if not self._watch.left and self._watch.wanted is None:
+        if not self._watch.has_left and self._watch.condition is None:
             lines.append(f"  {PROCESS}, this test, which is not waiting for anything at the moment")
         lines.insert(0, f"t = {clock.t_ns / 1e9:.2f} s, {clock.state}; waiting_for:{'' if lines else ' none'}")
         return "\n".join(lines)
@@ -418,11 +420,11 @@ class Federation(Assertions):
             return fault
         if (code := self._launcher.code) is not None:
             return f"the run has ended with code {code}: {self._last_line(LAUNCHER)}"
-        return "the run has ended" if self._watch.left else None
+        return "the run has ended" if self._watch.has_left else None
 
     def _program_fault(self) -> str:
         for name, program in self._programs.items():
-            if program.code and not program.asked:
+            if program.code and not program.end_requested:
                 ended = f"ended with code {program.code}: {self._last_line(name)}"
                 return f"{name} ({shlex.join(program.words)}) {ended}"
         return ""
@@ -440,7 +442,7 @@ class Federation(Assertions):
         """Take part in the run from start to end; the world waits for this participant."""
 
         def is_over() -> bool:
-            return self._over or self._launcher.code is not None
+            return self._is_closed or self._launcher.code is not None
 
         try:
             with find_world(self.endpoint, self.name, None, stopped=is_over) as (link, info):
@@ -457,7 +459,7 @@ class Federation(Assertions):
                 print(printable(f"{PROCESS}: {error}"), file=sys.stderr)
         finally:
             with self._watch.news:
-                self._link, self._watch.left = None, True
+                self._link, self._watch.has_left = None, True
                 self._watch.news.notify_all()
 
     def _take_clock(self, payload: bytes) -> None:
@@ -479,10 +481,10 @@ class _Watch(Agent):
 
     Attributes:
         news: condition variable that guards the other attributes and signals their changes.
-        wanted: the condition that the test waits for; None while simulated time stands still.
+        condition: the condition that the test waits for; None while simulated time stands still.
         moment: the moment of the newest gate; None before the first.
         raised: the exception that the condition raised.
-        left: whether the participant has left the run.
+        has_left: whether the participant has left the run.
         ahead_s: time after the newest gate that the world cannot have computed yet [s]; None in realtime.
     """
 
@@ -492,10 +494,10 @@ class _Watch(Agent):
     def __init__(self) -> None:
         super().__init__()
         self.news = threading.Condition()
-        self.wanted: Condition | None = None
+        self.condition: Condition | None = None
         self.moment: Moment | None = None
         self.raised: BaseException | None = None
-        self.left = False
+        self.has_left = False
         self.ahead_s: float | None = None
         self._holds = True
         self._now_ns = 0
@@ -517,7 +519,7 @@ class _Watch(Agent):
         """Let simulated time pass until a condition is met; the caller must hold `news`."""
         self._events = [event for event in self._events if event.t_ns >= self._now_ns]
         self.moment = self.moment and self.moment._replace(events=())
-        self.raised, self.wanted = None, condition
+        self.raised, self.condition = None, condition
         self.news.notify_all()
 
     def finish(self) -> None:
@@ -540,14 +542,14 @@ class _Watch(Agent):
             events = tuple(event for event in self._events if event.t_ns < t_ns)
             self.moment = Moment(t_ns / 1e9, dict(self._states), dict(self._truth), events)
             while True:
-                wanted = self.wanted
-                if wanted is not None:
+                condition = self.condition
+                if condition is not None:
                     try:
-                        if not wanted(self.moment):
+                        if not condition(self.moment):
                             return []
                     except BaseException as error:  # raised again in the test's thread
                         self.raised = error
-                    self.wanted = None
+                    self.condition = None
                 self.news.notify_all()
                 if not self._holds:
                     return []
@@ -568,28 +570,28 @@ def _condition(what: str | float | Condition) -> tuple[Condition, str]:
             return in_phase, f"the phase {what!r}"
         if what not in EVENT_KINDS:
             hint = suggestion(what, (*phases, *EVENT_KINDS))
-            must = f"must be a phase ({', '.join(phases)}), or a kind of event ({', '.join(EVENT_KINDS)})"
-            raise RunError(f"wait_until: is {what!r}; {hint}{must}")
+            rule = f"must be a phase ({', '.join(phases)}), or a kind of event ({', '.join(EVENT_KINDS)})"
+            raise RunError(f"wait_until: is {what!r}; {hint}{rule}")
         return lambda moment: any(event.kind == what for event in moment.events), f"an event of kind {what!r}"
     if not isinstance(what, int | float):
         raise RunError(f"wait_until: is {show(what)}; must be a phase, a kind of event, a time [s], or a function")
     return lambda moment: moment.t_s >= what, f"t = {what:g} s"
 
 
-def _named(program: str | Sequence[str]) -> tuple[str, list[str]]:
+def _split_program(program: str | Sequence[str]) -> tuple[str, list[str]]:
     """Return the process name of a program (empty if it has none) and the words of its command line."""
-    words = shlex.split(program) if isinstance(program, str) else list(program)
-    if not words:
+    arguments = shlex.split(program) if isinstance(program, str) else list(program)
+    if not arguments:
         raise RunError("programs: a command line is empty; must be words such as 'python my_controller.py'")
-    name, equals, first = words[0].partition("=")
+    name, equals, first = arguments[0].partition("=")
     if equals and "." in name and keys.PROCESS_NAME.fullmatch(name):
-        return name, [first, *words[1:]]
-    return "", words
+        return name, [first, *arguments[1:]]
+    return "", arguments
 
 
 def _reserved_port() -> socket.socket:
     """Return a socket that reserves a free port but still lets a world listen on it."""
-    kept = socket.socket()
-    kept.bind(("127.0.0.1", 0))
-    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after bind, so that no other socket gets the port
-    return kept
+    reserved = socket.socket()
+    reserved.bind(("127.0.0.1", 0))
+    reserved.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # after bind, so that no other socket gets the port
+    return reserved

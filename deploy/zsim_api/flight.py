@@ -76,19 +76,19 @@ def run(
     source = scenario_of(scenario).changed(seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator)
     if options and not processes:
         raise RunError(f"options is {list(options)}; must be empty without processes=True")
-    flown, made = calling(lambda: with_agents(source.resolved, agents))
-    place = Path(out) if out is not None else None
-    screen = screen_for(flown.duration_s) if progress else None
+    resolved, own_agents = calling(lambda: with_agents(source.resolved, agents))
+    out_folder = Path(out) if out is not None else None
+    screen = screen_for(resolved.duration_s) if progress else None
     if processes:
-        folder = run_folder.make_directory(place, flown, force)
+        folder = run_folder.make_directory(out_folder, resolved, force)
         source.keep_modules(folder)
-        _fly_as_processes(source, agents, [agent.name for agent in made], options, folder, screen)
+        _fly_as_processes(source, agents, [agent.name for agent in own_agents], options, folder, screen)
     else:
         launch = run_folder.new_launch(in_process=True, changed=source.changes or ())
-        with run_folder.run_directory(place, flown, force) as folder:
+        with run_folder.run_directory(out_folder, resolved, force) as folder:
             source.keep_modules(folder)
             with screen or nullcontext(), _ctrl_c() as stop_reason:
-                calling(lambda: fly_here(flown, folder, launch, made, screen, stop_reason), folder)
+                calling(lambda: fly_here(resolved, folder, launch, own_agents, screen, stop_reason), folder)
         if reason := stop_reason():
             raise KeyboardInterrupt(f"{reason}; zsim.load({str(folder)!r}) reads the record so far")
     from zsim_api.recorded import load
@@ -128,15 +128,15 @@ def _fly_as_processes(
     """Fly by means of `zsim run`, which shows its own progress on a terminal; in a notebook, show it here."""
     log = folder / run_folder.LOGS / f"{LAUNCHER}.log"
     log.parent.mkdir(exist_ok=True)
-    drawn_here = isinstance(screen, NotebookScreen)
-    words, environment = command_of(source, agents, names, options, folder)
-    words += ["--json-progress"] if drawn_here else []
-    program = Program(words, environment, PIPE if drawn_here else None if screen else log)
+    shows_progress = isinstance(screen, NotebookScreen)
+    command, environment = command_of(source, agents, names, options, folder)
+    command += ["--json-progress"] if shows_progress else []
+    program = Program(command, environment, PIPE if shows_progress else None if screen else log)
     try:
-        with screen if drawn_here else nullcontext():
+        with screen if shows_progress else nullcontext():
             while True:
                 try:
-                    for line in program.lines() if drawn_here else ():
+                    for line in program.lines() if shows_progress else ():
                         _show(line, screen, log)
                     code = program.wait()
                     break
@@ -168,15 +168,15 @@ def command_of(
     The launcher is a separate process, so that it has signals and children of its own.
     """
     command = [*COMMAND, "run", str(_file_of(source, folder)), "--out", str(folder), "--force", "--no-report"]
-    command += [word for change in source.changes or () for word in ("--set", change)]
-    mine = [Path(each) for each in sys.path if each and not plugin.is_library(f"{each}{os.sep}")]
-    folders = [folder, *source.folders, *(each for each in mine if each.is_dir())]
+    command += [argument for change in source.changes or () for argument in ("--set", change)]
+    user_folders = [Path(each) for each in sys.path if each and not plugin.is_library(f"{each}{os.sep}")]
+    folders = [folder, *source.folders, *(each for each in user_folders if each.is_dir())]
     if agents:
         from zsim_api.own_code import module_folders, name_of
 
-        named = [name_of(each, folder) for each in agents]
-        folders += module_folders(named)
-        command += [w for name, each in zip(names, named, strict=True) for w in ("--agent", f"{name}={each}")]
+        class_names = [name_of(each, folder) for each in agents]
+        folders += module_folders(class_names)
+        command += [w for name, each in zip(names, class_names, strict=True) for w in ("--agent", f"{name}={each}")]
     return [*command, *options], {"PYTHONPATH": search_path(folders)}
 
 
@@ -196,8 +196,8 @@ def raise_failure(folder: Path, code: int) -> None:
         raise RunFailedError(f"{folder}: nothing was recorded: {_last_line(folder, code)}")
     failures = [each.text for each in verdict(record).shortfalls if each.kind == "process" and each.fails]
     flight = read_flight(record, motion=False)
-    flew = any(len(track.t_ns) for track in flight.tracks)
-    if not failures and (not flew or (folder / run_folder.JOURNAL).exists()):  # an early end leaves the journal
+    has_flown = any(len(track.t_ns) for track in flight.tracks)
+    if not failures and (not has_flown or (folder / run_folder.JOURNAL).exists()):  # an early end leaves the journal
         failures = [str((flight.end or {}).get("reason", _last_line(folder, code)))]
     if failures:
         raise RunFailedError(f"{failures[0]}; the record is {record}, the logs are in {folder / run_folder.LOGS}")
@@ -221,8 +221,8 @@ def calling(call: Callable[[], Result], folder: Path | None = None) -> Result:
         failure, raised = error, plugin.raised_by_user(error)
     if raised is None:  # the user's code returned something unusable
         raise failure.with_traceback(None) from None
-    kept = f"; zsim.load({str(folder)!r}) reads the record so far" if folder and (folder / RECORD).exists() else ""
-    print(printable(f"{failure}{kept}"), file=sys.stderr, flush=True)
+    hint = f"; zsim.load({str(folder)!r}) reads the record so far" if folder and (folder / RECORD).exists() else ""
+    print(printable(f"{failure}{hint}"), file=sys.stderr, flush=True)
     raise raised
 
 
@@ -283,8 +283,8 @@ def fly_as_processes(scenario: Resolved, folder: Path) -> None:
     log.parent.mkdir(parents=True)
     file = folder / run_folder.SCENARIO
     file.write_text(scenario_file.to_text(scenario), encoding="utf-8")
-    words = [*COMMAND, "run", str(file), "--out", str(folder), "--force", "--no-report"]
-    program = Program(words, {"PYTHONPATH": search_path(plugin.folders())}, log)
+    command = [*COMMAND, "run", str(file), "--out", str(folder), "--force", "--no-report"]
+    program = Program(command, {"PYTHONPATH": search_path(plugin.folders())}, log)
     try:
         code = program.wait()
     finally:

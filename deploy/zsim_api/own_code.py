@@ -54,27 +54,29 @@ def name_of(obj: object, folder: Path, name: str | None = None) -> str:
             written.
     """
     kind: Any = obj if hasattr(obj, "__qualname__") else type(obj)  # a class or function, or the class of an instance
-    if kind is obj and name in (None, kind.__qualname__) and _is_found(kind):
+    if kind is obj and name in (None, kind.__qualname__) and _is_importable_by_name(kind):
         return f"{kind.__module__}:{kind.__qualname__}"
-    given = name or str(kind.__name__ if NAME.fullmatch(kind.__name__) else "function")
-    return f"{_written(obj, kind, given, folder)}:{given}"
+    own_name = name or str(kind.__name__ if NAME.fullmatch(kind.__name__) else "function")
+    return f"{_write_module(obj, kind, own_name, folder)}:{own_name}"
 
 
-def _written(obj: object, kind: Any, name: str, folder: Path) -> str:
+def _write_module(obj: object, kind: Any, name: str, folder: Path) -> str:
     """Write the module of an object, and register it in this process; return the module's name."""
-    pickled, files = _pickled(obj, kind)
+    pickled, files = _pickle_by_value(obj, kind)
     source = _source(kind)
-    made = f"{name} = pickle.loads(base64.b64decode({PICKLED}))\n"
-    digest = hashlib.sha256(f"{_PYTHON}{source}{made}{''.join(_tokens(pickled, files))}".encode())
+    assignment = f"{name} = pickle.loads(base64.b64decode({PICKLED}))\n"
+    digest = hashlib.sha256(f"{_PYTHON}{source}{assignment}{''.join(_tokens(pickled, files))}".encode())
     module = ModuleType(f"{plugin.MADE}{digest.hexdigest()[:12]}")
-    head = HEAD.format(title=f"{module.__name__}:{name}", of=_shown(kind), version=__version__, python=_PYTHON)
-    readable = "".join(f"# {line}".rstrip() + "\n" for line in source.splitlines())
+    header = HEAD.format(title=f"{module.__name__}:{name}", of=_shown(kind), version=__version__, python=_PYTHON)
+    commented_source = "".join(f"# {line}".rstrip() + "\n" for line in source.splitlines())
     lines = base64.encodebytes(pickled).decode()
     path = folder / f"{module.__name__}.py"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not path.exists():
-            path.write_text(f'{head}\n{readable}\n{PICKLED} = """\n{lines}"""\n{made}', encoding="utf-8")
+            path.write_text(
+                f'{header}\n{commented_source}\n{PICKLED} = """\n{lines}"""\n{assignment}', encoding="utf-8"
+            )
     except OSError as error:
         raise RunError(f"{path}: cannot be written ({error.strerror})") from error
     setattr(module, PICKLED, lines)
@@ -121,27 +123,27 @@ def module_folders(names: Iterable[str]) -> list[Path]:
     return list(folders)
 
 
-def _is_found(own: Any) -> bool:
+def _is_importable_by_name(obj: Any) -> bool:
     """Return whether other processes find this very object under its own module and name."""
-    module = sys.modules.get(own.__module__ or "")
-    if module is None or module.__name__ == "__main__" or getattr(module, own.__qualname__, None) is not own:
+    module = sys.modules.get(obj.__module__ or "")
+    if module is None or module.__name__ == "__main__" or getattr(module, obj.__qualname__, None) is not obj:
         return False
     return _is_importable(module)
 
 
 def _is_importable(module: ModuleType) -> bool:
     """Return whether Python finds a module by its name, in the file from which it was loaded."""
-    found: ModuleSpec | None = None
+    spec: ModuleSpec | None = None
     try:
         for part in accumulate(module.__name__.split("."), "{}.{}".format):
-            place = found.submodule_search_locations if found else None
-            found = next(filter(None, (finder.find_spec(part, place) for finder in sys.meta_path)), None)
+            search_path = spec.submodule_search_locations if spec else None
+            spec = next(filter(None, (finder.find_spec(part, search_path) for finder in sys.meta_path)), None)
     except (ImportError, AttributeError, ValueError):
         return False
-    return found is not None and (not found.has_location or found.origin == module.__file__)
+    return spec is not None and (not spec.has_location or spec.origin == module.__file__)
 
 
-def _pickled(obj: object, kind: Any) -> tuple[bytes, set[str]]:
+def _pickle_by_value(obj: object, kind: Any) -> tuple[bytes, set[str]]:
     """Pickle an object by value, with all that it uses from its own module; return the pickle and its code's files.
 
     Raises:
@@ -155,21 +157,21 @@ def _pickled(obj: object, kind: Any) -> tuple[bytes, set[str]]:
             return file.getvalue(), pickler.files
         except Exception as error:  # any type, since the pickled objects raise it
             part = " of ".join([*reversed(_unpicklable(obj)), _shown(kind)])
-            must = "create it in the method that first needs it"
-            raise RunError(f"{part} cannot be pickled ({reason_of(error)}); {must}") from error
+            hint = "create it in the method that first needs it"
+            raise RunError(f"{part} cannot be pickled ({reason_of(error)}); {hint}") from error
 
 
 @contextmanager
 def _by_value(kind: Any) -> Iterator[None]:
     """Let the contents of the module of `kind` be pickled by value if other processes cannot import it."""
     module = sys.modules.get(kind.__module__ or "")
-    wanted = module is not None and module.__name__ != "__main__" and not _is_importable(module)
-    if wanted:
+    is_by_value = module is not None and module.__name__ != "__main__" and not _is_importable(module)
+    if is_by_value:
         cloudpickle.register_pickle_by_value(module)
     try:
         yield
     finally:
-        if wanted:
+        if is_by_value:
             cloudpickle.unregister_pickle_by_value(module)
 
 
@@ -184,18 +186,18 @@ class _Pickler(cloudpickle.Pickler):
     def _code(self, code: CodeType) -> tuple[Any, ...]:
         self.files.add(code.co_filename)
         path = "".join(code.co_filename)  # a new string, as from cloudpickle, so that memoization does not vary
-        made, arguments, *rest = cloudpickle.Pickler.dispatch_table[CodeType](code)
-        return made, tuple(path if each == "<dynamic-code>" else each for each in arguments), *rest
+        constructor, arguments, *rest = cloudpickle.Pickler.dispatch_table[CodeType](code)
+        return constructor, tuple(path if each == "<dynamic-code>" else each for each in arguments), *rest
 
 
 def _tokens(pickled: bytes, files: set[str]) -> Iterator[str]:
     """Yield a pickle's content without files and the random identifiers of a process: the same for equal objects."""
-    drawn: dict[str, str] = {}
+    class_tokens: dict[str, str] = {}
     for opcode, arg, _ in pickletools.genops(pickled):
         if not isinstance(arg, str):  # a frame's argument is its size in bytes; that of array content, a bytearray
             yield "" if opcode.name == "FRAME" else f"{arg!r}\n"
         elif arg in cloudpickle_parts._DYNAMIC_CLASS_TRACKER_BY_ID:
-            yield drawn.setdefault(arg, f"class {len(drawn)}\n")
+            yield class_tokens.setdefault(arg, f"class {len(class_tokens)}\n")
         elif arg not in files:
             yield f"{arg!r}\n"
 
@@ -228,7 +230,7 @@ def _unpicklable(obj: Any, depth: int = 0) -> list[str]:
         part = getattr(part, "__func__", part)  # the function of a static or class method
         try:
             cloudpickle.dumps(part)
-        except Exception:  # any type, as in _pickled
+        except Exception:  # any type, as in _pickle_by_value
             return [name, *(_unpicklable(part, depth + 1) if depth < DEPTH_MAX else ())]
     return []
 

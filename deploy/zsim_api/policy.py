@@ -84,9 +84,9 @@ class Interface:
     """
 
     def __init__(self, scenario: Scenario, observe: Observe, action: Action, step_s: float | None = None) -> None:
-        for what, found, allowed in (("observe", observe, get_args(Observe)), ("action", action, get_args(Action))):
-            if found not in allowed:
-                raise RunError(f"{what} is {found!r}; must be one of {', '.join(allowed)}")
+        for option, value, allowed in (("observe", observe, get_args(Observe)), ("action", action, get_args(Action))):
+            if value not in allowed:
+                raise RunError(f"{option} is {value!r}; must be one of {', '.join(allowed)}")
         gate_s = scenario.time.gate_ms / 1e3
         self.gates = round((step_s or gate_s) / gate_s)
         if self.gates < 1 or abs(self.gates * gate_s - (step_s or gate_s)) > 1e-9:
@@ -98,10 +98,10 @@ class Interface:
         self.observe, self.action = observe, action
         self._drones = {drone.name: drone for drone in scenario.drones}
         self.names = list(self._drones)
-        of_clusters = {cluster.name: list(cluster.drones) for cluster in scenario.clusters}
-        self._members = of_clusters if action == "cluster" else {name: [name] for name in self.names}
+        drones_by_cluster = {cluster.name: list(cluster.drones) for cluster in scenario.clusters}
+        self._members = drones_by_cluster if action == "cluster" else {name: [name] for name in self.names}
         self.agents = list(self._members)
-        self._places = {agent: [self.names.index(drone) for drone in self._members[agent]] for agent in self.agents}
+        self._indices = {agent: [self.names.index(drone) for drone in self._members[agent]] for agent in self.agents}
         self._spaces = {each.name: scenario_space(scenario, each) for each in scenario.clusters}
         self._sensed = {name: _readings(drone) for name, drone in self._drones.items()}
 
@@ -131,26 +131,26 @@ class Interface:
                 high += [speed, speed, climb, yaw_rate]
                 low += [-speed, -speed, -climb, -yaw_rate]
         if self.action == "cluster":
-            least = [self._drones[name].limits for name in self._members[agent]]
-            speed = min(each.horizontal_speed_m_s for each in least)
-            turn = min(np.radians(each.yaw_rate_deg_s) for each in least)
-            high = [speed if unit(name) == "m" else turn for name in self._spaces[agent].names]
+            limits_of_drones = [self._drones[name].limits for name in self._members[agent]]
+            speed = min(each.horizontal_speed_m_s for each in limits_of_drones)
+            yaw_rate_max = min(np.radians(each.yaw_rate_deg_s) for each in limits_of_drones)
+            high = [speed if unit(name) == "m" else yaw_rate_max for name in self._spaces[agent].names]
             low = [-each for each in high]
         return np.array(low), np.array(high)
 
     def observations(self, flown: Flown) -> dict[str, Floats]:
         """Return the observation of every agent."""
         if self.observe == "sensors":
-            seen = {drone: self._samples(flown, drone) for drone in self.names}
-            return {agent: np.concatenate([seen[name] for name in self._members[agent]]) for agent in self.agents}
-        of = flown.truth if self.observe == "truth" else flown.estimates
-        parts = [of.position_m, of.velocity_m_s, of.orientation_wxyz]
-        parts += [of.angular_velocity_rad_s] if isinstance(of, Truth) else []
+            observed = {drone: self._samples(flown, drone) for drone in self.names}
+            return {agent: np.concatenate([observed[name] for name in self._members[agent]]) for agent in self.agents}
+        states = flown.truth if self.observe == "truth" else flown.estimates
+        parts = [states.position_m, states.velocity_m_s, states.orientation_wxyz]
+        parts += [states.angular_velocity_rad_s] if isinstance(states, Truth) else []
         flat = np.concatenate(parts, axis=1).ravel()
-        picked, origins, ends = self._layout
-        seen = flat[picked]
-        seen -= np.append(flat, 0.0)[origins]
-        return dict(zip(self.agents, np.split(_bounded(seen), ends), strict=True))
+        selected, origins, ends = self._layout
+        observed = flat[selected]
+        observed -= np.append(flat, 0.0)[origins]
+        return dict(zip(self.agents, np.split(_bounded(observed), ends), strict=True))
 
     @cached_property
     def _layout(self) -> tuple[NDArray[np.intp], NDArray[np.intp], list[int]]:
@@ -158,16 +158,16 @@ class Interface:
         subtract (-1 for none), and the ends of the agents' observations.
         """
         width = 13 if self.observe == "truth" else 10
-        picked: list[int] = []
+        selected: list[int] = []
         origins: list[int] = []
         ends: list[int] = []
-        for places in self._places.values():
-            own = [width * i + j for i in places for j in range(width)]
-            others = [i for i in range(len(self.names)) if i not in places]
-            picked += own + [width * i + j for i in others for j in range(6)]
-            origins += [-1] * len(own) + [width * places[0] + j for _ in others for j in range(6)]
-            ends.append(len(picked))
-        return np.array(picked), np.array(origins), ends[:-1]
+        for indices in self._indices.values():
+            own = [width * i + j for i in indices for j in range(width)]
+            others = [i for i in range(len(self.names)) if i not in indices]
+            selected += own + [width * i + j for i in others for j in range(6)]
+            origins += [-1] * len(own) + [width * indices[0] + j for _ in others for j in range(6)]
+            ends.append(len(selected))
+        return np.array(selected), np.array(origins), ends[:-1]
 
     def begin(self, flown: Flown) -> dict[str, Command] | None:
         """Return the commands for take-off; None once all drones are in the air and a policy may begin."""
@@ -183,27 +183,27 @@ class Interface:
             UserCodeError: an action is of an unknown agent or the wrong shape, or is not finite; `by` names its source.
         """
         commands: dict[str, Command] = {}
-        for agent, given in actions.items():
+        for agent, values in actions.items():
             if agent not in self._bounds:
                 raise UserCodeError(f"{by}: action is for {agent!r}; must be for one of {', '.join(self.agents)}")
             low, high = self._bounds[agent]
-            action = np.asarray(given, np.float32)
+            action = np.asarray(values, np.float32)
             if action.shape != low.shape:
                 raise UserCodeError(f"{by}: action of {agent} has shape {action.shape}; must be {low.shape}")
             if not np.isfinite(action).all():
                 raise UserCodeError(f"{by}: action of {agent} is {action.tolist()}; must be finite")
-            wanted = low + (np.minimum(np.maximum(action, -1.0), 1.0).astype(np.float64) + 1.0) / 2.0 * (high - low)
+            command = low + (np.minimum(np.maximum(action, -1.0), 1.0).astype(np.float64) + 1.0) / 2.0 * (high - low)
             if self.action == "cluster":
-                commands |= self._of_cluster(agent, flown, wanted)
+                commands |= self._cluster_commands(agent, flown, command)
             else:
-                commands[agent] = self._of_drone(wanted)
+                commands[agent] = self._drone_command(command)
         return commands
 
     @cached_property
     def _bounds(self) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
         return {agent: self.bounds(agent) for agent in self.agents}
 
-    def _of_drone(self, action: NDArray[np.float64]) -> Command:
+    def _drone_command(self, action: NDArray[np.float64]) -> Command:
         if self.action == "rotors":
             return rotors(action)
         if self.action == "velocity":
@@ -212,32 +212,32 @@ class Interface:
         (sr, sp), (cr, cp) = np.sin([roll / 2, pitch / 2]), np.cos([roll / 2, pitch / 2])
         return attitude((cr * cp, sr * cp, cr * sp, -sr * sp), thrust_n, yaw_rate)  # the product q_pitch ⊗ q_roll
 
-    def _of_cluster(self, cluster: str, flown: Flown, c_dot: NDArray[np.float64]) -> dict[str, Command]:
+    def _cluster_commands(self, cluster: str, flown: Flown, c_dot: NDArray[np.float64]) -> dict[str, Command]:
         """Return velocity commands for the drones of a cluster; zero if the cluster's shape is singular."""
-        of = flown.truth if self.observe == "truth" else flown.estimates
-        places, space = self._places[cluster], self._spaces[cluster]
-        w, x, y, z = of.orientation_wxyz[places].T
+        states = flown.truth if self.observe == "truth" else flown.estimates
+        indices, space = self._indices[cluster], self._spaces[cluster]
+        w, x, y, z = states.orientation_wxyz[indices].T
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         try:
-            v_W, yaw_rates = robot_rates(space, space.forward(of.position_m[places], yaw), c_dot)
+            v_W, yaw_rates = robot_rates(space, space.forward(states.position_m[indices], yaw), c_dot)
         except SingularClusterError:
-            v_W, yaw_rates = np.zeros((len(places), 3)), np.zeros(len(places))
-        moved = zip(self._members[cluster], v_W.tolist(), yaw_rates.tolist(), strict=True)
-        return {name: velocity(vx, vy, vz, yaw_rate, frame="world") for name, (vx, vy, vz), yaw_rate in moved}
+            v_W, yaw_rates = np.zeros((len(indices), 3)), np.zeros(len(indices))
+        rates = zip(self._members[cluster], v_W.tolist(), yaw_rates.tolist(), strict=True)
+        return {name: velocity(vx, vy, vz, yaw_rate, frame="world") for name, (vx, vy, vz), yaw_rate in rates}
 
     def _samples(self, flown: Flown, drone: str) -> Floats:
-        place = self.names.index(drone)
+        index = self.names.index(drone)
         parts: list[NDArray[Any]] = []
-        came = {*flown.sensors}
+        received = {*flown.sensors}
         for sensor, field, width in self._sensed[drone]:
-            column = getattr(flown.sensors[sensor], field)[place] if sensor in came else np.zeros(width)
+            column = getattr(flown.sensors[sensor], field)[index] if sensor in received else np.zeros(width)
             parts.append(np.atleast_1d(np.asarray(column, np.float64)))
         return _bounded(np.concatenate(parts))
 
 
 def _readings(drone: Drone) -> list[tuple[str, str, int]]:
     """Return the sensor, field and width of every numeric field that a drone's sensors measure."""
-    found = []
+    readings = []
     for name, kind, settings in drone.sensors.sections():
         if getattr(settings, "rate_hz", 1.0) == 0:
             continue
@@ -246,17 +246,17 @@ def _readings(drone: Drone) -> list[tuple[str, str, int]]:
         for field in info.fields:
             match field.type:
                 case inspect.FloatType():
-                    found.append((name, field.name, 1))
+                    readings.append((name, field.name, 1))
                 case inspect.TupleType(item_types=items) if all(isinstance(each, inspect.FloatType) for each in items):
-                    found.append((name, field.name, len(items)))
-    return found
+                    readings.append((name, field.name, len(items)))
+    return readings
 
 
 def _bounded(numbers: NDArray[np.float64]) -> Floats:
     """Clip numbers to the bounds of an observation; NaN becomes 0."""
-    within = np.minimum(np.maximum(numbers, -FARTHEST), FARTHEST)
-    within[np.isnan(within)] = 0.0
-    return within.astype(np.float32)
+    clipped = np.minimum(np.maximum(numbers, -FARTHEST), FARTHEST)
+    clipped[np.isnan(clipped)] = 0.0
+    return clipped.astype(np.float32)
 
 
 class PolicyAgent(Agent):
@@ -281,31 +281,31 @@ class PolicyAgent(Agent):
         drones = self.interface.names
         self.period_ns = self.interface.gates * info.gate_ns
         self.gate_keys = tuple(map(keys.status, drones))
-        read = {"truth": keys.truth, "estimate": keys.estimate, "sensors": lambda drone: f"drone/{drone}/sensor/*"}
-        own = tuple(map(read[self.observe], drones))
-        self.reads = (*self.gate_keys, *own)
+        key_of = {"truth": keys.truth, "estimate": keys.estimate, "sensors": lambda drone: f"drone/{drone}/sensor/*"}
+        drone_keys = tuple(map(key_of[self.observe], drones))
+        self.reads = (*self.gate_keys, *drone_keys)
         if self.observe == "estimate":
-            self.gate_keys = (*self.gate_keys, *own)
+            self.gate_keys = (*self.gate_keys, *drone_keys)
         self.counted = tuple(drones) if self.observe == "sensors" else ()
-        self._flown = _Received(drones, max(len(drone.rotors) for drone in info.drones))
-        self._is_begun = False
+        self._received = _Received(drones, max(len(drone.rotors) for drone in info.drones))
+        self._has_begun = False
         super().bind(info, name, radio)
 
     def receive(self, key: str, message: Any) -> None:
         """Store a message for the observations."""
-        self._flown.put(key, message)
+        self._received.put(key, message)
 
     def step(self, t_ns: int) -> list[Output]:
         """Return the commands at a gate."""
-        begin = None if self._is_begun else self.interface.begin(self._flown)
-        if begin is None:
-            self._is_begun = True
-            by = f"{plugin.full_name(type(self))}.policy"
-            actions = self.policy(self.interface.observations(self._flown))
+        commands = None if self._has_begun else self.interface.begin(self._received)
+        if commands is None:
+            self._has_begun = True
+            source = f"{plugin.full_name(type(self))}.policy"
+            actions = self.policy(self.interface.observations(self._received))
             if not isinstance(actions, Mapping):
-                raise UserCodeError(f"{by} returns a {type(actions).__name__}; must be a map of actions by agent")
-            begin = self.interface.commands(self._flown, actions, by)
-        return [self.command(t_ns, drone, command) for drone, command in begin.items()]
+                raise UserCodeError(f"{source} returns a {type(actions).__name__}; must be a map of actions by agent")
+            commands = self.interface.commands(self._received, actions, source)
+        return [self.command(t_ns, drone, command) for drone, command in commands.items()]
 
 
 class _Received:

@@ -31,7 +31,7 @@ GRACE_S = 10.0  # wall time for a program to end after SIGTERM; `zsim run` ends 
 KEEPER = (sys.executable, "-I", "-S", __file__)
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 NOT_STARTED = 127
-AGAIN_S = 0.02  # interval between rounds of killing
+RETRY_S = 0.02  # interval between rounds of killing
 
 
 class Program:
@@ -52,18 +52,18 @@ class Program:
         folder: Path | None = None,
     ) -> None:
         self.words = tuple(words)
-        self.asked = False  # whether this process has requested the program's end
+        self.end_requested = False  # whether this process has requested the program's end
         self._lock = threading.Lock()
         environment = {**os.environ, **(environment or {})}
         if output is not None:
             environment.pop("FORCE_COLOR", None)  # set by notebook kernels; the output is not a terminal
         with open(output if isinstance(output, Path) else os.devnull, "ab") as log:
-            goes_to = log if isinstance(output, Path) else output
+            target = log if isinstance(output, Path) else output
             self._keeper = subprocess.Popen(
                 [*KEEPER, str(GRACE_S), *words],
                 stdin=subprocess.PIPE,
-                stdout=goes_to,
-                stderr=subprocess.STDOUT if goes_to == PIPE else goes_to,
+                stdout=target,
+                stderr=subprocess.STDOUT if target == PIPE else target,
                 env=environment,
                 cwd=folder,
                 start_new_session=True,
@@ -102,14 +102,14 @@ class Program:
     def close(self) -> int:
         """Send SIGTERM, kill the program if it has not ended within GRACE_S, and return its exit code."""
         with self._lock:
-            self.asked = self.asked or self.code is None
+            self.end_requested = self.end_requested or self.code is None
             assert self._keeper.stdin is not None
             with suppress(OSError):
                 self._keeper.stdin.close()
             return self._keeper.wait()
 
 
-def filled(words: Sequence[str], values: Mapping[str, str]) -> list[str]:
+def fill_placeholders(words: Sequence[str], values: Mapping[str, str]) -> list[str]:
     """Replace `{endpoint}` and the like in a command line by their values."""
     for name, value in values.items():
         words = [word.replace(f"{{{name}}}", value) for word in words]
@@ -124,8 +124,8 @@ def environment_of(endpoint: str, federation: str) -> dict[str, str]:
 
 def search_path(folders: Sequence[str | Path]) -> str:
     """Return PYTHONPATH with further folders in front."""
-    former = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    return os.pathsep.join(dict.fromkeys([*map(str, folders), *filter(None, former)]))
+    previous = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    return os.pathsep.join(dict.fromkeys([*map(str, folders), *filter(None, previous)]))
 
 
 # The keeper
@@ -133,12 +133,12 @@ def search_path(folders: Sequence[str | Path]) -> str:
 
 def keep(grace_s: float, words: list[str]) -> int:
     """Run a program to its end as its keeper; return the exit code."""
-    early: list[int] = []
+    pending: list[int] = []
     program: subprocess.Popen[bytes] | None = None
 
     def forward(number: int, _: object = None) -> None:
         if program is None:
-            early.append(number)
+            pending.append(number)
         else:
             with suppress(ProcessLookupError):
                 os.killpg(program.pid, number)
@@ -160,7 +160,7 @@ def keep(grace_s: float, words: list[str]) -> int:
     except OSError as error:
         sys.stderr.write(f"{words[0]!a}: cannot be started ({error.strerror})\n")
         return NOT_STARTED
-    for number in early:
+    for number in pending:
         forward(number)
     threading.Thread(target=await_caller, daemon=True).start()
     code = program.wait()
@@ -180,7 +180,7 @@ def _kill_children() -> None:
         for pid in children:
             with suppress(ProcessLookupError):
                 os.kill(int(pid), signal.SIGKILL)
-        time.sleep(AGAIN_S)
+        time.sleep(RETRY_S)
 
 
 if __name__ == "__main__":

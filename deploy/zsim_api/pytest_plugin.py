@@ -20,33 +20,33 @@ FAILED_RUNS = "zsim_failed_runs"  # option of pytest's configuration
 class Federations:
     """Starts the federations of one test, each with its own folder."""
 
-    def __init__(self, folder: Path, kept: Path, modules: tuple[Path, ...]) -> None:
-        self.made: list[Federation] = []
+    def __init__(self, folder: Path, failed_folder: Path, modules: tuple[Path, ...]) -> None:
+        self.started: list[Federation] = []
         self.failed = False
-        self._folder, self._kept, self._modules = folder, kept, modules
+        self._folder, self._failed_folder, self._modules = folder, failed_folder, modules
 
     def __call__(self, scenario: Any, duration: float | None = None, **options: Any) -> "Federation":
         """Start a federation; arguments as in `zsim.Federation`."""
         from zsim_api.federation import Federation
 
-        options = {"out": self._folder / f"run{len(self.made) + 1}", "modules": self._modules, **options}
-        self.made.append(Federation(scenario, duration, **options))
-        return self.made[-1]
+        options = {"out": self._folder / f"run{len(self.started) + 1}", "modules": self._modules, **options}
+        self.started.append(Federation(scenario, duration, **options))
+        return self.started[-1]
 
-    def kept(self, made: "Federation") -> Path:
+    def kept_path(self, run: "Federation") -> Path:
         """Return the path to which a run's folder is copied if the test has failed."""
-        return self._kept / made.folder.name
+        return self._failed_folder / run.folder.name
 
     def close(self) -> None:
-        for each in self.made:
+        for each in self.started:
             each.close()
         if self.failed:
-            shutil.rmtree(self._kept, ignore_errors=True)
-            for each in self.made:
-                shutil.copytree(each.folder, self.kept(each))
+            shutil.rmtree(self._failed_folder, ignore_errors=True)
+            for each in self.started:
+                shutil.copytree(each.folder, self.kept_path(each))
 
 
-MADE = pytest.StashKey[Federations]()
+FEDERATIONS = pytest.StashKey[Federations]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -64,22 +64,22 @@ def federation(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Feder
     logs are kept in `runs/failed` (`zsim_failed_runs`).
     """
     test = re.sub(r"[^\w.-]+", "-", request.node.nodeid.rpartition("/")[2]).strip("-")
-    kept = request.config.rootpath / request.config.getini(FAILED_RUNS) / test
-    made = request.node.stash[MADE] = Federations(tmp_path, kept, (request.path.parent,))
+    failed_folder = request.config.rootpath / request.config.getini(FAILED_RUNS) / test
+    federations = request.node.stash[FEDERATIONS] = Federations(tmp_path, failed_folder, (request.path.parent,))
     try:
-        yield made
+        yield federations
     finally:
-        made.close()
+        federations.close()
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Any:
     """Add the diagnoses of the federations to the report of a failed test."""
     report: pytest.TestReport = yield
-    started = item.stash.get(MADE, None)
-    if started is not None and report.failed and report.when != "teardown":
-        started.failed = True
-        for each in started.made:
-            title = f"federation {each.name}, kept in {started.kept(each)}"
+    federations = item.stash.get(FEDERATIONS, None)
+    if federations is not None and report.failed and report.when != "teardown":
+        federations.failed = True
+        for each in federations.started:
+            title = f"federation {each.name}, kept in {federations.kept_path(each)}"
             report.sections.append((title, each.diagnosis()))
     return report

@@ -114,22 +114,22 @@ class Run:
 
     def truth(self, drone: str) -> "DataFrame":
         """Return the true motion of a drone at every gate, in W and B; raise RunError if there is none."""
-        return self._of("drone", drone, "truth")
+        return self._read_leaf("drone", drone, "truth")
 
     def estimate(self, drone: str) -> "DataFrame":
         """Return the estimates of a drone's motion, with their covariance; raise RunError if there are none."""
-        return self._of("drone", drone, "estimate")
+        return self._read_leaf("drone", drone, "estimate")
 
     def sensor(self, drone: str, sensor: str) -> "DataFrame":
         """Return the samples of imu, gps, mag, baro, sonar, flow, or your own sensor; raise RunError if there are none.
 
         `t_sample_ns` is the time at which a sample was taken; the index is the time of its delivery.
         """
-        return self._of("drone", drone, f"sensor/{sensor}")
+        return self._read_leaf("drone", drone, f"sensor/{sensor}")
 
     def status(self, drone: str) -> "DataFrame":
         """Return the state of a drone's firmware and battery at every gate; raise RunError if there is none."""
-        return self._of("drone", drone, "sensor/status")
+        return self._read_leaf("drone", drone, "sensor/status")
 
     def commands(self, drone: str, kind: str = "velocity") -> "DataFrame":
         """Return all commands sent to a drone, with their `source`; raise RunError if there are none.
@@ -138,7 +138,7 @@ class Run:
             drone: name.
             kind: velocity, attitude, rotors, ardrone or mode.
         """
-        return self._of("drone", drone, f"cmd/{kind}")
+        return self._read_leaf("drone", drone, f"cmd/{kind}")
 
     def cluster(self, cluster: str | None = None) -> "DataFrame":
         """Return the states of a cluster as its controller saw it: `phase`, `value_p`, `desired_p` and so on [m, rad].
@@ -149,7 +149,7 @@ class Run:
         Raises:
             RunError: no such cluster, or its controller published nothing.
         """
-        return self._of("cluster", self._cluster(cluster), "state")
+        return self._read_leaf("cluster", self._cluster(cluster), "state")
 
     def messages(self, key: str) -> "DataFrame":
         """Return all messages of a key, with `t_ns`, `seq`, and `wall_ns`, the time of recording [ns since 1970].
@@ -184,17 +184,17 @@ class Run:
         Raises:
             RunError: no such cluster, or its states cannot be judged.
         """
-        found = self.judged_formation(cluster)
+        states = self.judged_formation(cluster)
         parts = {
-            "desired": found.desired,
-            "estimate": found.value,
-            "truth": found.true,
-            "estimate_error": found.est_error,
-            "truth_error": found.true_error,
+            "desired": states.desired,
+            "estimate": states.value,
+            "truth": states.true,
+            "estimate_error": states.est_error,
+            "truth_error": states.true_error,
         }
-        table: Table = {INDEX: found.t_s, "phase": np.array(found.phases, object)}
-        for i, name in enumerate(found.names):
-            table |= {f"{what}_{name}_{unit(name)}": values[:, i] for what, values in parts.items()}
+        table: Table = {INDEX: states.t_s, "phase": np.array(states.phases, object)}
+        for i, name in enumerate(states.names):
+            table |= {f"{kind}_{name}_{unit(name)}": values[:, i] for kind, values in parts.items()}
         return frame(table)
 
     def estimate_errors(self, drone: str) -> "DataFrame":
@@ -241,7 +241,7 @@ class Run:
                 name: (unit(name), *(getattr(moments, field) for field in ParameterErrors.__struct_fields__))
                 for name, moments in each.errors(window).items()
             }
-            for each in self._judged[1]
+            for each in self._assessment[1]
         }
         return _statistics("cluster", rows, ParameterErrors.__struct_fields__)
 
@@ -252,14 +252,16 @@ class Run:
             import xarray
 
         parts: list[Dataset] = []
-        for what, read in (("truth", self.truth), ("estimate", self.estimate)):
-            known = [drone for drone in self.drones if f"drone/{drone}/{what}" in self.keys]
-            if known:
-                self._read([key for drone in known if (key := f"drone/{drone}/{what}") not in self._tables])
-                tables = {drone: read(drone).select_dtypes("number").add_prefix(f"{what}_") for drone in known}
+        for kind, read in (("truth", self.truth), ("estimate", self.estimate)):
+            recorded_drones = [drone for drone in self.drones if f"drone/{drone}/{kind}" in self.keys]
+            if recorded_drones:
+                self._read([key for drone in recorded_drones if (key := f"drone/{drone}/{kind}") not in self._tables])
+                tables = {
+                    drone: read(drone).select_dtypes("number").add_prefix(f"{kind}_") for drone in recorded_drones
+                }
                 # a restarted world may have published a gate again
                 once = {drone: table[~table.index.duplicated()] for drone, table in tables.items()}
-                parts.append(pandas.concat(once, names=["drone"]).to_xarray().reindex(drone=known))
+                parts.append(pandas.concat(once, names=["drone"]).to_xarray().reindex(drone=recorded_drones))
         return xarray.merge(parts, join="outer", compat="no_conflicts")
 
     # The flight
@@ -281,7 +283,7 @@ class Run:
     @property
     def summary(self) -> RunSummary:
         """The content of summary.json; raises RecordError if no truth is on record."""
-        return self._judged[2]
+        return self._assessment[2]
 
     @property
     def duration_s(self) -> float:
@@ -332,18 +334,18 @@ class Run:
         with what_is_missing():
             from zsim_analysis.report.make_report import draw_marked, planned_figures
 
-        flight, formations, summary = self._judged
-        known = []
+        flight, formations, summary = self._assessment
+        names = []
         with plugin.names_only(not self._trust, looked_up=False):
             for each in planned_figures(flight, formations, summary.window_s):
                 stem = Path(each.name).stem
-                known.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
-                if name in (known[-1], stem):
+                names.append(stem.split("_", 2)[2] if stem.startswith("figure_") else stem)  # figure_8_shape
+                if name in (names[-1], stem):
                     drawing = draw_marked(each, summary).drawing
                     # without pyplot, a notebook displays a figure only if it has this method
                     setattr(drawing, "_repr_png_", _png_of(drawing))  # noqa: B010
                     return drawing
-        raise RunError(f"{self.record}: has no figure {name!r}; {_choices(name, known)}")
+        raise RunError(f"{self.record}: has no figure {name!r}; {_choices(name, names)}")
 
     def report(self, formats: Sequence[str] = ()) -> Path:
         """Write the report into the run's folder, as `zsim report` does; return the path of its page.
@@ -389,13 +391,13 @@ class Run:
     # Reading
 
     @cached_property
-    def _judged(self) -> tuple[RecordedFlight, list[Formation], RunSummary]:
+    def _assessment(self) -> tuple[RecordedFlight, list[Formation], RunSummary]:
         with plugin.names_only(not self._trust, looked_up=False):
             return judge(self.record, answers=True)
 
     @cached_property
     def _drone_errors(self) -> dict[str, EstimateErrors]:
-        return estimate_errors(self._judged[0])
+        return estimate_errors(self._assessment[0])
 
     @cached_property
     def _end(self) -> Mapping[str, Any]:
@@ -418,9 +420,9 @@ class Run:
 
     def _of_all_drones(self, key: str) -> list[str]:
         """Return the keys of all drones that correspond to a drone's key; for any other key, that key alone."""
-        kind, _, what = keys.parts(key)
-        alike = [f"drone/{drone}/{what}" for drone in self.drones] if kind == "drone" else [key]
-        return [each for each in alike if each in self.keys]
+        kind, _, leaf = keys.parts(key)
+        corresponding = [f"drone/{drone}/{leaf}" for drone in self.drones] if kind == "drone" else [key]
+        return [each for each in corresponding if each in self.keys]
 
     def _read(self, wanted: Sequence[str]) -> None:
         """Read the tables of the `wanted` keys in one pass over the record."""
@@ -437,13 +439,13 @@ class Run:
         """Return the messages of a key without their stamps."""
         return frame({column: values for column, values in self._table(key).items() if column not in STAMPS})
 
-    def _of(self, kind: str, name: str, what: str) -> "DataFrame":
-        key = f"{kind}/{self._known(kind, name, self.drones if kind == 'drone' else self.clusters)}/{what}"
+    def _read_leaf(self, kind: str, name: str, leaf: str) -> "DataFrame":
+        key = f"{kind}/{self._known(kind, name, self.drones if kind == 'drone' else self.clusters)}/{leaf}"
         if key not in self.keys:
-            group, _, last = what.rpartition("/")  # "sensor", "gps"
-            head = f"{kind}/{name}/{group}/" if group else f"{kind}/{name}/"
-            available = [each.removeprefix(head) for each in self.keys if each.startswith(head)]
-            missing = f"{group} {last!r}" if group else what
+            group, _, last = leaf.rpartition("/")  # "sensor", "gps"
+            prefix = f"{kind}/{name}/{group}/" if group else f"{kind}/{name}/"
+            available = [each.removeprefix(prefix) for each in self.keys if each.startswith(prefix)]
+            missing = f"{group} {last!r}" if group else leaf
             raise RunError(f"{self.record}: has no {missing} of {name}; {_choices(last, available)}")
         return self._plain(key)
 
@@ -463,7 +465,7 @@ class Run:
 
     def _untrusted(self, cluster: str) -> str:
         """Return the end of an error that names the space of a cluster; empty if the space was imported."""
-        scenario = None if self._trust else self._judged[0].scenario
+        scenario = None if self._trust else self._assessment[0].scenario
         own = cluster_of(scenario, cluster)
         names = [each.space for each in (own, *own.groups) if each.space and ":" in each.space] if own else []
         return f"; its space {names[0]} is imported only by zsim.load(…, trust=True)" if names else ""
@@ -471,10 +473,10 @@ class Run:
     def judged_formation(self, cluster: str | None = None) -> Formation:
         """Return the content of `formation` as arrays; errors as there."""
         name = self._cluster(cluster)
-        found = next((each for each in self._judged[1] if each.name == name), None)
-        if found is None:
+        formation = next((each for each in self._assessment[1] if each.name == name), None)
+        if formation is None:
             raise RunError(f"{self.record}: has no states of cluster {name} that can be judged{self._untrusted(name)}")
-        return found
+        return formation
 
 
 def _checked(window: Window) -> Window:
@@ -495,30 +497,32 @@ def _moments(errors: EstimateErrors, window: Window) -> dict[str, tuple[Any, ...
     units = ("m", "m", "m", "rad", "")
     columns = np.column_stack([errors.error, errors.nees])[rows].T
     for name, measure, values, share in zip((*ERROR_COLUMNS, "nees"), units, columns, (*inside, None), strict=True):
-        known = values[np.isfinite(values)]
-        found = (known.std(), np.sqrt(np.mean(known**2)), known.mean()) if len(known) else (None,) * 3
-        moments[name] = (measure, *found, share)
+        finite = values[np.isfinite(values)]
+        statistics = (finite.std(), np.sqrt(np.mean(finite**2)), finite.mean()) if len(finite) else (None,) * 3
+        moments[name] = (measure, *statistics, share)
     return moments
 
 
 def _statistics(
-    of: str, rows: Mapping[str, Mapping[str, tuple[Any, ...]]], fields: Sequence[str] = ("std", "rms", "mean", "inside")
+    index_name: str,
+    rows: Mapping[str, Mapping[str, tuple[Any, ...]]],
+    fields: Sequence[str] = ("std", "rms", "mean", "inside"),
 ) -> "DataFrame":
     """Return a frame with a row for each variable of each cluster or drone: its unit, and numbers or None."""
     flat = [(name, variable, *values) for name, variables in rows.items() for variable, values in variables.items()]
-    names = (of, "variable", "unit", *fields)
+    names = (index_name, "variable", "unit", *fields)
     texts = 3
     return frame(
         {name: np.array([row[i] for row in flat], object if i < texts else np.float64) for i, name in enumerate(names)},
-        (of, "variable"),
+        (index_name, "variable"),
     )
 
 
-def _choices(given: str, names: Iterable[str]) -> str:
+def _choices(name: str, names: Iterable[str]) -> str:
     """Return a hint at the most similar name, and the available names."""
     names = list(names)
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return f"{suggestion(given, names)}there are {', '.join(names[:SHOWN])}{more}" if names else "there are none"
+    omitted = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{suggestion(name, names)}there are {', '.join(names[:SHOWN])}{omitted}" if names else "there are none"
 
 
 def _png_of(drawing: "Figure") -> Callable[[], bytes]:
@@ -530,10 +534,10 @@ def _png_of(drawing: "Figure") -> Callable[[], bytes]:
     return png
 
 
-def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    head = "".join(f"<th>{html.escape(each)}</th>" for each in heads)
+def _html_table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    header = "".join(f"<th>{html.escape(each)}</th>" for each in titles)
     body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    return f"<table>{f'<tr>{head}</tr>' if head else ''}{body}</table>"
+    return f"<table>{f'<tr>{header}</tr>' if header else ''}{body}</table>"
 
 
 # Messages as tables
@@ -559,8 +563,8 @@ def read_tables(record: Path, wanted: Collection[str]) -> dict[str, Table]:
             for name, kind, values in column_values(survey.table(batch.kind)[1:], batch):
                 parts[by_subject[batch.only]].setdefault(name, []).append(as_array(kind, values))
         own = {key: _own_table(reader, key) for key in wanted if key not in parts}
-    joined = {key: {name: np.concatenate(each) for name, each in columns.items()} for key, columns in parts.items()}
-    return {**joined, **own}
+    tables = {key: {name: np.concatenate(each) for name, each in columns.items()} for key, columns in parts.items()}
+    return {**tables, **own}
 
 
 def frame(table: Mapping[str, NDArray[Any]], index: Sequence[str] = (INDEX,)) -> "DataFrame":
@@ -593,16 +597,16 @@ def _own_table(reader: RecordReader, key: str) -> Table:
 
 
 def _own_columns(name: str, values: Sequence[Any]) -> Table:
-    known = [value for value in values if value is not None]
-    width = len(known[0]) if known and isinstance(known[0], list) else 0
-    vectors = (isinstance(each, list) and len(each) == width and _kind(each) in ("whole", "number") for each in known)
+    present = [value for value in values if value is not None]
+    width = len(present[0]) if present and isinstance(present[0], list) else 0
+    vectors = (isinstance(each, list) and len(each) == width and _kind(each) in ("whole", "number") for each in present)
     if width and all(vectors):
         rows = np.array([value or [np.nan] * width for value in values], np.float64)
         return dict(zip(component_names(name, width), rows.T, strict=True))
-    kind = _kind(known)
+    kind = _kind(present)
     if kind == "text":
         values = [value if isinstance(value, str | bytes | None) else json_text(value) for value in values]
-    elif kind == "flag" and len(known) < len(values):
+    elif kind == "flag" and len(present) < len(values):
         return {name: np.array(values, object)}
     return {name: as_array(kind, list(values))}
 

@@ -208,14 +208,14 @@ def left_only_if_flown(folder: Path) -> Iterator[None]:
 
 def launch_of(folder: Path) -> Launch:
     """Return the launch of an interrupted run; raise RunError if the run is over, or the folder holds none."""
-    place = folder / JOURNAL / LAUNCH
+    path = folder / JOURNAL / LAUNCH
     try:
-        return msgspec.convert(json.loads(place.read_bytes()), Launch)
+        return msgspec.convert(json.loads(path.read_bytes()), Launch)
     except FileNotFoundError as error:
         state = "is over" if (folder / RECORD).exists() else "does not exist"
         raise RunError(f"{folder}: the run {state}; must be the folder of one that was interrupted") from error
     except (OSError, ValueError, msgspec.MsgspecError) as error:
-        raise RunError(f"{place}: cannot be read ({error}); must be as `zsim run` wrote it") from error
+        raise RunError(f"{path}: cannot be read ({error}); must be as `zsim run` wrote it") from error
 
 
 def reopen_record(folder: Path) -> None:

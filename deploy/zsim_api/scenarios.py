@@ -42,9 +42,9 @@ class Scenario:
     def load(cls, path: str | Path) -> Self:
         """Return the scenario in a YAML file; raise ScenarioError if it cannot be read."""
         path = Path(path)
-        made = cls(**yaml_file.read(path, scenario_file.EXAMPLE, ScenarioError))
-        made.source, made.folders, made.changes = path.name, (path.parent,), ()
-        return made
+        scenario = cls(**yaml_file.read(path, scenario_file.EXAMPLE, ScenarioError))
+        scenario.source, scenario.folders, scenario.changes = path.name, (path.parent,), ()
+        return scenario
 
     def with_(self, set: Mapping[str, Any] = {}, /, **fields: Any) -> Self:
         """Return the scenario with other values.
@@ -56,19 +56,19 @@ class Scenario:
         Raises:
             ScenarioError: with a line for each path that does not exist.
         """
-        made = copy.copy(self)
-        made.__dict__.pop("resolved", None)
-        made._document = document = copy.deepcopy(self._document)
+        changed = copy.copy(self)
+        changed.__dict__.pop("resolved", None)
+        changed._document = document = copy.deepcopy(self._document)
         faults: list[str] = []
-        for path, given in {**fields, **set}.items():
-            value = made.named(given)
+        for path, raw in {**fields, **set}.items():
+            value = changed.named(raw)
             if fault := scenario_file.apply_override(document, f"{path}=", lambda _, value=value: copy.deepcopy(value)):
                 faults.append(fault.replace("--set ", "", 1))
-            elif made.changes is not None:
-                made.changes = (*made.changes, f"{path}={value if isinstance(value, str) else json.dumps(value)}")
+            elif changed.changes is not None:
+                changed.changes = (*changed.changes, f"{path}={value if isinstance(value, str) else json.dumps(value)}")
         if faults:
             raise ScenarioError([f"{self.source}: {line}" for line in faults])
-        return made
+        return changed
 
     def changed(
         self,
@@ -167,13 +167,13 @@ class Scenario:
 
 def _by_path(values: Any, path: str = "") -> dict[str, Any]:
     """Return all values by path; a list entry with a name is found under that name."""
-    found = {path: values} if path else {}
+    result = {path: values} if path else {}
     parts: dict[str, Any] = values if isinstance(values, dict) else {}
     if isinstance(values, list):
         parts = {each["name"]: each for each in values if isinstance(each, dict) and "name" in each}
     for name, each in parts.items():
-        found |= _by_path(each, f"{path}.{name}" if path else name)
-    return found
+        result |= _by_path(each, f"{path}.{name}" if path else name)
+    return result
 
 
 # Lets editors complete the fields and show their declared types.

@@ -117,8 +117,8 @@ class Simulation:
         self.source = scenario_of(scenario).changed(
             seed=seed, duration_s=duration_s, set=set, law=law, estimator=estimator
         )
-        given = () if agents is None or agents == "stock" else sequence_of_agents(agents, "'stock', None, or ")
-        self._own: Sequence[OwnAgent] = tuple(given)
+        own_agents = () if agents is None or agents == "stock" else sequence_of_agents(agents, "'stock', None, or ")
+        self._own: Sequence[OwnAgent] = tuple(own_agents)
         self._stock = stock and agents is not None
         self._pristine = {i: _copied(each) for i, each in enumerate(self._own) if isinstance(each, Agent)}
         self._folder, self._writer = folder, None
@@ -194,7 +194,7 @@ class Simulation:
 
     def state(self, drone: str) -> str:
         """Return the state of a drone's firmware: "landed", "hovering", "flying" and so on."""
-        return self._flight.world.fleet.status(self._place(drone))[0]
+        return self._flight.world.fleet.status(self._index_of(drone))[0]
 
     def step(self, commands: Mapping[str, Command | Sequence[Command]] = {}) -> Truth:
         """Fly one gate.
@@ -212,7 +212,7 @@ class Simulation:
             raise RunError(f"step: the flight is over ({world.ended}); reset() begins another one")
         sent: list[tuple[str, Command]] = []
         for drone, given in commands.items():
-            self._place(drone)
+            self._index_of(drone)
             several: Any = given if isinstance(given, list | tuple) else (given,)
             sent += [(drone, command) for command in several]
         self.events = []
@@ -246,7 +246,7 @@ class Simulation:
         Raises:
             RunError: no drone has that name.
         """
-        self._place(name)
+        self._index_of(name)
         return PilotedDrone(name, self.ask)
 
     def inject(self, fault: Mapping[str, Any]) -> dict[str, Any]:
@@ -309,12 +309,12 @@ class Simulation:
             self._end()
             raise self._flight.world.failure
 
-    def _place(self, drone: str) -> int:
-        place = self._index.get(drone)
-        if place is None:
+    def _index_of(self, drone: str) -> int:
+        index = self._index.get(drone)
+        if index is None:
             hint = suggestion(drone, self.names)
             raise RunError(f"no drone is named {drone!r}; {hint}must be one of {', '.join(self.names)}")
-        return place
+        return index
 
     # Observer of the flight
 
@@ -353,20 +353,20 @@ class Sensors(Mapping[str, "Samples"]):
 
     def _fold(self) -> None:
         for gate in self._gates:
-            for place, which in enumerate(gate.which.tolist()):
-                self._newest[gate.table[which]] = (gate, place)
+            for index, entry in enumerate(gate.which.tolist()):
+                self._newest[gate.table[entry]] = (gate, index)
         self._gates.clear()
 
     def _update(self) -> None:
         self._fold()
         newest, self._newest = self._newest, {}
-        for key, (gate, place) in newest.items():
+        for key, (gate, index) in newest.items():
             if not keys.is_sensor(key) or keys.is_status(key):
                 continue
-            message = messages.decode(key, gate.payload(place))
+            message = messages.decode(key, gate.payload(index))
             if isinstance(message, Sample):
-                _, drone, what = keys.parts(key)
-                sensor = what.removeprefix("sensor/")
+                _, drone, leaf = keys.parts(key)
+                sensor = leaf.removeprefix("sensor/")
                 if sensor not in self._samples:
                     self._samples[sensor] = Samples(type(message), len(self._names))
                 self._samples[sensor].put(self._names.index(drone), message)
@@ -375,8 +375,8 @@ class Sensors(Mapping[str, "Samples"]):
         self._update()
         if sensor not in self._samples:
             hint = suggestion(sensor, [*self._samples])
-            known = ", ".join(self._samples) or "none yet"
-            raise RunError(f"no sample of {sensor!r} was received; {hint}there are {known}")
+            available = ", ".join(self._samples) or "none yet"
+            raise RunError(f"no sample of {sensor!r} was received; {hint}there are {available}")
         return self._samples[sensor]
 
     def __iter__(self) -> Iterator[str]:
@@ -399,14 +399,14 @@ class Samples:
         self._count = drones
         self._columns: dict[str, NDArray[Any]] = {}
 
-    def put(self, place: int, message: Struct) -> None:
+    def put(self, index: int, message: Struct) -> None:
         for name, value in structs.asdict(message).items():
             if name not in self._columns:
                 is_integer = isinstance(value, int) and not isinstance(value, bool)
                 shape = np.shape(value) if not isinstance(value, str) else ()
                 kind = np.int64 if is_integer else object if isinstance(value, str) else np.float64
                 self._columns[name] = np.full((self._count, *shape), -1 if is_integer else np.nan, dtype=kind)
-            self._columns[name][place] = value
+            self._columns[name][index] = value
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         columns = self.__dict__.get("_columns", {})

@@ -104,18 +104,18 @@ def sweep(
     texts = [_text(path, values, varied) for path, values in vary.items()]
     varied.search()
     try:
-        plan = planned(varied.source, varied.document(), texts, runs, keep_records, varied.changes, console)
+        plan = checked_plan(varied.source, varied.document(), texts, runs, keep_records, varied.changes, console)
     except ScenarioError as error:
         raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
     folder = Path(out) if out is not None else temporary_folder("sweep-")
-    named = re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())  # anywhere in the plan
-    modules = made_modules(named, [scratch_folder()])
+    module_names = re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())  # anywhere in the plan
+    modules = made_modules(module_names, [scratch_folder()])
     try:
-        rows = flown(plan, folder, workers, client, console=console, modules=tuple(modules))
+        rows = fly_plan(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:
         finished = len(SweepFolder(folder, plan).rows())
-        kept = folder if out is not None else folder.replace(tempfile.mkdtemp(prefix="zsim-sweep-"))
-        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(kept)!r} continues"
+        kept_folder = folder if out is not None else folder.replace(tempfile.mkdtemp(prefix="zsim-sweep-"))
+        text = f"interrupted: {finished} of {plan.runs} runs are finished; out={str(kept_folder)!r} continues"
         console.print(cell(text), soft_wrap=True)
         raise
     except RunError as error:
@@ -130,7 +130,7 @@ def sweep(
     return frame
 
 
-def planned(
+def checked_plan(
     source: str,
     document: dict[str, Any],
     vary: list[str],
@@ -144,18 +144,18 @@ def planned(
     status = console.status("checking every combination …") if console.is_terminal else None
     with status or nullcontext():
 
-        def look(run: int, of: int) -> None:
+        def show_progress(run: int, total: int) -> None:
             if status:
-                status.update(f"checking combination {run + 1} of {of}")
+                status.update(f"checking combination {run + 1} of {total}")
 
-        return make_plan(source, document, vary, runs, records, look, faults, changed)
+        return make_plan(source, document, vary, runs, records, show_progress, faults, changed)
 
 
-def flown(
-    plan: SweepPlan, folder: Path, workers: int | None = None, dask: Any = None, force: bool = False, **more: Any
+def fly_plan(
+    plan: SweepPlan, folder: Path, workers: int | None = None, dask: Any = None, force: bool = False, **options: Any
 ) -> list[Row]:
     """Fly a plan into a folder; return its rows. Arguments as in `SweepRequest`, errors as in `sweep`."""
-    return swept(SweepRequest(plan, folder, workers, dask, force, open_run=partial(load, trust=True), **more))
+    return swept(SweepRequest(plan, folder, workers, dask, force, open_run=partial(load, trust=True), **options))
 
 
 def _text(path: str, values: Any, scenario: Scenario) -> str:
@@ -164,8 +164,8 @@ def _text(path: str, values: Any, scenario: Scenario) -> str:
         return f"{path}={values}"
     values = values.tolist() if isinstance(values, np.ndarray) else values
     if isinstance(values, Mapping) or not isinstance(values, Iterable):
-        must = "must be a sequence of values, or a text such as 'uniform(0, 2)'"
-        raise ScenarioError([f"vary {path} is {show(values)}; {must}"])
+        rule = "must be a sequence of values, or a text such as 'uniform(0, 2)'"
+        raise ScenarioError([f"vary {path} is {show(values)}; {rule}"])
     try:
         return f"{path}={','.join(json.dumps(scenario.named(value)) for value in values)}"
     except TypeError as error:
@@ -190,11 +190,11 @@ def _frame(rows: Sequence[Row], varied: Collection[str]) -> "pd.DataFrame":
 
 def _labels(values: Any, scenario: Scenario) -> dict[str, str]:
     """Return labels for the classes and functions among values, by their names in the scenario."""
-    given = [] if isinstance(values, str) else [*values]
-    texts = [text_of(scenario.named(value)) for value in given]
-    made = {place: value.__name__ for place, value in enumerate(given) if hasattr(value, "__name__")}
-    labels = distinct(texts, made)
-    return {texts[place]: labels[place] for place in made}
+    entries = [] if isinstance(values, str) else [*values]
+    texts = [text_of(scenario.named(value)) for value in entries]
+    generated = {index: value.__name__ for index, value in enumerate(entries) if hasattr(value, "__name__")}
+    labels = distinct(texts, generated)
+    return {texts[index]: labels[index] for index in generated}
 
 
 def _in_python(line: str) -> str:

@@ -98,7 +98,7 @@ def _await_configuration(pilot: PlainPilot, control: socket.socket) -> None:
     """Wait for the answer to a request: by then all earlier datagrams to the AT port have been handled."""
     pilot.send(at_commands.Control(0, at_commands.SEND_CONFIGURATION))
     data = b""
-    while not data.endswith(at_commands.END):
+    while not data.endswith(at_commands.TERMINATOR):
         received = control.recv(65_536)
         assert received, "the control port has been closed"
         data += received

@@ -219,8 +219,8 @@ def _find_outline(level: Levels, noise: float, rays: Levels, focal_px: float) ->
         return None
     cosine = float(rays[v, u, 2])
     core = (level > CORE * peak).astype(np.uint8)
-    near = cv2.dilate(core, SQUARE_5).astype(np.uint8)
-    covered = _covered(level, core, near, peak)
+    dilated = cv2.dilate(core, SQUARE_5).astype(np.uint8)
+    covered = _covered(level, core, dilated, peak)
     oblique = cosine * cosine  # ratio of the principal variances of a ball's image at this angle from the optical axis
     if _roundness(covered) / oblique < ROUND_MIN:
         return None
@@ -230,21 +230,21 @@ def _find_outline(level: Levels, noise: float, rays: Levels, focal_px: float) ->
     return (circle, scale) if is_reliable else None
 
 
-def _covered(level: Levels, core: Picture, near: Picture, peak: float) -> Levels:
+def _covered(level: Levels, core: Picture, dilated: Picture, peak: float) -> Levels:
     """Return the covered share of each pixel: its level over that of the hat alone, which varies with the shading."""
     inner = cv2.erode(core, SQUARE_3)
     count = int(inner.sum())
-    own: Levels | float
+    hat_level: Levels | float
     if count > CORE_MIN_PX:
         side = 2 * round(math.sqrt(count) / 4) + 5
         total = cv2.blur(level * inner, (side, side), borderType=cv2.BORDER_CONSTANT)
         weight = cv2.blur(inner.astype(np.float32), (side, side), borderType=cv2.BORDER_CONSTANT)
         mean = np.float32((level * inner).sum() / count)
-        own = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), mean)
+        hat_level = np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), mean)
     else:
-        blurred = peak / float((level * near).sum()) * 2 * math.pi * POINT_BLUR_PX2
-        own = peak / (1 - math.exp(-float(np.interp(-blurred, -_PEAK, _x))))
-    return np.clip(level / own, 0, 1) * near
+        blurred = peak / float((level * dilated).sum()) * 2 * math.pi * POINT_BLUR_PX2
+        hat_level = peak / (1 - math.exp(-float(np.interp(-blurred, -_PEAK, _x))))
+    return np.clip(level / hat_level, 0, 1) * dilated
 
 
 def _roundness(covered: Levels) -> float:

@@ -122,11 +122,11 @@ class DroneImager:
         distances = np.sqrt((centres * centres).sum(axis=-1))
         margin_m = EXTENT_MAX_M * max(model.size for model in self._models)
         depth_limit = centres[:, 2] + margin_m
-        near = np.abs(centres[:, 0]) - 2 * margin_m < self._across * depth_limit
-        near &= np.abs(centres[:, 1]) - 2 * margin_m < self._down * depth_limit
-        near &= (distances < VISIBLE_MAX_M) & (depth_limit > 0)
-        near[self._carrier] = False  # no part of the carrier appears in its own picture
-        in_view: list[int] = np.flatnonzero(near).tolist()
+        is_candidate = np.abs(centres[:, 0]) - 2 * margin_m < self._across * depth_limit
+        is_candidate &= np.abs(centres[:, 1]) - 2 * margin_m < self._down * depth_limit
+        is_candidate &= (distances < VISIBLE_MAX_M) & (depth_limit > 0)
+        is_candidate[self._carrier] = False  # no part of the carrier appears in its own picture
+        in_view: list[int] = np.flatnonzero(is_candidate).tolist()
         kinds: defaultdict[int, list[int]] = defaultdict(list)
         for i in in_view:
             kinds[self._kinds[i]].append(i)
@@ -141,8 +141,8 @@ class DroneImager:
         images: dict[int, tuple[float, list[BallImage | DroneImage]]] = {}
         for i in in_view:
             layers = [image for image in (drones.get(i), seen.get(i)) if image is not None]
-            hat_is_behind = not cameras_B[i, 2] > self._hat[2] - self._radius_m
-            images[i] = float(distances[i]), layers[::-1] if hat_is_behind else layers
+            is_hat_behind = not cameras_B[i, 2] > self._hat[2] - self._radius_m
+            images[i] = float(distances[i]), layers[::-1] if is_hat_behind else layers
         return images
 
     def hats(self, centres_K: Array, displacements_K: Array, motion: CameraMotion) -> dict[int, BallImage]:
@@ -447,8 +447,8 @@ def _covered(
 ) -> Levels:
     """Return the covered share of each pixel, averaged over time, from how far within the radius its ray passes."""
     fractions = ((np.arange(steps) + 0.5) / steps - 0.5)[:, None]  # time since mid-exposure over the exposure time
-    moved = centres + fractions[..., None] * displacements
-    distance2 = (moved * moved).sum(axis=-1)
+    positions = centres + fractions[..., None] * displacements
+    distance2 = (positions * positions).sum(axis=-1)
     along = pixels.along + fractions.astype(np.float32) * pixels.along_displacement
     offset2 = pixels.per_pixel(distance2) - along * along
     px_per_m = pixels.per_pixel(focal_px / np.sqrt((centres * centres).sum(axis=-1)))
@@ -513,14 +513,14 @@ def _in_front(corners: Array) -> Array:
     depth = corners[:, 2] - NEAR_M
     if (depth > 0).all():
         return corners
-    kept: list[Array] = []
+    clipped: list[Array] = []
     for i, depth_i in enumerate(depth):
         j = (i + 1) % len(corners)
         if depth_i > 0:
-            kept.append(corners[i])
+            clipped.append(corners[i])
         if (depth_i > 0) != (depth[j] > 0):
-            kept.append(corners[i] + (corners[j] - corners[i]) * (depth_i / (depth_i - depth[j])))
-    return np.array(kept).reshape(-1, 3)
+            clipped.append(corners[i] + (corners[j] - corners[i]) * (depth_i / (depth_i - depth[j])))
+    return np.array(clipped).reshape(-1, 3)
 
 
 def to_fixed_point(pixels: Array) -> NDArray[np.int32]:
@@ -553,16 +553,16 @@ class SurfaceImager:
         """Return the distance [m] and index of each triangle that may be visible, and keep its data for `draw`."""
         self._points_K = motion.points_K(self._corners_W)
         z = self._points_K[..., 2]
-        ahead = (z > NEAR_M).all(axis=1)
+        is_ahead = (z > NEAR_M).all(axis=1)
         self._pixels = np.zeros((len(z), 3, 2))
-        if ahead.any():
-            self._pixels[ahead] = self._view.pixels(self._points_K[ahead])
+        if is_ahead.any():
+            self._pixels[is_ahead] = self._view.pixels(self._points_K[is_ahead])
         low, high = self._pixels.min(axis=1), self._pixels.max(axis=1)
         size = self._view.lens.width, self._view.lens.height
-        inside = ahead & (high >= 0.0).all(axis=1) & (low <= size).all(axis=1)
-        bent = self._view.distorts & ((high - low).max(axis=1) > BENT_PX)
-        self._is_plain = inside & ~bent
-        indices = np.flatnonzero(inside | (~ahead & (z > NEAR_M).any(axis=1)))
+        is_inside = is_ahead & (high >= 0.0).all(axis=1) & (low <= size).all(axis=1)
+        is_bent = self._view.distorts & ((high - low).max(axis=1) > BENT_PX)
+        self._is_plain = is_inside & ~is_bent
+        indices = np.flatnonzero(is_inside | (~is_ahead & (z > NEAR_M).any(axis=1)))
         offset = self._middles_W[indices] - motion.p_WK
         sides = np.where((self._normals_W[indices] * offset).sum(axis=1) > 0.0, -1.0, 1.0)  # the visible side
         lit = np.maximum(sides * (self._normals_W[indices] @ SUN_W), 0.0)

@@ -161,18 +161,21 @@ class _Noise:
         levels = np.rint(min(sigma, NOISE_MAX) * drawn)
         self._shape = shape
         self._key = zlib.crc32(name.encode()) ^ (seed & 0xFFFFFFFF)
-        self._over = np.clip(levels, 0, 255).astype(np.uint8)
-        self._under = np.clip(-levels, 0, 255).astype(np.uint8)
+        self._positive = np.clip(levels, 0, 255).astype(np.uint8)
+        self._negative = np.clip(-levels, 0, 255).astype(np.uint8)
 
     def add(self, picture: Picture, number: int) -> None:
         bits = ((number * 4 + 1) * MIX ^ self._key * MIX >> 7) & (2**64 - 1)
         v, u = bits >> 40 & (MARGIN - 1), bits >> 52 & (MARGIN - 1)
         height, width = self._shape
-        over, under = self._over[v : v + height, u : u + width], self._under[v : v + height, u : u + width]
+        positive, negative = (
+            self._positive[v : v + height, u : u + width],
+            self._negative[v : v + height, u : u + width],
+        )
         if bits >> 60 & 1:
-            over, under = under, over
-        cv2.add(picture, over, dst=picture)
-        cv2.subtract(picture, under, dst=picture)
+            positive, negative = negative, positive
+        cv2.add(picture, positive, dst=picture)
+        cv2.subtract(picture, negative, dst=picture)
 
 
 def _pinhole(view: View) -> tuple[View, tuple[Picture, Picture]]:

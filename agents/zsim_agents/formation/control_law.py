@@ -296,8 +296,8 @@ class Grants:
             raise self._not_granted(law, "the map", "law_map", "law_map: true")
         return self._map
 
-    def _not_granted(self, law: type, what: str, field: str, line: str) -> UserCodeError:
-        where = f"{plugin.full_name(law)} reads {what}, which clusters.{self._cluster}.{field} does not grant"
+    def _not_granted(self, law: type, subject: str, field: str, line: str) -> UserCodeError:
+        where = f"{plugin.full_name(law)} reads {subject}, which clusters.{self._cluster}.{field} does not grant"
         return UserCodeError(f"{where}; write `{line}` there, or leave it out of the class")
 
     def snapshot(self) -> State:
@@ -453,13 +453,13 @@ def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limit_valu
     """
     limits = RobotLimits(*limit_values)
     order[:] = 0
-    near = near_pairs(p_W, max(reach(limits), limits.separation_alarm_m))
-    alarms = note_alarms(p_W, near, limits.separation_alarm_m, order)
+    pairs = near_pairs(p_W, max(reach(limits), limits.separation_alarm_m))
+    alarms = note_alarms(p_W, pairs, limits.separation_alarm_m, order)
     guards = 0
     for _ in range(GUARD_SWEEPS):
         is_settled = True
-        for k in range(near.shape[0]):
-            i, j = near[k, 0], near[k, 1]
+        for k in range(pairs.shape[0]):
+            i, j = pairs[k, 0], pairs[k, 1]
             if separate(p_W, v_W, v_cmd_W, i, j, limits):
                 is_settled = False
                 if order[i, j] == 0:
@@ -471,11 +471,11 @@ def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limit_valu
 
 
 @portable
-def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: Order) -> int:
+def note_alarms(p_W: Array, pairs: PairTable, separation_alarm_m: float, order: Order) -> int:
     """Number the pairs closer than the alarm threshold below the diagonal of `order`; return their count."""
     alarms = 0
-    for k in range(near.shape[0]):
-        i, j = near[k, 0], near[k, 1]
+    for k in range(pairs.shape[0]):
+        i, j = pairs[k, 0], pairs[k, 1]
         if norm(subtract(row(p_W, j), row(p_W, i))) < separation_alarm_m:
             alarms += 1
             order[j, i] = alarms

@@ -129,12 +129,14 @@ class OlfatiSaber(Pilot):
         self._commanded = np.zeros(2)  # velocity of the double integrator
 
     def velocity(self, now: Sight) -> Array:
-        own, v = self.parameters, self._commanded
-        reach = own.range_ratio * own.spacing_m
-        u = alpha_force(now.p_W, v, now.heard, own.spacing_m, reach, own.alpha_1_s2)
-        u += beta_force(v, self.obstacles_near(now.p_W, own.clearance_m), own.clearance_m, own.beta_1_s2)
-        u += gamma_force(now.p_W, v, now.reference.p_W, now.reference.v_W, own.gamma_1_s2)
-        self._commanded = limited(v + self._dt * limited(u, own.accel_max_m_s2), own.speed_max_m_s)
+        parameters, v = self.parameters, self._commanded
+        reach = parameters.range_ratio * parameters.spacing_m
+        u = alpha_force(now.p_W, v, now.heard, parameters.spacing_m, reach, parameters.alpha_1_s2)
+        u += beta_force(
+            v, self.obstacles_near(now.p_W, parameters.clearance_m), parameters.clearance_m, parameters.beta_1_s2
+        )
+        u += gamma_force(now.p_W, v, now.reference.p_W, now.reference.v_W, parameters.gamma_1_s2)
+        self._commanded = limited(v + self._dt * limited(u, parameters.accel_max_m_s2), parameters.speed_max_m_s)
         return self._commanded
 
     def snapshot(self) -> State:

@@ -83,7 +83,7 @@ class Pose(NamedTuple):
 
     def offset(self, c: Array) -> tuple[Array, Array]:
         """Return the offset of a position c (2,) of the formation from the centre [m; W], and its rate [m/s]."""
-        return turned(self.turn, c), turned(self.turn_rate, c)
+        return transformed(self.turn, c), transformed(self.turn_rate, c)
 
 
 class Sight(NamedTuple):
@@ -133,14 +133,14 @@ class Pilot(Agent):
 
     def __init__(self, drone: str, scenario: Scenario) -> None:
         super().__init__()
-        own = self.parameters
+        parameters = self.parameters
         self._drone = drone
         self._gate_ns = round(scenario.time.gate_ms * 1e6)
-        self._message_ns = max(self._gate_ns, round(1e9 / own.message_rate_hz))
-        self._silence_ns = round(own.silence_s * 1e9)
+        self._message_ns = max(self._gate_ns, round(1e9 / parameters.message_rate_hz))
+        self._silence_ns = round(parameters.silence_s * 1e9)
         self._obstacles = [surroundings.row_of(each) for each in scenario.environment.obstacles]
         self._surfaces = [_sheet(each) for each in scenario.environment.surfaces or ()]
-        self._reference = self.reference_of(own)
+        self._reference = self.reference_of(parameters)
         self._heard: dict[str, Motion] = {}
         self._state = "landed"
         self._p_W = self._v_W = np.zeros(3)
@@ -152,8 +152,8 @@ class Pilot(Agent):
         """Prepare the law's data from the scenario."""
 
     @staticmethod
-    def reference_of(own: Any) -> "FormationReference":
-        return FormationReference(own.centre_m, 0.0, 1.0, own.start_s)
+    def reference_of(parameters: Any) -> "FormationReference":
+        return FormationReference(parameters.centre_m, 0.0, 1.0, parameters.start_s)
 
     @abstractmethod
     def velocity(self, now: Sight) -> Array:
@@ -183,16 +183,16 @@ class Pilot(Agent):
                 self._heard[drone] = message
 
     def step(self, t_ns: int) -> list[Output]:
-        own, outputs = self.parameters, []
+        parameters, outputs = self.parameters, []
         is_airborne = self._state in AIRBORNE
-        height_error = own.height_m - float(self._p_W[2])
+        height_error = parameters.height_m - float(self._p_W[2])
         self._has_flown |= is_airborne
         self._is_engaged = is_airborne and (self._is_engaged or abs(height_error) <= ENGAGE_M)
         if t_ns // self._message_ns != (t_ns - self._gate_ns) // self._message_ns:
             p_W, v_W = triple(self._p_W), triple(self._v_W)
             outputs.append(self.message(t_ns, Motion(position_m=p_W, velocity_m_s=v_W, is_engaged=self._is_engaged)))
-        must_take_off = t_ns >= own.takeoff_s * 1e9 and t_ns % COMMAND_PERIOD_NS < self._gate_ns
-        if own.land_s is not None and t_ns >= own.land_s * 1e9:
+        must_take_off = t_ns >= parameters.takeoff_s * 1e9 and t_ns % COMMAND_PERIOD_NS < self._gate_ns
+        if parameters.land_s is not None and t_ns >= parameters.land_s * 1e9:
             if is_airborne and t_ns % COMMAND_PERIOD_NS < self._gate_ns:
                 outputs.append(self.command(t_ns, self._drone, Mode(*UNSTAMPED, "land")))
         elif self._state == "landed" and must_take_off and not self._has_flown:
@@ -333,7 +333,7 @@ def polygon(count: int, radius_m: float) -> Array:
 # Vector functions, with the same order of operations on every processor
 
 
-def turned(matrix: Array, c: Array) -> Array:
+def transformed(matrix: Array, c: Array) -> Array:
     """Return a matrix (2, 2) times c (2,), with the same order of operations on every processor."""
     return np.array([matrix[0, 0] * c[0] + matrix[0, 1] * c[1], matrix[1, 0] * c[0] + matrix[1, 1] * c[1]])
 

@@ -47,14 +47,14 @@ class ShapePilot(Pilot):
     Parameters = ShapeParameters
 
     def begin(self, scenario: Scenario) -> None:
-        own, names = self.parameters, [drone.name for drone in scenario.drones]
-        positions = np.array(own.places_m) if own.places_m else polygon(len(names), own.radius_m)
+        parameters, names = self.parameters, [drone.name for drone in scenario.drones]
+        positions = np.array(parameters.places_m) if parameters.places_m else polygon(len(names), parameters.radius_m)
         self._positions: dict[str, Array] = dict(zip(names, positions, strict=True))
-        self._informed = self._drone in (names[:1] if own.informed is None else own.informed)
+        self._informed = self._drone in (names[:1] if parameters.informed is None else parameters.informed)
 
     @staticmethod
-    def reference_of(own: Any) -> FormationReference:
-        return FormationReference(own.centre_m, own.heading_deg, own.scale, own.start_s)
+    def reference_of(parameters: Any) -> FormationReference:
+        return FormationReference(parameters.centre_m, parameters.heading_deg, parameters.scale, parameters.start_s)
 
     def relative(self, now: Sight) -> list[tuple[Array, Array]]:
         """Return z_ij = p_j - p_i [m; W] of each neighbour, and its desired value."""

@@ -65,32 +65,35 @@ class Vasarhelyi(Pilot):
         """Drones, obstacles and surfaces closer than this repel the drone, in addition to the law; 0: no repulsion."""
 
     def velocity(self, now: Sight) -> Array:
-        own = self.parameters
+        parameters = self.parameters
         velocity = now.reference.v_W.copy()
-        if own.v_flock_m_s:
-            velocity += own.v_flock_m_s * unit(now.v_W)
+        if parameters.v_flock_m_s:
+            velocity += parameters.v_flock_m_s * unit(now.v_W)
         for each in now.heard:
             z, r = each.p_W - now.p_W, length(each.p_W - now.p_W)
-            velocity += repelled(z, own.r0_rep_m, own.p_rep_1_s)
-            allowed = braking(r - own.r0_frict_m, own.a_frict_m_s2, own.p_frict_1_s)
-            velocity += friction(each.v_W - now.v_W, max(own.v_frict_m_s, allowed), own.c_frict)
+            velocity += repelled(z, parameters.r0_rep_m, parameters.p_rep_1_s)
+            allowed = braking(r - parameters.r0_frict_m, parameters.a_frict_m_s2, parameters.p_frict_1_s)
+            velocity += friction(each.v_W - now.v_W, max(parameters.v_frict_m_s, allowed), parameters.c_frict)
         for distance, away, v_wall in self._walls(now):
-            allowed = braking(distance - own.r0_shill_m, own.a_shill_m_s2, own.p_shill_1_s)
-            velocity += friction(v_wall + own.v_shill_m_s * away - now.v_W, allowed, 1.0)
+            allowed = braking(distance - parameters.r0_shill_m, parameters.a_shill_m_s2, parameters.p_shill_1_s)
+            velocity += friction(v_wall + parameters.v_shill_m_s * away - now.v_W, allowed, 1.0)
         return velocity
 
     def _walls(self, now: Sight) -> list[tuple[float, Array, Array]]:
         """Return the distance [m], the direction away and the velocity [m/s] of each wall and obstacle."""
-        own, walls = self.parameters, []
-        speed_max, final_speed = own.v_shill_m_s + own.speed_max_m_s, own.a_shill_m_s2 / own.p_shill_1_s
-        reach = own.r0_shill_m + (speed_max * speed_max + final_speed * final_speed) / (
-            2.0 * own.a_shill_m_s2
+        parameters, walls = self.parameters, []
+        speed_max, final_speed = (
+            parameters.v_shill_m_s + parameters.speed_max_m_s,
+            parameters.a_shill_m_s2 / parameters.p_shill_1_s,
+        )
+        reach = parameters.r0_shill_m + (speed_max * speed_max + final_speed * final_speed) / (
+            2.0 * parameters.a_shill_m_s2
         )  # beyond this distance, (4) allows any speed
         walls += [(distance, away, np.zeros(2)) for distance, away in self.obstacles_near(now.p_W, reach)]
-        for axis in (0, 1) if own.arena_m else ():
+        for axis in (0, 1) if parameters.arena_m else ():
             for side in (-1.0, 1.0):
                 away = np.zeros(2)
                 away[axis] = -side
-                distance = 0.5 * own.arena_m - side * float(now.p_W[axis] - now.reference.p_W[axis])
+                distance = 0.5 * parameters.arena_m - side * float(now.p_W[axis] - now.reference.p_W[axis])
                 walls.append((distance, away, now.reference.v_W))
         return walls

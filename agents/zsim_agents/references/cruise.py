@@ -90,14 +90,14 @@ class Course:
         speeds: Cruise = UNLIMITED,
     ) -> None:
         """Set the goal and the rate to follow; `position` and `drone_rate` are those of the drone at `t_s`."""
-        own, own_rate = self._motion(t_s, position, drone_rate)
+        start, start_rate = self._motion(t_s, position, drone_rate)
         self._goal, self._rate, self._speeds = goal, rate, speeds
-        self._begin(t_s, own, own_rate)
+        self._begin(t_s, start, start_rate)
 
     def stop(self, t_s: float, position: Vector4, drone_rate: Vector4) -> Vector:
         """Return the position [m; W] where the drone can come to rest; arguments as in `send`."""
-        own, rate = (np.array(each, float) for each in self._motion(t_s, position, drone_rate))
-        x, y, z = cruise_to_rest(own, self._limits, rate).value(math.inf)[0][:3].tolist()
+        start, rate = (np.array(each, float) for each in self._motion(t_s, position, drone_rate))
+        x, y, z = cruise_to_rest(start, self._limits, rate).value(math.inf)[0][:3].tolist()
         return x, y, z
 
     def velocity(self, t_s: float, position: Vector4, drone_rate: Vector4) -> tuple[Vector, float]:
@@ -125,12 +125,12 @@ class Course:
 
     def _motion(self, t_s: float, position: Vector4, drone_rate: Vector4) -> tuple[Vector4, Vector4]:
         """Return position and rate: those of the path on the axes it controls, those of the drone on the others."""
-        own, rate = list(position), list(drone_rate)
+        start, rate = list(position), list(drone_rate)
         if self._path is not None and not self._is_off_path(t_s, position):
             path_position, path_rate = self._state(t_s)
             for k in self._axes():
-                own[k], rate[k] = path_position[k], path_rate[k]
-        return own, rate
+                start[k], rate[k] = path_position[k], path_rate[k]
+        return start, rate
 
     def _axes(self) -> list[int]:
         """Return the axes that the path controls: those with a goal and no rate."""
@@ -333,9 +333,11 @@ def _polynomials(translation: list[_Segment], turn: list[_Segment]) -> Piecewise
     times_kept = [t for t, after in pairwise(times) if after - t > SHORT_S]
     coefficients = np.zeros((len(times_kept), DEGREE + 1, 4))
     for row, t in zip(coefficients, times_kept, strict=True):
-        for segments, own, columns in zip((translation, turn), starts_s, (slice(0, 3), slice(3, 4)), strict=True):
+        for segments, start_times, columns in zip(
+            (translation, turn), starts_s, (slice(0, 3), slice(3, 4)), strict=True
+        ):
             count = columns.stop - columns.start
-            position, velocity, accel = _state(segments, own, t)
+            position, velocity, accel = _state(segments, start_times, t)
             row[:3, columns] = np.array([position[:count], velocity[:count], [a / 2.0 for a in accel[:count]]])
     return PiecewisePolynomial(np.diff([*times_kept, times[-1]]), coefficients)
 

@@ -132,23 +132,25 @@ class Flight:
         leg = self.leg_at(t_s)
         if leg is None:
             return "holding", None
-        own_s, end_s = t_s - leg.start_s, leg.path.duration_s
-        if end_s is not None and own_s > end_s:
+        local_s, end_s = t_s - leg.start_s, leg.path.duration_s
+        if end_s is not None and local_s > end_s:
             return "holding", None
-        return leg.phase, own_s if leg.phase == "path" else None
+        return leg.phase, local_s if leg.phase == "path" else None
 
     def peaks(self) -> Peaks:
         """Return the peaks over all legs; their times are not determined and set to 0."""
-        each = [peaks_of(leg.path) for leg in self.legs]
-        speed, climb, turn, accel = np.max([[0.0] * 4, *(peaks[:4] for peaks in each)], axis=0).tolist()
+        leg_peaks = [peaks_of(leg.path) for leg in self.legs]
+        speed, climb, turn, accel = np.max([[0.0] * 4, *(peaks[:4] for peaks in leg_peaks)], axis=0).tolist()
         return Peaks(speed, climb, turn, accel, at_s=(0.0, 0.0, 0.0, 0.0))
 
 
 def limits_of(drone: Drone, gravity_m_s2: float) -> PathLimits:
     """Return the path limits of a drone: its firmware's limits, with the tilt converted to an acceleration."""
-    own = drone.limits
-    accel = gravity_m_s2 * el.tan(math.radians(own.tilt_deg))
-    return PathLimits(own.horizontal_speed_m_s, own.vertical_speed_m_s, math.radians(own.yaw_rate_deg_s), accel)
+    limits = drone.limits
+    accel = gravity_m_s2 * el.tan(math.radians(limits.tilt_deg))
+    return PathLimits(
+        limits.horizontal_speed_m_s, limits.vertical_speed_m_s, math.radians(limits.yaw_rate_deg_s), accel
+    )
 
 
 def hover_of(drone: Drone) -> Array:
@@ -231,7 +233,7 @@ def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Ref
         return ExpressionTrajectory(PoseVariables(), spec.expressions, base, spec.constants, spec.duration_s)
 
     def laps(curve: Any, settings: Any) -> Reference:
-        return Laps(lambda angle: _turned(curve(angle), yaw), settings.period_s, settings.laps)
+        return Laps(lambda angle: _with_yaw(curve(angle), yaw), settings.period_s, settings.laps)
 
     round_, eight = spec.circle, spec.figure_eight
     return {
@@ -244,7 +246,7 @@ def _paths_of(spec: DroneReference, yaw: float) -> Mapping[str, Callable[[], Ref
     }
 
 
-def _turned(point: tuple[Array, Array], yaw: float) -> tuple[Array, Array]:
+def _with_yaw(point: tuple[Array, Array], yaw: float) -> tuple[Array, Array]:
     point[0][3] = yaw
     return point
 

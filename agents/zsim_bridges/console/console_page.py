@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import viser
 
 from zsim_agents.formation.flight_check import DOWN
-from zsim_bridges.console.console_tables import DroneRow, drone_table, event_table, figure_lines, preflight_lines
+from zsim_bridges.console.console_tables import DroneRow, drone_table, event_table, metric_lines, preflight_lines
 from zsim_bridges.console.control_desk import ALL_PARTS, RUN, ControlDesk, ControlForm
 from zsim_bridges.console.formation_form import FormationForm
 from zsim_bridges.console.histories import TRAIL_S, TRAILS_S, FlightHistory, VariablePlots
@@ -31,7 +31,7 @@ from zsim_bridges.console.run_forms import (
     refusal_lines,
     set_refusals,
 )
-from zsim_bridges.console.run_monitor import FlightFigures
+from zsim_bridges.console.run_monitor import FlightMetrics
 from zsim_bridges.console.scene import ChosenRing, draw_ground
 from zsim_bridges.console.view_buffer import ALL, KINDS, EventRow, chosen_rows
 
@@ -108,7 +108,7 @@ class ConsolePage:
         self._show_preview = show_preview
         self.forms: dict[str, FormationForm] = {}
         self.plots: dict[str, VariablePlots] = {}
-        self.flights = FlightHistory([drone.name for drone in run.scenario.drones], around=run.is_replay)
+        self.flights = FlightHistory([drone.name for drone in run.scenario.drones], is_replay=run.is_replay)
         self.chosen = next(iter(run.spaces), "")
         self.parts: dict[str, str] = {}
         self._folders: dict[str, list[viser.GuiFolderHandle]] = {}
@@ -144,7 +144,7 @@ class ConsolePage:
         panel = gui.add_panel()
         with panel.add_tab("Drones", viser.Icon.DRONE):
             self.drone_folder = gui.add_folder(None)
-            self.figure_folder = gui.add_folder(None)
+            self.instrument_folder = gui.add_folder(None)
         with panel.add_tab("Events", viser.Icon.LIST):
             self.event_folder = gui.add_folder(None)
         panel.dock_left()
@@ -195,7 +195,7 @@ class _PageForm(NamedTuple):
     fleet: "FleetTable"
     ring: ChosenRing
     instruments: viser.GuiHtmlHandle
-    figures: viser.GuiHtmlHandle
+    sensor_table: viser.GuiHtmlHandle
     events: "EventForm"
 
 
@@ -261,7 +261,7 @@ class PageForms:
     def show(
         self,
         rows: Sequence[DroneRow],
-        figures: Mapping[str, FlightFigures],
+        metrics: Mapping[str, FlightMetrics],
         sensors_of: Callable[[str], str],
         events: Sequence[EventRow],
     ) -> None:
@@ -270,12 +270,12 @@ class PageForms:
         `sensors_of` returns the table of a drone's sensors as HTML.
         """
         chosen = {form.drone.chosen for form in list(self._forms.values())}
-        contents = {drone: (figure_lines(figures.get(drone)), sensors_of(drone)) for drone in chosen}
+        contents = {drone: (metric_lines(metrics.get(drone)), sensors_of(drone)) for drone in chosen}
 
         def show(form: _PageForm) -> None:
-            form.instruments.content, form.figures.content = contents.get(form.drone.chosen, ("", ""))
+            form.instruments.content, form.sensor_table.content = contents.get(form.drone.chosen, ("", ""))
             form.events.show(events)
-            form.fleet.show(rows, figures, form.drone.chosen)
+            form.fleet.show(rows, metrics, form.drone.chosen)
 
         self._update(show)
 
@@ -312,8 +312,8 @@ class PageForms:
             drone = DroneForm(gui, self._client, self._names, control_refusal, self._request_return)
             instruments = gui.add_html("")
             fleet = FleetTable(gui, self._names, lambda: drone.select(fleet.selected))
-        with shared.figure_folder:
-            figures = gui.add_html("")
+        with shared.instrument_folder:
+            sensor_table = gui.add_html("")
         with shared.event_folder:
             events = EventForm(gui, self._names)
         with shared.theme_folder:
@@ -325,7 +325,7 @@ class PageForms:
 
         theme.on_update(lambda _: set_page_theme())
         ring = ChosenRing(page.scene, self._radii_m)
-        self._forms[client_id] = _PageForm(control, drone, fleet, ring, instruments, figures, events)
+        self._forms[client_id] = _PageForm(control, drone, fleet, ring, instruments, sensor_table, events)
         if client_id not in self._server.get_clients():
             self._remove(page)  # it has disconnected meanwhile
 
@@ -462,11 +462,11 @@ class FleetTable:
         if drone in self._names:
             self._select(self._selected ^ {drone})
 
-    def show(self, rows: Sequence[DroneRow], figures: Mapping[str, FlightFigures], chosen: str) -> None:
+    def show(self, rows: Sequence[DroneRow], metrics: Mapping[str, FlightMetrics], chosen: str) -> None:
         """Show rows; `chosen` is the drone whose instruments the page shows."""
         shown = filtered_rows(rows, self._order.value, self._choice.value, self._text.value, self._selected)
         self._shown = tuple(row.name for row in shown)
-        self.table.content = drone_table(shown, figures, self._selected, chosen, NO_ROW if rows else "")
+        self.table.content = drone_table(shown, metrics, self._selected, chosen, NO_ROW if rows else "")
 
     def _select(self, names: frozenset[str]) -> None:
         self._selected = names

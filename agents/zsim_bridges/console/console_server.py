@@ -139,8 +139,8 @@ class Console:
         say: Callable[[str], None],
     ) -> None:
         """Show a run until it is over or `stopped` returns true."""
-        shown_by = self._cameras, self._rate_hz, self._world
-        self._run_page = page = RunPage(self._viser.server, link, info, observer, *shown_by)
+        view_args = self._cameras, self._rate_hz, self._world
+        self._run_page = page = RunPage(self._viser.server, link, info, observer, *view_args)
         try:
             page.run(stopped)
         finally:
@@ -211,7 +211,7 @@ class RunPage:
         age_s = scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
         self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
         self.views = ViewBuffer(
-            link, info, observer, variables, self._on_refused_command, asked=self._on_foreign_request
+            link, info, observer, variables, self._on_refused_command, on_foreign_request=self._on_foreign_request
         )
         self._monitor = RunMonitor(self.views, self._time_monitor, run, world)
         hats = scenario.environment.hats
@@ -234,7 +234,7 @@ class RunPage:
             self._scene.trails.choose_length, lambda cluster: self.flying.returns.request_formation(cluster),
             self._scene.preview,
         )  # fmt: skip
-        self.desk = ControlDesk(list(spaces), partial(self._tell, "Control", "orange"))
+        self.desk = ControlDesk(list(spaces), partial(self._notify_page, "Control", "orange"))
         part_of = {drone: name for name, drones in self._members.items() for drone in drones}
         self._page_forms = PageForms(
             server, self._client, self._page, self._names, self._scene.nodes.radii_m, self.desk,
@@ -294,7 +294,7 @@ class RunPage:
     def head(self) -> dict[str, Any]:
         head, stall = self._monitor.head(time.monotonic()), self._time_monitor.stall
         stalled = stall and {"lasted_s": stall.lasted_s, "ago_s": time.monotonic() - stall.ended_s}
-        ages = {"heard_s": self._time_monitor.heard_s, "stall": stalled}
+        ages = {"heard_s": self._time_monitor.answer_age_s, "stall": stalled}
         return {**head, **ages, "run_id": self._run.info.run_id, "orders": self.orders.rows()}
 
     def command(self, request: OrderRequest) -> dict[str, Any]:
@@ -310,7 +310,7 @@ class RunPage:
         refusal = "" if part is None else self.desk.use(client_id, part)
         if refusal and time.monotonic() - self._notified_s.get(client_id, -math.inf) > REFUSAL_S:
             self._notified_s[client_id] = time.monotonic()
-            self._tell("Control", "orange", client_id, f"Refused: {refusal}")
+            self._notify_page("Control", "orange", client_id, f"Refused: {refusal}")
         return not refusal
 
     # Pictures
@@ -329,10 +329,10 @@ class RunPage:
             self._monitor_s = wall_s
             if self._run.is_replay and self._scene.drones is not None:
                 self._keep_past(self._scene.drones.t_ns / 1e9)
-            for done in self._monitor.update(wall_s):
-                self._note("done", done.subject, f"{done.text}: done")
+            for completed in self._monitor.update(wall_s):
+                self._note("done", completed.subject, f"{completed.text}: done")
             self._update_orders()
-        self._fill_past(self.record.take())
+        self._fill_past(self.record.pop_instants())
         self.cameras.update()
         self.flying.returns.tick()
         for form in self._page.forms.values():
@@ -373,20 +373,22 @@ class RunPage:
         for past in instants:
             drones = drone_poses(past.drones, self._names)
             self._scene.trails.add(drones.t_ns / 1e9, drones.p_W)
-            known = {n: view for n, view in past.clusters.items() if n in spaces and view.names == spaces[n].names}
-            self._add_points(drones, self._scene.shapes_of(drones), known, past.estimates)
+            known_clusters = {
+                n: view for n, view in past.clusters.items() if n in spaces and view.names == spaces[n].names
+            }
+            self._add_points(drones, self._scene.shapes_of(drones), known_clusters, past.estimates)
         self._scene.trails.number += bool(instants)
 
     def _keep_past(self, t_s: float) -> None:
         """Read the record around the time that a replay shows, and drop points far from that time."""
         self.record.fill(t_s)
-        kept = t_s - KEPT_S, t_s + KEPT_S
-        self._scene.trails.keep(*kept)
+        kept_span_s = t_s - KEPT_S, t_s + KEPT_S
+        self._scene.trails.keep(*kept_span_s)
         for history in (self._page.flights.history, *(plots.history for plots in self._page.plots.values())):
-            history.keep(*kept)
+            history.keep(*kept_span_s)
 
     def _add_newest_points(self, drones: DronePoses) -> None:
-        estimates = {name: each.estimate for name, each in self.views.estimates().items() if each.fresh}
+        estimates = {name: each.estimate for name, each in self.views.estimates().items() if each.is_fresh}
         self._add_points(drones, self._scene.shapes, self.views.clusters, estimates)
 
     def _add_points(
@@ -407,12 +409,12 @@ class RunPage:
     # Controls and tables
 
     def _update_tables(self, wall_s: float) -> None:
-        page, run, flown = self._page, self._monitor.condition, self._monitor.flight.figures
+        page, run, metrics = self._page, self._monitor.condition, self._monitor.flight.metrics
         page.refresh(run)
         self.desk.release_lost()
         self._page_forms.refresh(run, page.chosen)
         rows, sensors_of = self._table_rows.drone_rows(), self._table_rows.sensor_table
-        self._page_forms.show(rows, flown, sensors_of, self.views.log.rows())
+        self._page_forms.show(rows, metrics, sensors_of, self.views.log.rows())
         page.phases.content = console_tables.formation_lines(run.phases)
         watch = self._monitor.fault_watch
         page.faults.content = console_tables.fault_lines(watch.lines(), watch.lines(is_over=True))
@@ -447,17 +449,17 @@ class RunPage:
     def _on_foreign_request(self, cluster: str, text: str) -> None:
         """Notify every page of another client's request to a formation, since the last request takes effect."""
         for client_id in () if self._run.is_replay else self._server.get_clients():
-            self._tell("Control", "orange", client_id, text)
+            self._notify_page("Control", "orange", client_id, text)
 
     def _note(self, kind: str, subject: str, text: str) -> None:
         """Log an event of the console itself."""
         self.views.log.add(Event(self._observer.now_ns, 0, kind, self._observer.name, subject, text))
 
-    def _notify(self, what: str, refusal: str) -> None:
+    def _notify(self, request: str, refusal: str) -> None:
         for client_id in self._server.get_clients():
-            self._tell(f"Refused: {what}", "red", client_id, refusal)
+            self._notify_page(f"Refused: {request}", "red", client_id, refusal)
 
-    def _tell(self, title: str, colour: Any, client_id: int, line: str) -> None:
+    def _notify_page(self, title: str, colour: Any, client_id: int, line: str) -> None:
         """Show a notification in the corner of one page."""
         client = self._server.get_clients().get(client_id)
         if client is not None:
@@ -477,12 +479,12 @@ def console_state(
     `shapes` are the formations' true shapes.
     """
     view, clock, silent_s = views.drones, time_monitor.clock, time_monitor.silent_s
-    sigmas = {name: received.sigma_m for name, received in views.estimates().items() if received.fresh}
+    sigmas = {name: received.sigma_m for name, received in views.estimates().items() if received.is_fresh}
     clusters = []
     for name, cluster in dict(views.clusters).items():
         shape = shapes.get(name)
         values = {"desired": cluster.desired, "value": cluster.value, "true": () if shape is None else shape.c.tolist()}
-        named = {what: dict(zip(cluster.names, each, strict=False)) for what, each in values.items()}
+        named = {series: dict(zip(cluster.names, each, strict=False)) for series, each in values.items()}
         clusters.append({"name": name, "phase": cluster.phase, "reason": cluster.reason, **named})
     return {
         "run_id": run_id,

@@ -19,7 +19,7 @@ from zsim_bridges.console.run_condition import (
     Severity,
     battery_severity,
 )
-from zsim_bridges.console.run_monitor import FlightFigures
+from zsim_bridges.console.run_monitor import FlightMetrics
 from zsim_bridges.console.view_buffer import EventRow, ReceivedLink, ViewBuffer
 
 GREY, RED, AMBER, GREEN, BLUE = "#868e96", "#e03131", "#e8890c", "#2f9e44", "#1971c2"
@@ -39,15 +39,15 @@ EVENT_COLOURS = {
 }
 LINK_COLOURS = {"waiting": AMBER, "connected": BLUE, "armed": GREEN, "lost": RED}
 SEVERITY_COLOURS = {"red": RED, "amber": AMBER}
-LEFT_MAX_S = 24 * 3600.0  # a battery's maximum remaining time that is shown
+REMAINING_MAX_S = 24 * 3600.0  # a battery's maximum remaining time that is shown
 COLUMNS = 8  # number of columns of the table of drones
 PITCH_PX_PER_DEG, PITCH_MAX_PX = 0.9, 36.0  # scale and limit of the artificial horizon
 NO_FAULT = "no active fault"
-FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
+LIMITED_HEIGHT = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
-BESIDE = "padding:2px 10px"  # padding of a text in a panel, equal to that of viser's controls
-TABLE_BESIDE = "padding:2px 12px 2px 8px;overflow-x:auto"  # padding of a table; the panel's scroll bar is 12 px wide
-NAME_WHOLE = 8  # number of characters of a name that fit on one line of the table of drones
+PANEL_PADDING = "padding:2px 10px"  # padding of a text in a panel, equal to that of viser's controls
+TABLE_PADDING = "padding:2px 12px 2px 8px;overflow-x:auto"  # padding of a table; the panel's scroll bar is 12 px wide
+NAME_FIT_CHARS = 8  # number of characters of a name that fit on one line of the table of drones
 WRAP = "white-space:normal"
 SPAN_NS = 1_000_000_000  # simulated; minimum time over which a sensor's rate is averaged
 
@@ -115,7 +115,7 @@ class TableRows:
         if received is None:
             return sensor_table(drone, {}, {}, "no estimate yet", own_rates)
         sensors = received.estimate.sensors
-        if not received.fresh:
+        if not received.is_fresh:
             return sensor_table(drone, sensors, {}, f"no estimate since {received.t_ns / 1e9:.1f} s", own_rates)
         rates = self._rates.update(drone, received.t_ns, sensors)
         uncertainty = f"σ of position {received.sigma_m:.2f} m, of heading {received.yaw_sigma_deg:.1f}°"
@@ -154,7 +154,7 @@ class SensorRates:
 
 def drone_table(
     rows: Sequence[DroneRow],
-    figures: Mapping[str, FlightFigures] | None = None,
+    metrics: Mapping[str, FlightMetrics] | None = None,
     selected: Collection[str] = (),
     chosen: str = "",
     empty: str = "",
@@ -162,13 +162,13 @@ def drone_table(
     """Return a table of drones.
 
     Args:
-        figures: flight figures by drone.
+        metrics: flight figures by drone.
         selected: names of the drones that are selected for one command.
         chosen: name of the drone whose instruments are shown.
         empty: text shown if there are no rows.
     """
     if not rows and empty:
-        return f"<div style='{STYLE};{BESIDE};color:{GREY}'>{escape(empty)}</div>"
+        return f"<div style='{STYLE};{PANEL_PADDING};color:{GREY}'>{escape(empty)}</div>"
     head = _head(
         ("", "selected for one command"),
         ("drone", ""),
@@ -179,40 +179,44 @@ def drone_table(
         ("battery", "charge, and time left at the present drain"),
         ("σ [m]", "σ of the estimated position"),
     )
-    cells = (_drone_cells(row, (figures or {}).get(row.name), row.name in selected, row.name == chosen) for row in rows)
+    cells = (_drone_cells(row, (metrics or {}).get(row.name), row.name in selected, row.name == chosen) for row in rows)
     return _table(head + "".join(cells))
 
 
-def _drone_cells(row: DroneRow, figures: FlightFigures | None, selected: bool, chosen: bool) -> str:
+def _drone_cells(row: DroneRow, metrics: FlightMetrics | None, selected: bool, chosen: bool) -> str:
     """Return a drone's rows: its figures, and notes on its commander, failsafe, faults and link."""
     drone = row.drone
     name = _coloured(drone.name, SEVERITY_COLOURS[row.severity]) if row.severity else escape(drone.name)
-    if len(drone.name) > NAME_WHOLE:
+    if len(drone.name) > NAME_FIT_CHARS:
         name = f"<div style='{WRAP};overflow-wrap:anywhere'>{name}</div>"
     state = _coloured(drone.state.replace("_", " "), STATE_COLOURS.get(drone.state, GREY))
-    flown = ["–"] * 3
-    if figures is not None:
-        flown = [f"{figures.position_m[2]:.1f}", f"{figures.speed_m_s:.1f}", f"{figures.heading_deg:.0f}°"]
-    left_s = figures.battery_left_s if figures else None
-    left = "" if left_s is None or left_s > LEFT_MAX_S else f"{left_s / 60.0:.0f}\N{NO-BREAK SPACE}min"
+    flight_cells = ["–"] * 3
+    if metrics is not None:
+        flight_cells = [f"{metrics.position_m[2]:.1f}", f"{metrics.speed_m_s:.1f}", f"{metrics.heading_deg:.0f}°"]
+    remaining_s = metrics.battery_remaining_s if metrics else None
+    remaining = (
+        "" if remaining_s is None or remaining_s > REMAINING_MAX_S else f"{remaining_s / 60.0:.0f}\N{NO-BREAK SPACE}min"
+    )
     severity = battery_severity(drone.battery_percent)
     colour = SEVERITY_COLOURS[severity] if severity else "inherit"
-    charge = _coloured(f"{drone.battery_percent:.0f} %{',' if left else ''}", colour)
-    battery = f"<div style='{WRAP}'>{charge} {_coloured(left, colour)}</div>" if left else charge
+    charge = _coloured(f"{drone.battery_percent:.0f} %{',' if remaining else ''}", colour)
+    battery = f"<div style='{WRAP}'>{charge} {_coloured(remaining, colour)}</div>" if remaining else charge
     sigma = "–" if drone.sigma_m is None else f"{drone.sigma_m:.2f}"
-    ticked, label = ("true" if selected else "false"), escape(drone.name)
-    tick = f"<span class='zsim-select' role=checkbox aria-checked={ticked} aria-label='select {label}'></span>"
+    aria_checked, label = ("true" if selected else "false"), escape(drone.name)
+    checkbox = (
+        f"<span class='zsim-select' role=checkbox aria-checked={aria_checked} aria-label='select {label}'></span>"
+    )
     mark = f" data-zsim-drone='{label}'{' data-zsim-chosen' if chosen else ''}"
 
     lag = "no estimate" if drone.lag_ms is None else f"lag {drone.lag_ms:.0f} ms"
     lag_colour = AMBER if drone.lag_ms is not None and drone.lag_ms > LAG_MAX_MS else "inherit"
-    who = f"{escape(drone.commander or 'nobody')} · {_coloured(lag, lag_colour)} · GPS {escape(row.gps)}"
-    if figures is not None and figures.obstacle_m is not None:
-        who += f" · {figures.obstacle_m:.1f} m from an obstacle"
+    status = f"{escape(drone.commander or 'nobody')} · {_coloured(lag, lag_colour)} · GPS {escape(row.gps)}"
+    if metrics is not None and metrics.obstacle_m is not None:
+        status += f" · {metrics.obstacle_m:.1f} m from an obstacle"
     failsafe = drone.failsafe if drone.state in ("landing", "landed", "emergency") else ""
     faults = f"⚠ {', '.join(row.faults)}" if row.faults else ""
-    notes = [(who, GREY), (escape(failsafe), RED), (escape(faults), AMBER), (escape(row.link[0]), row.link[1])]
-    return _cells((tick, name, state, *flown, battery, sigma), mark) + "".join(
+    notes = [(status, GREY), (escape(failsafe), RED), (escape(faults), AMBER), (escape(row.link[0]), row.link[1])]
+    return _cells((checkbox, name, state, *flight_cells, battery, sigma), mark) + "".join(
         f"<tr{mark}><td></td><td colspan={COLUMNS - 1} style='color:{colour};padding:0 4px 2px;{WRAP}'>{note}</td></tr>"
         for note, colour in notes
         if note
@@ -227,10 +231,10 @@ def link_note(link: ReceivedLink | None) -> tuple[str, str]:
     if link.age_s > LINK_SILENT_S:
         return f"external; its driver has been silent for {link.age_s:.0f} s", RED
     age, loss, round_trip = state.age_ms, state.loss_percent, state.round_trip_ms
-    figures = (("age {:.0f} ms", age), ("loss {:.0f} %", loss), ("round trip {:.0f} ms", round_trip))
-    known = [text.format(value) for text, value in figures if value is not None]
-    known += [f"{state.refused} refused"] if state.refused else []
-    return f"external; {state.state}: {', '.join([state.peer, *known])}", LINK_COLOURS[state.state]
+    metrics = (("age {:.0f} ms", age), ("loss {:.0f} %", loss), ("round trip {:.0f} ms", round_trip))
+    texts = [text.format(value) for text, value in metrics if value is not None]
+    texts += [f"{state.refused} refused"] if state.refused else []
+    return f"external; {state.state}: {', '.join([state.peer, *texts])}", LINK_COLOURS[state.state]
 
 
 # One drone
@@ -239,23 +243,23 @@ def link_note(link: ReceivedLink | None) -> tuple[str, str]:
 _INSTRUMENTS = importlib.resources.files("zsim_bridges.console.frame").joinpath("instruments.html").read_text("utf-8")
 
 
-def figure_lines(figures: FlightFigures | None) -> str:
+def metric_lines(metrics: FlightMetrics | None) -> str:
     """Return position, velocity and attitude of one drone, with its instruments."""
-    if figures is None:
-        return f"<div style='{STYLE};{BESIDE}'>not seen yet</div>"
-    x, y, z = figures.position_m
+    if metrics is None:
+        return f"<div style='{STYLE};{PANEL_PADDING}'>not seen yet</div>"
+    x, y, z = metrics.position_m
     instruments = _INSTRUMENTS.format(
-        bank=f"{-figures.roll_deg:.1f}",
-        pitch_px=f"{max(-PITCH_MAX_PX, min(PITCH_MAX_PX, figures.pitch_deg * PITCH_PX_PER_DEG)):.1f}",
-        course=f"{90.0 - figures.heading_deg:.0f}",  # a heading counts from east to north; north is up on the compass
-        speed=f"{figures.speed_m_s:.1f}",
+        bank=f"{-metrics.roll_deg:.1f}",
+        pitch_px=f"{max(-PITCH_MAX_PX, min(PITCH_MAX_PX, metrics.pitch_deg * PITCH_PX_PER_DEG)):.1f}",
+        course=f"{90.0 - metrics.heading_deg:.0f}",  # a heading counts from east to north; north is up on the compass
+        speed=f"{metrics.speed_m_s:.1f}",
         height=f"{z:.1f}",
-        climb=f"{figures.climb_m_s:+.1f}",
+        climb=f"{metrics.climb_m_s:+.1f}",
     )
     position = f"position {x:.2f}, {y:.2f}, {z:.2f} m"
-    speed = f"speed {figures.speed_m_s:.2f} m/s, climb {figures.climb_m_s:+.2f} m/s"
-    turn = f"roll {figures.roll_deg:+.1f}°, pitch {figures.pitch_deg:+.1f}°, heading {figures.heading_deg:.0f}°"
-    return f"<div style='{STYLE};{BESIDE}'>{instruments}{position}<br>{speed}<br>{turn}</div>"
+    speed = f"speed {metrics.speed_m_s:.2f} m/s, climb {metrics.climb_m_s:+.2f} m/s"
+    turn = f"roll {metrics.roll_deg:+.1f}°, pitch {metrics.pitch_deg:+.1f}°, heading {metrics.heading_deg:.0f}°"
+    return f"<div style='{STYLE};{PANEL_PADDING}'>{instruments}{position}<br>{speed}<br>{turn}</div>"
 
 
 def sensor_table(
@@ -271,7 +275,7 @@ def sensor_table(
         for kind, (used, refused) in counts.items()
     ]
     others = [(kind, "–", "–", f"{rate:.0f} Hz (configured)") for kind, rate in own_rates.items() if kind not in counts]
-    title = f"<div style='{STYLE};{BESIDE}'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
+    title = f"<div style='{STYLE};{PANEL_PADDING}'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
     head = _head(
         ("sensor", "sensor of the drone"),
         ("used", "measurements that its estimator used"),
@@ -291,7 +295,7 @@ def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
         f"<b>{escape(name)}</b>: {escape(phase.replace('_', ' '))}" + (f" – {escape(reason)}" if reason else "")
         for name, (phase, reason) in states.items()
     ]
-    return f"<div style='{STYLE};{FEW_LINES};{BESIDE}'>{'<br>'.join(lines) or 'no formation'}</div>"
+    return f"<div style='{STYLE};{LIMITED_HEIGHT};{PANEL_PADDING}'>{'<br>'.join(lines) or 'no formation'}</div>"
 
 
 def preflight_lines(checks: Mapping[str, Sequence[Check]]) -> str:
@@ -309,7 +313,7 @@ def preflight_lines(checks: Mapping[str, Sequence[Check]]) -> str:
     elif ready:
         lines.append(_coloured(f"✓ ready: {', '.join(ready)}", GREEN))
     title = "<b>Before take-off</b><br>" if lines else ""
-    return f"<div style='{STYLE};{FEW_LINES};{BESIDE};padding-bottom:8px'>{title}{'<br>'.join(lines)}</div>"
+    return f"<div style='{STYLE};{LIMITED_HEIGHT};{PANEL_PADDING};padding-bottom:8px'>{title}{'<br>'.join(lines)}</div>"
 
 
 def event_table(newest_first: Iterable[EventRow]) -> str:
@@ -328,16 +332,16 @@ def event_table(newest_first: Iterable[EventRow]) -> str:
     return _table(head + "".join(lines))
 
 
-def fault_lines(active: Sequence[str], over: Sequence[str] = ()) -> str:
+def fault_lines(active: Sequence[str], ended: Sequence[str] = ()) -> str:
     """Return the active faults, followed by past ones in grey, as HTML."""
     lines = [_coloured(f"⚠ {fault}", AMBER) for fault in active] or [_coloured(NO_FAULT, GREY)]
-    lines += [_coloured(f"over: {fault}", GREY) for fault in reversed(over)]
-    return f"<div style='{STYLE};{FEW_LINES};{BESIDE};overflow-wrap:anywhere'>{'<br>'.join(lines)}</div>"
+    lines += [_coloured(f"over: {fault}", GREY) for fault in reversed(ended)]
+    return f"<div style='{STYLE};{LIMITED_HEIGHT};{PANEL_PADDING};overflow-wrap:anywhere'>{'<br>'.join(lines)}</div>"
 
 
 def _table(body: str) -> str:
     table = f"<table style='{STYLE};white-space:nowrap;border-spacing:2px 1px;width:100%'>{body}</table>"
-    return f"<div style='{TABLE_BESIDE}'>{table}</div>"
+    return f"<div style='{TABLE_PADDING}'>{table}</div>"
 
 
 def _head(*titles: tuple[str, str]) -> str:

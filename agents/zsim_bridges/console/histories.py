@@ -34,7 +34,7 @@ TRAIL_S = 60.0  # initial length of trails, simulated
 SPACING_M = 0.08  # minimum distance between two points of a trail: a sixth of a hull
 SPACING_S = 0.05  # simulated; minimum time between two points of a trail: the period of pictures at 1 × real time
 RECORD_GAP_S = 5.0  # simulated; a larger gap in a record has not been read yet, so nothing is drawn across it
-STILL_M = 1e-3  # minimum length of a segment that is drawn: a stationary drone leaves no trail
+SEGMENT_MIN_M = 1e-3  # minimum length of a segment that is drawn: a stationary drone leaves no trail
 PLOTS_SHOWN = 3  # number of plots shown at once
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # colours of SERIES
 HEIGHT_PX = 150
@@ -47,7 +47,7 @@ STEPS_PER_WINDOW = 6  # number of steps in which a time axis advances by its len
 CURVE_POINTS_MIN = 2  # minimum number of points of a curve that is drawn
 VALUE_RANGE_MIN = 0.01  # minimum range of values from which the steps of an axis are derived, in their unit
 WINDOWS_S = (SPAN_S, 60.0, 20.0)  # selectable lengths of plots, simulated
-FLIGHT = {
+FLIGHT_UNITS = {
     "x": "m",
     "y": "m",
     "z": "m",
@@ -55,7 +55,7 @@ FLIGHT = {
     "roll": "deg",
     "pitch": "deg",
 }  # variables of each drone, with units
-ESTIMATED = 4  # only this many of them, the first ones, are estimated: views of estimates have no roll and pitch
+ESTIMATED_COUNT = 4  # only this many of them, the first ones, are estimated: views of estimates have no roll and pitch
 DESIRED, TRUE = SERIES.index("desired"), SERIES.index("true")
 
 
@@ -77,8 +77,8 @@ class _TimedRows(Generic[Row]):
         self.rows.insert(index, row)
 
     def keep(self, from_s: float, to_s: float = math.inf) -> None:
-        old, late = bisect_left(self.times, from_s), bisect_left(self.times, to_s)
-        del self.times[late:], self.rows[late:], self.times[:old], self.rows[:old]
+        begin, end = bisect_left(self.times, from_s), bisect_left(self.times, to_s)
+        del self.times[end:], self.rows[end:], self.times[:begin], self.rows[:begin]
 
 
 class CanvasTrails:
@@ -86,16 +86,16 @@ class CanvasTrails:
 
     Args:
         count: N.
-        around: whether the trails are those of a record, which is read on both sides of the shown time.
+        is_replay: whether the trails are those of a record, which is read on both sides of the shown time.
 
     Attributes:
         length_s: length of the trails, simulated.
         number: changes whenever the trails are not just the previous ones extended.
     """
 
-    def __init__(self, count: int, around: bool = False) -> None:
+    def __init__(self, count: int, is_replay: bool = False) -> None:
         self._count = count
-        self._around = around
+        self._is_replay = is_replay
         self._points = _TimedRows[NDArray[np.float32]]()
         self.length_s = TRAIL_S
         self.number = 0
@@ -106,18 +106,18 @@ class CanvasTrails:
         In a flight, positions are skipped while no drone has moved.
         """
         points = self._points
-        if not self._around and points.times and t_s < points.times[-1]:
+        if not self._is_replay and points.times and t_s < points.times[-1]:
             self._points = points = _TimedRows()
             self.number += 1
         if points.is_near(t_s, SPACING_S * 0.99):
             return
-        if not self._around and points.rows:
-            away_m = np.linalg.norm(p_W - points.rows[-1], axis=1)
+        if not self._is_replay and points.rows:
+            moved_m = np.linalg.norm(p_W - points.rows[-1], axis=1)
             appears = np.isfinite(p_W[:, 0]) & ~np.isfinite(points.rows[-1][:, 0])
-            if not (appears | (away_m >= SPACING_M)).any():
+            if not (appears | (moved_m >= SPACING_M)).any():
                 return
         points.insert(t_s, p_W.astype(np.float32))
-        if not self._around:
+        if not self._is_replay:
             points.keep(t_s - SPAN_S)
 
     def keep(self, from_s: float, to_s: float) -> None:
@@ -145,9 +145,9 @@ class CanvasTrails:
         times = np.append(times[rows], t_s)
         path = np.stack([*(points.rows[begin + k] for k in rows), p_W]).astype(float)
         lines = np.stack((path[:-1], path[1:]), axis=2).transpose(1, 0, 2, 3)  # drone, time, end, axis
-        drawn = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=2) > STILL_M  # False for NaN
+        drawn = np.linalg.norm(lines[:, :, 1] - lines[:, :, 0], axis=2) > SEGMENT_MIN_M  # False for NaN
         drawn &= np.isfinite(p_W[:, :1])
-        drawn &= (np.diff(times) < RECORD_GAP_S) | (not self._around)
+        drawn &= (np.diff(times) < RECORD_GAP_S) | (not self._is_replay)
         owners, begins = np.nonzero(drawn)
         return lines[drawn], owners, times[begins]
 
@@ -162,18 +162,18 @@ class VariableHistory:
     """Points of some variables, each with the values of `SERIES`.
 
     Args:
-        around: whether the points are those of a record, which is read on both sides of the shown time.
+        is_replay: whether the points are those of a record, which is read on both sides of the shown time.
     """
 
-    def __init__(self, size: int, around: bool = False) -> None:
+    def __init__(self, size: int, is_replay: bool = False) -> None:
         self._size = size
-        self._around = around
+        self._is_replay = is_replay
         self._points = _TimedRows[Array]()
         self._lock = threading.Lock()  # pages read curves in their own threads
 
     def is_due(self, t_s: float) -> bool:
         """Return whether a point at a time [s] would be added."""
-        if self._around:
+        if self._is_replay:
             return not self._points.is_near(t_s, INTERVAL_S / 2.0)
         times = self._points.times
         return not times or not 0.0 <= t_s - times[-1] < INTERVAL_S
@@ -189,12 +189,12 @@ class VariableHistory:
         row = np.array([unknown if each is None else np.asarray(each, float) for each in (desired, value, true)])
         with self._lock:
             points = self._points
-            if not self._around and points.times and t_s < points.times[-1]:
+            if not self._is_replay and points.times and t_s < points.times[-1]:
                 self._points = points = _TimedRows()
             if not self.is_due(t_s):
                 return False
             points.insert(t_s, row)
-            if not self._around:
+            if not self._is_replay:
                 # by age as well as by number, since the points of a fast run are sparse
                 points.keep(max(t_s - SPAN_S, points.times[-HISTORY_POINTS_MAX:][0]))
         return True
@@ -208,7 +208,7 @@ class VariableHistory:
         index: int,
         angular: bool,
         span_s: float = SPAN_S,
-        less: int | None = None,
+        subtracted: int | None = None,
         at_s: float | None = None,
     ) -> tuple[Array, ...]:
         """Return times (M,) and three curves (M,) of a variable, ordered as `SERIES`; angles in degrees, wrapped.
@@ -217,7 +217,7 @@ class VariableHistory:
 
         Args:
             span_s: length of the curves.
-            less: index in `SERIES` of the curve that is subtracted, for errors; None for values.
+            subtracted: index in `SERIES` of the curve that is subtracted, for errors; None for values.
             at_s: time at the centre of the curves; None: they end at the newest point.
         """
         with self._lock:
@@ -225,8 +225,8 @@ class VariableHistory:
             table = np.array([row[:, index] for row in self._points.rows]).reshape(-1, len(SERIES))
         shown = t >= (t[-1] if len(t) else 0.0) - span_s if at_s is None else abs(t - at_s) <= span_s / 2.0
         t, table = t[shown], table[shown]
-        if less is not None:
-            table = table - table[:, [less]]
+        if subtracted is not None:
+            table = table - table[:, [subtracted]]
         if angular:
             table = np.degrees(np.arctan2(np.sin(table), np.cos(table)))
             wraps = np.abs(np.diff(table, axis=0, prepend=table[:1])) > 180.0
@@ -245,30 +245,30 @@ class PlottedVariable(NamedTuple):
 
 
 class FlightHistory:
-    """Points of all drones of a run, each with the variables of FLIGHT; `around` as in `VariableHistory`."""
+    """Points of all drones of a run, each with the variables of FLIGHT_UNITS; `is_replay` as in `VariableHistory`."""
 
-    def __init__(self, names: Sequence[str], around: bool = False) -> None:
+    def __init__(self, names: Sequence[str], is_replay: bool = False) -> None:
         self.names = tuple(names)
-        self.history = VariableHistory(len(names) * len(FLIGHT), around)
+        self.history = VariableHistory(len(names) * len(FLIGHT_UNITS), is_replay)
 
     def add(self, drones: DronePoses, estimates: Mapping[str, EstimateView]) -> None:
         """Add the drones' true and estimated poses, if the last point is old enough."""
         if not self.history.is_due(drones.t_ns / 1e9):
             return
-        estimated = np.full((len(self.names), len(FLIGHT)), np.nan)
+        estimated = np.full((len(self.names), len(FLIGHT_UNITS)), np.nan)
         for i, name in enumerate(self.names):
             if name in estimates:
-                estimated[i, :ESTIMATED] = *estimates[name].position_m, estimates[name].yaw_rad
+                estimated[i, :ESTIMATED_COUNT] = *estimates[name].position_m, estimates[name].yaw_rad
         rpy = frames.rpy_from_quaternion(drones.q_WB)
         true = np.column_stack((drones.p_W, rpy[:, [2, 0, 1]]))
         true[~drones.present] = np.nan
         self.history.add(drones.t_ns / 1e9, None, estimated.ravel(), true.ravel())
 
     def variables(self, name: str) -> list[PlottedVariable]:
-        first = self.names.index(name) * len(FLIGHT)
+        first = self.names.index(name) * len(FLIGHT_UNITS)
         return [
             PlottedVariable(self.history, first + k, f"{variable} of {name} [{unit}]", unit == "deg", TRUE)
-            for k, (variable, unit) in enumerate(FLIGHT.items())
+            for k, (variable, unit) in enumerate(FLIGHT_UNITS.items())
         ]
 
 
@@ -284,28 +284,28 @@ class VariablePlots:
         cluster: Cluster,
         names: Sequence[str],
         flights: FlightHistory,
-        replayed: bool = False,
+        is_replay: bool = False,
     ) -> None:
-        self.history = VariableHistory(len(names), around=replayed)
-        self._cursor_s: float | None = 0.0 if replayed else None
-        of_all = [
+        self.history = VariableHistory(len(names), is_replay=is_replay)
+        self._cursor_s: float | None = 0.0 if is_replay else None
+        formation_variables = [
             PlottedVariable(self.history, k, f"{name} [{shown_unit(name)}]", shown_unit(name) == "deg", DESIRED)
             for k, name in enumerate(names)
         ]
-        self._choices = _triples("", of_all)
+        self._choices = _triples("", formation_variables)
         for name in cluster.drones:
             self._choices |= _triples(f"{name}: ", flights.variables(name))
         self._choice = gui.add_dropdown("variables", [NONE, *self._choices], initial_value=next(iter(self._choices)))
-        windows = {f"{span_s:g} s around" if replayed else f"the last {span_s:g} s": span_s for span_s in WINDOWS_S}
+        windows = {f"{span_s:g} s around" if is_replay else f"the last {span_s:g} s": span_s for span_s in WINDOWS_S}
         self._window = gui.add_dropdown("window", list(windows))
         self._windows = windows
         self._errors = gui.add_checkbox("Errors", False, hint="Relative to desired values; for a drone, to true ones")
         self._freeze = gui.add_checkbox(
             "Freeze", False, hint="Drag over a plot to zoom, double-click to reset the zoom"
         )
-        gui.add_markdown(f"<sub>{_legend(replayed)} over time [s]; below a plot, the values at the cursor</sub>")
-        self._plots = [_plot(gui, each, replayed) for each in of_all[:PLOTS_SHOWN]]
-        self._shown: tuple[PlottedVariable, ...] = tuple(of_all[:PLOTS_SHOWN])
+        gui.add_markdown(f"<sub>{_legend(is_replay)} over time [s]; below a plot, the values at the cursor</sub>")
+        self._plots = [_plot(gui, each, is_replay) for each in formation_variables[:PLOTS_SHOWN]]
+        self._shown: tuple[PlottedVariable, ...] = tuple(formation_variables[:PLOTS_SHOWN])
         self._scales: dict[int, dict[str, uplot.Scale]] = {}  # by plot
         self._lock = threading.Lock()
         for control in (self._choice, self._window, self._errors):
@@ -333,9 +333,9 @@ class VariablePlots:
 
     def _send(self, index: int, each: PlottedVariable) -> None:
         plot, span_s = self._plots[index], self._windows[self._window.value]
-        less = each.reference if self._errors.value else None
+        subtracted = each.reference if self._errors.value else None
         at_s = self._cursor_s
-        curves = each.history.curves(each.column, each.angular, span_s, less, at_s)
+        curves = each.history.curves(each.column, each.angular, span_s, subtracted, at_s)
         if len(curves[0]) < CURVE_POINTS_MIN:
             plot.data = BLANK if at_s is None else (*BLANK, BLANK[1])
             return
@@ -384,9 +384,9 @@ class AxisRange(NamedTuple):
         known = known[np.isfinite(known)]
         if not len(known) or not (always or any(np.isnan(each).all() for each in values)):
             return None
-        least, greatest = float(known.min()), float(known.max())
-        step = 10.0 ** math.floor(math.log10(max(greatest - least, VALUE_RANGE_MIN)))
-        return cls((math.floor(least / step) - 0.5) * step, (math.ceil(greatest / step) + 0.5) * step)
+        lowest, highest = float(known.min()), float(known.max())
+        step = 10.0 ** math.floor(math.log10(max(highest - lowest, VALUE_RANGE_MIN)))
+        return cls((math.floor(lowest / step) - 0.5) * step, (math.ceil(highest / step) + 0.5) * step)
 
 
 def _with_cursor(curves: Sequence[Array], at_s: float, values: AxisRange) -> tuple[Array, ...]:
@@ -399,21 +399,21 @@ def _with_cursor(curves: Sequence[Array], at_s: float, values: AxisRange) -> tup
     return np.insert(curves[0], index, (at_s, at_s)), *doubled, cursor
 
 
-def _triples(of: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
+def _triples(prefix: str, variables: list[PlottedVariable]) -> dict[str, tuple[PlottedVariable, ...]]:
     triples = [variables[k : k + PLOTS_SHOWN] for k in range(0, len(variables), PLOTS_SHOWN)]
-    return {of + ", ".join(each.label.partition(" ")[0] for each in triple): tuple(triple) for triple in triples}
+    return {prefix + ", ".join(each.label.partition(" ")[0] for each in triple): tuple(triple) for triple in triples}
 
 
-def _legend(replayed: bool) -> str:
-    lines = [*zip(SERIES, COLOURS, strict=True), *([("shown time", CURSOR_COLOUR)] if replayed else [])]
+def _legend(is_replay: bool) -> str:
+    lines = [*zip(SERIES, COLOURS, strict=True), *([("shown time", CURSOR_COLOUR)] if is_replay else [])]
     return ", ".join(f"<span style='color:{c}'>{name}</span>" for name, c in lines)
 
 
-def _plot(gui: viser.GuiApi, variable: PlottedVariable, replayed: bool) -> Any:
+def _plot(gui: viser.GuiApi, variable: PlottedVariable, is_replay: bool) -> Any:
     curves = [uplot.Series(label=n, stroke=c, width=1.5) for n, c in zip(SERIES, COLOURS, strict=True)]
-    curves += [uplot.Series(label="shown", stroke=CURSOR_COLOUR, width=2.0)] if replayed else []
+    curves += [uplot.Series(label="shown", stroke=CURSOR_COLOUR, width=2.0)] if is_replay else []
     return gui.add_uplot(
-        (*BLANK, BLANK[1]) if replayed else BLANK,
+        (*BLANK, BLANK[1]) if is_replay else BLANK,
         (uplot.Series(label="t [s]"), *curves),
         title=variable.label,
         height=HEIGHT_PX,

@@ -511,7 +511,7 @@ class PageFlying:
             return DroneStatus()
         received = self._views.estimates().get(drone)
         pose = None
-        if received is not None and received.fresh:
+        if received is not None and received.is_fresh:
             estimate = received.estimate
             t_s = received.t_ns * 1e-9
             pose = DronePose(estimate.position_m, estimate.yaw_rad, estimate.velocity_m_s, t_s)

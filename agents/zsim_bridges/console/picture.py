@@ -32,7 +32,7 @@ PATH_POINTS = 120  # number of points of one leg of a drone's reference: smooth 
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has a desired shape
 CORNER_SHARE = 0.25  # position of an angle's label between its corner (0) and the opposite side (1), clear of names
 CLICK_RAD = 0.012  # minimum half angle within which a click hits a drone; design choice: about five pixels
-LARGE_MAX = 12  # maximum number of drones whose names are shown in full and at full size
+FULL_NAMES_MAX = 12  # maximum number of drones whose names are shown in full and at full size
 PLAN_DIGITS = 2  # decimals of metres: finer than a pixel
 HEADING_DIGITS = 3  # decimals of radians
 SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at the ends of each side; docs/conventions.md
@@ -100,11 +100,11 @@ def radio_lines(hears: Sequence[Sequence[int]], drones: DronePoses) -> tuple[Arr
     `hears` has, for each drone, the indices of the drones that it hears.
     """
     present = drones.present
-    known = [(i, j) for i, heard in enumerate(hears) for j in heard if max(i, j) < len(present)]
-    links = {(i, j) for i, j in known if present[i] and present[j]}
-    both = sorted((i, j) for i, j in links if i < j and (j, i) in links)
-    single = sorted((i, j) for i, j in links if (j, i) not in links)
-    ends = [drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (both, single)]
+    pairs = [(i, j) for i, senders in enumerate(hears) for j in senders if max(i, j) < len(present)]
+    links = {(i, j) for i, j in pairs if present[i] and present[j]}
+    bidirectional = sorted((i, j) for i, j in links if i < j and (j, i) in links)
+    one_way = sorted((i, j) for i, j in links if (j, i) not in links)
+    ends = [drones.p_W[np.array(each, dtype=int).reshape(-1, 2)] for each in (bidirectional, one_way)]
     return ends[0], ends[1]
 
 
@@ -122,31 +122,31 @@ def drone_on_ray(
     length = float(np.linalg.norm(direction))
     if not 0.0 < length < math.inf:
         return None
-    away = drones.p_W - np.array(origin_W)
-    ahead_m = away @ (direction / length)
-    distances_m = np.linalg.norm(away - ahead_m[:, None] * (direction / length), axis=1)
-    hit = (ahead_m > 0.0) & (distances_m <= np.maximum(radii_m, CLICK_RAD * ahead_m))
+    offsets = drones.p_W - np.array(origin_W)
+    along_m = offsets @ (direction / length)
+    distances_m = np.linalg.norm(offsets - along_m[:, None] * (direction / length), axis=1)
+    hit = (along_m > 0.0) & (distances_m <= np.maximum(radii_m, CLICK_RAD * along_m))
     return drones.names[int(np.argmin(np.where(hit, distances_m, math.inf)))] if hit.any() else None
 
 
 def shown_names(names: Sequence[str]) -> list[str]:
-    """Return names, without their common prefix if there are more than LARGE_MAX and none would become empty."""
-    if len(names) <= LARGE_MAX:
+    """Return names, without their common prefix if there are more than FULL_NAMES_MAX and none would become empty."""
+    if len(names) <= FULL_NAMES_MAX:
         return list(names)
-    alike = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
-    stem = len(list(alike))
-    short = [name[stem:] for name in names]
+    common = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
+    prefix_length = len(list(common))
+    short = [name[prefix_length:] for name in names]
     return short if all(short) else list(names)
 
 
-def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:
+def rotor_angles(angles: Array, speeds: Array, directions: Array, dt_s: float) -> Array:
     """Return the angles [rad] at which rotors are drawn `dt_s` later, slowed down so that their turning is visible.
 
     Args:
         angles, speeds: (M,) rad, rad/s.
-        turns: (M,), 1 for a rotor that turns clockwise seen from above, otherwise -1.
+        directions: (M,), 1 for a rotor that turns clockwise seen from above, otherwise -1.
     """
-    return (angles - turns * speeds * (dt_s / ROTOR_SLOWDOWN)) % math.tau
+    return (angles - directions * speeds * (dt_s / ROTOR_SLOWDOWN)) % math.tau
 
 
 def rotor_poses(p_W: Array, q_WB: Array, hubs_B: Array, angles: Array) -> tuple[Array, Array]:
@@ -206,11 +206,11 @@ def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationSha
     except SingularClusterError:
         return None
     roll, pitch, turn = (c[space.index(name)] if name in space.names else 0.0 for name in ("roll", "pitch", "yaw"))
-    of_groups = any("." in name for name in space.names)  # if so, p and q are distances between groups, not robots
-    known = [name for name in SIDES if name in space.names and not of_groups]
-    sides = [FormationSide(f"{name} {c[space.index(name)]:.2f} m", p_W[list(SIDES[name])]) for name in known]
+    has_groups = any("." in name for name in space.names)  # if so, p and q are distances between groups, not robots
+    side_names = [name for name in SIDES if name in space.names and not has_groups]
+    sides = [FormationSide(f"{name} {c[space.index(name)]:.2f} m", p_W[list(SIDES[name])]) for name in side_names]
     corner = None
-    if "beta" in space.names and len(known) == 2:
+    if "beta" in space.names and len(side_names) == 2:
         sides.append(FormationSide("", p_W[[1, 2]]))
         corner = (
             p_W[0] + CORNER_SHARE * (p_W[1:].mean(axis=0) - p_W[0]),
@@ -264,15 +264,15 @@ def plan_formations(
     shown = []
     for name, view in views.items():
         desired = ghosts(spaces[name], view)
-        places = [] if desired is None else np.round(desired[0][:, :2], PLAN_DIGITS).tolist()
-        shown.append({"name": name, "phase": view.phase, "drones": members[name], "places": places})
+        positions = [] if desired is None else np.round(desired[0][:, :2], PLAN_DIGITS).tolist()
+        shown.append({"name": name, "phase": view.phase, "drones": members[name], "places": positions})
     return shown
 
 
 # What a formation would fly
 
-POINTS = 121  # number of points of a path; design choice: a curve in 3-D looks smooth
-TRANSIT_SHARE = 0.25  # number of points of the transit to a trajectory's start, as a share of POINTS
+PREVIEW_POINTS = 121  # number of points of a path; design choice: a curve in 3-D looks smooth
+TRANSIT_SHARE = 0.25  # number of points of the transit to a trajectory's start, as a share of PREVIEW_POINTS
 ENDLESS_S = 120.0  # simulated; how much of an endless trajectory is shown
 
 
@@ -292,44 +292,50 @@ class FlightPreview(NamedTuple):
     text: str
 
 
-def preview_of(space: ClusterSpace, op: str, args: Mapping[str, Any], base: Array, apart_min_m: float) -> FlightPreview:
+def preview_of(
+    space: ClusterSpace, op: str, args: Mapping[str, Any], base: Array, separation_min_m: float
+) -> FlightPreview:
     """Return the paths of a `target` or `trajectory`; the controller may still refuse it, or fly it more slowly.
 
     Args:
         op, args: operation and arguments of the request, as sent.
         base: present desired variables of the formation, (4n,).
-        apart_min_m: minimum distance between two drones that the controller permits.
+        separation_min_m: minimum distance between two drones that the controller permits.
 
     Raises:
         PreviewError: the request is invalid, or no formation of this space can fly it.
     """
-    lead, span_s, length = np.zeros((0, space.size)), 0.0, ""
+    transit, span_s, length = np.zeros((0, space.size)), 0.0, ""
     try:
         request = read_request(op, args)
         if isinstance(request, MoveTo):
-            flown = _ramp(space, base, request.goal(space, base), POINTS)
+            path = _ramp(space, base, request.goal(space, base), PREVIEW_POINTS)
         else:
             assert isinstance(request, Follow)
             reference = request.trajectory(space, base)
             span_s = reference.duration_s or ENDLESS_S
             length = f"{span_s:g} s{'' if reference.duration_s else ' shown'}"
-            flown = np.array([reference.value(t_s)[0] for t_s in np.linspace(0.0, span_s, POINTS)])
-            lead = _ramp(space, base, flown[0], round(POINTS * TRANSIT_SHARE))
-        paths_W = np.array([space.inverse(c)[0] for c in (*lead, *flown)]).transpose(1, 0, 2)
+            path = np.array([reference.value(t_s)[0] for t_s in np.linspace(0.0, span_s, PREVIEW_POINTS)])
+            transit = _ramp(space, base, path[0], round(PREVIEW_POINTS * TRANSIT_SHARE))
+        paths_W = np.array([space.inverse(c)[0] for c in (*transit, *path)]).transpose(1, 0, 2)
     except REFUSALS as error:
         raise PreviewError(str(error)) from None
-    flown_W = paths_W[:, len(lead) :]
-    steps_m, heights_m = np.linalg.norm(np.diff(flown_W, axis=1), axis=2), flown_W[:, :, 2]
-    figures = [
+    path_W = paths_W[:, len(transit) :]
+    steps_m, heights_m = np.linalg.norm(np.diff(path_W, axis=1), axis=2), path_W[:, :, 2]
+    texts = [
         length or f"{steps_m.sum(axis=1).max():.1f} m at most",
         f"heights {heights_m.min():.1f} to {heights_m.max():.1f} m",
     ]
     if span_s:
-        figures.append(f"{steps_m.max() * (POINTS - 1) / span_s:.1f} m/s at most")
-    pairs = combinations(flown_W, 2)
-    apart_m = min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in pairs), default=math.inf)
-    too_near = f", less than the {apart_min_m:g} m that the controller requires" if apart_m < apart_min_m else ""
-    return FlightPreview(paths_W, "; ".join([*figures, f"drones {apart_m:.1f} m apart or more{too_near}"]))
+        texts.append(f"{steps_m.max() * (PREVIEW_POINTS - 1) / span_s:.1f} m/s at most")
+    pairs = combinations(path_W, 2)
+    separation_m = min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in pairs), default=math.inf)
+    too_near = (
+        f", less than the {separation_min_m:g} m that the controller requires"
+        if separation_m < separation_min_m
+        else ""
+    )
+    return FlightPreview(paths_W, "; ".join([*texts, f"drones {separation_m:.1f} m apart or more{too_near}"]))
 
 
 def _ramp(space: ClusterSpace, start: Array, goal: Array, count: int) -> Array:

@@ -42,8 +42,8 @@ SPEED_S = 0.2  # simulated; span over which a speed is averaged: a shorter one w
 FAULTS_KEPT = 8  # maximum number of past faults that are still shown
 SIGMA_GROWN = 1.2  # minimum ratio to the initial sigma that is shown; smaller changes occur without a fault
 LAG_GROWN_MS = 40.0  # minimum increase in lag that is shown: two gates
-LIFE = ("alive", "dead")  # states of a process
-DEATH_AND_RETURN = 3  # number of states: alive, dead, alive
+PROCESS_STATES = ("alive", "dead")  # states of a process
+RESTART_STATE_COUNT = 3  # number of states: alive, dead, alive
 WIND_GROWN_M_S = 0.3  # minimum increase in wind that is shown; design choice: above the rounding of the display
 BATTERY_S = 20.0  # simulated; how long a battery must have been observed before its remaining time is shown
 BATTERY_POINTS_MAX = 120
@@ -56,7 +56,7 @@ STALL_S = 2.0  # wall; a longer time without a beat is a stall
 SILENT_S = 1.7  # wall; after this long without an answer the world counts as silent: a stop is shown within 2 s
 PIECE_S = 10.0  # simulated; span read in one request, which blocks a replay of thirty drones for 0.15 s
 INSTANT_DRONES_MAX = 9_000  # maximum number of drone views in a piece; a replay returns fewer than 10 000
-BEHIND_S, AHEAD_S = (
+READ_BEFORE_S, READ_AFTER_S = (
     SPAN_S,
     SPAN_S / 2.0,
 )  # simulated; spans read before and after the shown time, as far as trails and curves reach
@@ -126,13 +126,13 @@ class RunMonitor:
         )
         active, states = views.active_faults(), {name: phase for name, (phase, _) in phases.items()}
         wind_m_s = max((math.hypot(*each) for each in views.drones.wind_m_s), default=0.0) if views.drones else 0.0
-        self.fault_watch.update(list(views.begun), active, drones, states, views.losses.current, wind_m_s)
-        found: list[run_condition.Alarm] = []
+        self.fault_watch.update(list(views.recent_faults), active, drones, states, views.losses.current, wind_m_s)
+        alarms: list[run_condition.Alarm] = []
         if views.drones is not None and not self._ended:
-            found = [alarm for drone in drones.values() for alarm in run_condition.drone_alarms(drone)]
-            found += run_condition.formation_alarms(phases, foreign, dict(views.clusters))
-            found += run_condition.run_alarms(views.losses.current, active, self.condition.silent_s)
-        self.board.update(found, wall_s)
+            alarms = [alarm for drone in drones.values() for alarm in run_condition.drone_alarms(drone)]
+            alarms += run_condition.formation_alarms(phases, foreign, dict(views.clusters))
+            alarms += run_condition.run_alarms(views.losses.current, active, self.condition.silent_s)
+        self.board.update(alarms, wall_s)
         return self.pending.pop_done(views.clusters, self.condition.drones)
 
     def head(self, wall_s: float) -> dict[str, Any]:
@@ -150,7 +150,7 @@ class RunMonitor:
         if t_ns < self._t_ns:
             self.board.clear()
             self.fault_watch.clear()
-            self.views.begun.clear()
+            self.views.recent_faults.clear()
             self.views.losses.current, self.views.failsafes = {}, {}
         self._t_ns = t_ns
 
@@ -164,7 +164,7 @@ class RunMonitor:
         return "; ".join(filter(None, (view.reason, *notes)))
 
 
-class FlightFigures(NamedTuple):
+class FlightMetrics(NamedTuple):
     """Figures of one drone; position and velocity in W, heading counter-clockwise from east."""
 
     position_m: tuple[float, float, float]
@@ -173,7 +173,7 @@ class FlightFigures(NamedTuple):
     roll_deg: float
     pitch_deg: float
     heading_deg: float  # 0 to 360
-    battery_left_s: float | None  # time left at the present drain; None while unknown
+    battery_remaining_s: float | None  # time left at the present drain; None while unknown
     obstacle_m: float | None = None  # distance from the drone's centre to the nearest obstacle or surface, if any
 
 
@@ -181,7 +181,7 @@ class FlightMeter:
     """Derives figures of each drone's flight from views of the true states, and from the surroundings."""
 
     def __init__(self, environment: Environment) -> None:
-        self._around = Surroundings(environment)
+        self._surroundings = Surroundings(environment)
         # positions [m; W] and charges [%] of each drone, with their simulated times [s]
         self._positions: defaultdict[str, deque[tuple[float, tuple[float, float, float]]]]
         self._charges: defaultdict[str, deque[tuple[float, float]]]
@@ -207,9 +207,9 @@ class FlightMeter:
                 charges.append((t_s, drone.battery_percent))
 
     @property
-    def figures(self) -> dict[str, FlightFigures]:
-        found = {}
-        distances_m = self._around.distances_m([drone.position_m for drone in self._drones]).tolist()
+    def metrics(self) -> dict[str, FlightMetrics]:
+        metrics = {}
+        distances_m = self._surroundings.distances_m([drone.position_m for drone in self._drones]).tolist()
         for drone, obstacle_m in zip(self._drones, distances_m, strict=True):
             (first_s, first), (last_s, last) = self._positions[drone.name][0], self._positions[drone.name][-1]
             span_s = max(last_s - first_s, 1e-9)  # after a single view, the drone appears at rest
@@ -217,7 +217,7 @@ class FlightMeter:
             roll, pitch, yaw = np.degrees(frames.rpy_from_quaternion(np.array([drone.orientation_wxyz]))[0]).tolist()
             since_s, charge = self._charges[drone.name][0]
             lasted_s, used = self._t_s - since_s, charge - drone.battery_percent
-            found[drone.name] = FlightFigures(
+            metrics[drone.name] = FlightMetrics(
                 drone.position_m,
                 math.hypot(*velocity_m_s),
                 velocity_m_s[2],
@@ -225,9 +225,9 @@ class FlightMeter:
                 pitch,
                 yaw % 360.0,
                 drone.battery_percent * lasted_s / used if lasted_s >= BATTERY_S and used > 0.0 else None,
-                None if self._around.is_empty else obstacle_m,
+                None if self._surroundings.is_empty else obstacle_m,
             )
-        return found
+        return metrics
 
 
 class FaultWatch:
@@ -241,28 +241,28 @@ class FaultWatch:
 
     def update(
         self,
-        begun: Iterable[Fault],
+        recent: Iterable[Fault],
         active: Iterable[Fault],
         drones: Mapping[str, DroneCondition],
         phases: Mapping[str, str],
         lost: Collection[str],
         wind_m_s: float,
     ) -> None:
-        """Update from the present condition; `begun` are recent faults, `lost` names dead or silent processes."""
-        acting = {fault.id: fault for fault in active}
-        known = {fault.id: fault for fault in begun} | acting
+        """Update from the present condition; `recent` are recent faults, `lost` names dead or silent processes."""
+        active_by_id = {fault.id: fault for fault in active}
+        known = {fault.id: fault for fault in recent} | active_by_id
         for number in self._watched.keys() - known.keys():
-            self._watched[number].over = True
+            self._watched[number].is_over = True
         for number, fault in known.items():
             watched = self._watched.setdefault(number, _WatchedFault(fault))
-            watched.fault, watched.over = acting.get(number, watched.fault), number not in acting
+            watched.fault, watched.is_over = active_by_id.get(number, watched.fault), number not in active_by_id
             watched.update(drones, phases, lost, wind_m_s)
-        over = [number for number, each in self._watched.items() if each.over]
-        for number in over[:-FAULTS_KEPT]:
+        ended = [number for number, each in self._watched.items() if each.is_over]
+        for number in ended[:-FAULTS_KEPT]:
             del self._watched[number]
 
     def lines(self, is_over: bool = False) -> list[str]:
-        return [each.line() for each in self._watched.values() if each.over == is_over]
+        return [each.line() for each in self._watched.values() if each.is_over == is_over]
 
 
 @dataclass
@@ -273,7 +273,7 @@ class _WatchedFault:
     before: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] at the target when the fault began
     worst: tuple[float, ...] = ()  # the worst of these while the fault is active
     states: dict[str, list[str]] = field(default_factory=dict)  # successive states of drones, formations and processes
-    over: bool = False
+    is_over: bool = False
 
     def update(
         self,
@@ -284,28 +284,28 @@ class _WatchedFault:
     ) -> None:
         """Record the worst figures and all states while the fault is active, and a killed process's return later."""
         parts = self.fault.target.split("/")
-        things = {part.rpartition(".")[2] for part in parts}
-        is_world = not things & (set(drones) | set(phases))
-        struck = [drone for name, drone in drones.items() if is_world or name in things]
-        sigma_m = max((drone.sigma_m or 0.0 for drone in struck), default=0.0)
-        lag_ms = max((drone.lag_ms or 0.0 for drone in struck), default=0.0)
+        names = {part.rpartition(".")[2] for part in parts}
+        is_world = not names & (set(drones) | set(phases))
+        affected = [drone for name, drone in drones.items() if is_world or name in names]
+        sigma_m = max((drone.sigma_m or 0.0 for drone in affected), default=0.0)
+        lag_ms = max((drone.lag_ms or 0.0 for drone in affected), default=0.0)
         now = (sigma_m, lag_ms, wind_m_s if self.fault.kind == "gust" else 0.0)
         self.before = self.before or now
-        if not self.over:
+        if not self.is_over:
             self.worst = tuple(map(max, self.worst or now, now))
-        states = {drone.name: drone.state for drone in struck}
-        states |= phases if is_world or len(phases) == 1 else {name: phases[name] for name in things & set(phases)}
-        states |= {part: LIFE[part in lost] for part in parts if "." in part}
+        states = {drone.name: drone.state for drone in affected}
+        states |= phases if is_world or len(phases) == 1 else {name: phases[name] for name in names & set(phases)}
+        states |= {part: PROCESS_STATES[part in lost] for part in parts if "." in part}
         for name, state in states.items():
             seen = self.states.setdefault(name, [state])
-            is_killed = state in LIFE and len(seen) < DEATH_AND_RETURN
-            if seen[-1] != state and (not self.over or is_killed):
+            is_killed = state in PROCESS_STATES and len(seen) < RESTART_STATE_COUNT
+            if seen[-1] != state and (not self.is_over or is_killed):
                 seen.append(state)
 
     def line(self) -> str:
         fault, worst = self.fault, self.worst or self.before
         until = "" if fault.until_ns is None else f" to {fault.until_ns / 1e9:.1f} s"
-        what = " ".join(
+        label = " ".join(
             filter(None, (f"#{fault.id} {fault.kind} of {fault.target}", run_condition.parameters_text(fault)))
         )
         effects = []
@@ -318,7 +318,7 @@ class _WatchedFault:
         for name, seen in self.states.items():
             if len(seen) > 1 or seen == ["dead"]:
                 effects.append(f"{name} {' → '.join(each.replace('_', ' ') for each in seen[-4:])}")
-        return f"{what}, {fault.from_ns / 1e9:.1f} s{until}: {', '.join(effects) or 'no effect seen'}"
+        return f"{label}, {fault.from_ns / 1e9:.1f} s{until}: {', '.join(effects) or 'no effect seen'}"
 
 
 class Stall(NamedTuple):
@@ -377,7 +377,7 @@ class TimeMonitor:
         self._is_polling = False
         self._awake = AwakeClock(wall_s)
         self._answered_s = self._awake.now_s()
-        self._known_s = -math.inf
+        self._clock_read_s = -math.inf
         self.clock: run_messages.Clock | None = None  # the newest answer
 
     @contextmanager
@@ -419,14 +419,14 @@ class TimeMonitor:
             for sample in samples:
                 clock = self._observer.update_clock(sample.payload)
                 if clock is not None:
-                    self.clock, self._known_s, self._answered_s = clock, start_s, self._awake.now_s()
+                    self.clock, self._clock_read_s, self._answered_s = clock, start_s, self._awake.now_s()
 
     def now_ns(self) -> int:
         """Return simulated time for a stamp, after a poll if it may be too old; takes 2 ANSWER_TIMEOUT_S at most."""
 
         def is_old() -> bool:
             rate = max(1.0, self.clock.rate) if self.clock else 1.0  # the measured rate is 0 at the beginning of a run
-            return (self._wall_s() - self._known_s) * rate > self._stamp_age_s
+            return (self._wall_s() - self._clock_read_s) * rate > self._stamp_age_s
 
         if is_old():
             with self._poll_lock:
@@ -437,10 +437,10 @@ class TimeMonitor:
     @property
     def silent_s(self) -> float:
         """Time since the world last answered [s; wall]; 0 below SILENT_S."""
-        return self.heard_s if self.heard_s >= SILENT_S else 0.0
+        return self.answer_age_s if self.answer_age_s >= SILENT_S else 0.0
 
     @property
-    def heard_s(self) -> float:
+    def answer_age_s(self) -> float:
         """Time awake since the world's last answer [s; wall]; 0 while the clock is not polled."""
         return self._awake.now_s() - self._answered_s if self._is_polling else 0.0
 
@@ -467,7 +467,7 @@ class RecordPlayer:
         self._every_s = max(INTERVAL_S, PIECE_S * drones / INSTANT_DRONES_MAX)
         self._lock = threading.Lock()
         self._shown_s = 0.0
-        self._known: set[int] = set()  # numbers of the pieces that were read
+        self._pieces_read: set[int] = set()  # numbers of the pieces that were read
         self._is_reading = False
         self._arrived: deque[list[PastInstant]] = deque()
 
@@ -502,35 +502,35 @@ class RecordPlayer:
             return
         with self._lock:
             self._shown_s = t_s
-            self._known = {k for k in self._known if abs(self._middle_s(k) - t_s) < KEPT_S - PIECE_S}
-            if self._is_reading or self._missing() is None:
+            self._pieces_read = {k for k in self._pieces_read if abs(self._middle_s(k) - t_s) < KEPT_S - PIECE_S}
+            if self._is_reading or self._next_missing() is None:
                 return
             self._is_reading = self._client.read(self._read_missing)
 
-    def take(self) -> list[PastInstant]:
+    def pop_instants(self) -> list[PastInstant]:
         """Return the views of the next piece that has been read, each piece once; empty if there is none."""
         return self._arrived.popleft() if self._arrived else []
 
     def _middle_s(self, piece: int) -> float:
         return self.timeline["from_s"] + (piece + 0.5) * PIECE_S
 
-    def _missing(self) -> int | None:
+    def _next_missing(self) -> int | None:
         """Return the unread piece nearest to the shown time, None if there is none."""
         from_s, to_s = self.timeline["from_s"], self.timeline["to_s"]
-        first_s, last_s = max(from_s, self._shown_s - BEHIND_S), min(to_s, self._shown_s + AHEAD_S)
+        first_s, last_s = max(from_s, self._shown_s - READ_BEFORE_S), min(to_s, self._shown_s + READ_AFTER_S)
         pieces = range(math.floor((first_s - from_s) / PIECE_S), math.floor((last_s - from_s) / PIECE_S) + 1)
-        unread = [k for k in pieces if k not in self._known]
+        unread = [k for k in pieces if k not in self._pieces_read]
         return min(unread, key=lambda k: abs(self._middle_s(k) - self._shown_s), default=None)
 
     def _read_missing(self) -> None:
         """Read until no piece is missing; a piece that cannot be read is not retried."""
         while True:
             with self._lock:
-                piece = self._missing()
+                piece = self._next_missing()
                 if piece is None:
                     self._is_reading = False
                     return
-                self._known.add(piece)
+                self._pieces_read.add(piece)
             begin_s = self.timeline["from_s"] + piece * PIECE_S
             end_s = min(begin_s + PIECE_S - self._every_s / 2.0, self.timeline["to_s"])
             instants = self._client.past_views(begin_s, end_s, self._every_s)

@@ -32,7 +32,7 @@ from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.histories import CanvasTrails
 from zsim_bridges.console.page_cameras import PageCameras
 from zsim_bridges.console.picture import (
-    LARGE_MAX,
+    FULL_NAMES_MAX,
     Array,
     DronePoses,
     Ellipsoids,
@@ -53,7 +53,7 @@ from zsim_bridges.console.run_condition import ShownRun
 from zsim_bridges.console.view_buffer import ViewBuffer
 
 NAMED_MAX = 60  # maximum number of drones with names beside them; more names would overlap
-SMALL = 0.8  # relative size of the names if there are many drones
+NAME_SCALE_SMALL = 0.8  # relative size of the names if there are many drones
 SOLID = (134, 142, 150)
 EDGE = (96, 102, 118)  # edges of a surface's triangles, since shading hardly shows their slopes
 GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
@@ -66,19 +66,19 @@ WIND_M_PER_M_S = 0.5  # length of the wind's arrow per unit of wind speed
 WIND_MIN_M_S = 0.05  # a weaker wind has no arrow
 WIND_ABOVE_M = 1.5  # height of the arrow above the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; position of a name relative to its drone
-MIDDLE = "center-center"  # anchor of a label
+LABEL_ANCHOR = "center-center"  # anchor of a label
 LABELS_MAX = 3  # maximum number of a formation's figures: p, q and beta
 LUMINANCE_MIN = 0.12  # minimum luminance of a trail: a contrast of 2.5 with the ground of the dark theme (WCAG 2.2)
 HIDDEN = (0.0, 0.0, -1000.0)  # m; position of hidden instances, since viser cannot hide them one by one
-HALF_M = 150.0  # half a side of the ground
+GROUND_HALF_M = 150.0  # half a side of the ground
 FIELD_BELOW_M = 0.15  # depth of the field below the grid; a depth buffer cannot order closer surfaces
-THICK_M = 0.02  # thickness of the field
+FIELD_THICKNESS_M = 0.02  # thickness of the field
 LIGHT = ((206, 219, 196), (190, 200, 184), (138, 150, 132))  # colours of the field, the grid's cells and its sections
 DARK = ((30, 35, 30), (84, 94, 82), (122, 134, 118))
 CHOSEN = (25, 113, 194)
 ARM_M = 0.1785  # distance from the centre to a rotor's axis
 ROTOR_RADIUS_M = 0.10  # the AR.Drone's 8 inch propellers
-RING = 1.31  # outer radius of a hull ring, in rotor radii: half the hull's 0.515 m less the ring's offset of 0.126 m
+RING_RADIUS_RATIO = 1.31  # of a hull ring to a rotor; half the hull's 0.515 m less the ring's offset of 0.126 m
 ROTOR_Z_M = 0.030  # height of the rotors above the centre of mass, as drawn
 COLOURS = {  # sRGB, 0 to 255; the greys are lighter than the AR.Drone's, to stand out in the dark theme too
     "cross": (104, 108, 116),
@@ -101,7 +101,7 @@ class RunScene:
         self.drones: DronePoses | None = None  # newest poses of the drones
         self.shapes: dict[str, FormationShape | None] = {}  # true shapes by formation; None if a drone is missing
         self.previews: dict[str, Array] = {}  # paths (n, M, 3) [m] that formations would fly
-        self.trails = CanvasTrails(len(run.names), around=run.is_replay)
+        self.trails = CanvasTrails(len(run.names), is_replay=run.is_replay)
         robots = sum(space.n for space in run.spaces.values())
         arms_m = [drone.arm_m for drone in run.scenario.drones]
         self.nodes = SceneNodes(server, run.info.drones, arms_m, robots, len(run.spaces))
@@ -124,16 +124,16 @@ class RunScene:
         self._cameras.set_target(self._camera_targets(drones))
         return drones
 
-    def draw(self, view: ViewDrones, longest_s: float, chosen: str) -> DronePoses:
+    def draw(self, view: ViewDrones, interval_max_s: float, chosen: str) -> DronePoses:
         """Draw a view of the drones, and return their poses.
 
-        Rotors turn for at most `longest_s` between pictures; `chosen` is the formation whose figures are shown.
+        Rotors turn for at most `interval_max_s` between pictures; `chosen` is the formation whose figures are shown.
         """
         before_ns = self.drones.t_ns if self.drones is not None else 0
         drones = self.store(view)
-        self.nodes.drones(drones, min(longest_s, max(0.0, (drones.t_ns - before_ns) / 1e9)))
+        self.nodes.drones(drones, min(interval_max_s, max(0.0, (drones.t_ns - before_ns) / 1e9)))
         estimates = self._views.estimates().values()
-        self.nodes.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
+        self.nodes.estimates(ellipsoids([each.estimate for each in estimates if each.is_fresh]))
         if self.shapes:
             self.nodes.shapes(list(self.shapes.values()), list(self.shapes).index(chosen))
         desired = {name: (view.phase, view.desired) for name, view in self._views.clusters.items()}
@@ -196,17 +196,17 @@ class SceneNodes:
         scene.add_frame("/origin", axes_length=1.0, axes_radius=0.02, position=(0.0, 0.0, 0.01))
         scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
         scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
-        looks = [shape_of(*each) for each in zip(drones, arms_m, strict=True)]
-        self.radii_m: Array = np.array([look.reach_m for look in looks])  # (N,), from the centre
+        shapes = [shape_of(*each) for each in zip(drones, arms_m, strict=True)]
+        self.radii_m: Array = np.array([shape.reach_m for shape in shapes])  # (N,), from the centre
 
         self._airframes: list[tuple[NDArray[np.int64], Any]] = []  # one node for all drones that look alike
-        for k, look in enumerate(dict.fromkeys(looks)):
-            owners = np.array([i for i, other in enumerate(looks) if other == look])
+        for k, shape in enumerate(dict.fromkeys(shapes)):
+            owners = np.array([i for i, other in enumerate(shapes) if other == shape])
             p, q, _ = _padded(len(owners))
-            node = scene.add_batched_glb(f"/drones/{k}" if k else "/drones", coloured_glb(look), q, p, lod="off")
+            node = scene.add_batched_glb(f"/drones/{k}" if k else "/drones", coloured_glb(shape), q, p, lod="off")
             self._airframes.append((owners, node))
-        self._rotors = _RotorNodes(drones, looks, self._batch)
-        ghost = whole_mesh(looks[0])
+        self._rotors = _RotorNodes(drones, shapes, self._batch)
+        ghost = drone_mesh(shapes[0])
         self._ghosts = self._batch("/ghosts", ghost, robots, GHOST, opacity=0.5) if robots else None
         self._ellipsoids = self._batch("/estimates", ball_mesh(), len(names), ELLIPSOID, opacity=0.35)
         if robots:
@@ -217,7 +217,10 @@ class SceneNodes:
             )  # fmt: skip
         self._names: list[Any] = []
         if len(names) <= NAMED_MAX:
-            style: Any = {"anchor": "bottom-center", "font_screen_scale": SMALL if len(names) > LARGE_MAX else 1.0}
+            style: Any = {
+                "anchor": "bottom-center",
+                "font_screen_scale": NAME_SCALE_SMALL if len(names) > FULL_NAMES_MAX else 1.0,
+            }
             texts = zip(names, shown_names(names), strict=True)
             self._names = [scene.add_label(f"/names/{name}", text, **style) for name, text in texts]
         self._wind = scene.add_arrows(
@@ -231,8 +234,9 @@ class SceneNodes:
             p, q, _ = _padded(clusters)
             axes: Any = {"axes_length": 0.7, "axes_radius": 0.02}
             self._formation_frames: Any = scene.add_batched_axes("/formations/frames", q, p, **axes)
-            self._figures = [
-                scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
+            self._value_labels = [
+                scene.add_label(f"/formations/label{i}", "", visible=False, anchor=LABEL_ANCHOR)
+                for i in range(LABELS_MAX)
             ]
 
     def _batch(self, name: str, mesh: "Mesh", count: int, colour: Any, opacity: float | None = None) -> Any:
@@ -246,30 +250,30 @@ class SceneNodes:
         for each in obstacles:
             x, y, z = each.position_m
             turn = math.radians(each.yaw_deg) / 2
-            look: Any = {"wxyz": (math.cos(turn), 0.0, 0.0, math.sin(turn)), "color": SOLID}
+            style: Any = {"wxyz": (math.cos(turn), 0.0, 0.0, math.sin(turn)), "color": SOLID}
             name = f"/obstacles/{each.name}"
             height_m = each.height_m or 0.0
             if each.size_m is not None:
-                self._scene.add_box(name, dimensions=each.size_m, position=(x, y, z + each.size_m[2] / 2), **look)
+                self._scene.add_box(name, dimensions=each.size_m, position=(x, y, z + each.size_m[2] / 2), **style)
             elif each.shape == "cylinder":
                 centre = (x, y, z + height_m / 2)
-                self._scene.add_cylinder(name, radius=each.radius_m or 0.0, height=height_m, position=centre, **look)
+                self._scene.add_cylinder(name, radius=each.radius_m or 0.0, height=height_m, position=centre, **style)
             else:
-                self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
+                self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **style)
 
     def surfaces(self, surfaces: Sequence[Surface]) -> None:
         for each in surfaces:
             corners = corners_of(placed(each)).reshape(-1, 3).astype(np.float32)
             faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-            look: Any = {"color": SOLID, "flat_shading": True, "side": "double"}
-            self._scene.add_mesh_simple(f"/surfaces/{each.name}", corners, faces, **look)
+            style: Any = {"color": SOLID, "flat_shading": True, "side": "double"}
+            self._scene.add_mesh_simple(f"/surfaces/{each.name}", corners, faces, **style)
             self._scene.add_mesh_simple(f"/surfaces/{each.name}/edges", corners, faces, color=EDGE, wireframe=True)
 
     def references(self, lines: Array) -> None:
         """Draw the reference paths of single drones, as segments (M, 2, 3) [m; W]."""
         if len(lines):
-            look: Any = {"thickness": SIDE_PX, "thickness_units": "screen"}
-            self._scene.add_line_segments("/references", lines.astype(np.float32), GHOST, **look)
+            style: Any = {"thickness": SIDE_PX, "thickness_units": "screen"}
+            self._scene.add_line_segments("/references", lines.astype(np.float32), GHOST, **style)
 
     def on_click(self, act: Callable[[viser.SceneClickEvent], None]) -> None:
         """Register a callback for viser's event of each click in the scene.
@@ -295,9 +299,9 @@ class SceneNodes:
         """Draw the arrow of the wind above the drones."""
         speed = float(np.linalg.norm(drones.wind_W))
         present = drones.p_W[drones.present]
-        blows = speed >= WIND_MIN_M_S and len(present) > 0
-        self._wind.visible = self._wind_label.visible = blows
-        if blows:
+        has_wind = speed >= WIND_MIN_M_S and len(present) > 0
+        self._wind.visible = self._wind_label.visible = has_wind
+        if has_wind:
             start = np.array([*present[:, :2].mean(axis=0), present[:, 2].max() + WIND_ABOVE_M])
             self._wind.points = np.array([[start, start + WIND_M_PER_M_S * drones.wind_W]])
             self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
@@ -305,9 +309,9 @@ class SceneNodes:
     def radio(self, lines: tuple[Array, Array]) -> None:
         """Draw the lines of bidirectional and of one-way radio links between drones."""
         points = np.concatenate([*lines, np.tile(HIDDEN, (1, 2, 1))]).astype(np.float32)
-        count, weak = len(points), len(lines[0])
+        count, bidirectional = len(points), len(lines[0])
         colours = np.tile(linear(np.array(RADIO)), (count, 2, 1))
-        colours[weak:] = linear(np.array(ONE_WAY))
+        colours[bidirectional:] = linear(np.array(ONE_WAY))
         if self._radio is None:
             self._radio = self._scene.add_line_segments(
                 "/radio", points, colours, thickness=RADIO_PX, thickness_units="screen"
@@ -353,7 +357,7 @@ class SceneNodes:
         shape = shapes[chosen]
         texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]
         texts += [(shape.corner[1], shape.corner[0])] if shape is not None and shape.corner else []
-        for i, label in enumerate(self._figures):
+        for i, label in enumerate(self._value_labels):
             label.visible = i < len(texts)
             if label.visible:
                 label.text, label.position = texts[i]
@@ -369,9 +373,9 @@ class SceneNodes:
         else:
             self._trail_node.points, self._trail_node.colors = segments, colours
 
-    def show(self, what: str, visible: bool) -> None:
-        self._trails_shown = visible if what == "trails" else self._trails_shown
-        node = {"ghosts": self._ghosts, "estimates": self._ellipsoids, "trails": self._trail_node}[what]
+    def show(self, layer: str, visible: bool) -> None:
+        self._trails_shown = visible if layer == "trails" else self._trails_shown
+        node = {"ghosts": self._ghosts, "estimates": self._ellipsoids, "trails": self._trail_node}[layer]
         if node is not None:
             node.visible = visible
 
@@ -379,15 +383,15 @@ class SceneNodes:
 class _RotorNodes:
     """The rotors of all drones as one node, each rotor at its own size."""
 
-    def __init__(self, drones: Sequence[DroneInfo], looks: Sequence["DroneShape"], batch: Any) -> None:
-        self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
-        self._rotor_indices = np.concatenate([np.arange(len(look.hubs_B)) for look in looks])
-        hubs = [(x, y, ROTOR_Z_M * look.size) for look in looks for x, y in look.hubs_B]
+    def __init__(self, drones: Sequence[DroneInfo], shapes: Sequence["DroneShape"], batch: Any) -> None:
+        self._owners = np.repeat(np.arange(len(shapes)), [len(shape.hubs_B) for shape in shapes])
+        self._rotor_indices = np.concatenate([np.arange(len(shape.hubs_B)) for shape in shapes])
+        hubs = [(x, y, ROTOR_Z_M * shape.size) for shape in shapes for x, y in shape.hubs_B]
         rotors = [drone.rotors or cross_layout(ARM_M) for drone in drones]
         self._turns = np.array([float(rotor.turn) for layout in rotors for rotor in layout])
         self._hubs_B, self._angles = np.array(hubs), np.zeros(len(hubs))
         self._node = batch("/rotors", rotor_mesh(), len(hubs), COLOURS["rotor"])
-        scales = [look.radius_m / ROTOR_RADIUS_M for look in looks]
+        scales = [shape.radius_m / ROTOR_RADIUS_M for shape in shapes]
         self._node.batched_scales = np.tile(np.array(scales)[self._owners, None], (1, 3))
 
     def move(self, drones: DronePoses, dt_s: float) -> None:
@@ -418,9 +422,9 @@ class ChosenRing:
         self._radii_m = radii_m
         self._chosen = -1
         mesh = ring_mesh()
-        level, nowhere = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array(HIDDEN).reshape(1, 3)
+        level, hidden = np.array([[1.0, 0.0, 0.0, 0.0]]), np.array(HIDDEN).reshape(1, 3)
         self._node: Any = scene.add_batched_meshes_simple(
-            "/chosen", mesh.vertices, mesh.faces, level, nowhere, batched_scales=np.ones((1, 3)),
+            "/chosen", mesh.vertices, mesh.faces, level, hidden, batched_scales=np.ones((1, 3)),
             batched_colors=CHOSEN, lod="off", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
@@ -439,11 +443,13 @@ def draw_ground(scene: viser.SceneApi, *, dark: bool = False) -> None:
     The field is opaque, and there is no sky: viser's grid plane, or a background image, would hide transparent objects.
     """
     field, cells, sections = DARK if dark else LIGHT
-    position = (0.0, 0.0, -FIELD_BELOW_M - THICK_M / 2.0)
-    scene.add_box("/field", field, (2 * HALF_M, 2 * HALF_M, THICK_M), position=position, cast_shadow=False)
+    position = (0.0, 0.0, -FIELD_BELOW_M - FIELD_THICKNESS_M / 2.0)
+    scene.add_box(
+        "/field", field, (2 * GROUND_HALF_M, 2 * GROUND_HALF_M, FIELD_THICKNESS_M), position=position, cast_shadow=False
+    )
     scene.add_grid(
-        "/ground", 2 * HALF_M, 2 * HALF_M, cell_size=1.0, section_size=5.0, cell_color=cells, section_color=sections,
-        fade_distance=80.0, shadow_opacity=0.0,
+        "/ground", 2 * GROUND_HALF_M, 2 * GROUND_HALF_M, cell_size=1.0, section_size=5.0, cell_color=cells,
+        section_color=sections, fade_distance=80.0, shadow_opacity=0.0,
     )  # fmt: skip
 
 
@@ -454,7 +460,7 @@ def luminance(colour: Sequence[float]) -> float:
 
 def lightened(colour: Sequence[float]) -> Sequence[float]:
     """Return a colour mixed with white until it has enough contrast with the ground of the dark theme."""
-    mixed = (np.array(colour) + share * (255.0 - np.array(colour)) for share in np.arange(0.0, 1.01, 0.05))
+    mixed = (np.array(colour) + fraction * (255.0 - np.array(colour)) for fraction in np.arange(0.0, 1.01, 0.05))
     return next(each.tolist() for each in mixed if luminance(each.tolist()) >= LUMINANCE_MIN)
 
 
@@ -485,7 +491,7 @@ class DroneShape(NamedTuple):
     @property
     def reach_m(self) -> float:
         """Distance of the hull's outer edge from the centre [m]."""
-        return self.size * ARM_M + RING * self.radius_m
+        return self.size * ARM_M + RING_RADIUS_RATIO * self.radius_m
 
 
 def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
@@ -503,33 +509,33 @@ def coloured_glb(shape: DroneShape) -> bytes:
     for name, solids in _solids(shape).items():
         solid = _joined(solids)
         solid.unmerge_vertices()  # otherwise shading would blur the edges
-        look = PBRMaterial(baseColorFactor=(*COLOURS[name], 255), metallicFactor=0.0, roughnessFactor=0.75)
-        solid.visual = TextureVisuals(material=look)
+        material = PBRMaterial(baseColorFactor=(*COLOURS[name], 255), metallicFactor=0.0, roughnessFactor=0.75)
+        solid.visual = TextureVisuals(material=material)
         scene.add_geometry(solid, geom_name=name)
     return bytes(scene.export(file_type="glb"))  # type: ignore[arg-type]
 
 
 @cache
-def whole_mesh(shape: DroneShape) -> Mesh:
+def drone_mesh(shape: DroneShape) -> Mesh:
     return _mesh([solid for solids in _solids(shape).values() for solid in solids])
 
 
 def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
     """Return the solids of a drone by colour, built at the AR.Drone's size and then scaled."""
     hubs = [(x / shape.size, y / shape.size) for x, y in shape.hubs_B]
-    radius = RING * shape.radius_m / shape.size
+    radius = RING_RADIUS_RATIO * shape.radius_m / shape.size
     cross = []
     for x, y in hubs:
         beam = box((math.hypot(x, y), 0.014, 0.012))
         motor, foot = cylinder(0.017, 0.034, sections=12), cylinder(0.006, 0.058, sections=8)
         cross.append(_moved(beam, (x / 2, y / 2, 0.004), math.atan2(y, x)))
         cross += [_moved(motor, (x, y, ROTOR_Z_M / 2)), _moved(foot, (0.92 * x, 0.92 * y, -0.029))]
-    ahead = trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0))
+    to_forward = trimesh.transformations.rotation_matrix(math.pi / 2, (0, 1, 0))
     lens = cylinder(0.013, 0.03, sections=14)  # of the front camera
-    lens.apply_transform(ahead)
+    lens.apply_transform(to_forward)
     rings = [annulus(radius - 0.016, radius, 0.042, sections=28) for _ in hubs]  # foam of the indoor hull
     body = capsule(height=0.19, radius=0.045, count=[14, 14])  # body with the battery, from nose to tail
-    body.apply_transform(ahead)
+    body.apply_transform(to_forward)
     body.apply_scale((1.0, 1.0, 0.72))
     nose = icosphere(subdivisions=2, radius=0.042)
     nose.apply_scale((1.25, 1.0, 0.78))
@@ -541,7 +547,7 @@ def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
         ],
         "nose": [_moved(nose, (0.115, 0, 0.012))],
     }
-    for solid in (solid for of_one in solids.values() for solid in of_one):
+    for solid in (solid for part_solids in solids.values() for solid in part_solids):
         solid.apply_scale(shape.size)
     hats = Hats()  # not scaled: drones detect each other by their hats, and cameras assume this size
     return {**solids, "hat": [_moved(icosphere(subdivisions=3, radius=hats.diameter_m / 2), hats.position_m)]}

@@ -45,7 +45,7 @@ class ReceivedEstimate(NamedTuple):
     process: str
     t_ns: int
     estimate: EstimateView
-    fresh: bool
+    is_fresh: bool
 
     @property
     def yaw_sigma_deg(self) -> float:
@@ -72,8 +72,9 @@ class ViewBuffer:
 
     Args:
         variables: names of each formation's variables; views of other formations or variables are refused.
-        refused: called with the event of each command from the console that the world refuses.
-        asked: called with a formation and a description of the request whenever another client makes one to it.
+        on_refused_command: called with the event of each command from the console that the world refuses.
+        on_foreign_request: called with a formation and a description of the request whenever another client makes one
+            to it.
     """
 
     def __init__(
@@ -82,19 +83,19 @@ class ViewBuffer:
         info: Info,
         observer: Participant,
         variables: Mapping[str, tuple[str, ...]],
-        refused: Callable[[Event], None],
+        on_refused_command: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,
-        asked: Callable[[str, str], None] = lambda *_: None,
+        on_foreign_request: Callable[[str, str], None] = lambda *_: None,
     ) -> None:
         self._link = link
         self._names = frozenset(drone.name for drone in info.drones)
         self._observer = observer
         self._variables = variables
-        self._refused = refused
-        self._asked = asked
+        self._on_refused_command = on_refused_command
+        self._on_foreign_request = on_foreign_request
         self._wall_s = wall_s
         self._received_s: dict[str, float] = {}  # wall times of views and link states, by key
-        self._new: dict[str, bytes] = {}
+        self._undecoded: dict[str, bytes] = {}
         self._arrived = threading.Condition()
         self._answers: Counter[str] = Counter()
         self.drones: ViewDrones | None = None
@@ -109,7 +110,7 @@ class ViewBuffer:
         self.log = EventLog(observer.name)
         self.losses = Losses()
         self.failsafes: dict[str, Event] = {}  # last automatic landing or stop of each drone, until its next mode
-        self.begun: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
+        self.recent_faults: deque[Fault] = deque(maxlen=FAULTS_KEPT)  # the most recently begun faults
         self.end = ""  # why the run ended, by its last event; empty while it continues
         self.on_own_event: Callable[[Event], None] = lambda _: None  # called with events that the console causes
 
@@ -124,46 +125,47 @@ class ViewBuffer:
         samples = self._link.get(keys.FAULTS)
         with self._arrived:
             for sample in samples:
-                self._new.setdefault(sample.key, sample.payload)  # a message that arrived meanwhile is newer
+                self._undecoded.setdefault(sample.key, sample.payload)  # a message that arrived meanwhile is newer
 
     def update(self) -> bool:
         """Decode what was received since the last update; return whether there is a new view of the drones."""
         with self._arrived:
-            new, self._new = self._new, {}
-        for key, payload in new.items():
+            undecoded, self._undecoded = self._undecoded, {}
+        for key, payload in undecoded.items():
             try:
                 self._store(key, messages.decode(key, payload))
             except DecodeError:
                 self._observer.health.refused += 1
-        return keys.VIEW_DRONES in new
+        return keys.VIEW_DRONES in undecoded
 
     def estimates(self) -> dict[str, ReceivedEstimate]:
         """Return each drone's newest estimate by name, from any estimator; after a rewind, later ones are ignored."""
         now_ns = self.drones.t_ns if self.drones else 0
         newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
-            seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
-            fresh = abs(view.t_ns - now_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S  # neither view covers every gate
-            if fresh or view.t_ns <= now_ns:
+            age_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
+            # Neither view covers every gate.
+            is_fresh = abs(view.t_ns - now_ns) <= FRESH_S * 1e9 or abs(age_s) <= FRESH_S
+            if is_fresh or view.t_ns <= now_ns:
                 known = (estimate for estimate in view.estimates if estimate.name in self._names)
-                newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in known}
+                newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, is_fresh) for each in known}
         return newest
 
     def conditions(self) -> dict[str, DroneCondition]:
-        estimates, found = self.estimates(), {}
+        estimates, conditions = self.estimates(), {}
         for drone in self.drones.drones if self.drones else ():
             _, x, y, _ = drone.orientation_wxyz
             failsafe, link = self.failsafes.get(drone.name), self.link_of(drone.name)
             received = estimates.get(drone.name)
-            fresh = received if received is not None and received.fresh else None
-            found[drone.name] = DroneCondition(
+            fresh_estimate = received if received is not None and received.is_fresh else None
+            conditions[drone.name] = DroneCondition(
                 drone.name,
                 drone.state,
                 drone.battery_percent,
                 lag_ms=self.lag_ms(received) if received else None,
-                sigma_m=fresh.sigma_m if fresh else None,
-                yaw_sigma_deg=fresh.yaw_sigma_deg if fresh else None,
-                estimate_lost=received is not None and fresh is None,
+                sigma_m=fresh_estimate.sigma_m if fresh_estimate else None,
+                yaw_sigma_deg=fresh_estimate.yaw_sigma_deg if fresh_estimate else None,
+                estimate_lost=received is not None and fresh_estimate is None,
                 tilt_deg=math.degrees(math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))),
                 failsafe=failsafe.text if failsafe else "",
                 commander=drone.commander,
@@ -173,7 +175,7 @@ class ViewBuffer:
                 link_age_ms=link.state.age_ms if link else None,
                 link_loss_percent=link.state.loss_percent if link else None,
             )
-        return found
+        return conditions
 
     def link_of(self, drone: str) -> ReceivedLink | None:
         key = keys.link(drone)
@@ -186,22 +188,22 @@ class ViewBuffer:
     def lag_ms(self, received: ReceivedEstimate) -> float:
         """Return an estimator's lag [ms]: from its health, or from the age of its view if that is not fresh."""
         health = self.healths.get(received.process)
-        if health is not None and received.fresh:
+        if health is not None and received.is_fresh:
             return health.lag_ns / 1e6
         return max(0, (self.drones.t_ns if self.drones else 0) - received.t_ns) / 1e6
 
     def answered_commands(self, drone: str) -> int:
         return self._answers[drone]
 
-    def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
-        """Wait, for at most `within_s`, until more than `beyond` commands to a drone have been answered."""
+    def await_answer(self, drone: str, count_before: int, within_s: float) -> None:
+        """Wait, for at most `within_s`, until more than `count_before` commands to a drone have been answered."""
         with self._arrived:
-            self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
+            self._arrived.wait_for(lambda: self._answers[drone] > count_before, within_s)
 
     def _on_publication(self, sample: RawSample) -> None:
         self._observer.health.received += 1
         with self._arrived:
-            self._new[sample.key] = sample.payload
+            self._undecoded[sample.key] = sample.payload
 
     def _store(self, key: str, message: Any) -> None:
         if isinstance(message, ViewDrones):
@@ -236,7 +238,7 @@ class ViewBuffer:
             source = request.source or "an unnamed client"
             text = f"{cluster}: {request.op} by {source} {arguments_text(request.args)}".strip()
             self.log.add(Event(request.t_ns, 0, "accepted", request.source, cluster, text))
-            self._asked(cluster, text)
+            self._on_foreign_request(cluster, text)
 
     def _on_event(self, sample: RawSample) -> None:
         try:
@@ -254,7 +256,7 @@ class ViewBuffer:
             self.failsafes = {name: each for name, each in self.failsafes.items() if name != event.subject}
         elif event.kind == "fault":
             with suppress(msgspec.ValidationError):  # any process may publish an event
-                self.begun.append(msgspec.convert(event.data, Fault))
+                self.recent_faults.append(msgspec.convert(event.data, Fault))
         elif event.kind == "end":
             self.end = event.text
         if event.kind != "command":  # a more specific event, of a mode or a refusal, follows
@@ -262,7 +264,7 @@ class ViewBuffer:
         if event.source == self._observer.name:
             self.on_own_event(event)
             if event.kind == "refused":
-                self._refused(event)
+                self._on_refused_command(event)
 
 
 def arguments_text(args: Mapping[str, Any]) -> str:
@@ -291,7 +293,7 @@ class EventRow(NamedTuple):
 
     event: Event
     times: int
-    own: bool
+    is_own: bool
 
 
 class EventLog:
@@ -308,14 +310,14 @@ class EventLog:
 
     def add(self, event: Event) -> None:
         key = (event.kind, event.source, event.subject, _NUMBER.sub("#", event.text))
-        own = event.source == self._name and event.kind in OWN_KINDS
+        is_own = event.source == self._name and event.kind in OWN_KINDS
         with self._lock:
             self.newest.appendleft(event)
             before = self._rows.pop(key, None)
-            self._rows[key] = EventRow(event, before.times + 1 if before else 1, own)
-            same = [key for key, row in self._rows.items() if row.own == own]
-            if len(same) > (OWN_ROWS_KEPT if own else ROWS_KEPT):
-                del self._rows[same[0]]
+            self._rows[key] = EventRow(event, before.times + 1 if before else 1, is_own)
+            same_origin = [key for key, row in self._rows.items() if row.is_own == is_own]
+            if len(same_origin) > (OWN_ROWS_KEPT if is_own else ROWS_KEPT):
+                del self._rows[same_origin[0]]
 
     def rows(self) -> list[EventRow]:
         with self._lock:
@@ -329,6 +331,6 @@ def chosen_rows(rows: Iterable[EventRow], drone: str = ALL, kind: str = ALL) -> 
         row
         for row in rows
         if (drone == ALL or name.search(f"{row.event.subject} {row.event.text}"))
-        and (row.own or kind != OWN)
+        and (row.is_own or kind != OWN)
         and (not kinds or row.event.kind in kinds)
     ]

@@ -128,9 +128,9 @@ class ClusterSpace(ABC):
         """Return r_dot (4n,) = J^-1 c_dot; spaces with a large J^-1 override this to avoid the matrix."""
         return linear.product(self.inverse_jacobian(c), c_dot)
 
-    def specimen(self, apart_m: float) -> Array:
+    def specimen(self, separation_m: float) -> Array:
         """Return c (4n,) of a level formation with robots at least a given distance apart, for rehearsals."""
-        radius_m = self.n * apart_m
+        radius_m = self.n * separation_m
         angles = np.arange(self.n) * (TAU / self.n)
         x, y = (el.elementwise(function)(angles) for function in (el.cos, el.sin))
         p_W = radius_m * np.column_stack((x, y, np.ones(self.n)))

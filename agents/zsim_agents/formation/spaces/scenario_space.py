@@ -171,14 +171,16 @@ class NestedCluster(ClusterSpace):
             r_dot[group.rows] = group.space.motion(own, own_dot)
         return r_dot
 
-    def specimen(self, apart_m: float) -> Array:
+    def specimen(self, separation_m: float) -> Array:
         c = np.zeros(self.size)
-        separation_m = apart_m
+        parent_separation_m = separation_m
         for group in self._groups:
-            own = group.space.specimen(apart_m)
+            own = group.space.specimen(separation_m)
             c[group.own] = own[group.rest]
-            separation_m = max(separation_m, 2.0 * float(np.ptp(group.space.inverse(own)[0], axis=0).max()))
-        c[: self.parent.size] = self.parent.specimen(separation_m)
+            parent_separation_m = max(
+                parent_separation_m, 2.0 * float(np.ptp(group.space.inverse(own)[0], axis=0).max())
+            )
+        c[: self.parent.size] = self.parent.specimen(parent_separation_m)
         return c
 
     def parts(self, c: Array) -> list[Array]:

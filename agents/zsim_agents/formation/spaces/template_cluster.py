@@ -131,12 +131,12 @@ class TemplateCluster(ClusterSpace):
         r_dot[:, 3] = c_dot[5] + c_dot[6 : self._shape]
         return r_dot.ravel()
 
-    def specimen(self, apart_m: float) -> Array:
+    def specimen(self, separation_m: float) -> Array:
         c = np.zeros(self.size)
         distance = np.linalg.norm(self.t_C[:, None] - self.t_C, axis=2)[np.triu_indices(self.n, 1)].min()
         radius_m = math.sqrt(float((self.t_C**2).sum()) / self.n)
-        c[self._shape] = radius_m * max(apart_m / max(float(distance), LENGTH_MIN_M) - 1.0, 0.0)
-        c[2] = float(np.abs(self._points_C(c)).max()) + apart_m
+        c[self._shape] = radius_m * max(separation_m / max(float(distance), LENGTH_MIN_M) - 1.0, 0.0)
+        c[2] = float(np.abs(self._points_C(c)).max()) + separation_m
         return c
 
     def spread(self, c: Array) -> float:

@@ -76,7 +76,7 @@ def test_a_battery_has_the_colour_of_its_alarm(percent: float, colour: str):
 
 def test_many_formations_leave_room_for_the_emergency_button():
     html = console_tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
-    assert console_tables.FEW_LINES in html
+    assert console_tables.LIMITED_HEIGHT in html
     assert html.count("<br>") == 15
     assert has_terms(without_tags(html), "taking off", "&lt;waits&gt")
 

@@ -78,7 +78,7 @@ def test_long_trails_are_thinned_out_consistently(count: int):
 
 
 def test_trails_of_a_record_cover_all_pieces_that_were_read():
-    trails, here = CanvasTrails(1, around=True), np.array([(100.0, 0.0, 1.0)])
+    trails, here = CanvasTrails(1, is_replay=True), np.array([(100.0, 0.0, 1.0)])
     for t_s in (*np.arange(60.0, 80.0, 0.25), *np.arange(0.0, 20.0, 0.25)):  # one piece, then an earlier one
         trails.add(t_s, np.array([(t_s, 0.0, 1.0)]))
     trails.choose_length(30.0)
@@ -94,9 +94,9 @@ def test_trails_of_a_record_cover_all_pieces_that_were_read():
 # Curves
 
 
-def curve(*points: tuple[float, float, float, Any], around: bool = False) -> VariableHistory:
+def curve(*points: tuple[float, float, float, Any], is_replay: bool = False) -> VariableHistory:
     """Return the history of one variable, with points (t [s], desired, estimated, true)."""
-    history = VariableHistory(1, around)
+    history = VariableHistory(1, is_replay)
     for t_s, desired, estimated, true in points:
         history.add(t_s, (desired,), (estimated,), None if true is None else np.array([true]))
     return history
@@ -104,7 +104,7 @@ def curve(*points: tuple[float, float, float, Any], around: bool = False) -> Var
 
 def test_curves_of_a_record_surround_the_shown_instant():
     pieces = (*np.arange(100.0, 110.0, INTERVAL_S), *np.arange(80.0, 90.0, INTERVAL_S), 105.01)
-    history = curve(*((t_s, t_s, t_s, None) for t_s in pieces), around=True)
+    history = curve(*((t_s, t_s, t_s, None) for t_s in pieces), is_replay=True)
     t, desired, *_ = history.curves(0, angular=False, span_s=60.0, at_s=95.0)
     assert (t[0], t[-1], len(t)) == (80.0, 109.75, 80)
     assert (desired == t).all()
@@ -143,7 +143,7 @@ def test_a_wrapping_angle_breaks_the_curve_but_not_its_error():
     assert np.isnan(desired[2])
     assert desired[3] == pytest.approx(math.degrees(3.3) - 360)
     apart = curve(*((float(k), 3.1, yaw, yaw - 0.1) for k, yaw in enumerate((3.0, 3.1, -3.1))))
-    _, desired, estimated, true = apart.curves(0, angular=True, less=0)
+    _, desired, estimated, true = apart.curves(0, angular=True, subtracted=0)
     assert desired == pytest.approx([0.0, 0.0, 0.0])
     assert np.radians(estimated) == pytest.approx([-0.1, 0.0, math.tau - 6.2])
     assert np.radians(true) == pytest.approx([-0.2, -0.1, math.tau - 6.3])

@@ -63,7 +63,7 @@ def test_radio_links_are_lines_between_present_drones():
 
 
 def test_many_names_are_shown_by_their_numbers_if_these_are_unambiguous():
-    many = range(10, 10 + pic.LARGE_MAX + 1)
+    many = range(10, 10 + pic.FULL_NAMES_MAX + 1)
     assert pic.shown_names([f"drone{i}" for i in many]) == [str(i) for i in many]
     assert pic.shown_names(["drone1", "drone2"]) == ["drone1", "drone2"]  # few enough for full names
     for names in (["drone", *(f"drone{i}" for i in many)], [*(f"{'abcdefghijklmn'[i % 14]}{i}" for i in many)]):

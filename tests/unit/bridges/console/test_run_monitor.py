@@ -251,7 +251,7 @@ def test_a_dead_estimator_is_not_shown_as_healthy(monitored: MonitoredRun):
     shown = monitored.words.sensor_table("drone1")
     assert has_terms(without_tags(shown), "no estimate", "2.0 s")
     assert "Hz" not in shown
-    assert not monitored.views.estimates()["drone1"].fresh
+    assert not monitored.views.estimates()["drone1"].is_fresh
     assert monitored.state()["drones"][0]["sigma_m"] is None
 
 
@@ -270,7 +270,7 @@ def test_an_estimate_is_fresh_by_its_time_or_by_its_arrival(
     monitored.wall_s += waited_s
     monitored.deliver(drones(round(seen_s * S)))
     found = monitored.views.estimates().get("drone1")
-    assert (found and found.fresh) == fresh
+    assert (found and found.is_fresh) == fresh
     assert monitored.words.drone_rows()[0].drone.lag_ms == (None if fresh is None else 0.0)
 
 
@@ -360,24 +360,24 @@ def test_the_obstacle_distance_is_that_to_the_nearest_obstacle():
     wall = Surface(name="wall", triangles=packed(np.array([[4.4, -9, 0, 4.4, 9, 0, 4.4, 0, 19]], dtype=float)))
     meter = FlightMeter(Environment(obstacles=poles, surfaces=[wall]))
     meter.update(view(0.0, 5.0))
-    assert meter.figures["drone1"].obstacle_m == pytest.approx(0.6, abs=1e-6)
+    assert meter.metrics["drone1"].obstacle_m == pytest.approx(0.6, abs=1e-6)
     meter.update(view(0.1, 5.6))
-    assert meter.figures["drone1"].obstacle_m == pytest.approx(1.2, abs=1e-6)
+    assert meter.metrics["drone1"].obstacle_m == pytest.approx(1.2, abs=1e-6)
 
 
 def test_flight_figures_are_derived_from_past_positions():
     meter = FlightMeter(Environment())
     for step in range(10):
         meter.update(view(0.1 * step, 0.2 * step))
-    figures = meter.figures["drone1"]
+    figures = meter.metrics["drone1"]
     assert figures.speed_m_s == pytest.approx(math.hypot(2.0, 1.0))
     assert figures.climb_m_s == pytest.approx(1.0)
     assert figures.heading_deg == pytest.approx(90.0)
-    assert (figures.battery_left_s, figures.obstacle_m) == (None, None)
+    assert (figures.battery_remaining_s, figures.obstacle_m) == (None, None)
     meter.update(view(40.0, 0.0, 70.0))
-    assert meter.figures["drone1"].battery_left_s == pytest.approx(70.0 / 0.25)
+    assert meter.metrics["drone1"].battery_remaining_s == pytest.approx(70.0 / 0.25)
     meter.update(view(1.0, 50.0))  # a replay that goes back restarts the figures
-    assert meter.figures["drone1"].speed_m_s == 0.0
+    assert meter.metrics["drone1"].speed_m_s == 0.0
 
 
 # The time of a replay
@@ -462,7 +462,7 @@ def test_a_record_is_read_around_the_shown_instant_nearest_first():
     assert read(515.0) == [600.0]
     assert read(5.0)[0] == 0.0
     assert read(505.0)[0] == 500.0  # too far from the shown instant to be kept
-    assert made.take() == [(500.0, 509.875)]
+    assert made.pop_instants() == [(500.0, 509.875)]
 
 
 # What faults did

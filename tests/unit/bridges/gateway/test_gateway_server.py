@@ -69,7 +69,7 @@ def test_a_lost_link_is_back_before_another_run_ends_its_run(gateway: Gateway, l
     first = a_run("first")
     gateway._begin(first)
     gateway._notify_link(first, False)
-    gateway._end(first, another=True)
+    gateway._end(first, has_successor=True)
     gateway._notify_link(first, True)  # the late report of the link itself
     assert [state for state, _ in log.states] == ["begun", "lost", "back", "ended"]
 
