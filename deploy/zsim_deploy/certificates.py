@@ -36,7 +36,9 @@ from zsim_deploy.inventory import InventoryFile
 
 AUTHORITY_DAYS = 1825  # lifetime of an authority, 5 years; its key never leaves the machine where it was made
 AUTHORITY_KEY = "ca.key"
-BACK = timedelta(days=1)  # certificates are back-dated by this, because clocks of hosts in the field may be hours off
+BACKDATE = timedelta(
+    days=1
+)  # certificates are back-dated by this, because clocks of hosts in the field may be hours off
 EXPIRED = "expired on"  # start of a fault text; a date follows
 OPERATORS = "operators"  # folder, in place of HOST, for operators without a host in the inventory
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -68,13 +70,13 @@ class Authority(NamedTuple):
     key: ec.EllipticCurvePrivateKey
 
 
-def folder_of(placed: InventoryFile) -> Path:
-    return placed.folder / Path(placed.inventory.security.certificates).expanduser()
+def folder_of(inventory_file: InventoryFile) -> Path:
+    return inventory_file.folder / Path(inventory_file.inventory.security.certificates).expanduser()
 
 
-def init_command(placed: InventoryFile, renew: bool = False) -> str:
+def init_command(inventory_file: InventoryFile, renew: bool = False) -> str:
     """Return the command that makes the certificates of an inventory."""
-    return f"zsim certs init {placed.word} --scenario FILE{' --renew' if renew else ''}"
+    return f"zsim certs init {inventory_file.shell_path} --scenario FILE{' --renew' if renew else ''}"
 
 
 def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
@@ -83,28 +85,28 @@ def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
     `force`: create a new one, which invalidates all earlier certificates. Raise RunError if the authority is
     incomplete, has expired, or cannot be read or written.
     """
-    place, key_place = folder / AUTHORITY, folder / AUTHORITY_KEY
-    existing = [path for path in (place, key_place) if path.exists()]
+    certificate_path, key_path = folder / AUTHORITY, folder / AUTHORITY_KEY
+    existing = [path for path in (certificate_path, key_path) if path.exists()]
     if force or not existing:
         return _make_authority(folder, now)
     if len(existing) == 1:
-        missing = key_place if existing == [place] else place
+        missing = key_path if existing == [certificate_path] else certificate_path
         raise RunError(
             f"{missing}: is missing beside {existing[0].name}; copy it here, or --force makes a new authority"
         )
     try:
-        with file_fault(key_place, "cannot be read", "run this as the user who made it"):
-            key = serialization.load_pem_private_key(key_place.read_bytes(), password=None)
+        with file_fault(key_path, "cannot be read", "run this as the user who made it"):
+            key = serialization.load_pem_private_key(key_path.read_bytes(), password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-        raise RunError(f"{key_place}: is not a private key; --force makes a new authority") from error
+        raise RunError(f"{key_path}: is not a private key; --force makes a new authority") from error
     if (
         not isinstance(key, ec.EllipticCurvePrivateKey)
         or (certificate := root(folder)).public_key() != key.public_key()
     ):
-        raise RunError(f"{key_place}: is not the key of {place.name}; --force makes a new authority")
+        raise RunError(f"{key_path}: is not the key of {certificate_path.name}; --force makes a new authority")
     if now >= certificate.not_valid_after_utc:
         day = certificate.not_valid_after_utc.date()
-        raise RunError(f"{place}: the authority expired on {day}; --force makes a new one")
+        raise RunError(f"{certificate_path}: the authority expired on {day}; --force makes a new one")
     return Authority(certificate, key)
 
 
@@ -124,22 +126,22 @@ def _make_authority(folder: Path, now: datetime) -> Authority:
     return Authority(certificate, key)
 
 
-def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
+def issue(folder: Path, signer: Authority, request: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
     """Make the key and certificate of a process on a host; return their folder."""
     purposes = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]  # a router is both
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key())
-    key, builder = _key_and_builder(_name(wanted.process), signer.certificate.subject, now, days)
+    key, builder = _key_and_builder(_name(request.process), signer.certificate.subject, now, days)
     certificate = (
         builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-        .add_extension(x509.SubjectAlternativeName(list(_alternative_names(wanted.addresses))), critical=False)
+        .add_extension(x509.SubjectAlternativeName(list(_alternative_names(request.addresses))), critical=False)
         .add_extension(issuer, critical=False)
         .sign(signer.key, hashes.SHA256())
     )
-    place = folder / wanted.host / wanted.process
+    process_folder = folder / request.host / request.process
     for file, content in zip(CERTIFICATES, (_pem(signer.certificate), _pem(certificate), _key_pem(key)), strict=True):
-        write(place / file, content)
-    return place
+        write(process_folder / file, content)
+    return process_folder
 
 
 def _key_and_builder(
@@ -148,7 +150,7 @@ def _key_and_builder(
     key = ec.generate_private_key(ec.SECP256R1())
     builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
     builder = builder.serial_number(x509.random_serial_number())
-    return key, builder.not_valid_before(now - BACK).not_valid_after(now + timedelta(days=days))
+    return key, builder.not_valid_before(now - BACKDATE).not_valid_after(now + timedelta(days=days))
 
 
 def _name(text: str) -> x509.Name:
@@ -174,13 +176,13 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def write(path: Path, content: bytes) -> None:
     """Write a file atomically, readable by its owner alone."""
-    fresh = path.with_name(f".{path.name}.new")
+    temporary = path.with_name(f".{path.name}.new")
     with file_fault(path, "cannot be written", "give another folder"):
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        fresh.unlink(missing_ok=True)
-        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        temporary.unlink(missing_ok=True)
+        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(content)
-        fresh.replace(path)
+        temporary.replace(path)
 
 
 def root(folder: Path) -> Root:
@@ -191,9 +193,11 @@ def root(folder: Path) -> Root:
 def show(folder: Path, now: datetime) -> list[CertificateStatus]:
     statuses = []
     for path in sorted(folder.glob(f"*/*/{CERTIFICATE}")):
-        certificate, place = _load(path), path.parent
-        fault, until = _fault(place, certificate, root(folder), now) or "", certificate.not_valid_after_utc
-        statuses.append(CertificateStatus(place.parent.name, place.name, _addresses(certificate), until, fault))
+        certificate, process_folder = _load(path), path.parent
+        fault, until = _fault(process_folder, certificate, root(folder), now) or "", certificate.not_valid_after_utc
+        statuses.append(
+            CertificateStatus(process_folder.parent.name, process_folder.name, _addresses(certificate), until, fault)
+        )
     return statuses
 
 
@@ -205,25 +209,25 @@ def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
             yield name if host == OPERATORS else f"{name}@{host}"
 
 
-def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
+def renewal_reason(folder: Path, signer: Root, request: CertificateRequest, now: datetime) -> str | None:
     """Return why a certificate must be made; None if a valid one and its key exist."""
-    place = folder / wanted.host / wanted.process
-    if not all((place / name).exists() for name in CERTIFICATES):
+    process_folder = folder / request.host / request.process
+    if not all((process_folder / name).exists() for name in CERTIFICATES):
         return "new"
     try:
-        certificate = x509.load_pem_x509_certificate((place / CERTIFICATE).read_bytes())
+        certificate = x509.load_pem_x509_certificate((process_folder / CERTIFICATE).read_bytes())
     except (OSError, ValueError):
         return "cannot be read"
-    if fault := _fault(place, certificate, signer, now):
+    if fault := _fault(process_folder, certificate, signer, now):
         return fault
-    due = {str(name.value) for name in _alternative_names(wanted.addresses)}
-    return None if set(_addresses(certificate)) == due else "other addresses"
+    expected = {str(name.value) for name in _alternative_names(request.addresses)}
+    return None if set(_addresses(certificate)) == expected else "other addresses"
 
 
-def _fault(place: Path, certificate: x509.Certificate, signer: Root, now: datetime) -> str | None:
+def _fault(process_folder: Path, certificate: x509.Certificate, signer: Root, now: datetime) -> str | None:
     """Return the fault of a certificate or of the files beside it, for instance after an interrupted `certs init`."""
     try:
-        authority_pem, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
+        authority_pem, key = (process_folder / AUTHORITY).read_bytes(), (process_folder / KEY).read_bytes()
         public = serialization.load_pem_private_key(key, password=None).public_key()
     except (OSError, ValueError, TypeError, UnsupportedAlgorithm):
         return "cannot be read"
@@ -254,66 +258,72 @@ def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
     return tuple(str(name.value) for name in names)
 
 
-def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
+def certificate_faults(
+    inventory_file: InventoryFile, hosts_by_process: Mapping[str, str] | None, now: datetime
+) -> list[str]:
     """Return a line for each fault of a run's certificates and access control.
 
-    `places`: host of each process to start, with or without routers; None: check only the world and the routers.
+    `hosts_by_process`: host of each process to start, with or without routers; None: only the world and the routers.
     """
-    if placed.inventory.security.insecure:
+    if inventory_file.inventory.security.insecure:
         return []
-    folder = folder_of(placed)
-    if places is None:
-        places = inv.spread(placed.inventory.roles, [WORLD])
-    routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
-    names: dict[str, list[str]] = {}
+    folder = folder_of(inventory_file)
+    if hosts_by_process is None:
+        hosts_by_process = inv.spread(inventory_file.inventory.roles, [WORLD])
+    routers = {f"{ROUTER}.{name}": router.host for name, router in inventory_file.inventory.routers.items()}
+    processes_by_fault: dict[str, list[str]] = {}
     try:
         if not (folder / AUTHORITY).exists():
-            remedy = f"make them with `{init_command(placed)}`, or set security.insecure on a network of your own"
+            remedy = (
+                f"make them with `{init_command(inventory_file)}`, or set security.insecure on a network of your own"
+            )
             return [f"{folder}: has no certificates; {remedy}"]
         signer = root(folder)
-        for name, host in {**places, **routers}.items():
-            wanted = CertificateRequest(host, name, (placed.inventory.hosts[host].address,))
+        for name, host in {**hosts_by_process, **routers}.items():
+            request = CertificateRequest(host, name, (inventory_file.inventory.hosts[host].address,))
             listens = name == WORLD or name in routers
-            why, fault = renewal_reason(folder, signer, wanted, now), None
-            if why == "new":
+            reason, fault = renewal_reason(folder, signer, request, now), None
+            if reason == "new":
                 fault = "certificate missing"
-            elif why == "other addresses":
+            elif reason == "other addresses":
                 fault = "certificate for other addresses" if listens else None  # a client's addresses are not checked
-            elif why:
-                fault = f"certificate {why}"
+            elif reason:
+                fault = f"certificate {reason}"
             elif listens and not (folder / host / f"{name}.access.json").exists():
                 fault = "access control missing"
             if fault:
-                names.setdefault(fault, []).append(f"{name} on {host}")
+                processes_by_fault.setdefault(fault, []).append(f"{name} on {host}")
     except RunError as error:
         return [str(error)]
     except OSError as error:
         return [f"{folder}: cannot be read ({error.strerror}); run this as the user who made it"]
     lines = []
-    for fault, who in names.items():
-        more = f" and {len(who) - SHOWN_MAX} more" if len(who) > SHOWN_MAX else ""
-        remedy = f"make them with `{init_command(placed, renew=EXPIRED in fault)}`"
-        lines.append(f"{folder}: {fault}: {', '.join(who[:SHOWN_MAX])}{more}; {remedy}")
+    for fault, processes in processes_by_fault.items():
+        further = f" and {len(processes) - SHOWN_MAX} more" if len(processes) > SHOWN_MAX else ""
+        remedy = f"make them with `{init_command(inventory_file, renew=EXPIRED in fault)}`"
+        lines.append(f"{folder}: {fault}: {', '.join(processes[:SHOWN_MAX])}{further}; {remedy}")
     return lines
 
 
-def exposed_keys(placed: InventoryFile) -> str | None:
+def exposed_keys(inventory_file: InventoryFile) -> str | None:
     """Return a warning about private keys that other users can read; None if there are none."""
-    if placed.inventory.security.insecure:
+    if inventory_file.inventory.security.insecure:
         return None
-    folder = folder_of(placed)
+    folder = folder_of(inventory_file)
     exposed = []
     for path in (folder / AUTHORITY_KEY, *folder.glob(f"*/*/{KEY}")):
         with suppress(OSError):
             exposed += [path] if path.stat().st_mode & READABLE_BY_OTHERS else []
     if not exposed:
         return None
-    more = f" and {len(exposed) - 1} more private keys" if len(exposed) > 1 else ""
-    return f"{min(exposed)}{more} can be read by other users of this machine; chmod -R go= {shlex.quote(str(folder))}"
+    further = f" and {len(exposed) - 1} more private keys" if len(exposed) > 1 else ""
+    return (
+        f"{min(exposed)}{further} can be read by other users of this machine; chmod -R go= {shlex.quote(str(folder))}"
+    )
 
 
 def enrolment(
-    placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()
+    inventory_file: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()
 ) -> tuple[list[CertificateRequest], list[tuple[str, str, dict[str, Any]]]]:
     """Return the required certificates, and the (host, process, access control) of every listening process.
 
@@ -327,46 +337,55 @@ def enrolment(
         InventoryError: a process has no host, or the host of an operator is unknown.
         BadNameError: a name is not allowed by the contract.
     """
-    hosts, routers = placed.inventory.hosts, placed.inventory.routers
-    places = inv.placement(placed, scenario)
-    people: dict[tuple[str, str | None], None] = {}  # (name, host) of the operators, in order
+    hosts, routers = inventory_file.inventory.hosts, inventory_file.inventory.routers
+    hosts_by_process = inv.placement(inventory_file, scenario)
+    operator_hosts: dict[tuple[str, str | None], None] = {}  # (name, host) of the operators, in order
     for name, at, host in (text.partition("@") for text in operators):
         name = keys.name(name.removeprefix(f"{OPERATOR}."), OPERATOR)
         if at and host not in hosts:
-            known = f"must be one of hosts: {', '.join(hosts)}"
-            raise InventoryError([f"{placed.source}: operator {name!r} is at {host!r}; {known}"])
-        people[f"{OPERATOR}.{name}", host or None] = None
+            hint = f"must be one of hosts: {', '.join(hosts)}"
+            raise InventoryError([f"{inventory_file.source}: operator {name!r} is at {host!r}; {hint}"])
+        operator_hosts[f"{OPERATOR}.{name}", host or None] = None
     # Any host may run any process of the scenario, and any driver, even one that the scenario does not expect.
-    movable = [name for name in places if name != WORLD]
-    movable += [name for name in drivers_of(scenario) if name not in places]
-    wanted = [(places[WORLD], WORLD), *((router.host, f"{ROUTER}.{name}") for name, router in routers.items())]
-    wanted += [(host, name) for name in movable for host in hosts]
-    wanted += [(host or OPERATORS, name) for name, host in people]
-    requests = [CertificateRequest(at, name, (hosts[at].address,) if at in hosts else ()) for at, name in wanted]
+    movable = [name for name in hosts_by_process if name != WORLD]
+    movable += [name for name in drivers_of(scenario) if name not in hosts_by_process]
+    required = [
+        (hosts_by_process[WORLD], WORLD),
+        *((router.host, f"{ROUTER}.{name}") for name, router in routers.items()),
+    ]
+    required += [(host, name) for name in movable for host in hosts]
+    required += [(host or OPERATORS, name) for name, host in operator_hosts]
+    requests = [CertificateRequest(at, name, (hosts[at].address,) if at in hosts else ()) for at, name in required]
 
     def operators_at(router: str | None) -> list[str]:
-        return list(dict.fromkeys(who for who, at in people if (hosts[at].router if at else None) == router))
+        return list(
+            dict.fromkeys(
+                operator
+                for operator, operator_host in operator_hosts
+                if (hosts[operator_host].router if operator_host else None) == router
+            )
+        )
 
     def clients_of(router: str) -> list[str]:
         """Return the processes that may connect to a router: every role if it has hosts, as any role can move there."""
         has_hosts = any(host.router == router for host in hosts.values())
         return [*(movable if has_hosts else []), *operators_at(router)]
 
-    def lower(router: str | None) -> list[str]:
+    def downstream(router: str | None) -> list[str]:
         return [name for name, below in routers.items() if below.upstream == router]
 
-    def behind(router: str) -> list[str]:
-        return [*clients_of(router), *(process for name in lower(router) for process in behind(name))]
+    def processes_behind(router: str) -> list[str]:
+        return [*clients_of(router), *(process for name in downstream(router) for process in processes_behind(name))]
 
     def below(router: str | None) -> dict[str, list[str]]:
         """Return the routers that connect to a router, or to the world (None), with the processes behind each."""
-        return {f"{ROUTER}.{name}": processes for name in lower(router) if (processes := behind(name))}
+        return {f"{ROUTER}.{name}": processes for name in downstream(router) if (processes := processes_behind(name))}
 
     rules = access_control(scenario, [*movable, *operators_at(None)], below(None))
-    access = [(places[WORLD], WORLD, rules)]
+    access = [(hosts_by_process[WORLD], WORLD, rules)]
     for name, router in routers.items():
-        above = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
-        rules = access_control(scenario, clients_of(name), below(name), [above])
+        upstream = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
+        rules = access_control(scenario, clients_of(name), below(name), [upstream])
         access.append((router.host, f"{ROUTER}.{name}", rules))
     return requests, access
 
@@ -405,11 +424,13 @@ def access_control(
         above: name of the world or the router to which the listening process itself connects, if any.
     """
     granted = {name: rights.rights_for(name, scenario) for name in clients}
-    for name, behind in routers.items():
-        granted[name] = rights.combined(rights.rights_for(process, scenario) for process in behind)
+    for name, processes in routers.items():
+        granted[name] = rights.combined(rights.rights_for(process, scenario) for process in processes)
     granted |= dict.fromkeys(above, rights.ALL_RIGHTS)
     entries = [(name, _rules(name, right, scenario.federation)) for name, right in granted.items()]
-    queries = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ACCESS_QUERY]
+    queries = [
+        _rule(ANYONE, (flow,), (message,), (keys.access("*"),), scenario.federation) for flow, message in _ACCESS_QUERY
+    ]
     subjects = [{"id": name, "cert_common_names": [name]} for name, _ in entries]
     entries.append((ANYONE, queries))
     return {
@@ -425,7 +446,11 @@ def _rules(name: str, right: Rights, federation: str) -> list[dict[str, Any]]:
     if right == rights.ALL_RIGHTS:
         return [_rule(name, ("ingress", "egress"), _MESSAGES, rights.EVERYTHING, federation)]
     granted = [(flow, messages, getattr(right, field)) for flow, messages, field in _WIRE]
-    rules = [_rule(name, (flow,), messages, which, federation) for flow, messages, which in granted if which]
+    rules = [
+        _rule(name, (flow,), messages, expressions, federation)
+        for flow, messages, expressions in granted
+        if expressions
+    ]
     return [*rules, _rule(name, ("egress",), _DECLARATIONS, rights.EVERYTHING, federation)]
 
 

@@ -49,9 +49,9 @@ def rerun_in_environment(
     executable = str(python or sys.executable)
     environment = _environment(executable, lock, needs, note)
     options = [*(["--commands-only"] if commands_only else []), *(["--trust"] if trust else [])]
-    words = [str(_python_of(environment)), SAFE_PATH, "-m", "zsim_deploy", "rerun", str(bundle.resolve()), *options]
+    command = [str(_python_of(environment)), SAFE_PATH, "-m", "zsim_deploy", "rerun", str(bundle.resolve()), *options]
     note(f"flying it again in {environment}")
-    return subprocess.run(words, env=_clean(), check=False).returncode
+    return subprocess.run(command, env=_clean(), check=False).returncode
 
 
 def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: Callable[[str], None]) -> Path:
@@ -59,15 +59,15 @@ def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: C
     version = _output([python, "-c", "import sys; print(sys.version)"], f"{python}: is not a Python interpreter")
     name, origin = str(checkout() or ""), ""
     if not name:
-        name, separator, rest = requirement(distribution(PROJECT)).partition(" @ ")
-        name, origin = (PROJECT, f" @ {rest}") if separator else (PROJECT, name.removeprefix(PROJECT))
-    wanted = [f"{name}[{','.join(EXTRAS)}]{origin}", *needs]
-    key = hashlib.sha256(json.dumps([python, version, __version__, wanted, list(lock)]).encode()).hexdigest()
+        name, separator, url = requirement(distribution(PROJECT)).partition(" @ ")
+        name, origin = (PROJECT, f" @ {url}") if separator else (PROJECT, name.removeprefix(PROJECT))
+    requirements = [f"{name}[{','.join(EXTRAS)}]{origin}", *needs]
+    key = hashlib.sha256(json.dumps([python, version, __version__, requirements, list(lock)]).encode()).hexdigest()
     folder = default_cache() / "environments" / key[:KEY_DIGITS]
     with file_fault(folder, "cannot be created", "set XDG_CACHE_HOME to a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "lock").open("a") as held:
-            if not take_lock(held):
+        with (folder / "lock").open("a") as lock_file:
+            if not take_lock(lock_file):
                 raise RunError(f"{folder}: another command is creating this environment; wait for it to end")
             if not (folder / READY).exists():
                 note(f"creating an environment with {len(lock)} packages in {folder}")
@@ -75,8 +75,8 @@ def _environment(python: str, lock: Sequence[str], needs: Sequence[str], note: C
                 _output([python, "-m", "venv", str(folder / "venv")], f"{folder}: no environment can be created")
                 (folder / names.LOCK).write_text("".join(f"{line}\n" for line in lock), "utf-8")
                 pip = [str(_python_of(folder)), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
-                what = "the packages of the bundle cannot be installed with this Python"
-                _output([*pip, "-q", "--constraint", str(folder / names.LOCK), *wanted], f"{folder}: {what}")
+                fault = "the packages of the bundle cannot be installed with this Python"
+                _output([*pip, "-q", "--constraint", str(folder / names.LOCK), *requirements], f"{folder}: {fault}")
                 (folder / READY).touch()
     return folder
 
@@ -90,10 +90,10 @@ def _clean() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in LEFT_OUT}
 
 
-def _output(words: Sequence[str], fault: str) -> str:
+def _output(command: Sequence[str], fault: str) -> str:
     """Run a program and return its output; raise RunError with its last error line if it fails."""
     try:
-        done = subprocess.run(words, env=_clean(), capture_output=True, text=True, errors="replace", check=False)
+        done = subprocess.run(command, env=_clean(), capture_output=True, text=True, errors="replace", check=False)
     except OSError as error:
         raise RunError(f"{fault} ({error.strerror})") from error
     if done.returncode:

@@ -40,10 +40,12 @@ HOSTS_MAX = DRONES_MAX  # with more, some hosts would have no drone
 ROLES_MAX = PROCESSES_MAX  # each entry stands for at least one process
 ROUTER_PORT = 7448  # differs from ZENOH_PORT, for a world on the same host
 MODULE = (SAFE_PATH, "-m", "zsim_deploy.cli")  # arguments for the Python interpreter
-NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # extras by process name, in placement order
-OF_CAMERAS = ("camera", "detector")  # roles that a run waits for only if the scenario names them
+EXTRAS_BY_NAME = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # extras by process name, in placement order
+CAMERA_ROLES = ("camera", "detector")  # roles that a run waits for only if the scenario names them
 COMMANDS = {RECORDER: "record", "detector": "detect"}  # commands that are not named after their role
-KINDS = {f"{name}.": ROLES[name].extra for name in (*AGENTS, *OF_CAMERAS)}  # extras by prefix of the process name
+EXTRAS_BY_ROLE = {
+    f"{name}.": ROLES[name].extra for name in (*AGENTS, *CAMERA_ROLES)
+}  # extras by prefix of the process name
 MODULES = {  # module imported to check that an extra is installed; "": the installation without extras
     "": "zsim.transport.session",
     "agents": "zsim_agents.estimation.estimator",
@@ -114,7 +116,7 @@ class InventoryFile(NamedTuple):
     source: str
 
     @property
-    def word(self) -> str:
+    def shell_path(self) -> str:
         """Return the path of the file, quoted for a shell."""
         return shlex.quote(str(self.folder / self.source))
 
@@ -129,10 +131,10 @@ def load(path: Path) -> InventoryFile:
     return InventoryFile(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
 
 
-def insecure(placed: InventoryFile) -> InventoryFile:
+def insecure(inventory_file: InventoryFile) -> InventoryFile:
     """Return a copy of the inventory with `security: {insecure: true}`."""
-    security = msgspec.structs.replace(placed.inventory.security, insecure=True)
-    return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
+    security = msgspec.structs.replace(inventory_file.inventory.security, insecure=True)
+    return inventory_file._replace(inventory=msgspec.structs.replace(inventory_file.inventory, security=security))
 
 
 def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
@@ -143,15 +145,15 @@ def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
         value = document.get(name)
         return list(value.items()) if isinstance(value, dict) and len(value) <= ROLES_MAX else []
 
-    def unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
+    def unknown(path: str, name: Any, known: list[Any], kind: str) -> Iterator[Fault]:
         if isinstance(name, str) and name not in known:
-            yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'none defined'}"
+            yield path, f"is {name!r}; must be one of {kind}: {', '.join(map(str, known)) or 'none defined'}"
 
     hosts, routers = ([key for key, _ in entries(name)] for name in ("hosts", "routers"))
-    for key, wanted in entries("roles"):
-        for name in wanted if isinstance(wanted, list) else [wanted]:
+    for key, targets in entries("roles"):
+        for name in targets if isinstance(targets, list) else [targets]:
             yield from unknown(f"roles.{key}", name, hosts, "hosts")
-        if wanted == []:
+        if targets == []:
             yield f"roles.{key}", "names no host; must name at least one"
     upstream = {}
     for key, router in entries("routers"):
@@ -168,11 +170,11 @@ def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
     if isinstance(document.get("hosts"), dict) and not hosts:
         yield "hosts", "has 0 entries; must have at least 1"
     for start in upstream:
-        seen, at = {start}, upstream[start]
-        while at in upstream and at not in seen:
-            seen.add(at)
-            at = upstream[at]
-        if at == start:
+        visited, current = {start}, upstream[start]
+        while current in upstream and current not in visited:
+            visited.add(current)
+            current = upstream[current]
+        if current == start:
             yield f"routers.{start}.upstream", "leads back to itself; must lead to the world"
 
 
@@ -181,33 +183,33 @@ def roles(scenario: Scenario) -> list[str]:
     return [WORLD, RECORDER, *(name for name in expected_processes(scenario) if name != RECORDER)]
 
 
-def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
+def placement(inventory_file: InventoryFile, scenario: Scenario) -> dict[str, str]:
     """Return the host of every process, as assigned by `spread`.
 
     A program of the scenario may have no host: `zsim up` then starts it on the launcher's machine. Raises
     InventoryError if any other process has no host, an entry matches no process, or two processes listen on the same
     port.
     """
-    names, inventory = roles(scenario), placed.inventory
+    names, inventory = roles(scenario), inventory_file.inventory
     entries = inventory.roles
-    places = spread(entries, names)
+    hosts_by_process = spread(entries, names)
     lines = [
         f"roles has no host for {name}; add {name!r}"
         for name in names
-        if name not in {**places, **scenario.own_programs}
+        if name not in {**hosts_by_process, **scenario.own_programs}
     ]
     unused = [key for key in entries if not any(fnmatch.fnmatchcase(name, key) for name in names)]
     lines += [f"roles.{key} matches no process of {scenario.name!r}; it has {', '.join(names)}" for key in unused]
-    if WORLD in places:
-        first = {(places[WORLD], inventory.port): WORLD}
+    if WORLD in hosts_by_process:
+        listeners = {(hosts_by_process[WORLD], inventory.port): WORLD}
         for name, router in inventory.routers.items():
-            other = first.setdefault((router.host, router.port), f"{ROUTER}.{name}")
+            other = listeners.setdefault((router.host, router.port), f"{ROUTER}.{name}")
             if other != f"{ROUTER}.{name}":
-                taken = f"on which {other} listens on {router.host}"
-                lines.append(f"routers.{name}.port is {router.port}, {taken}; give another port")
+                conflict = f"on which {other} listens on {router.host}"
+                lines.append(f"routers.{name}.port is {router.port}, {conflict}; give another port")
     if lines:
-        raise InventoryError([f"{placed.source}: {line}" for line in lines])
-    return places
+        raise InventoryError([f"{inventory_file.source}: {line}" for line in lines])
+    return hosts_by_process
 
 
 def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
@@ -216,49 +218,52 @@ def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict
     A name takes precedence over a pattern, and a longer pattern over a shorter one. By default the recorder runs on the
     world's host.
     """
-    places: dict[str, str] = {}
-    turns: Counter[str] = Counter()
+    hosts_by_process: dict[str, str] = {}
+    next_indices: Counter[str] = Counter()
     for name in names:
         matching = [key for key in roles if fnmatch.fnmatchcase(name, key)]
         if matching:
             key = max(matching, key=lambda key: (key == name, len(key)))
             entry = roles[key]
             hosts = [entry] if isinstance(entry, str) else entry
-            places[name] = hosts[turns[key] % len(hosts)]
-            turns[key] += 1
-        elif name == RECORDER and WORLD in places:
-            places[name] = places[WORLD]
-    return places
+            hosts_by_process[name] = hosts[next_indices[key] % len(hosts)]
+            next_indices[key] += 1
+        elif name == RECORDER and WORLD in hosts_by_process:
+            hosts_by_process[name] = hosts_by_process[WORLD]
+    return hosts_by_process
 
 
-def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
+def endpoint(inventory_file: InventoryFile, hosts_by_process: dict[str, str], host: str) -> str:
     """Return the endpoint to which the roles on a host connect: that of their router or of the world."""
-    return listening(placed, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
+    return listening(
+        inventory_file,
+        *_listener(inventory_file.inventory, hosts_by_process, inventory_file.inventory.hosts[host].router),
+    )
 
 
-def listening(placed: InventoryFile, host: str, port: int) -> str:
+def listening(inventory_file: InventoryFile, host: str, port: int) -> str:
     """Return the endpoint of a process that listens on a host, with the address at which other hosts reach it."""
-    address = placed.inventory.hosts[host].address
-    shown = f"[{address}]" if ":" in address else address
-    return f"{'tcp' if placed.inventory.security.insecure else 'tls'}/{shown}:{port}"
+    address = inventory_file.inventory.hosts[host].address
+    host_text = f"[{address}]" if ":" in address else address
+    return f"{'tcp' if inventory_file.inventory.security.insecure else 'tls'}/{host_text}:{port}"
 
 
-def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
+def connections(inventory_file: InventoryFile, hosts_by_process: dict[str, str]) -> dict[tuple[str, int], set[str]]:
     """Return, by host and port of the listening process, the other hosts whose roles or routers connect to it."""
-    inventory = placed.inventory
-    links = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
+    inventory = inventory_file.inventory
+    links = [(host, inventory.hosts[host].router) for name, host in hosts_by_process.items() if name != WORLD]
     links += [(router.host, router.upstream) for router in inventory.routers.values()]
     sources: dict[tuple[str, int], set[str]] = {}
-    for source, above in links:
-        target = _listener(inventory, places, above)
+    for source, upstream in links:
+        target = _listener(inventory, hosts_by_process, upstream)
         if target[0] != source:
             sources.setdefault(target, set()).add(source)
     return sources
 
 
-def _listener(inventory: Inventory, places: dict[str, str], router: str | None) -> tuple[str, int]:
+def _listener(inventory: Inventory, hosts_by_process: dict[str, str], router: str | None) -> tuple[str, int]:
     if router is None:
-        return places[WORLD], inventory.port
+        return hosts_by_process[WORLD], inventory.port
     return inventory.routers[router].host, inventory.routers[router].port
 
 
@@ -308,12 +313,12 @@ class ProcessFiles(NamedTuple):
     out: str  # folder for the record
 
 
-def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
+def processes(inventory_file: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
     """Return the processes that zsim can start: the world, the recorder, agents, cameras, then routers.
 
     `pace`: command-line options that set the world's pace. Raises InventoryError as `placement` does.
     """
-    inventory, places = placed.inventory, placement(placed, scenario)
+    inventory, hosts_by_process = inventory_file.inventory, placement(inventory_file, scenario)
 
     def planned(name: str, host: str, words: Iterable[str], thing: str | None, port: int | None) -> PlannedProcess:
         death = on_death(scenario.processes.on_death, name)
@@ -322,54 +327,61 @@ def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (
     def role(name: str, host: str) -> PlannedProcess:
         role, _, thing = name.partition(".")
         if name == WORLD:
-            listen = listening(placed, host, inventory.port)
+            listen = listening(inventory_file, host, inventory.port)
             return planned(name, host, (WORLD, "--listen", listen, "--expect", RECORDER, *pace), None, inventory.port)
-        reach = ("--connect", endpoint(placed, places, host), "--federation", scenario.federation)
+        reach = ("--connect", endpoint(inventory_file, hosts_by_process, host), "--federation", scenario.federation)
         words = (COMMANDS.get(role, role), *reach)
         if role in scenario.own_agents:
             return planned(name, host, ("agent", *reach), name, None)
-        if role in OF_CAMERAS:
+        if role in CAMERA_ROLES:
             words = (*words, "--name", name)
             thing = thing if thing in {drone.name for drone in scenario.drones} else ""  # empty: all with a camera
         return planned(name, host, words, thing or None, None)
 
     def router(name: str) -> PlannedProcess:
         host, port = inventory.routers[name].host, inventory.routers[name].port
-        upstream = listening(placed, *_listener(inventory, places, inventory.routers[name].upstream))
-        words = (ROUTER, "--listen", listening(placed, host, port), "--connect", upstream)
-        more = ("--federation", scenario.federation, *([REALTIME] if REALTIME in pace else []))
-        return planned(f"{ROUTER}.{name}", host, (*words, *more), name, port)
+        upstream = listening(inventory_file, *_listener(inventory, hosts_by_process, inventory.routers[name].upstream))
+        words = (ROUTER, "--listen", listening(inventory_file, host, port), "--connect", upstream)
+        options = ("--federation", scenario.federation, *([REALTIME] if REALTIME in pace else []))
+        return planned(f"{ROUTER}.{name}", host, (*words, *options), name, port)
 
-    ours = [role(name, host) for name, host in places.items() if _is_known(name, scenario)]
+    role_processes = [role(name, host) for name, host in hosts_by_process.items() if _is_known(name, scenario)]
 
     def depth(name: str) -> int:
-        above = inventory.routers[name].upstream
-        return 0 if above is None else 1 + depth(above)
+        parent = inventory.routers[name].upstream
+        return 0 if parent is None else 1 + depth(parent)
 
-    return ours + [router(name) for name in sorted(inventory.routers, key=lambda name: (depth(name), name))]
+    return role_processes + [router(name) for name in sorted(inventory.routers, key=lambda name: (depth(name), name))]
 
 
-def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
+def own_programs(inventory_file: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
     """Return a line about each of the user's own programs, with its command.
 
     `host`: only programs placed on that host; None: all, including those without a host.
     """
-    places = placement(placed, scenario)
-    own = [(name, at, f" on {at}") for name, at in places.items() if not _is_known(name, scenario)]
-    own += [(name, places[WORLD], "") for name in (programs_here(placed, scenario) if host is None else ())]
+    hosts_by_process = placement(inventory_file, scenario)
+    found = [
+        (name, program_host, f" on {program_host}")
+        for name, program_host in hosts_by_process.items()
+        if not _is_known(name, scenario)
+    ]
+    found += [
+        (name, hosts_by_process[WORLD], "")
+        for name in (local_programs(inventory_file, scenario) if host is None else ())
+    ]
     remarks = []
-    for name, at, where in own:
-        if host in (None, at):
-            reach = endpoint(placed, places, at)
-            what = f"{name}{where} is a program of your own: start it yourself; it connects to {reach}"
-            remarks.append(what + _command_text(name, scenario, reach))
+    for name, program_host, where in found:
+        if host in (None, program_host):
+            address = endpoint(inventory_file, hosts_by_process, program_host)
+            text = f"{name}{where} is a program of your own: start it yourself; it connects to {address}"
+            remarks.append(text + _command_text(name, scenario, address))
     return remarks
 
 
-def programs_here(placed: InventoryFile, scenario: Scenario) -> list[str]:
+def local_programs(inventory_file: InventoryFile, scenario: Scenario) -> list[str]:
     """Return the names of a scenario's programs without a host; `zsim up` starts them on this machine."""
-    places = placement(placed, scenario)
-    return [name for name in programs(scenario) if name not in places]
+    hosts_by_process = placement(inventory_file, scenario)
+    return [name for name in programs(scenario) if name not in hosts_by_process]
 
 
 def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
@@ -381,7 +393,7 @@ def _command_text(name: str, scenario: Scenario, endpoint: str) -> str:
 
 
 def _is_known(name: str, scenario: Scenario) -> bool:
-    return name in (WORLD, RECORDER, *agent_names(scenario)) or name.partition(".")[0] in OF_CAMERAS
+    return name in (WORLD, RECORDER, *agent_names(scenario)) or name.partition(".")[0] in CAMERA_ROLES
 
 
 def command(process: PlannedProcess, files: ProcessFiles) -> list[str]:
@@ -409,8 +421,8 @@ def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
 
 
 def extras(names: Sequence[str]) -> list[str]:
-    named = {NAMED[name] for name in names if name in NAMED}
-    return sorted(named | {extra for name in names for kind, extra in KINDS.items() if name.startswith(kind)})
+    named = {EXTRAS_BY_NAME[name] for name in names if name in EXTRAS_BY_NAME}
+    return sorted(named | {extra for name in names for kind, extra in EXTRAS_BY_ROLE.items() if name.startswith(kind)})
 
 
 def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:
@@ -420,17 +432,17 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
     programs need no extra.
     """
     extras_by_host: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
-    for process, host in spread(inventory.roles, NAMED).items():
-        extras_by_host[host].add(NAMED[process])
+    for process, host in spread(inventory.roles, EXTRAS_BY_NAME).items():
+        extras_by_host[host].add(EXTRAS_BY_NAME[process])
     for pattern, entry in inventory.roles.items():
         for host in [entry] if isinstance(entry, str) else entry:
-            extras_by_host[host].update(extra for kind, extra in KINDS.items() if _can_match(pattern, kind))
+            extras_by_host[host].update(extra for kind, extra in EXTRAS_BY_ROLE.items() if _can_match(pattern, kind))
     return {name: frozenset(extras) for name, extras in extras_by_host.items()}
 
 
 def _can_match(pattern: str, kind: str) -> bool:
     """Whether a pattern can match a name with the prefix `kind`."""
-    if kind.removesuffix(".") in OF_CAMERAS:
+    if kind.removesuffix(".") in CAMERA_ROLES:
         return pattern.startswith(kind)  # these roles exist only where they are named
     literal = pattern[: min((pattern.find(sign) for sign in "*?[" if sign in pattern), default=len(pattern))]
     return literal.startswith(kind) or (literal != pattern and kind.startswith(literal))

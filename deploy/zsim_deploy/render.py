@@ -56,27 +56,37 @@ FINAL_CODES = [USER_FAULT, SUPERSEDED]  # exit codes after which no restart help
 # systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops them together
 
 
-def systemd(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+def systemd(inventory_file: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
     """Return the files `HOST/zsim-PROCESS.service` and `HOST/zsim.target`, and the scenario for the world's host.
 
     The options are those of systemd.exec(5) and systemd.service(5), without MemoryDenyWriteExecute (numba compiles) and
     ProcSubset (libraries read /proc/cpuinfo). `pace`: command-line options that set the world's pace. Raises
     InventoryError if a process has no host, or if a host has no user, or a relative path to its interpreter.
     """
-    planned, hosts = inv.processes(placed, scenario, pace), placed.inventory.hosts
-    _refuse(placed, [f"hosts.{name}.{text}" for name in inv.used_hosts(planned) for text in _lacks(hosts[name])])
+    planned, hosts = inv.processes(inventory_file, scenario, pace), inventory_file.inventory.hosts
+    _refuse(
+        inventory_file,
+        [f"hosts.{name}.{text}" for name in inv.used_hosts(planned) for text in _host_faults(hosts[name])],
+    )
     texts: Rendered = {}
     for name in inv.used_hosts(planned):
-        here = inv.on_host(planned, name)
-        texts |= {f"{name}/{process.unit}": _service(scenario, process, hosts[name], here) for process in here}
-        values = {"scenario": scenario.name, "host": name, "units": " ".join(process.unit for process in here)}
-        texts[f"{name}/zsim.target"] = _text("zsim.target", values, inv.own_programs(placed, scenario, name))
-        if any(process.name == WORLD for process in here):
+        local_processes = inv.on_host(planned, name)
+        texts |= {
+            f"{name}/{process.unit}": _service(scenario, process, hosts[name], local_processes)
+            for process in local_processes
+        }
+        values = {
+            "scenario": scenario.name,
+            "host": name,
+            "units": " ".join(process.unit for process in local_processes),
+        }
+        texts[f"{name}/zsim.target"] = _text("zsim.target", values, inv.own_programs(inventory_file, scenario, name))
+        if any(process.name == WORLD for process in local_processes):
             texts[f"{name}/scenario.yaml"] = scenario_file.to_text(scenario)
     return texts
 
 
-def _lacks(host: Host) -> Iterator[str]:
+def _host_faults(host: Host) -> Iterator[str]:
     if host.user is None:
         yield "user is missing; must be the user that the units run as; add it"
     elif not _home(host.user):
@@ -101,10 +111,10 @@ def _absolute(host: Host, path: str) -> str:
     return path if path.startswith("/") else f"{_home(host.user)}/{path.removeprefix('~/')}"
 
 
-def _service(scenario: Scenario, process: PlannedProcess, host: Host, here: Sequence[PlannedProcess]) -> str:
+def _service(scenario: Scenario, process: PlannedProcess, host: Host, local_processes: Sequence[PlannedProcess]) -> str:
     """Return the unit of a process; units stop in reverse order: the world first, which ends the run, routers last."""
     rank = {ROUTER: 0, WORLD: 2}
-    earlier = [each.unit for each in here if rank.get(each.role, 1) < rank.get(process.role, 1)]
+    earlier = [each.unit for each in local_processes if rank.get(each.role, 1) < rank.get(process.role, 1)]
     folder = _absolute(host, host.folder)
     files = ProcessFiles(
         scenario=f"{folder}/scenario.yaml",
@@ -147,25 +157,25 @@ def _systemd_word(text: str) -> str:
 # Docker Compose: a folder per host
 
 
-def compose(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+def compose(inventory_file: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
     """Return the files `HOST/compose.yaml` and `HOST/Dockerfile`, and the scenario for the world's host.
 
     `pace`: command-line options that set the world's pace. Raises InventoryError if a process has no host.
     """
-    planned = inv.processes(placed, scenario, pace)
+    planned = inv.processes(inventory_file, scenario, pace)
     head, (project,) = _yaml_template("compose.yaml")
     service = project["services"]["process"]
     texts: Rendered = {}
     for host in inv.used_hosts(planned):
-        here = inv.on_host(planned, host)
+        local_processes = inv.on_host(planned, host)
         values = {"project": scenario.federation.replace(".", "-").lstrip("-_") or "zsim"}  # allowed: a-z, 0-9, - and _
-        services = {process.name: _compose_service(service, scenario, process) for process in here}
-        remarks = [*_filled(head, {"restarts_max": RESTARTS_MAX}), *_unused(placed, host)]
-        remarks += [f"# {line}" for line in inv.own_programs(placed, scenario, host)]
+        services = {process.name: _compose_service(service, scenario, process) for process in local_processes}
+        remarks = [*_filled(head, {"restarts_max": RESTARTS_MAX}), *_unused(inventory_file, host)]
+        remarks += [f"# {line}" for line in inv.own_programs(inventory_file, scenario, host)]
         filled = {**_filled({**project, "services": {}}, values), "services": services}
         texts[f"{host}/compose.yaml"] = _dump(remarks, [filled])
-        texts[f"{host}/Dockerfile"] = _dockerfile(here)
-        if any(process.name == WORLD for process in here):
+        texts[f"{host}/Dockerfile"] = _dockerfile(local_processes)
+        if any(process.name == WORLD for process in local_processes):
             texts[f"{host}/scenario.yaml"] = scenario_file.to_text(scenario)
     return texts
 
@@ -202,8 +212,8 @@ def _mounted(process: PlannedProcess) -> set[str]:
     return {name for name, is_used in uses.items() if is_used}
 
 
-def _unused(placed: InventoryFile, host: str) -> list[str]:
-    described = placed.inventory.hosts[host]
+def _unused(inventory_file: InventoryFile, host: str) -> list[str]:
+    described = inventory_file.inventory.hosts[host]
     defaults = Host(address=described.address)
     names = [name for name in ("folder", "python") if getattr(described, name) != getattr(defaults, name)]
     return [f"# hosts.{host}: {', '.join(names)} not used; the image has its own"] if names else []
@@ -212,22 +222,24 @@ def _unused(placed: InventoryFile, host: str) -> list[str]:
 def _dockerfile(planned: Sequence[PlannedProcess]) -> str:
     """Return the Dockerfile of an image with the extras that processes need; zsim's wheel must lie beside it."""
     extras = inv.extras([process.name for process in planned])
-    wanted = f"[{','.join(extras)}]" if extras else ""
-    return _text("Dockerfile", {**IN_A_CONTAINER, "wheel": WHEEL, "base": BASE, "extras": wanted})
+    extras_text = f"[{','.join(extras)}]" if extras else ""
+    return _text("Dockerfile", {**IN_A_CONTAINER, "wheel": WHEEL, "base": BASE, "extras": extras_text})
 
 
 # Kubernetes: roles end with the run, so they are Jobs; a router does not, so it is a Deployment
 
 
-def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
+def kubernetes(
+    inventory_file: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE
+) -> Rendered:
     """Return the files `namespace.yaml`, `zsim.yaml`, `records.yaml`, a Dockerfile, and with TLS also `secrets.sh`.
 
     The hosts must be named like the Kubernetes nodes, which must find the Dockerfile's image under the name `image`.
     `pace`: command-line options that set the world's pace. Raises InventoryError if a process has no host, Kubernetes
     does not allow a name, or the scenario is too large.
     """
-    planned, text = inv.processes(placed, scenario, pace), scenario_file.to_text(scenario)
-    _refuse(placed, _kubernetes_faults(planned, text))
+    planned, text = inv.processes(inventory_file, scenario, pace), scenario_file.to_text(scenario)
+    _refuse(inventory_file, _kubernetes_faults(planned, text))
     shared = {**IN_A_CONTAINER, "space": label(scenario.federation), "image": image}
     head, manifests = _yaml_template("kubernetes/zsim.yaml")
     by_kind = {manifest["kind"]: manifest for manifest in manifests}
@@ -237,24 +249,24 @@ def kubernetes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = 
         _filled(by_kind["Service"], {**shared, "labels": _labels(world), "port": world.port}),
         *(_role_manifest(by_kind, shared, process) for process in planned),
     ]
-    address = placed.inventory.hosts[world.host].address
+    address = inventory_file.inventory.hosts[world.host].address
     certified = f"# The world's certificate is for {address}: over TLS use that address, not the name of the Service."
     remarks = [*head, *([certified] if world.secure else [])]
-    remarks += [line for host in inv.used_hosts(planned) for line in _unused(placed, host)]
-    remarks += [f"# {line}" for line in inv.own_programs(placed, scenario)]
+    remarks += [line for host in inv.used_hosts(planned) for line in _unused(inventory_file, host)]
+    remarks += [f"# {line}" for line in inv.own_programs(inventory_file, scenario)]
     texts = {"namespace.yaml": "", "zsim.yaml": _dump(remarks, objects), "records.yaml": ""}
     for name in ("namespace.yaml", "records.yaml"):
-        head, lasting = _yaml_template(f"kubernetes/{name}")
-        texts[name] = _dump(head, _filled(lasting, shared))
+        head, documents = _yaml_template(f"kubernetes/{name}")
+        texts[name] = _dump(head, _filled(documents, shared))
     texts["Dockerfile"] = _dockerfile(planned)
-    if not placed.inventory.security.insecure:
-        puts = []  # lines that copy the certificates of `zsim certs init` into Kubernetes
+    if not inventory_file.inventory.security.insecure:
+        commands = []  # lines that copy the certificates of `zsim certs init` into Kubernetes
         for process in planned:
             files = [f'--from-file="$certs/{process.host}/{process.name}"']
             if process.port is not None:
                 files.append(f'--from-file=access.json="$certs/{process.host}/{inv.access_file(process)}"')
-            puts.append(f"put certs-{label(process.name)} {' '.join(files)}")
-        texts["secrets.sh"] = _text("kubernetes/secrets.sh", {**shared, "puts": "\n".join(puts)})
+            commands.append(f"put certs-{label(process.name)} {' '.join(files)}")
+        texts["secrets.sh"] = _text("kubernetes/secrets.sh", {**shared, "puts": "\n".join(commands)})
     return texts
 
 
@@ -280,8 +292,8 @@ def label(name: str) -> str:
 
 
 def _labels(process: PlannedProcess) -> dict[str, str]:
-    about = {"name": "zsim", "component": process.role, "instance": label(process.name)}
-    return {f"app.kubernetes.io/{key}": value for key, value in about.items()}
+    values_by_key = {"name": "zsim", "component": process.role, "instance": label(process.name)}
+    return {f"app.kubernetes.io/{key}": value for key, value in values_by_key.items()}
 
 
 def _role_manifest(by_kind: Mapping[str, Any], shared: Mapping[str, Any], process: PlannedProcess) -> Any:
@@ -311,9 +323,9 @@ def _role_manifest(by_kind: Mapping[str, Any], shared: Mapping[str, Any], proces
     return _filled(by_kind[kind], {**values, "pod": pod})
 
 
-def _refuse(placed: InventoryFile, lines: Sequence[str]) -> None:
+def _refuse(inventory_file: InventoryFile, lines: Sequence[str]) -> None:
     if lines:
-        raise InventoryError([f"{placed.source}: {line}" for line in lines])
+        raise InventoryError([f"{inventory_file.source}: {line}" for line in lines])
 
 
 def _template(name: str) -> tuple[list[str], str]:
@@ -397,18 +409,18 @@ def write(out: Path, target: str, texts: Mapping[str, str], force: bool = False)
     lines: list[str] = []
     with file_fault(out, "cannot be written", OTHER_OUT), contextlib.suppress(FileNotFoundError):
         lines = record.read_text(encoding="utf-8", errors="replace").splitlines()
-    former = {name: known for known, _, name in (line.partition("  ") for line in lines) if name}  # digests, by path
+    previous = {name: known for known, _, name in (line.partition("  ") for line in lines) if name}  # digests, by path
     if not force:
         for name, text in texts.items():
-            path, known = root / name, (former.get(name, ""), digest(text.encode()))
+            path, known = root / name, (previous.get(name, ""), digest(text.encode()))
             if path.exists() and not has_digest(path, known):
-                why = "was not rendered, or was changed since"
-                raise RunError(f"{path}: {why}; give --out another folder, or --force to replace it")
-    stale = [name for name in former if name not in texts and is_inside(name) and (root / name).is_file()]
+                reason = "was not rendered, or was changed since"
+                raise RunError(f"{path}: {reason}; give --out another folder, or --force to replace it")
+    stale = [name for name in previous if name not in texts and is_inside(name) and (root / name).is_file()]
     for name in stale:
-        if not has_digest(root / name, (former[name],)):
-            why = "was rendered earlier, and changed since"
-            raise RunError(f"{root / name}: {why}; remove it, or give --out another folder")
+        if not has_digest(root / name, (previous[name],)):
+            reason = "was rendered earlier, and changed since"
+            raise RunError(f"{root / name}: {reason}; remove it, or give --out another folder")
     for path in (root / name for name in stale):
         with file_fault(path, "cannot be removed", OTHER_OUT):
             path.unlink(missing_ok=True)

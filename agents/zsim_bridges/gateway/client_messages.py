@@ -170,7 +170,7 @@ class MessageDefaults:
 # JSON
 
 
-def is_sound(key: str, payload: bytes) -> bool:
+def is_valid(key: str, payload: bytes) -> bool:
     """Return whether a payload is a message of the contract for its key; on other keys, any payload is valid."""
     try:
         return messages.type_of(key) is None or messages.decode(key, payload) is not None

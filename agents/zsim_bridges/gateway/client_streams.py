@@ -24,7 +24,7 @@ FLUSH_S = 2.0  # time limit for sending the remaining lines once a connection en
 LINES_PER_TURN = 100  # consecutive lines of one client after which other tasks of the loop may run
 LINE_MAX = 1_000_000  # size limit of a request [bytes]
 HEARTBEAT_S = 20.0  # wall; period of the pings that detect a WebSocket whose client is gone
-ALIVE_S = 10.0  # wall; silence after which a stream sends a sign of life, to detect a client that is gone
+KEEPALIVE_S = 10.0  # wall; silence after which a stream sends a sign of life, to detect a client that is gone
 LINGER_S = 10.0  # wall; how long a camera's subscription outlives its last client: some request single pictures
 BOUNDARY = "zsim-picture"
 PICTURE_HEADERS = {"Cache-Control": "no-store", "Access-Control-Allow-Origin": "*"}
@@ -37,22 +37,22 @@ _SOCKET_OPTIONS = (
     (socket.IPPROTO_TCP, "TCP_USER_TIMEOUT", 15_000),  # ms without an acknowledgement of sent data
 )
 
-Half = Coroutine[Any, Any, None]
+StreamCoroutine = Coroutine[Any, Any, None]
 
 
 class Outbox:
     """A queue of lines for one client. When full, it drops the oldest lines; dropping an answer ends the connection.
 
     Args:
-        cut: ends the connection at once.
+        abort: ends the connection at once.
         lost_line: returns the line that reports how many values were dropped.
         bytes_max: limit of the total size of the waiting lines.
     """
 
     def __init__(
-        self, cut: Callable[[], None], lost_line: Callable[[int], bytes], bytes_max: int = OUTBOX_BYTES_MAX
+        self, abort: Callable[[], None], lost_line: Callable[[int], bytes], bytes_max: int = OUTBOX_BYTES_MAX
     ) -> None:
-        self._cut = cut
+        self._abort = abort
         self._lost_line = lost_line
         self._lines: deque[tuple[bytes, bool]] = deque()
         self._bytes = 0
@@ -73,7 +73,7 @@ class Outbox:
             self._lost += 1
             if not was_droppable:
                 self._closed = True
-                self._cut()
+                self._abort()
         self._filled.set()
 
     def close(self) -> None:
@@ -86,12 +86,12 @@ class Outbox:
         while not self._lines and not self._closed:
             await self._filled.wait()
             self._filled.clear()
-        taken = [self._lost_line(self._lost)] if self._lost else []
-        taken += [line for line, _ in self._lines]
+        lines = [self._lost_line(self._lost)] if self._lost else []
+        lines += [line for line, _ in self._lines]
         self._lost = 0
         self._lines.clear()
         self._bytes = 0
-        return taken
+        return lines
 
 
 class StreamHandler(Protocol):
@@ -106,14 +106,16 @@ ClientFactory = Callable[[Outbox, bool], StreamHandler]
 """Creates the client of a connection from its outbox and whether it is authenticated; may refuse it."""
 
 
-async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], cut: Callable[[], None]) -> None:
+async def run_duplex(
+    reading: StreamCoroutine, sending: StreamCoroutine, finish: Callable[[], None], abort: Callable[[], None]
+) -> None:
     """Read and send concurrently until either ends; then send the rest.
 
     Args:
         reading: ends with the client's last request.
         sending: ends when nothing remains to be sent.
         finish: ends the client, so that sending ends.
-        cut: ends the connection at once if the client does not receive the rest.
+        abort: ends the connection at once if the client does not receive the rest.
     """
     reader, sender = asyncio.create_task(reading), asyncio.create_task(sending)
     try:
@@ -123,9 +125,9 @@ async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], c
     finally:
         finish()
         if not sender.done():
-            cut()
-        for half in (reader, sender):
-            half.cancel()
+            abort()
+        for task in (reader, sender):
+            task.cancel()
         await asyncio.gather(reader, sender, return_exceptions=True)
 
 
@@ -140,8 +142,8 @@ async def serve_lines(
     new_client: ClientFactory, authenticated: bool, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
 ) -> None:
     """Serve a TCP connection until it ends; if `authenticated`, the client needs no token."""
-    cut = writer.transport.abort
-    outbox = Outbox(cut, _lost_line)
+    abort = writer.transport.abort
+    outbox = Outbox(abort, _lost_line)
     raw = writer.get_extra_info("socket")
     for level, name, value in _SOCKET_OPTIONS:
         if raw is not None and hasattr(socket, name):
@@ -155,7 +157,7 @@ async def serve_lines(
                 await writer.drain()
 
     with suppress(asyncio.CancelledError):  # the gateway exits
-        await run_duplex(_read_lines(client, reader), send(), client.close, cut)
+        await run_duplex(_read_lines(client, reader), send(), client.close, abort)
     writer.close()
 
 
@@ -190,8 +192,8 @@ async def serve_websocket(request: web.Request, new_client: ClientFactory) -> we
     """Serve a WebSocket until it ends: each text message is a line. Its request has already been authenticated."""
     websocket = web.WebSocketResponse(max_msg_size=LINE_MAX, heartbeat=HEARTBEAT_S)
     await websocket.prepare(request)
-    cut = _cutter(request)
-    outbox = Outbox(cut, _lost_line)
+    abort = _abort_of(request)
+    outbox = Outbox(abort, _lost_line)
     client = new_client(outbox, True)
 
     async def read() -> None:
@@ -206,11 +208,11 @@ async def serve_websocket(request: web.Request, new_client: ClientFactory) -> we
                 for line in lines:
                     await websocket.send_str(line[:-1].decode())
 
-    await run_duplex(read(), send(), client.close, cut)
+    await run_duplex(read(), send(), client.close, abort)
     return websocket
 
 
-def _cutter(request: web.Request) -> Callable[[], None]:
+def _abort_of(request: web.Request) -> Callable[[], None]:
     return request.transport.abort if request.transport is not None else lambda: None
 
 
@@ -228,7 +230,7 @@ async def stream_events(
     For errors see `SharedSubscriptions.subscribe_stream`.
     """
     lost = b": %d events were lost, since they came faster than they were read\n\n"
-    outbox = Outbox(_cutter(request), lambda count: lost % count)
+    outbox = Outbox(_abort_of(request), lambda count: lost % count)
 
     def put(sample: RawSample) -> None:
         if event := event_of(sample):
@@ -241,7 +243,7 @@ async def stream_events(
         await response.prepare(request)
         while True:
             try:
-                chunk = b"".join(await asyncio.wait_for(outbox.take(), ALIVE_S))
+                chunk = b"".join(await asyncio.wait_for(outbox.take(), KEEPALIVE_S))
             except TimeoutError:
                 chunk = b": still here\n\n"
             await response.write(chunk)
@@ -277,7 +279,7 @@ class PictureFeed:
         self.watchers = 0  # number of clients
         self.stop: Callable[[], None] = lambda: None
 
-    def take(self, sample: RawSample) -> None:
+    def receive(self, sample: RawSample) -> None:
         try:
             image: CameraImage = messages.decode(self._key, sample.payload)
         except DecodeError as error:
@@ -288,11 +290,11 @@ class PictureFeed:
         arrived, self._arrived = self._arrived, asyncio.Event()
         arrived.set()
 
-    async def after(self, number: int, within_s: float) -> NumberedPicture | None:
+    async def wait_after(self, number: int, timeout_s: float) -> NumberedPicture | None:
         """Return the newest picture if it comes after `number`, otherwise the next; None if none arrives in time."""
         if self.newest is None or self.newest.number <= number:
             try:
-                await asyncio.wait_for(self._arrived.wait(), within_s)
+                await asyncio.wait_for(self._arrived.wait(), timeout_s)
             except TimeoutError:
                 return None
         return self.newest
@@ -316,7 +318,7 @@ class PictureFeeds:
         feed = self._feeds.get(key)
         if feed is None:
             feed = PictureFeed(key, self._refuse)
-            feed.stop = self._subscribe(key, feed.take)
+            feed.stop = self._subscribe(key, feed.receive)
             self._feeds[key] = feed
         feed.watchers += 1
         try:
@@ -332,7 +334,7 @@ class PictureFeeds:
             del self._feeds[key]
             feed.stop()
 
-    def forget(self) -> None:
+    def clear_pictures(self) -> None:
         """Drop the newest pictures, as another run begins."""
         for feed in self._feeds.values():
             feed.newest = None
@@ -347,7 +349,8 @@ async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.Stream
         await response.write(b"--%b\r\n" % BOUNDARY.encode())
         number = -1
         while request.transport is not None and not request.transport.is_closing():
-            picture = await feed.after(number, ALIVE_S) or feed.newest  # repeated, to detect a client that is gone
+            # The newest picture is repeated, to detect a client that is gone.
+            picture = await feed.wait_after(number, KEEPALIVE_S) or feed.newest
             if picture is not None:
                 number = picture.number
                 await response.write(picture_part(picture.image))
@@ -358,8 +361,8 @@ async def stream_pictures(request: web.Request, feed: PictureFeed) -> web.Stream
 
 def picture_part(image: CameraImage) -> bytes:
     """Return a picture as a part with the boundary after it, for which browsers wait before they show the part."""
-    kind = f"Content-Type: image/jpeg\r\nContent-Length: {len(image.data)}\r\n"
-    head = f"{kind}X-Timestamp: {exposure_s(image)}\r\n\r\n"
+    headers = f"Content-Type: image/jpeg\r\nContent-Length: {len(image.data)}\r\n"
+    head = f"{headers}X-Timestamp: {exposure_s(image)}\r\n\r\n"
     return b"%b%b\r\n--%b\r\n" % (head.encode(), image.data, BOUNDARY.encode())
 
 

@@ -47,12 +47,12 @@ CLIENTS_MAX = 500  # number of concurrent streams
 UNAUTHENTICATED_MAX = 100  # number of concurrent unauthenticated connections
 HELLO_TIMEOUT_S = 5.0  # time limit for a client to present its token
 DRAIN_S = 2.0  # after the end of a run, how long agents may still answer their last gates
-FAULTS_REPORTED_MAX = 100  # number of distinct errors that are printed
+ERRORS_REPORTED_MAX = 100  # number of distinct errors that are printed
 PICTURES_WAITING_MAX = 4  # number of waiting messages per camera; each may take megabytes
 RELEASE_TIMEOUT_S = 1.0  # ample: the world answers within milliseconds
 STREAM_RATE_HZ = 5_000.0  # requests per wall second on one stream; a loop in step with the fastest run makes 2 500
 STREAM_BURST = 10_000.0
-BYE_TIMEOUT_S = 2.0  # how long shutdown waits for the agents to leave
+LEAVE_TIMEOUT_S = 2.0  # how long shutdown waits for the agents to leave
 SUBSCRIPTIONS_MAX = 100  # number per client; `drone/*/truth` counts as one
 ANSWER_MAX = OUTBOX_BYTES_MAX  # size limit of an answer [bytes]
 PENDING_MAX = 8  # number of unanswered requests per client
@@ -108,7 +108,7 @@ class Gateway:
         self._say = say
         self._run: RunAccess | None = None
         self._link_lost = False
-        self._reported_faults: set[str] = set()
+        self._reported_errors: set[str] = set()
         self._clients: set[Client] = set()
         self._unauthenticated: dict[Client, None] = {}  # unauthenticated clients, in order of connection
         self._lockstep_threads: set[threading.Thread] = set()
@@ -121,20 +121,20 @@ class Gateway:
             raise NoWorldError("there is no run now; the gateway waits for the next")
         return self._run
 
-    def start_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
-        """Run a client's lockstep session on a link of its own until it ends; then call `ended` with the reason."""
+    def start_lockstep(self, session: LockstepSession, on_end: Callable[[str], None]) -> None:
+        """Run a client's lockstep session on a link of its own until it ends; then call `on_end` with the reason."""
         for client in self._clients:
             client.lose_lockstep(session, "another client took the name")
-        thread = threading.Thread(target=self._run_lockstep, args=(session, ended), name=session.name, daemon=True)
+        thread = threading.Thread(target=self._run_lockstep, args=(session, on_end), name=session.name, daemon=True)
         self._lockstep_threads.add(thread)
         thread.start()
 
-    def _run_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
+    def _run_lockstep(self, session: LockstepSession, on_end: Callable[[str], None]) -> None:
         reason = "the gateway failed"
         try:
             with self._dial(session.name) as (link, info):
-                left, lost = (lambda: session.has_left), (lambda: session.connection_lost)
-                reason = Runner(link, info, session, left, self._say, lost).run()
+                has_left, is_lost = (lambda: session.has_left), (lambda: session.connection_lost)
+                reason = Runner(link, info, session, has_left, self._say, is_lost).run()
         except ZsimError as error:
             reason = str(error)
         except Exception as error:  # an internal error: the client must not wait forever
@@ -143,7 +143,7 @@ class Gateway:
             self._say(f"{session.name}: left, {'its client is gone' if session.connection_lost else reason}")
             self._lockstep_threads.discard(threading.current_thread())
             with suppress(RuntimeError):  # the gateway has ended
-                self.loop.call_soon_threadsafe(ended, reason)
+                self.loop.call_soon_threadsafe(on_end, reason)
 
     def report(self, text: str) -> None:
         """Print an internal error of the gateway."""
@@ -207,19 +207,19 @@ class Gateway:
     def _begin(self, run: RunAccess) -> None:
         self._run, self._link_lost = run, False
         self.subscriptions.attach(run.link)
-        self._full_key_subscriptions.attach(run.bare_link)
+        self._full_key_subscriptions.attach(run.unprefixed_link)
         self._picture_subscriptions.attach(run.link)
-        self._pictures.forget()
+        self._pictures.clear_pictures()
         self._notify_clients("begun", run)
 
-    def _end(self, run: RunAccess, another: bool = False) -> None:
-        """End a run for the clients; `another`: another run has begun, so the link is restored."""
+    def _end(self, run: RunAccess, has_successor: bool = False) -> None:
+        """End a run for the clients; `has_successor`: another run has begun, so the link is restored."""
 
         def end_lockstep_sessions() -> None:
             for client in self._clients:
                 client.end_lockstep(run, RUN_ENDED)
 
-        if another:
+        if has_successor:
             self._notify_link(run, True)
         self._run = None
         self.subscriptions.detach()
@@ -233,19 +233,19 @@ class Gateway:
             client.notify_run(state, run.info.run_id)
 
     def _observe_link(self, run: RunAccess) -> None:
-        def on_link(up: bool) -> None:
+        def on_link(is_up: bool) -> None:
             with suppress(RuntimeError):  # called in a Zenoh thread, perhaps after the gateway has ended
-                self.loop.call_soon_threadsafe(self._notify_link, run, up)
+                self.loop.call_soon_threadsafe(self._notify_link, run, is_up)
 
         run.link.on_link(on_link)
         if not run.link.links():  # the link was lost before it was observed, so no event follows
             on_link(False)
 
-    def _notify_link(self, run: RunAccess, up: bool) -> None:
+    def _notify_link(self, run: RunAccess, is_up: bool) -> None:
         """Notify clients that the link is lost or restored, but not if the world exits after its run has ended."""
-        if run is self._run and up == self._link_lost:
-            self._link_lost = not up
-            self._notify_clients("back" if up else "lost", run)
+        if run is self._run and is_up == self._link_lost:
+            self._link_lost = not is_up
+            self._notify_clients("back" if is_up else "lost", run)
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Print an error that no client receives, each text once: a flood of connections causes a flood of errors."""
@@ -257,8 +257,8 @@ class Gateway:
         self._report_once(reason)
 
     def _report_once(self, text: str) -> None:
-        if text not in self._reported_faults and len(self._reported_faults) < FAULTS_REPORTED_MAX:
-            self._reported_faults.add(text)
+        if text not in self._reported_errors and len(self._reported_errors) < ERRORS_REPORTED_MAX:
+            self._reported_errors.add(text)
             self.report(text)
 
     # Servers
@@ -291,9 +291,9 @@ class Gateway:
 
     async def _close(self, site: ServedSite, lines: asyncio.Server) -> None:
         def join_all(threads: list[threading.Thread]) -> None:
-            end_s = time.monotonic() + BYE_TIMEOUT_S
+            deadline_s = time.monotonic() + LEAVE_TIMEOUT_S
             for thread in threads:
-                thread.join(max(0.0, end_s - time.monotonic()))
+                thread.join(max(0.0, deadline_s - time.monotonic()))
 
         lines.close()
         for client in list(self._clients):
@@ -431,8 +431,8 @@ class Client:
 
     def _latest(self, request: client_messages.LatestRequest) -> None:
         check_expression(request.key)
-        last = self._gateway.run().values
-        entries = [json_entry(key, payload, last.encoding(key)) for key, payload in last.matching(request.key)]
+        values = self._gateway.run().values
+        entries = [json_entry(key, payload, values.encoding(key)) for key, payload in values.matching(request.key)]
         self.send({"op": "latest", "values": entries}, request)
 
     def _put(self, request: client_messages.PutRequest) -> None:

@@ -69,7 +69,7 @@ METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"
 BYTES = "zenoh/bytes"  # the plugin's encoding for a body without Content-Type
-PICTURE_S = 2.0  # wall; time to wait for the first picture: twice the period of a slow camera
+PICTURE_TIMEOUT_S = 2.0  # wall; time to wait for the first picture: twice the period of a slow camera
 NO_PICTURE = "no picture yet; is a camera process publishing there, and is time running?"
 NO_VALUE = "no value yet; is the key right, and does a process publish it?"
 STREAM, DESCRIPTION, CAMERA = "/stream", "/openapi.json", "/camera/{drone}/{camera}"
@@ -77,8 +77,8 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _encode = msgspec.json.Encoder().encode
 _control_request = msgspec.json.Decoder(ControlRequest).decode
 JSON_PREFIX = "/json/"
-ONE_PICTURE = ".jpg"  # suffix of the path of a single picture
-DEFAULTED = ("t_ns", "seq", "source")  # fields that a client may leave out
+JPEG_SUFFIX = ".jpg"  # suffix of the path of a single picture
+DEFAULTED_FIELDS = ("t_ns", "seq", "source")  # fields that a client may leave out
 CONTROL_PATHS = ("world/control", "cluster/{cluster}/control", "drone/{drone}/control")
 _REF = "#/components/schemas/{name}"
 _OWN_KEY = {"type": "string", "pattern": "^[A-Za-z0-9_.-]{1,64}$"}  # schema of a client's own key; Zenoh accepts more
@@ -116,7 +116,7 @@ def application(access_check: "AccessCheck", trees: "KeyTrees", new_client: Clie
     """Return the web application of a gateway; `new_client` creates the client of a WebSocket."""
 
     async def index(request: web.Request) -> web.Response:
-        cameras = {"camera": "/camera/DRONE/CAMERA", "picture": f"/camera/DRONE/CAMERA{ONE_PICTURE}"}
+        cameras = {"camera": "/camera/DRONE/CAMERA", "picture": f"/camera/DRONE/CAMERA{JPEG_SUFFIX}"}
         paths = {"description": DESCRIPTION, "json": JSON_PREFIX, "stream": STREAM, **cameras}
         return web.json_response({"zsim": "gateway", **paths, "zenoh": "/FEDERATION/KEY"})
 
@@ -252,7 +252,7 @@ class KeyTrees:
             texts = ((sample.key or "ERROR", sample.payload.decode(errors="replace")) for sample in samples)
             items = "\n".join(f"<dt>{html.escape(key)}</dt>\n<dd>{html.escape(text)}</dd>\n" for key, text in texts)
             return web.Response(text=f"<dl>\n{items}\n</dl>\n", content_type="text/html")
-        return web.json_response([described_sample(sample) for sample in samples])
+        return web.json_response([sample_to_json(sample) for sample in samples])
 
     async def _query(self, request: web.Request, expression: str) -> list[RawSample]:
         body, run = await request.read(), self.run()
@@ -279,11 +279,11 @@ class KeyTrees:
         expression = _checked_key(request)
         if _first_accepted(request) == EVENT_STREAM:
             return await stream_events(request, self.subscriptions, expression, value_event)
-        last = self.run().values
-        entries = [json_entry(key, payload, last.encoding(key)) for key, payload in last.matching(expression)]
+        values = self.run().values
+        entries = [json_entry(key, payload, values.encoding(key)) for key, payload in values.matching(expression)]
         if "*" in expression:
-            return _as_json(entries)
-        return _as_json(entries[0]["value"]) if entries else error_response(404, f"{expression[:80]}: {NO_VALUE}")
+            return _json_response(entries)
+        return _json_response(entries[0]["value"]) if entries else error_response(404, f"{expression[:80]}: {NO_VALUE}")
 
     async def put_json(self, request: web.Request) -> web.Response:
         key, body = _checked_key(request), await request.read()
@@ -293,7 +293,7 @@ class KeyTrees:
             raise DecodeError(f"{key[:80]}: {error}; must be JSON") from error
         run = self.run()
         run.put(key, value, run.defaults)
-        return _as_json({})
+        return _json_response({})
 
     async def post_json(self, request: web.Request) -> web.Response:
         """Send a control request to the process that answers on a key."""
@@ -303,18 +303,18 @@ class KeyTrees:
         except REFUSALS as error:
             raise DecodeError(f"{key[:80]}: {error}; must be a JSON object with op and args") from error
         answer = await self.run().request(key, control.op, control.args, control.source or self.source)
-        return _as_json({"ok": answer.ok, "error": answer.error, "result": json_value(answer.result)})
+        return _json_response({"ok": answer.ok, "error": answer.error, "result": json_value(answer.result)})
 
     async def get_pictures(self, request: web.Request) -> web.StreamResponse:
         """Answer with all pictures from now on, or with only the newest one if the path ends with `.jpg`."""
         camera = request.match_info["camera"]
-        key = self.run().camera_key(request.match_info["drone"], camera.removesuffix(ONE_PICTURE))
+        key = self.run().camera_key(request.match_info["drone"], camera.removesuffix(JPEG_SUFFIX))
         self.limit.enter()
         try:
             with self.feeds.watched(key) as feed:
-                if not camera.endswith(ONE_PICTURE):
+                if not camera.endswith(JPEG_SUFFIX):
                     return await stream_pictures(request, feed)
-                picture = feed.newest or await feed.after(-1, PICTURE_S)
+                picture = feed.newest or await feed.wait_after(-1, PICTURE_TIMEOUT_S)
         finally:
             self.limit.leave()
         if picture is None:
@@ -374,7 +374,7 @@ def _first_accepted(request: web.Request) -> str:
 # Responses
 
 
-def described_sample(sample: RawSample) -> dict[str, Any]:
+def sample_to_json(sample: RawSample) -> dict[str, Any]:
     """Return an answer or a publication in the plugin's JSON format."""
     kind, payload = sample.encoding.partition(";")[0], sample.payload
     value: Any = base64.b64encode(payload).decode() if payload else None  # if invalid in its encoding
@@ -391,7 +391,7 @@ def described_sample(sample: RawSample) -> dict[str, Any]:
 
 @lru_cache(maxsize=CACHED_VALUES)
 def _sample_event(sample: RawSample) -> bytes:
-    return _event(sample.kind, json.dumps(described_sample(sample)).encode())
+    return _event(sample.kind, json.dumps(sample_to_json(sample)).encode())
 
 
 @lru_cache(maxsize=CACHED_VALUES)
@@ -409,7 +409,7 @@ def _event(kind: str, data: bytes) -> bytes:
     return b"event: %b\ndata: %b\n\n" % (kind.encode(), data)
 
 
-def _as_json(value: Any) -> web.Response:
+def _json_response(value: Any) -> web.Response:
     return web.Response(body=_encode(value), content_type="application/json")
 
 
@@ -428,16 +428,16 @@ def description() -> dict[str, Any]:
         get = {
             "summary": f"The last {name}, or with Accept: text/event-stream each one from now on",
             "description": kind.__doc__ or "",
-            "responses": _responses(_json({"$ref": _REF.format(name=name)})),
+            "responses": _responses(_json_content({"$ref": _REF.format(name=name)})),
         }
-        paths[f"{JSON_PREFIX}{path}"] = item = {"parameters": [_named(each) for each in names], "get": get}
+        paths[f"{JSON_PREFIX}{path}"] = item = {"parameters": [_name_parameter(each) for each in names], "get": get}
         if is_client_key(shape.replace("*", "any")):
             # Fields that the gateway fills in are optional for clients.
-            required = [field for field in schemas[name]["required"] if field not in DEFAULTED]
+            required = [field for field in schemas[name]["required"] if field not in DEFAULTED_FIELDS]
             schemas[f"{name}Sent"] = {**schemas[name], "required": required}
             item["put"] = {
-                "summary": f"Publish a {name}; {', '.join(DEFAULTED)} may be left out",
-                "requestBody": {"required": True, **_json({"$ref": _REF.format(name=f"{name}Sent")})},
+                "summary": f"Publish a {name}; {', '.join(DEFAULTED_FIELDS)} may be left out",
+                "requestBody": {"required": True, **_json_content({"$ref": _REF.format(name=f"{name}Sent")})},
                 "responses": _responses(text="published"),
             }
     refusal = {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
@@ -472,33 +472,33 @@ def _other_paths() -> dict[str, Any]:
     for key in CONTROL_PATHS:
         post = {
             "summary": "Send a control request; the answer says whether it was done",
-            "requestBody": {"required": True, **_json({"$ref": _REF.format(name="ControlRequest")})},
-            "responses": _responses(_json({"$ref": _REF.format(name="ControlAnswer")})),
+            "requestBody": {"required": True, **_json_content({"$ref": _REF.format(name="ControlRequest")})},
+            "responses": _responses(_json_content({"$ref": _REF.format(name="ControlAnswer")})),
         }
         paths[f"{JSON_PREFIX}{key}"] = {
-            "parameters": [_named("cluster")] if "{cluster}" in key else [],
+            "parameters": [_name_parameter("cluster")] if "{cluster}" in key else [],
             "post": post,
         }
 
-    anything = {"description": "a value, or for an expression a list of keys and values"}
+    any_value = {"description": "a value, or for an expression a list of keys and values"}
     paths[f"{JSON_PREFIX}{{key}}"] = {
         "parameters": [_parameter("key", _OWN_KEY)],
-        "get": {"summary": "The last value", "responses": _responses(_json(anything))},
+        "get": {"summary": "The last value", "responses": _responses(_json_content(any_value))},
         "put": {
             "summary": "Publish any JSON on a key of your own",
-            "requestBody": {"required": True, **_json({})},
+            "requestBody": {"required": True, **_json_content({})},
             "responses": _responses(text="published"),
         },
     }
 
     binary = {"schema": {"type": "string", "format": "binary"}}
     camera = _parameter("camera", {"type": "string", "enum": list(CAMERAS)})
-    for end, kind, text in (
+    for suffix, kind, text in (
         ("", "multipart/x-mixed-replace", "The pictures of a camera from now on"),
-        (ONE_PICTURE, "image/jpeg", "The newest picture of a camera"),
+        (JPEG_SUFFIX, "image/jpeg", "The newest picture of a camera"),
     ):
         get = {"summary": text, "responses": _responses({"content": {kind: binary}}, "JPEG")}
-        paths[f"/camera/{{drone}}/{{camera}}{end}"] = {"parameters": [_named("drone"), camera], "get": get}
+        paths[f"/camera/{{drone}}/{{camera}}{suffix}"] = {"parameters": [_name_parameter("drone"), camera], "get": get}
 
     entry = {
         "type": "object",
@@ -510,7 +510,7 @@ def _other_paths() -> dict[str, Any]:
             "timestamp": {"type": ["string", "null"]},
         },
     }
-    answered, done = _responses(_json({"type": "array", "items": entry})), _responses(text="done")
+    answered, done = _responses(_json_content({"type": "array", "items": entry})), _responses(text="done")
     body = {"content": {"*/*": binary}}
     examples = {"federation": "zsim", "key": "world/info"}
     paths["/{federation}/{key}"] = {
@@ -528,18 +528,18 @@ def _parameter(name: str, schema: dict[str, Any]) -> dict[str, Any]:
     return {"name": name, "in": "path", "required": True, "schema": schema}
 
 
-def _named(kind: str) -> dict[str, Any]:
+def _name_parameter(kind: str) -> dict[str, Any]:
     """Return the path parameter with the name of a process, a drone or a cluster."""
     length_max = 48 if kind in ("process", "estimates") else 32
     return _parameter(kind, {"type": "string", "pattern": f"^[a-z0-9_.-]{{1,{length_max}}}$"})
 
 
-def _json(schema: dict[str, Any]) -> dict[str, Any]:
+def _json_content(schema: dict[str, Any]) -> dict[str, Any]:
     return {"content": {"application/json": {"schema": schema}}}
 
 
 def _responses(content: dict[str, Any] | None = None, text: str = "answered") -> dict[str, Any]:
     """Return the responses of an operation: its answer, and the errors."""
-    errors = _json({"$ref": _REF.format(name="Refusal")})
+    errors = _json_content({"$ref": _REF.format(name="Refusal")})
     refusals = {str(status): {"description": text, **errors} for status, text in _ERRORS.items()}
     return {"200": {"description": text, **(content or {})}, **refusals}

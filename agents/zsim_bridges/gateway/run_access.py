@@ -38,7 +38,7 @@ from zsim_bridges.gateway.client_messages import (
     is_client_key,
     is_control_key,
     is_counted_key,
-    is_sound,
+    is_valid,
     json_to_payload,
 )
 
@@ -79,14 +79,14 @@ class RunAccess:
         self.info = info
         self.values = LastValues(run_key_table(info))
         self.defaults = MessageDefaults(observer.name)
-        self.bare_link = link.unprefixed()
+        self.unprefixed_link = link.unprefixed()
         self._observer = observer
         self._prefix = f"{link.federation}/"
         self._threads = ThreadPoolExecutor(REQUESTS_MAX, thread_name_prefix="ask")
         self._pending = 0
         self._traffic: Traffic | None = None
         scenario = scenario_file.from_text(info.scenario)
-        self._may_write = roles.rights_for(observer.name, scenario).writes if secured else None
+        self._writable_keys = roles.rights_for(observer.name, scenario).writes if secured else None
         self.required_processes = [(name, name.partition(".")[2]) for name in expected_processes(scenario)]
         self._known_names = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
 
@@ -101,39 +101,39 @@ class RunAccess:
         """Subscribe to the messages that pass through the world, and read the current last values."""
         self._traffic = Traffic(self.link, run_key_table(self.info), self.count_refused)
         # Views do not pass through the world.
-        self.link.declare_subscriber("view/**", lambda sample: self._keep(self.values.add, sample))
+        self.link.declare_subscriber("view/**", lambda sample: self._store_valid(self.values.add, sample))
         for expression in roles.LAST_VALUES:
             for sample in self.link.get(expression):
-                self._keep(self.values.add, sample)
+                self._store_valid(self.values.add, sample)
 
     def receive_until_end(self, stopped: Callable[[], bool]) -> None:
         """Store the messages that pass through the world until the run is over or `stopped` returns true."""
-        traffic, over = self._traffic, threading.Event()
+        traffic, finished = self._traffic, threading.Event()
         assert traffic is not None
 
         def tick() -> None:
-            while not over.wait(TICK_S):
+            while not finished.wait(TICK_S):
                 traffic.wake()
 
         ticker = threading.Thread(target=tick, name="tick", daemon=True)
         ticker.start()
         try:
             while not self._observer.end_reason and not stopped():
-                passed = traffic.receive()
-                self._observer.health.received += bool(passed)
-                for entry in passed:
+                received = traffic.receive()
+                self._observer.health.received += bool(received)
+                for entry in received:
                     if isinstance(entry, GateMessages):
                         self.values.add_gate(entry)
                     else:
-                        self._keep(self.values.add_passed, entry)
+                        self._store_valid(self.values.add_forwarded, entry)
                 self._observer.tick()
         finally:
-            over.set()
+            finished.set()
             ticker.join()
 
-    def _keep(self, add: Callable[[str, bytes], None], sample: RawSample | ReceivedSample) -> None:
+    def _store_valid(self, add: Callable[[str, bytes], None], sample: RawSample | ReceivedSample) -> None:
         """Store a last value; count an invalid message, which any process may publish, but ignore it."""
-        if is_sound(sample.key, sample.payload):
+        if is_valid(sample.key, sample.payload):
             add(sample.key, sample.payload)
         else:
             self.count_refused()
@@ -181,9 +181,9 @@ class RunAccess:
 
     def check_writable(self, key: str) -> None:
         """Raise a ForbiddenError for a key on which access control drops the gateway's messages."""
-        if self._may_write is not None and not roles.permits(self._may_write, key):
+        if self._writable_keys is not None and not roles.permits(self._writable_keys, key):
             raise ForbiddenError(
-                f"{key[:80]}: the gateway's certificate lets it write on {', '.join(self._may_write)} only"
+                f"{key[:80]}: the gateway's certificate lets it write on {', '.join(self._writable_keys)} only"
             )
 
     def check_known(self, key: str) -> None:
@@ -225,46 +225,46 @@ class RunAccess:
 
     async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[RawSample]:
         """Return the answers to a Zenoh get on a full expression; for errors see `request`."""
-        return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
+        return await self._in_thread(self.unprefixed_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload on a full key; raise a DecodeError if it is not a message of the key."""
-        own = self._federation_key(key)
-        if own is None:
-            self.bare_link.put_sample(key, payload, encoding)
+        local_key = self._local_key(key)
+        if local_key is None:
+            self.unprefixed_link.put_sample(key, payload, encoding)
             return
-        if messages.type_of(own) is not None:
-            messages.decode(own, payload)
-        self.publish(own, payload, encoding)
+        if messages.type_of(local_key) is not None:
+            messages.decode(local_key, payload)
+        self.publish(local_key, payload, encoding)
 
     def delete_full_key(self, key: str) -> None:
         """Publish that a full key no longer has a value."""
-        own = self._federation_key(key)
-        self.bare_link.delete(key)
-        if own is not None:
-            self.values.drop(own)
+        local_key = self._local_key(key)
+        self.unprefixed_link.delete(key)
+        if local_key is not None:
+            self.values.drop(local_key)
 
-    def _federation_key(self, key: str) -> str | None:
+    def _local_key(self, key: str) -> str | None:
         """Return a full key without this federation's name; None for a key of no federation or of another one.
 
         Raises:
             DecodeError, ForbiddenError, UnknownError: clients may not publish on this key, in any federation.
         """
-        own = key.removeprefix(self._prefix)
-        if own != key:
-            self._check_key(own)
-            self.check_writable(own)
-            return own
+        local_key = key.removeprefix(self._prefix)
+        if local_key != key:
+            self._check_key(local_key)
+            self.check_writable(local_key)
+            return local_key
         check_not_reserved(key)
         check_not_reserved(key.partition("/")[2] or key)
         return None
 
-    async def _in_thread(self, wait: Callable[..., Any], *args: Any) -> Any:
+    async def _in_thread(self, call: Callable[..., Any], *args: Any) -> Any:
         if self._pending >= REQUESTS_MAX:
             raise TooManyError(f"{REQUESTS_MAX} requests are already waiting for answers; try again later")
         self._pending += 1
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._threads, wait, *args)
+            return await asyncio.get_running_loop().run_in_executor(self._threads, call, *args)
         finally:
             self._pending -= 1
 
@@ -298,7 +298,7 @@ class EchoFilter:
             return False
         del self._waiting[key]
         newer = waiting[waiting.index(hash(payload)) + 1 :]
-        if any(mark is not DELETED for mark in newer):
+        if any(entry is not DELETED for entry in newer):
             self._waiting[key] = deque(newer, maxlen=ECHOES_MAX)
         return bool(newer)
 
@@ -318,7 +318,7 @@ class LastValues:
         self._lock = threading.Lock()  # clients and the world add values in different threads
         self._encodings: dict[str, tuple[bytes, str]] = {}
         self._echoes = EchoFilter(KEYS_MAX)
-        self._of_gates: dict[int, tuple[GateMessages, int]] = {}
+        self._gate_entries: dict[int, tuple[GateMessages, int]] = {}
 
     def add(self, key: str, payload: bytes) -> None:
         with self._lock:
@@ -330,7 +330,7 @@ class LastValues:
             self._echoes.add(key, payload)
             self._add(key, payload, encoding)
 
-    def add_passed(self, key: str, payload: bytes) -> None:
+    def add_forwarded(self, key: str, payload: bytes) -> None:
         """Store a message that has passed through the world."""
         with self._lock:
             if not self._echoes.is_stale(key, payload):
@@ -339,11 +339,11 @@ class LastValues:
     def _add(self, key: str, payload: bytes, encoding: str = "") -> None:
         has_room = key in self._payloads or len(self._payloads) < KEYS_MAX
         if messages.type_of(key) is None:
-            more = len(payload) - len(self._payloads.get(key, b""))
-            if not has_room or self._own_bytes + more > OWN_BYTES_MAX:
+            added_bytes = len(payload) - len(self._payloads.get(key, b""))
+            if not has_room or self._own_bytes + added_bytes > OWN_BYTES_MAX:
                 self._drop(key)  # no value is better than an outdated one
                 return
-            self._own_bytes += more
+            self._own_bytes += added_bytes
         if has_room:
             self._payloads[key] = payload
             if encoding:
@@ -369,7 +369,7 @@ class LastValues:
     def add_gate(self, gate: GateMessages) -> None:
         """Store the world's messages of a gate; their columns have been checked."""
         for m, index in enumerate(gate.which.tolist()):
-            self._of_gates[index] = (gate, m)
+            self._gate_entries[index] = (gate, m)
 
     def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
         """Return the keys that an expression matches, sorted, with their payloads.
@@ -381,12 +381,12 @@ class LastValues:
         if "*" not in expression:
             matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
         else:
-            known = {*self._payloads, *(self._table[index] for index in list(self._of_gates))}  # a copy
+            known = {*self._payloads, *(self._table[index] for index in list(self._gate_entries))}  # a copy
             matching = sorted(key for key in known if keys.matches(expression, prefix + key))
         return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 
     def _payload(self, key: str) -> bytes | None:
-        gate, m = self._of_gates.get(self._indices.get(key, -1), (None, 0))
+        gate, m = self._gate_entries.get(self._indices.get(key, -1), (None, 0))
         return gate.payload(m) if gate else self._payloads.get(key)
 
 
@@ -616,10 +616,10 @@ def gate_keys_of(info: Info, reads: Sequence[str], name: str, required: Collecti
     cluster.
     """
     served = {thing for process, thing in required if process != name}
-    of_world = [key(drone.name) for drone in info.drones for key in (keys.status, keys.truth)]
+    world_keys = [key(drone.name) for drone in info.drones for key in (keys.status, keys.truth)]
     estimates = [keys.estimate(drone.name) for drone in info.drones if drone.name in served]
     states = [keys.cluster_state(cluster.name) for cluster in info.clusters if cluster.name in served]
-    gate_keys = [key for key in (*of_world, *estimates, *states) if any(keys.matches(each, key) for each in reads)]
+    gate_keys = [key for key in (*world_keys, *estimates, *states) if any(keys.matches(each, key) for each in reads)]
     return tuple(gate_keys) or (keys.CLOCK,)
 
 

@@ -25,7 +25,7 @@ REQUEST_S = 5.0  # wall time in which a request must arrive with its body; a bro
 SMALL_BYTES = 16_384  # size of a body that is always accepted; commands and requests have a few hundred bytes
 BODY_BYTES_MAX = 16_000_000  # total size of all larger bodies at once; 16 of the largest that the gateway accepts
 CONNECTIONS_MAX = 1000  # twice the gateway's maximum number of clients
-REFUSED_FROM = 400  # lowest HTTP status of an error
+ERROR_STATUS_MIN = 400  # lowest HTTP status of an error
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 ANY_PORT = 0  # lets the kernel choose
 BACKLOG = 128  # connections that the kernel queues until they are accepted; aiohttp's default
@@ -152,7 +152,7 @@ class HttpConnections:
         self._request_s = request_s
         self._body_bytes_max = body_bytes_max
         self._body_bytes = 0
-        self._body_gone = asyncio.Condition()
+        self._body_released = asyncio.Condition()
         self._open: dict[asyncio.BaseTransport, HttpConnection] = {}
         self._strangers: dict[HttpConnection, None] = {}  # an ordered set, longest wait first
         self._idle: dict[HttpConnection, None] = {}  # likewise, known connections without a request
@@ -166,49 +166,49 @@ class HttpConnections:
         since_s = connection.since_s
         self._forget(connection)
         try:
-            async with AsyncExitStack() as room:
-                await self._receive(request, connection, since_s, room)
-                connection.is_whole = True
+            async with AsyncExitStack() as reservations:
+                await self._receive(request, connection, since_s, reservations)
+                connection.is_complete = True
                 response = await handler(request)
-            connection.known = connection.known or response.status < REFUSED_FROM
+            connection.is_known = connection.is_known or response.status < ERROR_STATUS_MIN
             return response
         finally:
             if connection.is_open:
                 self._wait(connection)
 
     async def _receive(
-        self, request: web.Request, connection: "HttpConnection", since_s: float | None, room: AsyncExitStack
+        self, request: web.Request, connection: "HttpConnection", since_s: float | None, reservations: AsyncExitStack
     ) -> None:
-        """Receive the body of a request before the handler runs; `room` holds its reservation until that has finished.
+        """Receive the body of a request before the handler runs; `reservations` holds its room until that has finished.
 
         Raises aiohttp's errors for a body that is too long or did not arrive in time, for instance for lack of room.
         """
         if not request.can_read_body:
             return
-        longest = request.client_max_size
-        size = longest if request.content_length is None else min(request.content_length, longest)
-        until_s = (asyncio.get_running_loop().time() if since_s is None else since_s) + self._request_s
+        size_max = request.client_max_size
+        size = size_max if request.content_length is None else min(request.content_length, size_max)
+        deadline_s = (asyncio.get_running_loop().time() if since_s is None else since_s) + self._request_s
         try:
-            async with asyncio.timeout_at(until_s):
+            async with asyncio.timeout_at(deadline_s):
                 if size > SMALL_BYTES:
-                    await room.enter_async_context(self._body_room(size))
+                    await reservations.enter_async_context(self._reserve_body(size))
                 await request.read()
         except TimeoutError:
-            connection.known = False  # its next request has a stranger's time limit
+            connection.is_known = False  # its next request has a stranger's time limit
             raise web.HTTPRequestTimeout(text=f"a request must be whole within {self._request_s:g} s") from None
 
     @asynccontextmanager
-    async def _body_room(self, size: int) -> AsyncIterator[None]:
+    async def _reserve_body(self, size: int) -> AsyncIterator[None]:
         """Wait until there is room for a body besides the others, and reserve it."""
-        async with self._body_gone:
-            await self._body_gone.wait_for(lambda: self._body_bytes + size <= self._body_bytes_max)
+        async with self._body_released:
+            await self._body_released.wait_for(lambda: self._body_bytes + size <= self._body_bytes_max)
             self._body_bytes += size
         try:
             yield
         finally:
             self._body_bytes -= size
-            async with self._body_gone:
-                self._body_gone.notify_all()
+            async with self._body_released:
+                self._body_released.notify_all()
 
     def enter(self, connection: "HttpConnection", transport: asyncio.Transport) -> bool:
         """Accept a new connection; return False if there is no room because all others have requests in progress."""
@@ -229,26 +229,26 @@ class HttpConnections:
         """Close the longest-waiting connection of the first non-empty group; return False if all are empty."""
         for group in groups:
             if group:
-                next(iter(group)).cut()
+                next(iter(group)).abort()
                 return True
         return False
 
     def _wait(self, connection: "HttpConnection") -> None:
         """Let a connection wait for its next request; aiohttp itself closes idle known connections."""
-        (self._idle if connection.known else self._strangers)[connection] = None
-        if not connection.known:
-            connection.timer = asyncio.get_running_loop().call_later(self._request_s, connection.cut)
+        (self._idle if connection.is_known else self._strangers)[connection] = None
+        if not connection.is_known:
+            connection.timer = asyncio.get_running_loop().call_later(self._request_s, connection.abort)
         if connection.has_more:
-            self.begin(connection)
-        connection.is_whole = connection.has_more = False
+            self.start_timer(connection)
+        connection.is_complete = connection.has_more = False
 
-    def begin(self, connection: "HttpConnection") -> None:
+    def start_timer(self, connection: "HttpConnection") -> None:
         """Start the time limit of a request when its first bytes arrive on a waiting connection."""
         if connection.since_s is not None or not (connection in self._idle or connection in self._strangers):
             return
         loop = asyncio.get_running_loop()
         connection.since_s = loop.time()
-        connection.timer = connection.timer or loop.call_later(self._request_s, connection.cut)
+        connection.timer = connection.timer or loop.call_later(self._request_s, connection.abort)
 
     def _forget(self, connection: "HttpConnection") -> None:
         self._strangers.pop(connection, None)
@@ -266,8 +266,8 @@ class HttpConnection(asyncio.Protocol):
         self._http = http
         self._connections = connections
         self._transport: asyncio.Transport | None = None
-        self.known = False  # whether one of its requests was answered without an error
-        self.is_whole = False  # whether the request in progress has arrived completely
+        self.is_known = False  # whether one of its requests was answered without an error
+        self.is_complete = False  # whether the request in progress has arrived completely
         self.has_more = False  # whether part of the next request has arrived meanwhile
         self.since_s: float | None = None  # loop time at which the first byte of its next request arrived
         self.timer: asyncio.TimerHandle | None = None  # closes the connection when that request's time is over
@@ -293,8 +293,8 @@ class HttpConnection(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         if self._transport is None:
             return
-        self.has_more = self.has_more or self.is_whole
-        self._connections.begin(self)
+        self.has_more = self.has_more or self.is_complete
+        self._connections.start_timer(self)
         self._http.data_received(data)
 
     def eof_received(self) -> bool | None:
@@ -306,7 +306,7 @@ class HttpConnection(asyncio.Protocol):
     def resume_writing(self) -> None:
         self._http.resume_writing()
 
-    def cut(self) -> None:
+    def abort(self) -> None:
         """Close the connection at once, without an answer."""
         if self._transport is not None:
             transport = self._transport

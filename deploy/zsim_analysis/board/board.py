@@ -144,7 +144,7 @@ def _tasks(request: BoardRequest) -> list[Task]:
     faults: list[str] = []
     for law in request.laws:  # one check per law, in the first scenario, suffices
         try:
-            check_classes(resolved(law, request.scenarios[0], 1), law)
+            check_classes(resolve_scenario(law, request.scenarios[0], 1), law)
         except ScenarioError as error:
             faults += error.faults
     if faults:
@@ -152,7 +152,7 @@ def _tasks(request: BoardRequest) -> list[Task]:
     for seed in range(1, request.seeds + 1):
         for scenario in request.scenarios:
             for law in request.laws:
-                flight_scenario = resolved(law, scenario, seed)
+                flight_scenario = resolve_scenario(law, scenario, seed)
                 text = f"{__version__}\n{scenario_file.to_text(flight_scenario)}"
                 varied = {"scenario": scenario, "law": law, "identity": hashlib.sha256(text.encode()).hexdigest()}
                 tasks.append(Task(len(tasks), 0, varied, flight_scenario, more=partial(columns, law, scenario)))
@@ -245,7 +245,7 @@ def about(scenario: str) -> str:
     return board_document()["scenarios"][scenario]["about"]
 
 
-def chosen(given: str | None, known: Sequence[str], option: str, open_to_classes: bool = False) -> list[str]:
+def select_names(given: str | None, known: Sequence[str], option: str, open_to_classes: bool = False) -> list[str]:
     """Return the names of a comma-separated list without repetitions; for None, all known names.
 
     Raises:
@@ -261,7 +261,7 @@ def chosen(given: str | None, known: Sequence[str], option: str, open_to_classes
     return names
 
 
-def resolved(law: str, scenario: str, seed: int) -> Scenario:
+def resolve_scenario(law: str, scenario: str, seed: int) -> Scenario:
     """Return the resolved scenario of a flight; raise ScenarioError if a user's class cannot be flown."""
     return scenario_file.resolve(document(law, scenario, seed), f"board, {law} in {scenario}")
 

@@ -19,7 +19,7 @@ from zsim_analysis.board.board import (
     cells,
     heads,
     planned_figure,
-    resolved,
+    resolve_scenario,
     write_tables,
 )
 from zsim_analysis.board.board import BoardRequest as Request
@@ -126,7 +126,7 @@ def _paths(board: Board, first_seed_rows: dict[tuple[str, str], Row]) -> style.R
     for line, (scenario, (low, high)) in enumerate(zip(board.scenarios, boxes, strict=True)):
         plan, obstacle_scenario = (
             planned_figure(scenario),
-            resolved("consensus", scenario, 1),
+            resolve_scenario("consensus", scenario, 1),
         )  # same obstacles for all laws
         for axes, law in zip(panels[line], board.laws, strict=True):
             axes.set_aspect("equal")

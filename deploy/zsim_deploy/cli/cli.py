@@ -123,8 +123,8 @@ def _run() -> int | str | None:
         if error.errno not in FILE_FAULTS or error.filename is None:
             raise
         path = os.fsdecode(error.filename)
-        shown = path if len(path) <= PATH_SHOWN else f"{path[: PATH_SHOWN // 2]}…{path[-PATH_SHOWN // 2 :]}"
-        note(f"{shown}: cannot be used ({error.strerror}); give another path")
+        path_text = path if len(path) <= PATH_SHOWN else f"{path[: PATH_SHOWN // 2]}…{path[-PATH_SHOWN // 2 :]}"
+        note(f"{path_text}: cannot be used ({error.strerror}); give another path")
         return USER_FAULT
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED

@@ -41,10 +41,10 @@ def keys(
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
-        found = inspection.list_keys(link, expression)
-        for key, kind, count in found:
+        rows = inspection.list_keys(link, expression)
+        for key, kind, count in rows:
             say(f"{key:<36} {kind:<14} {count:>6}")
-        if not found:
+        if not rows:
             raise failed(f"no key in use matches {expression}{inspection.keys_like(link, expression)}")
 
 
@@ -262,8 +262,8 @@ def selector(which: str, scenario: str) -> dict[str, Any]:
         return {}
     if which.isdecimal():
         return {"id": int(which)}
-    known = fault_kinds.kinds_of(declarations(scenario_file.from_text(scenario).drones))
-    return {"kind" if which in known else "target": which}
+    kinds_by_name = fault_kinds.kinds_of(declarations(scenario_file.from_text(scenario).drones))
+    return {"kind" if which in kinds_by_name else "target": which}
 
 
 def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
@@ -278,5 +278,5 @@ def _ask(link: "Session", op: str, args: dict[str, Any]) -> dict[str, Any]:
     from zsim.contract import keys
     from zsim.transport.session import result_of
 
-    given = {name: value for name, value in args.items() if value is not None}
-    return result_of(link.request(keys.CONTROL, op, SOURCE, given))
+    arguments = {name: value for name, value in args.items() if value is not None}
+    return result_of(link.request(keys.CONTROL, op, SOURCE, arguments))

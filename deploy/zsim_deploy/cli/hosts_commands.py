@@ -26,7 +26,7 @@ from zsim_deploy.arguments import failed, note, require, say
 from zsim_deploy.hosts import control_socket
 
 UP_NEEDS = {"hosts": ("asyncssh", "cryptography"), "record": ("mcap", "zstandard")}
-EVERY = ""  # value of --federation that selects all federations
+ALL_FEDERATIONS = ""  # value of --federation that selects all federations
 FOLLOW_S = 0.2  # polling interval of a log with --follow, wall time
 FIRST_OPERATOR = "main"  # operator who gets a certificate if none is named
 DAYS_MIN = 0.05  # about an hour, longer than a flight
@@ -70,9 +70,9 @@ def push(
     from zsim_deploy.hosts.push import push as push_to
     from zsim_deploy.hosts.wheelhouse import default_cache
 
-    placed = inventory.load(hosts)
+    inventory_file = inventory.load(hosts)
     with PushProgress() as stages:
-        done = asyncio.run(push_to(placed, host or [], extra or [], stages.update, default_cache()))
+        done = asyncio.run(push_to(inventory_file, host or [], extra or [], stages.update, default_cache()))
     changed = sum(done.values())
     nothing = "nothing to do; all hosts are up to date"
     say(f"installed on {changed} of {len(done)} hosts" if changed else nothing)
@@ -104,12 +104,12 @@ def doctor(
     from zsim_deploy import inventory
     from zsim_deploy.hosts.doctor import check_hosts
 
-    placed = inventory.load(hosts)
-    places = inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
-    result = check_hosts(placed, places)
+    inventory_file = inventory.load(hosts)
+    hosts_by_process = inventory.placement(inventory_file, scenario_file.load(scenario)) if scenario else None
+    result = check_hosts(inventory_file, hosts_by_process)
     console = PipedConsole()
-    for shown in result.tables:
-        console.print(shown)
+    for each in result.tables:
+        console.print(each)
     for warning in result.warnings:
         note(f"warning: {warning}")
     if result.faults:
@@ -145,19 +145,23 @@ def _check_processor(scenario: Path, duration_s: float) -> str:
         # --trust adds no risk: the flight has just run the same code.
         code, text = _finished(("rerun", out, "--trust"), older_processor(), (0, 1))
     if code:
-        named = [line for line in text.splitlines() if "differs" in line]
-        found = "; ".join(dict.fromkeys(named)) or (text.strip() or "it printed nothing").splitlines()[-1]
-        return f"{scenario}: on another processor, {found}; see docs/extending.md, The same bits on every processor"
+        differing_lines = [line for line in text.splitlines() if "differs" in line]
+        differences = (
+            "; ".join(dict.fromkeys(differing_lines)) or (text.strip() or "it printed nothing").splitlines()[-1]
+        )
+        return (
+            f"{scenario}: on another processor, {differences}; see docs/extending.md, The same bits on every processor"
+        )
     say("flown again as on an older processor: identical to the bit")
     return ""
 
 
-def _finished(words: tuple[str, ...], settings: dict[str, str], allowed: tuple[int, ...]) -> tuple[int, str]:
-    command = [sys.executable, SAFE_PATH, "-m", "zsim_deploy", *words]
+def _finished(arguments: tuple[str, ...], settings: dict[str, str], allowed: tuple[int, ...]) -> tuple[int, str]:
+    command = [sys.executable, SAFE_PATH, "-m", "zsim_deploy", *arguments]
     done = subprocess.run(command, env={**os.environ, **settings}, capture_output=True, text=True, errors="replace")
     if done.returncode not in allowed:
         last = (done.stderr or done.stdout).strip().splitlines() or ["it printed nothing"]
-        raise RunError(f"zsim {words[0]} ended with exit code {done.returncode}: {last[-1]}")
+        raise RunError(f"zsim {arguments[0]} ended with exit code {done.returncode}: {last[-1]}")
     return done.returncode, done.stdout or done.stderr
 
 
@@ -186,21 +190,21 @@ def up(
     from zsim_deploy.hosts.status_table import RowChoice, StatusTable
 
     loaded = flight.scenario(elsewhere=True)
-    placed = inventory.load(hosts)
-    placed = inventory.insecure(placed) if insecure else placed
+    inventory_file = inventory.load(hosts)
+    inventory_file = inventory.insecure(inventory_file) if insecure else inventory_file
     choice = RowChoice(only or (), sort)
-    routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
-    hosts_of = {**routers, **inventory.placement(placed, loaded)}
+    routers = {f"{ROUTER}.{name}": router.host for name, router in inventory_file.inventory.routers.items()}
+    hosts_of = {**routers, **inventory.placement(inventory_file, loaded)}
     choice.check([{"role": role, "host": host} for role, host in hosts_of.items()])
     mode, pace = flight.mode_and_rate()
-    count, hosts_count = len(inventory.roles(loaded)), len(placed.inventory.hosts)
+    count, hosts_count = len(inventory.roles(loaded)), len(inventory_file.inventory.hosts)
     require_files(host_launcher_files(count, hosts_count), f"{count} processes on {hosts_count} hosts")
     was_there = out is not None and out.exists()
     with run_directory(out, loaded, force) as folder:
         try:
             with StatusTable(loaded.duration_s, choice=choice) as status:
                 launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()))
-                outcome = HostRun(loaded, placed, folder, launch, status).run()
+                outcome = HostRun(loaded, inventory_file, folder, launch, status).run()
             conclude(outcome, folder, report)
         finally:
             if not was_there:  # rmdir removes only an empty folder: that of a refused run
@@ -215,7 +219,7 @@ def ps(
     ] = None,
     only: Only = None,
     sort: Sort = None,
-    federation: Annotated[str, Option(help="Only runs of this federation.")] = EVERY,
+    federation: Annotated[str, Option(help="Only runs of this federation.")] = ALL_FEDERATIONS,
     as_json: Annotated[bool, Option("--json", help="Print JSON, one line per run.")] = False,
 ) -> None:
     """Show the processes of the runs on this machine: role, host, pid, state, lag, age, messages/s, restarts.
@@ -227,16 +231,16 @@ def ps(
 
     runs = []
     for name in control_socket.launchers():
-        if name == federation or name.startswith(f"{federation}@") or federation == EVERY:
+        if name == federation or name.startswith(f"{federation}@") or federation == ALL_FEDERATIONS:
             with contextlib.suppress(RunError):  # its launcher was killed or is ending
                 runs.append(control_socket.ask(name, "ps"))
     if not runs:
-        whose = "" if federation == EVERY else f" of federation {federation!r}"
-        raise RunError(f"no run{whose} of `zsim run` or `zsim up` is active on this machine")
+        federation_text = "" if federation == ALL_FEDERATIONS else f" of federation {federation!r}"
+        raise RunError(f"no run{federation_text} of `zsim run` or `zsim up` is active on this machine")
     choice = RowChoice([*(roles or ()), *(only or ())], sort)
     choice.check([row for status in runs for row in status["rows"]])
     for status in runs:
-        status["rows"] = choice.of(status["rows"])
+        status["rows"] = choice.select(status["rows"])
         if as_json:
             print(json.dumps(status))
         elif status["rows"]:
@@ -252,13 +256,13 @@ def logs(
     federation: Federation = "zsim",
 ) -> None:
     """Print the log of a process of the active run; `zsim up` itself shows progress and events."""
-    where = control_socket.ask(federation, "where")
-    if role not in where["roles"]:
-        raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
-    path = Path(where["out"]) / "logs" / f"{role}.log"
+    location = control_socket.ask(federation, "where")
+    if role not in location["roles"]:
+        raise RunError(f"role is {role!r}; must be one of {', '.join(location['roles'])}")
+    path = Path(location["out"]) / "logs" / f"{role}.log"
     if not path.exists():
-        shown = "its progress and events are shown by `zsim up`, and are in the record"
-        note(f"{role} has logged nothing; {shown}" if role == WORLD else f"{role} has logged nothing yet")
+        hint = "its progress and events are shown by `zsim up`, and are in the record"
+        note(f"{role} has logged nothing; {hint}" if role == WORLD else f"{role} has logged nothing yet")
 
     position, is_last = 0, not follow
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
@@ -274,7 +278,7 @@ def logs(
             return
         time.sleep(FOLLOW_S)
         try:
-            is_last = control_socket.ask(federation, "where")["out"] != where["out"]
+            is_last = control_socket.ask(federation, "where")["out"] != location["out"]
         except RunError:
             is_last = True
 
@@ -323,21 +327,23 @@ def init(
     """Make the missing certificates, their authority, and access control for the world and the routers."""
     from zsim_deploy import certificates, inventory
 
-    placed, now = inventory.load(hosts), datetime.now(UTC)
-    folder = certificates.folder_of(placed)
-    operators = [*(operator or ()), *certificates.operators(folder, placed.inventory.hosts)] or [FIRST_OPERATOR]
-    wanted, access = certificates.enrolment(placed, opt.load_scenario(scenario, set_, elsewhere=True), operators)
+    inventory_file, now = inventory.load(hosts), datetime.now(UTC)
+    folder = certificates.folder_of(inventory_file)
+    operators = [*(operator or ()), *certificates.operators(folder, inventory_file.inventory.hosts)] or [FIRST_OPERATOR]
+    requests, access = certificates.enrolment(
+        inventory_file, opt.load_scenario(scenario, set_, elsewhere=True), operators
+    )
     signer = certificates.authority(folder, now, force)
-    lacking = [each for each in wanted if renew or certificates.renewal_reason(folder, signer.certificate, each, now)]
+    lacking = [each for each in requests if renew or certificates.renewal_reason(folder, signer.certificate, each, now)]
     for each in lacking:
         certificates.issue(folder, signer, each, now, days)
     for host, process, rules in access:
         content = json.dumps(rules, indent=2) + "\n"
         certificates.write(folder / host / f"{process}.access.json", content.encode())
-    if warning := certificates.exposed_keys(placed):
+    if warning := certificates.exposed_keys(inventory_file):
         note(f"warning: {warning}")
-    kept = len(wanted) - len(lacking)
-    say(f"{folder}: {len(lacking)} certificates made, {kept} kept; zsim certs show {hosts} lists them")
+    kept_count = len(requests) - len(lacking)
+    say(f"{folder}: {len(lacking)} certificates made, {kept_count} kept; zsim certs show {hosts} lists them")
 
 
 @certs.command()
@@ -346,21 +352,21 @@ def show(hosts: Inventory) -> None:
     from zsim.presentation import Column, FittedTable, print_table
     from zsim_deploy import certificates, inventory
 
-    placed, now = inventory.load(hosts), datetime.now(UTC)
-    folder = certificates.folder_of(placed)
+    inventory_file, now = inventory.load(hosts), datetime.now(UTC)
+    folder = certificates.folder_of(inventory_file)
     statuses = certificates.show(folder, now)
     if not statuses:
-        raise RunError(f"{folder}: has no certificates; make them with `{certificates.init_command(placed)}`")
-    rows, over = [], False
+        raise RunError(f"{folder}: has no certificates; make them with `{certificates.init_command(inventory_file)}`")
+    rows, needs_renewal = [], False
     for status in statuses:
-        soon = "expires soon" if status.until - now < WARN else ""
-        over = over or bool(soon) or certificates.EXPIRED in status.fault
+        expiry_note = "expires soon" if status.until - now < WARN else ""
+        needs_renewal = needs_renewal or bool(expiry_note) or certificates.EXPIRED in status.fault
         until, addresses = f"{status.until:%Y-%m-%d %H:%M}Z", ", ".join(status.addresses)
-        rows.append((status.host, status.process, until, addresses, status.fault or soon))
+        rows.append((status.host, status.process, until, addresses, status.fault or expiry_note))
     print_table(FittedTable([Column("", kind) for kind in ("name", "name", "figure", "text", "text")], rows))
-    if over or any(status.fault for status in statuses):
-        note(f"renew them with `{certificates.init_command(placed, renew=over)}`")
-    if warning := certificates.exposed_keys(placed):
+    if needs_renewal or any(status.fault for status in statuses):
+        note(f"renew them with `{certificates.init_command(inventory_file, renew=needs_renewal)}`")
+    if warning := certificates.exposed_keys(inventory_file):
         note(f"warning: {warning}")
 
 
@@ -401,12 +407,12 @@ def _render(target: str, flight: opt.FlightOptions, hosts: Path, out: Path, forc
     from zsim_deploy import inventory, render
 
     loaded = flight.scenario(elsewhere=True)
-    placed = inventory.load(hosts)
-    for remark in inventory.own_programs(placed, loaded):
+    inventory_file = inventory.load(hosts)
+    for remark in inventory.own_programs(inventory_file, loaded):
         note(remark)
     texts = {"systemd": render.systemd, "compose": render.compose, "kubernetes": render.kubernetes}[target](
-        placed, loaded, flight.pace(), *more
+        inventory_file, loaded, flight.pace(), *more
     )
     removed = render.write(out, target, texts, force)
-    also = f"; removed from an earlier rendering: {', '.join(removed)}" if removed else ""
-    say(f"{len(texts)} files in {out}{also}")
+    removed_text = f"; removed from an earlier rendering: {', '.join(removed)}" if removed else ""
+    say(f"{len(texts)} files in {out}{removed_text}")

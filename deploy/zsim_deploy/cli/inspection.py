@@ -74,8 +74,8 @@ def echo(
 def keys_like(link: Session, expression: str) -> str:
     """Return the end of a message about a key without a publisher: similar keys that are in use."""
     in_use = [key for key, _, _ in list_keys(link, "**")]
-    named = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
-    return f"; similar keys in use: {named}" if named else "; `zsim keys` lists the keys in use"
+    names = ", ".join(get_close_matches(expression, in_use, NAMED_MAX))
+    return f"; similar keys in use: {names}" if names else "; `zsim keys` lists the keys in use"
 
 
 def readable(sample: ReceivedSample) -> Any:
@@ -139,7 +139,7 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
             arrived.append((time.monotonic(), sample.payload))
 
     link.declare_subscriber(expression, arrive)
-    rate, head = MessageRate(window), msgspec.msgpack.Decoder(_Stamp)
+    rate, stamp_decoder = MessageRate(window), msgspec.msgpack.Decoder(_Stamp)
     until_s, unheard_s = time.monotonic() + seconds, time.monotonic() + min(UNHEARD_S, seconds)
     nothing = f"no message on {expression} yet"
     while (now_s := time.monotonic()) < until_s:
@@ -148,7 +148,7 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
             wall_s, payload = arrived.popleft()
             t_ns = None
             with suppress(*messages.REFUSALS):
-                t_ns = head.decode(payload).t_ns
+                t_ns = stamp_decoder.decode(payload).t_ns
             rate.add(wall_s, t_ns)
         if not rate.total and time.monotonic() >= unheard_s:
             nothing, unheard_s = f"no message on {expression} yet{keys_like(link, expression)}", math.inf
@@ -199,8 +199,8 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
     drones = [drone.name for drone in info.drones]
     if keys.thing(key) not in drones:
         raise RunError(f"{key}: drone is {keys.thing(key)!r}; must be one of {', '.join(drones)}")
-    named = [name for name in messages.fields(kind) if name not in ("t_ns", "seq", "source")]
-    example = "{" + ", ".join(f'"{name}": …' for name in named) + "}"
+    field_names = [name for name in messages.fields(kind) if name not in ("t_ns", "seq", "source")]
+    example = "{" + ", ".join(f'"{name}": …' for name in field_names) + "}"
     fields = _map(f"{key}: the message", text, example)
     if "source" in kind.__struct_fields__:
         fields = {"source": PUB, **fields}
@@ -217,10 +217,10 @@ def publish(link: Session, info: messages.Info, key: str, text: str, count: int,
 
 
 def _outcome(
-    events: Subscription, clock: "_SimulatedTime", gate_ns: int, ours: tuple[str, str], sent: int
+    events: Subscription, clock: "_SimulatedTime", gate_ns: int, command_origin: tuple[str, str], sent: int
 ) -> Published:
     """Return the outcome of commands from the world's events, once the last one has taken effect or been refused."""
-    key, source = ours
+    key, source = command_origin
     accepted, refused, last_ns, reason = 0, 0, 0, ""
     until_s = time.monotonic() + OUTCOME_S
     while True:
@@ -237,8 +237,8 @@ def _outcome(
         if refused >= sent or (accepted + refused >= sent and now_ns >= last_ns):
             return Published(sent, min(refused, sent), reason)
         if time.monotonic() >= until_s:
-            now = clock.clock()
-            state = now.state if now else "unknown"
+            latest = clock.clock()
+            state = latest.state if latest else "unknown"
             note = f"the world is {state}; the outcome will be known only when time continues"
             return Published(sent, min(refused, sent), reason, note)
         time.sleep(POLL_S)
@@ -266,18 +266,18 @@ def _refuse_wildcards(key: str, command: str) -> None:
         raise RunError(f"key is {key!r}; `zsim {command}` takes one key, without wildcards")
 
 
-def _map(what: str, text: str, example: str) -> dict[str, Any]:
-    """Parse a JSON text that must be a map; raise RunError, beginning with `what`, if it is not."""
+def _map(name: str, text: str, example: str) -> dict[str, Any]:
+    """Parse a JSON text that must be a map; raise RunError, beginning with `name`, if it is not."""
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise RunError(f"{what} is not JSON ({error}); must be a map such as '{example}'") from error
+        raise RunError(f"{name} is not JSON ({error}); must be a map such as '{example}'") from error
     if not isinstance(fields, dict):
-        raise RunError(f"{what} is {text[:40]!r}; must be a map such as '{example}'")
+        raise RunError(f"{name} is {text[:40]!r}; must be a map such as '{example}'")
     try:
         msgspec.msgpack.encode(fields)
     except messages.REFUSALS as error:
-        raise RunError(f"{what} cannot be sent ({error}); must be a map such as '{example}'") from error
+        raise RunError(f"{name} cannot be sent ({error}); must be a map such as '{example}'") from error
     return fields
 
 

@@ -306,9 +306,9 @@ def console(
     require_files(SERVER_FILES, "a console and its pages")
     world = f"federation {reach.federation!r} on {reach.endpoint}"
     address = ListenAddress(listen, port or opt.CONSOLE_PORT, or_any=port is None)
-    shown = Console(address, own_name.removesuffix(".*"), token, rate_hz, say_line, world, folder)
-    with shown.open():
-        serve_as("console", own_name, shown.serve, reach, remain=shown.remain)
+    console_process = Console(address, own_name.removesuffix(".*"), token, rate_hz, say_line, world, folder)
+    with console_process.open():
+        serve_as("console", own_name, console_process.serve, reach, remain=console_process.remain)
 
 
 @bridges.command(rich_help_panel=opt.TRANSLATE)
@@ -336,14 +336,14 @@ def gateway(
     own_name = process_name("gateway", name, reach.who)
 
     def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
-        who = reach.who
-        if who.tls is not None:  # a client's certificate is kept beside the gateway's
-            folder = who.tls.parent / process
+        identity = reach.who
+        if identity.tls is not None:  # a client's certificate is kept beside the gateway's
+            folder = identity.tls.parent / process
             if not folder.is_dir():
                 remedy = "name it in the scenario and in the inventory"
                 raise SessionError(f"{process}: has no certificate here ({folder}); {remedy}")
-            who = who._replace(tls=folder, process=process)
-        return find_world(reach.endpoint, reach.federation, opt.LOOK_S, identity=who)
+            identity = identity._replace(tls=folder, process=process)
+        return find_world(reach.endpoint, reach.federation, opt.LOOK_S, identity=identity)
 
     require_files(SERVER_FILES, "a gateway and its clients")
     allow_files(SERVER_FILES + CONNECTIONS_MAX + CLIENTS_MAX)
@@ -409,10 +409,10 @@ def ros2(
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
 
     if reach.tls and router is None:
-        why = "the world's access control does not allow ROS keys"
-        raise BadParameter(f"--tls needs --router, the endpoint of an rmw_zenohd: {why}")
-    who = reach.who
-    to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
+        reason = "the world's access control does not allow ROS keys"
+        raise BadParameter(f"--tls needs --router, the endpoint of an rmw_zenohd: {reason}")
+    identity = reach.who
+    to_router = identity if router and is_tls(router) else Identity(host=identity.host, insecure=reach.insecure)
     network = RosNetwork(domain, router, to_router)
     serve_as("ros2", name, partial(serve, network=network, wall_ns=time.time_ns), reach, lowered=True)
 

@@ -37,10 +37,10 @@ BUNDLE_NEEDS = {**opt.FLIGHT_NEEDS, "report": ("matplotlib", "jinja2", "packagin
 REPLAY_NEEDS = {"record": ("mcap", "zstandard")}
 WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
 BUDGET_S = 600.0  # budget of a hunt if neither --budget nor --flights is given, wall time
-MOST = 3  # maximum number of faults in one flight of a hunt; software failures seldom need more conditions
+FAULTS_PER_FLIGHT = 3  # maximum number of faults in one flight of a hunt; software failures seldom need more conditions
 GATE = "a gate: a time step at which the processes synchronize"
-OF_PROCESSES = ("--realtime", "--rate", "--listen", "--hosted", "--console", "--cameras", "--detect")
-OF_A_NEW_RUN = (
+PROCESS_OPTIONS = ("--realtime", "--rate", "--listen", "--hosted", "--console", "--cameras", "--detect")
+NEW_RUN_OPTIONS = (
     *("--seed", "--duration", "--realtime", "--rate", "--set", "--out"),
     *("--in-process", "--listen", "--insecure", "--hosted", "--agent"),
 )
@@ -88,13 +88,13 @@ def run(
     from zsim_deploy.launch.role_launcher import RunConsole
     from zsim_deploy.launch.run import RunOptions, check_endpoint, check_open_files, fly, options_of, with_cameras
 
-    if in_process and (useless := _given(context, OF_PROCESSES)):
+    if in_process and (useless := _given(context, PROCESS_OPTIONS)):
         raise BadParameter(f"--in-process is lockstep, unpaced and without Zenoh; leave out {useless}, or --in-process")
     if console:
         require("console", opt.CONSOLE_NEEDS)
-    shown = RunConsole() if console else None
+    run_console = RunConsole() if console else None
     if continue_:
-        if useless := _given(context, OF_A_NEW_RUN):
+        if useless := _given(context, NEW_RUN_OPTIONS):
             raise BadParameter(f"--continue uses the options of the interrupted run; leave out {useless}")
         options = options_of(flight.path)
     else:
@@ -108,22 +108,28 @@ def run(
         agents = [AgentSpec.parse(shlex.split(each) or [""]) for each in agent or ()]
         if agents:
             scenario = with_own_agents(scenario, [each.name for each in agents])
-        own = tuple(tuple(each.arguments()) for each in agents)
-        how = {"in_process": in_process, "agents": own, "hosted": hosted, "insecure": insecure, "listen": listen}
-        launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()), **how)
+        agent_arguments = tuple(tuple(each.arguments()) for each in agents)
+        launch_options = {
+            "in_process": in_process,
+            "agents": agent_arguments,
+            "hosted": hosted,
+            "insecure": insecure,
+            "listen": listen,
+        }
+        launch = new_launch(mode=mode, rate=pace, changed=tuple(flight.changed()), **launch_options)
         options = RunOptions(scenario, Path(), launch, [name for name in order.split(",") if name])
-    options.console, options.cameras, options.detect = shown, cameras, detect
+    options.console, options.cameras, options.detect = run_console, cameras, detect
     options.json_progress = json_progress
     if not options.launch.in_process:
         if options.camera_children():
             require("run", opt.CAMERA_NEEDS)
         check_open_files(options)
-    place = locked(options.out) if continue_ else run_directory(out, options.scenario, force)
-    with place as options.out, shown or nullcontext(), interruptible():
+    folder_context = locked(options.out) if continue_ else run_directory(out, options.scenario, force)
+    with folder_context as options.out, run_console or nullcontext(), interruptible():
         with seen_by_ps(options.scenario.federation, options.status):
             outcome = fly(options)
-        if shown:
-            shown.outcome = outcome
+        if run_console:
+            run_console.outcome = outcome
         conclude(outcome, options.out, report)
 
 
@@ -148,10 +154,10 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
             else:
                 from zsim_analysis.reading.shortfall import marks_of, verdict
 
-                judged = verdict(record)
-                for mark, _ in marks_of(judged.shortfalls):
+                assessment = verdict(record)
+                for mark, _ in marks_of(assessment.shortfalls):
                     say(mark)
-                fault = _fault_of(judged.completeness.complete, str(judged.completeness), judged.shortfalls)
+                fault = _fault_of(assessment.completeness.complete, str(assessment.completeness), assessment.shortfalls)
         except ZsimError as error:
             if not outcome.failed:
                 raise
@@ -217,7 +223,7 @@ def report(
     from zsim.schema import plugin
     from zsim_analysis.sweep.design import is_sweep
 
-    wanted = opt.figure_formats(formats)
+    extra_formats = opt.figure_formats(formats)
     with plugin.names_only(not trust) as skipped:
         if len(directories) > 1:
             from zsim_analysis.report.comparison import compare, comparison_path
@@ -228,14 +234,14 @@ def report(
                 record_in(directory)
             page = out or comparison_path(directories)
             with working("reading the records …") as progress:
-                compare(directories, page, progress, wanted)
+                compare(directories, page, progress, extra_formats)
             say(f"report: {page}")
         elif out is not None:
             raise BadParameter("--out is for the comparison of several runs; leave it out")
         else:
             if not is_sweep(directories[0]):
                 record_in(directories[0])
-            _report(directories[0], wanted)
+            _report(directories[0], extra_formats)
     note_skipped(skipped)
 
 
@@ -249,14 +255,14 @@ def _report(folder: Path, formats: Sequence[str] = ()) -> str:
         if is_sweep(folder):
             from zsim_analysis.sweep.sweep_report import TerminalText, make_sweep_report
 
-            shown: Any = TerminalText(make_sweep_report(folder, progress, formats))
+            terminal_summary: Any = TerminalText(make_sweep_report(folder, progress, formats))
         else:
             from zsim_analysis.report.make_report import make_report
             from zsim_analysis.report.summary import terminal_text
 
             summary = make_report(folder, progress, formats)
-            shown = terminal_text(summary)
-    PipedConsole().print(shown)
+            terminal_summary = terminal_text(summary)
+    PipedConsole().print(terminal_summary)
     fault = _fault_of(summary.record.complete, summary.record.state, summary.shortfalls) if summary else ""
     say(f"report: {folder / 'report.html'}")
     return fault
@@ -298,8 +304,8 @@ def sweep(
 
     document, faults = read_document(scenario, set_ or [], seed=seed, duration_s=duration)
     changed = opt.changed_fields(set_, seed, duration)
-    shown = Console(stderr=True)
-    plan = checked_plan(scenario.name, document, vary or [], runs, keep_records, changed, shown, faults)
+    screen = Console(stderr=True)
+    plan = checked_plan(scenario.name, document, vary or [], runs, keep_records, changed, screen, faults)
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -308,11 +314,11 @@ def sweep(
         note(f"interrupted; the same command with --out {folder} continues; the table so far is in it")
         sys.exit(INTERRUPTED)
     failures = [row["failure"] for row in rows if row["failure"]]
-    short = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
-    _conclude(folder, failures, len(rows), report, short)
+    shortfall_texts = [row["shortfall"] for row in rows if row.get("shortfall") and not row["failure"]]
+    _conclude(folder, failures, len(rows), report, shortfall_texts)
 
 
-def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short: Sequence[str] = ()) -> None:
+def _conclude(folder: Path, failures: list[str], runs: int, report: bool, shortfall_texts: Sequence[str] = ()) -> None:
     """Make the report; exit with code 1 if a run failed, or no run was flown as planned."""
     if report:
         _report(folder)
@@ -321,8 +327,8 @@ def _conclude(folder: Path, failures: list[str], runs: int, report: bool, short:
         raise failed(f"all {runs} runs failed: {failures[0]}")
     if failures:
         raise failed(f"{len(failures)} of {runs} runs failed: {failures[0]}")
-    if len(failures) + len(short) == runs:
-        raise failed(f"none of the {runs} runs was flown as planned: {short[0]}")
+    if len(failures) + len(shortfall_texts) == runs:
+        raise failed(f"none of the {runs} runs was flown as planned: {shortfall_texts[0]}")
 
 
 @app.command(rich_help_panel=opt.RUN)
@@ -362,12 +368,12 @@ def export(
     selection = MessageSelection(tuple(keys or ()), from_, to)
     console = Console(stderr=True)
 
-    shown = Progress(console=console, transient=True, disable=not console.is_terminal)
-    with interruptible(), plugin.names_only(not trust) as skipped, shown as bar:
+    progress_bar = Progress(console=console, transient=True, disable=not console.is_terminal)
+    with interruptible(), plugin.names_only(not trust) as skipped, progress_bar as bar:
         task = bar.add_task("scanning the record", total=None)
 
-        def advance(count: int, of: int) -> None:
-            bar.update(task, description="reading messages", completed=count, total=of)
+        def advance(count: int, total: int) -> None:
+            bar.update(task, description="reading messages", completed=count, total=total)
 
         done = write(run, form, out, selection, force, advance, by_name)
     for text in done.notes:
@@ -407,7 +413,7 @@ def replay(
     if console:
         require("console", opt.CONSOLE_NEEDS)
     from zsim.schema import plugin
-    from zsim_deploy.launch.role_launcher import console_beside
+    from zsim_deploy.launch.role_launcher import running_console
     from zsim_deploy.roles.world_role import ReplayOptions, play
     from zsim_world.run.playback import PlaybackRange
 
@@ -416,8 +422,8 @@ def replay(
     choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused, holds=console)
     endpoints = tuple(listen or [opt.DEFAULT_ENDPOINT])
     options = ReplayOptions(choice, rate, tuple(expect or ()), endpoints, federation)
-    beside = console_beside(endpoints[0], directory, federation, who.tls) if console else nullcontext()
-    with plugin.names_only(not trust), beside:
+    console_context = running_console(endpoints[0], directory, federation, who.tls) if console else nullcontext()
+    with plugin.names_only(not trust), console_context:
         play(directory, options, who)
 
 
@@ -507,7 +513,7 @@ def hunt(
         Option(help="Kind of fault to draw, and its ranges: 'gust velocity_m_s=1..6' (default: all). Repeatable."),
     ] = None,
     without: Annotated[list[str] | None, Option(help="Kind of fault not to draw. Repeatable.")] = None,
-    most: Annotated[int, Option(min=0, max=6, help="Maximum number of faults in one flight.")] = MOST,
+    most: Annotated[int, Option(min=0, max=6, help="Maximum number of faults in one flight.")] = FAULTS_PER_FLIGHT,
     vary: Annotated[
         list[str] | None,
         Option(help="a.b.c=uniform(low,high), … as for a sweep (default wind.gust_m_s=uniform(0,2)). Repeatable."),
@@ -607,20 +613,20 @@ def board(
             raise BadParameter("--papers flies no scenario; leave out --laws, --scenarios and --format")
         from zsim_analysis.board.papers import terminal_table, write_papers
 
-        place = out or Path("runs") / "papers"
+        papers_folder = out or Path("runs") / "papers"
         with working("computing …") as progress:
-            found = write_papers(place, progress)
-        PipedConsole().print(terminal_table(found))
-        say(f"figures: {place}")
+            results = write_papers(papers_folder, progress)
+        PipedConsole().print(terminal_table(results))
+        say(f"figures: {papers_folder}")
         return
-    from zsim_analysis.board.board import LAW_NAMES, BoardRequest, chosen, fly_board, scenario_names
+    from zsim_analysis.board.board import LAW_NAMES, BoardRequest, fly_board, scenario_names, select_names
     from zsim_analysis.board.board_report import make_board_report, terminal_text
 
-    wanted = opt.figure_formats(formats)
+    extra_formats = opt.figure_formats(formats)
     folder = out or Path("runs") / f"board-{time.strftime('%Y%m%d-%H%M%S')}"
     request = BoardRequest(
-        chosen(laws, LAW_NAMES, "--laws", open_to_classes=True),
-        chosen(scenarios, scenario_names(), "--scenarios"),
+        select_names(laws, LAW_NAMES, "--laws", open_to_classes=True),
+        select_names(scenarios, scenario_names(), "--scenarios"),
         seeds,
         folder,
         workers,
@@ -633,8 +639,8 @@ def board(
         note(f"interrupted; the same command with --out {folder} continues")
         sys.exit(INTERRUPTED)
     with working("drawing …") as progress:
-        made = make_board_report(request, rows, progress, wanted)
-    PipedConsole().print(terminal_text(made))
+        finished_board = make_board_report(request, rows, progress, extra_formats)
+    PipedConsole().print(terminal_text(finished_board))
     say(f"report: {folder / 'report.html'}")
     say(f"table: {folder / 'board.csv'}")
     failures = [row["failure"] for row in rows if row["failure"]]

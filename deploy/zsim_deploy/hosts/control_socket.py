@@ -45,17 +45,17 @@ def launchers() -> list[str]:
 
     The sockets of killed launchers of `zsim run` are removed.
     """
-    found = []
+    names = []
     for path in sorted(place("").parent.glob("*.sock")):
         _, is_of_run, pid = path.stem.partition("@")
         try:
             if is_of_run:
                 os.kill(int(pid), 0)  # raises if there is no such process
-            found.append(path.stem)
+            names.append(path.stem)
         except (OSError, ValueError):
             path.unlink(missing_ok=True)
             path.with_suffix(".lock").unlink(missing_ok=True)
-    return found
+    return names
 
 
 def ask(federation: str, op: str, **args: Any) -> Any:
@@ -104,8 +104,8 @@ class ControlSocket:
         RunError: another launcher of the federation runs here, or no socket can be opened.
     """
 
-    def __init__(self, federation: str, acts: dict[str, Act]) -> None:
-        self._acts = acts
+    def __init__(self, federation: str, actions: dict[str, Act]) -> None:
+        self._actions = actions
         self._path = path = place(federation)
         with file_fault(path.parent, "cannot be created", "set XDG_RUNTIME_DIR to a folder of yours"):
             path.parent.mkdir(mode=0o700, exist_ok=True)
@@ -130,8 +130,8 @@ class ControlSocket:
             self._socket.close()
             os.close(self._lock)
             is_long = len(os.fsencode(path)) > PATH_MAX
-            why = f"the path is longer than {PATH_MAX} bytes; set XDG_RUNTIME_DIR or TMPDIR to a shorter one"
-            raise RunError(f"{path}: cannot listen on it ({why if is_long else error.strerror or error})") from error
+            reason = f"the path is longer than {PATH_MAX} bytes; set XDG_RUNTIME_DIR or TMPDIR to a shorter one"
+            raise RunError(f"{path}: cannot listen on it ({reason if is_long else error.strerror or error})") from error
         self._thread = threading.Thread(target=self._serve, name="control socket", daemon=True)
         self._thread.start()
 
@@ -151,14 +151,14 @@ class ControlSocket:
             answer: dict[str, Any] = {"ok": False}
             try:
                 request = json.loads(line)
-                act, args = self._acts[request["op"]], request.get("args", {})
-                inspect.signature(act).bind(**args)
+                action, args = self._actions[request["op"]], request.get("args", {})
+                inspect.signature(action).bind(**args)
             except (ValueError, KeyError, TypeError) as error:
                 remedy = "use the version of zsim that runs `zsim up`"
                 answer["error"] = f"it is not a request of zsim {__version__} ({error}); {remedy}"
             else:
                 try:
-                    answer = {"ok": True, "result": act(**args)}
+                    answer = {"ok": True, "result": action(**args)}
                 except (ZsimError, TimeoutError) as error:
                     answer["error"] = str(error) or "it took too long"
                 except Exception as error:

@@ -116,41 +116,49 @@ class CheckResult(NamedTuple):
     warnings: list[str]
 
 
-def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
+def check_hosts(inventory_file: InventoryFile, hosts_by_process: dict[str, str] | None) -> CheckResult:
     """Check the certificates and the hosts; with a placement, also the network paths to the world and the routers.
 
-    `places`: host of each process; None: no network paths.
+    `hosts_by_process`: host of each process; None: no network paths.
     """
 
     async def check() -> tuple[list[FittedTable], list[str], list[str]]:
-        links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
-        pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
+        links = {
+            name: HostLink(name, host, inventory_file.folder) for name, host in inventory_file.inventory.hosts.items()
+        }
+        pythons = {name: inv.python(host) for name, host in inventory_file.inventory.hosts.items()}
         try:
-            work = (host_report(link, pythons[name], placed.word) for name, link in links.items())
+            work = (host_report(link, pythons[name], inventory_file.shell_path) for name, link in links.items())
             results = await asyncio.gather(*work, return_exceptions=True)
             reports = {name: each for name, each in zip(links, results, strict=True) if isinstance(each, HostReport)}
             for result in results:
                 if isinstance(result, BaseException) and not isinstance(result, ZsimError):
                     raise result
             faults = [str(result) for result in results if isinstance(result, ZsimError)]
-            wrong, warnings = compare_reports(reports)
+            differences, warnings = compare_reports(reports)
             paths: list[NetworkPath] = []  # measured one after another
-            for (target, port), sources in inv.connections(placed, places).items() if places else ():
+            for (target, port), sources in (
+                inv.connections(inventory_file, hosts_by_process).items() if hosts_by_process else ()
+            ):
                 if target in reports:
-                    chosen = [links[name] for name in sorted(sources & set(reports))]
-                    paths += await network_paths(chosen, links[target], pythons, port)
-            cut, slow = path_faults(paths)
-            left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
+                    source_links = [links[name] for name in sorted(sources & set(reports))]
+                    paths += await network_paths(source_links, links[target], pythons, port)
+            blocked, slow = path_faults(paths)
+            leftover_lines = await asyncio.gather(*(leftovers(links[name], inventory_file.folder) for name in reports))
             tables = [hosts_table(reports), *([paths_table(paths)] if paths else [])]
-            return tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)]
+            return (
+                tables,
+                [*faults, *differences, *blocked],
+                [*warnings, *slow, *(line for lines in leftover_lines for line in lines)],
+            )
         finally:
             for link in links.values():
                 await link.close()
 
     tables, faults, warnings = asyncio.run(check())
-    lacks = certificates.certificate_faults(placed, places, datetime.now(UTC))
-    exposed = certificates.exposed_keys(placed)
-    return CheckResult(tables, [*lacks, *faults], [*warnings, *([exposed] if exposed else [])])
+    certificate_lines = certificates.certificate_faults(inventory_file, hosts_by_process, datetime.now(UTC))
+    exposed = certificates.exposed_keys(inventory_file)
+    return CheckResult(tables, [*certificate_lines, *faults], [*warnings, *([exposed] if exposed else [])])
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
@@ -162,27 +170,27 @@ async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostR
     remedy = f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
     answers: list[tuple[float, float]] = []  # round trip of a line, and clock offset [s]
     try:
-        async with _probe(link, python, "about", link.host.folder) as there:
-            facts = await there.answer(ABOUT_S)
+        async with _probe(link, python, "about", link.host.folder) as probe:
+            facts = await probe.answer(ABOUT_S)
             for _ in range(OFFSET_SAMPLES):
                 start_s, sent_s = time.time(), time.monotonic()
-                there.send("\n")
-                there_s = (await there.answer(ABOUT_S))["time_ns"] / 1e9
+                probe.send("\n")
+                host_s = (await probe.answer(ABOUT_S))["time_ns"] / 1e9
                 took_s = time.monotonic() - sent_s
-                answers.append((took_s, there_s - (start_s + took_s / 2)))
+                answers.append((took_s, host_s - (start_s + took_s / 2)))
     except ProgramEndedError as error:
         raise HostsError(f"{link.name}: {_probe_fault(link, python, remedy, error)}") from error
     return HostReport(facts, *min(answers), remedy)
 
 
 def _probe_fault(link: HostLink, python: str, remedy: str, error: ProgramEndedError) -> str:
-    text, why = error.last.lower(), error.last or "it printed nothing"
+    text, reason = error.last.lower(), error.last or "it printed nothing"
     if NO_MODULE in text:
         return f"{python} has no zsim {__version__}; {remedy}"
     if error.status not in NO_PROGRAM_CODES and not any(sign in text for sign in NO_PROGRAM):
-        return f"{python}: the probe ended with code {error.status} ({why}); is it a Python that has zsim?"
+        return f"{python}: the probe ended with code {error.status} ({reason}); is it a Python that has zsim?"
     if link.host.python:
-        return f"python {python} is not a program there ({why}); correct hosts.{link.name}.python, or {remedy}"
+        return f"python {python} is not a program there ({reason}); correct hosts.{link.name}.python, or {remedy}"
     return f"has no zsim in {link.host.folder}; {remedy}"
 
 
@@ -197,9 +205,9 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
         facts = report.facts
         if facts["zsim"] != __version__:
             faults.append(f"{name}: zsim is {facts['zsim']}; must be {__version__} as here; {report.remedy}")
-        if why := facts["unwritable"]:
+        if reason := facts["unwritable"]:
             remedy = f"correct hosts.{name}.folder, or create the folder there"
-            faults.append(f"{name}: its folder cannot be used ({why}); {remedy}")
+            faults.append(f"{name}: its folder cannot be used ({reason}); {remedy}")
         if abs(report.clock_offset_s) > CLOCK_OFFSET_MAX_S + report.round_trip_s:
             warnings.append(f"{name}: its clock is {report.clock_offset_s:+.1f} s off; set it with chrony or ntp")
         if facts["load"] > LOAD_MAX * facts["cores"]:
@@ -212,28 +220,28 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
             free = f"{facts['free_bytes'] / 1e9:.1f} GB are free on its disk"
             warnings.append(f"{name}: {free}; a record of an hour takes about 1 GB")
     computing = {name: report for name, report in reports.items() if NEEDED_TO_COMPUTE in report.facts["machine"]}
-    return faults, [*warnings, *_different_fingerprints(computing), *_lacking(computing)]
+    return faults, [*warnings, *_different_fingerprints(computing), *_lacked_packages(computing)]
 
 
 def _different_fingerprints(reports: dict[str, HostReport]) -> Iterator[str]:
     """Yield a warning if the fingerprints differ, with the parts that cause it."""
-    prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
-    if len(set(prints.values())) < 2:
+    fingerprints = {name: report.facts["fingerprint"] for name, report in reports.items()}
+    if len(set(fingerprints.values())) < 2:
         return
-    shown = ", ".join(f"{name} {text[:8]}" for name, text in prints.items())
+    listed = ", ".join(f"{name} {text[:8]}" for name, text in fingerprints.items())
     parts = {name: report.facts["parts"] for name, report in reports.items()}
     names = dict.fromkeys(part for each in parts.values() for part in each)
     differing = [part for part in names if len({each.get(part) for each in parts.values()}) > 1]
     values = {part: [f"{name} {each.get(part, 'none')}" for name, each in parts.items()] for part in differing}
-    causes = "; ".join(f"{part}: {', '.join(found)}" for part, found in values.items())
-    yield f"the hosts have different code, so identical results are not guaranteed (fingerprints {shown}); {causes}"
+    causes = "; ".join(f"{part}: {', '.join(host_values)}" for part, host_values in values.items())
+    yield f"the hosts have different code, so identical results are not guaranteed (fingerprints {listed}); {causes}"
 
 
-def _lacking(reports: dict[str, HostReport]) -> Iterator[str]:
+def _lacked_packages(reports: dict[str, HostReport]) -> Iterator[str]:
     """Yield a warning for each host that lacks a package that others compute with: slower, but with the same bits."""
     for name, report in reports.items():
-        others = {part for each in reports.values() for part in each.facts["machine"]}
-        if lacking := " and ".join(sorted(others - set(report.facts["machine"]))):
+        all_parts = {part for each in reports.values() for part in each.facts["machine"]}
+        if lacking := " and ".join(sorted(all_parts - set(report.facts["machine"]))):
             yield f"{name}: has no {lacking}, which other hosts compute with; {report.remedy}"
 
 
@@ -272,18 +280,18 @@ def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
     """Return a fault for each blocked path and a warning for each slow one, one line each."""
     faults, slow = [], []
     for path in paths:
-        why, taken = path.measured.get("error"), path.measured.get("taken")
-        if why is None:
+        reason, is_taken = path.measured.get("error"), path.measured.get("taken")
+        if reason is None:
             if path.measured["bits_per_s"] < BITS_PER_S_MIN:
-                shown = f"{path.measured['bits_per_s'] / 1e6:.1f} Mbit/s"
-                slow.append(f"{path.source} reaches {path.target} at only {shown}")
-        elif taken:
+                bandwidth = f"{path.measured['bits_per_s'] / 1e6:.1f} Mbit/s"
+                slow.append(f"{path.source} reaches {path.target} at only {bandwidth}")
+        elif is_taken:
             faults.append(port_in_use(path.target, path.port))
-        elif taken is False:
-            fault = f"cannot listen on port {path.port} there ({why}); give another port in the inventory"
+        elif is_taken is False:
+            fault = f"cannot listen on port {path.port} there ({reason}); give another port in the inventory"
             faults.append(f"{path.target}: {fault}")
         else:
-            fault = f"port {path.port} of {path.target} cannot be reached ({why}); is it open in the firewall?"
+            fault = f"port {path.port} of {path.target} cannot be reached ({reason}); is it open in the firewall?"
             faults.append(f"{path.source}: {fault}")
     return faults, slow
 
@@ -311,8 +319,8 @@ async def leftovers(link: HostLink, base: Path) -> list[str]:
     name, folder = link.name, runs_folder(link.host)
     script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
     output = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
-    words = [line.split(" ", 1) for line in output.splitlines()]
-    runs = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
+    entries = [line.split(" ", 1) for line in output.splitlines()]
+    runs = {kind: [entry[1] for entry in entries if entry[0] == kind and len(entry) > 1] for kind in (RECORD, KEY)}
     lines = []
     if records := [f"{folder}/{run}/{RECORD}" for run in runs[RECORD]]:
         lines.append(
@@ -330,13 +338,13 @@ async def leftovers(link: HostLink, base: Path) -> list[str]:
 def scp(host: Host, base: Path, path: str) -> str:
     """Return the scp command that copies a file from a host to here, with the ssh settings of `zsim up`."""
     address = host.ssh or host.address
-    shown = f"[{address}]" if ":" in address else address
-    words = ["scp", *(["-P", str(host.port)] if host.port != SSH_PORT else [])]
-    words += ["-i", str(base / Path(host.key).expanduser())] if host.key else []
+    host_text = f"[{address}]" if ":" in address else address
+    command = ["scp", *(["-P", str(host.port)] if host.port != SSH_PORT else [])]
+    command += ["-i", str(base / Path(host.key).expanduser())] if host.key else []
     if host.known_hosts:
-        words += ["-o", f"UserKnownHostsFile={base / Path(host.known_hosts).expanduser()}"]
+        command += ["-o", f"UserKnownHostsFile={base / Path(host.known_hosts).expanduser()}"]
     user = f"{host.user}@" if host.user else ""
-    return shlex.join([*words, f"{user}{shown}:{path.removeprefix('~/')}", "."])
+    return shlex.join([*command, f"{user}{host_text}:{path.removeprefix('~/')}", "."])
 
 
 async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
@@ -345,8 +353,8 @@ async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list
         return []
     command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"
     output = await link.run(command, TRY_PORTS.encode(), TRY_PORTS_S, "looking for free ports")
-    taken = (json_answer(output.decode(errors="replace").splitlines()) or {}).get("taken", [])
-    return [port_in_use(link.name, port) for port in taken]
+    occupied = (json_answer(output.decode(errors="replace").splitlines()) or {}).get("taken", [])
+    return [port_in_use(link.name, port) for port in occupied]
 
 
 def port_in_use(host: str, port: int) -> str:

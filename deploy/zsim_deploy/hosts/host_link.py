@@ -62,17 +62,17 @@ class EventLoopThread:
     def spawn(self, work: Coroutine[Any, Any, None]) -> Future[None]:
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
-    def call_soon(self, act: Any, *args: Any) -> None:
-        self._loop.call_soon_threadsafe(act, *args)
+    def call_soon(self, callback: Any, *args: Any) -> None:
+        self._loop.call_soon_threadsafe(callback, *args)
 
     def close(self) -> None:
         """Cancel the running tasks and end the thread."""
 
         async def cancel_all() -> None:
-            others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
-            for task in others:
+            tasks = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+            for task in tasks:
                 task.cancel()
-            await asyncio.wait(others, timeout=CLOSE_S / 2) if others else None
+            await asyncio.wait(tasks, timeout=CLOSE_S / 2) if tasks else None
 
         self.call(cancel_all(), CLOSE_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -134,8 +134,8 @@ class HostLink:
             try:
                 done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
             except TimeoutError as error:
-                act = what or repr(command[:60])
-                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {act}") from error
+                description = what or repr(command[:60])
+                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {description}") from error
             except (asyncssh.Error, OSError) as error:
                 raise _broken(self.name, error) from error
         if done.exit_status != 0:
@@ -199,8 +199,8 @@ def _broken(name: str, error: Exception) -> HostsError:
 class HostLinks:
     """A link to each host of a run."""
 
-    def __init__(self, placed: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
-        self._placed = placed
+    def __init__(self, inventory_file: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
+        self._inventory_file = inventory_file
         self._loop = loop
         self.by_name = {
             name: self.to(name) for name in names
@@ -208,7 +208,7 @@ class HostLinks:
 
     def to(self, name: str) -> HostLink:
         """Return a new link to a host of the inventory, without adding it."""
-        return HostLink(name, self._placed.inventory.hosts[name], self._placed.folder)
+        return HostLink(name, self._inventory_file.inventory.hosts[name], self._inventory_file.folder)
 
     def add(self, link: HostLink) -> None:
         self.by_name = {**self.by_name, link.name: link}
@@ -229,8 +229,8 @@ class HostLinks:
             try:
                 return await asyncio.wait_for(work(link), within_s)
             except TimeoutError as error:
-                why = f"not done within {within_s:g} s; is the link slow or the host busy?"
-                raise HostsError(f"{link.name}: {why}") from error
+                reason = f"not done within {within_s:g} s; is the link slow or the host busy?"
+                raise HostsError(f"{link.name}: {reason}") from error
 
         async def gathered() -> list[Any]:
             return await asyncio.gather(*map(bounded, self.by_name.values()), return_exceptions=True)
@@ -388,15 +388,15 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
     """
     client, address = _Client(), host.ssh or host.address
     options: dict[str, Any] = {"keepalive_interval": KEEPALIVE_S, "keepalive_count_max": KEEPALIVE_COUNT}
-    known = Path("~/.ssh/known_hosts")
+    known_hosts = Path("~/.ssh/known_hosts")
     try:
         if host.user is not None:
             options["username"] = host.user
         if host.key is not None:
             options["client_keys"] = [str(base / Path(host.key).expanduser())]
         if host.known_hosts is not None:
-            known = base / Path(host.known_hosts).expanduser()
-            options["known_hosts"] = str(known)
+            known_hosts = base / Path(host.known_hosts).expanduser()
+            options["known_hosts"] = str(known_hosts)
         opening = asyncssh.connect(address, host.port, client_factory=lambda: client, **options)
         return await asyncio.wait_for(opening, CONNECT_S)
     except (asyncssh.Error, asyncssh.KeyImportError, OSError, ValueError, TimeoutError) as error:
@@ -407,30 +407,30 @@ async def connect(name: str, host: Host, base: Path) -> Connection:
             with contextlib.suppress(asyncssh.Error, OSError, ValueError, TimeoutError):
                 key = await asyncio.wait_for(asyncssh.get_server_host_key(address, host.port), CONNECT_S)
                 refused = (address, "", host.port, key) if key else None
-        reason = _changed_key(name, host, known, *refused) if refused else ""
-        raise HostsError(f"{name}: {reason or _reason(name, host, base, known, error)}") from error
+        reason = _changed_key(name, host, known_hosts, *refused) if refused else ""
+        raise HostsError(f"{name}: {reason or _reason(name, host, base, known_hosts, error)}") from error
 
 
 def _changed_key(
-    name: str, host: Host, known: Path, looked_for: str, address: str, port: int, shown: asyncssh.SSHKey
+    name: str, host: Host, known_hosts: Path, searched_name: str, address: str, port: int, host_key: asyncssh.SSHKey
 ) -> str:
     """Return a text on a host key that differs from the known one; empty if it does not, or none is known."""
-    path = str(known.expanduser())
+    path = str(known_hosts.expanduser())
     try:
-        keys = asyncssh.match_known_hosts(path, looked_for, address, None if port == SSH_PORT else port)[0]
+        keys = asyncssh.match_known_hosts(path, searched_name, address, None if port == SSH_PORT else port)[0]
     except (OSError, ValueError):
         return ""
-    if not keys or shown in keys:
+    if not keys or host_key in keys:
         return ""
-    entry = looked_for if host.port == SSH_PORT else f"[{looked_for}]:{host.port}"
+    entry = searched_name if host.port == SSH_PORT else f"[{searched_name}]:{host.port}"
     return (
-        f"the host key of {host.ssh or host.address} port {host.port} is not the one in {known} (it shows "
-        f"{shown.get_fingerprint()}); another machine may pose as {name}; ask who runs it, and only if the key was "
+        f"the host key of {host.ssh or host.address} port {host.port} is not the one in {known_hosts} (it shows "
+        f"{host_key.get_fingerprint()}); another machine may pose as {name}; ask who runs it, and only if the key was "
         f"changed there, remove the old one ({shlex.join(['ssh-keygen', '-f', path, '-R', entry])}) and add the new one"
     )
 
 
-def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) -> str:
+def _reason(name: str, host: Host, base: Path, known_hosts: Path, error: Exception) -> str:
     """Return why a connection failed, and what to do."""
     address = host.ssh or host.address
     at = f"{address} port {host.port}"
@@ -439,7 +439,7 @@ def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) ->
     match error:
         case asyncssh.HostKeyNotVerifiable():
             scan = shlex.join(["ssh-keyscan", "-p", str(host.port), address])
-            return f"the host key of {at} is not in {known}; check it and add it: {scan} >> {known}"
+            return f"the host key of {at} is not in {known_hosts}; check it and add it: {scan} >> {known_hosts}"
         case asyncssh.PermissionDenied():
             return f"ssh at {at} refuses user {user} with {key}; correct hosts.{name}.user or key, or run ssh-copy-id"
         case asyncssh.KeyImportError() if "Passphrase" in str(error):
@@ -453,7 +453,7 @@ def _reason(name: str, host: Host, base: Path, known: Path, error: Exception) ->
         case socket.gaierror():
             return f"address {address!r} cannot be resolved; correct hosts.{name}.address or ssh"
         case OSError():
-            why = os.strerror(error.errno) if error.errno else error
-            return f"ssh at {at} cannot be reached ({why}); is sshd running there and the port open?"
+            cause = os.strerror(error.errno) if error.errno else error
+            return f"ssh at {at} cannot be reached ({cause}); is sshd running there and the port open?"
         case _:
             return f"ssh at {at} failed ({error}); try `ssh -p {host.port} {user}@{address}`"

@@ -74,17 +74,17 @@ class HostRun:
     """One run on several hosts; raises InventoryError if a process has no host."""
 
     def __init__(
-        self, scenario: Scenario, placed: InventoryFile, out: Path, launch: Launch, status: StatusTable
+        self, scenario: Scenario, inventory_file: InventoryFile, out: Path, launch: Launch, status: StatusTable
     ) -> None:
         self._scenario, self._launch = scenario, launch
-        self._placed = placed
+        self._inventory_file = inventory_file
         self._out = out
         self._status = status
         pace = [*pace_options(launch.mode, launch.rate), *changed_options(launch.changed)]
-        self._plan = HostPlan(placed, scenario, launch.run_id, pace)  # replaced after each move
+        self._plan = HostPlan(inventory_file, scenario, launch.run_id, pace)  # replaced after each move
         self._supervisor = Supervisor(scenario.processes, status)
         self._loop = EventLoopThread()
-        self._links = HostLinks(placed, self._plan.hosts(), self._loop)
+        self._links = HostLinks(inventory_file, self._plan.hosts(), self._loop)
         self._record_stays = False
         self._signals = EndSignals(out / "up.log", status.hang_up)
         self._replacing = threading.Lock()  # held by a request that replaces a process
@@ -106,7 +106,7 @@ class HostRun:
             with self._signals, ControlSocket(self._scenario.federation, requests):
                 if faults := self._plan.certificate_faults(datetime.now(UTC)):
                     raise HostsError("\n".join(faults))
-                if warning := certificates.exposed_keys(self._placed):
+                if warning := certificates.exposed_keys(self._inventory_file):
                     self._status.say(f"warning: {warning}")
                 with self._timed("connect"):
                     self._links.on_all(HostLink.open, CONNECT_S)
@@ -122,24 +122,24 @@ class HostRun:
             self._loop.close()
 
     @contextlib.contextmanager
-    def _timed(self, what: str) -> Iterator[None]:
+    def _timed(self, step: str) -> Iterator[None]:
         start_s = time.monotonic()
         yield
-        self._status.stages_s[what] = time.monotonic() - start_s
+        self._status.stages_s[step] = time.monotonic() - start_s
 
     def _check(self) -> None:
         async def inspect(link: HostLink) -> tuple[HostReport, list[str], list[str]]:
             """Return the report of a host, faults of its ports, and lines on what earlier runs have left there."""
             python = self._plan.python(link.name)
-            report = await host_report(link, python, self._placed.word)
-            taken = await port_faults(link, python, self._plan.ports(link.name))
-            return report, taken, await leftovers(link, self._placed.folder)
+            report = await host_report(link, python, self._inventory_file.shell_path)
+            port_lines = await port_faults(link, python, self._plan.ports(link.name))
+            return report, port_lines, await leftovers(link, self._inventory_file.folder)
 
-        found = self._links.on_all(inspect, CHECK_S)
-        faults, warnings = compare_reports({name: report for name, (report, _, _) in found.items()})
-        for warning in [*warnings, *(line for _, _, left in found.values() for line in left)]:
+        results = self._links.on_all(inspect, CHECK_S)
+        faults, warnings = compare_reports({name: report for name, (report, _, _) in results.items()})
+        for warning in [*warnings, *(line for _, _, leftover_lines in results.values() for line in leftover_lines)]:
             self._status.say(f"warning: {warning}")
-        if faults := [*faults, *(line for _, taken, _ in found.values() for line in taken)]:
+        if faults := [*faults, *(line for _, port_lines, _ in results.values() for line in port_lines)]:
             raise HostsError("\n".join(faults))
 
     async def _prepare(self, link: HostLink) -> None:
@@ -153,18 +153,18 @@ class HostRun:
             (self._out / "scenario.yaml").write_text(scenario_file.to_text(self._scenario))
         for remark in self._plan.remarks:
             self._status.say(remark)
-        here = programs_of(self._scenario, self._plan.programs, self._plan.endpoint(), self._out, self._launch)
-        self._supervisor.members = [*(self._remote(self._plan, name) for name in self._plan.processes), *here]
+        own_programs = programs_of(self._scenario, self._plan.programs, self._plan.endpoint(), self._out, self._launch)
+        self._supervisor.members = [*(self._remote(self._plan, name) for name in self._plan.processes), *own_programs]
         self._status.members, self._status.links = self._supervisor.members, self._links.by_name
         self._links.listen()
         self._record_stays = True
-        self._look()
+        self._poll()
         try:
-            outcome = self._supervisor.run(self._look)
+            outcome = self._supervisor.run(self._poll)
             fault = self._fetch()
         except KeyboardInterrupt:
-            where = self._plan.record_location()
-            self._status.say(f"the record was not fetched; what was recorded is at {where}")
+            location = self._plan.record_location()
+            self._status.say(f"the record was not fetched; what was recorded is at {location}")
             raise
         if fault and not outcome.failed and not outcome.interrupted:
             return replace(outcome, reason=fault, failed=True)
@@ -172,7 +172,7 @@ class HostRun:
             self._status.say(fault)
         return outcome
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """End the run if its output can no longer be seen; report hosts that have stopped answering."""
         if reason := self._signals.look():
             self._supervisor.interrupt(reason)
@@ -188,15 +188,15 @@ class HostRun:
 
     def _fetch(self) -> str:
         """Fetch the record; return why that failed, empty if it did not."""
-        host, into = self._plan.host(RECORDER), self._out / RECORD
+        host, target = self._plan.host(RECORDER), self._out / RECORD
         self._status.say(f"fetching the record from {host}:{self._plan.record()} …")
         try:
-            exists = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
+            exists = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), target))
             if exists:
-                repair(into)
+                repair(target)
         except (ZsimError, OSError) as error:
-            where = self._plan.record_location()
-            return f"the record could not be fetched ({error}); what was recorded is at {where}"
+            location = self._plan.record_location()
+            return f"the record could not be fetched ({error}); what was recorded is at {location}"
         self._record_stays = False
         return "" if exists else "nothing was recorded"
 
@@ -238,7 +238,7 @@ class HostRun:
         self._refuse_unless_runs(role)
         if role in (WORLD, RECORDER) or role.startswith(f"{ROUTER}."):
             raise RunError(f"{role} cannot be moved while the run goes on; change the inventory and run again")
-        if host not in (hosts := self._plan.placed.inventory.hosts):
+        if host not in (hosts := self._plan.inventory_file.inventory.hosts):
             raise RunError(f"host is {host!r}; must be one of {', '.join(hosts)}")
         with self._replacing:
             plan = self._plan.moved(role, host)
@@ -281,15 +281,15 @@ class HostRun:
             time.sleep(LOOK_S)
         new = self._remote(plan, role)
 
-        def take() -> None:
+        def replace_process() -> None:
             self._supervisor.replace(new)
             self._plan = plan
 
-        carried_out = self._supervisor.submit(take)
-        wait([carried_out], ORDER_S)
-        carried_out.cancel()  # has no effect once the order is being carried out
+        replacement = self._supervisor.submit(replace_process)
+        wait([replacement], ORDER_S)
+        replacement.cancel()  # has no effect once the order is being carried out
         try:
-            carried_out.result()
+            replacement.result()
         except CancelledError as error:
             raise RunError("the run is ending; no more processes are started") from error
         return f"{role} on {host}"
@@ -310,22 +310,28 @@ async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
 class HostPlan:
     """The processes that zsim starts in a run, and their hosts; immutable. Raises InventoryError if one has none."""
 
-    def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
-        self.placed = placed
+    def __init__(
+        self, inventory_file: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()
+    ) -> None:
+        self.inventory_file = inventory_file
         self._scenario = scenario
         self._run_id = run_id  # names the run's folder on each host
         self._pace = pace  # command line options of the world
-        in_order = sorted(inv.processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
-        self.processes = {process.name: process for process in in_order}  # each after the process that it connects to
-        self.programs = inv.programs_here(placed, scenario)  # the user's own programs, started on this machine
+        ordered = sorted(inv.processes(inventory_file, scenario, pace), key=lambda process: process.role != ROUTER)
+        self.processes = {process.name: process for process in ordered}  # each after the process that it connects to
+        self.programs = inv.local_programs(inventory_file, scenario)  # the user's own programs, started on this machine
         # a line about each of the user's programs that is placed on a host; zsim does not start these
-        self.remarks = [line for host in placed.inventory.hosts for line in inv.own_programs(placed, scenario, host)]
+        self.remarks = [
+            line for host in inventory_file.inventory.hosts for line in inv.own_programs(inventory_file, scenario, host)
+        ]
 
     def moved(self, name: str, host: str) -> HostPlan:
         """Return a plan with another host for one process."""
-        places = {**inv.placement(self.placed, self._scenario), name: host}
-        placed = self.placed._replace(inventory=structs.replace(self.placed.inventory, roles=places))
-        return HostPlan(placed, self._scenario, self._run_id, self._pace)
+        hosts_by_process = {**inv.placement(self.inventory_file, self._scenario), name: host}
+        inventory_file = self.inventory_file._replace(
+            inventory=structs.replace(self.inventory_file.inventory, roles=hosts_by_process)
+        )
+        return HostPlan(inventory_file, self._scenario, self._run_id, self._pace)
 
     def hosts(self) -> list[str]:
         return sorted({process.host for process in self.processes.values()})
@@ -334,7 +340,7 @@ class HostPlan:
         return self.processes[name].host
 
     def folder(self, host: str) -> str:
-        return f"{runs_folder(self.placed.inventory.hosts[host])}/{self._run_id}"
+        return f"{runs_folder(self.inventory_file.inventory.hosts[host])}/{self._run_id}"
 
     def keys(self, host: str) -> str:
         """Return the folder on a host that holds the private keys of this run's processes."""
@@ -342,7 +348,7 @@ class HostPlan:
 
     def endpoint(self) -> str:
         """Return the endpoint to which programs on this machine connect."""
-        return inv.endpoint(self.placed, inv.placement(self.placed, self._scenario), self.host(WORLD))
+        return inv.endpoint(self.inventory_file, inv.placement(self.inventory_file, self._scenario), self.host(WORLD))
 
     def record(self) -> str:
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"
@@ -350,17 +356,19 @@ class HostPlan:
     def record_location(self) -> str:
         """Return the host and path of the record, with the command that fetches it."""
         name = self.host(RECORDER)
-        command = scp(self.placed.inventory.hosts[name], self.placed.folder, self.record())
+        command = scp(self.inventory_file.inventory.hosts[name], self.inventory_file.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"
 
     def ports(self, host: str) -> list[int]:
         return [process.port for process in self.processes.values() if process.host == host and process.port]
 
     def certificate_faults(self, now: datetime) -> list[str]:
-        return certificates.certificate_faults(self.placed, {name: self.host(name) for name in self.processes}, now)
+        return certificates.certificate_faults(
+            self.inventory_file, {name: self.host(name) for name in self.processes}, now
+        )
 
     def python(self, host: str) -> str:
-        return inv.python(self.placed.inventory.hosts[host])
+        return inv.python(self.inventory_file.inventory.hosts[host])
 
     def arguments(self, name: str) -> list[str]:
         """Return the arguments of `zsim` that start a process."""
@@ -389,11 +397,11 @@ class HostPlan:
         process = self.processes[name]
         if not process.secure:
             return {}
-        source = certificates.folder_of(self.placed) / process.host
+        source = certificates.folder_of(self.inventory_file) / process.host
         paths = {file: source / name / file for file in CERTIFICATES}
         if process.port is not None:
             paths[ACCESS] = source / inv.access_file(process)
-        init = certificates.init_command(self.placed)
+        init = certificates.init_command(self.inventory_file)
         remedy = f"make certificates with `{init}`, or set security.insecure on a network of your own"
         contents = {}
         for file, path in paths.items():

@@ -53,31 +53,36 @@ Progress = Callable[[str, str], None]  # host, current step
 
 
 async def push(
-    placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
+    inventory_file: InventoryFile, names: Sequence[str], extra_names: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
     """Install on hosts, by default on all, what their roles need; return whether anything was installed, by host.
 
-    `names`: the hosts; `more`: extras besides those of the roles; `cache`: folder of the wheelhouse. Raise
+    `names`: the hosts; `extra_names`: extras besides those of the roles; `cache`: folder of the wheelhouse. Raise
     InventoryError if a host or an extra is unknown, and HostsError with a line for each host that failed, once the
     others are done.
     """
-    hosts = placed.inventory.hosts
-    more = list(more)
+    hosts = inventory_file.inventory.hosts
+    extra_names = list(extra_names)
     unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
-    known = sorted(importlib.metadata.metadata("zsim").get_all("Provides-Extra") or [])
-    unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
+    available = sorted(importlib.metadata.metadata("zsim").get_all("Provides-Extra") or [])
+    unknown += [
+        f"--extra {name}: must be one of {', '.join(available)}" for name in extra_names if name not in available
+    ]
     if unknown:
         raise InventoryError(unknown)
-    wanted = needed_extras(placed.inventory, more)
+    extras_by_host = needed_extras(inventory_file.inventory, extra_names)
     wheelhouse = Wheelhouse(cache, lambda text: progress(LAUNCHER, text))
-    chosen = list(dict.fromkeys(names)) or list(hosts)
-    work = [_push_to(name, hosts[name], placed.folder, wanted[name], wheelhouse, progress) for name in chosen]
+    selected = list(dict.fromkeys(names)) or list(hosts)
+    work = [
+        _push_to(name, hosts[name], inventory_file.folder, extras_by_host[name], wheelhouse, progress)
+        for name in selected
+    ]
     results = raise_faults(await asyncio.gather(*work, return_exceptions=True))
-    return dict(zip(chosen, results, strict=True))
+    return dict(zip(selected, results, strict=True))
 
 
 async def _push_to(
-    name: str, host: Host, base: Path, wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
+    name: str, host: Host, base: Path, extras: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
 ) -> bool:
     if host.python:
         progress(name, f"uses its own zsim, that of {host.python}")
@@ -88,8 +93,8 @@ async def _push_to(
         output = await link.run(shell_line(["sh", "-c", interpreter_query()]), timeout_s=ASK_S)
         interpreters = parse_interpreters(output.decode(errors="replace"))
         python = choose_interpreter(name, interpreters, sys.version_info[:2]).path
-        async with open_installer(link, python, host.folder, partial(progress, name)) as there:
-            return await _install(link, there, wanted, wheelhouse, partial(progress, name))
+        async with open_installer(link, python, host.folder, partial(progress, name)) as installer:
+            return await _install(link, installer, extras, wheelhouse, partial(progress, name))
     except HostsError:
         progress(name, "failed")
         raise
@@ -98,14 +103,18 @@ async def _push_to(
 
 
 async def _install(
-    link: HostLink, there: "Installer", wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Callable[[str], None]
+    link: HostLink,
+    installer: "Installer",
+    extras: frozenset[str],
+    wheelhouse: Wheelhouse,
+    progress: Callable[[str], None],
 ) -> bool:
     """Install zsim with the wanted extras; return whether anything was installed."""
-    facts = await there.ask("look", ASK_S)
-    needed = await wheelhouse.wheel_set(link.name, wheel_target(link.name, facts), wanted)
-    described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
+    facts = await installer.ask("look", ASK_S)
+    needed = await wheelhouse.wheel_set(link.name, wheel_target(link.name, facts), extras)
+    description = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
     if is_installed(needed, facts["installed"]):
-        progress(f"{described} is already installed")
+        progress(f"{description} is already installed")
         return False
     await _copy(link, f"{facts['folder']}/wheels", missing(needed, facts), progress)
     progress("installing")
@@ -117,11 +126,11 @@ async def _install(
         "modules": [MODULES[extra] for extra in ("", *needed.extras) if extra in MODULES],
         "note": needed.manifest(),
     }
-    await there.ask("install", INSTALL_S, **order)
+    await installer.ask("install", INSTALL_S, **order)
     if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
         progress("compiling the kernels")
-        await there.ask("warm_up", COMPILE_S, module=warm_up.__name__, extras=needed.extras)
-    progress(f"{described} installed")
+        await installer.ask("warm_up", COMPILE_S, module=warm_up.__name__, extras=needed.extras)
+    progress(f"{description} installed")
     return True
 
 
@@ -134,8 +143,8 @@ def is_installed(wanted: WheelSet, installed: dict[str, Any] | None) -> bool:
 
 def _new(wanted: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
     """Return the wheels of other projects that are not installed yet."""
-    known = installed["wheels"] if installed else {}
-    return [wheel for wheel in wanted.others if known.get(wheel.path.name) != wheel.sha256]
+    installed_hashes = installed["wheels"] if installed else {}
+    return [wheel for wheel in wanted.others if installed_hashes.get(wheel.path.name) != wheel.sha256]
 
 
 def missing(wanted: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
@@ -151,11 +160,11 @@ async def _copy(link: HostLink, folder: str, wheels: Sequence[Wheel], progress: 
     gate = asyncio.Semaphore(COPIES)
 
     async def one(sftp: asyncssh.SFTPClient, wheel: Wheel) -> None:
-        part, seen = f"{folder}/{wheel.path.name}.part", 0
+        part, copied_before = f"{folder}/{wheel.path.name}.part", 0
 
         def on_copied(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
-            nonlocal done, seen
-            done, seen = done + copied - seen, copied
+            nonlocal done, copied_before
+            done, copied_before = done + copied - copied_before, copied
             progress(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
 
         async with gate:
@@ -167,8 +176,8 @@ async def _copy(link: HostLink, folder: str, wheels: Sequence[Wheel], progress: 
             await sftp.makedirs(folder, exist_ok=True)
             await asyncio.gather(*(one(sftp, wheel) for wheel in wheels))
     except (asyncssh.Error, OSError) as error:
-        why = f"copying to {folder} failed ({error}); is there space, and is the link up?"
-        raise HostsError(f"{link.name}: {why}") from error
+        reason = f"copying to {folder} failed ({error}); is there space, and is the link up?"
+        raise HostsError(f"{link.name}: {reason}") from error
 
 
 class Interpreter(NamedTuple):
@@ -190,21 +199,21 @@ def parse_interpreters(answer: str) -> list[Interpreter]:
     return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in matches]
 
 
-def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
-    """Return the Python to install for: one with the launcher's minor version (`here`), preferably called `python3`.
+def choose_interpreter(name: str, interpreters: Sequence[Interpreter], local: tuple[int, int]) -> Interpreter:
+    """Return the Python to install for: one with the launcher's minor version (`local`), preferably called `python3`.
 
     Raise HostsError if the host has none, because runs with different Pythons would not be identical.
     """
-    fit = [each for each in interpreters if each.version[:2] == here]
-    if fit:
-        return max(fit, key=lambda each: (each.command == PLAIN, each.version))
-    wanted = ".".join(map(str, here))
+    matching = [each for each in interpreters if each.version[:2] == local]
+    if matching:
+        return max(matching, key=lambda each: (each.command == PLAIN, each.version))
+    needed = ".".join(map(str, local))
     if not interpreters:
-        raise HostsError(f"{name}: has no python3; must be Python {wanted} as here; install python{wanted} there")
+        raise HostsError(f"{name}: has no python3; must be Python {needed} as here; install python{needed} there")
     by_version = {".".join(map(str, each.version)): each.command for each in reversed(interpreters)}
-    found = ", ".join(f"{command} {version}" for version, command in by_version.items())
+    available = ", ".join(f"{command} {version}" for version, command in by_version.items())
     raise HostsError(
-        f"{name}: has {found}; must be Python {wanted} as here, for identical results; install python{wanted} too, "
+        f"{name}: has {available}; must be Python {needed} as here, for identical results; install python{needed} too, "
         "or run zsim here with a Python that the host has"
     )
 
@@ -215,10 +224,10 @@ class Installer:
     def __init__(self, name: str, python: str, program: RemoteProgram) -> None:
         self._name, self._python, self._program = name, python, program
 
-    async def ask(self, act: str, timeout_s: float, **order: Any) -> dict[str, Any]:
+    async def ask(self, action: str, timeout_s: float, **order: Any) -> dict[str, Any]:
         """Send an order and return the answer; raise HostsError if it fails, takes too long, or the host is lost."""
-        self._program.send(json.dumps({"act": act, **order}) + "\n")
-        message = await self.answer(timeout_s, f"{act} took longer than {timeout_s:g} s; is the host busy?")
+        self._program.send(json.dumps({"act": action, **order}) + "\n")
+        message = await self.answer(timeout_s, f"{action} took longer than {timeout_s:g} s; is the host busy?")
         if "error" in message:
             raise HostsError(f"{self._name}: {message['error'][:300]}")
         return message
@@ -242,8 +251,8 @@ async def open_installer(
     """
     script = Path(on_host.__file__).read_bytes()
     start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # the orders follow in the same stream
-    who = f"{getpass.getuser()}@{socket.gethostname()}"
-    async with open_program(link, shell_line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])) as program:
+    user = f"{getpass.getuser()}@{socket.gethostname()}"
+    async with open_program(link, shell_line([python, "-P", "-c", start, folder, user, f"{SILENT_S:g}"])) as program:
 
         async def beat() -> None:
             with contextlib.suppress(asyncssh.Error, OSError):
@@ -252,20 +261,20 @@ async def open_installer(
                     program.send("\n")
 
         program.send(script.decode())
-        there = Installer(link.name, python, program)
+        installer = Installer(link.name, python, program)
         beats = asyncio.create_task(beat())
         try:
-            message = await there.answer(START_S)
+            message = await installer.answer(START_S)
             if holder := message.get("waits"):
                 progress(f"waiting for the push of {holder}")
-                late = f"{holder} is pushing to it; wait for that push to end, or end it there"
-                message = await there.answer(WAIT_S, late)
-            if why := message.get("unwritable"):
+                timeout_text = f"{holder} is pushing to it; wait for that push to end, or end it there"
+                message = await installer.answer(WAIT_S, timeout_text)
+            if reason := message.get("unwritable"):
                 remedy = f"correct hosts.{link.name}.folder, or create the folder there"
-                raise HostsError(f"{link.name}: its folder cannot be used ({why}); {remedy}")
-            if why := message.get("unlocked"):
-                progress(f"its folder cannot be locked ({why}); do not run two pushes to it at a time")
-            yield there
+                raise HostsError(f"{link.name}: its folder cannot be used ({reason}); {remedy}")
+            if reason := message.get("unlocked"):
+                progress(f"its folder cannot be locked ({reason}); do not run two pushes to it at a time")
+            yield installer
         finally:
             beats.cancel()
 

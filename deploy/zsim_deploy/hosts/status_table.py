@@ -79,7 +79,7 @@ class StatusTable(Screen):
             self._flies = True
             took_s = time.monotonic() - self._begun_s
             stages_s = {**self.stages_s, "processes": took_s - sum(self.stages_s.values())}
-            self.say(f"flies after {took_s:.1f} s: " + ", ".join(f"{what} {s:.1f} s" for what, s in stages_s.items()))
+            self.say(f"flies after {took_s:.1f} s: " + ", ".join(f"{step} {s:.1f} s" for step, s in stages_s.items()))
         if not self._is_live:
             super().clock(line)
 
@@ -151,7 +151,7 @@ class StatusTable(Screen):
     def _render(self) -> Group:
         clock = self.clock_now
         head = cell(describe(clock, self._duration_s) if clock else "starting …")
-        rows = self._choice.of(self.rows())
+        rows = self._choice.select(self.rows())
         lines = max(1, self.console.height - AROUND)
         if len(rows) <= lines:
             return Group(head, table(rows, one_line=True))
@@ -195,27 +195,27 @@ class RowChoice(NamedTuple):
     only: Sequence[str] = ()  # patterns of roles (`estimator.*2`), drones, formations or hosts; empty: all rows
     sort: RowOrder | None = None  # None: in the order of the processes
 
-    def of(self, rows: Sequence[Row]) -> list[Any]:
+    def select(self, rows: Sequence[Row]) -> list[Any]:
         """Return the selected rows, in a stable order."""
-        shown = [row for row in rows if not self.only or any(_matches(pattern, row) for pattern in self.only)]
+        selected = [row for row in rows if not self.only or any(_matches(pattern, row) for pattern in self.only)]
         if self.sort is None:
-            return shown
-        by = self.sort.value
+            return selected
+        sort_key = self.sort.value
         if self.sort is RowOrder.ATTENTION:
-            return sorted(shown, key=needs_attention)
-        if by not in NUMBERS:
-            return sorted(shown, key=lambda row: row[by])
-        field, unknown = NUMBERS[by]
-        return sorted(shown, key=lambda row: -(unknown if row.get(field) is None else row[field]))
+            return sorted(selected, key=needs_attention)
+        if sort_key not in NUMBERS:
+            return sorted(selected, key=lambda row: row[sort_key])
+        field, unknown = NUMBERS[sort_key]
+        return sorted(selected, key=lambda row: -(unknown if row.get(field) is None else row[field]))
 
     def check(self, rows: Sequence[Row]) -> None:
         """Raise RunError, naming some of the roles, if a pattern matches no row."""
         for pattern in self.only:
             if not any(_matches(pattern, row) for row in rows):
                 roles = [row["role"] for row in rows]
-                more = [f"and {len(roles) - NAMED_MAX} more"] if len(roles) > NAMED_MAX else []
-                named = ", ".join([*roles[:NAMED_MAX], *more]) or "none"
-                raise RunError(f"role is {pattern!r}; must match a role, its drone or formation, or a host: {named}")
+                omitted = [f"and {len(roles) - NAMED_MAX} more"] if len(roles) > NAMED_MAX else []
+                names = ", ".join([*roles[:NAMED_MAX], *omitted]) or "none"
+                raise RunError(f"role is {pattern!r}; must match a role, its drone or formation, or a host: {names}")
 
 
 def _matches(pattern: str, row: Row) -> bool:

@@ -131,12 +131,12 @@ class Wheelhouse:
                 raise HostsError(self._unreachable)  # another attempt would take just as long
             try:
                 project = await self._project()
-                wanted = tuple(sorted(extras))
-                key = _key([requirements(project), wanted, target.options(), constraints(), lock()])
-                note = self._houses / f"{key}.json"
-                names = json.loads(note.read_text()) if note.exists() else []
+                extra_names = tuple(sorted(extras))
+                key = _key([requirements(project), extra_names, target.options(), constraints(), lock()])
+                note_path = self._houses / f"{key}.json"
+                names = json.loads(note_path.read_text()) if note_path.exists() else []
                 if not names or not all((self._wheels / name).exists() for name in names):
-                    names = await self._gather(host, note, project, wanted, target)
+                    names = await self._gather(host, note_path, project, extra_names, target)
             except UnreachableError as error:
                 self._unreachable = (
                     f"launcher: the package index cannot be reached ({error}); connect this machine to it for the "
@@ -146,7 +146,7 @@ class Wheelhouse:
         wheels = [_wheel(self._wheels / name) for name in names]
         installer = next(wheel for wheel in wheels if wheel.path.name.startswith(f"{PIP}-"))
         others = tuple(wheel for wheel in wheels if wheel is not installer)
-        return WheelSet(_wheel(project), installer, others, wanted)
+        return WheelSet(_wheel(project), installer, others, extra_names)
 
     async def _project(self) -> Path:
         """Return the wheel of this project, built from the checkout or from the installed version.
@@ -162,7 +162,7 @@ class Wheelhouse:
                 built = Path(temporary, "wheel")
                 build = ("wheel", "--no-deps", "--wheel-dir", str(built), source)
                 try:
-                    if not await is_kept(self._builders, build, self._progress):
+                    if not await has_all_wheels(self._builders, build, self._progress):
                         if needs := _description(root)["build-system"]["requires"] if root else []:
                             await pip("download", "--dest", str(self._builders), *needs, progress=self._progress)
                         await pip(*build, "--find-links", str(self._builders), progress=self._progress)
@@ -181,11 +181,11 @@ class Wheelhouse:
         self, host: str, note: Path, project: Path, extras: Sequence[str], target: WheelTarget
     ) -> list[str]:
         self._progress(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
-        wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
+        requested = f"{project}[{','.join(extras)}]" if extras else str(project)
         with tempfile.TemporaryDirectory(dir=self._folder) as temporary:
             try:
                 other_versions = await download_wheels(
-                    [wanted, PIP], target, Path(temporary), (constraints(), lock()), self._wheels, self._progress
+                    [requested, PIP], target, Path(temporary), (constraints(), lock()), self._wheels, self._progress
                 )
             except PipError as error:
                 line = f"no wheels for {target}: {error}"
@@ -252,8 +252,8 @@ def _sources(root: Path) -> list[tuple[str, str]]:
     files = [root / "pyproject.toml", root / "README.md"]
     for package in _description(root)["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
         files += sorted(path for path in (root / package).rglob("*") if path.is_file())
-    kept = [path for path in files if "__pycache__" not in path.parts]
-    return [(str(path.relative_to(root)), _sha256(path)) for path in kept]
+    sources = [path for path in files if "__pycache__" not in path.parts]
+    return [(str(path.relative_to(root)), _sha256(path)) for path in sources]
 
 
 def _wheel(path: Path) -> Wheel:
@@ -274,19 +274,19 @@ def default_cache() -> Path:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
     except RuntimeError as error:  # HOME is not set, and the system does not know the user
-        why = "this user has no home folder for the cache; set XDG_CACHE_HOME to a folder"
-        raise HostsError(f"push: {why}") from error
+        reason = "this user has no home folder for the cache; set XDG_CACHE_HOME to a folder"
+        raise HostsError(f"push: {reason}") from error
 
 
 # Running pip
 
 
 async def download_wheels(
-    wanted: Sequence[str],
+    requested: Sequence[str],
     target: WheelTarget,
     into: Path,
-    held: Sequence[Sequence[str]],
-    kept: Path,
+    constraint_lists: Sequence[Sequence[str]],
+    cached: Path,
     progress: Progress,
 ) -> bool:
     """Collect wheels for a target in a folder; return whether the first list of constraints could not be met.
@@ -294,47 +294,47 @@ async def download_wheels(
     Projects that the index has only as sources are built here.
 
     Args:
-        held: lists of pip constraints, the preferred one first: the versions of this machine, because identical results
-            need identical versions. The first list that can be met is used, else the newest versions.
-        kept: folder of cached wheels; no index is needed if it has all of them.
+        constraint_lists: lists of pip constraints, the preferred one first: the versions of this machine, because
+            identical results need identical versions. The first list that can be met is used, else the newest versions.
+        cached: folder of cached wheels; no index is needed if it has all of them.
 
     Raises:
         PipError: there are no wheels for the target.
         UnreachableError: the index does not answer.
     """
-    fit = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
+    pip_arguments = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
 
-    async def download(wanted: Sequence[str], built: str) -> None:
+    async def download(requested: Sequence[str], built: str) -> None:
         """Download wheels; if that fails, first build wheels from sources into the folder `built`."""
         try:
-            await pip(*fit, *wanted, progress=progress)
+            await pip(*pip_arguments, *requested, progress=progress)
         except PipError:
             progress("building packages from sources")
-            await pip("wheel", "--wheel-dir", built, *wanted, progress=progress)
-            await pip(*fit, "--find-links", built, *wanted, progress=progress)
+            await pip("wheel", "--wheel-dir", built, *requested, progress=progress)
+            await pip(*pip_arguments, "--find-links", built, *requested, progress=progress)
 
-    with tempfile.TemporaryDirectory() as aside:
-        for count, versions in enumerate(filter(None, held)):
-            limits = Path(aside, f"constraints{count}.txt")
+    with tempfile.TemporaryDirectory() as scratch:
+        for count, versions in enumerate(filter(None, constraint_lists)):
+            limits = Path(scratch, f"constraints{count}.txt")
             limits.write_text("\n".join(versions))
-            same = (*wanted, "--constraint", str(limits))
-            if await is_kept(kept, (*fit, *same), progress):
+            pinned = (*requested, "--constraint", str(limits))
+            if await has_all_wheels(cached, (*pip_arguments, *pinned), progress):
                 return count > 0
             try:
-                await download(same, f"{aside}/{count}")
+                await download(pinned, f"{scratch}/{count}")
                 return count > 0
             except PipError:
                 progress("looking for other package versions")
-        await download(wanted, f"{aside}/other")
+        await download(requested, f"{scratch}/other")
         return True
 
 
-async def is_kept(kept: Path, arguments: Sequence[str], progress: Progress) -> bool:
+async def has_all_wheels(cached: Path, arguments: Sequence[str], progress: Progress) -> bool:
     """Run pip with the wheels of a folder and no index; return whether these were enough."""
-    if not any(kept.glob("*.whl")):
+    if not any(cached.glob("*.whl")):
         return False
     try:
-        await pip(*arguments, "--no-index", "--find-links", str(kept), progress=progress)
+        await pip(*arguments, "--no-index", "--find-links", str(cached), progress=progress)
     except PipError:
         return False
     return True

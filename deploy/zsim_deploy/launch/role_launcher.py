@@ -319,12 +319,12 @@ class ProgramProcess:
     host = HERE
 
     def __init__(
-        self, name: str, words: Sequence[str], logs: Path, environment: Mapping[str, str], folder: Path | None
+        self, name: str, command: Sequence[str], logs: Path, environment: Mapping[str, str], folder: Path | None
     ) -> None:
         self.name = name
         self.role = name.partition(".")[0]
         self.restarts = 0
-        self._words, self._environment, self._folder = words, environment, folder
+        self._command, self._environment, self._folder = command, environment, folder
         self._log = logs / f"{name}.log"
         self._program: Program | None = None
         self._interruption: threading.Timer | None = None
@@ -332,7 +332,7 @@ class ProgramProcess:
     def start(self) -> None:
         if self._program is not None:
             self._program.close()
-        self._program = Program(self._words, self._environment, self._log, self._folder)
+        self._program = Program(self._command, self._environment, self._log, self._folder)
 
     @property
     def state(self) -> str:
@@ -437,7 +437,7 @@ class RunConsole:
 
 
 @contextmanager
-def console_beside(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
+def running_console(endpoint: str, record: Path, federation: str | None, tls: Path | None) -> Iterator[None]:
     """Run a console for the duration of the `with` block; it waits for the world, and prints the links to its pages.
 
     It connects to `endpoint`, with 127.0.0.1 in place of 0.0.0.0 (all addresses); the default federation is the
@@ -448,8 +448,8 @@ def console_beside(endpoint: str, record: Path, federation: str | None, tls: Pat
 
         with open_run(record) as (_, _, scenario):
             federation = scenario.federation
-    reach = ["--connect", endpoint.replace("0.0.0.0", "127.0.0.1"), "--federation", federation]
-    process = subprocess.Popen([*ZSIM, "console", *reach, *(["--tls", str(tls)] if tls else [])])
+    arguments = ["--connect", endpoint.replace("0.0.0.0", "127.0.0.1"), "--federation", federation]
+    process = subprocess.Popen([*ZSIM, "console", *arguments, *(["--tls", str(tls)] if tls else [])])
     try:
         yield
     finally:

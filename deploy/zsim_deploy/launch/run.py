@@ -132,7 +132,7 @@ def _run_on(options: RunOptions, endpoint: str, screen: Shown, launcher: RoleLau
     supervisor = Supervisor(options.scenario.processes, screen)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
     options.supervisor = supervisor
-    supervisor.lasting = options.console.process if options.console else None
+    supervisor.survivor = options.console.process if options.console else None
 
     def end_with_output() -> None:
         if reason := signals.look():
@@ -145,27 +145,29 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     logs, scenario, launch = options.out / "logs", options.scenario, options.launch
     # Another run's world may listen where ours could not; the run id keeps the processes of this run from joining it.
     launched = ["--launched", launch.run_id, *(["--insecure"] if launch.insecure else [])]
-    reach = ["--connect", endpoint, "--federation", scenario.federation, *launched]
+    connection_options = ["--connect", endpoint, "--federation", scenario.federation, *launched]
     pace = [*pace_options(launch.mode, launch.rate), *launched, *changed_options(launch.changed)]
     world = ["world", str(options.out / "scenario.yaml"), "--listen", endpoint, "--expect", RECORDER, *pace]
     world += ["--journal", str(options.out / JOURNAL), *(["--all-died"] if options.continued else [])]
-    commands = {"world": world, RECORDER: ["record", "--out", str(options.out), *reach]}
-    wanted = scenario.processes.expect
-    names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
+    commands = {"world": world, RECORDER: ["record", "--out", str(options.out), *connection_options]}
+    expected = scenario.processes.expect
+    names = [name for name in agents_of(scenario) if expected is None or name in expected]
     if launch.hosted and names:
-        commands[names[-1]] = ["host", *reach, "--", *names]
+        commands[names[-1]] = ["host", *connection_options, "--", *names]
     else:
         for role, _, thing in (name.partition(".") for name in names):
             name = f"{role}.{thing}"  # preceded by -- below, because it may begin with -
             commands[name] = (
-                ["agent", *reach, "--", name] if role in scenario.own_agents else [role, *reach, "--", thing]
+                ["agent", *connection_options, "--", name]
+                if role in scenario.own_agents
+                else [role, *connection_options, "--", thing]
             )
     for agent in options.agents():
-        commands[agent.name] = ["agent", "--name", agent.name, *reach, "--", *agent.arguments()]
+        commands[agent.name] = ["agent", "--name", agent.name, *connection_options, "--", *agent.arguments()]
     if options.console:
-        commands[CONSOLE] = ["console", "--name", CONSOLE, "--folder", str(options.out), *reach]
+        commands[CONSOLE] = ["console", "--name", CONSOLE, "--folder", str(options.out), *connection_options]
     for role, name, drones in options.camera_children():
-        commands[name] = [COMMANDS.get(role, role), "--name", name, *reach, "--", *drones]
+        commands[name] = [COMMANDS.get(role, role), "--name", name, *connection_options, "--", *drones]
     children: list[RunProcess] = [*programs_of(scenario, programs(scenario), endpoint, options.out, options.launch)]
     for name, command in commands.items():
         on_line = supervisor.handle_line if name in ("world", CONSOLE) else None
@@ -188,8 +190,11 @@ def run_in_process(options: RunOptions, screen: Shown) -> Outcome:
             return signals.look() or stop.reason()
 
         try:
-            own, here = [each.make for each in options.agents()], (options.scenario, options.out, options.launch)
-            ended = fly_here(*here, own, screen, reason, options.continued)
+            agents, arguments = (
+                [each.make for each in options.agents()],
+                (options.scenario, options.out, options.launch),
+            )
+            ended = fly_here(*arguments, agents, screen, reason, options.continued)
         except (DivergedError, RunFailedError) as error:
             return Outcome(str(error), failed=True)
         finally:
@@ -267,8 +272,8 @@ def with_cameras(scenario: Scenario) -> Scenario:
     """Return the scenario with cameras: if no drone has any, every drone gets the two cameras of the AR.Drone."""
     if any(drone.sensors.cameras() for drone in scenario.drones):
         return scenario
-    two = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
-    drones = [replace(drone, sensors=replace(drone.sensors, **two)) for drone in scenario.drones]
+    default_cameras = {"front_camera": FrontCamera(), "bottom_camera": BottomCamera()}
+    drones = [replace(drone, sensors=replace(drone.sensors, **default_cameras)) for drone in scenario.drones]
     return replace(scenario, drones=drones)
 
 
@@ -279,17 +284,19 @@ def camera_children(scenario: Scenario, cameras: bool, detect: bool) -> list[Cam
     cameras of all drones; `detect`: whether to detect hats in the images of all drones.
     """
     filmed = watched_drones("", scenario)
-    everybody = [drone.name for drone in scenario.drones]  # images may come from cameras outside zsim
+    all_drones = [drone.name for drone in scenario.drones]  # images may come from cameras outside zsim
     expected = scenario.processes.expect or ()
     children: list[CameraChild] = []
-    for role, known, drones, wanted in (
+    for role, candidates, drones, is_requested in (
         ("camera", filmed, filmed, cameras),
-        ("detector", everybody, filmed or everybody, detect),
+        ("detector", all_drones, filmed or all_drones, detect),
     ):
-        own = [CameraChild(role, f"{role}.{drone}", (drone,)) for drone in known if f"{role}.{drone}" in expected]
-        main, names = f"{role}.main", {child.name for child in own}
-        others = tuple(drone for drone in drones if f"{role}.{drone}" not in expected)
-        if drones and main not in names and (main in expected or (wanted and others)):
-            own.append(CameraChild(role, main, others if own else ()))
-        children += own
+        role_children = [
+            CameraChild(role, f"{role}.{drone}", (drone,)) for drone in candidates if f"{role}.{drone}" in expected
+        ]
+        main, names = f"{role}.main", {child.name for child in role_children}
+        remaining = tuple(drone for drone in drones if f"{role}.{drone}" not in expected)
+        if drones and main not in names and (main in expected or (is_requested and remaining)):
+            role_children.append(CameraChild(role, main, remaining if role_children else ()))
+        children += role_children
     return children

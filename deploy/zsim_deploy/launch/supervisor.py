@@ -89,7 +89,7 @@ class Supervisor:
 
     def __init__(self, processes: Processes, show: ProgressSink) -> None:
         self.members: list[RunProcess] = []  # all processes, including the world; must be set before `run`
-        self.lasting: RunProcess | None = None  # member that outlives the run; the caller must stop and close it
+        self.survivor: RunProcess | None = None  # member that outlives the run; the caller must stop and close it
         self.clock: dict[str, Any] | None = None  # the world's latest clock line
         self._deaths = DeathPolicy(processes)
         self._show = show
@@ -106,8 +106,8 @@ class Supervisor:
         self._world_watch = WorldWatch()
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
-    def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
-        """Start all processes, supervise them until the run ends, and end them all; call `look` at every poll.
+    def run(self, on_poll: Callable[[], None] = lambda: None) -> Outcome:
+        """Start all processes, supervise them until the run ends, and end them all; call `on_poll` at every poll.
 
         Ctrl-C and SIGTERM end the run in an orderly way; a second signal raises KeyboardInterrupt without waiting.
         """
@@ -124,13 +124,13 @@ class Supervisor:
                 for child in self.members:
                     if not child.is_program:  # programs may try to connect only once, so they start after the world
                         child.start()
-                self._watch(look)
+                self._watch(on_poll)
                 self._finish()
             finally:
                 while not self._requests.empty():
                     self._requests.get()[1].cancel()
                 replaced = [*(child for child, _ in self._leaving.values()), *self._left]
-                members = [*(child for child in self.members if child is not self.lasting), *replaced]
+                members = [*(child for child in self.members if child is not self.survivor), *replaced]
                 with ThreadPoolExecutor(len(members)) as pool:  # an unreachable process must not delay the others
                     for closed in [pool.submit(member.close) for member in members]:
                         closed.result()
@@ -199,7 +199,7 @@ class Supervisor:
 
     # Watching
 
-    def _watch(self, look: Callable[[], None]) -> None:
+    def _watch(self, on_poll: Callable[[], None]) -> None:
         world = next(child for child in self.members if child.role == "world")
         self._silent_s = time.monotonic() + SILENT_S
         to_start = [child for child in self.members if child.is_program]
@@ -213,10 +213,10 @@ class Supervisor:
                 if child is not world and child.code is not None and child.name not in self._dead:
                     self._on_exit(child, world)
             while not self._requests.empty():
-                act, outcome = self._requests.get()
+                action, outcome = self._requests.get()
                 if outcome.set_running_or_notify_cancel():
                     try:
-                        outcome.set_result(act())
+                        outcome.set_result(action())
                     except Exception as error:  # whatever it is, the run continues
                         outcome.set_exception(error)
             while to_start and self._world_watch.last_s is not None:
@@ -228,16 +228,19 @@ class Supervisor:
                 self._show.say(f"{silent}: {world.last_log_line() or 'its log is empty'}; the others wait")
             if line := self._world_watch.change(time.monotonic(), world.pid):
                 self._show.say(line)
-            look()
+            on_poll()
             world.wait(POLL_S)
         if world.code != 0:
             self._fail(f"the world died: {world.outcome()}", after_end=True)
 
     def _restarts_world(self, world: RunProcess) -> bool:
         code = world.code
-        flew = code is not None and code not in (0, USER_FAULT) and (self._flies or code < 0)
+        has_flown = code is not None and code not in (0, USER_FAULT) and (self._flies or code < 0)
         return (
-            flew and not self._reason and not self._interrupted and self._apply_on_death(world, flies=True) == "restart"
+            has_flown
+            and not self._reason
+            and not self._interrupted
+            and self._apply_on_death(world, flies=True) == "restart"
         )
 
     def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
@@ -257,21 +260,21 @@ class Supervisor:
 
     def _apply_on_death(self, child: RunProcess, flies: bool) -> OnDeath:
         """Decide what follows the death of a process, and restart it if that is the decision."""
-        action, why = self._deaths.decide(child.name, child.code, flies)
+        action, reason = self._deaths.decide(child.name, child.code, flies)
         if child.role != "world" or action == "restart":
-            self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {why}")
+            self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; {reason}")
         if action == "restart":
             child.restarts += 1
             child.start()
         return action
 
-    def submit(self, act: Callable[[], Any]) -> Future[Any]:
+    def submit(self, action: Callable[[], Any]) -> Future[Any]:
         """Schedule a function to be called between two polls of the processes; callable from any thread.
 
         The returned future is cancelled if the run ends first.
         """
         outcome: Future[Any] = Future()
-        self._requests.put((act, outcome))
+        self._requests.put((action, outcome))
         return outcome
 
     def interrupt(self, reason: str) -> None:
@@ -317,7 +320,7 @@ class Supervisor:
 
     def _finish(self) -> None:
         """Let all processes leave; after an orderly end the recorder leaves last, on its own."""
-        members = [child for child in self.members if child is not self.lasting]
+        members = [child for child in self.members if child is not self.survivor]
         programs = [child for child in members if child.is_program and child.name not in self._dead]
         for program in programs:  # they may have died since the last poll
             if program.code and self._deaths.decide(program.name, program.code, self._flies).action == "end":
@@ -362,22 +365,22 @@ class DeathPolicy:
         if action == "end":
             return DeathDecision("end", "on_death: end")
         is_settled = flies and (action == "wait" or lets_drop(processes.on_death, name))  # the scenario's choice stands
-        ends, why = False, ""
+        ends, reason = False, ""
         if code == USER_FAULT and not is_settled:
-            ends, why = is_needed(name), "a restart would not help"
+            ends, reason = is_needed(name), "a restart would not help"
         elif action == "restart":
             deaths = self._deaths[name]
             deaths.append(time.monotonic())
             if len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S:
-                why = f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s"
-        if not why:
+                reason = f"more than {RESTARTS_MAX} restarts within {RESTART_WINDOW_S:g} s"
+        if not reason:
             return DeathDecision(action, f"on_death: {action}")
         overdue = on_overdue(processes.on_overdue or {}, name, gating=processes.gating or ())
         ends = ends or overdue == "end" or processes.gates(role)
         is_awaited = not flies and not is_needed(name) and name in (processes.expect or ())
         if ends or is_awaited:  # a run that has not begun would wait for an expected process indefinitely
-            return DeathDecision("end", f"{why}; the run ends")
-        return DeathDecision("drop", f"{why}; it is dropped, and the run continues without it")
+            return DeathDecision("end", f"{reason}; the run ends")
+        return DeathDecision("drop", f"{reason}; it is dropped, and the run continues without it")
 
 
 class WorldWatch:
@@ -404,11 +407,11 @@ class WorldWatch:
         if not self._is_silent:
             return f"world (pid {pid}) is back"
         if self._ends_for:
-            named = ", ".join(self._ends_for)
-            return f"world (pid {pid}) has ended and waits for {named}: stopped or out of reach"
+            names = ", ".join(self._ends_for)
+            return f"world (pid {pid}) has ended and waits for {names}: stopped or out of reach"
         silent_s = now_s - self.last_s
-        go_on = f"kill -CONT {pid} continues it"
-        return f"world (pid {pid}) shows no sign of life for {silent_s:.1f} s: it is stopped ({go_on}) or out of reach"
+        hint = f"kill -CONT {pid} continues it"
+        return f"world (pid {pid}) shows no sign of life for {silent_s:.1f} s: it is stopped ({hint}) or out of reach"
 
 
 class EndSignals:
@@ -425,11 +428,11 @@ class EndSignals:
         self._looked_s = 0.0
 
     def __enter__(self) -> "EndSignals":
-        wanted: dict[int, Any] = {signal.SIGTERM: signal.default_int_handler}
+        handlers: dict[int, Any] = {signal.SIGTERM: signal.default_int_handler}
         if hasattr(signal, "SIGHUP"):  # not on Windows
-            wanted[signal.SIGHUP] = self._on_hangup
-        self._former = {number: signal.getsignal(number) for number in wanted}
-        for number, handler in wanted.items():
+            handlers[signal.SIGHUP] = self._on_hangup
+        self._former = {number: signal.getsignal(number) for number in handlers}
+        for number, handler in handlers.items():
             if self._former[number] is not signal.SIG_IGN:
                 signal.signal(number, handler)
         return self

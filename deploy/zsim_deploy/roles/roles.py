@@ -91,18 +91,18 @@ def agent(build: Build, reach: WorldAccess, name: str = "") -> None:
     Raises UserCodeError if a user's class raises an exception or returns something unusable; a launched process prints
     the error and exits instead.
     """
-    launched, who = reach.launched, reach.who._replace(process=name)
-    stop = StopChannel(launched, who)
+    launched, identity = reach.launched, reach.who._replace(process=name)
+    stop = StopChannel(launched, identity)
     say = log_printer(launched)
     try:
         with find_world(
-            reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, run_id=launched, identity=who
+            reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, run_id=launched, identity=identity
         ) as (link, info):
             scenario = scenario_file.from_text(info.scenario)
             member = build(info, scenario)
-            check_certificate(member, who)
-            also = f", and replaces {', '.join(member.serves)}" if member.serves else ""
-            say(f"{member.name}: in run {info.run_id}{also}")
+            check_certificate(member, identity)
+            replaces = f", and replaces {', '.join(member.serves)}" if member.serves else ""
+            say(f"{member.name}: in run {info.run_id}{replaces}")
             gc.collect()
             gc.freeze()
             snapshot_ns = round(scenario.processes.snapshot_s * 1e9)
@@ -126,8 +126,8 @@ def agent_of(role: str, names: Sequence[str]) -> Build:
     agent_class(role)  # imports the role's modules before connecting to the world
 
     def build(info: Info, scenario: Scenario) -> Agent:
-        wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
-        agents = make_agents(role, info, scenario, wanted)
+        selected = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
+        agents = make_agents(role, info, scenario, selected)
         return agents[0] if len(agents) == 1 else AgentGroup(agents, output_hold_ns(info))
 
     return build
@@ -143,11 +143,11 @@ def recorder(out: Path, reach: WorldAccess) -> None:
     from zsim.record.completeness import record_completeness
     from zsim_agents.recorder import Recorder
 
-    launched, who = reach.launched, reach.who._replace(process=RECORDER)
-    stop = StopChannel(launched, who)
+    launched, identity = reach.launched, reach.who._replace(process=RECORDER)
+    stop = StopChannel(launched, identity)
     say = log_printer(launched)
     make_folder(out.parent if RUN_ID in out.name else out)
-    connection = find_world(reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, True, launched, who)
+    connection = find_world(reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, True, launched, identity)
     with connection as (link, info):
         folder = record_folder(out, info.run_id)
         make_folder(folder)
@@ -232,8 +232,8 @@ class RouterLinks:
         while self.watch.closed:
             closed = self.watch.closed.popleft()
             names = ", ".join(closed.names) or "no process of the run"
-            what = f"read none of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
-            self._say(f"{closed.process or 'an unnamed client'} at {closed.address} ({names}) {what}")
+            backlog = f"read none of {closed.held_bytes / 1e6:.1f} MB; its link is closed ({closed.times} so far)"
+            self._say(f"{closed.process or 'an unnamed client'} at {closed.address} ({names}) {backlog}")
 
 
 def serve_runs(
@@ -258,25 +258,27 @@ def serve_runs(
         SystemExit: the process was launched, and was ended by a SIGTERM that did not come from its launcher.
     """
     launched, wait_s = reach.launched, reach.wait_s
-    who = reach.who._replace(process="" if name.endswith(ANY) else name)
-    stop = StopChannel(launched, who)
+    identity = reach.who._replace(process="" if name.endswith(ANY) else name)
+    stop = StopChannel(launched, identity)
     say = log_printer(launched)
     role, _, thing = name.partition(".")
-    own_name, served = name, ""
+    own_name, served_run_id = name, ""
     try:
         while not stop.stopped():
-            with find_world(reach.endpoint, reach.federation, wait_s, say, stop.stopped, True, launched, who) as (
+            with find_world(reach.endpoint, reach.federation, wait_s, say, stop.stopped, True, launched, identity) as (
                 link,
                 info,
             ):
-                if info.run_id != served:
+                if info.run_id != served_run_id:
                     if own_name == f"{role}.{ANY}":
-                        taken = link.tokens(keys.token(f"{role}.$*"))
-                        own_name = next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
+                        taken_tokens = link.tokens(keys.token(f"{role}.$*"))
+                        own_name = next(
+                            candidate for i in count(1) if keys.token(candidate := f"{role}.{i}") not in taken_tokens
+                        )
                     participant = Participant(link, info, own_name, stands_for(info), slack_ns(info))
                     try:
                         _serve(serve, link, participant, info, stop, say)
-                        served = info.run_id
+                        served_run_id = info.run_id
                     except NoWorldError as error:  # the world ended while this process was joining
                         if launched:
                             raise
@@ -284,7 +286,7 @@ def serve_runs(
                     if participant.superseded and thing != ANY:
                         raise SupersededError(f"{name}: {participant.end_reason}; this process ends")
                     if participant.superseded:  # two processes may have chosen the same free number
-                        own_name, served = f"{role}.{int(participant.name.rpartition('.')[2]) + 1}", ""
+                        own_name, served_run_id = f"{role}.{int(participant.name.rpartition('.')[2]) + 1}", ""
                 else:
                     time.sleep(PAUSE_S)
             if launched:
@@ -326,22 +328,22 @@ def serve_pictures(
         with_cameras = [drone.name for drone in scenario.drones if drone.sensors.cameras()]
         if role == "camera":
             return chosen("camera: drone with a camera", drones or ["*"], with_cameras)
-        everybody = [drone.name for drone in scenario.drones]
-        return chosen("detect: drone", drones, everybody) if drones else watched_drones("", scenario) or everybody
+        all_drones = [drone.name for drone in scenario.drones]
+        return chosen("detect: drone", drones, all_drones) if drones else watched_drones("", scenario) or all_drones
 
     def serve(link: Session, info: Info, participant: Participant, stopped: Stopped, say: Say) -> None:
         from zsim_agents.cameras.camera_process import CameraProcess, DetectorProcess
 
         scenario = scenario_file.from_text(info.scenario)
-        own = drones_of(scenario)
+        drones_served = drones_of(scenario)
         if role == "camera":
-            say(f"{participant.name}: renders the cameras of {', '.join(own)}")
-            CameraProcess(link, info, participant, scenario, own).run(stopped)
+            say(f"{participant.name}: renders the cameras of {', '.join(drones_served)}")
+            CameraProcess(link, info, participant, scenario, drones_served).run(stopped)
         else:
-            say(f"{participant.name}: looks for hats in the images of {', '.join(own)}")
+            say(f"{participant.name}: looks for hats in the images of {', '.join(drones_served)}")
             hats = scenario.environment.hats
             diameter = diameter_m or (Hats() if hats is UNSET else hats).diameter_m
-            DetectorProcess(link, participant, say, own, diameter).run(stopped)
+            DetectorProcess(link, participant, say, drones_served, diameter).run(stopped)
 
     def stands_for(info: Info) -> tuple[str, ...]:
         return tuple(f"{role}.{drone}" for drone in drones_of(scenario_file.from_text(info.scenario)))
@@ -361,16 +363,16 @@ def process_of(role: str, names: Sequence[str]) -> str:
     return f"{role}.{names[0]}" if len(names) == 1 and not set(names[0]) & set(PATTERN) else ""
 
 
-def process_name(role: str, name: str, who: Identity, thing: str = "main") -> str:
+def process_name(role: str, name: str, identity: Identity, thing: str = "main") -> str:
     """Return the name of a process: `name` if given, else the one in its certificate, else ROLE.THING.
 
     Raises SessionError if the certificate cannot be used.
     """
-    if name or who.tls is None:
+    if name or identity.tls is None:
         return name or f"{role}.{thing}"
-    if fault := tls.own_fault(who):
+    if fault := tls.own_fault(identity):
         raise SessionError(fault)
-    return tls.own_name(who)
+    return tls.own_name(identity)
 
 
 def check_certificate(member: Agent, identity: Identity) -> None:
@@ -378,9 +380,9 @@ def check_certificate(member: Agent, identity: Identity) -> None:
     if not identity.tls:
         return
     if member.serves:
-        others = ", ".join(member.serves)
+        replaced = ", ".join(member.serves)
         raise RunError(
-            f"{member.name}: a certificate is for one process, but this one also replaces {others}; "
+            f"{member.name}: a certificate is for one process, but this one also replaces {replaced}; "
             "run each of them separately, or without TLS"
         )
     if fault := tls.own_fault(identity._replace(process=member.name)):

@@ -136,11 +136,11 @@ class StopChannel:
 
         for line in sys.stdin:
             self._last_line_s = time.monotonic()
-            word, _, rest = line.strip().partition(" ")
-            if word == "stop":
-                self._stop(rest or "stopped by the launcher")
-            elif word == "orphan-after":
-                threading.Thread(target=await_beats, args=(float(rest),), name="beats", daemon=True).start()
+            command, _, argument = line.strip().partition(" ")
+            if command == "stop":
+                self._stop(argument or "stopped by the launcher")
+            elif command == "orphan-after":
+                threading.Thread(target=await_beats, args=(float(argument),), name="beats", daemon=True).start()
         self._leave("the launcher is gone")
 
     def _leave(self, reason: str) -> None:
@@ -188,12 +188,12 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 @contextmanager
 def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
     """Handle SIGINT and SIGTERM with a function for the duration of the `with` block."""
-    former = {number: signal.signal(number, handler) for number in REASONS}
+    previous_handlers = {number: signal.signal(number, handler) for number in REASONS}
     try:
         yield
     finally:
-        for number, before in former.items():
-            signal.signal(number, before)
+        for number, previous in previous_handlers.items():
+            signal.signal(number, previous)
 
 
 @contextmanager

@@ -70,12 +70,12 @@ def world(
     text = "compiling the world's kernel; later runs on this machine find it compiled"
     if is_kept(advance):
         text = "loading the world's kernel; this machine is busy"
-    start = SlowStart(JsonProgress().say if launched else print, text)
+    slow_start = SlowStart(JsonProgress().say if launched else print, text)
     try:
         run_id = launched or (journaled_run(journal) if journal else None)
         run_world = World(scenario, mode, rate, time.monotonic_ns, run_id, changed)
     finally:
-        start.over()
+        slow_start.over()
     run_world.is_launched = launched is not None
     for name in expect or ():
         run_world.barrier.expect(name)
@@ -84,14 +84,17 @@ def world(
     sha256 = scenario_file.sha256(scenario_file.to_text(scenario))
     if launched:
         progress = JsonProgress()
-        kept = RunJournal(journal, run_world.run_id, sha256, progress.say, all_died)
-        run(run_world, endpoints, stop.reason, WorldProgress(progress).show, identity=identity, journal=kept)
+        run_journal = RunJournal(journal, run_world.run_id, sha256, progress.say, all_died)
+        run(run_world, endpoints, stop.reason, WorldProgress(progress).show, identity=identity, journal=run_journal)
         stop.exit_if_terminated()
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        kept, show = RunJournal(journal, run_world.run_id, sha256, screen.say, all_died), WorldProgress(screen).show
-        run(run_world, endpoints, stop.reason, show, lambda: screen.say(listening), identity, kept)
+        run_journal, show = (
+            RunJournal(journal, run_world.run_id, sha256, screen.say, all_died),
+            WorldProgress(screen).show,
+        )
+        run(run_world, endpoints, stop.reason, show, lambda: screen.say(listening), identity, run_journal)
         screen.say(f"ended: {run_world.ended}")
     if run_world.left_early:  # for a launched world, the launcher reads this from the record
         raise RunFailedError("; ".join(run_world.left_early))
@@ -105,7 +108,7 @@ class WorldProgress:
         self._clocks = RateLimit(PERIOD_S)
         self._healths = RateLimit(HEALTH_PERIOD_S)
         self._reasons = HoldReasons()
-        self._shown = 0
+        self._shown_count = 0
         self._links: dict[str, str] = {}  # link state of each drone
 
     def show(self, kind: str, message: Any, about: str) -> None:
@@ -122,16 +125,16 @@ class WorldProgress:
         elif kind == "health" and self._healths.spend(about):
             sink.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
         elif kind == "link":
-            if message.state != self._links.get(about) and self._shown < SHOWN_EVENTS:
-                self._shown += 1
+            if message.state != self._links.get(about) and self._shown_count < SHOWN_EVENTS:
+                self._shown_count += 1
                 sink.say(f"  {message.t_ns / 1e9:8.2f} s  link of {about}: {message.state}, {message.peer}")
             self._links[about] = message.state
         elif kind == "resumed":
             sink.say(f"{about}: continues at t = {message / 1e9:.2f} s")
         elif kind == "event":
             is_vital = message.kind in VITAL or message.data.get("fails")
-            if is_vital or self._shown < SHOWN_EVENTS:
-                self._shown += message.kind not in QUIET
+            if is_vital or self._shown_count < SHOWN_EVENTS:
+                self._shown_count += message.kind not in QUIET
                 event = {name: getattr(message, name) for name in ("kind", "subject", "text")}
                 sink.event({"t_s": message.t_ns / 1e9, **event, "data": message.data if is_vital else {}})
 
@@ -146,10 +149,10 @@ class ReplayOptions(NamedTuple):
     federation: str | None = None  # federation to play in; None: the record's
 
 
-def play(place: Path, options: ReplayOptions, who: Identity) -> None:
+def play(path: Path, options: ReplayOptions, who: Identity) -> None:
     """Play a record until its end, or until the process is stopped.
 
-    `place`: folder of a run, or its run.mcap. Raises RunError or RecordError if there is no record or it has nothing to
+    `path`: folder of a run, or its run.mcap. Raises RunError or RecordError if there is no record or it has nothing to
     play, and SessionError if an endpoint is in use, a key expression is invalid, or the identity cannot be used.
     """
     from zsim.record.record_reader import record_notes
@@ -160,11 +163,11 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     for expression in options.choice.keys:
         check_expression(expression)
     stop = StopChannel()
-    with open_run(place) as (reader, info, scenario):
+    with open_run(path) as (reader, info, scenario):
         for expression in options.choice.keys:
             if not any(keys.matches(expression, key) for key in reader.topics()):
-                known = ", ".join(list(reader.topics())[:20])
-                raise RunError(f"--keys is {expression!r}; must match a recorded key: {known} …")
+                available = ", ".join(list(reader.topics())[:20])
+                raise RunError(f"--keys is {expression!r}; must match a recorded key: {available} …")
         if options.federation is not None:
             federation = keys.name(options.federation, "federation")
             scenario = msgspec.structs.replace(scenario, federation=federation)

@@ -34,7 +34,7 @@ from zsim_bridges.gateway.client_messages import (
     decode_request,
     is_control_key,
     is_reserved,
-    is_sound,
+    is_valid,
     json_to_payload,
     json_value,
     payload_to_json,
@@ -42,7 +42,7 @@ from zsim_bridges.gateway.client_messages import (
 )
 from zsim_bridges.gateway.client_streams import BOUNDARY, Outbox, PictureFeed, PictureFeeds, picture_part
 from zsim_bridges.gateway.gateway_server import Client
-from zsim_bridges.gateway.http_server import AccessCheck, described_sample, description, methods_of, value_event
+from zsim_bridges.gateway.http_server import AccessCheck, description, methods_of, sample_to_json, value_event
 from zsim_bridges.gateway.run_access import EchoFilter, LastValues, LockstepSession, gate_keys_of
 
 VELOCITY = "drone/drone1/cmd/velocity"
@@ -101,12 +101,12 @@ def test_payloads_of_unknown_keys_are_shown_as_far_as_json_allows(payload: bytes
 
 @pytest.mark.parametrize("payload", [b"\xc0", msgspec.msgpack.encode({"t_ns": 1}), b"\xc1 no msgpack", b""])
 def test_a_payload_that_is_not_a_message_of_its_key_is_not_shown(payload: bytes):
-    assert not is_sound(VELOCITY, payload)
+    assert not is_valid(VELOCITY, payload)
     with pytest.raises(DecodeError):
         payload_to_json(VELOCITY, payload)
     sent = RawSample("PUT", VELOCITY, payload or b"\xc0", "zenoh/bytes", None)
     assert (value_line(sent), value_event(sent)) == (b"", b"")
-    assert is_sound("my/key", payload)
+    assert is_valid("my/key", payload)
 
 
 def test_values_unknown_to_json_become_base64_and_a_deleted_key_null():
@@ -141,7 +141,7 @@ def test_last_values_are_the_newest_of_each_key():
         ("drone/drone1/sensor/status", messages.encode(Status(20, 1, "landed", 99.0, False, None, 2))),
     ]
     values.add("drone/drone1/sensor/imu", b"old")
-    values.add_passed("clock", b"now")
+    values.add_forwarded("clock", b"now")
     values.add_gate(GateMessages.of(20, 1, table, entries))
     assert values.matching("drone/drone1/sensor/*") == entries
     assert values.matching("zsim/drone/*/sensor/imu", "zsim/") == entries[:1]
@@ -170,7 +170,7 @@ def test_own_values_are_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch, values
 
 def test_an_echo_does_not_overwrite_a_later_value(values: LastValues):
     def echoed(payload: bytes) -> list[bytes]:
-        values.add_passed("my/own", payload)
+        values.add_forwarded("my/own", payload)
         return [entries for _, entries in values.matching("my/own")]
 
     values.add_own("my/own", b"1", "text/plain")
@@ -457,9 +457,9 @@ def test_an_internal_error_is_reported_unless_the_client_has_left(
     ],
 )
 def test_values_are_described_as_the_rest_plugin_of_zenoh_does(encoding: str, payload: bytes, value: Any):
-    entries = described_sample(RawSample("PUT", "zsim/a", payload, encoding, None))
+    entries = sample_to_json(RawSample("PUT", "zsim/a", payload, encoding, None))
     assert entries == {"key": "zsim/a", "value": value, "encoding": encoding, "timestamp": None}
-    assert described_sample(RawSample("ERROR", "", b"no", encoding, None))["key"] == "ERROR"
+    assert sample_to_json(RawSample("ERROR", "", b"no", encoding, None))["key"] == "ERROR"
 
 
 def test_the_description_has_every_message_and_the_writable_keys():
@@ -507,12 +507,12 @@ def test_a_late_viewer_gets_the_newest_picture_and_none_twice() -> None:
     async def look() -> list[int | None]:
         feed = PictureFeed(FRONT, lambda reason: None)
         for number in range(5):
-            feed.take(sample(number))
-        late = await feed.after(-1, 1.0)
+            feed.receive(sample(number))
+        late = await feed.wait_after(-1, 1.0)
         assert late is not None
-        again = await feed.after(late.number, 0.0)
-        feed.take(sample(9))
-        next_one = await feed.after(late.number, 1.0)
+        again = await feed.wait_after(late.number, 0.0)
+        feed.receive(sample(9))
+        next_one = await feed.wait_after(late.number, 1.0)
         return [picture and picture.image.seq for picture in (late, again, next_one)]
 
     assert asyncio.run(look()) == [4, None, 9]
@@ -521,9 +521,9 @@ def test_a_late_viewer_gets_the_newest_picture_and_none_twice() -> None:
 def test_a_waiting_viewer_gets_the_next_picture() -> None:
     async def look() -> int:
         feed = PictureFeed(FRONT, lambda reason: None)
-        waiting = asyncio.create_task(feed.after(-1, 60.0))
+        waiting = asyncio.create_task(feed.wait_after(-1, 60.0))
         await asyncio.sleep(0)
-        feed.take(sample(7))
+        feed.receive(sample(7))
         picture = await waiting
         assert picture is not None
         return picture.image.seq
@@ -537,8 +537,8 @@ def test_an_invalid_picture_is_refused_and_not_shown(payload: bytes) -> None:
 
     async def look() -> PictureFeed:
         feed = PictureFeed(FRONT, refused.append)
-        feed.take(sample(3))
-        feed.take(RawSample("PUT", FRONT, payload, "", None))
+        feed.receive(sample(3))
+        feed.receive(RawSample("PUT", FRONT, payload, "", None))
         return feed
 
     newest = asyncio.run(look()).newest
@@ -558,7 +558,7 @@ def test_all_viewers_share_one_subscription_which_ends_with_the_last(monkeypatch
 
         async def watch() -> None:
             with feeds.watched(FRONT) as feed:
-                assert await feed.after(-1, 60.0)
+                assert await feed.wait_after(-1, 60.0)
 
         watchers = [asyncio.create_task(watch()) for _ in range(100)]
         await asyncio.sleep(0)
@@ -580,7 +580,7 @@ def test_pictures_of_an_earlier_run_are_dropped() -> None:
         with feeds.watched(FRONT) as feed:
             publisher.publish(sample(0))
             assert feed.newest
-            feeds.forget()
+            feeds.clear_pictures()
             return feed.newest is None
 
     assert asyncio.run(look())

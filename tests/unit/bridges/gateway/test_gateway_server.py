@@ -69,7 +69,7 @@ def test_a_lost_link_is_back_before_another_run_ends_its_run(gateway: Gateway, l
     first = a_run("first")
     gateway._begin(first)
     gateway._notify_link(first, False)
-    gateway._end(first, another=True)
+    gateway._end(first, has_successor=True)
     gateway._notify_link(first, True)  # the late report of the link itself
     assert [state for state, _ in log.states] == ["begun", "lost", "back", "ended"]
 
@@ -93,7 +93,7 @@ def test_a_link_lost_before_it_is_observed_is_reported(gateway: Gateway, log: St
 
 
 def a_run(run_id: str, link: Any = None) -> Any:
-    return SimpleNamespace(link=link, bare_link=None, info=SimpleNamespace(run_id=run_id))
+    return SimpleNamespace(link=link, unprefixed_link=None, info=SimpleNamespace(run_id=run_id))
 
 
 def never(_: str) -> Any:

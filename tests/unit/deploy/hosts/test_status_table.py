@@ -141,7 +141,7 @@ ROWS = [
 
 
 def roles(choice: RowChoice) -> list[str]:
-    return [each["role"].rpartition(".")[2] for each in choice.of(ROWS)]
+    return [each["role"].rpartition(".")[2] for each in choice.select(ROWS)]
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_a_run_that_ends_normally_has_not_failed():
 def test_a_process_that_outlives_the_run_is_left_to_the_caller():
     console = Member("console.run")
     team = Team(console, Member("estimator.d1"))
-    team.watch.lasting = team.others[0]
+    team.watch.survivor = team.others[0]
     team.go()
     assert (console.stopped_for, console.closed, console.code) == (None, False, None)
     assert all(member.closed for member in team.members if member is not console)
