@@ -70,7 +70,7 @@ def fly(scenario: Scenario) -> Relative:
             fleet.advance()
         for sample in samples_of(fleet):
             feed(bank, sample, fleet.gps_sigma_m[sample.drone])
-        for each in fleet.seen.values():
+        for each in fleet.observations.values():
             bank.receive(each.drone, "sightings", each.message(0), each.t_ns * 1e-9)
         estimates = bank.estimate(t_s)
         if abs(t_s - TAKEOFF_S) < GATE_S / 2:

@@ -96,5 +96,5 @@ if __name__ == "__main__":
     forkserver._run_role = run_role
     forkserver.renew_streams = end_with_parent
     role_launcher.RoleLauncher._start_forkserver = start
-    world_process.CLOCK_STANDING_NS = STANDING_NS
+    world_process.IDLE_CLOCK_PERIOD_NS = STANDING_NS
     forkserver.main()

@@ -531,8 +531,8 @@ class RecordPlayer:
                     self._is_reading = False
                     return
                 self._pieces_read.add(piece)
-            begin_s = self.timeline["from_s"] + piece * PIECE_S
-            end_s = min(begin_s + PIECE_S - self._every_s / 2.0, self.timeline["to_s"])
-            instants = self._client.past_views(begin_s, end_s, self._every_s)
+            piece_start_s = self.timeline["from_s"] + piece * PIECE_S
+            end_s = min(piece_start_s + PIECE_S - self._every_s / 2.0, self.timeline["to_s"])
+            instants = self._client.past_views(piece_start_s, end_s, self._every_s)
             if instants:
                 self._arrived.append(instants)

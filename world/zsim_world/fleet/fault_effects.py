@@ -70,10 +70,10 @@ class Impairment:
                 self._impair(fault, self._index[fault.target], stuck)
         # Newly stuck sensors hold their next sample; those no longer stuck are released.
         hold = self._w.senses.fault[:, :, FAULT.hold]
-        kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
+        still_stuck = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
         hold[:] = ss.FREE
-        for place in stuck:
-            hold[place] = ss.HOLDING if place in kept else ss.ARMED
+        for index in stuck:
+            hold[index] = ss.HOLDING if index in still_stuck else ss.ARMED
         self._gusts = tuple(fault for fault in acting if fault.kind == "gust")
 
     def blow(self, from_ns: int, until_ns: int) -> None:
@@ -86,26 +86,26 @@ class Impairment:
         self._calm = not self._gusts
 
     def _impair(self, fault: Fault, i: int, stuck: set[tuple[int, int]]) -> None:
-        what, _, how = fault.kind.rpartition("_")
-        if what == "rotor":
-            self._impair_rotors(fault, i, how)
+        device, _, effect = fault.kind.rpartition("_")
+        if device == "rotor":
+            self._impair_rotors(fault, i, effect)
             return
-        if what in SCANNERS:
-            for row in self._scans.rows_of(i, what) if self._scans else ():
-                _impair_scanner(row, how, fault.parameters)
+        if device in SCANNERS:
+            for row in self._scans.rows_of(i, device) if self._scans else ():
+                _impair_scanner(row, effect, fault.parameters)
             return
-        if how in ("dropout", "stuck"):
-            row = self._w.senses.config[i, self._sensor[what]]
-            if how == "stuck":
+        if effect in ("dropout", "stuck"):
+            row = self._w.senses.config[i, self._sensor[device]]
+            if effect == "stuck":
                 row[CONFIG.faulty] = 1.0
-                stuck.add((i, self._sensor[what]))
+                stuck.add((i, self._sensor[device]))
             else:
                 row[CONFIG.drop] = dropped(row[CONFIG.drop], fault.parameters["probability"])
             return
-        part = self._parts[what]
+        part = self._parts[device]
         s = self._sensor[part.sensor]
         row, first = self._w.senses.config[i, s], part.first
-        if how == "noise":
+        if effect == "noise":
             row[CONFIG.white + first : CONFIG.white + first + part.width] *= fault.parameters["factor"]
         else:
             row[CONFIG.faulty] = 1.0
@@ -113,12 +113,12 @@ class Impairment:
             (bias,) = fault.parameters.values()  # the only parameter: a number or vector, named by its unit
             offset += np.multiply(bias, part.channel.to_si)
 
-    def _impair_rotors(self, fault: Fault, i: int, how: str) -> None:
-        row, which, count = self._w.boards.actuator[i], fault.parameters["rotor"], len(self._w.bodies.each)
+    def _impair_rotors(self, fault: Fault, i: int, effect: str) -> None:
+        row, target_rotor, count = self._w.boards.actuator[i], fault.parameters["rotor"], len(self._w.bodies.each)
         row[ACTUATOR.faulty] = 1.0
         for r, name in enumerate(self.rotors[fault.target]):
-            if which in (name, "all"):
-                if how == "efficiency":  # thrust is proportional to the speed squared
+            if target_rotor in (name, "all"):
+                if effect == "efficiency":  # thrust is proportional to the speed squared
                     row[ACTUATOR.size + r] *= math.sqrt(fault.parameters["value"])
                 else:
                     if fault.id not in self._held:  # at speed_rad_s, or at each rotor's speed at the start of the fault
@@ -127,12 +127,12 @@ class Impairment:
                     row[ACTUATOR.size + count + r] = self._held[fault.id][r]
 
 
-def _impair_scanner(row: NDArray[np.float64], how: str, parameters: Mapping[str, float]) -> None:
-    if how == "stuck":
+def _impair_scanner(row: NDArray[np.float64], effect: str, parameters: Mapping[str, float]) -> None:
+    if effect == "stuck":
         row[SCANNER.stuck] = 1.0
-    elif how == "dropout":
+    elif effect == "dropout":
         row[SCANNER.drop] = dropped(row[SCANNER.drop], parameters["probability"])
-    elif how == "noise":
+    elif effect == "noise":
         row[[SCANNER.noise, SCANNER.share, SCANNER.square]] *= parameters["factor"]
     else:
         row[SCANNER.bias] += parameters["value_m"]

@@ -116,10 +116,10 @@ class Fleet:
         gps_sigma_m: standard deviation of each drone's GPS fixes [m].
         impairment: effects of faults.
         bodies, boards: arrays of the kernel, read-only for callers.
-        things: names of the obstacles, then of the surfaces.
-        beside: names of sightings and scanners, whose sensor numbers follow those of `sensors`.
+        object_names: names of the obstacles, then of the surfaces.
+        extra_sensors: names of sightings and scanners, whose sensor numbers follow those of `sensors`.
         sampled: samples due for publication in the last gate.
-        seen: messages of sightings and scanners, by row of `sampled`.
+        observations: messages of sightings and scanners, by row of `sampled`.
         closest_m: smallest distance between two drones during the last gate [m]; inf for a single drone.
         collisions: pairs of drones whose hulls began to touch in the last gate.
         touching: whether a drone's hull touched another's in the last gate, (N,).
@@ -167,7 +167,7 @@ class Fleet:
         simulated = [drone.sensors for drone in scenario.drones if not drone.is_external]
         scanned = [name for name in SCANNERS if any(getattr(each, name) is not UNSET for each in simulated)]
         has_sightings = any(each.sightings is not UNSET for each in simulated)
-        self.beside = (*([SIGHTINGS] if has_sightings else []), *scanned)
+        self.extra_sensors = (*([SIGHTINGS] if has_sightings else []), *scanned)
         self._seeing: list[SightingSampler | ScanSampler] = []
         scans: ScanSampler | None = None
         if has_sightings:
@@ -175,16 +175,16 @@ class Fleet:
         if scanned:
             scans = ScanSampler(scenario, hulls.copy(), self._w.scene)
             self._seeing.append(scans)
-        self.seen: dict[int, PictureSightings | Scan] = {}
+        self.observations: dict[int, PictureSightings | Scan] = {}
         self._held = hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
         self.impairment = Impairment(self._w, self.names, vehicles, self.sensors, scans)
         self.touching = np.zeros(self.count, dtype=bool)
         self._hull_m = float(hulls.max())
         self._integrate(0)
-        place = scenario.environment
-        self.things = [each.name for each in (*place.obstacles, *(place.surfaces or ()))]
-        self._watch = FlightWatch(self._w, self.names, self.things)
+        environment = scenario.environment
+        self.object_names = [each.name for each in (*environment.obstacles, *(environment.surfaces or ()))]
+        self._watch = FlightWatch(self._w, self.names, self.object_names)
         # Load or compile now what the first command needs, because in realtime no gate may wait for it.
         kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
@@ -223,19 +223,19 @@ class Fleet:
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
         self.sampled = self._sampler.due(logged, self.t_ns)
         if self._seeing:
-            self.seen = {}
-            seen = [each for sampler in self._seeing for each in sampler.due(self.bodies.state, self.t_ns)]
-            if seen:
-                self._insert_seen(seen)
+            self.observations = {}
+            observations = [each for sampler in self._seeing for each in sampler.due(self.bodies.state, self.t_ns)]
+            if observations:
+                self._insert_observations(observations)
 
-    def _insert_seen(self, seen: list[PictureSightings | Scan]) -> None:
+    def _insert_observations(self, observations: list[PictureSightings | Scan]) -> None:
         """Insert sightings and scans into the samples of the gate, after those of the same drone and time."""
-        number = {name: len(self.sensors.names) + place for place, name in enumerate(self.beside)}
-        seen.sort(key=lambda each: (each.t_ns, each.drone, number[each.sensor], each.t_sample_ns, each.camera))
-        rows = [(number[each.sensor], each.drone, each.t_ns, each.t_sample_ns) for each in seen]
-        whose, values, places = with_more(*self.sampled, np.array(rows, dtype=np.int64))
+        number = {name: len(self.sensors.names) + k for k, name in enumerate(self.extra_sensors)}
+        observations.sort(key=lambda each: (each.t_ns, each.drone, number[each.sensor], each.t_sample_ns, each.camera))
+        rows = [(number[each.sensor], each.drone, each.t_ns, each.t_sample_ns) for each in observations]
+        whose, values, indices = with_more(*self.sampled, np.array(rows, dtype=np.int64))
         self.sampled = Sampled(whose, values)
-        self.seen = dict(zip(places.tolist(), seen, strict=True))
+        self.observations = dict(zip(indices.tolist(), observations, strict=True))
 
     # State
 
@@ -254,8 +254,8 @@ class Fleet:
         unit, radius = row[VEHICLE.rotor_unit], float(row[VEHICLE.rotor_radius])
         x, y = (unit * groups[ROTOR.x]).tolist(), (unit * groups[ROTOR.y]).tolist()
         turns = groups[ROTOR.turn].tolist()
-        named = enumerate(self.impairment.rotors[self.names[i]])
-        return tuple(RotorInfo(name, x[r], y[r], 1 if turns[r] > 0.0 else -1, radius) for r, name in named)
+        numbered_names = enumerate(self.impairment.rotors[self.names[i]])
+        return tuple(RotorInfo(name, x[r], y[r], 1 if turns[r] > 0.0 else -1, radius) for r, name in numbered_names)
 
     @property
     def wind_m_s(self) -> NDArray[np.float64]:
@@ -272,7 +272,7 @@ class Fleet:
         return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
 
     def bumps(self) -> list[tuple[int, int]]:
-        """Return the contacts that began in the last gate, as pairs of a drone's index and an index in `things`."""
+        """Return the contacts that began in the last gate, as pairs of indices of a drone and in `object_names`."""
         if not self.bodies.bumped.size:
             return []
         return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
@@ -292,9 +292,9 @@ class Fleet:
         charge = self.status(i)[1]
         if refusal := self._state_refusal(i, "takeoff"):
             return refusal
-        least = TAKEOFF_CHARGE * self.boards.setting.item(i, SETTING.low_battery)
-        if charge < least:
-            return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {least:g} %"
+        min_charge = TAKEOFF_CHARGE * self.boards.setting.item(i, SETTING.low_battery)
+        if charge < min_charge:
+            return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {min_charge:g} %"
         x, y = self.boards.belief[i, BELIEF.q_WB + 1 : BELIEF.q_WB + 3]
         if 1.0 - 2.0 * (x * x + y * y) < UPRIGHT_COSINE:
             return f"{self.names[i]} does not stand upright; a take-off needs it within 30 deg of level"
@@ -431,8 +431,8 @@ class ExternalDrones:
         length = el.length(message.orientation_wxyz)
         row[STATE.q_WB : STATE.q_WB + 4] = np.divide(message.orientation_wxyz, length)
         row[STATE.w_WB_B : STATE.w_WB_B + 3] = message.angular_velocity_rad_s
-        most = self._fleet.bodies.vehicle.item(i, VEHICLE.rotor_max)
-        row[STATE.size :] = np.clip(message.rotor_rad_s, 0.0, most)
+        max_rad_s = self._fleet.bodies.vehicle.item(i, VEHICLE.rotor_max)
+        row[STATE.size :] = np.clip(message.rotor_rad_s, 0.0, max_rad_s)
         self._poses[i] = Pose(t_ns, row)
         return None
 
@@ -475,9 +475,9 @@ class ExternalDrones:
 def _initial_arrays(
     scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable
 ) -> Arrays:
-    dt, drones, place = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
+    dt, drones, environment = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
     each = rotor_slots(vehicles)
-    row = np.array([vehicle_row(vehicle, drone, place) for vehicle, drone in zip(vehicles, drones, strict=True)])
+    row = np.array([vehicle_row(vehicle, drone, environment) for vehicle, drone in zip(vehicles, drones, strict=True)])
     rotors = np.array([rotor_row(vehicle, drone, each) for vehicle, drone in zip(vehicles, drones, strict=True)])
     clock = np.zeros(CLOCK.size, dtype=np.int64)
     clock[CLOCK.ticks_per_step] = round(observer.STEP_S / dt)
@@ -487,13 +487,13 @@ def _initial_arrays(
     senses = _senses(scenario, sensors, noise)
     watched = Watched(seen=np.zeros((len(drones), SEEN.size)), found=np.zeros(len(drones), dtype=np.int64))
     watched.seen[bodies.external, SEEN.external] = 1.0
-    wind, air = place.wind, np.empty(WIND.size)
+    wind, air = environment.wind, np.empty(WIND.size)
     air[WIND.steady : WIND.steady + 3] = wind.steady_m_s
     air[WIND.gust], air[WIND.correlation] = wind.gust_m_s, wind.gust_correlation
     air[WIND.length], air[WIND.speed_min] = wind.gust_length_m, wind.gust_speed_min_m_s
-    sheet = sheet_of(place)
-    seen = scene(bodies.obstacle, sheet.triangle)
-    return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched, seen, sheet)
+    sheet = sheet_of(environment)
+    static_scene = scene(bodies.obstacle, sheet.triangle)
+    return Arrays(time, bodies, boards, numbers, senses, air, noise.gust, watched, static_scene, sheet)
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
@@ -511,11 +511,12 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     aero = np.array([aero_row(drone, scenario.environment) for drone in drones])
     external = np.array([i for i, drone in enumerate(drones) if drone.is_external], dtype=np.int64)
     pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)  # found in the first tick: no drone is at its origin
-    eye = np.array([_look(drone) for drone in drones])
+    eye = np.array([_look_down(drone) for drone in drones])
     number, above = np.zeros(1, dtype=np.int64), np.zeros(n, dtype=np.int8)
     near = NearPairs(pair=pairs, number=number, origin=np.full((n, 3), np.inf), above=above, eye=eye)
-    own = rigid_body.half_decay
-    half_decay = getattr(own, "py_func", own)  # not compiled: for so few numbers, compiling would take longer
+    kernel_function = rigid_body.half_decay
+    # not compiled: for so few numbers, compiling would take longer
+    half_decay = getattr(kernel_function, "py_func", kernel_function)
     return Bodies(
         each=tuple(range(each)),
         vehicle=row,
@@ -546,7 +547,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) 
     )
 
 
-def _look(drone: Drone) -> tuple[float, float, float]:
+def _look_down(drone: Drone) -> tuple[float, float, float]:
     """Return the row of `NearPairs.eye` for a drone's downward sonar and flow sensor."""
     sonar, flow = drone.sensors.sonar, drone.sensors.flow
     away_m = max(el.length(sensor.mount.position_m) for sensor in (sonar, flow))
@@ -555,14 +556,14 @@ def _look(drone: Drone) -> tuple[float, float, float]:
 
 def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, rotors: np.ndarray) -> Boards:
     drones, n, each = scenario.drones, len(scenario.drones), rotors.shape[1] // ROTOR.size
-    both = list(zip(vehicles, drones, strict=True))
-    setting = np.array([firmware.settings(vehicle, drone) for vehicle, drone in both])
+    pairs = list(zip(vehicles, drones, strict=True))
+    setting = np.array([firmware.settings(vehicle, drone) for vehicle, drone in pairs])
     calibration = np.array([_calibration(drone, scenario) for drone in drones])
     rows = zip(drones, row, calibration, strict=True)
     mounts = calibration[:, CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4]
     return Boards(
         setting=setting,
-        gain=np.array([observer.gain_row(vehicle, drone, scenario.environment) for vehicle, drone in both]),
+        gain=np.array([observer.gain_row(vehicle, drone, scenario.environment) for vehicle, drone in pairs]),
         calibration=calibration,
         setpoint=np.zeros((n, firmware.SETPOINT.size)),
         set_tick=np.zeros(n, dtype=np.int64),

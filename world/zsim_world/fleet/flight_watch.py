@@ -23,7 +23,7 @@ from zsim_world.vehicles.observer import STEP_S
 IMPACT_STEPS = 4  # steps over which a change of velocity is measured: 20 ms, about half of a foot contact
 IMPACT_G = 5.0  # mean over these steps; design choice: twice what rotors and drag cause; a fall from 0.4 m reaches it
 IMPACT_M_S = IMPACT_G * G_M_S2 * IMPACT_STEPS * STEP_S  # m/s, largest change of velocity without an impact
-UPRIGHT_AGAIN = 0.5  # cosine of 60 deg of tilt; design choice: well below 90 deg, so that one flip counts once
+RIGHTED_COSINE = 0.5  # cosine of 60 deg of tilt; design choice: well below 90 deg, so that one flip counts once
 QUIET_STEPS = round(1.0 / STEP_S)  # design choice: contacts within 1 s of an impact count as its bounces
 MODE, FLIP, IMPACT, EMPTY, TOUCHDOWN = 1, 2, 4, 8, 16  # incident bits of a drone
 NOTHING, GROUND, FIRST_OBSTACLE = 0, 1, 2  # what a drone touches; from FIRST_OBSTACLE on: obstacles, surfaces, drones
@@ -56,37 +56,37 @@ class Incident(NamedTuple):
 
 
 class FlightWatch:
-    """Describes the incidents of a fleet's drones; `drones` and `things` are names."""
+    """Describes the incidents of a fleet's drones; `drones` and `objects` are names."""
 
-    def __init__(self, arrays: Arrays, drones: Sequence[str], things: Sequence[str]) -> None:
+    def __init__(self, arrays: Arrays, drones: Sequence[str], objects: Sequence[str]) -> None:
         self._bodies, self._boards = arrays.bodies, arrays.boards
         self._seen, self._found = arrays.watched
         self._names = drones
-        self._others = ("", "the ground", *things, *drones)  # indexed by `SEEN.touched`
+        self._object_names = ("", "the ground", *objects, *drones)  # indexed by `SEEN.touched`
 
     def note_command(self, i: int, mode: int) -> None:
         """Note a commanded mode: entering it is not an incident."""
         self._seen[i, SEEN.mode] = mode
 
     def incidents(self) -> list[Incident]:
-        found = []
+        incidents = []
         for i in np.flatnonzero(self._found).tolist():
             bits, name, seen = int(self._found[i]), self._names[i], self._seen[i]
             if bits & EMPTY:
-                found.append(Incident(i, "battery", f"{name} has no charge left", {"charge_percent": 0.0}))
+                incidents.append(Incident(i, "battery", f"{name} has no charge left", {"charge_percent": 0.0}))
             if bits & MODE:
-                found.append(self._own_mode(i, name))
+                incidents.append(self._own_mode(i, name))
             if bits & FLIP:
-                found.append(Incident(i, "flip", f"{name} turns upside down", {}))
+                incidents.append(Incident(i, "flip", f"{name} turns upside down", {}))
             if bits & IMPACT:
-                speed_m_s, other = float(seen[SEEN.speed]), self._others[int(seen[SEEN.touched])]
+                speed_m_s, other = float(seen[SEEN.speed]), self._object_names[int(seen[SEEN.touched])]
                 data = {"speed_m_s": round(speed_m_s, 3), "other": other}
-                found.append(Incident(i, "impact", f"{name} hits {other} at {speed_m_s:.1f} m/s", data))
+                incidents.append(Incident(i, "impact", f"{name} hits {other} at {speed_m_s:.1f} m/s", data))
             if bits & TOUCHDOWN:
-                other = self._others[int(seen[SEEN.surface])]
+                other = self._object_names[int(seen[SEEN.surface])]
                 text = f"{name} touches {other} in flight: no landing was commanded"
-                found.append(Incident(i, "touchdown", text, {"other": other}))
-        return found
+                incidents.append(Incident(i, "touchdown", text, {"other": other}))
+        return incidents
 
     def _own_mode(self, i: int, name: str) -> Incident:
         """Return the incident that a drone's firmware has entered a mode by itself, with the reason."""
@@ -121,14 +121,14 @@ def watch(bodies: Bodies, memory: NDArray, watched: Watched, step: int) -> None:
         if up < 0.0 and seen[i, SEEN.flipped] == 0.0:
             seen[i, SEEN.flipped] = 1.0
             bits |= FLIP
-        elif up > UPRIGHT_AGAIN:
+        elif up > RIGHTED_COSINE:
             seen[i, SEEN.flipped] = 0.0
         change, former = 0.0, 0.0
         for k in range(3):
-            was, now = seen[i, oldest + k], bodies.state[i, STATE.v_WB + k]
-            change += (now - was) * (now - was)
-            former += was * was
-            seen[i, oldest + k] = now
+            previous, current = seen[i, oldest + k], bodies.state[i, STATE.v_WB + k]
+            change += (current - previous) * (current - previous)
+            former += previous * previous
+            seen[i, oldest + k] = current
         if seen[i, SEEN.quiet] > 0.0:
             seen[i, SEEN.quiet] -= 1.0
         elif change > IMPACT_M_S * IMPACT_M_S:
@@ -147,21 +147,21 @@ def _touchdown(bodies: Bodies, seen: NDArray, i: int, mode: float) -> int:
         seen[i, SEEN.airborne], seen[i, SEEN.grounded] = 1.0, 0.0
         return 0
     surface = _surface(bodies, i)
-    touched, things = surface, bodies.bumping.shape[1]
+    touched, object_count = surface, bodies.bumping.shape[1]
     if bodies.braced[i] != 0:
-        for m in range(things):
+        for m in range(object_count):
             if bodies.bumping[i, m] != 0:
                 touched = FIRST_OBSTACLE + m
         for j in range(bodies.state.shape[0]):
             if bodies.touching[min(i, j), max(i, j)] != 0:
-                touched = FIRST_OBSTACLE + things + j
+                touched = FIRST_OBSTACLE + object_count + j
     if touched != NOTHING:
         seen[i, SEEN.touched] = touched
     if surface == NOTHING:
         return 0
-    left = mode == TAKING_OFF and seen[i, SEEN.airborne] != 0.0  # during take-off, once it has left the ground
+    has_lifted_off = mode == TAKING_OFF and seen[i, SEEN.airborne] != 0.0  # in take-off, once off the ground
     seen[i, SEEN.airborne] = 0.0
-    if seen[i, SEEN.grounded] != 0.0 or not (left or mode in (HOVERING, FLYING)):
+    if seen[i, SEEN.grounded] != 0.0 or not (has_lifted_off or mode in (HOVERING, FLYING)):
         return 0
     seen[i, SEEN.grounded], seen[i, SEEN.surface] = 1.0, surface
     return TOUCHDOWN

@@ -59,9 +59,9 @@ def _drain(bodies: Bodies) -> None:
 def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> None:
     count = gust.shape[0]
     at = noise.at[STREAMS.wind] + 3 * noise.cursor[count, STREAMS.wind]
-    common, loaded = vector(noise.table[count], at), vector(wind, 0) + four(wind, 3)
+    common, wind_row = vector(noise.table[count], at), vector(wind, 0) + four(wind, 3)
     for i in range(count):
-        blow(loaded, vector(state[i], STATE.v_WB), gust[i], common, vector(noise.table[i], at), STEP_S)
+        blow(wind_row, vector(state[i], STATE.v_WB), gust[i], common, vector(noise.table[i], at), STEP_S)
     for i in range(count + 1):
         noise.cursor[i, STREAMS.wind] += 1
 
@@ -105,8 +105,8 @@ def _due(plan: NDArray, tick: int) -> bool:
     if plan[SCHEDULE.due] > tick:
         return False
     plan[SCHEDULE.count] += 1
-    per = plan[SCHEDULE.denominator]
-    plan[SCHEDULE.due] = (plan[SCHEDULE.count] * plan[SCHEDULE.numerator] + per - 1) // per
+    denominator = plan[SCHEDULE.denominator]
+    plan[SCHEDULE.due] = (plan[SCHEDULE.count] * plan[SCHEDULE.numerator] + denominator - 1) // denominator
     return True
 
 
@@ -137,9 +137,9 @@ def _sense(
 @inlined
 def _expose(s: int, i: int, tick: int, bodies: Bodies, senses: Senses) -> None:
     """Log the truth for a user's sensor, whose equation is applied after the gate."""
-    place = senses.exposed_count[0]
-    row = senses.exposed[place]
-    _note(senses.exposed_whose[place], s, i, tick)
+    count = senses.exposed_count[0]
+    row = senses.exposed[count]
+    _note(senses.exposed_whose[count], s, i, tick)
     for k in range(STATE.size):
         row[EXPOSED.state + k] = bodies.state[i, k]
     for k in range(6):
@@ -163,10 +163,10 @@ def _take(
 ) -> int:
     """Sample sensor s of drone i for the firmware and, if due, for the log; return the length of the log."""
     value = senses.value[logged]
-    kept = ss.sample(s, i, bodies, noise, senses, scene, value)
-    if kept:
+    is_received = ss.sample(s, i, bodies, noise, senses, scene, value)
+    if is_received:
         _register(device, s, value)
-    if _due(senses.schedule[i, s], tick) and kept:
+    if _due(senses.schedule[i, s], tick) and is_received:
         _note(senses.whose[logged], s, i, tick)
         logged += 1
     return logged
@@ -181,11 +181,11 @@ def _note(row: NDArray, s: int, i: int, tick: int) -> None:
 def _diverged(state: NDArray) -> int:
     """Return the first drone whose state is not finite or is out of bounds; -1 if none is."""
     for i in range(state.shape[0]):
-        size = 0.0
+        total = 0.0
         for k in range(state.shape[1]):
-            size += abs(state[i, k])
+            total += abs(state[i, k])
         p, _, _, rate = body.pose(state[i])
-        if not (math.isfinite(size) and norm(p) < POSITION_MAX_M and norm(rate) < RATE_MAX_RAD_S):
+        if not (math.isfinite(total) and norm(p) < POSITION_MAX_M and norm(rate) < RATE_MAX_RAD_S):
             return i
     return -1
 
@@ -214,7 +214,7 @@ def advance(held: Held, ticks: int) -> tuple[int, float, int, bool]:
 def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
     time, bodies, boards, noise, senses, wind, gust, watched, scene, sheet = w
     clock, device = time.clock, boards.device
-    logged, least = 0, math.inf
+    logged, min_distance = 0, math.inf
     bodies.touched.fill(0)
     bodies.bumped.fill(0)
     watched.found.fill(0)
@@ -231,7 +231,7 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
         if step and ticks > 0:
             _gusts(wind, gust, bodies.state, noise)
             _drain(bodies)
-        least = min(least, _meet(wind, gust, bodies, sheet))
+        min_distance = min(min_distance, _meet(wind, gust, bodies, sheet))
         if step:
             accelerate(bodies)
             if ticks > 0:
@@ -240,4 +240,4 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int, bool]:
     incidents = 0
     for i in range(watched.found.size):
         incidents |= watched.found[i]
-    return logged, least, _diverged(bodies.state), incidents != 0
+    return logged, min_distance, _diverged(bodies.state), incidents != 0

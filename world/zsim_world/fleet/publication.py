@@ -105,9 +105,9 @@ class GatePublication:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        own = [*fleet.sensors.names[STOCK_SENSORS:], *fleet.beside]
-        self._encoder = UserMessages(fleet) if own else None
-        self.table = key_table(fleet.names, own)
+        names = [*fleet.sensors.names[STOCK_SENSORS:], *fleet.extra_sensors]
+        self._encoder = UserMessages(fleet) if names else None
+        self.table = key_table(fleet.names, names)
         bodies = fleet.bodies
         self._seen = PublishedArrays(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
         self._commanders: list[str | None] = []  # commanders at the last gate
@@ -122,7 +122,7 @@ class GatePublication:
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = framing.words((*firmware.MODES, None))
         payloads = self._payloads()
-        self._room_beside = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
+        self._user_room = 2 * len(payloads.data)  # bytes of messages that are encoded in Python
         self._make_room(16 * fleet.count)
         # Load or compile the functions that the first gate needs, without counting messages.
         uncounted = self._fleetwide._replace(counts=self.counts.copy())
@@ -134,8 +134,8 @@ class GatePublication:
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + self._own_count
         payloads = self._payloads()
-        if count > self._written.columns.shape[1] or len(payloads.data) > self._room_beside:
-            self._room_beside = 2 * len(payloads.data)
+        if count > self._written.columns.shape[1] or len(payloads.data) > self._user_room:
+            self._user_room = 2 * len(payloads.data)
             self._make_room(2 * count)
         if commanders != self._commanders:
             wide.commanders[:] = [self._number(commander) for commander in commanders]
@@ -162,7 +162,7 @@ class GatePublication:
 
     def _make_room(self, count: int) -> None:
         columns, first = np.zeros((3, count), dtype=np.int64), np.zeros(self._fleet.count + 1, dtype=np.int64)
-        size = count * LAYOUTS.room(self._words) + self._room_beside
+        size = count * LAYOUTS.room(self._words) + self._user_room
         self._written = PublicationBuffers(columns, first, np.zeros(size, dtype=np.uint8))
         self._held = hold(PublicationState(self._words, self._seen, self._fleetwide, self._written))
 
@@ -176,16 +176,16 @@ class UserMessages:
 
     def encoded(self, counts: NDArray[np.int64]) -> UserPayloads:
         """Return the messages of a gate; `counts`: messages published so far by drone and kind, (N, kinds)."""
-        seen = self._fleet.seen
+        seen = self._fleet.observations
         if not (seen or self._messages):
             return NO_PAYLOADS
         whose, values = self._fleet.sampled
-        places = [*seen]
+        indices = [*seen]
         if self._messages:
-            places = np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
+            indices = np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist()
         sizes, data = np.zeros(len(whose), dtype=np.int64), bytearray()
         seq: dict[tuple[int, int], int] = {}
-        for m in places:
+        for m in indices:
             s, i, t_ns, t_sample_ns = whose[m].tolist()
             number = seq.get((i, s), counts.item(i, s + 2))
             seq[i, s] = number + 1
@@ -213,11 +213,11 @@ class UserMessages:
             if not all(map(math.isfinite, numbers)):
                 raise ValueError(f"is {list(numbers)}; must be finite")
         except plugin.RAISED as error:
-            what = f"{self._fleet.names[i]}: sensors.{self._fleet.sensors.names[s]} at {stamps[0] / 1e9:.3f} s"
-            if (failure := plugin.user_code_error(error, what)) is not None:
+            where = f"{self._fleet.names[i]}: sensors.{self._fleet.sensors.names[s]} at {stamps[0] / 1e9:.3f} s"
+            if (failure := plugin.user_code_error(error, where)) is not None:
                 raise failure from error
             text = f"its reading makes no {kind.message.__name__} ({reason_of(error)})"
-            raise UserCodeError(text, what) from error
+            raise UserCodeError(text, where) from error
         return self._messages[s - STOCK_SENSORS](*stamps, *fields)
 
 
@@ -328,14 +328,14 @@ def publish(held: Held, whose: NDArray, values: NDArray, data: NDArray, ends: ND
     _by_drone(whose, wide.own, first)
     order = _in_order(whose, wide.own, first)
     for i in range(drones):
-        for place in range(first[i], first[i + 1]):
-            kind = _fill(row, order[place], i, sampled, seen, wide, now_ns, first[i + 1] - first[i] - 1)
+        for n in range(first[i], first[i + 1]):
+            kind = _fill(row, order[n], i, sampled, seen, wide, now_ns, first[i + 1] - first[i] - 1)
             layout = kind
             if kind == TRUTH and wide.rotors[i] > ROTORS_MIN:
                 layout = STATUS + wide.rotors[i] - ROTORS_MIN
             if kind <= STATUS:
                 at = write(program, words, layout, row.ints, row.bits, out.data, at + GAP)
             else:
-                at = _copy(user, order[place], out.data, at + GAP)
-            columns[WHICH, place], columns[STAMPS, place], columns[ENDS, place] = i * kinds + kind, row.ints[0], at
+                at = _copy(user, order[n], out.data, at + GAP)
+            columns[WHICH, n], columns[STAMPS, n], columns[ENDS, n] = i * kinds + kind, row.ints[0], at
     return at

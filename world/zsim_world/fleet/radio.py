@@ -66,30 +66,34 @@ class RadioChannel:
             reception = _received(distance_m, radio.range_m, radio.spread_m)
         elif radio.range_m is not None:
             hears &= distance_m <= radio.range_m
-        struck = [fault for fault in faults if fault.kind == "radio"]
-        for fault in struck:
-            of_target = self._of_target(fault.target)
-            lowered = reception * _received(distance_m, fault.parameters["range_m"], fault.parameters["spread_m"])
-            reception = np.where(of_target[:, None] | of_target[None, :], lowered, reception)
+        radio_faults = [fault for fault in faults if fault.kind == "radio"]
+        for fault in radio_faults:
+            is_target = self._target_mask(fault.target)
+            reduced = reception * _received(distance_m, fault.parameters["range_m"], fault.parameters["spread_m"])
+            reception = np.where(is_target[:, None] | is_target[None, :], reduced, reception)
         hears &= reception >= RECEPTION_MIN
         if radio.line_of_sight and not self._is_open:
             clear_lines(place_m, self._scene, hears)
         if topology.nearest is not None:
-            apart_m = np.where(hears, distance_m, np.inf)[:n, :n]
-            others = np.argsort(apart_m, axis=1, kind="stable")[:, topology.nearest :]
-            np.put_along_axis(hears[:n, :n], others, False, axis=1)
+            masked_m = np.where(hears, distance_m, np.inf)[:n, :n]
+            too_far = np.argsort(masked_m, axis=1, kind="stable")[:, topology.nearest :]
+            np.put_along_axis(hears[:n, :n], too_far, False, axis=1)
         if topology.symmetric:
             hears |= hears.T
         heard = [np.flatnonzero(row).tolist() for row in hears]
-        soft = bool(struck) or (radio.range_m is not None and radio.spread_m > 0.0)
-        chances = tuple(tuple(row[of].tolist()) for row, of in zip(reception, heard, strict=True)) if soft else ()
+        is_random = bool(radio_faults) or (radio.range_m is not None and radio.spread_m > 0.0)
+        chances = (
+            tuple(tuple(row[senders].tolist()) for row, senders in zip(reception, heard, strict=True))
+            if is_random
+            else ()
+        )
         return RadioLinks(t_ns, seq, tuple(map(tuple, heard)), chances)
 
-    def _of_target(self, target: str) -> Matrix:
+    def _target_mask(self, target: str) -> Matrix:
         """Return which indices are drones of a cluster; all drones if the target is the world rather than a cluster."""
-        of_target = np.zeros(len(self._allowed), dtype=bool)
-        of_target[: self._count] = self._clusters.get(target, True)
-        return of_target
+        is_target = np.zeros(len(self._allowed), dtype=bool)
+        is_target[: self._count] = self._clusters.get(target, True)
+        return is_target
 
 
 def _received(distance_m: NDArray[np.float64], range_m: float, spread_m: float) -> NDArray[np.float64]:
@@ -104,8 +108,8 @@ def allowed(drones: list[str], topology: Topology) -> Matrix:
         return np.ones((n, n), dtype=bool)
     hears = np.zeros((n, n), dtype=bool)
     if isinstance(graph, dict):
-        for hearer, heard in graph.items():
-            hears[drones.index(hearer), [drones.index(name) for name in heard]] = True
+        for hearer, senders in graph.items():
+            hears[drones.index(hearer), [drones.index(name) for name in senders]] = True
         return hears
     for i in range(n if graph == "ring" else n - 1):
         hears[i, (i + 1) % n] = hears[(i + 1) % n, i] = True
@@ -113,14 +117,14 @@ def allowed(drones: list[str], topology: Topology) -> Matrix:
 
 
 @kernel()
-def clear_lines(place_m: NDArray, scene: Held, hears: NDArray) -> None:
+def clear_lines(position_m: NDArray, scene: Held, hears: NDArray) -> None:
     """Remove from `hears` the pairs whose line of sight meets an obstacle or a surface."""
-    for i in range(place_m.shape[0]):
+    for i in range(position_m.shape[0]):
         for j in range(i):
             if not (hears[i, j] or hears[j, i]):
                 continue
-            start = vector(place_m[i], 0)
-            to = subtract(vector(place_m[j], 0), start)
+            start = vector(position_m[i], 0)
+            to = subtract(vector(position_m[j], 0), start)
             length = norm(to)
             if length > 0.0 and cast_parts(scene.content, start, scaled(to, 1.0 / length), length) < length:
                 hears[i, j] = hears[j, i] = False

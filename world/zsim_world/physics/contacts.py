@@ -57,10 +57,10 @@ def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt
         relative = v_WB[k] - wind[WIND.steady + k] - gust[k]
         square += relative * relative
     decay = gust_decay(wind[WIND.length], math.sqrt(square), wind[WIND.speed_min], dt)
-    fresh = wind[WIND.gust] * math.sqrt(1.0 - decay * decay)
+    noise_gain = wind[WIND.gust] * math.sqrt(1.0 - decay * decay)
     share = wind[WIND.correlation]
     for k in range(3):
-        gust[k] = decay * gust[k] + fresh * gust_noise(share, common[k], own[k])
+        gust[k] = decay * gust[k] + noise_gain * gust_noise(share, common[k], own[k])
 
 
 @inlined
@@ -91,7 +91,7 @@ def downwash(thrust_n: float, density: float, start_m: float, below_m: float, as
 
 
 DISTANCE_MIN_M = 1e-9  # m; lower bound, so that two drones at the same position have a direction between them
-CLOSE = 1.0 + 1e-9  # factor on a squared distance that covers any rounding error
+ROUNDING_MARGIN = 1.0 + 1e-9  # factor on a squared distance that covers any rounding error
 STRAY_M = 0.25  # m; displacement of a drone after which the near pairs are updated; 0.4 s at 0.6 m/s
 APPROACH_M = 0.501  # m; largest change of a pair's distance by then: twice STRAY_M, plus a margin for rounding
 
@@ -105,7 +105,7 @@ def hull_force(stiffness: float, damping: float, depth_m: float, closing_m_s: fl
 
 
 @inlined
-def _apart(state: NDArray, i: int, j: int) -> Vector:
+def _displacement(state: NDArray, i: int, j: int) -> Vector:
     return (
         state[j, STATE.p_WB] - state[i, STATE.p_WB],
         state[j, STATE.p_WB + 1] - state[i, STATE.p_WB + 1],
@@ -127,22 +127,22 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
     Both forces act at one point, a = (R_i - dent) n from i, so that linear and angular momentum are conserved.
     """
     n = scaled(d, 1.0 / distance)
-    one, other = bodies.vehicle[i], bodies.vehicle[j]
-    share = distance / (one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius])
-    arms = scaled(n, share * one[VEHICLE.hull_radius]), scaled(n, -share * other[VEHICLE.hull_radius])
+    first, second = bodies.vehicle[i], bodies.vehicle[j]
+    share = distance / (first[VEHICLE.hull_radius] + second[VEHICLE.hull_radius])
+    arms = scaled(n, share * first[VEHICLE.hull_radius]), scaled(n, -share * second[VEHICLE.hull_radius])
     v = subtract(velocity_at(bodies.state[j], arms[1]), velocity_at(bodies.state[i], arms[0]))
     # The softer hull counts, so that the time step is short enough for a light drone.
-    stiffness = min(one[VEHICLE.hull_stiffness], other[VEHICLE.hull_stiffness])
-    damping = min(one[VEHICLE.hull_damping], other[VEHICLE.hull_damping])
-    depth = one[VEHICLE.hull_radius] + other[VEHICLE.hull_radius] - distance
+    stiffness = min(first[VEHICLE.hull_stiffness], second[VEHICLE.hull_stiffness])
+    damping = min(first[VEHICLE.hull_damping], second[VEHICLE.hull_damping])
+    depth = first[VEHICLE.hull_radius] + second[VEHICLE.hull_radius] - distance
     normal = hull_force(stiffness, damping, depth, -dot(v, n))
     slip = axpy(v, -dot(v, n), n)
     # Slip decays at the rate of the approach, although a tangential force, which turns the hull, meets less inertia.
-    straight = 1.0 / one[VEHICLE.mass] + 1.0 / other[VEHICLE.mass]
-    turning = dot(arms[0], arms[0]) / _least_inertia(one) + dot(arms[1], arms[1]) / _least_inertia(other)
+    linear_mobility = 1.0 / first[VEHICLE.mass] + 1.0 / second[VEHICLE.mass]
+    angular_mobility = dot(arms[0], arms[0]) / _min_inertia(first) + dot(arms[1], arms[1]) / _min_inertia(second)
     viscous, limit = (
-        damping * straight / (straight + turning),
-        min(one[VEHICLE.friction], other[VEHICLE.friction]) * normal,
+        damping * linear_mobility / (linear_mobility + angular_mobility),
+        min(first[VEHICLE.friction], second[VEHICLE.friction]) * normal,
     )
     speed = norm(slip)
     across = viscous if viscous * speed <= limit else limit / speed
@@ -158,7 +158,7 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
 
 
 @inlined
-def _least_inertia(row: NDArray) -> float:
+def _min_inertia(row: NDArray) -> float:
     return min(row[VEHICLE.inertia], row[VEHICLE.inertia + 1], row[VEHICLE.inertia + 2])
 
 
@@ -166,11 +166,11 @@ def _least_inertia(row: NDArray) -> float:
 def _meet(bodies: Bodies, i: int, j: int) -> float:
     """Let drones i < j act on each other; return the square of their distance [m^2]."""
     vehicle = bodies.vehicle
-    dx, dy, dz = _apart(bodies.state, i, j)
+    dx, dy, dz = _displacement(bodies.state, i, j)
     aside2 = dx * dx + dy * dy
     square = aside2 + dz * dz
     distance, hulls = math.inf, vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
-    if square < CLOSE * hulls * hulls:  # most pairs are farther apart, and the square root is costly
+    if square < ROUNDING_MARGIN * hulls * hulls:  # most pairs are farther apart, and the square root is costly
         distance = max(math.sqrt(square), DISTANCE_MIN_M)
     contact = distance < hulls
     if contact:
@@ -204,26 +204,26 @@ def _may_see(radius: float, eye: NDArray, aside: float, dz: float, distance: flo
     Args:
         eye: row of the looking drone in `NearPairs.eye`.
     """
-    room, cosine = radius + eye[0] + APPROACH_M, eye[2]
-    return cosine * aside + math.sqrt(1.0 - cosine * cosine) * dz < room and distance < eye[1] + room
+    margin, cosine = radius + eye[0] + APPROACH_M, eye[2]
+    return cosine * aside + math.sqrt(1.0 - cosine * cosine) * dz < margin and distance < eye[1] + margin
 
 
 @inlined
 def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPairs) -> None:
     """Note all pairs that can touch, be in downwash or be the closest until a drone strays, and who is above others."""
-    count, least = 0, math.inf
+    count, min_distance = 0, math.inf
     for i in range(state.shape[0]):
         near.above[i] = 0
         for k in range(3):
             near.origin[i, k] = state[i, STATE.p_WB + k]
     for i in range(state.shape[0]):
         for j in range(i + 1, state.shape[0]):
-            dx, dy, dz = _apart(state, i, j)
+            dx, dy, dz = _displacement(state, i, j)
             aside = math.sqrt(dx * dx + dy * dy)
             distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-            least = min(least, distance)
+            min_distance = min(min_distance, distance)
             hulls = vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
-            closest = max(least + APPROACH_M, hulls) + APPROACH_M
+            closest = max(min_distance + APPROACH_M, hulls) + APPROACH_M
             if _may_see(vehicle[j, VEHICLE.hull_radius], near.eye[i], aside, dz, distance):
                 near.above[i] = 1
             if _may_see(vehicle[i, VEHICLE.hull_radius], near.eye[j], aside, -dz, distance):
@@ -249,7 +249,7 @@ def meet_drones(bodies: Bodies) -> float:
     near = bodies.near
     if _strayed(bodies.state, near.origin):
         _find_near(bodies.vehicle, bodies.state, bodies.touching, near)
-    least = math.inf
+    min_square = math.inf
     for n in range(near.number[0]):
-        least = min(least, _meet(bodies, near.pair[n, 0], near.pair[n, 1]))
-    return max(math.sqrt(least), DISTANCE_MIN_M)
+        min_square = min(min_square, _meet(bodies, near.pair[n, 0], near.pair[n, 1]))
+    return max(math.sqrt(min_square), DISTANCE_MIN_M)

@@ -286,15 +286,15 @@ def lift_share(rotors: PerRotor, r: int) -> float:
 
 
 @inlined
-def put_of(rotors: PerRotor, r: int, value: float) -> None:
+def put_value(rotors: PerRotor, r: int, value: float) -> None:
     """Set the value for rotor r in the first group."""
     rotors.numbers[rotors.first + rotors.step * r] = value
 
 
 def rotor_slots(vehicles: Iterable[Vehicle]) -> int:
-    slots, of_cross = CROSS_ROTORS, np.array((_Y, [-x for x in _X], _TURN))
+    slots, cross_allocation = CROSS_ROTORS, np.array((_Y, [-x for x in _X], _TURN))
     for vehicle in vehicles:
-        cross = np.array_equal(allocation(vehicle), of_cross)
+        cross = np.array_equal(allocation(vehicle), cross_allocation)
         slots = max(slots, len(vehicle.rotors) if cross else max(len(vehicle.rotors), CROSS_ROTORS + 1))
     return slots
 

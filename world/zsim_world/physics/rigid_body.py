@@ -28,7 +28,7 @@ from zsim_world.physics.fleet_arrays import (
     place,
     put,
     put_four,
-    put_of,
+    put_value,
     vector,
 )
 from zsim_world.physics.surfaces import Touch, contact, touched
@@ -92,8 +92,8 @@ def accelerations(
     force = add(add(ground[0], push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
     force = axpy(force, -row[VEHICLE.drag], axpy(v_WB, -1.0, air_W))
     if aero is not None and len(aero.parts) > 1:
-        more = _flow(row, rotors, aero.numbers, axpy(v_WB, -1.0, air_W), q_WB, w_WB_B, speeds, commands, decay)
-        force, moment = add(force, more[0]), add(moment, more[1])
+        flow = _flow(row, rotors, aero.numbers, axpy(v_WB, -1.0, air_W), q_WB, w_WB_B, speeds, commands, decay)
+        force, moment = add(force, flow[0]), add(moment, flow[1])
     inv = 1.0 / row[VEHICLE.mass]
     wx, wy, wz = w_WB_B
     return (
@@ -180,7 +180,7 @@ def step(
 def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
     """Advance rotor speeds [rad/s] in place until the fraction `decay` of their error is left."""
     for r in range(len(speeds.each)):
-        put_of(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
+        put_value(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
 
 
 @inlined
@@ -364,27 +364,27 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
     low = thrust * row[VEHICLE.rotor_min] * row[VEHICLE.rotor_min]
     high = thrust * row[VEHICLE.rotor_max] * row[VEHICLE.rotor_max]
     roll, pitch = moment[0] / row[VEHICLE.rotor_unit], moment[1] / row[VEHICLE.rotor_unit]
-    reach, least, most_lift = 0.0, lift_share(rotors, 0), lift_share(rotors, 0)
+    tilt_force, min_lift, max_lift = 0.0, lift_share(rotors, 0), lift_share(rotors, 0)
     for r in range(len(rotors.each)):
         by_roll, by_pitch, _, _ = mixed(rotors, r)
-        reach = max(reach, abs(by_roll * roll + by_pitch * pitch))
-        least, most_lift = min(least, lift_share(rotors, r)), max(most_lift, lift_share(rotors, r))
+        tilt_force = max(tilt_force, abs(by_roll * roll + by_pitch * pitch))
+        min_lift, max_lift = min(min_lift, lift_share(rotors, r)), max(max_lift, lift_share(rotors, r))
     # Find a mean with (low + reach) / least <= mean <= (high - reach) / most_lift; reduce the tilt until one exists.
-    room = (high * least - low * most_lift) * (2.0 / (least + most_lift))
-    scale = room / (2.0 * reach) if 2.0 * reach > room else 1.0
-    roll, pitch, reach = roll * scale, pitch * scale, reach * scale
-    mean = min(max(row[VEHICLE.rotor_share] * thrust_n, (low + reach) / least), (high - reach) / most_lift)
+    margin = (high * min_lift - low * max_lift) * (2.0 / (min_lift + max_lift))
+    scale = margin / (2.0 * tilt_force) if 2.0 * tilt_force > margin else 1.0
+    roll, pitch, tilt_force = roll * scale, pitch * scale, tilt_force * scale
+    mean = min(max(row[VEHICLE.rotor_share] * thrust_n, (low + tilt_force) / min_lift), (high - tilt_force) / max_lift)
     yaw = moment[2] * thrust / row[VEHICLE.torque]
-    sign, most = (1.0 if yaw >= 0.0 else -1.0), abs(yaw)
+    sign, max_yaw = (1.0 if yaw >= 0.0 else -1.0), abs(yaw)
     for r in range(len(rotors.each)):
         by_roll, by_pitch, by_yaw, inverse = mixed(rotors, r)
         force, share = mean * lift_share(rotors, r) + by_roll * roll + by_pitch * pitch, sign * by_yaw
-        room = (high - force if share > 0.0 else low - force) * (sign * inverse)
-        most = min(most, room if share != 0.0 else most)
+        margin = (high - force if share > 0.0 else low - force) * (sign * inverse)
+        max_yaw = min(max_yaw, margin if share != 0.0 else max_yaw)
     for r in range(len(rotors.each)):
         by_roll, by_pitch, by_yaw, _ = mixed(rotors, r)
         force = mean * lift_share(rotors, r) + by_roll * roll + by_pitch * pitch
-        put_of(speeds, r, math.sqrt(max(force + sign * by_yaw * most, low) / thrust))
+        put_value(speeds, r, math.sqrt(max(force + sign * by_yaw * max_yaw, low) / thrust))
 
 
 @inlined

@@ -51,22 +51,28 @@ def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDAr
         parts: pairs of a first column and the numbers (N, any) from there on. Lanes without a drone, which are
             computed too, get those of the last drone, to avoid division by 0 in Python.
     """
-    listed = list(parts)
-    drones = len(listed[0][1])
+    column_parts = list(parts)
+    drones = len(column_parts[0][1])
     number = -(-drones // LANES)
     drone = np.minimum(np.arange(number * LANES), drones - 1).reshape(number, LANES)
-    made = np.zeros((number, count, LANES))
-    for first, known in listed:
-        made[:, first : first + known.shape[1]] = known[drone].swapaxes(1, 2)
-    return made.reshape(number, -1)
+    filled = np.zeros((number, count, LANES))
+    for first, values in column_parts:
+        filled[:, first : first + values.shape[1]] = values[drone].swapaxes(1, 2)
+    return filled.reshape(number, -1)
 
 
 def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray, aero: NDArray) -> NDArray[np.float64]:
     """Return the blocks of N level bodies: parameters, rotors, their `half_decay` (N, 1), aerodynamics."""
     each = rotors.shape[1] // ROTOR.size
-    known = BODY_LANES.size + BODY_ROTORS.known * each
+    rotors_start = BODY_LANES.size + BODY_ROTORS.known * each
     level = (BODY_LANES.state + STATE.q_WB, np.tile(LEVEL, (len(row), 1)))
-    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (BODY_LANES.aero, aero), level, (known, rotors))
+    parts = (
+        (BODY_LANES.vehicle, row),
+        (BODY_LANES.decay, decay),
+        (BODY_LANES.aero, aero),
+        level,
+        (rotors_start, rotors),
+    )
     return blocks(BODY_LANES.size + BODY_ROTORS.size * each, parts)
 
 

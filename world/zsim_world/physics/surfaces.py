@@ -163,7 +163,7 @@ def ball(row: Row, k: int) -> tuple[Vector, float]:
 
 
 @inlined
-def _across(a: Vector, n: Vector) -> Vector:
+def _tangential_part(a: Vector, n: Vector) -> Vector:
     """Return the component of a vector perpendicular to the unit vector n."""
     return axpy(a, -dot(a, n), n)
 
@@ -189,7 +189,7 @@ def touched(
             depth, n = radius - distance, (nx, ny, nz)
             if depth > 0.0:
                 v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
-                f_W = _pushed(row, k, depth, n, subtract(x, vector(touch.anchor[s, k], 0)), v)
+                f_W = _contact_force(row, k, depth, n, subtract(x, vector(touch.anchor[s, k], 0)), v)
                 force = add(force, f_W)
                 moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
     for k in range(touch.plane.shape[0]):
@@ -197,19 +197,19 @@ def touched(
         if plane[PLANE.side] != 0.0:
             r_B, radius = ball(row, k)
             x, n = add(p_WB, rotate(q_WB, r_B)), vector(plane, PLANE.normal_W)
-            moved = subtract(x, vector(plane, PLANE.centre_W))
-            depth = radius - (plane[PLANE.distance] + dot(n, moved))
+            displacement = subtract(x, vector(plane, PLANE.centre_W))
+            depth = radius - (plane[PLANE.distance] + dot(n, displacement))
             if depth > 0.0:
                 v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
                 gap = subtract(x, vector(plane, PLANE.anchor_W))
-                f_W = _pushed(row, k, depth, n, gap, v)
+                f_W = _contact_force(row, k, depth, n, gap, v)
                 force = add(force, f_W)
                 moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
     return force, moment
 
 
 @inlined
-def _pushed(row: Row, k: int, depth: float, n: Vector, gap: Vector, v: Vector) -> Vector:
+def _contact_force(row: Row, k: int, depth: float, n: Vector, gap: Vector, v: Vector) -> Vector:
     """Return the force in W [N] on ball k, which is `depth` [m] deep in a body with surface normal n.
 
     Args:
@@ -219,9 +219,9 @@ def _pushed(row: Row, k: int, depth: float, n: Vector, gap: Vector, v: Vector) -
     stiffness = row[VEHICLE.hull_stiffness] if hull else row[VEHICLE.foot_stiffness]
     damping = row[VEHICLE.hull_damping] if hull else row[VEHICLE.foot_damping]
     normal = max(stiffness * depth - damping * dot(v, n), 0.0)
-    held = axpy(scaled(_across(gap, n), -stiffness), -damping, _across(v, n))
-    size, limit = norm(held), row[VEHICLE.friction] * normal
-    return axpy(scaled(n, normal), 1.0 if size <= limit else limit / size, held)
+    friction = axpy(scaled(_tangential_part(gap, n), -stiffness), -damping, _tangential_part(v, n))
+    size, limit = norm(friction), row[VEHICLE.friction] * normal
+    return axpy(scaled(n, normal), 1.0 if size <= limit else limit / size, friction)
 
 
 @inlined
@@ -266,10 +266,10 @@ def reach_of(row: NDArray, v_WB: Vector) -> float:
 
 
 @inlined
-def note_bump(bodies: Bodies, i: int, thing: int, hit: bool) -> None:
-    if hit and bodies.bumping[i, thing] == 0:
-        bodies.bumped[i, thing] = 1
-    bodies.bumping[i, thing] = 1 if hit else 0
+def note_bump(bodies: Bodies, i: int, m: int, hit: bool) -> None:
+    if hit and bodies.bumping[i, m] == 0:
+        bodies.bumped[i, m] = 1
+    bodies.bumping[i, m] = 1 if hit else 0
 
 
 @inlined
@@ -290,9 +290,9 @@ def _slot(bodies: Bodies, i: int, m: int, distance: float) -> int:
     for s in range(solid.shape[0]):
         if solid[s] == m:
             return s
-        away = math.inf if solid[s] < 0 else nearest(bodies.obstacle[solid[s]], x, y, z)[0]
-        if away > farthest:
-            chosen, farthest = s, away
+        slot_distance = math.inf if solid[s] < 0 else nearest(bodies.obstacle[solid[s]], x, y, z)[0]
+        if slot_distance > farthest:
+            chosen, farthest = s, slot_distance
     return chosen
 
 
@@ -320,7 +320,7 @@ def drag(row: Row, depth: float, x: Vector, n: Vector, anchor: NDArray, is_new: 
     keep, gap = 0.0, (0.0, 0.0, 0.0)
     if depth > 0.0:
         if not is_new:
-            gap = _across(subtract(x, vector(anchor, 0)), n)
+            gap = _tangential_part(subtract(x, vector(anchor, 0)), n)
         size, limit = norm(gap), row[VEHICLE.friction] * depth
         keep = 1.0 if size <= limit else limit / size
     for axis in range(3):
@@ -356,12 +356,12 @@ def meet_surfaces(bodies: Bodies, sheet: Sheet) -> None:
         else:
             for k in range(BALLS):
                 planes[k, PLANE.side] = 0.0
-        for thing in range(first, bodies.bumping.shape[1]):
+        for m in range(first, bodies.bumping.shape[1]):
             hit = False
             for k in range(FEET, BALLS):
-                if planes[k, PLANE.surface] == thing - first and plane_depth(planes[k], ball(row, k)[1]) > 0.0:
+                if planes[k, PLANE.surface] == m - first and plane_depth(planes[k], ball(row, k)[1]) > 0.0:
                     hit = True
-            note_bump(bodies, i, thing, hit)
+            note_bump(bodies, i, m, hit)
 
 
 @inlined
@@ -373,25 +373,26 @@ def _follow(row: Row, sheet: Sheet, plane: NDArray, k: int, p_WB: Vector, q_WB: 
     """
     r_B, radius = ball(row, k)
     x = add(p_WB, rotate(q_WB, r_B))
-    found = nearest_point(sheet, x, away + norm(r_B) + ROOM_M)
+    closest = nearest_point(sheet, x, away + norm(r_B) + ROOM_M)
     is_new = plane[PLANE.side] == 0.0
     side = 1.0 if is_new else plane[PLANE.side]
-    was = p_WB if is_new else vector(plane, PLANE.centre_W)
-    near = row[VEHICLE.foot_depth] if is_new else norm(subtract(x, was))  # if farther away, it has not crossed
-    if found.distance <= near and crosses(sheet, was, x):
+    previous = p_WB if is_new else vector(plane, PLANE.centre_W)
+    # if farther away, it has not crossed
+    max_distance = row[VEHICLE.foot_depth] if is_new else norm(subtract(x, previous))
+    if closest.distance <= max_distance and crosses(sheet, previous, x):
         side = -side
-    triangle = sheet.triangle[found.triangle]
+    triangle = sheet.triangle[closest.triangle]
     n = vector(plane, PLANE.normal_W)
-    if found.feature == FACE:
+    if closest.feature == FACE:
         volume, normal = side_of(triangle, x)
         n = scaled(normal, (side if volume >= 0.0 else -side) / norm(normal))
     else:
-        if sheet.rim[found.triangle, found.feature] != 0:
+        if sheet.rim[closest.triangle, closest.feature] != 0:
             side = 1.0
-        if found.distance > TINY_M:
-            n = scaled(subtract(x, found.point), side / found.distance)
-    plane[PLANE.side], plane[PLANE.distance] = side, side * found.distance
-    plane[PLANE.surface] = sheet.surface[found.triangle]
+        if closest.distance > TINY_M:
+            n = scaled(subtract(x, closest.point), side / closest.distance)
+    plane[PLANE.side], plane[PLANE.distance] = side, side * closest.distance
+    plane[PLANE.surface] = sheet.surface[closest.triangle]
     for axis in range(3):
         plane[PLANE.normal_W + axis], plane[PLANE.centre_W + axis] = n[axis], x[axis]
     anchor = plane[PLANE.anchor_W : PLANE.anchor_W + 3]

@@ -48,7 +48,7 @@ class Participant:
         return f"{self.name} on {self.join.host} (pid {self.join.pid})"
 
     @property
-    def place(self) -> dict[str, Any]:
+    def location(self) -> dict[str, Any]:
         """The host and process id, for the data of an event."""
         return {"host": self.join.host, "pid": self.join.pid}
 
@@ -266,8 +266,8 @@ class Barrier:
     def remove(self, name: str) -> None:
         """Remove a participant that has said bye or is dropped, and stop expecting it."""
         removed = self.participants.pop(name, None)
-        gone = (name, *(removed.join.serves if removed else ()))
-        self._expected = [expected for expected in self._expected if expected not in gone]
+        removed_names = (name, *(removed.join.serves if removed else ()))
+        self._expected = [expected for expected in self._expected if expected not in removed_names]
 
     # Losses
 
@@ -304,7 +304,7 @@ class Barrier:
         """Return the names that other living participants serve in common with this one, by participant."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
-        return {p.name: both for p in others if (both := served & p.served_names)}
+        return {p.name: shared for p in others if (shared := served & p.served_names)}
 
     def absent(self) -> list[str]:
         """Return the expected names that have not joined yet."""
@@ -332,17 +332,17 @@ class Barrier:
         returns whether the reader may be waiting for the writer's outputs.
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
-        rank = {name: place for place, name in enumerate(self._expected)}
+        rank = {name: index for index, name in enumerate(self._expected)}
         awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
-        late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
+        blockers = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
         waiting = []
-        for victim in late:  # which may itself be waiting for outputs of other late participants
+        for victim in blockers:  # which may itself be waiting for outputs of other late participants
             read_by = victim.served_names if victim.gating and victim.alive and not victim.away else ()
-            others = (p for p in late if p is not victim and p.gating)
+            others = (p for p in blockers if p is not victim and p.gating)
             held_by = (p.name for p in others if any(feeds(w, r) for w in p.served_names for r in read_by))
             waiting.append(victim.waiting(wall_ns, tuple(held_by)))
         return (*absent, *waiting)
 
 
-def _incarnation_refusal(participant: Participant, found: str) -> Refusal:
-    return Refusal("incarnation", found, f"must be {participant.join.incarnation}, the newest to join")
+def _incarnation_refusal(participant: Participant, actual: str) -> Refusal:
+    return Refusal("incarnation", actual, f"must be {participant.join.incarnation}, the newest to join")

@@ -128,8 +128,8 @@ class CommandIntake:
             return False
 
         def distance_m(fault: Fault) -> float | None:
-            place = place_of(sender, fault.parameters["place"], self._drones, self._position_m)
-            return distance_between(self._position_m(drone), place)
+            position_m = place_of(sender, fault.parameters["place"], self._drones, self._position_m)
+            return distance_between(self._position_m(drone), position_m)
 
         return total_delay_ns(radios, self._scenario.seed, WORLD, key, command.message, distance_m) is NEVER
 
@@ -357,8 +357,8 @@ class CommandQueue:
         """Take the drone from its commander; return the refusal if the source is not the commander."""
         commander = self._commanders[drone]
         if commander is None or commander.source != source:
-            who = f"{commander.source!r}" if commander else "nobody"
-            state = f"flown by {who}, not by {source!r}"
+            owner = f"{commander.source!r}" if commander else "nobody"
+            state = f"flown by {owner}, not by {source!r}"
             return Refusal(self._names[drone], state, "only its commander can release it")
         self._commanders[drone] = None
         self._priorities.pop((drone, source), None)
@@ -378,8 +378,8 @@ class CommandQueue:
     def _drop_setpoints(self, source: str, drones: Container[int]) -> None:
         """Remove the queued setpoints of a source to some drones; mode commands stay queued."""
         for instant, queued in self._queued.items():
-            kept = [c for c in queued if c.kind == "mode" or c.source != source or c.drone not in drones]
-            self._queued[instant] = kept
+            remaining = [c for c in queued if c.kind == "mode" or c.source != source or c.drone not in drones]
+            self._queued[instant] = remaining
 
 
 def _command(kind: str, fields: Any) -> Any:

@@ -104,7 +104,7 @@ class Coordinator(ABC):
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         """Handle a command to a drone; return False for a duplicate."""
 
-    def take_of_driver(self, drone: str, message: Any) -> str | None:
+    def accept_from_driver(self, drone: str, message: Any) -> str | None:
         """Handle a message of an external drone's driver; return why it is refused, or None."""
         return None
 
@@ -135,19 +135,19 @@ class Coordinator(ABC):
 
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
         """Handle a message of a participant or any other process."""
-        kind, name, what = keys.parts(key)
-        if kind == "drone" and what.startswith("cmd/"):
+        kind, name, topic = keys.parts(key)
+        if kind == "drone" and topic.startswith("cmd/"):
             self.barrier.count_output(message.source)
-            if self._handle_command(name, what[4:], message):
+            if self._handle_command(name, topic[4:], message):
                 self.statistics.ages.command(message.t_ns, wall_ns)
-        elif kind == "process" and what == "done":
+        elif kind == "process" and topic == "done":
             if refusal := self.barrier.done(name, message, self.clock.now_ns, wall_ns):
                 self.outbox.refuse(name, key, refusal)
             elif refusal := self.barrier.take_back_bye(name):
                 self.outbox.refuse(name, keys.process(name, "bye"), refusal)
-        elif kind == "process" and what == "join":
+        elif kind == "process" and topic == "join":
             self.join(name, message, wall_ns)
-        elif kind == "process" and what == "bye":
+        elif kind == "process" and topic == "bye":
             self._take_bye(name, message, wall_ns)
 
     def count_output(self, source: str) -> None:
@@ -185,7 +185,7 @@ class Coordinator(ABC):
         if not is_known:
             strangers.spend("join")
         joined, kind = barrier.participants[name], "join"
-        data = {"incarnation": joined.join.incarnation, **joined.place}
+        data = {"incarnation": joined.join.incarnation, **joined.location}
         data |= {"from_ns": joined.from_ns, "done_ns": joined.done_ns}
         if joined.join.serves:
             data["serves"] = joined.join.serves
@@ -194,13 +194,13 @@ class Coordinator(ABC):
         outbox.event(kind, name, str(joined), data, name)
         for dead in replaced:
             self.release_drones(dead.name)
-        found, own = joined.join.fingerprint, fingerprint()
-        if found and found != own:
-            who = f"{name} on {joined.join.host}"
-            text = f"{who} runs different code (fingerprint); the same bits are not guaranteed"
-            outbox.event("fingerprint", name, text, {"found": found, "expected": own})
-        for other, both in barrier.duplicates(name).items():
-            text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
+        actual, expected = joined.join.fingerprint, fingerprint()
+        if actual and actual != expected:
+            process = f"{name} on {joined.join.host}"
+            text = f"{process} runs different code (fingerprint); the same bits are not guaranteed"
+            outbox.event("fingerprint", name, text, {"found": actual, "expected": expected})
+        for other, shared in barrier.duplicates(name).items():
+            text = f"{name} and {other} both do the work of {', '.join(sorted(shared))}; end one of them"
             outbox.event("doubled", name, text, {"other": other})
 
     def _take_bye(self, name: str, message: Bye, wall_ns: int) -> None:
@@ -252,7 +252,7 @@ class Coordinator(ABC):
         """Handle the bye of a process that failed, which is not restarted because it would fail again."""
         name, action = participant.name, self._on_death(participant)
         action = "end" if action == "restart" else action
-        self.outbox.event("failure", name, reason, {**participant.place, "on_death": action}, name)
+        self.outbox.event("failure", name, reason, {**participant.location, "on_death": action}, name)
         if action == "drop":
             self._drop(name)
             return
@@ -282,7 +282,7 @@ class Coordinator(ABC):
         substitute = self.barrier.substitute(name)
         action = "drop" if substitute else self._on_death(participant)
         then = f"{substitute.name} does its work" if substitute else f"on_death: {action}"
-        self.outbox.event("death", name, f"{participant} died; {then}", {**participant.place, "on_death": action})
+        self.outbox.event("death", name, f"{participant} died; {then}", {**participant.location, "on_death": action})
         if action == "drop":
             self._drop(name, is_news=substitute is None)
         elif self.clock.mode == "realtime":
@@ -350,17 +350,17 @@ class Coordinator(ABC):
         processes = self.scenario.processes
         participant = self.barrier.participants.get(name)
         if participant is not None:
-            place, action = participant.place, self._on_death(participant)
+            location, action = participant.location, self._on_death(participant)
             if action not in ("drop", "end"):  # on_death applies to silent processes as well
                 role, gating = participant.join.role, processes.gating or ()
                 action = roles.on_overdue(processes.on_overdue or {}, name, role, gating)
             text = f"{name} has not come back within {processes.return_s:g} s"
         elif name in self.barrier.absent():
-            place, action = {"host": "", "pid": 0}, "drop" if lets_drop(processes.on_overdue or {}, name) else "end"
+            location, action = {"host": "", "pid": 0}, "drop" if lets_drop(processes.on_overdue or {}, name) else "end"
             text = f"{name} has not joined within {self._start_timeout_s(name):g} s; see processes.start_timeout_s"
         else:
             return
-        self.outbox.event("overdue", name, text, {**place, "on_overdue": action})
+        self.outbox.event("overdue", name, text, {**location, "on_overdue": action})
         if action == "drop":
             self._drop(name)
         else:
@@ -373,10 +373,10 @@ class Coordinator(ABC):
             return
         participant.silent_wall_ns = since_wall_ns
         if since_wall_ns is None:
-            self.outbox.event("silent_end", name, f"{participant} is back", participant.place)
+            self.outbox.event("silent_end", name, f"{participant} is back", participant.location)
         else:
             text = f"{participant} shows no sign of life; it is stopped, or its host is gone"
-            self.outbox.event("silent", name, text, participant.place)
+            self.outbox.event("silent", name, text, participant.location)
 
     def reader_closed(self, text: str, data: dict[str, Any]) -> None:
         """Report a reader whose link was closed because it stopped reading; the run does not wait for it."""
@@ -392,8 +392,8 @@ class Coordinator(ABC):
             self.outbox.refusals.count += 1
             return
         data = {"host": join.host, "pid": join.pid, "incarnation": join.incarnation}
-        what = "takes nobody's place" if name in self.barrier.participants else "is not waited for"
-        text = f"{name} on {join.host} (pid {join.pid}) {fault}; its join {what}"
+        effect = "takes nobody's place" if name in self.barrier.participants else "is not waited for"
+        text = f"{name} on {join.host} (pid {join.pid}) {fault}; its join {effect}"
         self.outbox.event("no_show", name, text, data)
 
     def not_shown(self, name: str, fault: str, wall_ns: int) -> None:
@@ -401,7 +401,7 @@ class Coordinator(ABC):
         participant = self.barrier.participants.get(name)
         if participant is None or not participant.alive or self._has_left(name, wall_ns):
             return
-        self.outbox.event("no_show", name, f"{participant} {fault}", participant.place)
+        self.outbox.event("no_show", name, f"{participant} {fault}", participant.location)
         if participant.rejoined:
             self.died(name, wall_ns)
             return
@@ -438,8 +438,8 @@ class Coordinator(ABC):
             text = f"{source or 'somebody'} asks {op}: {'done' if answer.ok else answer.error}"
             args = request.args
             if len(msgspec.msgpack.encode(args)) > ARGS_BYTES_MAX:
-                short = list(args.items())[:8]
-                args = {str(k)[:40]: value if number(value) is not None else str(value)[:80] for k, value in short}
+                items = list(args.items())[:8]
+                args = {str(k)[:40]: value if number(value) is not None else str(value)[:80] for k, value in items}
             self.outbox.event("control", op, text, {"args": args, "ok": answer.ok}, source)
         return answer
 

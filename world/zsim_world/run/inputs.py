@@ -24,8 +24,8 @@ from zsim.schema.message import Count
 from zsim_world.run.coordinator import Coordinator
 
 PHASE_EVERY = 10  # one in this many cluster states is read for the phase on display
-OF_CAMERAS = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed from every process with a camera
-OF_DRIVERS = ("truth", "link")  # published by the driver of an external drone, beside its sensors
+CAMERA_MESSAGES = (flight_messages.CameraInfo, flight_messages.Sightings)  # relayed from every process with a camera
+DRIVER_TOPICS = ("truth", "link")  # published by the driver of an external drone, beside its sensors
 
 ProgressCallback = Callable[[str, Any, str], None]
 """Shows progress. Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every
@@ -129,11 +129,13 @@ class Run:
 
     def learn_handler(self, key: str) -> Handler:
         """Return the handler of a key's messages and cache it: the same keys recur at every gate."""
-        kind, (place, name, what) = messages.type_of(key), keys.parts(key)
-        if messages.is_relayed(kind) or (kind in OF_CAMERAS and not keys.is_sensor(key)):
+        kind, (group, name, topic) = messages.type_of(key), keys.parts(key)
+        if messages.is_relayed(kind) or (kind in CAMERA_MESSAGES and not keys.is_sensor(key)):
             handler = self._relay
-        elif place == "drone" and name in self.world.external and (what in OF_DRIVERS or what.startswith("sensor/")):
-            handler = self._take_of_driver
+        elif (
+            group == "drone" and name in self.world.external and (topic in DRIVER_TOPICS or topic.startswith("sensor/"))
+        ):
+            handler = self._handle_driver_message
         elif key.startswith("process/") or keys.is_command(key):
             handler = self._hand_over
         else:
@@ -188,14 +190,14 @@ class Run:
             source = f"{'estimator' if kind is flight_messages.Estimate else 'controller'}.{keys.thing(key)}"
         self.world.count_output(source)
 
-    def _take_of_driver(self, sample: Sample, wall_ns: int) -> None:
+    def _handle_driver_message(self, sample: Sample, wall_ns: int) -> None:
         """Keep a message of a driver about its drone, unless the world refuses it."""
         self.history.passed.append(sample)
         key, payload = sample
         drone = keys.thing(key)
         try:
             message = messages.decode(key, payload)
-            refusal = self.world.take_of_driver(drone, message)
+            refusal = self.world.accept_from_driver(drone, message)
             if refusal is not None:
                 raise DecodeError(refusal)
             self.history.add(key, payload, message.t_ns)
@@ -373,14 +375,14 @@ class MessageHistory:
             (key, payload) in order of arrival, and the position of the next page; None after the last page.
         """
         passed: list[tuple[str, bytes]] = []
-        known: dict[str, bool] = {}
+        verdicts: dict[str, bool] = {}
         size = 0
         for number, (t_ns, key, payload) in enumerate(self._each(), self._forgotten):
             if number < start or t_ns <= from_ns:
                 continue
-            if key not in known:
-                known[key] = wanted(key)
-            if not known[key]:
+            if key not in verdicts:
+                verdicts[key] = wanted(key)
+            if not verdicts[key]:
                 continue
             size += len(payload)
             if passed and size > self._page_bytes:
@@ -399,12 +401,12 @@ class MessageHistory:
             replay = msgspec.convert(args, _ReplayArgs)
         except REFUSALS as error:
             return ControlAnswer(False, f"replay: needs from_ns (whole number) and keys (list of texts): {error}")
-        passed, more = self.page(
+        passed, next_page = self.page(
             replay.from_ns,
             lambda key: roles.permits(replay.keys, key) and roles.permits(readable, key),
             replay.page,
         )
-        return ControlAnswer(True, result=passed, more=more)
+        return ControlAnswer(True, result=passed, more=next_page)
 
     def lost_outputs(self, kept: Any, done_ns: int) -> Pairs:
         """Return the outputs kept by a participant that have not arrived, for example after a cut link, each once.

@@ -21,7 +21,7 @@ EVENTS_MAX = 20  # refusal events per source, subject and reason; further refusa
 REASONS_MAX = 10  # distinct reasons per source and subject; all further ones count as one
 REFUSED_MAX = 1000  # refusal events of all sources at once, since names can be invented; then one per simulated second
 
-_FIGURE = re.compile(r"\d[\d.e+-]*")
+_NUMBER = re.compile(r"\d[\d.e+-]*")
 
 
 class RunOutbox:
@@ -123,7 +123,7 @@ class RefusalLog:
         if len(self._counts) > SUBJECTS_MAX:
             self._counts.clear()
         by_reason = self._counts.setdefault((source, subject), {})
-        pattern = _FIGURE.sub("#", reason)
+        pattern = _NUMBER.sub("#", reason)
         if pattern not in by_reason and len(by_reason) >= REASONS_MAX:
             pattern = ""
         former = by_reason.get(pattern, 0)
@@ -159,12 +159,12 @@ class Budgets:
         self.unjoined = ChangeBudget(now_ns, gate_ns / UNJOINED, UNJOINED * CHANGES_MAX)
         self.strangers = ChangeBudget(now_ns, SECOND_NS, STRANGERS_MAX)
 
-    def allows(self, source: str, what: str, has_joined: bool) -> bool:
+    def allows(self, source: str, kind: str, has_joined: bool) -> bool:
         """Return whether a source may make one more change."""
-        return self.changes.allows(f"{what}{source}") and (has_joined or self.unjoined.allows(what))
+        return self.changes.allows(f"{kind}{source}") and (has_joined or self.unjoined.allows(kind))
 
-    def spend(self, source: str, what: str, has_joined: bool) -> bool:
+    def spend(self, source: str, kind: str, has_joined: bool) -> bool:
         """Count a change of a source; return False if its budget is exhausted."""
-        if not self.allows(source, what, has_joined):
+        if not self.allows(source, kind, has_joined):
             return False
-        return self.changes.spend(f"{what}{source}") and (has_joined or self.unjoined.spend(what))
+        return self.changes.spend(f"{kind}{source}") and (has_joined or self.unjoined.spend(kind))

@@ -32,18 +32,18 @@ from zsim_world.run.coordinator import FLIGHT_REQUESTS, Coordinator
 from zsim_world.run.outbox import Refusal
 from zsim_world.run.run_clock import number, refused_argument
 
-RECORD_OVER = "the record is over"  # why a replay of the whole record ended
+RECORD_ENDED = "the record is over"  # why a replay of the whole record ended
 
 NOT_FLYABLE = "a replay: nobody can be flown"
 SEEK_MAX_S = 1e9  # limit that keeps nanoseconds within an int64
 VIEWED_MAX = 10_000  # drones times time steps in one answer to `views`: 2 MB
 VIEWED_MAX_S = 60.0  # simulated time in one answer to `views`; design choice: the replay stands still while reading
 BEFORE_NS = 1_000_000_000  # time within which every source of a view is published at least once
-OF_CAMERAS = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish them
+CAMERA_ROLES = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish them
 MARKS_MAX = 400  # marks on a timeline; more would be narrower than a pixel
-LEFT_OUT = frozenset({"command", "end"})  # kinds of events without a mark; commands are too many
+UNMARKED_EVENTS = frozenset({"command", "end"})  # kinds of events without a mark; commands are too many
 TEXT_MAX = 120  # maximum length of a mark's text, characters
-SOURCED = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # messages that name their publisher
+SOURCED_TYPES = (flight_messages.Command, CameraImage, CameraInfo, Sightings)  # messages that name their publisher
 
 
 class PlaybackRange(NamedTuple):
@@ -102,10 +102,10 @@ class Playback(Coordinator):
         self._cameras = {drone.name: drone.sensors.cameras() for drone in scenario.drones}
         self._table = run_key_table(info)
         self._kinds = len(self._table) // len(self.names)  # number of kinds of messages about a drone
-        self._place = {key: place for place, key in enumerate(self._table)}
-        of_drones = (key for name in self.names for key in (keys.truth(name), keys.status(name), keys.estimate(name)))
-        of_clusters = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
-        self._view_sources = {*of_drones, keys.VIEW_DRONES, *of_clusters}
+        self._indices = {key: index for index, key in enumerate(self._table)}
+        drone_keys = (key for name in self.names for key in (keys.truth(name), keys.status(name), keys.estimate(name)))
+        cluster_keys = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
+        self._view_sources = {*drone_keys, keys.VIEW_DRONES, *cluster_keys}
         self._last: dict[str, bytes] = {}
         topics = reader.topics()
         wanted = {key for key in topics if _is_played(key) and roles.permits(played.keys, key)}
@@ -113,10 +113,10 @@ class Playback(Coordinator):
         self._recounts = any(keys.is_sensor(key) and key not in wanted for key in topics)
         self._reader = reader
         # Published only on change: the last ones before the first gate are played with it.
-        self._standing = {key for key in wanted if key == keys.FAULTS or messages.type_of(key) is CameraInfo}
+        self._latched = {key for key in wanted if key == keys.FAULTS or messages.type_of(key) is CameraInfo}
         gate_keys = wanted | ({keys.VIEW_DRONES} & topics.keys())
         self._recorded_gates = RecordedGates(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
-        self._wind(played.from_ns)
+        self._continue_from(played.from_ns)
         if self._coming is None or (played.to_ns is not None and self._coming.t_ns > played.to_ns):
             until = "on" if played.to_ns is None else f"to {played.to_ns / 1e9:.12g} s"
             window = f"from {played.from_ns / 1e9:.12g} s {until}"
@@ -138,33 +138,33 @@ class Playback(Coordinator):
     def advance(self, wall_ns: int) -> None:
         """Play the next gate, if there is one; pause or end after the last one."""
         gate = self._coming
-        if gate is not None and not self._over():
+        if gate is not None and not self._end_reason():
             if self.clock.state == "waiting":
                 self.clock.start(gate.t_ns, self._played.paused)
             else:
                 self.clock.advance(gate.t_ns)
             self._play(gate, wall_ns)
             self._read_next()
-        if over := self._over():
+        if end_reason := self._end_reason():
             if self._played.holds:
                 self.clock.hold()
             else:
-                self.clock.stop(over)
+                self.clock.stop(end_reason)
 
-    def _over(self) -> str:
+    def _end_reason(self) -> str:
         """Return why nothing remains to be played; empty while something does."""
         to_ns = self._played.to_ns
         if self._coming is None:
-            return RECORD_OVER
+            return RECORD_ENDED
         return f"played to {to_ns / 1e9:g} s" if to_ns is not None and self._coming.t_ns > to_ns else ""
 
-    def _wind(self, from_ns: int) -> None:
+    def _continue_from(self, from_ns: int) -> None:
         """Continue with the first gate at or after a time."""
         self._gates = self._recorded_gates.gates(from_ns)
         self._read_next()
         before: list[Recorded] = []
-        if self._standing and from_ns > 0:
-            before = [m for m in self._reader.messages(self._standing, by_time=False) if m.t_ns < from_ns]
+        if self._latched and from_ns > 0:
+            before = [m for m in self._reader.messages(self._latched, by_time=False) if m.t_ns < from_ns]
         self._pending = list({m.key: m for m in sorted(before, key=lambda m: m.t_ns)}.values())
 
     def _read_next(self) -> None:
@@ -179,20 +179,20 @@ class Playback(Coordinator):
 
         def is_of_cameras(name: str) -> bool:
             role, _, drone = name.partition(".")
-            return role in OF_CAMERAS.values() and drone in self._cameras
+            return role in CAMERA_ROLES.values() and drone in self._cameras
 
         by_name = {name for names in served if not any(map(is_of_cameras, names)) for name in names}
         return _Live({name for names in served for name in names}, by_name)
 
     def _is_replaced(self, recorded: Recorded, live: _Live) -> bool:
         """Return whether a participant publishes a message in place of one on record."""
-        role = OF_CAMERAS.get(messages.type_of(recorded.key))
+        role = CAMERA_ROLES.get(messages.type_of(recorded.key))
         if role is None:
             return bool(live.names) and _author(recorded) in live.names
-        _, drone, what = keys.parts(recorded.key)
+        _, drone, topic = keys.parts(recorded.key)
         if f"{role}.{drone}" in live.names:  # replaces the scenario's cameras of that drone, or any if it has none
-            cameras, camera = self._cameras.get(drone), what.removeprefix("camera/").removesuffix("/info")
-            if not cameras or camera == what or camera in cameras:
+            cameras, camera = self._cameras.get(drone), topic.removeprefix("camera/").removesuffix("/info")
+            if not cameras or camera == topic or camera in cameras:
                 return True
         return bool(live.by_name) and _author(recorded) in live.by_name
 
@@ -203,12 +203,12 @@ class Playback(Coordinator):
         for recorded in played:
             if recorded.key == keys.FAULTS:  # must be known before the gate
                 self._publish(recorded)
-        if of_drones := [m for m in gate.messages if m.key in self._place]:
-            self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
+        if drone_messages := [m for m in gate.messages if m.key in self._indices]:
+            self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, drone_messages))
         self.statistics.gate(gate.t_ns, wall_ns)
         self.outbox.put(keys.CLOCK, self.clock_message(self.missed(wall_ns)))
         for recorded in played:
-            if recorded.key in self._place or recorded.key == keys.FAULTS or self._is_replaced(recorded, live):
+            if recorded.key in self._indices or recorded.key == keys.FAULTS or self._is_replaced(recorded, live):
                 continue
             self._publish(recorded)
 
@@ -225,25 +225,25 @@ class Playback(Coordinator):
         elif key != keys.VIEW_DRONES:
             self.outbox.put(key, msgspec.Raw(payload))
 
-    def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
+    def _gate_messages(self, t_ns: int, drone_messages: list[Recorded]) -> GateMessages:
         """Return the world's messages about its drones in the order of publication: drone by drone, status last.
 
         The count in each status is corrected to the sensor messages played, because agents would wait for the others.
         """
-        of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
-        which = np.array([self._place[m.key] for m in of_drones])
-        first = np.searchsorted(which // self._kinds, np.arange(len(self.names) + 1)).tolist()
-        payloads = [m.payload for m in of_drones]
+        drone_messages.sort(key=lambda m: self._indices[m.key] // self._kinds)
+        indices = np.array([self._indices[m.key] for m in drone_messages])
+        first = np.searchsorted(indices // self._kinds, np.arange(len(self.names) + 1)).tolist()
+        payloads = [m.payload for m in drone_messages]
         if self._recounts:
-            kinds, truth, status = (which % self._kinds).tolist(), KINDS.index("truth"), KINDS.index("status")
+            kinds, truth, status = (indices % self._kinds).tolist(), KINDS.index("truth"), KINDS.index("status")
             for begin, end in pairwise(first):
                 count = sum(kind != truth for kind in kinds[begin:end])
                 for m in range(begin, end):
                     if kinds[m] == status:
                         message = messages.decode_as(flight_messages.Status, payloads[m], "status")
                         payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))
-        pairs = list(zip([m.key for m in of_drones], payloads, strict=True))
-        stamps = [m.t_ns for m in of_drones]
+        pairs = list(zip([m.key for m in drone_messages], payloads, strict=True))
+        stamps = [m.t_ns for m in drone_messages]
         return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
 
     def views(self, seq: int) -> Sequence[Output]:
@@ -251,9 +251,9 @@ class Playback(Coordinator):
         live = self._live().names
         own = {keys.estimates_view(name) for name in live}
         own |= {keys.cluster_view(name.removeprefix("controller.")) for name in live if name.startswith("controller.")}
-        return [output for output in self._made_views(self._last, self.now_ns, seq) if output.key not in own]
+        return [output for output in self._build_views(self._last, self.now_ns, seq) if output.key not in own]
 
-    def _made_views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
+    def _build_views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
         """Yield the views at the gate t_ns for which the last values of the sources are known."""
         drones = []
         estimates: defaultdict[str, list[flight_messages.EstimateView]] = defaultdict(list)
@@ -261,8 +261,8 @@ class Playback(Coordinator):
             truth, status = _read(last, keys.truth(drone)), _read(last, keys.status(drone))
             if truth is not None and status is not None:
                 pose = (truth.position_m, truth.orientation_wxyz, truth.rotor_rad_s)
-                about = (status.state, status.battery_percent, status.commander)
-                drones.append(flight_messages.DroneView(drone, *pose, *about))
+                condition = (status.state, status.battery_percent, status.commander)
+                drones.append(flight_messages.DroneView(drone, *pose, *condition))
             estimate = _read(last, keys.estimate(drone))
             if estimate is not None:
                 estimates[f"estimator.{drone}"].append(flight_messages.estimate_view(drone, estimate))
@@ -280,8 +280,8 @@ class Playback(Coordinator):
     def result(self) -> dict[str, Any]:
         """Return the statistics of the replay so far."""
         statistics = self.statistics.result(self.barrier.participants.values())
-        about = {"replay_of": self._recorded.run_id, "refused": self.outbox.refusals.count}
-        return {"reason": self.ended, "last_ns": self.now_ns, **statistics, **about}
+        replay_values = {"replay_of": self._recorded.run_id, "refused": self.outbox.refusals.count}
+        return {"reason": self.ended, "last_ns": self.now_ns, **statistics, **replay_values}
 
     # Commands and requests
 
@@ -309,13 +309,13 @@ class Playback(Coordinator):
         if gating:
             return Refusal(", ".join(gating), "in the lockstep", "seek needs nobody who is waited for")
         former = self._gates, self._coming, self._pending
-        self._wind(round(t_s * 1e9))
+        self._continue_from(round(t_s * 1e9))
         if self._coming is None:
             self._gates, self._coming, self._pending = former
             return refused_argument(request, "t_s", "a time on record [s]")
         self._last.clear()
         self.statistics.rate.jump()
-        if keys.FAULTS in self._standing and not any(m.key == keys.FAULTS for m in self._pending):
+        if keys.FAULTS in self._latched and not any(m.key == keys.FAULTS for m in self._pending):
             t_ns = self._coming.t_ns
             self._pending.append(Recorded(keys.FAULTS, messages.encode(run_messages.Faults(t_ns, 0, ())), t_ns, 0))
         self.clock.jumps += 1
@@ -330,7 +330,7 @@ class Playback(Coordinator):
         for recorded in self._reader.messages([keys.EVENT]):
             with suppress(DecodeError):
                 event: run_messages.Event = messages.decode(keys.EVENT, recorded.payload)
-                if event.kind not in LEFT_OUT:
+                if event.kind not in UNMARKED_EVENTS:
                     text = f"{event.subject}: {event.text}" if event.subject else event.text
                     marks.append({"t_s": event.t_ns / 1e9, "kind": event.kind, "text": text[:TEXT_MAX]})
         return ControlAnswer(True, result={**span, "marks": marks[:: -(-len(marks) // MARKS_MAX) or 1]})
@@ -347,12 +347,12 @@ class Playback(Coordinator):
             return refused_argument(request, "every_s", f"above 0, for {count_max} instants of this run at most")
         instants = [round((from_s + k * every_s) * 1e9) for k in range(int((to_s - from_s) / every_s) + 1)]
         last: dict[str, bytes] = {}
-        found: list[tuple[str, bytes]] = []
+        views: list[tuple[str, bytes]] = []
         for seq, (t_ns, passed) in enumerate(self._recorded_gates.before(instants, self._viewed, BEFORE_NS)):
             last |= passed
             if any(key.endswith("/truth") for key in passed):  # otherwise a gap in the record, or its end
-                found += [(key, messages.encode(message)) for key, message in self._made_views(last, t_ns, seq)]
-        return ControlAnswer(True, result=found)
+                views += [(key, messages.encode(message)) for key, message in self._build_views(last, t_ns, seq)]
+        return ControlAnswer(True, result=views)
 
 
 class Gate(NamedTuple):
@@ -399,14 +399,14 @@ class RecordedGates:
                 yield gate
 
     def _all(self, from_ns: int) -> Iterator[Gate]:
-        held: dict[int, list[Recorded]] = {}
+        waiting: dict[int, list[Recorded]] = {}
         gates: deque[int] = deque()
         newest = None
 
         def take(t_ns: int) -> Gate:
             """Return a gate, including the messages due at earlier gates that are missing from the record."""
-            due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
-            return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
+            due = sorted(gate_ns for gate_ns in waiting if gate_ns <= t_ns)
+            return Gate(t_ns, [recorded for gate_ns in due for recorded in waiting.pop(gate_ns)])
 
         # Answers to the first gate and samples for it may be in a chunk that begins before it.
         for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
@@ -415,7 +415,7 @@ class RecordedGates:
                 if newest is not None:
                     writing_ns = newest + self._gate_ns
                     due_ns = due_ns if newest - self._slack_ns < due_ns <= writing_ns else writing_ns
-                held.setdefault(due_ns, []).append(recorded)
+                waiting.setdefault(due_ns, []).append(recorded)
             elif (newest is None or recorded.t_ns > newest) and _is_gate(recorded.payload):
                 newest = recorded.t_ns
                 gates.append(newest)
@@ -441,8 +441,8 @@ class RecordedGates:
                 break
             if first_ns <= recorded.t_ns <= last_ns:
                 of_instant = newest[bisect_left(instants_ns, recorded.t_ns)]
-                held = of_instant.get(recorded.key)
-                if held is None or held.t_ns <= recorded.t_ns:
+                previous = of_instant.get(recorded.key)
+                if previous is None or previous.t_ns <= recorded.t_ns:
                     of_instant[recorded.key] = recorded
         for t_ns, of_instant in zip(instants_ns, newest, strict=True):
             yield t_ns, {key: recorded.payload for key, recorded in of_instant.items()}
@@ -462,8 +462,8 @@ def _is_played(key: str) -> bool:
     A replay publishes its own info, clock and views, and omits messages about the recorded processes.
     """
     views = (ViewDrones, flight_messages.ViewCluster, ViewEstimates)
-    anew = key in (keys.INFO, keys.CLOCK) or messages.type_of(key) in views
-    return not anew and not key.startswith("process/")
+    is_republished = key in (keys.INFO, keys.CLOCK) or messages.type_of(key) in views
+    return not is_republished and not key.startswith("process/")
 
 
 def _author(recorded: Recorded) -> str:
@@ -475,7 +475,7 @@ def _author(recorded: Recorded) -> str:
         return f"{roles.PILOT}.{keys.thing(recorded.key)}"
     if kind in (flight_messages.ClusterState, run_messages.ClusterRequest):
         return f"controller.{keys.thing(recorded.key)}"
-    if kind is None or not issubclass(kind, SOURCED):
+    if kind is None or not issubclass(kind, SOURCED_TYPES):
         return ""
     try:
         return _decode_sourced(recorded.payload).source

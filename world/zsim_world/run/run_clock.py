@@ -101,12 +101,12 @@ class RunClock:
         return {**pausing, "rate": self._set_rate, "stop": self._stop}
 
     def _pause_or_continue(self, request: ControlRequest) -> Refusal | None:
-        op, needed = request.op, "running" if request.op == "pause" else "paused"
+        op, required_state = request.op, "running" if request.op == "pause" else "paused"
         gates = number(request.args.get("gates", 1)) if op == "step" else 1
         if gates is None or not 1 <= gates <= GATES_MAX or gates != int(gates):
             return refused_argument(request, "gates", f"a whole number from 1 to {GATES_MAX}")
-        if self.state != needed:
-            return Refusal("the run", self.state, f"{op} needs a {needed} one")
+        if self.state != required_state:
+            return Refusal("the run", self.state, f"{op} needs a {required_state} one")
         if op == "pause":
             self.hold()
         elif op == "resume":
@@ -125,8 +125,8 @@ class RunClock:
 
     def _stop(self, request: ControlRequest) -> None:
         reason = str(request.args.get("reason", ""))[:200]
-        who = request.source[:40] or "somebody"
-        self.stop(f"stopped by {who}" + (f": {reason}" if reason else ""))
+        source = request.source[:40] or "somebody"
+        self.stop(f"stopped by {source}" + (f": {reason}" if reason else ""))
 
 
 def refused_argument(request: ControlRequest, name: str, allowed: str) -> Refusal:

@@ -123,8 +123,8 @@ class World(Coordinator):
             version=__version__,
             fingerprint=fingerprint(),
             user_sensors=user_sensors or UNSET,
-            sightings=SIGHTINGS in self.fleet.beside or UNSET,
-            scanners=tuple(name for name in self.fleet.beside if name != SIGHTINGS) or UNSET,
+            sightings=SIGHTINGS in self.fleet.extra_sensors or UNSET,
+            scanners=tuple(name for name in self.fleet.extra_sensors if name != SIGHTINGS) or UNSET,
             module_folders=tuple(map(str, plugin.folders())) if s.own_code() else UNSET,
             changed=self._changed,
             user_messages=tuple(s.own_messages()) or UNSET,
@@ -149,7 +149,7 @@ class World(Coordinator):
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
         return self._intake.accept(drone, kind, message)
 
-    def take_of_driver(self, drone: str, message: Any) -> str | None:
+    def accept_from_driver(self, drone: str, message: Any) -> str | None:
         former, refusal = self.drivers.status(self.names.index(drone)), self.drivers.take(drone, message, self.now_ns)
         stopped = isinstance(message, Status) and message.state == "emergency"
         if refusal is None and stopped and former and former.state not in ("landed", "emergency"):
@@ -213,7 +213,7 @@ class World(Coordinator):
             name, other = self.names[i], self.names[j]
             self.outbox.notice("collision", name, f"{name} and {other} collide", {"other": other})
         for i, m in self.fleet.bumps():
-            name, other = self.names[i], self.fleet.things[m]
+            name, other = self.names[i], self.fleet.object_names[m]
             self.outbox.notice("collision", name, f"{name} runs into {other}", {"other": other})
         for each in self.fleet.incidents():
             data = {**each.data, "commander": self.queue.commanders()[each.drone]}

@@ -44,8 +44,8 @@ class NoiseTable:
         rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
         self._rows = np.array([math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)])
         widths = [[noise_width(n, channels(drone.sensors, s)) for s, n in STREAMS] for drone in scenario.drones]
-        least = [2 * n + 1 for _, n in STREAMS]  # widths of the last row, which has no sensors
-        self.width = np.array([[*row, GUST_WIDTH] for row in (*widths, least)], dtype=np.int64)
+        last_widths = [2 * n + 1 for _, n in STREAMS]  # widths of the last row, which has no sensors
+        self.width = np.array([[*row, GUST_WIDTH] for row in (*widths, last_widths)], dtype=np.int64)
         ends = np.cumsum(self._rows * self.width.max(axis=0))
         self.at = np.array([0, *ends[:-1]], dtype=np.int64)
         self.table = np.zeros((len(names) + 1, ends[-1]))
@@ -141,26 +141,26 @@ class Ziggurat(NamedTuple):
 def _read_tables() -> Ziggurat:
     """Read the tables of numpy's ziggurat from the numbers that it draws."""
     rng = np.random.Generator(np.random.PCG64(0))
-    width = np.array([_drawn(rng, layer, 1)[0] for layer in range(_LAYERS)])
+    width = np.array([_numpy_draw(rng, layer, 1)[0] for layer in range(_LAYERS)])
     inside = np.zeros(_LAYERS, dtype=np.uint64)  # 0 for layer 1, which is the cap
     for layer in (0, *range(2, _LAYERS)):
-        near = round(width[layer - 1] / width[layer] * _SIZES)
-        sizes = range(near - _ROUNDING, near + _ROUNDING)
-        inside[layer] = sizes[bisect_left(sizes, True, key=lambda size, at=layer: not _drawn(rng, at, size)[1])]
+        estimate = round(width[layer - 1] / width[layer] * _SIZES)
+        sizes = range(estimate - _ROUNDING, estimate + _ROUNDING)
+        inside[layer] = sizes[bisect_left(sizes, True, key=lambda size, at=layer: not _numpy_draw(rng, at, size)[1])]
     height = np.array([1.0, *(el.exp(-0.5 * el.square(x * _SIZES)) for x in width[1:].tolist())])
     return Ziggurat(width, inside, height)
 
 
-def _drawn(rng: np.random.Generator, layer: int, size: int) -> tuple[float, bool]:
+def _numpy_draw(rng: np.random.Generator, layer: int, size: int) -> tuple[float, bool]:
     """Return the number that numpy draws for a word, and whether it used only this word."""
     bits, state = (
         rng.bit_generator,
         layer | size << int(_SIZE_SHIFT),
     )  # if the high bits are 0, the word equals the low bits
-    held = bits.state
-    step = held["state"]["inc"]
-    before = (state - step) * _MULTIPLIER_INVERSE % _MODULUS
-    bits.state = {**held, "state": {"state": before, "inc": step}}
+    original = bits.state
+    step = original["state"]["inc"]
+    previous = (state - step) * _MULTIPLIER_INVERSE % _MODULUS
+    bits.state = {**original, "state": {"state": previous, "inc": step}}
     number = rng.standard_normal()
     return number, bits.state["state"]["state"] == state
 
@@ -174,14 +174,14 @@ def words(rng: np.random.Generator) -> list[int]:
     Raises:
         ValueError: the generator is not a PCG64.
     """
-    held = rng.bit_generator.state
-    if held["bit_generator"] != "PCG64":
-        raise ValueError(f"numpy's generator is {held['bit_generator']}; must be PCG64")
-    state, step = held["state"]["state"], held["state"]["inc"]
+    current = rng.bit_generator.state
+    if current["bit_generator"] != "PCG64":
+        raise ValueError(f"numpy's generator is {current['bit_generator']}; must be PCG64")
+    state, step = current["state"]["state"], current["state"]["inc"]
     return [state >> 64, state & (2**64 - 1), step >> 64, step & (2**64 - 1)]
 
 
-def place(rng: np.random.Generator, stream: Sequence[int]) -> None:
+def set_generator(rng: np.random.Generator, stream: Sequence[int]) -> None:
     """Set the state of numpy's generator to the words of a stream, (WORDS.size,)."""
     state = stream[WORDS.state] << 64 | stream[WORDS.state + 1]
     step = stream[WORDS.step] << 64 | stream[WORDS.step + 1]
@@ -201,15 +201,15 @@ def fill(out: NDArray, stream: NDArray) -> None:
         x = size * _WIDTH[layer]
         if (word >> _SIGN_SHIFT) & _ONE:
             x = -x
-        kept = size < _INSIDE[layer]
-        if not kept and layer == 0:
+        is_accepted = size < _INSIDE[layer]
+        if not is_accepted and layer == 0:
             x, state = _tail(state, step, ((size >> _TAIL_SIGN_SHIFT) & _ONE) != 0)
-            kept = True
-        elif not kept:
+            is_accepted = True
+        elif not is_accepted:
             state = _advanced(state, step)
-            above, here = _HEIGHT[layer - _ONE], _HEIGHT[layer]
-            kept = (above - here) * _unit(state) + here < el.exp(-0.5 * x * x)
-        if kept:
+            upper, lower = _HEIGHT[layer - _ONE], _HEIGHT[layer]
+            is_accepted = (upper - lower) * _unit(state) + lower < el.exp(-0.5 * x * x)
+        if is_accepted:
             out[drawn] = x
             drawn += 1
     stream[WORDS.state], stream[WORDS.state + 1] = state

@@ -29,7 +29,7 @@ from zsim.schema.checker import show
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
 from zsim_world.physics.fleet_arrays import EXPOSED, STATE, Senses, four, vector
 from zsim_world.sensors import sensor_set
-from zsim_world.sensors.noise import place, words
+from zsim_world.sensors.noise import set_generator, words
 from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors, noise_width, read
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
@@ -62,15 +62,15 @@ class Sampler:
     SAVED: ClassVar[Saved] = {"_later": Sampled, "_user_sensors": PART}
 
     def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
-        place = scenario.environment
+        environment = scenario.environment
         latency_ns = sensor_set.latencies(sensors)
-        anchor = frames.anchor(place.latitude_deg, place.longitude_deg, place.height_m)
+        anchor = frames.anchor(environment.latitude_deg, environment.longitude_deg, environment.height_m)
         self._log = SampledLog(senses.whose, senses.value, latency_ns, *anchor)
         self._held = hold(self._log)
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
-        own = len(sensors.names) > len(SENSORS)
-        self._user_sensors = UserSensors(scenario, sensors, senses) if own else None
-        self._in_order = not (own or latency_ns.any())
+        has_user_sensors = len(sensors.names) > len(SENSORS)
+        self._user_sensors = UserSensors(scenario, sensors, senses) if has_user_sensors else None
+        self._in_order = not (has_user_sensors or latency_ns.any())
         self._later = NONE
 
     def due(self, logged: int, now_ns: int) -> Sampled:
@@ -85,13 +85,13 @@ class Sampler:
             whose = np.concatenate((self._log.whose[:logged], user_whose))
             value = np.concatenate((self._log.value[:logged], user_value))
             held, logged = hold(self._log._replace(whose=whose, value=value)), len(whose)
-        fresh = Sampled(*stamped(held, logged, self._tick_ns))
+        new = Sampled(*stamped(held, logged, self._tick_ns))
         if self._in_order:
-            return fresh
-        index = np.concatenate((self._later.whose, fresh.whose))
-        values = np.concatenate((self._later.values, fresh.values))
-        late = index[:, WHOSE.t] > now_ns
-        self._later, due, due_values = Sampled(index[late], values[late]), index[~late], values[~late]
+            return new
+        index = np.concatenate((self._later.whose, new.whose))
+        values = np.concatenate((self._later.values, new.values))
+        is_early = index[:, WHOSE.t] > now_ns
+        self._later, due, due_values = Sampled(index[is_early], values[is_early]), index[~is_early], values[~is_early]
         order = np.lexsort((due[:, WHOSE.sensor], due[:, WHOSE.drone], due[:, WHOSE.t]))
         return Sampled(due[order], due_values[order])
 
@@ -104,14 +104,14 @@ def stamped(held: Held, count: int, tick_ns: int) -> tuple[NDArray, NDArray]:
         held: the SampledLog, wrapped by `hold`.
         tick_ns: interval between ticks [ns].
     """
-    whose, value, latency_ns, rows, place = held.content
+    whose, value, latency_ns, rows, origin = held.content
     index, values = np.empty((count, WHOSE.size), np.int64), np.empty((count, VALUE_COLUMNS))
     for m in range(count):
         s, i, first = whose[m, 0], whose[m, 1], 0
         index[m, WHOSE.sensor], index[m, WHOSE.drone], index[m, WHOSE.t_sample] = s, i, whose[m, 2] * tick_ns
         index[m, WHOSE.t] = index[m, WHOSE.t_sample] + latency_ns[i, s]
         if s == sensor_set.GPS:
-            values[m, 0:3] = frames.geodetic(value[m : m + 1, 0:3], rows, place)[0]
+            values[m, 0:3] = frames.geodetic(value[m : m + 1, 0:3], rows, origin)[0]
             first = 3
         for k in range(sensor_set.CHANNELS_MAX):
             values[m, first + k] = value[m, k]
@@ -163,8 +163,8 @@ class UserSensors:
                 settings = sensors.settings[i][s]
                 if settings is not None:
                     name, rng = sensors.names[s], stream(scenario.seed, f"{drone.name}/{sensors.names[s]}")
-                    what = f"{drone.name}: sensors.{name}"
-                    self._sensors[s, i] = _UserSensor(what, sensors.types[s], settings, rng, senses.config[i, s])
+                    label = f"{drone.name}: sensors.{name}"
+                    self._sensors[s, i] = _UserSensor(label, sensors.types[s], settings, rng, senses.config[i, s])
 
     @property
     def sensors(self) -> list["_UserSensor"]:
@@ -177,7 +177,7 @@ class UserSensors:
         Raises:
             UserCodeError: an equation fails, or returns no valid reading.
         """
-        senses, kept = self._senses, []
+        senses, received = self._senses, []
         count = int(senses.exposed_count[0])
         values = np.zeros((count, CHANNELS_MAX))
         for m in range(count):
@@ -187,8 +187,8 @@ class UserSensors:
             sensor.measure(truth, self._environment, values[m])
             noise = sensor.rng.standard_normal(sensor.noise_width)
             if read(sensor.width, values[m], senses.config[i, s], sensor.bias, senses.fault[i, s], noise):
-                kept.append(m)
-        return senses.exposed_whose[kept], values[kept]
+                received.append(m)
+        return senses.exposed_whose[received], values[received]
 
 
 class _UserSensor:
@@ -197,9 +197,9 @@ class _UserSensor:
     SAVED: ClassVar[Saved] = {"bias": IN_PLACE, "stream": list[int]}
 
     def __init__(
-        self, what: str, kind: SensorType, settings: Sensor, rng: np.random.Generator, config: NDArray[np.float64]
+        self, label: str, kind: SensorType, settings: Sensor, rng: np.random.Generator, config: NDArray[np.float64]
     ) -> None:
-        self._what, self._kind, self._settings, self.rng = what, kind, settings, rng
+        self._label, self._kind, self._settings, self.rng = label, kind, settings, rng
         self.width = kind.width
         models = kind.errors(settings)
         self.bias = np.zeros(2 * CHANNELS_MAX)
@@ -217,7 +217,7 @@ class _UserSensor:
 
     @stream.setter
     def stream(self, stream: list[int]) -> None:
-        place(self.rng, stream)
+        set_generator(self.rng, stream)
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
         """Return the truth at a sampling time of the sensor, from a row of EXPOSED."""
@@ -239,7 +239,7 @@ class _UserSensor:
         """Write the error-free values into `values`, (6,)."""
         assert self._kind.equation is not None  # the catalogue refuses user modules without an equation
         count = self._kind.values
-        equation, where = self._kind.equation, f"{self._what} at {truth.t_s:.3f} s"
+        equation, where = self._kind.equation, f"{self._label} at {truth.t_s:.3f} s"
         name = f"{equation.__module__}:{getattr(equation, '__qualname__', type(equation).__qualname__)}"
         try:
             returned = equation(truth, self._settings, environment)
@@ -298,11 +298,11 @@ class Exposures:
         due, between = [], None
         if self._next_ns <= now_ns:
             now = state[:, : STATE.size].copy()
-            for place, rate_hz in enumerate(self._rates_hz):
-                while self._due_ns[place] <= now_ns:
-                    due.append((self._due_ns[place], place))
-                    self._counts[place] += 1
-                    self._due_ns[place] = round(self._counts[place] * 1e9 / rate_hz)
+            for index, rate_hz in enumerate(self._rates_hz):
+                while self._due_ns[index] <= now_ns:
+                    due.append((self._due_ns[index], index))
+                    self._counts[index] += 1
+                    self._due_ns[index] = round(self._counts[index] * 1e9 / rate_hz)
             due.sort()
             self._next_ns = min(self._due_ns)
             former, former_ns = (self._former, self._former_ns) if len(self._former) else (now, now_ns)

@@ -127,9 +127,11 @@ class ScanSampler:
 
     def __init__(self, scenario: Scenario, hulls: Array, scene: Scene) -> None:
         self._mounted = [*_mounted(scenario)]
-        own = ["/".join(filter(None, (scenario.drones[m.drone].name, m.sensor, m.camera))) for m in self._mounted]
-        generators = [stream(scenario.seed, name) for name in own]
-        rows, first, origin = np.zeros((len(own), SCANNER.size)), 0, 0
+        stream_names = [
+            "/".join(filter(None, (scenario.drones[m.drone].name, m.sensor, m.camera))) for m in self._mounted
+        ]
+        generators = [stream(scenario.seed, name) for name in stream_names]
+        rows, first, origin = np.zeros((len(stream_names), SCANNER.size)), 0, 0
         for row, each, rng in zip(rows, self._mounted, generators, strict=True):
             _fill_row(row, each, first, origin, rng)
             first, origin = first + len(each.rays), origin + len(each.origins)
@@ -155,25 +157,25 @@ class ScanSampler:
     def due(self, state: Array, now_ns: int) -> list[Scan]:
         """Return the scans due by a gate, given the states of all drones at it, (N, STATE.size or more)."""
         samples, between = self._exposures.until(state, now_ns)
-        for at_ns, place in samples:
-            self._scan(at_ns, place, between)
-        return [self._made(each) for each in released(self._later, now_ns)]
+        for at_ns, index in samples:
+            self._scan(at_ns, index, between)
+        return [self._message_of(each) for each in released(self._later, now_ns)]
 
-    def _scan(self, at_ns: int, place: int, between: Between | None) -> None:
+    def _scan(self, at_ns: int, index: int, between: Between | None) -> None:
         """Take a sample and hold it until it is due."""
         assert between is not None  # as always when samples are due
         poses = poses_between(*between, at_ns)
-        values = scan(self._held, place, poses, self._streams[place])
+        values = scan(self._held, index, poses, self._streams[index])
         if len(values):
             sent = values.astype(SINGLE).tobytes()
-            if self._rows[place, SCANNER.stuck]:
-                sent = self._stuck.setdefault(place, sent)
+            if self._rows[index, SCANNER.stuck]:
+                sent = self._stuck.setdefault(index, sent)
             else:
-                self._stuck.pop(place, None)
-            latency_ns = round(self._mounted[place].settings.latency_ms * 1e6)
-            self._later.append(WaitingScan(at_ns + latency_ns, at_ns, place, sent))
+                self._stuck.pop(index, None)
+            latency_ns = round(self._mounted[index].settings.latency_ms * 1e6)
+            self._later.append(WaitingScan(at_ns + latency_ns, at_ns, index, sent))
 
-    def _made(self, waiting: WaitingScan) -> Scan:
+    def _message_of(self, waiting: WaitingScan) -> Scan:
         m = self._mounted[waiting.place]
         return Scan(waiting.t_ns, m.drone, waiting.t_sample_ns, m.kind, m.sensor, m.camera, waiting.values, m.fixed)
 
@@ -210,8 +212,8 @@ def _rays(directions_B: Array, share: Array | float = 1.0) -> Array:
 
 
 def _beams(i: int, name: str, settings: RangeConfig, p_BS: Array, R_BS: Array) -> Mounted:
-    half, turn = math.radians(0.5 * settings.cone_deg), 2.0 * math.pi / CONE_RAYS
-    rim = [(el.cos(half), el.sin(half) * el.cos(k * turn), el.sin(half) * el.sin(k * turn)) for k in range(CONE_RAYS)]
+    half, step = math.radians(0.5 * settings.cone_deg), 2.0 * math.pi / CONE_RAYS
+    rim = [(el.cos(half), el.sin(half) * el.cos(k * step), el.sin(half) * el.sin(k * step)) for k in range(CONE_RAYS)]
     cone = np.array([(1.0, 0.0, 0.0), *(rim if half else ())])
     names = sorted(settings.beams)  # as in the resolved scenario
     poses = [_pose(settings.beams[beam]) for beam in names]
@@ -233,17 +235,17 @@ def _lidar(i: int, name: str, settings: LidarConfig, p_BS: Array, R_BS: Array) -
     return Mounted(i, name, Lidar, "", settings, p_BS[None], _rays(_turned(R_BS, directions)), channels * count, fixed)
 
 
-def _depth(i: int, name: str, settings: DepthConfig, camera: str, of: Camera) -> Mounted:
+def _depth(i: int, name: str, settings: DepthConfig, camera: str, optics: Camera) -> Mounted:
     """Return a depth camera with a ray through the centre of each depth pixel, which is a block of camera pixels."""
-    pose, lens, rows, count = camera_pose(of), lens_of(of), settings.rows, settings.columns
-    wide, high = lens.width / count, lens.height / rows  # size of a depth pixel in camera pixels
-    places: Any = np.meshgrid((np.arange(count) + 0.5) * wide - 0.5, (np.arange(rows) + 0.5) * high - 0.5)
-    x, y = undistorted(lens, *(place.ravel() for place in places))
+    pose, lens, rows, count = camera_pose(optics), lens_of(optics), settings.rows, settings.columns
+    width, height = lens.width / count, lens.height / rows  # size of a depth pixel in camera pixels
+    grids: Any = np.meshgrid((np.arange(count) + 0.5) * width - 0.5, (np.arange(rows) + 0.5) * height - 0.5)
+    x, y = undistorted(lens, *(grid.ravel() for grid in grids))
     length = np.sqrt(x * x + y * y + 1.0)
     directions = np.stack([x, y, np.ones_like(x)], axis=1) / length[:, None]
     fixed = {"camera": camera, "columns": count, "rows": rows, "max_m": settings.max_m}
-    fixed["focal_px"] = (lens.fx / wide, lens.fy / high)
-    fixed["centre_px"] = ((lens.cx + 0.5) / wide - 0.5, (lens.cy + 0.5) / high - 0.5)
+    fixed["focal_px"] = (lens.fx / width, lens.fy / height)
+    fixed["centre_px"] = ((lens.cx + 0.5) / width - 0.5, (lens.cy + 0.5) / height - 0.5)
     rays = _rays(_turned(pose.R_BK, directions), 1.0 / length)
     return Mounted(i, name, Depth, camera, settings, pose.p_BK[None], rays, rows * count, fixed)
 
@@ -261,48 +263,48 @@ def _fill_row(row: Array, mounted: Mounted, first: int, origin: int, rng: np.ran
 
 
 @kernel()
-def scan(held: Held, place: int, poses: NDArray, stream: NDArray) -> NDArray:
+def scan(held: Held, index: int, poses: NDArray, stream: NDArray) -> NDArray:
     """Return the values [m] of one sensor's message, 0 where there is no echo; empty if the message is lost.
 
     Args:
         held: the ScanScene, wrapped by `hold`.
-        place: index of the sensor.
+        index: index of the sensor.
         poses: states of all drones, (N, STATE.size or more).
         stream: words of the sensor's random stream, (WORDS.size,), advanced in place.
     """
     scene, hulls, scanners, origins, rays = held.content
-    row = scanners[place]
+    row = scanners[index]
     i, values, each = int(row[SCANNER.drone]), int(row[SCANNER.values]), int(row[SCANNER.rays])
     drawn = np.empty(2 * values + 1)
     fill(drawn, stream)
     if drawn[2 * values] < row[SCANNER.drop]:
         return np.empty(0)
     p_WB, q_WB = vector(poses[i], STATE.p_WB), four(poses[i], STATE.q_WB)
-    R_WB, most, out = matrix(q_WB), row[SCANNER.max], np.empty(values)
-    near, count = np.empty(len(hulls), np.int64), 0
+    R_WB, max_range, out = matrix(q_WB), row[SCANNER.max], np.empty(values)
+    near_drones, count = np.empty(len(hulls), np.int64), 0
     for j in range(len(hulls)):
         away = subtract(vector(poses[j], STATE.p_WB), p_WB)
-        reach = most / SHARE_MIN + hulls[j] + MOUNT_MAX_M
-        if j != i and dot(away, away) < reach * reach:
-            near[count] = j
+        max_distance = max_range / SHARE_MIN + hulls[j] + MOUNT_MAX_M
+        if j != i and dot(away, away) < max_distance * max_distance:
+            near_drones[count] = j
             count += 1
     at, ray = int(row[SCANNER.origin]), int(row[SCANNER.first])
     o = add(p_WB, product(R_WB, vector(origins[at], 0)))
     for v in range(values):
         if row[SCANNER.apart] != 0.0:
             o = add(p_WB, product(R_WB, vector(origins[at + v], 0)))
-        least = math.inf
+        nearest = math.inf
         for _ in range(each):
             d, share = product(R_WB, vector(rays[ray], RAY.direction_B)), rays[ray, RAY.share]
-            far = most / share
-            met = cast(scene, o, d, far)
+            ray_end = max_range / share
+            hit = cast(scene, o, d, ray_end)
             for k in range(count):
-                j = near[k]
-                met = cast_hull(vector(poses[j], STATE.p_WB), four(poses[j], STATE.q_WB), hulls[j], o, d, met)
-            if met < far:
-                least = min(least, met * share)
+                j = near_drones[k]
+                hit = cast_hull(vector(poses[j], STATE.p_WB), four(poses[j], STATE.q_WB), hulls[j], o, d, hit)
+            if hit < ray_end:
+                nearest = min(nearest, hit * share)
             ray += 1
-        out[v] = _measured(row, least, drawn[2 * v], drawn[2 * v + 1])
+        out[v] = _measured(row, nearest, drawn[2 * v], drawn[2 * v + 1])
     return out
 
 

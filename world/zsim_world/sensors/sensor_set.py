@@ -113,7 +113,7 @@ def fleet_sensors(scenario: Scenario) -> FleetSensors:
     sections = [list(drone.sensors.sections()) for drone in scenario.drones]
     kinds = {name: kind for of_drone in sections for name, kind, _ in of_drone if name not in STOCK}
     names = (*SENSORS, *sorted(kinds))
-    simulated = [() if drone.is_external else of for drone, of in zip(scenario.drones, sections, strict=True)]
+    simulated = [() if drone.is_external else section for drone, section in zip(scenario.drones, sections, strict=True)]
     own = [{name: settings for name, _, settings in of_drone} for of_drone in simulated]
     types = STOCK | kinds
     return FleetSensors(names, tuple(types[n] for n in names), [[each.get(n) for n in names] for each in own])
@@ -297,10 +297,10 @@ def _read_faulty(
 ) -> bool:
     """Do the same as `_read`, but add the offset of a fault first and apply the hold of a stuck sensor last."""
     displace(CHANNELS[s], value, fault)
-    kept = _read(s, value, config, bias, noise, at, height)
-    if kept:
+    is_received = _read(s, value, config, bias, noise, at, height)
+    if is_received:
         hold_reading(value, fault)
-    return kept
+    return is_received
 
 
 @inlined
@@ -429,10 +429,10 @@ def read(n: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray,
     """Turn the error-free values of a user's sensor into a reading, in place; return False if it is lost."""
     displace(n, value, fault)
     add_errors(n, value, config, bias, noise, 0)
-    kept = noise[2 * n] >= config[CONFIG.drop]
-    if kept:
+    is_received = noise[2 * n] >= config[CONFIG.drop]
+    if is_received:
         hold_reading(value, fault)
-    return kept
+    return is_received
 
 
 @inlined
@@ -448,14 +448,14 @@ def _hull(state: NDArray, vehicle: NDArray, i: int, o: Vector, d: Vector, far: f
     Args:
         state, vehicle: rows of all drones, as in Bodies.
     """
-    nearest, whose = far, -1
+    nearest, owner = far, -1
     for j in range(state.shape[0]):
         if j != i:
             p, q = vector(state[j], STATE.p_WB), four(state[j], STATE.q_WB)
-            met = cast_hull(p, q, vehicle[j, VEHICLE.hull_radius], o, d, nearest)
-            if met < nearest:
-                nearest, whose = met, j
-    return nearest, whose
+            distance = cast_hull(p, q, vehicle[j, VEHICLE.hull_radius], o, d, nearest)
+            if distance < nearest:
+                nearest, owner = distance, j
+    return nearest, owner
 
 
 @noinline
@@ -498,26 +498,26 @@ def flow_over(
     """
     o, d = _beam(x, s)
     b, down = _beam(x, ranging)
-    far = ranging.range_max
+    max_distance = ranging.range_max
     if -d[2] < SONAR_COSINE_MIN or -down[2] < SONAR_COSINE_MIN:
         return value  # without an echo, the board keeps the last distance
-    seen = cast_parts(scene, o, d, far)
-    measured, _ = _hull(state, vehicle, i, b, down, cast_parts(scene, b, down, far))
-    covered, whose = _hull(state, vehicle, i, o, d, seen)
-    if whose >= 0 and not _covers(x, s, scene, state[whose], vehicle[whose, VEHICLE.hull_radius], o, far):
-        covered, whose = seen, -1
-    if covered >= far and measured >= far:
+    distance = cast_parts(scene, o, d, max_distance)
+    measured, _ = _hull(state, vehicle, i, b, down, cast_parts(scene, b, down, max_distance))
+    covered, owner = _hull(state, vehicle, i, o, d, distance)
+    if owner >= 0 and not _covers(x, s, scene, state[owner], vehicle[owner, VEHICLE.hull_radius], o, max_distance):
+        covered, owner = distance, -1
+    if covered >= max_distance and measured >= max_distance:
         return value
-    seen, measured = cast_ground(o, d, covered), cast_ground(b, down, measured)
-    if seen >= far or measured >= far or seen <= 0.0:
+    distance, measured = cast_ground(o, d, covered), cast_ground(b, down, measured)
+    if distance >= max_distance or measured >= max_distance or distance <= 0.0:
         return value
     u, v = value[0], value[1]
-    if whose >= 0:
-        arm = subtract(axpy(o, seen, d), vector(state[whose], STATE.p_WB))
-        moving, psi = velocity_at(state[whose], arm), heading(x.q_WB)
+    if owner >= 0:
+        arm = subtract(axpy(o, distance, d), vector(state[owner], STATE.p_WB))
+        v_hull, psi = velocity_at(state[owner], arm), heading(x.q_WB)
         cos, sin = el.cos(psi), el.sin(psi)
-        u, v = u - (cos * moving[0] + sin * moving[1]), v - (cos * moving[1] - sin * moving[0])
-    return (u * measured / seen, v * measured / seen, value[2])
+        u, v = u - (cos * v_hull[0] + sin * v_hull[1]), v - (cos * v_hull[1] - sin * v_hull[0])
+    return (u * measured / distance, v * measured / distance, value[2])
 
 
 @inlined
@@ -526,9 +526,9 @@ def _covers(x: BodyTruth, s: MountedSensor, scene: Scene, hull: NDArray, radius:
     cells, share = 0, 2.0 / 3.0
     for k in range(len(CELLS)):
         ahead, aside = share * HALF_VIEW[0] * CELLS[k][0], share * HALF_VIEW[1] * CELLS[k][1]
-        per = 1.0 / math.sqrt(ahead * ahead + aside * aside + 1.0)
-        d = rotate(x.q_WB, rotate(s.q_BS, (ahead * per, aside * per, -per)))
-        free = cast_parts(scene, o, d, far)
-        if cast_hull(vector(hull, STATE.p_WB), four(hull, STATE.q_WB), radius, o, d, free) < free:
+        scale = 1.0 / math.sqrt(ahead * ahead + aside * aside + 1.0)
+        d = rotate(x.q_WB, rotate(s.q_BS, (ahead * scale, aside * scale, -scale)))
+        background = cast_parts(scene, o, d, far)
+        if cast_hull(vector(hull, STATE.p_WB), four(hull, STATE.q_WB), radius, o, d, background) < background:
             cells += 1
     return cells >= CELLS_MIN

@@ -104,7 +104,7 @@ FALSE_DRAWS = 4  # normal numbers per false alarm: one for its occurrence, two f
 # Error of a measured diameter over that of a centre, due to noise and due to blur; measured
 DIAMETER_NOISE, DIAMETER_BLUR = 1.4, 2.8
 ANGLE_MAX = 3.0  # rad, largest apparent diameter; pi is that of a ball touching the lens
-SMALLEST = 0.1  # lower bound of a measured diameter over the true apparent one
+DIAMETER_RATIO_MIN = 0.1  # lower bound of a measured diameter over the true apparent one
 
 
 Array = NDArray[np.float64]
@@ -199,9 +199,9 @@ class SightingSampler:
 
     def _look(self, pictures: list[tuple[int, int]], between: Between) -> None:
         """Compute the sightings in pictures (instant [ns], camera), and hold them until they are due."""
-        which = np.array(pictures, dtype=np.int64)
+        indices = np.array(pictures, dtype=np.int64)
         seen: list[list[Seen]] = [[] for _ in pictures]
-        for picture, x, y, z, range_m, sigma, sigma_m in look(which, *between, self._held, self._streams).tolist():
+        for picture, x, y, z, range_m, sigma, sigma_m in look(indices, *between, self._held, self._streams).tolist():
             seen[int(picture)].append(Seen((x, y, z), range_m, sigma, sigma_m))
         for (at_ns, w), of_picture in zip(pictures, seen, strict=True):
             drone, name, latency_ns = self._pictures[w]
@@ -328,8 +328,8 @@ def _passes(eye: Vector, ray: Vector, away: float, p: Vector, radius: float) -> 
     """Return whether a sphere is clear of the sight line to a point at distance `away` [m] along `ray`."""
     to = subtract(p, eye)
     along = min(max(dot(to, ray), 0.0), away)
-    off = axpy(to, -along, ray)
-    return dot(off, off) > radius * radius
+    offset = axpy(to, -along, ray)
+    return dot(offset, offset) > radius * radius
 
 
 @inlined
@@ -382,8 +382,8 @@ def _write_outline(hidden: int, row: NDArray) -> None:
     row[VIEW.share], row[VIEW.centre], row[VIEW.radius] = 1.0, 1.0, 1.0
     if hidden == 0:
         return
-    around = POINTS - 1  # a detector ignores the points next to hidden ones
-    hidden |= hidden << 1 | hidden >> 1 | hidden << around | hidden >> around
+    wrap = POINTS - 1  # a detector ignores the points next to hidden ones
+    hidden |= hidden << 1 | hidden >> 1 | hidden << wrap | hidden >> wrap
     n, x, y, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(POINTS):
         if not hidden >> k & 1:
@@ -496,14 +496,14 @@ def _range_m(model: NDArray, angle: float) -> float:
 
 
 @inlined
-def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
+def _write_sighting(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
     """Write the sighting of a hat in view; return False if it is missed at random, or measured as too small."""
     centre_px, diameter_px = _sigmas_px(model, row)
     scale, angle = row[VIEW.scale], row[VIEW.angle]
     measured = angle + diameter_px / scale * noise[2]
     if measured * scale < model[DETECTOR.diameter_min] or _unit(noise[3]) < model[DETECTOR.miss]:
         return False
-    measured = max(measured, SMALLEST * angle)
+    measured = max(measured, DIAMETER_RATIO_MIN * angle)
     x, y, z = row[VIEW.direction_K], row[VIEW.direction_K + 1], row[VIEW.direction_K + 2]
     across = el.hypot(x, z)
     a, b = centre_px / scale * noise[0], centre_px / scale * noise[1]
@@ -516,7 +516,7 @@ def _see(model: NDArray, row: NDArray, noise: NDArray, out: NDArray) -> bool:
 
 
 @inlined
-def _see_nothing(model: NDArray, lens: Lens, noise: NDArray, out: NDArray) -> bool:
+def _write_false_alarm(model: NDArray, lens: Lens, noise: NDArray, out: NDArray) -> bool:
     """Write a false alarm, a small blob anywhere in the picture; return False if this picture has none."""
     if _unit(noise[0]) >= model[DETECTOR.false]:
         return False
@@ -558,9 +558,9 @@ def detect(model: NDArray, lens: Lens, view: NDArray, stream: NDArray, out: NDAr
     end = first
     for m in range(len(view)):
         noise = drawn[DRAWS * m : DRAWS * m + DRAWS]
-        if view[m, VIEW.seen] != 0.0 and _see(model, view[m], noise, out[end]):
+        if view[m, VIEW.seen] != 0.0 and _write_sighting(model, view[m], noise, out[end]):
             end += 1
-    if model[DETECTOR.false] > 0.0 and _see_nothing(model, lens, drawn[DRAWS * len(view) :], out[end]):
+    if model[DETECTOR.false] > 0.0 and _write_false_alarm(model, lens, drawn[DRAWS * len(view) :], out[end]):
         end += 1
     _sort(out, first, end)
     return end

@@ -30,8 +30,8 @@ STALL_NS = 300_000_000  # wall time between checks that indicates that the world
 SHOWN = 5  # maximum number of key expressions shown for a closed link
 _decode_health = msgspec.msgpack.Decoder(Health).decode
 TOKEN_NS = 3_000_000_000  # wall time limit for a token to appear; behind routers it takes up to 1 s (measured)
-SHOWN_NS = 10_000_000_000  # wall time limit for a first done that proves a process; a first step takes 1 s
-HELD_NS = 1_000_000_000  # wall time for which a living process must block the clock before another may replace it
+FIRST_DONE_NS = 10_000_000_000  # wall time limit for a first done that proves a process; a first step takes 1 s
+BLOCKED_MIN_NS = 1_000_000_000  # wall time for which a living process must block the clock before it may be replaced
 DONE_NS = 10_000_000_000  # wall time for which a process may block the clock before its first done, which takes 1 s
 LOOK_NS = 200_000_000  # wall time between checks of unproven processes
 WITHHELD_MAX = 1000  # maximum number of withheld joins of unknown processes
@@ -201,17 +201,17 @@ class SlowReaders:
                     with suppress(msgspec.MsgspecError):
                         reads += _decode_health(payload).reads
             names = ", ".join(closed.names) or "no process of the run"
-            more = " …" if len(reads) > SHOWN else ""
-            which = f", which reads {', '.join(reads[:SHOWN])}{more}," if reads else ""
-            who = f"{closed.process or 'somebody'} at {closed.address} on {host}"
-            held = f"{closed.held_bytes / 1e6:.1f} MB"
-            text = f"{who} ({names}){which} took nothing of {held}; its link is closed ({closed.times} so far)"
+            ellipsis = " …" if len(reads) > SHOWN else ""
+            clause = f", which reads {', '.join(reads[:SHOWN])}{ellipsis}," if reads else ""
+            reader = f"{closed.process or 'somebody'} at {closed.address} on {host}"
+            size = f"{closed.held_bytes / 1e6:.1f} MB"
+            text = f"{reader} ({names}){clause} took nothing of {size}; its link is closed ({closed.times} so far)"
             self._run.call("reader_closed", text, {**closed._asdict(), "host": host, "reads": reads})
 
     def stuck(self) -> str:
         """Return a text that names the blocked link."""
-        named = self.watch.stuck()
-        return f"the link to {named[0]} takes no data" if named else "no link is known to be full"
+        names = self.watch.stuck()
+        return f"the link to {names[0]} takes no data" if names else "no link is known to be full"
 
 
 @dataclass
@@ -244,7 +244,7 @@ class Admission:
         self._trusts = trusts
         self._sessions: dict[str, Sessions] = {}  # by process, the sessions whose tokens have proved it
         self._withheld: dict[str, _Withheld] = {}
-        self._standing_ns: dict[str, int] = {}  # how long processes lacking token or done have blocked the clock
+        self._blocked_ns: dict[str, int] = {}  # how long processes lacking token or done have blocked the clock
         self._look_wall_ns = 0
 
     def take(self, name: str, join: Join, wall_ns: int) -> None:
@@ -269,23 +269,23 @@ class Admission:
     def check_due(self, wall_ns: int) -> None:
         """Check the processes that are not yet proved to exist."""
         passed_ns = wall_ns - self._look_wall_ns
-        if passed_ns < LOOK_NS or not (self._withheld or self._standing_ns):
+        if passed_ns < LOOK_NS or not (self._withheld or self._blocked_ns):
             return
         self._look_wall_ns = wall_ns
         for name in list(self._withheld):
             self._check(name, wall_ns)
-        for name in list(self._standing_ns):  # forget proved processes, and report those that never had a token
+        for name in list(self._blocked_ns):  # forget proved processes, and report those that never had a token
             participant = self._barrier.participants.get(name)
             if participant is None or not participant.alive:
-                del self._standing_ns[name]
+                del self._blocked_ns[name]
                 continue
             self._sessions[name] = self._sessions.get(name) or self._tokens.sessions(name)
             has_token = self._trusts or self._tokens.is_alive(name)
             if has_token and not _owes_done(participant):
-                del self._standing_ns[name]
+                del self._blocked_ns[name]
             elif not has_token and wall_ns - participant.joined_wall_ns >= TOKEN_NS:
                 self._run.call("not_shown", name, NO_TOKEN, wall_ns)
-        self._count_standing(min(passed_ns, 2 * LOOK_NS), wall_ns)
+        self._count_blocked(min(passed_ns, 2 * LOOK_NS), wall_ns)
 
     def _needs_no_proof(self, name: str, join: Join) -> bool:
         """Return whether a join needs no proof: it replaces no process and is not a stranger's."""
@@ -293,21 +293,21 @@ class Admission:
 
     def _is_stranger(self, name: str, join: Join) -> bool:
         """Return whether a join is from an unexpected newcomer without a token, for which time would wait."""
-        stands = (join.period_ns > 0 or join.slack_ns > 0) and not self._barrier.join_refusal(name, join)
-        if not stands or name in self._barrier.participants:
+        would_block = (join.period_ns > 0 or join.slack_ns > 0) and not self._barrier.join_refusal(name, join)
+        if not would_block or name in self._barrier.participants:
             return False
         return not (self._trusts or name in self._barrier.absent() or self._tokens.is_alive(name))
 
     def _admit(self, name: str, join: Join, wall_ns: int) -> None:
         self._withheld.pop(name, None)
-        former, present = self._sessions.get(name, Sessions()), self._tokens.sessions(name)
+        former, current = self._sessions.get(name, Sessions()), self._tokens.sessions(name)
         if name not in self._barrier.participants:
             former = Sessions()
         self._run.call("join", name, join, wall_ns)
         participant = self._barrier.participants.get(name)
         if participant is not None and participant.join is join:
-            self._sessions[name] = (present & former) | frozenset(sorted(present - former)[:1])  # each join uses up one
-            self._standing_ns[name] = 0
+            self._sessions[name] = (current & former) | frozenset(sorted(current - former)[:1])  # each join uses up one
+            self._blocked_ns[name] = 0
 
     def _check(self, name: str, wall_ns: int) -> None:
         """Admit a withheld join once its process is proved to exist; reject it after its time limit."""
@@ -316,10 +316,10 @@ class Admission:
         if self._needs_no_proof(name, join) or self._may_replace(name, withheld, wall_ns):
             self._admit(name, join, wall_ns)
             return
-        reason = NO_DONE if self._tokens.is_alive(name) else NO_TOKEN
-        if wall_ns - withheld.since_ns >= (SHOWN_NS if reason == NO_DONE else TOKEN_NS):
+        fault = NO_DONE if self._tokens.is_alive(name) else NO_TOKEN
+        if wall_ns - withheld.since_ns >= (FIRST_DONE_NS if fault == NO_DONE else TOKEN_NS):
             del self._withheld[name]
-            self._run.call("falsely_joined", name, join, reason)
+            self._run.call("falsely_joined", name, join, fault)
 
     def _may_replace(self, name: str, withheld: _Withheld, wall_ns: int) -> bool:
         """Return whether a join may replace a process: the new one is proved, or the former one is gone or stuck."""
@@ -330,10 +330,10 @@ class Admission:
         former = self._barrier.participants.get(name)
         if former is None or not former.alive:
             return self._tokens.is_alive(name)
-        held_up = former in self._world.blocking_clock() and wall_ns - former.since_wall_ns >= HELD_NS
+        held_up = former in self._world.blocking_clock() and wall_ns - former.since_wall_ns >= BLOCKED_MIN_NS
         return held_up or former.silent_wall_ns is not None
 
-    def _count_standing(self, passed_ns: int, wall_ns: int) -> None:
+    def _count_blocked(self, passed_ns: int, wall_ns: int) -> None:
         """Count how long participants have owed their first done, and report those that exceed the limit.
 
         In lockstep, time counts only while the world waits for no other process, since that may be the cause; in
@@ -342,15 +342,15 @@ class Admission:
         clock = self._world.clock
         if clock.mode == "realtime":
             due = self._world.blocking() if clock.state == "running" and not clock.is_halted else ()
-            owing = [p for p in due if p.alive and p.name in self._standing_ns and _owes_done(p)]
+            owing = [p for p in due if p.alive and p.name in self._blocked_ns and _owes_done(p)]
         else:
             owing = self._world.blocking_clock()
-        if any(p.name not in self._standing_ns or not _owes_done(p) for p in owing):
+        if any(p.name not in self._blocked_ns or not _owes_done(p) for p in owing):
             return
         for participant in owing:
             if not self._world.must_wait_for(participant):
-                self._standing_ns[participant.name] += passed_ns
-                if self._standing_ns[participant.name] >= DONE_NS:
+                self._blocked_ns[participant.name] += passed_ns
+                if self._blocked_ns[participant.name] >= DONE_NS:
                     self._run.call("not_shown", participant.name, NO_DONE, wall_ns)
 
 

@@ -120,20 +120,20 @@ class RunJournal:
 
     def _write_checkpoint(self, number: int, content: bytes, former: int) -> None:
         """Write a checkpoint to disk, after the files on which it depends, and remove obsolete files."""
-        place = self._folder / f"{number}.checkpoint"
+        path = self._folder / f"{number}.checkpoint"
         os.fsync(former)
         os.close(former)
         os.fsync(self._truth)
-        file = os.open(place.with_suffix(".new"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+        file = os.open(path.with_suffix(".new"), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
             _write(file, _framed(msgspec.msgpack.encode(self._head)) + _framed(content))
             os.fsync(file)
         finally:
             os.close(file)
-        place.with_suffix(".new").replace(place)
-        for former_place in self._folder.iterdir():
-            if former_place.stem.isdecimal() and int(former_place.stem) <= number - CHECKPOINTS_KEPT:
-                former_place.unlink()
+        path.with_suffix(".new").replace(path)
+        for former_path in self._folder.iterdir():
+            if former_path.stem.isdecimal() and int(former_path.stem) <= number - CHECKPOINTS_KEPT:
+                former_path.unlink()
 
     def _open_entries(self, number: int) -> int:
         file = os.open(self._folder / f"{number}.entries", os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
@@ -147,8 +147,8 @@ class RunJournal:
             write()
         except OSError as error:
             self._is_kept = False
-            why = f"{self._folder}: the journal cannot be written ({error.strerror})"
-            self._say(f"{why}; if the world dies now, the run ends")
+            fault = f"{self._folder}: the journal cannot be written ({error.strerror})"
+            self._say(f"{fault}; if the world dies now, the run ends")
             self._entries.clear()
             self.close()
 
@@ -165,8 +165,8 @@ class RunJournal:
         """Remove the closed journal of a completed run."""
         if self._is_kept:
             with suppress(OSError):
-                for place in self._folder.iterdir():
-                    place.unlink()
+                for path in self._folder.iterdir():
+                    path.unlink()
                 self._folder.rmdir()
 
     # Reading
@@ -179,26 +179,26 @@ class RunJournal:
         Raises:
             RunError: the journal belongs to another run, is in use, or cannot be read or written.
         """
-        found = None
+        checkpoint = None
         if not self._is_kept:
-            return found
+            return checkpoint
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._truth = os.open(self._folder / "truth", os.O_RDWR | os.O_CREAT, 0o644)
             if not take_lock(self._truth):
                 raise RunError(f"{self._folder}: another world keeps its journal there; end that one")
-            numbers = sorted(int(place.stem) for place in self._folder.glob("*.entries"))
+            numbers = sorted(int(path.stem) for path in self._folder.glob("*.entries"))
             if numbers:
                 self._number = numbers[-1]
-                whole = [number for number in numbers if number == 0 or self._checkpoint(number)]
-                if not whole:
+                complete = [number for number in numbers if number == 0 or self._checkpoint(number)]
+                if not complete:
                     raise RunError(f"{self._folder}: no checkpoint is complete; the run cannot be continued")
-                self._first = whole[-2] if len(whole) > 1 else whole[0]
-                found = self._checkpoint(self._first) if self._first else Checkpoint(None, 0)
+                self._first = complete[-2] if len(complete) > 1 else complete[0]
+                checkpoint = self._checkpoint(self._first) if self._first else Checkpoint(None, 0)
             self._file = self._open_entries(self._number)
         except OSError as error:
             raise RunError(f"{self._folder}: no journal can be kept there ({error.strerror})") from error
-        return found
+        return checkpoint
 
     def _checkpoint(self, number: int) -> Checkpoint | None:
         """Return a checkpoint; None if it is incomplete."""
@@ -225,29 +225,29 @@ class RunJournal:
         while data := os.read(self._truth, HASHED_BYTES):
             yield data
 
-    def _frames(self, place: Path) -> Iterator[bytes]:
+    def _frames(self, path: Path) -> Iterator[bytes]:
         """Yield the complete frames after the head of a file, and truncate the file after them.
 
         Raises:
             RunError: the file belongs to another run.
         """
-        data, whole = place.read_bytes(), 0
-        for content, end in _whole_frames(data):
-            if whole:
+        data, complete_end = path.read_bytes(), 0
+        for content, end in _complete_frames(data):
+            if complete_end:
                 yield content
             else:
                 try:
                     head = msgspec.msgpack.decode(content, type=_Head)
                 except REFUSALS as error:
-                    raise RunError(f"{place}: is not the journal of a run ({error}); name another folder") from error
+                    raise RunError(f"{path}: is not the journal of a run ({error}); name another folder") from error
                 if head != self._head:
-                    raise RunError(f"{place}: belongs to {head}; must belong to {self._head}; name another folder")
-            whole = end
-        if whole < len(data):
-            os.truncate(place, whole)
+                    raise RunError(f"{path}: belongs to {head}; must belong to {self._head}; name another folder")
+            complete_end = end
+        if complete_end < len(data):
+            os.truncate(path, complete_end)
 
 
-def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
+def _complete_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
     """Yield the content and end offset of each frame of a file's data, up to the first incomplete one."""
     at = 0
     while len(data) - at >= _FRAME.size:
@@ -260,9 +260,9 @@ def _whole_frames(data: bytes) -> Iterator[tuple[bytes, int]]:
 
 def journaled_run(folder: Path) -> str | None:
     """Return the id of the run whose journal is in a folder; None if the folder has no journal."""
-    for place in sorted(folder.glob("*.entries")):
+    for path in sorted(folder.glob("*.entries")):
         with suppress(OSError, *REFUSALS):
-            return msgspec.msgpack.decode(next(_whole_frames(place.read_bytes()))[0], type=_Head).run_id
+            return msgspec.msgpack.decode(next(_complete_frames(path.read_bytes()))[0], type=_Head).run_id
     return None
 
 

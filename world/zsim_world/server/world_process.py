@@ -35,7 +35,7 @@ from zsim_world.server.liveliness import Admission, LivelinessMonitor, SlowReade
 from zsim_world.server.run_journal import RunJournal
 
 TICK_S = 0.1  # interval at which a waiting world checks the wall clock
-CLOCK_STANDING_NS = 1_000_000_000  # contract: `clock` is published once per wall second while time stands still
+IDLE_CLOCK_PERIOD_NS = 1_000_000_000  # contract: `clock` is published once per wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 views per wall second
 HEALTH, OWN = keys.process(WORLD, "health"), keys.process(WORLD, "")
 BYE_S = 5.0  # contract: the world waits at most 5 s for byes
@@ -46,7 +46,7 @@ PROCESSES, VIEWS = "process/", "view/"  # the world does not read views
 LAG_GATES = 2  # maximum number of gates by which the slowest agent lags when a series of gates begins
 GATES_SENT = 3  # number of gates sent together; more would leave agents idle
 DELAY_MAX_NS = 50_000_000  # maximum wall-time delay of a gate; by then even a slow agent has every gate it may receive
-STOOD_STILL_NS = 1_000_000_000  # lateness of a gate in wall time that indicates a standstill, not just a slow world
+STANDSTILL_MIN_NS = 1_000_000_000  # lateness of a gate in wall time that indicates a standstill, not just a slow world
 STUCK_NS = 2_000_000_000  # wall time after which a turn of the loop is reported as stuck; a turn takes milliseconds
 STOPPED_NS = 1_000_000_000  # wall time between checks that indicates a stopped process; ten times the usual interval
 
@@ -183,7 +183,7 @@ class WorldProcess:
 
     def _turn(self) -> None:
         former_wall_ns, self._turn_wall_ns = self._turn_wall_ns, time.monotonic_ns()
-        if former_wall_ns and self._turn_wall_ns - former_wall_ns > STOOD_STILL_NS:  # TICK_S at most if all is well
+        if former_wall_ns and self._turn_wall_ns - former_wall_ns > STANDSTILL_MIN_NS:  # TICK_S at most if all is well
             self._report_standstill(self._turn_wall_ns - former_wall_ns)
         self._take_in()
         if reason := self._stopped():
@@ -204,13 +204,13 @@ class WorldProcess:
         else:
             self._stand_still(wall_ns)
 
-    def _report_standstill(self, stood_ns: int) -> None:
+    def _report_standstill(self, standstill_ns: int) -> None:
         """In realtime, restart the pacing after a standstill rather than catch up with the wall clock in a burst."""
         if self._clock.mode == "realtime" and self._clock.state == "running":
             self._pacer.restart()
-            why = "this process or its machine was stopped, or nothing could be published"
-            text = f"time stood still for {stood_ns / 1e9:.1f} s of wall time: {why}"
-            seq, data = self._world.outbox.next_seq(keys.EVENT), {"wall_s": stood_ns / 1e9}
+            cause = "this process or its machine was stopped, or nothing could be published"
+            text = f"time stood still for {standstill_ns / 1e9:.1f} s of wall time: {cause}"
+            seq, data = self._world.outbox.next_seq(keys.EVENT), {"wall_s": standstill_ns / 1e9}
             event = run_messages.Event(self._world.now_ns, seq, "standstill", WORLD, WORLD, text, data)
             self._outputs.publish(Output(keys.EVENT, event))
 
@@ -231,8 +231,8 @@ class WorldProcess:
     def _advance(self, wall_ns: int, late_ns: int) -> None:
         """Advance to the next gate, publish it and due views, and add a checkpoint to the journal if one is due."""
         world = self._world
-        late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
-        self._run.enter(Advanced(wall_ns, late))
+        is_late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
+        self._run.enter(Advanced(wall_ns, is_late))
         self._outputs.gather()
         if isinstance(world, World) and self._journal.is_due(world.now_ns, wall_ns):  # the outbox is empty now
             state = {"world": world.checkpoint(), "last": self._history.last_values}
@@ -259,7 +259,7 @@ class WorldProcess:
 
     def _publish_clock(self, wall_ns: int, waiting_for: Callable[[int], tuple[run_messages.Waiting, ...]]) -> None:
         """Publish `clock` with the processes that the world waits for, at most once a second."""
-        if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
+        if wall_ns - self._clock_wall_ns >= IDLE_CLOCK_PERIOD_NS:
             self._outputs.publish(Output(keys.CLOCK, self._world.clock_message(waiting_for(wall_ns))))
 
     def _on_message(self, key: str, message: Any) -> None:
@@ -418,7 +418,7 @@ class TimedInputs:
     """Reads on separate threads, so that messages are stamped on arrival while the loop waits for its next gate."""
 
     def __init__(self, subscriptions: Sequence[Subscription]) -> None:
-        self._fresh = threading.Event()
+        self._has_input = threading.Event()
         self._arrived: list[tuple[Subscription, deque[tuple[int, ReceivedSample]]]] = [
             (s, deque()) for s in subscriptions
         ]
@@ -434,11 +434,11 @@ class TimedInputs:
                 return
             if sample is not None:
                 arrived.append((time.monotonic_ns(), sample))
-                self._fresh.set()
+                self._has_input.set()
 
     def wait(self, timeout_s: float | None) -> None:
-        self._fresh.wait(TICK_S if timeout_s is None else timeout_s)
-        self._fresh.clear()
+        self._has_input.wait(TICK_S if timeout_s is None else timeout_s)
+        self._has_input.clear()
 
     def wait_for(self, wanted: set[str]) -> None:
         self.wait(None)
@@ -449,7 +449,7 @@ class TimedInputs:
                 yield arrived.popleft()
 
     def wake(self) -> None:
-        self._fresh.set()
+        self._has_input.set()
 
     def close(self) -> None:
         for (subscription, _), thread in zip(self._arrived, self._threads, strict=True):
@@ -517,10 +517,10 @@ class WorldOutputs:
         passed, has_subscribers = self._run.history.passed, self._link.has_subscribers
         for key, message in outbox:
             if type(message) is GateMessages:
-                whole = (keys.GATE, message.pack())
-                passed.append(whole)
+                full_gate = (keys.GATE, message.pack())
+                passed.append(full_gate)
                 if has_subscribers(keys.GATE):
-                    self._unsent.append(whole)
+                    self._unsent.append(full_gate)
                 for gate_key, (first, last) in zip(self._gate_keys, pairwise(message.first), strict=True):
                     if last > first and has_subscribers(gate_key):
                         self._unsent.append((gate_key, message.pack(first, last)))
@@ -594,7 +594,7 @@ class Pacer:
             self._pace = (clock.rate, clock.jumps)
             self._start_wall_ns, self._start_sim_ns = wall_ns, clock.next_ns
         due_ns = self._start_wall_ns + round((clock.next_ns - self._start_sim_ns) / clock.rate)
-        if clock.mode == "lockstep" and wall_ns - due_ns > STOOD_STILL_NS:
+        if clock.mode == "lockstep" and wall_ns - due_ns > STANDSTILL_MIN_NS:
             self.restart()
         return due_ns
 
@@ -628,8 +628,8 @@ class Pipelining:
         """Return whether to delay the next gate although the world may advance."""
         if self._continues or not self._enabled:
             return False
-        late = wall_ns - self._delayed_wall_ns > DELAY_MAX_NS
-        self._continues = late or not self._world.blocking(self._ahead_ns)
+        is_overdue = wall_ns - self._delayed_wall_ns > DELAY_MAX_NS
+        self._continues = is_overdue or not self._world.blocking(self._ahead_ns)
         return not self._continues
 
     def continues(self) -> bool:

@@ -41,7 +41,7 @@ from zsim_world.physics.fleet_arrays import (
     of,
     put,
     put_four,
-    put_of,
+    put_value,
     vector,
 )
 from zsim_world.physics.rigid_body import charge_percent, mix
@@ -200,8 +200,13 @@ def board_blocks(row: NDArray, rotors: NDArray, setting: NDArray, mounts: NDArra
     """Return the blocks of N boards, given parameters of vehicles and rotors, settings, and the gyros' q_BS (N, 4)."""
     each = rotors.shape[1] // ROTOR.size
     drive = setting[:, SETTING.drive : SETTING.drive + DRIVE.size]
-    known = BOARD_LANES.size + BOARD_ROTORS.known * each
-    constant = ((BOARD_LANES.vehicle, row), (BOARD_LANES.drive, drive), (BOARD_LANES.mount, mounts), (known, rotors))
+    rotors_start = BOARD_LANES.size + BOARD_ROTORS.known * each
+    constant = (
+        (BOARD_LANES.vehicle, row),
+        (BOARD_LANES.drive, drive),
+        (BOARD_LANES.mount, mounts),
+        (rotors_start, rotors),
+    )
     level, unturned = np.tile(LEVEL, (len(row), 1)), np.ones((len(row), 1))
     start = ((BOARD_LANES.q_WB, level), (BOARD_LANES.cosine, unturned))
     return blocks(BOARD_LANES.size + BOARD_ROTORS.size * each, (*constant, *start))
@@ -284,7 +289,7 @@ def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i:
     put_lane_four(lanes, BOARD_LANES.q_WB, k, four(belief, BELIEF.q_WB))
     speeds = _rotors(lanes, BOARD_ROTORS.speed, k, each)
     for r in range(len(each)):
-        put_of(speeds, r, belief[BELIEF.size + r])
+        put_value(speeds, r, belief[BELIEF.size + r])
     put_lane_vector(lanes, BOARD_LANES.z_H, k, decision.z_H)
     lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k] = (
         decision.thrust_n,
@@ -308,7 +313,7 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
         drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, wanted)
         driven = lanes[LANES * BOARD_LANES.driven + k] > 0.0
         for r in range(len(each)):
-            put_of(commands, r, of(wanted, 0, r) if driven else of(commands, 0, r))
+            put_value(commands, r, of(wanted, 0, r) if driven else of(commands, 0, r))
 
 
 @inlined
@@ -371,7 +376,7 @@ def decide(
     _change_mode(memory, belief, setting, setpoint, silence_s, hover_s, land_s, charge_percent)
     mode, decision = int(memory[MEMORY.mode]), COMMAND_IS_SET
     for r in range(len(commands.each)):
-        put_of(commands, r, 0.0)
+        put_value(commands, r, 0.0)
     if mode in (TAKING_OFF, HOVERING, FLYING, LANDING):
         decision = _fly(commands, mode, memory, belief, own, row, rotors, setting, setpoint)
     memory[MEMORY.steps] += 1.0
@@ -444,9 +449,9 @@ def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
 def _arrived(memory: NDArray, belief: NDArray, setting: NDArray) -> bool:
     if memory[MEMORY.steps] * STEP_S > setting[SETTING.ascent_max]:
         return True
-    off = abs(memory[MEMORY.hold_z] - belief[BELIEF.height])
-    near = memory[MEMORY.holds_z] == HOLDING and off < setting[SETTING.arrived]
-    return near and abs(belief[BELIEF.v_H + 2]) < setting[SETTING.arrived_speed]
+    error = abs(memory[MEMORY.hold_z] - belief[BELIEF.height])
+    has_arrived = memory[MEMORY.holds_z] == HOLDING and error < setting[SETTING.arrived]
+    return has_arrived and abs(belief[BELIEF.v_H + 2]) < setting[SETTING.arrived_speed]
 
 
 @inlined
@@ -465,11 +470,11 @@ def _fly(
     kind = int(setpoint[SETPOINT.kind])
     if mode == FLYING and kind == ROTORS:
         for r in range(len(rotors.each)):
-            put_of(commands, r, clipped(rotors, r, setpoint[SETPOINT.value + r]))
+            put_value(commands, r, clipped(rotors, r, setpoint[SETPOINT.value + r]))
         return COMMAND_IS_SET
     if stands(memory, setting):
         for r in range(len(rotors.each)):
-            put_of(commands, r, of(rotors, ROTOR.low, r))
+            put_value(commands, r, of(rotors, ROTOR.low, r))
         return COMMAND_IS_SET
     if mode == FLYING and kind == ATTITUDE:
         z_des, lift, yaw_rate = _from_attitude(own, setting, setpoint)
@@ -577,10 +582,10 @@ def _climb(
 @inlined
 def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
     """Return the vertical velocity [m/s] of a take-off, which follows a steadily rising height."""
-    height, standing = belief[BELIEF.height], standing_height(belief, row)
-    final = min(setting[SETTING.takeoff_height] + (standing - row[VEHICLE.stand_height]), setting[SETTING.altitude])
+    height, start_height = belief[BELIEF.height], standing_height(belief, row)
+    final = min(setting[SETTING.takeoff_height] + (start_height - row[VEHICLE.stand_height]), setting[SETTING.altitude])
     if memory[MEMORY.holds_z] == 0.0:
-        memory[MEMORY.hold_z], memory[MEMORY.holds_z] = standing, RISING
+        memory[MEMORY.hold_z], memory[MEMORY.holds_z] = start_height, RISING
     rising = 0.0
     if memory[MEMORY.holds_z] == RISING:
         rising = setting[SETTING.ascent]
@@ -593,16 +598,16 @@ def _ascent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) ->
 @inlined
 def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray, each: tuple[int, ...]) -> float:
     """Return the speed of descent [m/s], and count the steps for which the ground has borne the weight."""
-    weak = lift(belief, row, each) < setting[SETTING.touch_share] * row[VEHICLE.gravity]
-    borne = weak and belief[BELIEF.v_H + 2] > -setting[SETTING.touch_speed]
-    memory[MEMORY.touch] = memory[MEMORY.touch] + 1.0 if borne else 0.0
-    faster = setting[SETTING.descent_far] * max(belief[BELIEF.height] - setting[SETTING.flare], 0.0)
-    return min(setting[SETTING.descent] + faster, max(setting[SETTING.climb], setting[SETTING.descent]))
+    is_weak = lift(belief, row, each) < setting[SETTING.touch_share] * row[VEHICLE.gravity]
+    is_borne = is_weak and belief[BELIEF.v_H + 2] > -setting[SETTING.touch_speed]
+    memory[MEMORY.touch] = memory[MEMORY.touch] + 1.0 if is_borne else 0.0
+    extra = setting[SETTING.descent_far] * max(belief[BELIEF.height] - setting[SETTING.flare], 0.0)
+    return min(setting[SETTING.descent] + extra, max(setting[SETTING.climb], setting[SETTING.descent]))
 
 
 @inlined
-def _clip(x: float, most: float) -> float:
-    return min(max(x, -most), most)
+def _clip(x: float, limit: float) -> float:
+    return min(max(x, -limit), limit)
 
 
 @inlined
@@ -645,7 +650,7 @@ def drive(
     mix(row, rotors, thrust_n, moment, commands)
     for r in range(len(rotors.each)):  # overdriven commands shorten the rotors' lag
         speed = of(speeds, 0, r)
-        put_of(commands, r, clipped(rotors, r, speed + overdrive * (of(commands, 0, r) - speed)))
+        put_value(commands, r, clipped(rotors, r, speed + overdrive * (of(commands, 0, r) - speed)))
 
 
 @inlined
@@ -658,7 +663,7 @@ def clipped(rotors: PerRotor, r: int, speed: float) -> float:
 def limited_tilt(z: Vector, slope: float) -> Vector:
     """Return the unit vector along `z`, with the tangent of its tilt from the vertical limited to `slope`."""
     across = math.sqrt(z[0] * z[0] + z[1] * z[1])
-    most = max(z[2], 1e-3) * slope
-    s = 1.0 if across <= most else most / across
+    limit = max(z[2], 1e-3) * slope
+    s = 1.0 if across <= limit else limit / across
     z = (s * z[0], s * z[1], max(z[2], 1e-3))
     return axpy((0.0, 0.0, 0.0), 1.0 / rot.norm(z), z)

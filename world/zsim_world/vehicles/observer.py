@@ -39,7 +39,7 @@ from zsim_world.physics.fleet_arrays import (
     of,
     put,
     put_four,
-    put_of,
+    put_value,
     vector,
 )
 from zsim_world.physics.rigid_body import free_thrust, lagged
@@ -314,7 +314,7 @@ def model_rotors(belief: NDArray, decay: float, commands: PerRotor) -> None:
     """Advance the modelled rotors by one step under commands [rad/s]; `decay`: fraction of the speed error left."""
     speeds = PerRotor(belief, BELIEF.size, 1, commands.each)
     for r in range(len(commands.each)):
-        put_of(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
+        put_value(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
 
 
 Array = NDArray[np.float64]
@@ -388,7 +388,7 @@ def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
         flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), sample_rate(s.flow)),
         baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), sample_rate(s.baro)),
         sonar=(_sigma(s.sonar.range_m, s.sonar.rate_hz, "sonar"), sample_rate(s.sonar)),
-        mag=(_within(heading_sigma(s.mag, field), "mag"), sample_rate(s.mag)),
+        mag=(_clipped(heading_sigma(s.mag, field), "mag"), sample_rate(s.mag)),
         disturbance_walk=walks.disturbance_walk,
         lift_walk=walks.lift_walk,
     )
@@ -401,12 +401,12 @@ def sample_rate(sensor: Sensor) -> float:
 
 
 def _sigma(model: ErrorModel, rate_hz: float, name: str) -> float:
-    return _within(el.hypot(noise_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
+    return _clipped(el.hypot(noise_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
 
 
-def _within(sigma: float, name: str) -> float:
-    least, most = SIGMAS[name]
-    return min(max(sigma, least), most)
+def _clipped(sigma: float, name: str) -> float:
+    low, high = SIGMAS[name]
+    return min(max(sigma, low), high)
 
 
 @lru_cache(maxsize=256)
@@ -462,11 +462,11 @@ def covariance(a: Array, walks: Array, meters: list[tuple[list[float], float, fl
     # process noise over one step by Simpson's rule: exact to dt^5 for these chains
     q = np.diag(walks * walks)
     half, full = (linear.exponential(a * s) for s in (dt / 2, dt))
-    noise = dt / 6.0 * (q + 4.0 * _carried(half, q) + _carried(full, q))
+    noise = dt / 6.0 * (q + 4.0 * _propagated(half, q) + _propagated(full, q))
     return _riccati(full, linear.product(h.T, linear.solve(r, h)), noise)
 
 
-def _carried(f: Array, p: Array) -> Array:
+def _propagated(f: Array, p: Array) -> Array:
     """Return F P F^T."""
     return linear.product(linear.product(f, p), f.T)
 
@@ -479,8 +479,8 @@ def _riccati(f: Array, information: Array, noise: Array) -> Array:
     """
     a, g, p = f.T, information, noise
     for _ in range(DOUBLINGS):
-        back = linear.solve(np.eye(len(a)) + linear.product(g, p), np.hstack([a, g]))
-        turned, spread = back[:, : len(a)], back[:, len(a) :]
-        g, p = g + _carried(a, spread), p + linear.product(linear.product(a.T, p), turned)
-        a = linear.product(a, turned)
+        solution = linear.solve(np.eye(len(a)) + linear.product(g, p), np.hstack([a, g]))
+        transformed, spread = solution[:, : len(a)], solution[:, len(a) :]
+        g, p = g + _propagated(a, spread), p + linear.product(linear.product(a.T, p), transformed)
+        a = linear.product(a, transformed)
     return 0.5 * (p + p.T)

@@ -464,5 +464,5 @@ def test_a_bump_into_a_surface_is_reported_by_its_name() -> None:
     for _ in range(100):
         fleet.advance()
         bumps += fleet.bumps()
-    assert [fleet.things[thing] for _, thing in bumps][:1] == ["sheet"]
+    assert [fleet.object_names[thing] for _, thing in bumps][:1] == ["sheet"]
     assert fleet.touching[0]

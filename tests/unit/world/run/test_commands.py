@@ -308,7 +308,7 @@ def world() -> World:
     for _ in range(20):
         made.advance(0)
     made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "pilot", "h", 1, GATE_NS), 0)
-    assert made.take_of_driver("d2", status(made.now_ns)) is None
+    assert made.accept_from_driver("d2", status(made.now_ns)) is None
     made.take_outbox()
     return made
 
@@ -358,7 +358,7 @@ def test_modes_are_checked_against_the_state_the_driver_reports(world: World):
     published = command(world, Mode(world.now_ns, 0, ME, "takeoff"), "mode")
     assert kinds(published) == ["refused"]
     assert has_terms(published[0][1].text, "d2 is hovering", "landed")
-    world.take_of_driver("d2", status(world.now_ns, "landed"))
+    world.accept_from_driver("d2", status(world.now_ns, "landed"))
     published = command(world, Mode(world.now_ns, 1, ME, "takeoff"), "mode")
     assert kinds(published) == ["mode"]
     assert dict(published)[keys.accepted("d2", "mode")] == Mode(world.now_ns, 0, ME, "takeoff")
@@ -433,7 +433,7 @@ def test_faults_of_an_external_drone_are_refused(world: World, kind: str):
 
 def test_an_external_drone_is_in_the_views_but_not_in_gates_or_hash(world: World):
     pose = Truth(world.now_ns, 0, (4.0, 1.0, 2.0), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (300.0,) * 4)
-    world.take_of_driver("d2", pose)
+    world.accept_from_driver("d2", pose)
     world.advance(0)
     _, shown = world.view(0).drones
     assert (shown.position_m, shown.state, shown.battery_percent) == ((4.0, 1.0, 2.0), "hovering", 70.0)
@@ -445,7 +445,7 @@ def test_an_external_drone_is_in_the_views_but_not_in_gates_or_hash(world: World
     alone = world_of(MIXED.replace("body: external", "battery_percent: 50"))
     for each in (moved, alone):
         for _ in range(5):
-            each.take_of_driver("d2", pose) if each is moved else None
+            each.accept_from_driver("d2", pose) if each is moved else None
             each.advance(0)
     assert moved.result()["truth_sha256"] != alone.result()["truth_sha256"]
 
@@ -453,7 +453,7 @@ def test_an_external_drone_is_in_the_views_but_not_in_gates_or_hash(world: World
 def test_the_result_has_the_shortest_distance_of_the_whole_run(world: World):
     for x_m in (4.0, 2.0, 3.0):
         pose = Truth(world.now_ns, 0, (x_m, 0.0, 0.058), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (300.0,) * 4)
-        assert world.take_of_driver("d2", pose) is None
+        assert world.accept_from_driver("d2", pose) is None
         world.advance(0)
     assert world.result()["closest_m"] == pytest.approx(2.0, abs=0.01)
 
@@ -499,6 +499,6 @@ def test_lockstep_with_an_external_drone_is_refused_with_the_reason():
 
 def test_an_emergency_reported_in_flight_is_an_event_once(world: World):
     for state in ("emergency", "emergency", "landed", "emergency"):
-        assert world.take_of_driver("d2", status(world.now_ns, state)) is None
+        assert world.accept_from_driver("d2", status(world.now_ns, state)) is None
     (event,) = [m for _, m in world.take_outbox() if isinstance(m, Event) and m.kind == "emergency"]
     assert (event.subject, event.data) == ("d2", {"cause": "driver"})

@@ -18,7 +18,7 @@ from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim.sensors.camera import FrontCamera
-from zsim_world.run.playback import MARKS_MAX, NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange, RecordedGates
+from zsim_world.run.playback import MARKS_MAX, NOT_FLYABLE, RECORD_ENDED, Playback, PlaybackRange, RecordedGates
 from zsim_world.run.world import World
 
 GATE_NS = 20_000_000
@@ -294,7 +294,7 @@ def test_a_death_or_departure_does_not_end_the_replay(flight: RecordReader):
     made.died("estimator.d1", 0)
     made.handle(keys.process("recorder", "bye"), Bye(0, 0, "enough"), 0)
     assert len(on(keys.CLOCK, played(made))) == 10
-    assert made.ended == RECORD_OVER
+    assert made.ended == RECORD_ENDED
 
 
 def test_commands_and_control_of_drones_are_refused(flight: RecordReader):

@@ -38,7 +38,9 @@ def fleet(*places: tuple[float, ...], obstacles: Any = (WALL,), **sensors: Any) 
 
 def taken(fleet: Fleet, kind: Any, drone: int = 0) -> Any:
     """Return the last gate's message of a kind, as readers receive it."""
-    (scan,) = (each for each in fleet.seen.values() if each.drone == drone and isinstance(each.message(0), kind))
+    (scan,) = (
+        each for each in fleet.observations.values() if each.drone == drone and isinstance(each.message(0), kind)
+    )
     key = f"drone/d{drone}/sensor/{scan.sensor}"
     return messages.decode(key, messages.encode(scan.message(0)))
 
@@ -128,7 +130,7 @@ def test_rays_and_messages_are_lost_at_the_configured_rates():
     assert lost / 2000 == pytest.approx(0.25, abs=4 * math.sqrt(0.25 * 0.75 / 2000))
     made, kept = fleet((0, 0, 0), range=missed | {"dropout": 0.5}), 0
     for _ in range(400):
-        kept += len(made.seen)
+        kept += len(made.observations)
         made.advance()
     assert kept / 400 == pytest.approx(0.5, abs=4 * math.sqrt(0.25 / 400))
 
@@ -139,7 +141,7 @@ def test_a_sample_is_measured_at_its_instant_and_delayed_by_its_latency():
     made, heights, seen = fleet((0, 0, 30), obstacles=(), range=down), {}, {}
     for _ in range(20):
         heights[made.t_ns] = float(made.truth().position_m[0, 2])
-        for each in made.seen.values():
+        for each in made.observations.values():
             message: Any = each.message(0)
             seen[each.t_sample_ns] = each.t_ns, message.ranges_m[0]
         made.advance()
@@ -159,7 +161,9 @@ def test_a_restored_fleet_scans_on_bit_identically():
     for _ in range(5):
         made.advance()
         other.advance()
-        assert [each.message(0) for each in other.seen.values()] == [each.message(0) for each in made.seen.values()]
+        assert [each.message(0) for each in other.observations.values()] == [
+            each.message(0) for each in made.observations.values()
+        ]
 
 
 def test_a_first_scan_larger_than_all_other_messages_is_published_whole():
@@ -187,7 +191,7 @@ def test_dropout_and_bias_faults_affect_one_sensor_and_end() -> None:
         assert ahead() == pytest.approx([5.0, 5.0 + bias_m], abs=1e-3)
     made.impairment.strike(faults(("range_dropout", {"probability": 1.0})))
     made.advance()
-    assert {each.drone for each in made.seen.values()} == {0}
+    assert {each.drone for each in made.observations.values()} == {0}
     made.impairment.strike([])
     assert ahead() == pytest.approx([5.0, 5.0], abs=1e-3)
 

@@ -18,11 +18,11 @@ from zsim.transport.link_watch import ClosedLink, SessionTokens
 from zsim_world.run.inputs import Run
 from zsim_world.run.outbox import STRANGERS_MAX
 from zsim_world.server.liveliness import (
+    BLOCKED_MIN_NS,
     DEAD_NS,
     DONE_NS,
-    HELD_NS,
+    FIRST_DONE_NS,
     LOOK_NS,
-    SHOWN_NS,
     SILENT_NS,
     TOKEN_NS,
     WITHHELD_MAX,
@@ -297,13 +297,13 @@ def case() -> Door:
 @pytest.mark.parametrize("forged", [{"pid": 8}, {"pid": 7, "host": "elsewhere"}, {"pid": 7, "period_ns": 0}])
 def test_a_forged_join_takes_nobody_s_place(case: Door, forged: dict[str, int]) -> None:
     case.join(ME, incarnation=2, **forged)  # type: ignore[arg-type]
-    case.flies_for(SHOWN_NS)
+    case.flies_for(FIRST_DONE_NS)
     assert case.kinds() == ["join", "no_show"]
     assert (case.incarnation(), case.world.barrier.participants[ME].gating) == (1, True)
 
 
 def test_a_repeated_forged_join_is_reported_just_as_soon(case: Door) -> None:
-    for incarnation in range(2, 2 + SHOWN_NS // LOOK_NS):
+    for incarnation in range(2, 2 + FIRST_DONE_NS // LOOK_NS):
         case.join(ME, pid=8, incarnation=incarnation)
         case.flies_for(0)
     case.flies_for(LOOK_NS)
@@ -345,7 +345,7 @@ def test_a_join_without_a_token_takes_over_from_an_unresponsive_process(case: Do
         case.passes(LOOK_NS)
     else:
         case.advance()
-        case.passes(HELD_NS)
+        case.passes(BLOCKED_MIN_NS)
     assert case.kinds() == ["join", "superseded"]
 
 
