@@ -220,10 +220,10 @@ class ManualFlight:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Send commands in a separate thread while the context is open."""
-        over = threading.Event()
+        stopped = threading.Event()
 
         def run() -> None:
-            while not over.is_set():
+            while not stopped.is_set():
                 self.tick()
                 self._wake.wait(PERIOD_S)
                 self._wake.clear()
@@ -233,7 +233,7 @@ class ManualFlight:
         try:
             yield
         finally:
-            over.set()
+            stopped.set()
             self._wake.set()
             thread.join(STALE_S)
             for page in list(self._flights):
@@ -302,10 +302,10 @@ class ManualFlight:
             if refusal or pose is None:
                 return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
             waypoint = x_m, y_m, pose.p_W[2] if z_m is None else z_m
-            before = flight.waypoints_W if append else ()
+            waypoints = flight.waypoints_W if append else ()
             flight.stick, flight.seen_s = None, self._wall_s()
-            if before[-1:] != (waypoint,):  # a page repeats an unconfirmed request
-                flight.waypoints_W = (*before[: WAYPOINTS_MAX - 1], waypoint)
+            if waypoints[-1:] != (waypoint,):  # a page repeats an unconfirmed request
+                flight.waypoints_W = (*waypoints[: WAYPOINTS_MAX - 1], waypoint)
         return self.answer(page)
 
     def has_waypoints(self, page: Any) -> bool:

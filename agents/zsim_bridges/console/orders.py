@@ -273,9 +273,9 @@ class CommandClient:
             self._releases.submit(self._release, drone, answered_before)
         return SUPERSEDED if is_superseded else ""
 
-    def _release(self, drone: str, before: int) -> None:
+    def _release(self, drone: str, answered_before: int) -> None:
         """Release a drone once the world has answered the mode, which needs the operator's priority until then."""
-        self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
+        self._views.await_answer(drone, answered_before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
 

@@ -381,8 +381,8 @@ class LastValues:
         if "*" not in expression:
             matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
         else:
-            known = {*self._payloads, *(self._table[index] for index in list(self._gate_entries))}  # a copy
-            matching = sorted(key for key in known if keys.matches(expression, prefix + key))
+            known_keys = {*self._payloads, *(self._table[index] for index in list(self._gate_entries))}  # a copy
+            matching = sorted(key for key in known_keys if keys.matches(expression, prefix + key))
         return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 
     def _payload(self, key: str) -> bytes | None:
