@@ -1,7 +1,7 @@
 """How well a position is held in gusts: measured in flight, and predicted by linear theory of the control loops.
 
-An outer loop on the truth commands v = 0.6 e + 0.05 integral(e). One horizontal axis is then a linear system driven by
-three white noises (gust, accelerometer, flow), and its spread follows from a Lyapunov equation.
+An outer loop around the true position commands v = 0.6 e + 0.05 integral(e). One horizontal axis is then a linear
+system driven by three white noises (gust, accelerometer, flow), and its spread follows from a Lyapunov equation.
 """
 
 import math
@@ -18,7 +18,7 @@ from zsim_world.vehicles.firmware import loop_gains
 from zsim_world.vehicles.observer import GAIN
 
 PROPORTIONAL, INTEGRAL = 0.6, 0.05  # 1/s, 1/s^2
-GUST, TAU_S = 0.5, 5.0  # m/s; s, 10 m at 2 m/s
+GUST, TAU_S = 0.5, 5.0  # m/s; s, the time of a gust 10 m long at 2 m/s
 DRAG = 0.249 / 0.429  # 1/s
 TILT_S = 0.12  # s, the tilt loop as a first-order lag
 PRESETS = {

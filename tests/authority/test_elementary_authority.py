@@ -77,11 +77,11 @@ def test_powers_are_within_their_bound() -> None:
 @pytest.mark.parametrize("name", ["sin", "cos", "tan", "asin", "acos", "atan", "exp", "log", "log1p"])
 @pytest.mark.parametrize("x", [0.0, -0.0, 1.0, -1.0, 2.0, math.inf, -math.inf, math.nan, 5e-324, 1e300, -1e300])
 def test_functions_match_numpy_at_special_values(name: str, x: float) -> None:
-    """Also in the sign of zero."""
+    """The sign of zero is the same, too."""
     with np.errstate(all="ignore"):
         wanted = float(getattr(np, {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}.get(name, name))(x))
     found = getattr(el, name)(x)
-    if abs(x) == 1e300 and name in ("sin", "cos", "tan"):  # an argument without digits after the point
+    if abs(x) == 1e300 and name in ("sin", "cos", "tan"):  # neighbouring doubles are many periods apart
         assert math.isfinite(found)
     else:
         assert (math.isnan(found) and math.isnan(wanted)) or found == pytest.approx(wanted, rel=4e-16, abs=0.0)
@@ -108,7 +108,7 @@ def test_plain_python_gives_the_same_bits_as_compiled_code(name: str) -> None:
 
 
 @pytest.mark.parametrize("x", [709.0, 709.7, 709.78, 709.782712893384, 709.79, 1000.0, 1099.9])
-def test_exp_overflows_to_inf_also_as_plain_python(x: float) -> None:
+def test_exp_overflows_to_inf_in_plain_python_too(x: float) -> None:
     with np.errstate(over="ignore"):
         wanted = float(np.exp(x))
     source: Callable[..., Any] = getattr(el.exp, "py_func", el.exp)

@@ -1,7 +1,7 @@
 """True errors of the formation with sightings: Tests 1 and 2 of the paper, and faults in formation.
 
 Errors are those of the true formation against the desired one, in gusts of 0.5 m/s, with the preset `paper`; those with
-GPS alone are in docs/cameras.md. The limits lie between what a joint filter reached and the paper's Table I.
+GPS alone are in docs/cameras.md. The limits lie above the errors measured there with sightings.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ AMISS = {
     "covered_hat": "environment.hats.covered=[drone2]",
     "false_hat": "environment.hats.false_m=[[5, -5, 0.07]]",
 }
-RARELY = tuple(each for each in AMISS if each != "false_hat")  # in the soak: one case suffices to see a fault
+RARELY = tuple(each for each in AMISS if each != "false_hat")  # soak tests: one case suffices to detect a defect
 SIGHTED = [
     "sensors.front_camera={}",
     "sensors.sightings={}",
@@ -67,7 +67,7 @@ def test_the_formation_keeps_its_shape_despite_faults(amiss: str, tmp_path: Path
 
 
 LIMITS = {"x_c": 0.11, "y_c": 0.11, "z_c": 0.02, "roll": 0.012, "pitch": 0.008, "yaw": 0.010, "beta": 0.012}  # m, rad
-TESTS = {  # of the paper: the fields to set, and the limits of the errors
+TESTS = {  # by scenario: the fields to set, and the limits of the errors
     "step.yaml": (SIGHTED, {**LIMITS, "p": 0.055, "q": 0.055}),
     "trajectory.yaml": (SIGHTED, {**LIMITS, "yaw": 0.015, "beta": 0.015, "p": 0.07, "q": 0.07}),
     "eyes.yaml": ([], {**LIMITS, "p": 0.055, "q": 0.055}),

@@ -1,4 +1,4 @@
-"""Hunts in flight: a violation repeats to the bit; a defect with three causes is found and shrunk to them."""
+"""Hunts that fly: a violation repeats bit for bit; a defect with three causes is found and shrunk to them."""
 
 import json
 import shlex
@@ -24,7 +24,7 @@ def hunted(scenario: Path, out: Path, *options: str, code: int) -> dict[str, Any
 
 
 @pytest.mark.soak
-def test_a_violation_is_kept_as_a_flight_that_repeats_to_the_bit(tmp_path: Path) -> None:
+def test_a_violation_is_kept_as_a_flight_that_repeats_bit_for_bit(tmp_path: Path) -> None:
     scenario, out = tmp_path / "pair.yaml", tmp_path / "hunt"
     scenario.write_text(PAIR)
     faults = ("imu_stuck at_s=2..3 for_s=1..2", "sonar_stuck")

@@ -1,4 +1,4 @@
-"""A cluster's law reads what the scenario grants, to the same bits however it is flown; anything else is refused."""
+"""A cluster's law reads only what the scenario grants it; processes, a hosted run and a rerun give the same bits."""
 
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,7 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_formation_stops_at_a_wall_with_the_same_bits_after_a_kill(tmp_path: Path, forked: None) -> None:
-    """The law keeps 2 m from what the beams see, with noise and bias of 1 cm each; the target is 9 m further on."""
+    """The law keeps 2 m from what the beams hit, with noise and bias of 1 cm each; the target is behind the wall."""
     alone = zsim.run(WALL, duration_s=FLOWN_S, out=tmp_path / "alone", progress=False)
     assert 1.8 < min(alone.summary.obstacle_distance_m.values()) < 2.2
     with zsim.Federation(WALL, duration=FLOWN_S, out=tmp_path / "many") as flight:
@@ -91,7 +91,7 @@ def test_grants_are_in_place_before_the_first_sample() -> None:
 
 
 def test_samples_of_a_user_s_sensor_have_the_user_s_class() -> None:
-    """Processes decode samples to a class built from the sensor's declaration; the law's module has its own class."""
+    """Samples are decoded into a class built from the sensor's declaration; a law asks for the user's own class."""
     from uwb_range import UwbRange  # type: ignore[import-not-found]
 
     scenario = cluster("sensors.uwb={module: uwb_range}", law="seeing:Blind", law_sensors=["uwb"])
@@ -114,7 +114,7 @@ def test_samples_of_a_user_s_sensor_have_the_user_s_class() -> None:
         ({"law": "seeing:Misled"}, ("seeing:Misled", "'range'", "Lidar", "Range")),
     ],
 )
-def test_reading_without_a_grant_is_refused_with_class_and_field(fields: Any, terms: tuple[str, ...]) -> None:
+def test_reading_without_a_grant_or_as_another_class_is_refused(fields: Any, terms: tuple[str, ...]) -> None:
     scenario = cluster(**fields)
     with pytest.raises(RunError) as raised:
         engagement_of(scenario, scenario.clusters[0])

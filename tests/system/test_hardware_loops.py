@@ -1,4 +1,4 @@
-"""Test 1 of the paper with hardware in the loop, against a run without, and the effects of a cut link."""
+"""Test 1 of the paper with hardware drones (played by a second world) and without, and the effects of a cut link."""
 
 import math
 import re
@@ -22,20 +22,20 @@ STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 WINDOW_S = (120.0, 320.0)
 DRONES = ("drone1", "drone2", "drone3")
 LANDS_S = 4.0  # 2 s of com_watchdog and 2 s of hovering
-MOST = 1.3  # maximum ratio to the errors without a wire
+MOST = 1.3  # maximum ratio to the errors without hardware drones
 AS_ONE = {"p": ("p", "q"), "x_c": ("x_c", "y_c"), "roll": ("roll", "pitch")}  # errors of the same kind, combined
 JUDGED = ("x_c", "z_c", "roll", "yaw", "p", "beta")
-RADIO = {"a wire": (0.0, 0.0, 0.0), "a radio": (20.0, 10.0, 0.02)}  # delay and jitter in simulated ms, share lost
+RADIO = {"a wire": (0.0, 0.0, 0.0), "a radio": (20.0, 10.0, 0.02)}  # simulated delay and jitter in ms, packet loss
 
 
 def kinds(rms: dict[str, float]) -> dict[str, float]:
-    """Return the judged errors, those of a kind combined."""
+    """Return the judged errors, with those of the same kind combined."""
     return {name: math.hypot(*(rms[each] for each in AS_ONE.get(name, (name,)))) for name in JUDGED}
 
 
 @pytest.fixture(scope="module")
 def direct(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> dict[str, float]:
-    """The RMS errors of Test 1 without a wire."""
+    """The RMS errors of Test 1 without hardware drones."""
     with Federation(tmp_path_factory.mktemp("direct")) as federation:
         federation.run(STEP.read_text(), "--in-process").ends(with_code=0)
         (formation,) = formations_of(read_flight(federation.out / "run.mcap"))
@@ -46,7 +46,7 @@ def direct(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> dict[str
 @pytest.mark.parametrize("external", [("drone3",), DRONES], ids=["one", "all"])
 @pytest.mark.parametrize("radio", RADIO)
 @pytest.mark.parametrize("wire", ["px4", "ardrone"])
-def test_test_1_has_similar_errors_with_hardware_in_the_loop(
+def test_test_1_has_similar_errors_with_hardware_drones(
     tmp_path: Path, direct: dict[str, float], wire: str, radio: str, external: tuple[str, ...]
 ) -> None:
     # AT commands are 15 to 30 ms of wall time apart, so twice real time would halve their number per flight.
@@ -95,7 +95,7 @@ class Flight:
         self.aircraft = hardware.federation.client().subscribe("drone/drone3/sensor/status")
 
     def states(self) -> list[str]:
-        """Return the states of the aircraft since the last call, without repetitions in a row."""
+        """Return the states of the aircraft since the last call, without consecutive repetitions."""
         seen: list[str] = []
         for received in self.aircraft.now():
             if seen[-1:] != [received.message["state"]]:

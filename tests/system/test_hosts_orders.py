@@ -1,4 +1,4 @@
-"""Commands to a running `zsim up`, and what it leaves behind on its hosts, over TLS."""
+"""Commands to a running `zsim up`, with and without TLS, and what it leaves behind on its hosts."""
 
 import re
 import signal
@@ -44,7 +44,7 @@ def goes_on(deployment: Deployment) -> None:
 
 @pytest.mark.soak
 def test_processes_can_be_restarted_and_moved_during_a_run(lab: Lab) -> None:
-    """One move is refused, as its host lacks the certificate; the other is to a host not used before."""
+    """One move is refused for lack of a certificate; the other succeeds, although no process has run on its host."""
     with closing(Deployment(lab, ROLES)) as deployment:
         rmtree(lab.folder / "certs" / SPARE / "estimator.drone1", ignore_errors=True)
         run = deployment.up("--rate", "4", "--duration", "3600")
@@ -104,7 +104,7 @@ def test_closing_the_terminal_ends_the_run_like_ctrl_c(lab: Lab) -> None:
 
 
 @pytest.mark.soak  # test_kill covers this on one host
-def test_a_broken_output_pipe_ends_the_run_and_fetches_its_record(lab: Lab) -> None:
+def test_after_a_broken_output_pipe_the_run_ends_and_its_record_is_fetched(lab: Lab) -> None:
     """As in `zsim up … 2>&1 | head`, the reader exits during the flight."""
     with closing(Deployment(lab, ROLES, secure=False)) as deployment:
         piped = '"$@" 2>&1 | sed -E "/' + IN_FLIGHT + '/q"'

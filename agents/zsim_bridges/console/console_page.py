@@ -119,7 +119,7 @@ class ConsolePage:
         gui.main_panel.set_width(PANEL_PX)
         self.phases = gui.add_html("")
         self.control_folder = gui.add_folder(None)
-        with self._part(gui, ALL_PARTS):
+        with self._assign(gui, ALL_PARTS):
             self.fleet = FleetForm(gui, self._client, run.scenario)
         if len(run.spaces) > 1:
             choice = gui.add_dropdown("formation", list(run.spaces))
@@ -129,10 +129,10 @@ class ConsolePage:
             self._formation_tabs(gui, tabs)
         with tabs.add_tab("Faults"):
             self.faults = gui.add_html("")
-            with self._part(gui, RUN):
+            with self._assign(gui, RUN):
                 FaultForm(gui, self._client, self._report, run.scenario, run.info.drones)
         with tabs.add_tab("Run"):
-            with self._part(gui, RUN):
+            with self._assign(gui, RUN):
                 self.run_form = RunForm(gui, self._client, run.info.rate)
             for layer, label in SWITCHES.items():
                 switch = gui.add_checkbox(label, True)
@@ -156,7 +156,7 @@ class ConsolePage:
         for cluster in self._run.scenario.clusters:
             name, space = cluster.name, self._run.spaces[cluster.name]
             preview = partial(self._show_preview, name)
-            with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder, self._part(gui, name):
+            with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder, self._assign(gui, name):
                 form = FormationForm(
                     gui, self._client, self._report, cluster, space, self._run.scenario, self._request_return, preview
                 )
@@ -168,11 +168,11 @@ class ConsolePage:
             self._folders[name] = [form_folder, plot_folder]
 
     @contextmanager
-    def _part(self, gui: viser.GuiApi, part: str) -> Iterator[None]:
+    def _assign(self, gui: viser.GuiApi, part: str) -> Iterator[None]:
         """Assign the controls added in this context to a part of the run."""
-        before = control_ids(gui)
+        previous_ids = control_ids(gui)
         yield
-        self.parts |= dict.fromkeys(control_ids(gui) - before, part)
+        self.parts |= dict.fromkeys(control_ids(gui) - previous_ids, part)
 
     def _show_formation(self, chosen: str) -> None:
         self.chosen = chosen
@@ -406,7 +406,7 @@ class DroneForm:
         common = {mode: refusals[0][mode] if all(each[mode] for each in refusals) else "" for mode in DRONE_MODES}
         set_refusals(self._buttons, common)
         landed = {d: run.checks.get(d, ()) for d in self.targets if run.drones.get(d) == "landed"}
-        checks = {drone: found for drone, found in landed.items() if found}
+        checks = {drone: drone_checks for drone, drone_checks in landed.items() if drone_checks}
         shown = preflight_lines(checks) if checks and not run.flight_refusal() else ""
         self._reasons.content = refusal_lines(DRONE_MODES, common) + shown
 

@@ -435,8 +435,8 @@ class RunPage:
             self._note("refused", outcome.subject, f"{outcome.request}: {outcome.refusal}")
             self._notify(outcome.request, outcome.refusal)
             return
-        known = self._monitor.pending.accept(outcome.subject, outcome.op, outcome.request, outcome.args)
-        if known or outcome.subject in self._run.spaces:
+        is_observable = self._monitor.pending.accept(outcome.subject, outcome.op, outcome.request, outcome.args)
+        if is_observable or outcome.subject in self._run.spaces:
             self._note("accepted", outcome.subject, f"{outcome.request}: accepted")
 
     def _on_return_over(self, subject: str, text: str) -> None:

@@ -13,7 +13,7 @@ from zsim_bridges.console.run_condition import (
     LINK_AGE_MAX_MS,
     LINK_LOSS_PERCENT,
     LINK_SILENT_S,
-    LOST,
+    LOSS_NAMES,
     Check,
     DroneCondition,
     Severity,
@@ -32,7 +32,7 @@ STATE_COLOURS = {
     "emergency": RED,
 }
 EVENT_COLOURS = {
-    **dict.fromkeys(("refused", "collision", *LOST, *INCIDENTS), RED),
+    **dict.fromkeys(("refused", "collision", *LOSS_NAMES, *INCIDENTS), RED),
     **dict.fromkeys(("landing", "fault", "fault_end", "fault_clear"), AMBER),
     "accepted": BLUE,
     "done": GREEN,
@@ -274,7 +274,9 @@ def sensor_table(
         (kind, used, refused, f"{rates[kind]:.0f} Hz" if kind in rates else "–")
         for kind, (used, refused) in counts.items()
     ]
-    others = [(kind, "–", "–", f"{rate:.0f} Hz (configured)") for kind, rate in own_rates.items() if kind not in counts]
+    uncounted = [
+        (kind, "–", "–", f"{rate:.0f} Hz (configured)") for kind, rate in own_rates.items() if kind not in counts
+    ]
     title = f"<div style='{STYLE};{PANEL_PADDING}'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
     head = _head(
         ("sensor", "sensor of the drone"),
@@ -282,7 +284,7 @@ def sensor_table(
         ("refused", "measurements that were too unlikely or unusable"),
         ("rate", "rate of arrival in simulated time"),
     )
-    rows = (_cells(escape(str(cell)) for cell in row) for row in (*counted, *others))
+    rows = (_cells(escape(str(cell)) for cell in row) for row in (*counted, *uncounted))
     return title + _table(head + "".join(rows))
 
 

@@ -147,17 +147,17 @@ class ControlDesk:
                 self._pass_on(part, f"{self.name_of(page)} has released")
 
     def holdings(self, page: int, parts: Collection[str]) -> list[Holding]:
-        found = []
+        holdings = []
         with self._lock:
             for part in parts:
                 holder, requester = self._holders.get(part), self._requesters.get(part)
                 if holder is None:
-                    found.append(Holding(part))
+                    holdings.append(Holding(part))
                     continue
                 requester_name = "" if requester is None else self.name_of(requester)
                 names = part, self.name_of(holder), self._silent_s(holder), requester_name
-                found.append(Holding(*names, is_mine=holder == page, is_requested_by_me=requester == page))
-        return found
+                holdings.append(Holding(*names, is_mine=holder == page, is_requested_by_me=requester == page))
+        return holdings
 
     def others(self, page: int) -> list[str]:
         """Return the names of the other open pages that have polled, operators first."""

@@ -75,7 +75,7 @@ class _Flight(NamedTuple):
     """A request for a target or trajectory."""
 
     op: str
-    shown: str  # the arguments as the page shows them
+    args_text: str  # the arguments as the page shows them
     args: dict[str, Any]  # arguments of the request, in SI units
 
 
@@ -112,7 +112,7 @@ class FormationForm:
         self._shown: tuple[float, ...] | None = (
             None  # the formation's desired variables, or the estimated ones while it has no desired shape
         )
-        self._written: tuple[float, ...] | None = None  # the formation's variables when the waypoints were prefilled
+        self._prefilled: tuple[float, ...] | None = None  # the formation's variables when the waypoints were prefilled
         self._edited = False
         self._controls: dict[str, Any] = {}
         for label, op in OPERATIONS.items():
@@ -129,7 +129,7 @@ class FormationForm:
             self._controls["return"] = return_button
         self._reasons = gui.add_html("")
         self._checks = gui.add_html("")
-        self._others: list[tuple[str, Any]] = []  # further controls, with the operation that each requests
+        self._extra_controls: list[tuple[str, Any]] = []  # further controls, with the operation that each requests
         hint = "Duration of a move; 0: as fast as the robots' limits allow"
         self._duration = gui.add_number("over [s]", 0.0, min=0.0, max=MOVE_DURATION_MAX_S, step=0.5, hint=hint)
         gui.add_html(limits_line(f"over: 0 to {MOVE_DURATION_MAX_S:g} s"))
@@ -152,7 +152,7 @@ class FormationForm:
         refusals = offered_refusals(run, partial(formation_refusals, cluster=name))
         refusals["return"] = refusals["target"]  # a return begins with a target
         set_refusals(self._controls, refusals)
-        for op, control in self._others:
+        for op, control in self._extra_controls:
             set_refusals({op: control}, refusals)
         assign(self._controls["rejoin"], visible=is_held_by_fault(run, name))
         for slider in self._sliders.values():
@@ -170,8 +170,8 @@ class FormationForm:
         shown = view.desired if view.phase in SHAPED_PHASES else view.value
         before, self._shown = self._shown, tuple(shown)
         if not self._edited:
-            ranges, written = list(self._ranges.values()), self._written
-            if self._shown == before or written is None or differs_by_step(self._shown, written, ranges):
+            ranges, prefilled = list(self._ranges.values()), self._prefilled
+            if self._shown == before or prefilled is None or differs_by_step(self._shown, prefilled, ranges):
                 self._prefill()
         for name, slider in self._sliders.items():
             slider.follow(shown[self._space.index(name)], wall_s)
@@ -210,7 +210,7 @@ class FormationForm:
             return
         op, shown, args = flight
         if op == "target" and self._previewed is not None and self._previewed.op == op:  # extend the preview
-            shown = f"{self._previewed.shown}, {shown}"
+            shown = f"{self._previewed.args_text}, {shown}"
             args = {**args, "values": {**self._previewed.args["values"], **args["values"]}}
         separation_min_m = self._cluster.gains.separation_min_m
         try:
@@ -233,12 +233,12 @@ class FormationForm:
             self._send(previewed)
 
     def _send(self, flight: _Flight) -> None:
-        self._client.request_cluster(self._cluster.name, flight.op, args_text=flight.shown, **flight.args)
+        self._client.request_cluster(self._cluster.name, flight.op, args_text=flight.args_text, **flight.args)
 
     def _other_button(self, gui: viser.GuiApi, op: str, label: str, act: Callable[[], Any]) -> None:
         button = gui.add_button(label)
         button.on_click(lambda _: act())
-        self._others.append((op, button))
+        self._extra_controls.append((op, button))
 
     def _single_variable(self, gui: viser.GuiApi, names: list[str]) -> None:
         def label_of(name: str) -> str:
@@ -284,7 +284,7 @@ class FormationForm:
         """
         if self._shown is None:
             return
-        self._edited, self._written = False, self._shown
+        self._edited, self._prefilled = False, self._shown
         assign(self._points, value=waypoints_from(self._shown, list(self._ranges.values())))
 
     def _fly(self, read: Callable[[], dict[str, Any]]) -> None:

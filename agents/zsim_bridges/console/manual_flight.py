@@ -171,7 +171,7 @@ class _Flight:
     started_s: float  # when the page requested it
     seen_s: float  # when the page last sent something
     id: str = ""  # id of the page's request
-    owned_s: float | None = None  # when the world granted it; None before
+    granted_s: float | None = None  # when the world granted it; None before
     sent_s: float = 0.0  # when the drone was last commanded
     stick: Stick | None = None  # present deflection; None: hover, or fly to `waypoints_W`
     waypoints_W: tuple[Vector, ...] = ()  # the drone's destinations, in order
@@ -220,10 +220,10 @@ class ManualFlight:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Send commands in a separate thread while the context is open."""
-        over = threading.Event()
+        stopped = threading.Event()
 
         def run() -> None:
-            while not over.is_set():
+            while not stopped.is_set():
                 self.tick()
                 self._wake.wait(PERIOD_S)
                 self._wake.clear()
@@ -233,7 +233,7 @@ class ManualFlight:
         try:
             yield
         finally:
-            over.set()
+            stopped.set()
             self._wake.set()
             thread.join(STALE_S)
             for page in list(self._flights):
@@ -302,10 +302,10 @@ class ManualFlight:
             if refusal or pose is None:
                 return self.answer(page)._replace(text=refusal or f"no estimate of {flight.drone}")
             waypoint = x_m, y_m, pose.p_W[2] if z_m is None else z_m
-            before = flight.waypoints_W if append else ()
+            waypoints = flight.waypoints_W if append else ()
             flight.stick, flight.seen_s = None, self._wall_s()
-            if before[-1:] != (waypoint,):  # a page repeats an unconfirmed request
-                flight.waypoints_W = (*before[: WAYPOINTS_MAX - 1], waypoint)
+            if waypoints[-1:] != (waypoint,):  # a page repeats an unconfirmed request
+                flight.waypoints_W = (*waypoints[: WAYPOINTS_MAX - 1], waypoint)
         return self.answer(page)
 
     def has_waypoints(self, page: Any) -> bool:
@@ -338,7 +338,7 @@ class ManualFlight:
             flight = self._flights.get(page)
             if flight is None:
                 return self._last_answers.get(page, FlightAnswer())
-            if flight.owned_s is None:
+            if flight.granted_s is None:
                 silence = self._run_status().silence
                 text = f"requested {self._wall_s() - flight.started_s:.1f} s ago, not confirmed"
                 return FlightAnswer(flight.drone, "taking", f"{text}: {silence}" if silence else text, id=flight.id)
@@ -364,7 +364,7 @@ class ManualFlight:
             reason = stall or self._end_reason(flight, run, wall_s)
             if reason:
                 self.leave(page, reason)
-            elif flight.owned_s is None:
+            elif flight.granted_s is None:
                 if not flight.is_requested and not run.silence and wall_s - flight.requested_s >= REPEAT_S:
                     self._request(flight)
             elif not run.is_paused and wall_s - flight.sent_s >= period_s:
@@ -406,7 +406,7 @@ class ManualFlight:
                 if not flight.is_lost:
                     self._last_answers[page] = FlightAnswer(flight.drone, text=refusal, id=flight.id)
             else:
-                flight.owned_s = self._wall_s()
+                flight.granted_s = self._wall_s()
 
     def _end_reason(self, flight: _Flight, run: RunStatus, wall_s: float) -> str:
         drone, status = flight.drone, self._drone_status(flight.drone)
@@ -414,9 +414,9 @@ class ManualFlight:
             return "the page was silent"
         if self._client.modes_requested(drone) != flight.modes:
             return f"another mode of {drone} was requested"
-        if flight.owned_s is not None and wall_s - flight.owned_s > SETTLED_S and status.commander != self._name:
+        if flight.granted_s is not None and wall_s - flight.granted_s > SETTLED_S and status.commander != self._name:
             return f"{drone} is flown by {status.commander or 'nobody'} now"
-        refusal = run.refusal or (run.silence if flight.owned_s is not None else "")
+        refusal = run.refusal or (run.silence if flight.granted_s is not None else "")
         return refusal or _too_fast(run.rate / 2.0) or state_refusal(drone, status.state, "velocity") or ""
 
     def _velocity(self, flight: _Flight, wall_s: float) -> VelocityCommand:
@@ -453,7 +453,7 @@ class ManualFlight:
 class PageFlying:
     """Flies single drones for the pages of one run; pages are identified by viser's number.
 
-    `note` is called with each drone or formation that ends its return without landing, and the reason.
+    `on_return_over` is called with each drone or formation that ends its return without landing, and the reason.
     """
 
     def __init__(
@@ -463,7 +463,7 @@ class PageFlying:
         name: str,
         scene: RunScene,
         pages: PageForms,
-        note: Callable[[str, str], None] = lambda subject, why: None,
+        on_return_over: Callable[[str, str], None] = lambda subject, why: None,
     ) -> None:
         self._run = run = monitor.run
         self._views = views = monitor.views
@@ -481,7 +481,7 @@ class PageFlying:
         }
         self.control = ManualFlight(client, name, limits, courses, fence, gate_s, self._drone_status, self._run_status)
         self.returns = ReturnFlights(
-            run.scenario, client, self.control, self._drone_status, lambda: views.clusters, note
+            run.scenario, client, self.control, self._drone_status, lambda: views.clusters, on_return_over
         )
 
     def plan(self, client_id: int | None, complete: bool) -> dict[str, Any]:
@@ -546,13 +546,13 @@ class ReturnFlights:
         control: ManualFlight,
         status_of: Callable[[str], DroneStatus],
         clusters: Callable[[], Mapping[str, ViewCluster]],
-        note: Callable[[str, str], None] = lambda subject, why: None,
+        on_return_over: Callable[[str, str], None] = lambda subject, why: None,
     ) -> None:
         self._client = client
         self._control = control
         self._status_of = status_of
         self._clusters = clusters
-        self._note = note
+        self._on_return_over = on_return_over
         self._lock = threading.Lock()
         self.starts: dict[str, Point] = {each.name: each.position_m[:2] for each in scenario.drones}
         self.centres: dict[str, Point] = {}
@@ -567,7 +567,7 @@ class ReturnFlights:
         for drone in drones:
             answer = self._control.take(ReturningDrone(drone), drone, take_over=True)
             if answer.state == "none":
-                self._note(drone, answer.text)
+                self._on_return_over(drone, answer.text)
                 continue
             with self._lock:
                 self._drones.add(drone)
@@ -602,7 +602,7 @@ class ReturnFlights:
         key, pose = ReturningDrone(drone), self._status_of(drone).pose
         answer = self._control.steer(key, None)  # keeps the flight alive, as an open page does
         if answer.state == "none":
-            self._note(drone, f"return of {drone} is over: {answer.text or 'it was released'}")
+            self._on_return_over(drone, f"return of {drone} is over: {answer.text or 'it was released'}")
             return False
         if answer.state == "taking" or pose is None:
             return True
@@ -621,7 +621,7 @@ class ReturnFlights:
         if self._client.cluster_requests[name] != returning.requests or view is None:
             return False  # another request was made
         if view.phase != "engaged":
-            self._note(name, f"return of {name} is over: it is {view.phase}")
+            self._on_return_over(name, f"return of {name} is over: it is {view.phase}")
             return False
         desired, value = (dict(zip(view.names, c, strict=True)) for c in (view.desired, view.value))
         goal_m, distance_m = (
@@ -629,7 +629,7 @@ class ReturnFlights:
         )
         returning.nearest_m = min(returning.nearest_m, goal_m)
         if goal_m > returning.nearest_m + OVERRULED_M:
-            self._note(name, f"return of {name} is over: it was sent elsewhere")
+            self._on_return_over(name, f"return of {name} is over: it was sent elsewhere")
             return False
         if max(goal_m, distance_m) > OVER_STARTS_M:
             return True

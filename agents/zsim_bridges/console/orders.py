@@ -273,9 +273,9 @@ class CommandClient:
             self._releases.submit(self._release, drone, answered_before)
         return SUPERSEDED if is_superseded else ""
 
-    def _release(self, drone: str, before: int) -> None:
+    def _release(self, drone: str, answered_before: int) -> None:
         """Release a drone once the world has answered the mode, which needs the operator's priority until then."""
-        self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
+        self._views.await_answer(drone, answered_before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
 
@@ -291,7 +291,7 @@ def _refusal_of(act: Callable[..., str], *args: Any) -> str:
 
 @dataclass
 class _DroneTasks:
-    busy: int = 0  # number of running tasks
+    running_count: int = 0  # number of running tasks
     waiting: deque[Task] = field(default_factory=deque)
 
 
@@ -317,7 +317,7 @@ class DroneQueue:
         """Run a task after all earlier ones of that name."""
         with self._lock:
             tasks = self._tasks.get(name)
-            if tasks is not None and tasks.busy:
+            if tasks is not None and tasks.running_count:
                 tasks.waiting.append(act)
             else:
                 self._start(self._pool, name, act)
@@ -344,8 +344,8 @@ class DroneQueue:
             tasks = self._tasks.get(name)
             if tasks is None:
                 return  # closed
-            tasks.busy -= 1
-            if tasks.busy:
+            tasks.running_count -= 1
+            if tasks.running_count:
                 return
             if tasks.waiting:
                 self._start(self._pool, name, tasks.waiting.popleft())
@@ -373,7 +373,7 @@ class _Target:
     is_drone: bool
     state: OrderState = "sent"
     reason: str = ""  # why the order is refused, or not yet confirmed
-    busy: bool = False  # whether an attempt is in progress
+    is_in_progress: bool = False  # whether an attempt is in progress
     attempts: int = 0
     sent_s: float = 0.0  # when the last attempt began [s; wall]
     modes: int = 0  # number of modes requested of a drone, including this order's; a further one replaces the order
@@ -387,7 +387,7 @@ class _Order:
     subject: str
     targets: dict[str, _Target]  # by name
     given_s: float  # when the order was given [s; wall]
-    since_ns: int  # when the order was given [simulated]
+    given_ns: int  # when the order was given [simulated]
     settled_s: float | None = None  # when the order was settled [s; wall]
     confirmed_ns: int | None = None
     refusal: str = ""
@@ -459,7 +459,7 @@ class OrderBook:
             target = order.targets.get(outcome.subject) if order else None
             if order is None or target is None:
                 return True
-            target.busy = False
+            target.is_in_progress = False
             if target.state != "sent":
                 return False
             target.reason = outcome.refusal
@@ -504,10 +504,10 @@ class OrderBook:
                         continue
                     # A formation's controller answers requests: its phase counts only after one had no answer.
                     has_effect = states.get(name) in _CARRIED_OUT[order.op] and (target.is_drone or target.attempts > 1)
-                    must_wait = target.busy or silent or (paused and target.accepted)
+                    must_wait = target.is_in_progress or silent or (paused and target.accepted)
                     if ended:
                         self._settle(order, target, "refused", ended)
-                    elif t_ns > order.since_ns and has_effect:
+                    elif t_ns > order.given_ns and has_effect:
                         self._settle(order, target, "confirmed", t_ns=t_ns)
                     elif target.is_drone and self._client.modes_requested(name) > target.modes:
                         self._settle(order, target, "replaced")
@@ -561,7 +561,7 @@ class OrderBook:
 
     def _send(self, order: _Order, name: str) -> None:
         target = order.targets[name]
-        target.busy, target.sent_s, target.accepted = True, self._wall_s(), False
+        target.is_in_progress, target.sent_s, target.accepted = True, self._wall_s(), False
         target.attempts += 1
         if target.is_drone:
             self._client.send_mode([name], order.op, order=order.id)

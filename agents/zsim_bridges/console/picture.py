@@ -135,8 +135,8 @@ def shown_names(names: Sequence[str]) -> list[str]:
         return list(names)
     common = takewhile(lambda column: len(set(column)) == 1 and not column[0].isdigit(), zip(*names, strict=False))
     prefix_length = len(list(common))
-    short = [name[prefix_length:] for name in names]
-    return short if all(short) else list(names)
+    suffixes = [name[prefix_length:] for name in names]
+    return suffixes if all(suffixes) else list(names)
 
 
 def rotor_angles(angles: Array, speeds: Array, directions: Array, dt_s: float) -> Array:

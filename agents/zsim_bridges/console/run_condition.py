@@ -32,7 +32,7 @@ UPSIDE_DOWN_DEG = 90.0
 LAG_MAX_MS = 200.0  # an estimator's lag above which an alarm is raised: ten gates of 20 ms
 SIGMA_HIGH_M = 2.0  # σ of a position above which an alarm is raised: the largest distance between the paper's drones
 LINK_AGE_MAX_MS, LINK_LOSS_PERCENT = 500.0, 10.0  # alarm thresholds; PX4 leaves offboard mode after the first
-LOST = {
+LOSS_NAMES = {
     "death": "dead",
     "no_show": "missing",
     "silent": "silent",
@@ -175,7 +175,7 @@ def _largest_deviation(view: ViewCluster) -> str:
 
 def run_alarms(losses: Mapping[str, Event], active: Iterable[Fault], silent_s: float) -> list[Alarm]:
     """Return the alarms of lost processes, of active injected faults, and of a silent world."""
-    alarms = [Alarm("red", name, LOST[event.kind], event.text) for name, event in losses.items()]
+    alarms = [Alarm("red", name, LOSS_NAMES[event.kind], event.text) for name, event in losses.items()]
     if silent_s:
         alarms.append(Alarm("red", "world", "silent", f"no answer for {silent_s:.0f} s"))
     return alarms + [Alarm("amber", fault.target, fault.kind, parameters_text(fault)) for fault in active]
@@ -195,7 +195,7 @@ class Losses:
     def note(self, event: Event) -> None:
         """Process an event: a process or drone may be lost, return, or be replaced."""
         is_false_join = event.kind == "no_show" and "incarnation" in event.data  # the process of that name is present
-        if event.kind in LOST and not is_false_join:
+        if event.kind in LOSS_NAMES and not is_false_join:
             self.current = {**self.current, event.subject: event}
         elif event.kind in RETURN_KINDS:
             self._remove({event.subject, *map(str, event.data.get("serves") or ())})

@@ -91,7 +91,7 @@ class FleetForm:
         self._client = client
         self._formations = {cluster.name: cluster.drones for cluster in scenario.clusters}
         self._drones = [drone.name for drone in scenario.drones]
-        self._single = single_drones(scenario)
+        self._single_drones = single_drones(scenario)
         self._run = RunCondition()
         takeoff = gui.add_button("Take off all", icon=viser.Icon.PLANE_DEPARTURE, color="gray")
         takeoff.on_click(lambda _: self._take_off())
@@ -103,7 +103,7 @@ class FleetForm:
     def refresh(self, run: RunCondition) -> None:
         """Disable what would be refused; Reset all is visible only while a drone is in an emergency."""
         self._run = run
-        refusals = fleet_refusals(run, self._single)
+        refusals = fleet_refusals(run, self._single_drones)
         set_refusals(self._controls, refusals)
         assign(self._controls["reset"], visible=not refusals["reset"])
         self._reasons.content = refusal_lines({"takeoff": "Take off all"}, refusals)
@@ -112,9 +112,9 @@ class FleetForm:
         for name, drones in self._formations.items():
             if not preflight_refusal(self._run, drones):
                 self._client.request_cluster(name, "takeoff")
-        single = [drone for drone in self._single if not preflight_refusal(self._run, [drone])]
-        if single:
-            self._client.send_mode(single, "takeoff")
+        ready = [drone for drone in self._single_drones if not preflight_refusal(self._run, [drone])]
+        if ready:
+            self._client.send_mode(ready, "takeoff")
 
     def _reset(self) -> None:
         self._client.send_mode([d for d in self._drones if self._run.drones.get(d) == "emergency"], "reset")

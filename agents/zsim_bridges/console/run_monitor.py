@@ -76,7 +76,7 @@ class RunMonitor:
         self.time_monitor = time_monitor
         self.run = run
         self._world = world
-        self._members, self._single = run.members, run.single
+        self._members, self._single_drones = run.members, run.single
         self._ended = ""
         self._t_ns = 0
         self.condition = RunCondition(replayed=run.is_replay)
@@ -108,7 +108,7 @@ class RunMonitor:
             name: (view.phase, self._reason(name, view, drones, foreign.get(name, {})))
             for name, view in views.clusters.items()
         }
-        others = {drone: who for each in foreign.values() for drone, who in each.items()}
+        foreign_by_drone = {drone: commander for each in foreign.values() for drone, commander in each.items()}
         end_s = self.record_s[1] if self.record_s else math.inf
         self.condition = RunCondition(
             clock=clock.state if clock else None,
@@ -120,7 +120,7 @@ class RunMonitor:
             phases=phases,
             members=self._members,
             checks={
-                name: preflight_checks(drone, name not in self._single, others.get(name, ""))
+                name: preflight_checks(drone, name not in self._single_drones, foreign_by_drone.get(name, ""))
                 for name, drone in drones.items()
             },
         )
@@ -139,7 +139,7 @@ class RunMonitor:
         """Return the head of the page as plain data; called from another thread than `update`."""
         t_ns = self.views.drones.t_ns if self.views.drones else 0
         name, clock, rows = self.run.scenario.name, self.time_monitor.clock, self.board.rows(wall_s)
-        return page_head(name, self.now(), clock, t_ns, rows, self._single, self._world, self.record_s)
+        return page_head(name, self.now(), clock, t_ns, rows, self._single_drones, self._world, self.record_s)
 
     def now(self) -> RunCondition:
         """Return the condition with the present silence of the world."""
@@ -270,7 +270,7 @@ class _WatchedFault:
     """A fault, and the quantities that it may change at its target: drones, or processes named after them."""
 
     fault: Fault
-    before: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] at the target when the fault began
+    initial: tuple[float, ...] = ()  # sigma [m], lag [ms] and wind [m/s] at the target when the fault began
     worst: tuple[float, ...] = ()  # the worst of these while the fault is active
     states: dict[str, list[str]] = field(default_factory=dict)  # successive states of drones, formations and processes
     is_over: bool = False
@@ -290,34 +290,34 @@ class _WatchedFault:
         sigma_m = max((drone.sigma_m or 0.0 for drone in affected), default=0.0)
         lag_ms = max((drone.lag_ms or 0.0 for drone in affected), default=0.0)
         now = (sigma_m, lag_ms, wind_m_s if self.fault.kind == "gust" else 0.0)
-        self.before = self.before or now
+        self.initial = self.initial or now
         if not self.is_over:
             self.worst = tuple(map(max, self.worst or now, now))
         states = {drone.name: drone.state for drone in affected}
         states |= phases if is_world or len(phases) == 1 else {name: phases[name] for name in names & set(phases)}
         states |= {part: PROCESS_STATES[part in lost] for part in parts if "." in part}
         for name, state in states.items():
-            seen = self.states.setdefault(name, [state])
-            is_killed = state in PROCESS_STATES and len(seen) < RESTART_STATE_COUNT
-            if seen[-1] != state and (not self.is_over or is_killed):
-                seen.append(state)
+            history = self.states.setdefault(name, [state])
+            is_killed = state in PROCESS_STATES and len(history) < RESTART_STATE_COUNT
+            if history[-1] != state and (not self.is_over or is_killed):
+                history.append(state)
 
     def line(self) -> str:
-        fault, worst = self.fault, self.worst or self.before
+        fault, worst = self.fault, self.worst or self.initial
         until = "" if fault.until_ns is None else f" to {fault.until_ns / 1e9:.1f} s"
         label = " ".join(
             filter(None, (f"#{fault.id} {fault.kind} of {fault.target}", run_condition.parameters_text(fault)))
         )
         effects = []
-        if worst[0] > SIGMA_GROWN * self.before[0] > 0.0:
-            effects.append(f"σ {self.before[0]:.2f} → {worst[0]:.2f} m")
-        if worst[1] > self.before[1] + LAG_GROWN_MS:
-            effects.append(f"lag {self.before[1]:.0f} → {worst[1]:.0f} ms")
-        if worst[2] > self.before[2] + WIND_GROWN_M_S:
-            effects.append(f"wind {self.before[2]:.1f} → {worst[2]:.1f} m/s")
-        for name, seen in self.states.items():
-            if len(seen) > 1 or seen == ["dead"]:
-                effects.append(f"{name} {' → '.join(each.replace('_', ' ') for each in seen[-4:])}")
+        if worst[0] > SIGMA_GROWN * self.initial[0] > 0.0:
+            effects.append(f"σ {self.initial[0]:.2f} → {worst[0]:.2f} m")
+        if worst[1] > self.initial[1] + LAG_GROWN_MS:
+            effects.append(f"lag {self.initial[1]:.0f} → {worst[1]:.0f} ms")
+        if worst[2] > self.initial[2] + WIND_GROWN_M_S:
+            effects.append(f"wind {self.initial[2]:.1f} → {worst[2]:.1f} m/s")
+        for name, history in self.states.items():
+            if len(history) > 1 or history == ["dead"]:
+                effects.append(f"{name} {' → '.join(each.replace('_', ' ') for each in history[-4:])}")
         return f"{label}, {fault.from_ns / 1e9:.1f} s{until}: {', '.join(effects) or 'no effect seen'}"
 
 
@@ -383,15 +383,15 @@ class TimeMonitor:
     @contextmanager
     def polling(self) -> Iterator[None]:
         """Poll the clock while the context is open."""
-        over = threading.Event()
+        stopped = threading.Event()
 
         def poll() -> None:
-            while not over.is_set():
+            while not stopped.is_set():
                 self.poll()
-                over.wait(POLL_S)
+                stopped.wait(POLL_S)
 
         def beat() -> None:
-            while not over.wait(BEAT_S):
+            while not stopped.wait(BEAT_S):
                 self._awake.beat()
 
         tasks = {"watch": poll, "heartbeat": beat}
@@ -404,7 +404,7 @@ class TimeMonitor:
             yield
         finally:
             self._is_polling = False
-            over.set()
+            stopped.set()
             for thread in threads:
                 thread.join(ANSWER_TIMEOUT_S)
 
@@ -531,8 +531,8 @@ class RecordPlayer:
                     self._is_reading = False
                     return
                 self._pieces_read.add(piece)
-            begin_s = self.timeline["from_s"] + piece * PIECE_S
-            end_s = min(begin_s + PIECE_S - self._every_s / 2.0, self.timeline["to_s"])
-            instants = self._client.past_views(begin_s, end_s, self._every_s)
+            piece_start_s = self.timeline["from_s"] + piece * PIECE_S
+            end_s = min(piece_start_s + PIECE_S - self._every_s / 2.0, self.timeline["to_s"])
+            instants = self._client.past_views(piece_start_s, end_s, self._every_s)
             if instants:
                 self._arrived.append(instants)

@@ -19,7 +19,7 @@ from zsim.contract.run_messages import INCIDENTS, Event, Fault, Health
 from zsim.errors import DecodeError
 from zsim.runtime.participant import Participant
 from zsim.transport.session import RawSample, Session
-from zsim_bridges.console.run_condition import LOST, RETURN_KINDS, DroneCondition, Losses
+from zsim_bridges.console.run_condition import LOSS_NAMES, RETURN_KINDS, DroneCondition, Losses
 
 FRESH_S = 1.0  # simulated or wall; views arrive 20 times a wall second: an older one shows a dead or stuck estimator
 FAULTS_KEPT = 8  # number of most recently begun faults that are kept
@@ -33,7 +33,7 @@ KINDS: dict[str, frozenset[str]] = {
     "refused": frozenset({"refused"}),
     "faults": frozenset({"fault", "fault_end", "fault_clear", "collision", "diverged", *INCIDENTS}),
     "flight": frozenset({"mode", "state", "commander", "release", "collision", "landing", "mission", *INCIDENTS}),
-    "processes": frozenset({*LOST, *RETURN_KINDS, "drop"} - {"diverged"}),
+    "processes": frozenset({*LOSS_NAMES, *RETURN_KINDS, "drop"} - {"diverged"}),
 }
 """Filters, and the kinds of events that they pass; empty: all kinds."""
 _NUMBER = re.compile(r"\d[\d.e+-]*")

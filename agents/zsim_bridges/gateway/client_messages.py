@@ -159,11 +159,11 @@ class MessageDefaults:
     @contextmanager
     def transaction(self) -> Iterator[None]:
         """Roll back the sequence numbers if an error leaves this context, so that refused messages cause no gaps."""
-        before = self._next_seq.copy()
+        saved = self._next_seq.copy()
         try:
             yield
         except BaseException:
-            self._next_seq = before
+            self._next_seq = saved
             raise
 
 

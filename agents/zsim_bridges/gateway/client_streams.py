@@ -58,7 +58,7 @@ class Outbox:
         self._bytes = 0
         self._bytes_max = bytes_max
         self._filled = asyncio.Event()
-        self._lost = 0
+        self._lost_count = 0
         self._closed = False
 
     def put(self, line: bytes, droppable: bool = False) -> None:
@@ -70,7 +70,7 @@ class Outbox:
         while self._bytes > self._bytes_max and len(self._lines) > 1:
             oldest, was_droppable = self._lines.popleft()
             self._bytes -= len(oldest)
-            self._lost += 1
+            self._lost_count += 1
             if not was_droppable:
                 self._closed = True
                 self._abort()
@@ -86,9 +86,9 @@ class Outbox:
         while not self._lines and not self._closed:
             await self._filled.wait()
             self._filled.clear()
-        lines = [self._lost_line(self._lost)] if self._lost else []
+        lines = [self._lost_line(self._lost_count)] if self._lost_count else []
         lines += [line for line, _ in self._lines]
-        self._lost = 0
+        self._lost_count = 0
         self._lines.clear()
         self._bytes = 0
         return lines
@@ -131,8 +131,8 @@ async def run_duplex(
         await asyncio.gather(reader, sender, return_exceptions=True)
 
 
-def _lost_line(lost: int) -> bytes:
-    return msgspec.json.encode({"op": "lost", "lines": lost}) + b"\n"
+def _lost_line(count: int) -> bytes:
+    return msgspec.json.encode({"op": "lost", "lines": count}) + b"\n"
 
 
 # Lines on TCP
@@ -229,8 +229,8 @@ async def stream_events(
 
     For errors see `SharedSubscriptions.subscribe_stream`.
     """
-    lost = b": %d events were lost, since they came faster than they were read\n\n"
-    outbox = Outbox(_abort_of(request), lambda count: lost % count)
+    comment = b": %d events were lost, since they came faster than they were read\n\n"
+    outbox = Outbox(_abort_of(request), lambda count: comment % count)
 
     def put(sample: RawSample) -> None:
         if event := event_of(sample):

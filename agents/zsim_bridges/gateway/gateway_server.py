@@ -207,7 +207,7 @@ class Gateway:
     def _begin(self, run: RunAccess) -> None:
         self._run, self._link_lost = run, False
         self.subscriptions.attach(run.link)
-        self._full_key_subscriptions.attach(run.bare_link)
+        self._full_key_subscriptions.attach(run.unprefixed_link)
         self._picture_subscriptions.attach(run.link)
         self._pictures.clear_pictures()
         self._notify_clients("begun", run)

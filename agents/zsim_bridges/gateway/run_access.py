@@ -79,7 +79,7 @@ class RunAccess:
         self.info = info
         self.values = LastValues(run_key_table(info))
         self.defaults = MessageDefaults(observer.name)
-        self.bare_link = link.unprefixed()
+        self.unprefixed_link = link.unprefixed()
         self._observer = observer
         self._prefix = f"{link.federation}/"
         self._threads = ThreadPoolExecutor(REQUESTS_MAX, thread_name_prefix="ask")
@@ -225,13 +225,13 @@ class RunAccess:
 
     async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[RawSample]:
         """Return the answers to a Zenoh get on a full expression; for errors see `request`."""
-        return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
+        return await self._in_thread(self.unprefixed_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload on a full key; raise a DecodeError if it is not a message of the key."""
         local_key = self._local_key(key)
         if local_key is None:
-            self.bare_link.put_sample(key, payload, encoding)
+            self.unprefixed_link.put_sample(key, payload, encoding)
             return
         if messages.type_of(local_key) is not None:
             messages.decode(local_key, payload)
@@ -240,7 +240,7 @@ class RunAccess:
     def delete_full_key(self, key: str) -> None:
         """Publish that a full key no longer has a value."""
         local_key = self._local_key(key)
-        self.bare_link.delete(key)
+        self.unprefixed_link.delete(key)
         if local_key is not None:
             self.values.drop(local_key)
 
@@ -381,8 +381,8 @@ class LastValues:
         if "*" not in expression:
             matching = [expression.removeprefix(prefix)] if expression.startswith(prefix) else []
         else:
-            known = {*self._payloads, *(self._table[index] for index in list(self._gate_entries))}  # a copy
-            matching = sorted(key for key in known if keys.matches(expression, prefix + key))
+            known_keys = {*self._payloads, *(self._table[index] for index in list(self._gate_entries))}  # a copy
+            matching = sorted(key for key in known_keys if keys.matches(expression, prefix + key))
         return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 
     def _payload(self, key: str) -> bytes | None:

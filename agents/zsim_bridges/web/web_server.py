@@ -239,10 +239,10 @@ class HttpConnections:
         if not connection.is_known:
             connection.timer = asyncio.get_running_loop().call_later(self._request_s, connection.abort)
         if connection.has_more:
-            self.begin(connection)
+            self.start_timer(connection)
         connection.is_complete = connection.has_more = False
 
-    def begin(self, connection: "HttpConnection") -> None:
+    def start_timer(self, connection: "HttpConnection") -> None:
         """Start the time limit of a request when its first bytes arrive on a waiting connection."""
         if connection.since_s is not None or not (connection in self._idle or connection in self._strangers):
             return
@@ -294,7 +294,7 @@ class HttpConnection(asyncio.Protocol):
         if self._transport is None:
             return
         self.has_more = self.has_more or self.is_complete
-        self._connections.begin(self)
+        self._connections.start_timer(self)
         self._http.data_received(data)
 
     def eof_received(self) -> bool | None:

@@ -267,9 +267,9 @@ class _Hunt:
                         verdict = "violated"
                         smallest_case = violating.case
                         violation = self._violation(violating, smallest_case, [])
-                        for smallest_case in self._shrunk(violating):
+                        for smallest_case in self._shrink(violating):
                             violation = self._violation(violating, smallest_case, [])
-                        violation = self._timed(RECORD, partial(self._recorded, violating, smallest_case))
+                        violation = self._timed(RECORD, partial(self._record_violation, violating, smallest_case))
                     self._done = True
             except KeyboardInterrupt:
                 interrupted, verdict = True, verdict if violation else "interrupted"

@@ -138,11 +138,11 @@ class Requirement:
         if isinstance(node, ast.UnaryOp):
             return ~self._margin(node.operand, quantities)
         if isinstance(node, ast.Compare):
-            sides = [self._figure(each, quantities) for each in (node.left, *node.comparators)]
+            sides = [self._quantity(each, quantities) for each in (node.left, *node.comparators)]
             pairs = zip(node.ops, sides, sides[1:], strict=False)
             parts = [self._compared(_COMPARES[type(op)], *two) for op, *two in pairs]
             return min(parts, key=lambda part: (part.holds, part.share))
-        value = self._figure(node, quantities)
+        value = self._quantity(node, quantities)
         if isinstance(value, Unknown):
             return Margin(False, BROKEN, None, value.name)
         if not isinstance(value, bool):
@@ -173,7 +173,7 @@ class Requirement:
                 raise self._fault(self._unknown(path, quantities))
             value = quantities[path]
             return Unknown(path) if value is None else value
-        values = [self._figure(each, quantities) for each in _operands(node)]
+        values = [self._quantity(each, quantities) for each in _operands(node)]
         if lacking := next((each for each in values if isinstance(each, Unknown)), None):
             return lacking
         if text := next((each for each in values if isinstance(each, str)), None):

@@ -1,4 +1,4 @@
-"""`zsim.sweep`: the frame of runs, and classes and functions of a script in workers that do not execute it."""
+"""`zsim.sweep`: the data frame of runs, and classes and functions of a script in workers that do not execute it."""
 
 import os
 import re
@@ -329,7 +329,7 @@ def test_a_notebook_cell_shows_progress_in_one_updated_line(tmp_path: Path, monk
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
     pytest.importorskip("ipykernel")
     write(tmp_path, pair_yaml=PAIR)
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # the kernel is killed in the end and leaves temporary files
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # the kernel is killed at the end and leaves temporary files
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(CELL)])
     options = {"resources": {"metadata": {"path": str(tmp_path)}}, "kernel_name": "python3"}
     nbclient.NotebookClient(notebook, timeout=300, **options).execute()
@@ -349,14 +349,14 @@ def test_an_interrupted_cell_ends_its_workers_and_keeps_its_folder(tmp_path: Pat
     write(tmp_path, one_yaml=ONE)
     manager, client = jupyter.manager.start_new_kernel(kernel_name="python3", cwd=str(tmp_path))
     try:
-        sent = client.execute(f"OUT = None\n{WAITING}", stop_on_error=False)  # otherwise it aborts the next request
+        sent = client.execute(f"OUT = None\n{WAITING}", stop_on_error=False)  # else its error aborts the next request
         while not (tmp_path / "flying").exists():
             time.sleep(0.05)
         kernel = psutil.Process(manager.provisioner.process.pid)
         workers = [each for each in kernel.children(recursive=True) if "spawn_main" in " ".join(each.cmdline())]
         assert len(workers) == 1
         manager.interrupt_kernel()
-        replies = iter(lambda: client.get_shell_msg(timeout=PATIENCE_S), None)  # replies to its start come first
+        replies = iter(lambda: client.get_shell_msg(timeout=PATIENCE_S), None)  # start-up replies come first
         reply = next(each for each in replies if each["parent_header"]["msg_id"] == sent)
         assert reply["content"]["ename"] == "KeyboardInterrupt"
         shown = iter(lambda: client.get_iopub_msg(timeout=PATIENCE_S)["content"], None)

@@ -56,7 +56,7 @@ def flies(*overrides: str, scenario: str) -> bool:
 
 
 @pytest.mark.parametrize("scenario", ["step", "trajectory"])
-def test_figures_are_the_paper_s_for_both_tests_and_any_window(scenario: str) -> None:
+def test_figures_get_the_paper_s_numbers_for_both_tests_and_any_window(scenario: str) -> None:
     assert flies(scenario=scenario)
     assert flies("report.window_s=[20, 30]", "name=mine", scenario=scenario)
     for other in ("environment.wind.gust_m_s=2", "sensors.preset=ardrone2", "drones.drone1.mass_kg=0.6"):
@@ -72,7 +72,7 @@ def test_test_2_is_recognised_by_equation_4_in_any_notation() -> None:
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[RecordedFlight, Formation]:
-    """Return a flight recorded as Test 1, and a formation that is engaged within its window."""
+    """Return a flight recorded as Test 1, and a formation that is engaged throughout the report's window."""
     flight = synthetic_record.flight(synthetic_record.traffic(Flown(duration_s=1.0)))
     (formation,) = formations_of(flight)
     return flight, replace(formation, t_s=np.linspace(*WINDOW_S, len(formation.t_s)))

@@ -61,7 +61,7 @@ def test_peers_are_names_or_addresses():
         peer_addresses(["no.such.host.invalid"])
 
 
-def test_loopback_allows_this_host_and_other_addresses_only_peers():
+def test_a_loopback_address_allows_this_host_and_any_other_allows_only_peers():
     assert HERE.allow(HOME)
     assert ELSEWHERE.allow("192.0.2.9")
     assert not ELSEWHERE.allow("192.0.2.10")
@@ -181,8 +181,8 @@ def test_pictures_are_subscribed_to_if_encodable_else_the_extra_is_named(
     assert server.observer.health.refused == 0
 
 
-def test_reasons_that_differ_in_numbers_are_printed_once_and_counted():
-    """A flood of datagrams may have all lengths; each drone and each sending host gets its own line."""
+def test_reasons_that_differ_only_in_numbers_are_printed_once_and_counted():
+    """A flood may contain datagrams of all lengths; each drone and each sending host gets its own line."""
     server, lines = offered()
     for size in range(40):
         for drone in ("drone1", "drone2"):

@@ -17,7 +17,7 @@ OPTIONS = tuple(tag for tag in LAYOUTS if tag != navdata.CHECKSUM_TAG)
 
 
 def counted(tag: int):
-    """Return an option with mostly different numbers, each of which fits a byte."""
+    """Return an option with mostly different numbers, each of which fits in a byte."""
     layout = LAYOUTS[tag]
     return layout.option(tuple((7 * tag + k) % 100 for k in range(len(layout.codec.unpack(bytes(layout.codec.size))))))
 
@@ -88,7 +88,7 @@ def test_an_invalid_packet_is_refused_with_a_reason(datagram: bytes, reason: str
         navdata.unpack(datagram)
 
 
-def test_corrupt_packets_raise_no_other_error():
+def test_corrupt_packets_raise_no_error_but_navdata_error():
     chance = random.Random(2)
     good = NavdataTemplate(FULL_TAGS).packet(0, 1, 0)
     refused = 0

@@ -366,9 +366,9 @@ def test_the_geofence_surrounds_all_starts_and_confines_drones():
     assert has_terms(FENCE.refusal(50.1, 0.0), "x", "50.1", "-50", "50")
     assert has_terms(FENCE.refusal(0.0, -60.0), "y", "-60.0", "-50", "50")
 
-    assert FENCE.within((2.0, -2.0, 1.0), (49.5, 0.0, 30.0)) == (0.5, -2.0, 0.0)
-    assert FENCE.within((2.0, 0.0, -1.0), (60.0, 0.0, 0.5)) == (0.0, 0.0, 0.0)
-    assert FENCE.within((-2.0, 0.0, 1.0), (60.0, 0.0, 0.5)) == (-2.0, 0.0, 1.0)
+    assert FENCE.limit_velocity((2.0, -2.0, 1.0), (49.5, 0.0, 30.0)) == (0.5, -2.0, 0.0)
+    assert FENCE.limit_velocity((2.0, 0.0, -1.0), (60.0, 0.0, 0.5)) == (0.0, 0.0, 0.0)
+    assert FENCE.limit_velocity((-2.0, 0.0, 1.0), (60.0, 0.0, 0.5)) == (-2.0, 0.0, 1.0)
 
 
 @given(deflections, deflections, deflections, deflections, st.floats(0.0, 100.0), st.floats(-4.0, 4.0))

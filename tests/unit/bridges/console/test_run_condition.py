@@ -83,7 +83,7 @@ def test_an_acknowledged_alarm_that_becomes_red_is_new(board: AlarmBoard):
 # Lost processes
 
 
-@pytest.mark.parametrize("kind", sorted(run_condition.LOST))
+@pytest.mark.parametrize("kind", sorted(run_condition.LOSS_NAMES))
 @pytest.mark.parametrize("back", sorted(run_condition.RETURN_KINDS))
 def test_a_lost_process_remains_lost_until_it_returns(kind: str, back: str, losses: Losses):
     losses.note(event(kind, "detector.main", host="lab", pid=7))

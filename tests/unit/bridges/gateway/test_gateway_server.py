@@ -93,7 +93,7 @@ def test_a_link_lost_before_it_is_observed_is_reported(gateway: Gateway, log: St
 
 
 def a_run(run_id: str, link: Any = None) -> Any:
-    return SimpleNamespace(link=link, bare_link=None, info=SimpleNamespace(run_id=run_id))
+    return SimpleNamespace(link=link, unprefixed_link=None, info=SimpleNamespace(run_id=run_id))
 
 
 def never(_: str) -> Any:

@@ -112,7 +112,7 @@ def test_the_clock_topic_carries_simulated_time():
     assert (message.clock.sec, message.clock.nanosec) == (61, 40_000_000)
 
 
-def test_values_beyond_the_fields_of_ros_are_refused_and_reported_once():
+def test_values_out_of_range_for_ros_fields_are_refused_and_reported_once():
     bench = Bench()
     navdata = Subscriber(bench.node, "/quad_1/ardrone/navdata")
     bench.bridge.forward(keys.status("quad-1"), b"garbage")
@@ -189,7 +189,7 @@ def picture_subscribers(drone: Drone) -> dict[str, Subscriber]:
     return {topic: drone.subscriber(topic) for topic in [*topics, ACTIVE.format(IMAGE), ACTIVE.format(INFO)]}
 
 
-def test_a_picture_is_published_on_its_own_and_on_the_active_topic() -> None:
+def test_a_picture_is_published_on_its_camera_s_and_on_the_active_topic() -> None:
     drone = Drone()
     subscribers = picture_subscribers(drone)
     drone.topics.cameras.publish("front", image(GATE_NS))
@@ -248,7 +248,7 @@ def test_the_cameras_are_in_the_frame_tree() -> None:
         ("/quad_1/ardrone/imu", []),
     ],
 )
-def test_a_camera_is_read_only_while_subscribed(topic: str, wanted: list[str]) -> None:
+def test_a_camera_is_read_only_while_one_of_its_topics_is_subscribed_to(topic: str, wanted: list[str]) -> None:
     bench = Bench()
     assert bench.bridge.watched_cameras() == []
     Subscriber(bench.node, topic)

@@ -130,5 +130,5 @@ def test_the_origin_of_odometry_follows_from_an_estimate_of_the_same_gate():
         own.update(flow(float(gate), x=1.0, y=0.0))
         own.update(status(gate * S))
     assert own.origin_m is None
-    own.update(estimate(2 * S, (12.0, 5.0, 1.0)))  # for two gates ago, when the aircraft had moved 2 m
+    own.update(estimate(2 * S, (12.0, 5.0, 1.0)))  # of two gates ago, when the aircraft had moved 2 m
     assert own.origin_m == pytest.approx((10.0, 5.0, 1.0))

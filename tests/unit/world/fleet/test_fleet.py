@@ -1,6 +1,7 @@
 """The fleet: samples and their times, refusals, reproducible bits, contacts, and vehicles defined by parameters alone.
 
-Six-rotor vehicles are compiled for these tests only, which takes longer than all others here: they run in the soak.
+The tests of six-rotor vehicles are soak tests: they alone need code for six rotors, whose compilation takes longer than
+all other tests in this file.
 """
 
 import hashlib
@@ -136,7 +137,7 @@ def test_the_sigma_that_a_gps_reports_is_that_of_its_errors():
 
 
 @pytest.mark.parametrize("rate_hz", [0.01, 0.0137, 999.9])
-def test_rates_from_the_lowest_to_the_highest_are_kept(rate_hz):
+def test_rates_from_the_lowest_to_the_highest_are_met(rate_hz):
     sensors = fleet_sensors(scenario(1, sensors={"baro": {"rate_hz": rate_hz}}))
     numerator, denominator = schedule(sensors, 2.5)[0, 3, :2]
     assert denominator / numerator / 0.0025 == pytest.approx(rate_hz, rel=5e-4)
@@ -177,7 +178,7 @@ def test_the_length_of_a_gate_does_not_change_the_physics():
 
 
 def test_more_drones_or_samples_change_no_other_random_stream():
-    """Far apart, only random streams could couple the drones; eleven fill a block of eight and part of another."""
+    """Drones far apart could be coupled only by random streams; eleven fill a block of eight and part of another."""
     apart: Any = {"spacing": 200.0}
     alone, many = Fleet(scenario(1, **apart)), Fleet(scenario(11, **apart))
     alone.takeoff(0)
@@ -210,7 +211,7 @@ def test_other_physics_steps_give_nearly_the_same_flight(dt_ms):
 # Commands and reports
 
 
-def test_refusals_give_the_drone_its_state_and_the_required_states():
+def test_refusals_name_the_drone_its_state_and_the_required_states():
     fleet = Fleet(scenario())
     for refusal in (
         fleet.set_velocity(0, (1, 0, 0)),

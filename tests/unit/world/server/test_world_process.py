@@ -1,4 +1,4 @@
-"""The world process: messages from strangers, lost outputs, a diverged state, the end of a run and delayed gates."""
+"""The world process: received messages, lost outputs, a diverged state, the end of a run and delayed gates."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -46,12 +46,12 @@ def events(link: FakeLink, kind: str) -> list[Event]:
     return [event for event in link.published_on(keys.EVENT) if event.kind == kind]
 
 
-# Messages from strangers
+# Received messages
 
 
 @pytest.mark.parametrize("key", [ESTIMATE, STATE, VELOCITY, keys.process(ME, "done"), keys.process(ME, "health")])
 @pytest.mark.parametrize("payload", [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000], ids=["utf8", "nested", "no", "deep"])
-def test_no_payload_ends_the_run(key: str, payload: bytes):
+def test_an_invalid_payload_does_not_end_the_run(key: str, payload: bytes):
     made, link = world(), FakeLink()
     link.deliver(key, payload)
     assert run(made, link).health.refused == 1
@@ -88,7 +88,7 @@ def test_a_request_with_an_invalid_source_is_refused():
     assert made.control(ControlRequest("stop", {}, "")).ok
 
 
-def test_states_and_healths_are_shown_with_their_cluster_or_process():
+def test_states_and_health_messages_are_shown_with_their_cluster_or_process():
     made, link, shown = world(), FakeLink(), []
     health = Health(0, 0, "estimator", "h", 1, {}, 0, 0, 0, 0, received=7)
     link.deliver(STATE, state(0))
@@ -126,7 +126,7 @@ def test_camera_info_is_kept_and_passed_on_but_pictures_are_not():
         (FRONT_INFO, image(0)),
         (DETECTIONS, info()),
         (FRONT_INFO, info(10**12)),
-        (keys.sensor("d1", keys.SIGHTINGS), sightings(0)),  # a key of the world's own
+        (keys.sensor("d1", keys.SIGHTINGS), sightings(0)),  # a key on which only the world publishes
     ],
 )
 def test_an_invalid_camera_message_is_refused_and_changes_nothing(key: str, message: Message):
@@ -139,7 +139,7 @@ def test_an_invalid_camera_message_is_refused_and_changes_nothing(key: str, mess
 
 
 def test_replayed_pictures_are_published_only_on_their_own_key():
-    """A recorder reads pictures on their keys; in batches as well, they would be recorded twice."""
+    """A recorder reads pictures on their keys; if batches contained them as well, they would be recorded twice."""
     made, link = world(), FakeLink()
     made.outbox.put(FRONT, msgspec.Raw(messages.encode(image(0))))
     made.outbox.put(FRONT_INFO, msgspec.Raw(messages.encode(info())))
@@ -217,7 +217,7 @@ def test_every_lost_output_is_recovered_and_nothing_is_duplicated():
 
 @pytest.mark.parametrize(("incarnation", "missing"), [(1, [1]), (2, [])])
 def test_a_participant_that_just_rejoined_is_queried_until_it_answers(incarnation: int, missing: list[int]):
-    """Behind a new router it cannot be reached at once; from any other participant, silence is an answer."""
+    """Behind a new router, it may not be reachable at once; the outputs of any other silent participant are missing."""
     link = Lossy({(ESTIMATE, 2)}, incarnation=incarnation)
     silent = iter(range(3))
     link.on_request = lambda key, args: link._outputs(key, args) if next(silent, None) is None else UNANSWERED
@@ -298,7 +298,7 @@ def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(("action", "waits"), [("restart", True), ("wait", True), ("end", False), ("drop", False)])
 def test_the_end_waits_for_a_dead_recorder_only_if_it_may_return(action: str, waits: bool):
-    """It has the last gates to write; others have nothing left to do."""
+    """A recorder still has to write the last gates; other processes have nothing left to do."""
     made = small_world(processes={"on_death": {"recorder": action}})
     join = Join(0, 0, "run1", 1, "recorder", "here", 1, 0, slack_ns=GATE_NS)
     made.handle(keys.process("recorder", "join"), join, 0)
@@ -355,10 +355,10 @@ def advance(world: Lagging, pipelining: Pipelining, wall_ns: int = 0) -> int:
     return gates
 
 
-def test_after_a_wait_the_world_resumes_once_the_agent_nearly_caught_up() -> None:
+def test_after_a_wait_the_world_resumes_once_the_agent_has_nearly_caught_up() -> None:
     world = Lagging()
     pipelining = pipelining_of(world)
-    assert advance(world, pipelining) == 6  # the first five gates need no answer
+    assert advance(world, pipelining) == 6  # the first gate and the five of the delay need no answer
     gates = []
     for _ in range(12):
         world.done += 1

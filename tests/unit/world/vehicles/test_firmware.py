@@ -48,7 +48,7 @@ def states(flight):
 
 
 def airborne(*args, climb_to=None, **kwargs):
-    """Return a fleet that hovers at 1 m, or that has climbed higher."""
+    """Return a fleet that hovers at 1 m, or has climbed to about `climb_to` [m]."""
     flight = fleet(*args, **kwargs)
     for i in range(flight.count):
         assert flight.takeoff(i) is None
@@ -159,7 +159,7 @@ def test_yaw_rates_and_world_frame_velocities_are_followed():
     np.testing.assert_allclose(track[-1].velocity_m_s[0], (1.0, 0.5, 0.0), atol=0.12)
 
 
-def test_the_velocity_limits_are_kept():
+def test_the_velocity_limits_are_respected():
     flight = airborne(limits={"horizontal_speed_m_s": 1.0, "vertical_speed_m_s": 0.3, "yaw_rate_deg_s": 30.0})
     end = run(flight, 6.0, every(flight, (9.0, 9.0, 9.0), 9.0))[-1]
     assert np.hypot(*end.velocity_m_s[0, :2]) == pytest.approx(1.0, abs=0.15)
@@ -167,14 +167,14 @@ def test_the_velocity_limits_are_kept():
     assert end.angular_velocity_rad_s[0, 2] == pytest.approx(math.radians(30.0), abs=0.03)
 
 
-def test_the_altitude_limit_is_kept():
+def test_the_altitude_limit_is_respected():
     flight = airborne(limits={"altitude_m": 3.0})
     track = run(flight, 8.0, every(flight, (0.0, 0.0, 1.0)))
     assert max(truth.position_m[0, 2] for truth in track) < 3.3
     assert track[-1].position_m[0, 2] == pytest.approx(3.0, abs=0.3)
 
 
-def test_the_tilt_limit_is_kept_under_an_aggressive_command():
+def test_the_tilt_limit_is_respected_under_an_aggressive_command():
     flight = airborne(gust=0.0, climb_to=8.0, limits={"tilt_deg": 10.0})
     track = run(flight, 3.0, every(flight, (5.0, 0.0, 0.0)))
     q = np.array([truth.orientation_wxyz[0] for truth in track])
@@ -182,7 +182,7 @@ def test_the_tilt_limit_is_kept_under_an_aggressive_command():
     assert math.radians(8.0) < tilt.max() < math.radians(12.5)
 
 
-def test_ardrone_commands_are_tilts():
+def test_ardrone_commands_set_tilts_climb_rate_and_yaw_rate():
     flight = airborne(gust=0.0, climb_to=8.0)
     track = run(flight, 1.5, lambda: flight.set_ardrone(0, 0.5, 0.0, 0.0, 0.0, False))
     q = track[-1].orientation_wxyz[0]
@@ -311,7 +311,7 @@ LOSSY = {"preset": "paper", "imu": {"dropout": 0.05}, "flow": {"dropout": 0.3}, 
     ],
     ids=["heavy", "light", "a turned and shifted board", "lost samples"],
 )
-def test_other_aircraft_boards_and_lossy_sensors_fly_too(sensors, aircraft, velocity, atol):
+def test_the_firmware_flies_other_aircraft_turned_boards_and_lossy_sensors(sensors, aircraft, velocity, atol):
     flight = airborne(2, sensors, **aircraft)
     track = run(flight, 6.0, every(flight, velocity))
     assert states(flight) == ["flying"] * 2
@@ -348,7 +348,7 @@ STEP_TICKS = 2  # physics ticks of 2.5 ms
 
 
 def flying():
-    """Return airborne drones of two kinds with setpoints of every kind; one stands on the ground."""
+    """Return a fleet of two kinds of drones: one is on the ground, the others fly with setpoints of every kind."""
     heavy: Any = {"mass_kg": 0.6, "arm_m": 0.25, "thrust_n_s2": 1.2e-5, "rotor_time_constant_s": 0.05}
     mount: Any = {"imu": {"mount": {"rpy_deg": [5.0, -3.0, 170.0]}}}
     drones = [
@@ -375,12 +375,12 @@ def flying():
 
 
 def lane(table, i, at, count):
-    """Return the values in these columns of drone i."""
+    """Return `count` values of drone i, from column `at` on."""
     return tuple(table[i // LANES].reshape(-1, LANES)[at : at + count, i % LANES].tolist())
 
 
 def rotors_of(table, i, group, count):
-    """Return per-rotor groups of values of drone i."""
+    """Return `count` per-rotor groups of values of drone i, from `group` on."""
     return PerRotor(np.array(lane(table, i, BOARD_LANES.size + 4 * group, 4 * count)), 0, 1, (0, 1, 2, 3))
 
 

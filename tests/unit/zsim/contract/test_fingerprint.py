@@ -36,7 +36,9 @@ def test_the_fingerprint_is_the_same_in_a_process_on_another_processor():
     assert re.fullmatch(r"[0-9a-f]{16}", found)
 
 
-def test_the_fingerprint_depends_on_text_but_not_line_ends_or_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_fingerprint_depends_on_text_but_not_line_endings_or_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     def code(folder: str, text: bytes) -> str:
         place = tmp_path / folder
         place.mkdir(exist_ok=True)

@@ -91,7 +91,7 @@ def _event_end() -> Struct:
 
 
 class Notes(Agent):
-    """Base of the agents in this file: notes what it receives."""
+    """Base of the fake agents: notes what it receives."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -240,7 +240,7 @@ def test_waiting_for_an_absent_process_is_an_error_not_an_endless_loop():
         bus.turn()
 
 
-# Agents of a user's own
+# A user's own agents
 
 
 class Chatter(Agent):
@@ -270,7 +270,7 @@ class Chatter(Agent):
 
 
 class AheadHub(Hub):
-    """A world with a command delay: it runs that many gates ahead of the dones."""
+    """A world with a command delay of `delay` gates, by which it runs ahead of the dones."""
 
     delay = 1
 
@@ -354,7 +354,7 @@ def test_numpy_values_reach_the_world_as_plain_floats():
         (lambda t_ns: 1 / (t_ns - t_ns), ("Chatter", "ZeroDivisionError", "test_bus.py:")),
     ],
 )
-def test_an_invalid_output_ends_its_agent_with_the_reason(returns: Any, terms: tuple[str, ...]):
+def test_an_invalid_output_or_an_error_ends_the_agent_with_the_reason(returns: Any, terms: tuple[str, ...]):
     hub, _, line = failed(lambda t_ns: velocity(t_ns) if t_ns < 2 * GATE_NS else returns(t_ns))
     assert line.startswith("talk.a at 0.04 s: ")
     assert all(term in line for term in terms), line
