@@ -37,7 +37,8 @@ from zsim_world.run.coordinator import FLIGHT_REQUESTS
 from zsim_world.run.world import World
 
 Say = Callable[[str], None]
-COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # fields hashed in truth_sha256
+# fields hashed in truth_sha256
+COMPARED_FIELDS = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")
 
 
 class RerunResult(NamedTuple):
@@ -163,8 +164,8 @@ def _judge(reader: RecordReader, recorded: str | None, result: RerunResult, say:
         say(f"truth_sha256 is the same: {result.sha256}")
         return ""
     condition = "is damaged" if reader.damaged else "does not hold the whole run" if reader.complete else "was cut"
-    lacks = f"{recorded} cannot be verified" if recorded else "has no truth_sha256"
-    reason = f"{until}, as it {condition}" if until else f"the record {condition} and {lacks}"
+    missing_hash = f"{recorded} cannot be verified" if recorded else "has no truth_sha256"
+    reason = f"{until}, as it {condition}" if until else f"the record {condition} and {missing_hash}"
     say(f"{reason}; truth is the same at all {compared.instants} instants before, to the bit")
     return "" if recorded is None and not until and not reader.damaged else reason
 
@@ -191,14 +192,14 @@ class Difference(NamedTuple):
 
 
 def difference(t_ns: int, drone: str, recorded: bytes, repeated: bytes) -> Difference | None:
-    """Return the difference between two true states; None if the COUNTED fields are bit-identical.
+    """Return the difference between two true states; None if the COMPARED_FIELDS are bit-identical.
 
     Raises:
         DecodeError: one of them is not a truth message.
     """
     key = keys.truth(drone)
     a, b = messages.decode(key, recorded), messages.decode(key, repeated)
-    if all(getattr(a, part) == getattr(b, part) for part in COUNTED):
+    if all(getattr(a, part) == getattr(b, part) for part in COMPARED_FIELDS):
         return None
     cosine = abs(sum(p * q for p, q in zip(a.orientation_wxyz, b.orientation_wxyz, strict=True)))
     return Difference(
@@ -208,7 +209,7 @@ def difference(t_ns: int, drone: str, recorded: bytes, repeated: bytes) -> Diffe
         math.dist(a.velocity_m_s, b.velocity_m_s),
         2 * math.acos(min(1.0, cosine)),
         math.dist(a.angular_velocity_rad_s, b.angular_velocity_rad_s),
-        differing_field(a, b, COUNTED),
+        differing_field(a, b, COMPARED_FIELDS),
     )
 
 

@@ -21,7 +21,7 @@ from pettingzoo import ParallelEnv
 
 from zsim.errors import RunError
 from zsim.scenario.roles import agent_names
-from zsim_api.policy import FARTHEST, Action, Floats, Interface, Observe
+from zsim_api.policy import OBSERVATION_MAX, Action, Floats, Interface, Observe
 from zsim_api.scenarios import AnyScenario, Scenario, scenario_of
 from zsim_api.simulation import Simulation
 
@@ -39,8 +39,8 @@ def never(sim: Simulation, agent: str) -> bool:
 def collided(sim: Simulation, agent: str) -> bool:
     """End the episode of a drone that hits a drone, an obstacle or the ground, or of a cluster with such a drone."""
     drones = _drones(sim, agent)
-    hits = (event for event in sim.events if event.kind in ("collision", "impact"))
-    return any(event.subject in drones or event.data.get("other") in drones for event in hits)
+    collisions = (event for event in sim.events if event.kind in ("collision", "impact"))
+    return any(event.subject in drones or event.data.get("other") in drones for event in collisions)
 
 
 def flipped(sim: Simulation, agent: str) -> bool:
@@ -98,7 +98,7 @@ class _Episodes:
         for agent in self.interface.agents:
             size, action_size = self.interface.size(agent), len(self.interface.bounds(agent)[0])
             self.action_spaces[agent] = Box(-1.0, 1.0, (action_size,), np.float32)
-            self.observation_spaces[agent] = Box(-FARTHEST, FARTHEST, (size,), np.float32)
+            self.observation_spaces[agent] = Box(-OBSERVATION_MAX, OBSERVATION_MAX, (size,), np.float32)
 
     def begin(self, rng: np.random.Generator) -> dict[str, Floats]:
         """Start an episode by flying until all drones are in the air; return the observations.
@@ -205,7 +205,7 @@ class FlightEnv(gymnasium.Env[Floats, Floats]):
         self._cuts = np.cumsum([space.shape[0] for space in own])[:-1]
         size = sum(episodes.interface.size(agent) for agent in self._agents)
         self.action_space = Box(-1.0, 1.0, (sum(space.shape[0] for space in own),), np.float32)
-        self.observation_space = Box(-FARTHEST, FARTHEST, (size,), np.float32)
+        self.observation_space = Box(-OBSERVATION_MAX, OBSERVATION_MAX, (size,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
         """Begin an episode; the same seed gives a bit-identical one."""
@@ -272,9 +272,9 @@ def vector_env(
 
 
 def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
-    known = [*signature(_Episodes).parameters][1:]  # without the scenario
-    if unknown := [name for name in settings if name not in known]:
-        raise RunError(f"settings: unknown {', '.join(unknown)}; must be one of {', '.join(known)}")
+    parameters = [*signature(_Episodes).parameters][1:]  # without the scenario
+    if unknown := [name for name in settings if name not in parameters]:
+        raise RunError(f"settings: unknown {', '.join(unknown)}; must be one of {', '.join(parameters)}")
     if "reward" not in settings:
         raise RunError("settings: reward is missing; must be a function of the zsim.Simulation and an agent's name")
     return dict(settings)

@@ -239,20 +239,20 @@ class _StopRequest:
 def _ctrl_c() -> Iterator[_StopRequest]:
     """Let Ctrl-C end a flight at its next gate, with a complete record; a second one interrupts at once."""
     request = _StopRequest()
-    former = signal.getsignal(signal.SIGINT)
-    if former is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+    previous = signal.getsignal(signal.SIGINT)
+    if previous is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
         yield request
         return
 
     def on_interrupt(*_: object) -> None:
         request.reason = "interrupted"
-        signal.signal(signal.SIGINT, former)
+        signal.signal(signal.SIGINT, previous)
 
     signal.signal(signal.SIGINT, on_interrupt)
     try:
         yield request
     finally:
-        signal.signal(signal.SIGINT, former)
+        signal.signal(signal.SIGINT, previous)
 
 
 def screen_for(duration_s: float) -> Screen:

@@ -38,7 +38,7 @@ from zsim_api.simulation import Estimates, Samples, Truth, estimates_of
 Observe = Literal["truth", "estimate", "sensors"]
 Action = Literal["velocity", "attitude", "rotors", "cluster"]
 Floats = NDArray[np.float32]
-FARTHEST = 1e6  # bound on observations, in their units; beyond the reach of any flight
+OBSERVATION_MAX = 1e6  # bound on observations, in their units; beyond the reach of any flight
 AIRBORNE = ("hovering", "flying")
 
 
@@ -254,7 +254,7 @@ def _readings(drone: Drone) -> list[tuple[str, str, int]]:
 
 def _bounded(numbers: NDArray[np.float64]) -> Floats:
     """Clip numbers to the bounds of an observation; NaN becomes 0."""
-    clipped = np.minimum(np.maximum(numbers, -FARTHEST), FARTHEST)
+    clipped = np.minimum(np.maximum(numbers, -OBSERVATION_MAX), OBSERVATION_MAX)
     clipped[np.isnan(clipped)] = 0.0
     return clipped.astype(np.float32)
 

@@ -109,11 +109,11 @@ class Program:
             return self._keeper.wait()
 
 
-def fill_placeholders(words: Sequence[str], values: Mapping[str, str]) -> list[str]:
+def fill_placeholders(arguments: Sequence[str], values: Mapping[str, str]) -> list[str]:
     """Replace `{endpoint}` and the like in a command line by their values."""
     for name, value in values.items():
-        words = [word.replace(f"{{{name}}}", value) for word in words]
-    return [*words]
+        arguments = [argument.replace(f"{{{name}}}", value) for argument in arguments]
+    return [*arguments]
 
 
 def environment_of(endpoint: str, federation: str) -> dict[str, str]:
@@ -131,7 +131,7 @@ def search_path(folders: Sequence[str | Path]) -> str:
 # The keeper
 
 
-def keep(grace_s: float, words: list[str]) -> int:
+def keep(grace_s: float, command: list[str]) -> int:
     """Run a program to its end as its keeper; return the exit code."""
     pending: list[int] = []
     program: subprocess.Popen[bytes] | None = None
@@ -156,9 +156,9 @@ def keep(grace_s: float, words: list[str]) -> int:
     if sys.platform == "linux":  # detached descendants become children of this process
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     try:
-        program = subprocess.Popen(words, stdin=subprocess.DEVNULL, process_group=0)
+        program = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0)
     except OSError as error:
-        sys.stderr.write(f"{words[0]!a}: cannot be started ({error.strerror})\n")
+        sys.stderr.write(f"{command[0]!a}: cannot be started ({error.strerror})\n")
         return NOT_STARTED
     for number in pending:
         forward(number)

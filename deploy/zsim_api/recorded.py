@@ -424,12 +424,12 @@ class Run:
         corresponding = [f"drone/{drone}/{leaf}" for drone in self.drones] if kind == "drone" else [key]
         return [each for each in corresponding if each in self.keys]
 
-    def _read(self, wanted: Sequence[str]) -> None:
-        """Read the tables of the `wanted` keys in one pass over the record."""
-        if not wanted:
+    def _read(self, requested_keys: Sequence[str]) -> None:
+        """Read the tables of the `requested_keys` in one pass over the record."""
+        if not requested_keys:
             return
         with plugin.names_only(not self._trust, looked_up=False):
-            tables = read_tables(self.record, wanted)
+            tables = read_tables(self.record, requested_keys)
         for table in tables.values():
             for values in table.values():
                 values.setflags(write=False)  # frames copy them, dicts share them
@@ -543,26 +543,26 @@ def _html_table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 # Messages as tables
 
 
-def read_tables(record: Path, wanted: Collection[str]) -> dict[str, Table]:
-    """Return all messages of the `wanted` keys, by key, in one pass over the record.
+def read_tables(record: Path, requested_keys: Collection[str]) -> dict[str, Table]:
+    """Return all messages of the `requested_keys`, by key, in one pass over the record.
 
     Columns are those of the export, without `name`, which is the same in all rows. Messages of a key outside the
     contract, and pictures, have a column for each field, or for each element of a field that is a list of numbers.
 
     Args:
         record: path of the file.
-        wanted: one key, or the same key of several drones.
+        requested_keys: one key, or the same key of several drones.
     """
     with RecordReader(record) as reader:
-        selection = MessageSelection(tuple(wanted))
+        selection = MessageSelection(tuple(requested_keys))
         survey = TableSurvey(reader, selection)
-        by_subject = {subject(key): key for key in wanted}
-        parts: dict[str, dict[str, list[NDArray[Any]]]] = {key: {} for key in wanted if key in survey.kinds}
+        by_subject = {subject(key): key for key in requested_keys}
+        parts: dict[str, dict[str, list[NDArray[Any]]]] = {key: {} for key in requested_keys if key in survey.kinds}
         decoded = DecodedMessages(selection.messages(reader, [*parts]), survey.decode, lambda _: None)
         for batch in batches(decoded, survey.width, by_name=True):
             for name, kind, values in column_values(survey.table(batch.kind)[1:], batch):
                 parts[by_subject[batch.only]].setdefault(name, []).append(as_array(kind, values))
-        own = {key: _own_table(reader, key) for key in wanted if key not in parts}
+        own = {key: _own_table(reader, key) for key in requested_keys if key not in parts}
     tables = {key: {name: np.concatenate(each) for name, each in columns.items()} for key, columns in parts.items()}
     return {**tables, **own}
 

@@ -29,8 +29,8 @@ from zsim.schema import plugin
 LOGS, SCENARIO, FIGURES = "logs", "scenario.yaml", "figures"
 JOURNAL = "journal"  # folder of the world's journal
 LAUNCH = "launch.json"  # file in the journal's folder
-LEFT = (SCENARIO, "run.log", "up.log")  # files left by a run that never flew, beside empty logs and journal
-WRITTEN = (RECORD, "summary.json", "report.html", *LEFT)  # files removed when a run is replaced
+LEFTOVERS = (SCENARIO, "run.log", "up.log")  # files left by a run that never flew, beside empty logs and journal
+WRITTEN = (RECORD, "summary.json", "report.html", *LEFTOVERS)  # files removed when a run is replaced
 WRITTEN_INTO = {LOGS: (".log",), FIGURES: (".png", ".pdf", ".svg")}  # suffixes of a run's files, by folder
 
 
@@ -103,7 +103,7 @@ def _make_room(out: Path, force: bool) -> None:
             raise RunError(f"{out}: holds a run that was interrupted; {options}")
         elif (out / RECORD).exists() or any(not log.is_file() or log.stat().st_size for log in (out / LOGS).glob("*")):
             raise RunError(f"{out}: holds a run already; --force replaces it, or give --out another folder")
-        refuse_others(out, (*LEFT, LOGS, JOURNAL), force, "fly into")
+        refuse_others(out, (*LEFTOVERS, LOGS, JOURNAL), force, "fly into")
 
 
 _MADE: set[Path] = set()  # folders that this process has created

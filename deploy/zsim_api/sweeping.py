@@ -25,7 +25,7 @@ from zsim_analysis.report import indented_json
 from zsim_analysis.sweep.design import METRICS, SweepDesign, SweepPlan, distinct, make_plan, text_of
 from zsim_analysis.sweep.sweep import TABLE, SweepFolder, SweepRequest, read_table
 from zsim_analysis.sweep.sweep import sweep as swept
-from zsim_analysis.sweep.sweep_run import FIXED, Row, made_modules
+from zsim_analysis.sweep.sweep_run import FIXED, Row, generated_modules
 from zsim_analysis.sweep.sweep_summary import SweepResults
 from zsim_api.recorded import load
 from zsim_api.scenarios import AnyScenario, Scenario, scenario_of, scratch_folder
@@ -109,7 +109,7 @@ def sweep(
         raise ScenarioError([_in_python(fault) for fault in error.faults]) from None
     folder = Path(out) if out is not None else temporary_folder("sweep-")
     module_names = re.findall(rf"{plugin.MADE}\w+", msgspec.json.encode(plan).decode())  # anywhere in the plan
-    modules = made_modules(module_names, [scratch_folder()])
+    modules = generated_modules(module_names, [scratch_folder()])
     try:
         rows = fly_plan(plan, folder, workers, client, console=console, modules=tuple(modules))
     except KeyboardInterrupt:

@@ -162,8 +162,8 @@ def process_option(default: str) -> Any:
     return Option(help=f"Process name (default {default}, or the certificate's).")
 
 
-def port_option(text: str, least: int = 1, **more: Any) -> Any:
-    return Option(min=least, max=PORT_MAX, help=text, **more)
+def port_option(text: str, minimum: int = 1, **more: Any) -> Any:
+    return Option(min=minimum, max=PORT_MAX, help=text, **more)
 
 
 def positive_option(text: str, **more: Any) -> Any:

@@ -19,7 +19,7 @@ from zsim import __version__
 from zsim.errors import RunError, file_fault
 from zsim.output_folder import take_lock
 from zsim_analysis.bundle import bundle_file as names
-from zsim_analysis.bundle.bundle_file import EXTRAS, opened, pins_of
+from zsim_analysis.bundle.bundle_file import EXTRAS, open_bundle, pins_of
 from zsim_analysis.bundle.bundle_rerun import check_content
 from zsim_deploy import SAFE_PATH
 from zsim_deploy.hosts.wheelhouse import PROJECT, checkout, default_cache, requirement
@@ -42,7 +42,7 @@ def rerun_in_environment(
     Raises:
         RunError: the bundle is refused, or the environment cannot be created.
     """
-    with opened(bundle) as (manifest, folder):
+    with open_bundle(bundle) as (manifest, folder):
         check_content(bundle, manifest, folder)
         lock = pins_of((folder / names.LOCK).read_text("utf-8"), f"{bundle}: {names.LOCK}")
         needs = pins_of("\n".join(manifest.needs), f"{bundle}: {names.MANIFEST}: needs") if trust else []

@@ -425,13 +425,13 @@ def extras(names: Sequence[str]) -> list[str]:
     return sorted(named | {extra for name in names for kind, extra in EXTRAS_BY_ROLE.items() if name.startswith(kind)})
 
 
-def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:
-    """Return the extras that each host needs, including `more`.
+def needed_extras(inventory: Inventory, additional: Iterable[str] = ()) -> dict[str, frozenset[str]]:
+    """Return the extras that each host needs, including `additional`.
 
     A pattern counts for every role that it can match, because the scenario is unknown here. Routers and the user's own
     programs need no extra.
     """
-    extras_by_host: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
+    extras_by_host: dict[str, set[str]] = {name: set(additional) for name in inventory.hosts}
     for process, host in spread(inventory.roles, EXTRAS_BY_NAME).items():
         extras_by_host[host].add(EXTRAS_BY_NAME[process])
     for pattern, entry in inventory.roles.items():

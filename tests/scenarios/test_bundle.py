@@ -17,7 +17,7 @@ from refused import has_terms
 
 from zsim.contract import keys
 from zsim.record import RecordReader, RecordWriter
-from zsim_analysis.bundle.bundle_file import MODULES, RECORD, opened, write_bundle
+from zsim_analysis.bundle.bundle_file import MODULES, RECORD, open_bundle, write_bundle
 from zsim_analysis.report.figure_style import ReportFigure
 
 OWN = """
@@ -99,7 +99,7 @@ def test_a_bundle_is_reproducible_and_rerun_elsewhere(
     command("bundle", alone, "-o", other, "--no-record")
     assert bare.read_bytes() == other.read_bytes()
 
-    with opened(once) as (manifest, folder):
+    with open_bundle(once) as (manifest, folder):
         assert {f"{MODULES}/heights.py", f"{MODULES}/climbing/climber.py", "figures/drones.csv"} <= set(manifest.files)
         assert set(manifest.outputs) == {f"drone/{d}/{of}" for d in ("d1", "d2") for of in OUTPUTS}
         assert list(places_of(folder / RECORD, str(federation.folder), socket.gethostname())) == []
@@ -191,6 +191,6 @@ def doctored(run: Path, into: Path, change: Callable[[str, dict[str, Any]], dict
 
 def resealed(bundle: Path, name: str, content: bytes) -> Path:
     """Rewrite a bundle with one member replaced and a valid seal, as a forger would."""
-    with opened(bundle) as (manifest, _), zipfile.ZipFile(bundle) as archive:
+    with open_bundle(bundle) as (manifest, _), zipfile.ZipFile(bundle) as archive:
         members: dict[str, Any] = {each: archive.read(each) for each in manifest.files}
     return write_bundle(bundle.with_name("resealed.zsim"), manifest, {**members, name: content}, force=False).path

@@ -249,8 +249,8 @@ def write_papers(out: Path, progress: Callable[[str], None]) -> list[Line]:
 
 
 def cells(line: Line) -> list[str]:
-    found = f"{line.found:.4g}" if line.found > 1e-4 else f"{line.found:.0e}"
-    return [line.paper, line.what, f"{line.expected:.4g}", found]
+    found_text = f"{line.found:.4g}" if line.found > 1e-4 else f"{line.found:.0e}"
+    return [line.paper, line.what, f"{line.expected:.4g}", found_text]
 
 
 def markdown(results: Sequence[Line]) -> str:

@@ -124,7 +124,7 @@ def write_bundle(out: Path, manifest: Manifest, members: Mapping[str, Path | byt
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[tuple[Manifest, Path]]:
+def open_bundle(path: Path) -> Iterator[tuple[Manifest, Path]]:
     """Check a bundle; yield its manifest and a temporary folder with its members.
 
     Raises:

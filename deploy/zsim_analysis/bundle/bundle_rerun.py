@@ -19,7 +19,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 from zsim_agents.hosting import agents_of
 from zsim_analysis.bundle import bundle_file as names
-from zsim_analysis.bundle.bundle_file import Manifest, differing_packages, opened, pins_of
+from zsim_analysis.bundle.bundle_file import Manifest, differing_packages, open_bundle, pins_of
 from zsim_analysis.in_process import InProcessFlight
 from zsim_analysis.reading import recorded_run
 from zsim_analysis.reading.recorded_run import GateDigests, OutputHashes, content_of, first_difference
@@ -40,7 +40,7 @@ def rerun_bundle(path: Path, commands_only: bool, say: Say, note: Say) -> str:
         RunError: the file is not a bundle, was changed, or names code of its own that may not be run.
         ScenarioError, RecordError: this version cannot read the bundle's scenario or record.
     """
-    with opened(path) as (manifest, folder):
+    with open_bundle(path) as (manifest, folder):
         scenario = check_content(path, manifest, folder)
         lock = pins_of((folder / names.LOCK).read_text("utf-8"), f"{path}: {names.LOCK}")
         if differing := differing_packages([*lock, *manifest.needs]):
@@ -76,8 +76,8 @@ def check_content(path: Path, manifest: Manifest, folder: Path) -> Scenario:
     record = folder / names.RECORD
     if record.exists():
         with RecordReader(record) as reader:
-            found = reader.last(keys.INFO)
-        info = recorded_run.decode_or_none(found) if found else None
+            recorded = reader.last(keys.INFO)
+        info = recorded_run.decode_or_none(recorded) if recorded else None
         if info is None or info.scenario != text:
             raise RunError(f"{path}: was changed: {names.RECORD} does not match {names.SCENARIO}")
     elif not (folder / names.GATES).exists():

@@ -201,8 +201,8 @@ class _Hosts:
 
     def __init__(self, reader: RecordReader) -> None:
         joins = (key for key in reader.topics() if keys.matches("process/*/join", key))
-        found = (recorded_run.decode_or_none(each) for each in reader.messages(set(joins), by_time=False))
-        self._names = dict.fromkeys(join.host for join in found if join is not None)
+        decoded = (recorded_run.decode_or_none(each) for each in reader.messages(set(joins), by_time=False))
+        self._names = dict.fromkeys(join.host for join in decoded if join is not None)
         self._stands_for = {name: f"host{count}" for count, name in enumerate(self._names, start=1)}
         spelled = "|".join(re.escape(name) for name in sorted(self._names, key=len, reverse=True) if name)
         self._pattern = re.compile(rf"(?<![\w.-])({spelled})(?![\w-])") if spelled else None
@@ -234,10 +234,10 @@ def _copy_record(
     noted: set[str] = set()
     with RecordWriter(into) as writer:
         for key, payload, t_ns, wall_ns in reader.messages(by_time=False):
-            kind, _, what = keys.parts(key)
+            kind, _, leaf = keys.parts(key)
             if key == keys.INFO:
                 payload = _without_folders(payload, has_modules)
-            elif kind in ("clock", "world", "process") and key != keys.FAULTS and what not in ("done", "snapshot"):
+            elif kind in ("clock", "world", "process") and key != keys.FAULTS and leaf not in ("done", "snapshot"):
                 try:
                     content = msgpack.unpackb(payload)
                 except (ValueError, msgpack.UnpackException):

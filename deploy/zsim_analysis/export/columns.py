@@ -46,11 +46,11 @@ class MessageSelection(NamedTuple):
         every = not self.expressions
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
-    def messages(self, reader: RecordReader, wanted: list[str]) -> Iterator[Recorded]:
-        """Yield the messages of the `wanted` keys within the times, in order of simulated time."""
+    def messages(self, reader: RecordReader, selected_keys: list[str]) -> Iterator[Recorded]:
+        """Yield the messages of the `selected_keys` keys within the times, in order of simulated time."""
         first = 0 if self.from_s is None else round(self.from_s * 1e9)
         last = 2**64 if self.to_s is None else round(self.to_s * 1e9)
-        return (message for message in reader.messages(frozenset(wanted)) if first <= message.t_ns <= last)
+        return (message for message in reader.messages(frozenset(selected_keys)) if first <= message.t_ns <= last)
 
 
 def subject(key: str) -> str:
@@ -265,7 +265,7 @@ class Sighting(Struct, frozen=True):
 
 
 class TableSurvey:
-    """The tables of a selection, found in a first pass over the record: the `wanted` keys, and `kinds`, their types.
+    """The tables of a selection, found in a first pass over the record: the `table_keys`, and `kinds`, their types.
 
     `pictures` is the number of pictures, which are in no table. `rows` counts messages by type (None for foreign keys),
     including those that are outside the times or cannot be decoded.
@@ -279,21 +279,21 @@ class TableSurvey:
         self.pictures = sum(counts[key] for key in chosen if messages.type_of(key) is CameraImage)
         if not selection.expressions:
             chosen = [key for key in chosen if not keys.is_accepted(key)]  # these repeat commands, which have rows
-        self.wanted = [key for key in chosen if messages.type_of(key) is not CameraImage]
+        self.table_keys = [key for key in chosen if messages.type_of(key) is not CameraImage]
         if (info := reader.last(keys.INFO)) is not None:
             decode_or_none(info)  # registers the message types of users' sensors
-        self.kinds = {key: kind for key in self.wanted if (kind := messages.type_of(key))}
+        self.kinds = {key: kind for key in self.table_keys if (kind := messages.type_of(key))}
         self.rows: Counter[type[Struct] | None] = Counter()
-        for key in self.wanted:
+        for key in self.table_keys:
             self.rows[self.kinds.get(key)] += counts[key]
-        opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
+        fields_by_kind = {kind: open_fields(kind) for kind in set(self.kinds.values())}
         self._names: dict[type[Struct], dict[str, dict[str, None]]] = {  # names in the open fields of all messages
-            kind: {field: {} for field in open_kinds} for kind, open_kinds in opened.items()
+            kind: {field: {} for field in open_kinds} for kind, open_kinds in fields_by_kind.items()
         }
-        open_keys = [key for key, kind in self.kinds.items() if opened[kind]]
+        open_keys = [key for key, kind in self.kinds.items() if fields_by_kind[kind]]
         for recorded in selection.messages(reader, open_keys) if open_keys else ():
             if (message := decode_or_none(recorded)) is not None:
-                for field, open_kind in opened[type(message)].items():
+                for field, open_kind in fields_by_kind[type(message)].items():
                     names = message.names if open_kind == "named" else getattr(message, field)
                     self._names[type(message)][field].update(dict.fromkeys(names))
         self._tables: dict[type[Struct], tuple[Columns, ...]] = {}

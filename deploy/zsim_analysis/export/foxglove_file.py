@@ -174,10 +174,12 @@ def _instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
         yield instant
 
 
-def _cameras_before(reader: RecordReader, selection: MessageSelection, wanted: Iterable[str]) -> Iterator[Instant]:
+def _cameras_before(
+    reader: RecordReader, selection: MessageSelection, selected_keys: Iterable[str]
+) -> Iterator[Instant]:
     """Yield the latest calibrations from before the selected times, as cameras may publish them only once."""
     from_ns = round((selection.from_s or 0.0) * 1e9)
-    camera_keys = [key for key in wanted if messages.type_of(key) is CameraInfo]
+    camera_keys = [key for key in selected_keys if messages.type_of(key) is CameraInfo]
     calibrations: dict[str, CameraInfo] = {}
     for recorded in reader.messages(camera_keys) if from_ns and camera_keys else ():
         if recorded.t_ns < from_ns and (info := _decode(recorded)) is not None:

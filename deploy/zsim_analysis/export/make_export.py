@@ -102,7 +102,7 @@ def _tables(
 ) -> ExportResult:
     survey = TableSurvey(reader, selection)
     total = sum(survey.rows.values())
-    messages = selection.messages(reader, survey.wanted)
+    messages = selection.messages(reader, survey.table_keys)
     decoded = DecodedMessages(messages, survey.decode, lambda done: progress(done, total))
     with staged_outputs(target) as (new,):
         if form is not Format.MAT:
@@ -408,9 +408,9 @@ class MatFile:
             else:
                 values = np.concatenate(values)
             if each.names:
-                known = ~np.isnan(values).all(axis=0)
-                struct["names"] = np.array(each.names, object)[known].reshape(-1, 1)
-                values = values[:, known]
+                is_known = ~np.isnan(values).all(axis=0)
+                struct["names"] = np.array(each.names, object)[is_known].reshape(-1, 1)
+                values = values[:, is_known]
             elif each.keys:
                 valid = matlab_names(each.keys)
                 values = {valid[key]: values[:, columns] for key, columns in each.keys.items()}

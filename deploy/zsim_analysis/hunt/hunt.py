@@ -397,9 +397,9 @@ class _Hunt:
         finally:
             self._waiting.clear()
 
-    def _shrink(self, found: HuntFlight) -> Iterator[Case]:
-        index = found.margins.index(found.worst)
-        is_unknown, failed = bool(found.worst.unknown), found.failure is not None
+    def _shrink(self, violating: HuntFlight) -> Iterator[Case]:
+        index = violating.margins.index(violating.worst)
+        is_unknown, failed = bool(violating.worst.unknown), violating.failure is not None
 
         outcomes: dict[bytes, bool] = {}  # results of the cases flown so far
 
@@ -417,29 +417,31 @@ class _Hunt:
             margin = result.margins[index]
             return not margin.holds and bool(margin.unknown) == is_unknown
 
-        margin_text = found.worst.unknown or f"margin {found.worst.value:.3g}"
-        self._screen.say(f"flight {found.number} breaks {self._requirements[index].text} ({margin_text}); shrinking it")
-        yield from Shrinker(self._space, violates).shrink(found.case)
+        margin_text = violating.worst.unknown or f"margin {violating.worst.value:.3g}"
+        self._screen.say(
+            f"flight {violating.number} breaks {self._requirements[index].text} ({margin_text}); shrinking it"
+        )
+        yield from Shrinker(self._space, violates).shrink(violating.case)
 
     def _violation(
-        self, found: HuntFlight, case: Case, causes: list[CauseFound], flown: HuntFlight | None = None
+        self, violating: HuntFlight, case: Case, causes: list[CauseFound], recorded: HuntFlight | None = None
     ) -> Violation:
-        index, result = found.margins.index(found.worst), flown or found
+        index, result = violating.margins.index(violating.worst), recorded or violating
         return Violation(
             requirement=self._requirements[index].text,
-            number=found.number,
-            found=found.case,
+            number=violating.number,
+            found=violating.case,
             shrunk=case,
             margin=result.margins[index].value,
             unknown=result.margins[index].unknown,
             causes=causes,
             options=self._space.options(case),
-            truth_sha256=flown.truth_sha256 if flown else None,
+            truth_sha256=recorded.truth_sha256 if recorded else None,
         )
 
-    def _record_violation(self, found: HuntFlight, case: Case) -> Violation:
+    def _record_violation(self, violating: HuntFlight, case: Case) -> Violation:
         """Fly the shrunk case for its record, and further cases that show the effect of each cause."""
-        index, causes = found.margins.index(found.worst), causes_of(case)
+        index, causes = violating.margins.index(violating.worst), causes_of(case)
         self._screen.stage = RECORD
         record_path = self._request.out / VIOLATION
         number = self._submit(case, RECORD, record_path)
@@ -449,7 +451,7 @@ class _Hunt:
             CauseFound(cause_text(case, each), *(one and one.margins[index].value for one in two))
             for each, *two in zip(causes, without, alone, strict=True)
         ]
-        return self._violation(found, case, table, self._result(number))
+        return self._violation(violating, case, table, self._result(number))
 
 
 def cause_text(case: Case, cause: tuple[str, int | str]) -> str:

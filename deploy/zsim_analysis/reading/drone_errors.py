@@ -15,7 +15,7 @@ from zsim_analysis.reading.recorded_flight import Array, RecordedFlight
 SIGMAS = 2.0  # half-width of the drawn band in standard deviations
 DEGREES = 6  # degrees of freedom of a drone's NEES: position and velocity
 ESTIMATES_MAX = 200_000  # most estimates evaluated per flight, which takes about a second
-FLOWN = ("approaching", "path", "holding")  # phases of a reference whose drone is to be in the air
+AIRBORNE_PHASES = ("approaching", "path", "holding")  # phases of a reference whose drone is to be in the air
 POSITION, YAW = (0, 1, 2), 3  # columns of errors and of velocities: x, y, z, heading
 INSTANTS = 1500  # number of times at which distances are computed, more than a figure has pixels across
 
@@ -107,7 +107,7 @@ def reference_errors(flight: RecordedFlight) -> dict[str, ReferenceErrors]:
     for track in flight.tracks:
         if track.external or (references := flight.references.get(track.name)) is None:
             continue
-        is_flown = np.isin(references.phases, FLOWN)
+        is_flown = np.isin(references.phases, AIRBORNE_PHASES)
         t_ns, truth_rows, reference_rows = np.intersect1d(
             track.t_ns, references.t_ns[is_flown], assume_unique=True, return_indices=True
         )

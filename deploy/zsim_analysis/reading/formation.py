@@ -220,9 +220,9 @@ def goal_errors(formation: Formation, scenario: Scenario | None) -> GoalErrors |
         return None
     later_s = (cluster.plan.trajectory and cluster.plan.trajectory.start_s, cluster.plan.land_s)
     until_s = min((each for each in later_s if each is not None), default=np.inf)
-    lost = (formation.t_s[:, None] >= until_s) | ~np.isfinite(goal)
+    is_undefined = (formation.t_s[:, None] >= until_s) | ~np.isfinite(goal)
     est, true = (
-        np.where(lost, np.nan, space.wrapped(values - np.nan_to_num(goal)))
+        np.where(is_undefined, np.nan, space.wrapped(values - np.nan_to_num(goal)))
         for values in (formation.value, formation.true)
     )
     return GoalErrors(goal, est, true)

@@ -32,7 +32,7 @@ from zsim_analysis.reading.recorded_run import scenario_of, search_modules
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
-CONNECTS = 0.5  # reception probability from which a link counts as connected; this defines the range
+CONNECTED_MIN = 0.5  # reception probability from which a link counts as connected; this defines the range
 
 
 @dataclass
@@ -147,7 +147,7 @@ class RadioHistory:
     Attributes:
         t_ns: times, ascending, (K,).
         heard: expected number of other drones whose messages arrive, (K, N).
-        connected: whether the graph of links of at least CONNECTS, without `loss`, was strongly connected, (K,).
+        connected: whether the graph of links of at least CONNECTED_MIN, without `loss`, was strongly connected, (K,).
         share: probability that a message of drone j arrives at drone i, mean over time, (N, N).
 
     Args:
@@ -186,7 +186,7 @@ def _graph(
         for j, probability in zip(*row, strict=False):
             if j < drones:
                 matrix[i, j] = probability
-    components, _ = connected_components(csr_array(matrix >= CONNECTS), directed=True, connection="strong")
+    components, _ = connected_components(csr_array(matrix >= CONNECTED_MIN), directed=True, connection="strong")
     return matrix, components == 1
 
 

@@ -23,7 +23,7 @@ from zsim_agents.formation.flight_plan import REFUSALS, Follow, MoveTo, plan_of,
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, Reference, variable_of
-from zsim_analysis.reading.drone_errors import FLOWN
+from zsim_analysis.reading.drone_errors import AIRBORNE_PHASES
 from zsim_analysis.reading.formation import cluster_of
 from zsim_analysis.reading.recorded_flight import Array, ClusterStates, RecordedFlight, read_flight
 
@@ -36,12 +36,14 @@ SAMPLE_NS = 100_000_000  # sampling interval of a reference that is compared wit
 # a drone farther off for that many successive seconds has strayed; design choice: over twice the minimum separation
 STRAYED_M, STRAYED_S = 5.0, 3
 SETTLED_S = 10.0  # time from the engagement until drones must be at their positions; design choice
-SAME = 1e-3  # m or rad; tolerance of the reference against the plan's, which is computed by the same formulas
+# m or rad; tolerance of the reference against the plan's, which is computed by the same formulas
+REFERENCE_TOLERANCE = 1e-3
 CONTROLLER, CONSOLE = ("controller.", f"{PILOT}."), "console"  # name prefixes of plans' controllers, and of operators
 CRASHES = ("emergency", "flip", "impact", "touchdown")  # incidents that bring a drone down
 ONE_HIT_NS = 500_000_000  # a touchdown within this time of an impact belongs to it; design choice
 REFUSED_NS = 5_000_000_000  # a command refused within this time before a landing explains it; design choice
-LEADS = ("hold", "land", "target", "trajectory", "assemble")  # requests that make a formation leave its plan
+# requests that make a formation leave its plan
+DEVIATING_REQUESTS = ("hold", "land", "target", "trajectory", "assemble")
 
 
 class Shortfall(Struct, frozen=True):
@@ -312,7 +314,7 @@ def _reference_shortfalls(drone: str, flight: RecordedFlight) -> Iterator[Shortf
     """Yield a shortfall if a drone did not fly its reference, or strayed from it."""
     references = flight.references[drone]
     track = next((each for each in flight.tracks if each.name == drone), None)
-    is_flown = np.isin(references.phases, FLOWN)
+    is_flown = np.isin(references.phases, AIRBORNE_PHASES)
     piloted = flight.scenario.piloted() if flight.scenario else {}
     takeoff_s, end_s = piloted[drone].takeoff_s if drone in piloted else 0.0, flight.last_ns / 1e9
     if not is_flown.any():
@@ -365,7 +367,7 @@ def _cluster_shortfalls(
     if flight.scenario and cluster:
         yield from _strayed(states, flight, flight.scenario, cluster)
     yield from _hold_shortfalls(states, flight)
-    requests = [each for each in states.requests if each.ok and each.op in LEADS]
+    requests = [each for each in states.requests if each.ok and each.op in DEVIATING_REQUESTS]
     if requests and takeoff_s is not None:
         first = ", ".join(f"{each.op} at {seconds_text(each.t_ns / 1e9)} s ({each.source})" for each in requests[:3])
         further = f" and {len(requests) - 3} more" if len(requests) > 3 else ""
@@ -496,7 +498,7 @@ class PlannedReference(NamedTuple):
             if states.phases[row] == "engaged":
                 value = self.reference.value(float(states.t_ns[row] / 1e9 - self.start_s))[0]
                 deviation = self.space.difference(states.desired[row], value)
-                is_followed[i] = np.abs(deviation[self.entries]).max(initial=0.0) <= SAME
+                is_followed[i] = np.abs(deviation[self.entries]).max(initial=0.0) <= REFERENCE_TOLERANCE
         return is_followed
 
 
@@ -558,7 +560,8 @@ def _trajectory_flown(states: ClusterStates, planned: PlannedReference, plan: Cl
         length = f"for {seconds_text(round(flown_s, 1))} s in all, at the longest " if is_interrupted else ""
         text = f"its trajectory was flown {length}from {seconds_text(span_s[0])} to {seconds_text(span_s[1])} of {due}"
     was_overridden = any(
-        each.ok and each.op in LEADS and each.t_ns / 1e9 < planned.start_s + due_s for each in states.requests
+        each.ok and each.op in DEVIATING_REQUESTS and each.t_ns / 1e9 < planned.start_s + due_s
+        for each in states.requests
     )
     yield _line(states, "plan", planned.start_s, f"{text}{refusals}", not was_overridden)
 
@@ -568,7 +571,10 @@ def _target_reached(states: ClusterStates, planned: PlannedReference, plan: Clus
     engaged_ns = states.t_ns[states.phases.index("engaged")]
     rows = _sampled(states, np.flatnonzero(states.t_ns >= engaged_ns))
     is_followed = planned.follows(states, rows)
-    was_overridden, engaged_s = any(each.ok and each.op in LEADS for each in states.requests), float(engaged_ns) / 1e9
+    was_overridden, engaged_s = (
+        any(each.ok and each.op in DEVIATING_REQUESTS for each in states.requests),
+        float(engaged_ns) / 1e9,
+    )
     if not is_followed.any():
         if states.phases[-1] in ("landing", "idle"):
             yield _line(states, "plan", engaged_s, "it landed before it was at its target", not was_overridden)

@@ -43,8 +43,8 @@ from zsim_analysis.report.summary import STATISTICS, RunSummary, flies_paper_tes
 ABSENT = "–"
 RUNS_PER_TABLE = 2  # runs side by side with all their statistics; more do not fit the page
 THERE = "there"  # cell of a named item, such as a drone, that another run does not have
-NAMED, NAMES_MAX = 3, 100  # number of runs in the page's file name, and of characters of their names
-MARK, MARK_WITHIN = b": comparison</title>", 4_000  # identifies comparison pages, within that many first bytes
+RUNS_NAMED, NAMES_MAX = 3, 100  # number of runs in the page's file name, and of characters of their names
+MARK, HEAD_BYTES = b": comparison</title>", 4_000  # identifies comparison pages, within that many first bytes
 UNPLANNED = "†"  # after the name of a run that was not flown as planned
 
 
@@ -95,8 +95,8 @@ def compare(
 def comparison_path(directories: Sequence[Path]) -> Path:
     """Return the default path of a comparison: beside the first run, with a name that no other comparison has."""
     names = [name.replace("/", "-") for name in run_names(directories)]
-    further = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
-    stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{further}"
+    further = f"-and-{len(names) - RUNS_NAMED}-more" if len(names) > RUNS_NAMED else ""
+    stem = f"compare-{'-'.join(names[:RUNS_NAMED])[:NAMES_MAX]}{further}"
     folder, identifier = directories[0].resolve().parent, runs_id(directories).encode()
     path, number = folder / f"{stem}.html", 1
     while MARK in (start := _first_bytes(path)) and identifier not in start:
@@ -110,7 +110,7 @@ def _first_bytes(page: Path) -> bytes:
     if not page.is_file():
         return b""
     with page.open("rb") as file:
-        return file.read(MARK_WITHIN)
+        return file.read(HEAD_BYTES)
 
 
 def run_names(directories: Sequence[Path]) -> list[str]:

@@ -211,9 +211,11 @@ def curves(formation: Formation, name: str) -> tuple[Array, Array, Array]:
 
 # Plan view
 
-ROOM = 0.06  # margin at each end of the plan, as a share of its range, so that marks at its edge are not cut off
+# margin at each end of the plan, as a share of its range, so that marks at its edge are not cut off
+MARGIN_SHARE = 0.06
 OUTLINES = 7  # most outlines of a formation in the plan, few enough to be distinguishable
-APART = 0.6  # smallest distance between outlines, as a share of the formation's size; closer ones would overlap
+# smallest distance between outlines, as a share of the formation's size; closer ones would overlap
+OUTLINE_DISTANCE_MIN = 0.6
 RING_MAX = 4  # most drones whose outline connects them in order; the outline of more drones is their convex hull
 
 
@@ -224,7 +226,7 @@ def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure
     style.dress(axes, "north y (m)")
     axes.set_xlabel("east x (m)", fontsize=style.PAPER_PT)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(ROOM)
+    axes.margins(MARGIN_SHARE)
     draw_obstacles(axes, flight.scenario)
     colours = drone_colours(len(flight.tracks))
     shows_names = len(flight.tracks) <= NAMED_MAX
@@ -299,7 +301,7 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
         p_W = paths_W[k]
         centre = p_W.mean(axis=0)
         size = np.linalg.norm(p_W - centre, axis=1).max()
-        if any(np.linalg.norm(p_W - other, axis=1).max() <= APART * size for other in outlines):
+        if any(np.linalg.norm(p_W - other, axis=1).max() <= OUTLINE_DISTANCE_MIN * size for other in outlines):
             continue
         ring = p_W
         if len(p_W) > RING_MAX:
@@ -562,18 +564,18 @@ def _draw_many_velocities(responses: Mapping[str, drone_errors.VelocityResponse]
     return figure
 
 
-OFF = ("east (m)", "north (m)", "up (m)", "heading (deg)")  # components of truth − reference
+REFERENCE_COMPONENTS = ("east (m)", "north (m)", "up (m)", "heading (deg)")  # components of truth − reference
 
 
 def draw_references(
     errors: Mapping[str, drone_errors.ReferenceErrors], colours: Mapping[str, str], marks: style.TimeMarks
 ) -> Figure:
     """Draw truth − reference of each drone with a reference of its own; for many drones their spread."""
-    figure = style.new_figure(style.COLUMN_IN, 0.9 + 0.85 * len(OFF))
-    grid = figure.subplots(len(OFF), 1, squeeze=False, sharex=True)
+    figure = style.new_figure(style.COLUMN_IN, 0.9 + 0.85 * len(REFERENCE_COMPONENTS))
+    grid = figure.subplots(len(REFERENCE_COMPONENTS), 1, squeeze=False, sharex=True)
     t_s = reduce(np.union1d, (each.t_s for each in errors.values()))
     for i, axes in enumerate(grid[:, 0]):
-        style.dress(axes, OFF[i])
+        style.dress(axes, REFERENCE_COMPONENTS[i])
         scale = math.degrees(1.0) if i == drone_errors.YAW else 1.0
         axes.axhline(0, color=style.BLACK, lw=0.5, zorder=1)
         if len(errors) > NAMED_MAX:

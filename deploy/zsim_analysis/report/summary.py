@@ -188,13 +188,13 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
             kept_counts[event.kind] += 1
             lines.append(EventLine(event.t_ns / 1e9, event.kind, event.source, event.subject, event.text))
     participant = ("name", "role", "host", "pid", "incarnations", "left")
-    began = datetime.fromtimestamp(flight.began_ns // 10**9, UTC).isoformat() if flight.began_ns else None
+    start_date = datetime.fromtimestamp(flight.began_ns // 10**9, UTC).isoformat() if flight.began_ns else None
     return RunSummary(
         scenario=flight.scenario.name if flight.scenario else None,
         seed=info.seed if info else None,
         mode=info.mode if info else None,
         run_id=info.run_id if info else None,
-        date=began.replace("+00:00", "Z") if began else None,
+        date=start_date.replace("+00:00", "Z") if start_date else None,
         changed=list(info.changed) if info and info.changed is not UNSET else None,
         versions={
             **({"world": info.version} if info else {}),

@@ -21,7 +21,7 @@ from zsim.schema import plugin
 from zsim.schema.checker import show
 from zsim_analysis.sweep.sweep_run import Row, Task, failed_row, fly
 
-AHEAD = 2  # tasks per thread of the cluster, so that no thread idles
+TASKS_PER_THREAD = 2  # tasks per thread of the cluster, so that no thread idles
 CONNECT_S = 5.0  # wall time within which a scheduler must answer
 
 _alone = threading.Lock()
@@ -132,7 +132,7 @@ class DaskPool:
 
     def _fill(self, flying: Any, pending: dict[Any, Task], tasks: Iterator[Task]) -> None:
         """Submit tasks up to AHEAD per thread of the cluster; new workers may join at any time."""
-        while len(pending) < AHEAD * sum(self._client.nthreads().values()):
+        while len(pending) < TASKS_PER_THREAD * sum(self._client.nthreads().values()):
             task = next(tasks, None)
             if task is None:
                 return

@@ -73,7 +73,7 @@ def _bare_start() -> Iterator[None]:
     `spawn` imports the main module again, which would rerun a script without `if __name__ == "__main__"`. Workers do
     not need it, since classes defined in a script are written to a module of their own.
     """
-    main, former = sys.modules["__main__"], os.environ.get(SAFE_PATH)
+    main, previous = sys.modules["__main__"], os.environ.get(SAFE_PATH)
     sys.modules["__main__"] = ModuleType("__main__")
     os.environ[SAFE_PATH] = "1"
     try:
@@ -81,8 +81,8 @@ def _bare_start() -> Iterator[None]:
     finally:
         sys.modules["__main__"] = main
         del os.environ[SAFE_PATH]
-        if former is not None:
-            os.environ[SAFE_PATH] = former
+        if previous is not None:
+            os.environ[SAFE_PATH] = previous
 
 
 class WorkerProcess:

@@ -389,8 +389,8 @@ POINTS_MAX = 24  # maximum number of points side by side in one panel; the table
 # colours of the combinations of those fields that are not on the axis
 SERIES = (style.BLUE, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, style.BLACK)
 DECADES_MIN = 30.0  # smallest ratio of the largest to the smallest value for a logarithmic axis
-TURNED_FROM = 34  # maximum length of all labels together, with a space each, that fits side by side in a panel
-ABOVE = 1.1  # height of the marks drawn above runs and intervals, as a share of the axes' height
+LABELS_LENGTH_MAX = 34  # maximum length of all labels together, with a space each, that fits side by side in a panel
+MARK_HEIGHT = 1.1  # height of the marks drawn above runs and intervals, as a share of the axes' height
 MARK = style.VERMILION
 GROUP_MAX = 0.3  # largest share of the axis range for the combinations at one value; leaves room for six marks
 TICKS_MAX = 8  # maximum number of labelled values on an axis; if there are more values, only every n-th is labelled
@@ -464,12 +464,12 @@ class GridAxis:
     @property
     def is_turned(self) -> bool:
         """Whether the labels are too long to fit side by side."""
-        return not self.field and sum(len(text) + 1 for text in self._labels) > TURNED_FROM
+        return not self.field and sum(len(text) + 1 for text in self._labels) > LABELS_LENGTH_MAX
 
     def mark(self, axes: Axes, points: Sequence[int]) -> None:
         look: dict[str, Any] = {"color": MARK, "ms": 6, "mew": 1.6, "clip_on": False}
         for position in (self.positions[point] for point in points if point in self.positions):
-            axes.plot([position.x], [ABOVE], "x", transform=axes.get_xaxis_transform(), **look)
+            axes.plot([position.x], [MARK_HEIGHT], "x", transform=axes.get_xaxis_transform(), **look)
 
     def dress(self, axes: Axes) -> None:
         if self.field:

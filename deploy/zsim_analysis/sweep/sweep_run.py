@@ -241,7 +241,7 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
     try:
         part.mkdir(parents=True)
         (part / "scenario.yaml").write_text(scenario_file.to_text(task.scenario), encoding="utf-8")
-        for module in made_modules(task.scenario.own_code(), plugin.folders()):
+        for module in generated_modules(task.scenario.own_code(), plugin.folders()):
             copy(module, part)
     except OSError as error:
         reason = f"cannot be written ({error.strerror}); free some space; the same command then continues"
@@ -261,10 +261,10 @@ def _record(task: Task) -> Iterator[RecordWriter | None]:
     part.rename(folder)
 
 
-def made_modules(names: Iterable[str], folders: Iterable[Path]) -> list[Path]:
+def generated_modules(names: Iterable[str], folders: Iterable[Path]) -> list[Path]:
     """Return the files of those modules in `names` that were generated from definitions in a notebook or script."""
-    made = dict.fromkeys(name.partition(":")[0] for name in names if name.startswith(plugin.MADE))
-    files = [folder / f"{module}.py" for module in made for folder in folders]
+    module_names = dict.fromkeys(name.partition(":")[0] for name in names if name.startswith(plugin.MADE))
+    files = [folder / f"{module}.py" for module in module_names for folder in folders]
     return [file for file in files if file.is_file()]
 
 

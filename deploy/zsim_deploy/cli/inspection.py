@@ -32,8 +32,8 @@ def list_keys(link: Session, expression: str) -> list[tuple[str, str, int]]:
     """Return (key, message type, number of messages) for every key with a message or an answer within LISTEN_S."""
     check_expression(expression)
     counts: Counter[str] = Counter()
-    for known in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
-        counts.update({sample.key: 0 for sample in link.get(known) if keys.matches(expression, sample.key)})
+    for pattern in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
+        counts.update({sample.key: 0 for sample in link.get(pattern) if keys.matches(expression, sample.key)})
     for sample in _samples(link.subscribe(expression), time.monotonic() + LISTEN_S):
         counts[sample.key] += 1
     kinds = {key: messages.type_of(key) for key in counts}

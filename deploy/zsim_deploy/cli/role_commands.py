@@ -553,7 +553,7 @@ def drive_mavlink(
     bounds: "tuple[FlightLimits, bool]",
     drone: DroneName,
     address: Annotated[str, Argument(help="UDP port of the vehicle: udp://HOST:PORT.")],
-    local_port: Annotated[int, opt.port_option("Local UDP port; 0 for any.", least=0)] = 0,
+    local_port: Annotated[int, opt.port_option("Local UDP port; 0 for any.", minimum=0)] = 0,
     system: Annotated[
         int, Option(min=0, max=255, help="System id of the vehicle; 0 for the first one that sends.")
     ] = 0,

@@ -85,8 +85,8 @@ def serve(port: int) -> None:
     try:
         server = listening(port)
     except OSError as error:
-        why = os.strerror(error.errno) if error.errno else str(error)
-        print(json.dumps({"error": why, "taken": error.errno == errno.EADDRINUSE}))
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        print(json.dumps({"error": reason, "taken": error.errno == errno.EADDRINUSE}))
         return
     with server:
         print(json.dumps({"ready": port}), flush=True)
@@ -110,9 +110,9 @@ def answer(connection: socket.socket) -> None:
     try:
         with connection.makefile("rb") as stream:
             while size := stream.read(SIZE_BYTES):
-                left = int.from_bytes(size, "big")
-                while left > 0 and (data := stream.read(min(left, CHUNK_BYTES))):
-                    left -= len(data)
+                remaining = int.from_bytes(size, "big")
+                while remaining > 0 and (data := stream.read(min(remaining, CHUNK_BYTES))):
+                    remaining -= len(data)
                 connection.sendall(DONE)
     except OSError:
         return

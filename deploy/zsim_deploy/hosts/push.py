@@ -134,22 +134,22 @@ async def _install(
     return True
 
 
-def is_installed(wanted: WheelSet, installed: dict[str, Any] | None) -> bool:
+def is_installed(wheels: WheelSet, installed: dict[str, Any] | None) -> bool:
     """Return whether the wanted wheels are installed on a host, according to the last push's note (`installed`)."""
-    if installed is None or installed["project"] != wanted.project.sha256:
+    if installed is None or installed["project"] != wheels.project.sha256:
         return False
-    return set(wanted.extras) <= set(installed["extras"]) and not _new(wanted, installed)
+    return set(wheels.extras) <= set(installed["extras"]) and not _new(wheels, installed)
 
 
-def _new(wanted: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
+def _new(wheels: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
     """Return the wheels of other projects that are not installed yet."""
     installed_hashes = installed["wheels"] if installed else {}
-    return [wheel for wheel in wanted.others if installed_hashes.get(wheel.path.name) != wheel.sha256]
+    return [wheel for wheel in wheels.others if installed_hashes.get(wheel.path.name) != wheel.sha256]
 
 
-def missing(wanted: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
+def missing(wheels: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
     """Return the wheels that must be copied to a host, the largest first, so that progress is smooth at the end."""
-    needed = [wanted.project, wanted.pip, *_new(wanted, facts["installed"])]
+    needed = [wheels.project, wheels.pip, *_new(wheels, facts["installed"])]
     lacking = [wheel for wheel in needed if facts["wheels"].get(wheel.path.name) != wheel.sha256]
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
 

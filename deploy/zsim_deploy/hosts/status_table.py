@@ -86,10 +86,10 @@ class StatusTable(Screen):
     def health(self, line: dict[str, Any]) -> None:
         """Store the health of a process; its message rate follows from the previous health."""
         now_s = time.monotonic()
-        former = self._health.get(line["name"])
+        previous = self._health.get(line["name"])
         rate = None
-        if former is not None and now_s > former["wall_s"] and line["received"] >= former["received"]:
-            rate = (line["received"] - former["received"]) / (now_s - former["wall_s"])
+        if previous is not None and now_s > previous["wall_s"] and line["received"] >= previous["received"]:
+            rate = (line["received"] - previous["received"]) / (now_s - previous["wall_s"])
         self._health[line["name"]] = {**line, "wall_s": now_s, "per_s": rate}
 
     def report_silent_hosts(self) -> None:
@@ -128,11 +128,11 @@ class StatusTable(Screen):
         if silent_s := self._no_sign_s(member.name, link.round_trip_s if link else 0.0):
             return f"no sign of life for {silent_s:.0f} s"
         waiting = (self.clock_now or {}).get("waiting_for", ())
-        waited = next((each for each in waiting if each["name"] == member.name), None)
-        if waited and waited.get("held_by"):
-            return f"waits for {', '.join(waited['held_by'])}"
-        if waited and waited["since_wall_s"] > WAITED_S:
-            return f"waited for {waited['since_wall_s']:.0f} s"
+        waiting_entry = next((each for each in waiting if each["name"] == member.name), None)
+        if waiting_entry and waiting_entry.get("held_by"):
+            return f"waits for {', '.join(waiting_entry['held_by'])}"
+        if waiting_entry and waiting_entry["since_wall_s"] > WAITED_S:
+            return f"waited for {waiting_entry['since_wall_s']:.0f} s"
         return member.state
 
     def _no_sign_s(self, name: str, round_trip_s: float) -> float:
@@ -158,8 +158,10 @@ class StatusTable(Screen):
         first = rows if self._choice.sort else sorted(rows, key=needs_attention)
         states = Counter(row["state"] for row in first[lines:])
         summary = ", ".join(f"{count} {state}" for state, count in states.most_common(3))
-        more = f"… and {len(first) - lines} more: {summary}{', …' if len(states) > 3 else ''}; `zsim ps` shows all"
-        return Group(head, table(first[:lines], one_line=True), cell(more))
+        hidden_text = (
+            f"… and {len(first) - lines} more: {summary}{', …' if len(states) > 3 else ''}; `zsim ps` shows all"
+        )
+        return Group(head, table(first[:lines], one_line=True), cell(hidden_text))
 
 
 def _is_silent(link: "HostLink") -> bool:

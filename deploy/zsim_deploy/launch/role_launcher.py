@@ -203,9 +203,9 @@ class RoleLauncher:
     def _start_forkserver(self) -> None:
         self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with other:
-            quiet, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
+            devnull, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
             self._forkserver = subprocess.Popen(
-                [*FORKSERVER, self._run, ROOM], stdin=other.fileno(), stdout=quiet, stderr=quiet, env=environment,
+                [*FORKSERVER, self._run, ROOM], stdin=other.fileno(), stdout=devnull, stderr=devnull, env=environment,
                 start_new_session=True,
             )  # fmt: skip
         start = SlowStart(self._say)
@@ -298,13 +298,13 @@ class ForkedProcess:
 
 @contextmanager
 def _subreaper() -> Iterator[None]:
-    libc, former = ctypes.CDLL(None), ctypes.c_int()
-    libc.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(former), 0, 0, 0)
+    libc, previous = ctypes.CDLL(None), ctypes.c_int()
+    libc.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(previous), 0, 0, 0)
     libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     try:
         yield
     finally:
-        libc.prctl(PR_SET_CHILD_SUBREAPER, former.value, 0, 0, 0)
+        libc.prctl(PR_SET_CHILD_SUBREAPER, previous.value, 0, 0, 0)
 
 
 class ProgramProcess:
@@ -421,8 +421,8 @@ class RunConsole:
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         if self.process is None:
             return
-        hurries = self.outcome.interrupted or isinstance(error, (KeyboardInterrupt, SystemExit))
-        limit_s = INTERRUPTED_S if hurries else COPIED_S
+        is_hurried = self.outcome.interrupted or isinstance(error, (KeyboardInterrupt, SystemExit))
+        limit_s = INTERRUPTED_S if is_hurried else COPIED_S
         try:
             with interruptible():
                 self.process.request_stop(self.outcome.reason)

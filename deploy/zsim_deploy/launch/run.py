@@ -65,7 +65,7 @@ class RunOptions:
         return {"rows": rows, "clock": clock, "out": str(self.out.absolute()), "roles": [row["role"] for row in rows]}
 
     def agents(self) -> list[AgentSpec]:
-        return [AgentSpec.parse(words) for words in self.launch.agents]
+        return [AgentSpec.parse(arguments) for arguments in self.launch.agents]
 
     def camera_children(self) -> "list[CameraChild]":
         return camera_children(self.scenario, self.cameras or self.scenario.gates("camera"), self.detect)

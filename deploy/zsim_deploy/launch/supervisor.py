@@ -431,14 +431,14 @@ class EndSignals:
         handlers: dict[int, Any] = {signal.SIGTERM: signal.default_int_handler}
         if hasattr(signal, "SIGHUP"):  # not on Windows
             handlers[signal.SIGHUP] = self._on_hangup
-        self._former = {number: signal.getsignal(number) for number in handlers}
+        self._previous = {number: signal.getsignal(number) for number in handlers}
         for number, handler in handlers.items():
-            if self._former[number] is not signal.SIG_IGN:
+            if self._previous[number] is not signal.SIG_IGN:
                 signal.signal(number, handler)
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._former.items():
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
 
     def _on_hangup(self, *_: object) -> None:

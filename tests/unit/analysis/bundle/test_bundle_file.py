@@ -19,7 +19,7 @@ from zsim_analysis.bundle.bundle_file import (
     README,
     SCENARIO,
     Manifest,
-    opened,
+    open_bundle,
     pins_of,
     write_bundle,
 )
@@ -64,7 +64,7 @@ def test_a_bundle_is_reproducible_and_contains_its_members(bundle: Path, tmp_pat
     again = write_bundle(tmp_path / "again.zsim", BLANK, dict(reversed(MEMBERS.items())), force=False)
     assert again.path.read_bytes() == bundle.read_bytes()
     assert zipfile.ZipFile(bundle).testzip() is None
-    with opened(bundle) as (manifest, folder):
+    with open_bundle(bundle) as (manifest, folder):
         assert set(manifest.files) == set(MEMBERS)
         assert (folder / "figures/a.csv").read_bytes() == MEMBERS["figures/a.csv"]
     assert not folder.exists()
@@ -109,7 +109,7 @@ def squeezed(entry: zipfile.ZipInfo, content: bytes) -> tuple[zipfile.ZipInfo, b
     ],
 )
 def test_a_changed_member_is_refused(bundle: Path, change: Change, terms: tuple[str, ...]) -> None:
-    with refused(RunError, *terms), opened(rewritten(bundle, change)):
+    with refused(RunError, *terms), open_bundle(rewritten(bundle, change)):
         pass
 
 
@@ -131,7 +131,7 @@ MANY = bundle_file.MEMBERS_MAX + 1
 def test_an_additional_member_is_refused_and_not_extracted(
     bundle: Path, tmp_path: Path, names: list[str], mode: int, terms: tuple[str, ...]
 ) -> None:
-    with refused(RunError, *terms), opened(added(bundle, *names, mode=mode | 0o644)):
+    with refused(RunError, *terms), open_bundle(added(bundle, *names, mode=mode | 0o644)):
         pass
     assert {path.name for path in tmp_path.iterdir()} == {"one.zsim"}
 
@@ -139,7 +139,7 @@ def test_an_additional_member_is_refused_and_not_extracted(
 @pytest.mark.parametrize("cut", [0, 10, 500, -30, -1])
 def test_a_truncated_or_empty_file_is_refused(bundle: Path, cut: int) -> None:
     bundle.write_bytes(bundle.read_bytes()[:cut])
-    with refused(RunError, "one.zsim", "bundle"), opened(bundle):
+    with refused(RunError, "one.zsim", "bundle"), open_bundle(bundle):
         pass
 
 
@@ -149,7 +149,7 @@ def test_any_changed_byte_of_content_is_refused_in_one_line(bundle: Path) -> Non
     for place in range(0, len(whole), 7):
         bundle.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
         try:
-            with opened(bundle) as (manifest, folder):
+            with open_bundle(bundle) as (manifest, folder):
                 held = {name: (folder / name).read_bytes() for name in manifest.files}
             accepted.append(place)
             assert held == MEMBERS, place  # a date or another archive field that does not affect the content
