@@ -1,4 +1,4 @@
-"""Measure the CPU time of an in-process run, excluding its first simulated second; print a line of JSON.
+"""Measure an in-process run: its CPU time after the first simulated second, and its memory; print a line of JSON.
 
 .venv/bin/python -m benchmarks.flight --drones 10 --seconds 5
 """
@@ -22,7 +22,7 @@ WARM_NS = 1_000_000_000  # simulated warm-up, not measured
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--drones", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=5.0, help="simulated")
+    parser.add_argument("--seconds", type=float, default=5.0, help="simulated time measured")
     given = parser.parse_args()
     print(json.dumps(fly(given.drones, given.seconds)), flush=True)
 
