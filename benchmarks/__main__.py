@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="number of repeats of every measurement (5)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--page", action="store_true", help="measure nothing; rewrite sections from the JSON files")
-    parser.add_argument("--no-page", action="store_true", help="leave benchmarks/README.md alone; redraw pictures")
+    parser.add_argument("--no-page", action="store_true", help="leave benchmarks/README.md alone; draw pictures")
     parser.add_argument("--against", metavar="REV", help="with only part c: measure this tree and a commit in turn")
     parser.add_argument(
         "--of",

@@ -103,7 +103,7 @@ def checked_out(revision: str, folder: Path) -> Iterator[Side]:
 
 
 def _environment(root: Path, folder: Path) -> Path:
-    """Make an environment with zsim from a checkout, the current packages and those that it lacks; return its Python."""
+    """Make an environment with zsim from a checkout, the current packages and those it lacks; return its Python."""
     project = tomllib.loads((root / "pyproject.toml").read_text())
     ours = project["tool"]["hatch"]["build"]["dev-mode-dirs"]
     shared = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
@@ -151,7 +151,7 @@ def described(root: Path) -> str:
 
 
 def _measured(sheet: Sheet, mine: str, name: str, flight: Flight, side: Side, path: Path) -> str:
-    """Make a short and a long flight, add the results, or why it failed, to the sheet; return them as text."""
+    """Make a short and a long flight, add the results, or why a flight failed, to the sheet; return them as text."""
     try:
         _, short_cpu_s, _ = _flown(side, flight, flight.short_s, path)
         factor, long_cpu_s, peak_mb = _flown(side, flight, flight.long_s, path)

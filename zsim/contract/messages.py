@@ -239,8 +239,12 @@ class Info(Message, frozen=True):
     @property
     def sensors_beside(self) -> tuple[str, ...]:
         """Names of the sensors besides the contract's six that the run's drones have, in the order of their keys."""
-        seen = (keys.SIGHTINGS,) * (self.sightings is True)
-        return (*(each.name for each in self.own_sensors), *seen, *(() if self.scanners is UNSET else self.scanners))
+        sightings = (keys.SIGHTINGS,) * (self.sightings is True)
+        return (
+            *(each.name for each in self.own_sensors),
+            *sightings,
+            *(() if self.scanners is UNSET else self.scanners),
+        )
 
     @property
     def own_messages(self) -> tuple[MessageInfo, ...]:
@@ -277,8 +281,8 @@ def shape_of(key: str) -> str:
     """Return a key with `*` in place of its name, as in TOPICS."""
     if key in TOPICS:
         return key
-    kind, whose, what = keys.parts(key)
-    return f"view/{whose}/*" if kind == "view" else f"{kind}/*/{what}"
+    kind, owner, topic = keys.parts(key)
+    return f"view/{owner}/*" if kind == "view" else f"{kind}/*/{topic}"
 
 
 @lru_cache(maxsize=KEYS_KEPT)
@@ -350,8 +354,8 @@ def output_type(key: str) -> type[Struct]:
         raise DecodeError(f"{key:.80}: is not a key of the contract; see docs/protocol.md")
     if not is_output(key):
         todo = "return it from `views`" if key.startswith("view/") else "only the process that owns it writes there"
-        what = "is not a key of an agent's outputs (commands, estimates, states, messages)"
-        raise DecodeError(f"{key:.80}: {what}; {todo}")
+        reason = "is not a key of an agent's outputs (commands, estimates, states, messages)"
+        raise DecodeError(f"{key:.80}: {reason}; {todo}")
     return kind
 
 

@@ -337,7 +337,7 @@ class DroneQueue:
         if self._closed:
             raise RuntimeError("closed")
         pool.submit(run)
-        self._tasks.setdefault(name, _DroneTasks()).busy += 1
+        self._tasks.setdefault(name, _DroneTasks()).running_count += 1
 
     def _end(self, name: str) -> None:
         with self._lock:

@@ -31,7 +31,7 @@ from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import ReportError, ScenarioError
-from zsim.output_folder import held_folder
+from zsim.output_folder import locked_folder
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import LAWS, Scenario
 from zsim_agents.hosting import check_classes
@@ -119,7 +119,7 @@ def fly_board(request: BoardRequest) -> list[Row]:
         KeyboardInterrupt: the finished flights are in the journal.
     """
     tasks = _tasks(request)
-    with held_folder(request.out, JOURNAL, OWN_FILES, request.force, "write a board into", "another board is flown"):
+    with locked_folder(request.out, JOURNAL, OWN_FILES, request.force, "write a board into", "another board is flown"):
         rows_by_identity = {row["identity"]: row for row in read_journal(request.out / JOURNAL)}
         missing = [task for task in tasks if task.varied["identity"] not in rows_by_identity]
         with SweepScreen(len(tasks), len(tasks) - len(missing), request.console) as screen:

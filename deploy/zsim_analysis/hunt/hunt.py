@@ -28,7 +28,7 @@ from rich.console import Console
 
 from zsim import __version__
 from zsim.errors import ReportError, RunError, ScenarioError
-from zsim.output_folder import held_folder
+from zsim.output_folder import locked_folder
 from zsim.scenario.faults import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim.schema import yaml_file
@@ -170,7 +170,7 @@ def hunt(request: HuntRequest) -> Hunted:
     space = HuntSpace(document, request.source, request.faults, request.without, request.vary, request.most)
     if (request.out / PLAN).exists() and not request.force:
         raise RunError(f"{request.out}: already holds a hunt; --force replaces it, or give --out another folder")
-    with held_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is running"):
+    with locked_folder(request.out, PLAN, OWN_FILES, request.force, "hunt into", "another hunt is running"):
         rmtree(request.out / VIOLATION, ignore_errors=True)  # left by an earlier hunt
         for name in (SCENARIO, BUNDLE):
             (request.out / name).unlink(missing_ok=True)

@@ -10,13 +10,13 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.transport.link_watch import (
+    EXCLUSION_S,
     HELD_BYTES,
-    KEPT_OUT_S,
     LOOK_S,
+    REPORT_PERIOD_S,
     SPARED,
     STALL_BYTES,
     STALL_S,
-    TOLD_S,
     Awaited,
     LinkSockets,
     LinkWatch,
@@ -143,7 +143,7 @@ def test_a_reader_that_stalls_repeatedly_is_kept_out_for_a_while():
     case.sockets.held = {READER: 0}
     case.passes(2.0)
     assert len(case.sockets.closed) == SPARED + 1
-    case.passes(2 * KEPT_OUT_S)
+    case.passes(2 * EXCLUSION_S)
     case.sockets.held = {READER: 0}
     case.passes(2.0)
     assert len(case.sockets.closed) == SPARED + 1
@@ -165,7 +165,7 @@ def test_closed_links_of_a_session_are_reported_at_intervals_with_a_count():
         case.sockets.held = {READER: HELD_BYTES}
         case.passes(1.0)
     assert [closed.times for closed in case.watch.closed] == [1]
-    case.passes(TOLD_S)
+    case.passes(REPORT_PERIOD_S)
     case.sockets.held = {READER: HELD_BYTES}
     case.passes(1.0)
     assert [closed.times for closed in case.watch.closed] == [1, SPARED]
@@ -177,7 +177,7 @@ def test_a_session_that_is_kept_out_is_reported_only_if_it_holds_data_back():
         case.sockets.held = {READER: HELD_BYTES}
         case.passes(1.0)
     case.watch.closed.clear()
-    case.passes(TOLD_S)
+    case.passes(REPORT_PERIOD_S)
     case.sockets.held = {READER: STALL_BYTES - 1}
     case.passes(1.0)
     assert len(case.sockets.closed) == SPARED + 1
