@@ -22,7 +22,7 @@ WARM_NS = 1_000_000_000  # simulated warm-up, not measured
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--drones", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=5.0, help="simulated time measured")
+    parser.add_argument("--seconds", type=float, default=5.0, help="simulated")
     given = parser.parse_args()
     print(json.dumps(fly(given.drones, given.seconds)), flush=True)
 
