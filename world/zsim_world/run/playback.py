@@ -38,7 +38,7 @@ NOT_FLYABLE = "a replay: nobody can be flown"
 SEEK_MAX_S = 1e9  # limit that keeps nanoseconds within an int64
 VIEWED_MAX = 10_000  # drones times time steps in one answer to `views`: 2 MB
 VIEWED_MAX_S = 60.0  # simulated time in one answer to `views`; design choice: the replay stands still while reading
-BEFORE_NS = 1_000_000_000  # time within which every source of a view is published at least once
+LOOKBACK_NS = 1_000_000_000  # time within which every source of a view is published at least once
 CAMERA_ROLES = {CameraImage: "camera", CameraInfo: "camera", Sightings: "detector"}  # roles that publish them
 MARKS_MAX = 400  # marks on a timeline; more would be narrower than a pixel
 UNMARKED_EVENTS = frozenset({"command", "end"})  # kinds of events without a mark; commands are too many
@@ -348,7 +348,7 @@ class Playback(Coordinator):
         instants = [round((from_s + k * every_s) * 1e9) for k in range(int((to_s - from_s) / every_s) + 1)]
         last: dict[str, bytes] = {}
         views: list[tuple[str, bytes]] = []
-        for seq, (t_ns, passed) in enumerate(self._recorded_gates.latest_before(instants, self._viewed, BEFORE_NS)):
+        for seq, (t_ns, passed) in enumerate(self._recorded_gates.latest_before(instants, self._viewed, LOOKBACK_NS)):
             last |= passed
             if any(key.endswith("/truth") for key in passed):  # otherwise a gap in the record, or its end
                 views += [(key, messages.encode(message)) for key, message in self._build_views(last, t_ns, seq)]
