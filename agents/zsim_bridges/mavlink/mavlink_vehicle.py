@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract.messages import Origin
 from zsim.contract.run_messages import Event
-from zsim.errors import without_figures
+from zsim.errors import without_numbers
 from zsim.math import elementary as el
 from zsim.math.frames import turned_about_up
 from zsim.math.rotation import Vector
@@ -354,8 +354,8 @@ class MavlinkVehicle:
 
     def _set_point(self, setpoint: Setpoint | str) -> None:
         reason = setpoint if isinstance(setpoint, str) else self.flight.set_point(setpoint)
-        if reason and without_figures(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
-            self._refused.add(without_figures(reason))  # a stream of refusals would flood the operator's screen
+        if reason and without_numbers(reason) not in self._refused and len(self._refused) < REFUSED_MAX:
+            self._refused.add(without_numbers(reason))  # a stream of refusals would flood the operator's screen
             self._deny(reason)
 
     def _steer(self, message: dialect.ManualControl) -> None:
