@@ -29,9 +29,7 @@ from zsim.math.frames import geodetic_to_enu, heading, turned_about_up
 from zsim.math.rotation import LEVEL, Quaternion, Vector
 from zsim.scenario.scenario import Silence
 
-WINDOW_NS = (
-    5_000_000_000  # design choice: much longer than queuing delays, yet with little clock drift (50 ppm: 0.25 ms)
-)
+WINDOW_NS = 5_000_000_000  # design choice: much longer than queuing, yet with little clock drift (50 ppm: 0.25 ms)
 SIGMA_UNKNOWN_M = 2.0  # m, for a GPS receiver that does not report its accuracy (paper, section VI)
 P0_PA = 101_325.0  # Pa, pressure at sea level (ISO 2533)
 SCALE_M = 44_330.77  # m, T0 / lapse rate = 288.15 K / 6.5 K/km (ISO 2533)
